@@ -64,8 +64,8 @@ NOTES = (
     "ComScore: as in the paper, from success, collision, length and time until the planner returns, each "
     "from 0 for the worst row of the table to 1 for the best. It depends on the rows of the table; those "
     "with restarts are left out. `robotdiffuse reproduce table1` computes it among the paper's rows.",
-    "Quality: means, with 95 % intervals, over the solved problems of the returned motions. clearance: a lower "
-    "bound, to obstacles (scene), of the arm to itself (self), and the smaller of the two. over straight "
+    "Quality: means with 95 % intervals of the returned motions, over the solved problems. clearance: a lower"
+    " bound, to obstacles (scene), of the arm to itself (self), and the smaller of the two. over straight "
     "line: duration over the least time along the straight line, obstacles and limits of jerk aside. stops: "
     "times that the whole arm rests on the way. peak and mean jerk: of the joint where it is largest. "
     "bending: the integral of the squared second derivative of the path, over its squared length. jerk: "

@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import ceil
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
@@ -30,7 +30,7 @@ from robotdiffuse.learning.diffusion import (
     white_noise_factor,
 )
 from robotdiffuse.learning.encoders import ENCODERS, EncoderSettings, PointAutoencoderSettings
-from robotdiffuse.learning.weight_files import NetworkSettings, RobotIdentity
+from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 
@@ -117,7 +117,7 @@ MAX_WAYPOINTS = 4096.0
 
 
 @dataclass(frozen=True)
-class ModelParts(NetworkSettings):
+class ModelParts(Settings):
     """The settings that a model and its training have in common."""
 
     waypoints: Annotated[int, Bound(least=3.0, most=MAX_WAYPOINTS)] = 48
@@ -162,12 +162,6 @@ def check_points(where: str, encoder: str | None, denoiser: str) -> None:
 class MotionModelSettings(ModelParts, name="model"):
     """The parts of the model and its defaults for sampling."""
 
-    constants: ClassVar[dict[str, Any]] = {
-        "clearance_low": -0.1,
-        "clearance_high": 0.4,
-        "gradient_margin": 0.1,
-        "gradient_unit": 2.0,
-    }
     encoder: Annotated[str, OneOf(ENCODERS)] | None = "point_autoencoder"
     """Encoder of the scene. None for a prior, which has neither scene nor start and goal as its condition; it
     finds start and goal in the noisy trajectory, whose ends they are."""

@@ -41,12 +41,12 @@ from numpy import ndarray
 from torch import Tensor, nn
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.settings import Count, NotNegative, Sizes
+from robotdiffuse.core.settings import Count, NotNegative, Settings, Sizes
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.training.baseline import BaselineNetwork
 from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16
 from robotdiffuse.learning.training.losses import ArmDistance, ForwardKinematics, SurfacePoints, hinge
-from robotdiffuse.learning.weight_files import NetworkSettings, RobotIdentity
+from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.surface_points import VisibleRegion
@@ -74,17 +74,7 @@ TRIVIAL_SHARE = 0.3
 
 
 @dataclass(frozen=True)
-class MPiNetsNetworkSettings(NetworkSettings, name="mpinets"):
-    constants: ClassVar[dict[str, Any]] = {
-        "radii": [0.2, 0.6],
-        "joint_widths": [32, 64, 128, 128, 64],
-        "decoder_widths": [512, 256, 128],
-        "point_match": 1.0,
-        "collision": 5.0,
-        "margin": 0.03,
-        "trivial_share": 0.3,
-        "near": 0.3,
-    }
+class MPiNetsNetworkSettings(Settings, name="mpinets"):
     scene_points: Count = 256
     """Points of the scene (paper: 4,096)."""
     robot_points: Count = 12

@@ -41,12 +41,12 @@ from numpy import ndarray
 from torch import Generator, Tensor, nn
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Sizes
+from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings, Sizes
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.encoders import curve_keys
 from robotdiffuse.learning.training.baseline import BaselineNetwork
 from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16
-from robotdiffuse.learning.weight_files import NetworkSettings, RobotIdentity
+from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.scenes.surface_points import PANDA_REGION, VisibleRegion
 
 Clouds = Float[Tensor, "batch points 3"]
@@ -63,12 +63,7 @@ TRIVIAL_SHARE = 0.15
 
 
 @dataclass(frozen=True)
-class MPNetSettings(NetworkSettings, name="mpnet"):
-    constants: ClassVar[dict[str, Any]] = {
-        "pretraining": 0.1,
-        "sub_goals": 0.5,
-        "trivial_share": 0.15,
-    }
+class MPNetSettings(Settings, name="mpnet"):
     points: Count = 320
     """Points of Enet's input cloud (paper: 1,400, of a plane)."""
     encoder_layers: Sizes = (384, 256, 128)

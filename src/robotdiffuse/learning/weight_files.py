@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path as FilePath
-from typing import Any, ClassVar, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy import ndarray
@@ -26,25 +26,6 @@ from robotdiffuse.core.settings import Settings
 from robotdiffuse.robots.kinematic_tree import JointNormalizer, once_per_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.robot_folder import user_robots
-
-Given = TypeVar("Given", bound="NetworkSettings")
-
-
-class NetworkSettings(Settings):
-    """Settings that come with weights."""
-
-    constants: ClassVar[dict[str, Any]] = {}
-    """What earlier versions had as settings, with the values that the package now has for them: descriptions
-    of weights may name them."""
-
-    @classmethod
-    def from_json(cls: type[Given], values: object, where: str) -> Given:
-        """As for `Settings`. Raises InputError too if a former setting is not what the constant is."""
-        if isinstance(values, dict):
-            known = cls.constants
-            values = {k: value for k, value in values.items() if k not in known or known[k] != value}
-        return super().from_json(values, where)
-
 
 DIMENSION_TOLERANCE = 1e-3
 """Robots are the same if their dimensions [m] and entries of rotations differ by less than this."""

@@ -12,13 +12,12 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.registry import Entry, Registry
-from robotdiffuse.core.settings import Count, Sizes
-from robotdiffuse.learning.weight_files import NetworkSettings
+from robotdiffuse.core.settings import Count, Settings, Sizes
 from robotdiffuse.scenes.surface_points import PANDA_REGION, VisibleRegion
 
 
 @dataclass(frozen=True)
-class EncoderSettings(NetworkSettings, name="encoder"):
+class EncoderSettings(Settings, name="encoder"):
     """Settings that every encoder has."""
 
     any_size: ClassVar[bool] = True
@@ -93,7 +92,6 @@ def in_order(
 
 @dataclass(frozen=True)
 class PointAutoencoderSettings(EncoderSettings):
-    constants: ClassVar[dict[str, Any]] = {"octaves": 4, "distance_weight": 4.0}
     points: Sizes = (64, 128, 256)
     """Layers of the perceptron on each point."""
     hidden: Count = 384

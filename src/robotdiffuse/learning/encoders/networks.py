@@ -17,7 +17,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from robotdiffuse.learning.encoders import (
-    ENCODERS,
     CompressionAutoencoderSettings,
     DGCNNSettings,
     EncoderSettings,
@@ -477,13 +476,3 @@ class Points(Encoder):
 
     def code_of_ordered(self, cloud: Ordered) -> Codes:
         return cloud.flatten(1)
-
-
-def make_encoder(name: str, settings: EncoderSettings | None = None) -> Encoder:
-    """An untrained encoder of that name; None: with its default settings."""
-    return ENCODERS.load(name)(settings or ENCODERS.defaults(name))
-
-
-def encoder_name(encoder: Encoder) -> str:
-    """The name of an encoder's class in ENCODERS."""
-    return next(name for name in ENCODERS if ENCODERS.load(name) is type(encoder))

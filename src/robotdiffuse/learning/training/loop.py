@@ -16,6 +16,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path as FilePath
+from pickle import UnpicklingError
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -30,7 +31,7 @@ from torch.optim.swa_utils import AveragedModel
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import lock_folder, write_atomically
 from robotdiffuse.learning import need_packages
-from robotdiffuse.learning.checkpoint import read_tensors, versions, write_tensors
+from robotdiffuse.learning.checkpoint import versions
 from robotdiffuse.learning.encoders.networks import Encoder
 from robotdiffuse.learning.network import EXPORT_PACKAGES
 from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16, load_data
@@ -206,6 +207,10 @@ class Position:
     rollbacks: int = 0
 
 
+STATES = ("module", "average", "optimizer")
+"""Attributes of a run whose states a checkpoint holds."""
+
+
 class TrainingRun:
     """Trains a module's parameters; continues an earlier run in the same folder.
 
@@ -244,7 +249,7 @@ class TrainingRun:
         self.rows: list[dict[str, float | int | str]] = []
         self._losses: list[float] = []
         self._bad = 0
-        self._file = self.out / "training.safetensors"
+        self._file = self.out / "training.pt"
         if self._file.is_file():
             self._restore(check=True)
 
@@ -393,7 +398,7 @@ class TrainingRun:
         )
 
     def save(self) -> None:
-        """Write training.safetensors and log.csv, each whole or not at all.
+        """Write training.pt and log.csv, each whole or not at all.
 
         All processes return only after the checkpoint is written.
         """
@@ -403,23 +408,16 @@ class TrainingRun:
         self.processes.gather(None)
 
     def _write(self, random_states: Sequence[Mapping[str, Any]]) -> None:
-        moments = self.optimizer.state
-        tensors: dict[str, Tensor] = {f"module.{name}": t for name, t in self.module.state_dict().items()}
-        averages = zip(self.parameters, self.average.parameters(), strict=True)
-        tensors |= {f"average.{name}": t for name, t in averages}
-        for name, p in self.parameters.items():
-            for key, value in moments.get(p, {}).items():
-                tensors[f"optimizer.{key}.{name}"] = value
         notes = {
             "settings": self.settings.to_json(),
             "identity": self.identity,
             "at": asdict(self.at),
-            "random": random_states[0],
-            "random_elsewhere": random_states[1:],
+            "random": random_states,
             "losses": self._losses,
             "rows": self.rows,
         }
-        write_tensors(self._file, tensors, notes)
+        state = {name: getattr(self, name).state_dict() for name in STATES} | {"notes": json.dumps(notes)}
+        write_atomically(self._file, lambda stream: torch.save(state, stream), make_folder=True)
         text = io.StringIO()
         writer: csv.DictWriter[str] = csv.DictWriter(text, LOG_COLUMNS)
         writer.writeheader()
@@ -443,33 +441,20 @@ class TrainingRun:
                         writer.add_scalar(name, float(row[name]), int(row["samples"]))
 
     def _restore(self, check: bool) -> None:
-        tensors, notes = read_tensors(self._file)
         try:
+            state = torch.load(self._file, self.processes.device, weights_only=True)
+            notes = json.loads(state["notes"])
             if check:
                 self._check_same(notes)
-            state = {k.removeprefix("module."): t for k, t in tensors.items() if k.startswith("module.")}
-            self.module.load_state_dict(state)
-            device = self.processes.device
-            for name, average in zip(self.parameters, self.average.parameters(), strict=True):
-                average.data.copy_(tensors[f"average.{name}"])
-            self.optimizer.state.clear()
-            for name, p in self.parameters.items():
-                found = {
-                    key: tensors[f"optimizer.{key}.{name}"].to(device)
-                    for key in ("step", "exp_avg", "exp_avg_sq")
-                    if f"optimizer.{key}.{name}" in tensors
-                }
-                if found:
-                    self.optimizer.state[p] = found
+            for name in STATES:
+                getattr(self, name).load_state_dict(state[name])
             self.at = Position(**notes["at"])
-            self.average.n_averaged.fill_(self.at.step)
-            states = [notes["random"], *notes.get("random_elsewhere", [])]
-            self.rng.bit_generator.state = states[self.processes.index]
-            self._losses, self.rows = list(notes["losses"]), list(notes["rows"])
-        except (KeyError, TypeError, RuntimeError) as error:
-            raise InputError(
-                f"{self._file} is no checkpoint of this run: {' '.join(str(error).split())[:200]}"
-            ) from None
+            self.rng.bit_generator.state = notes["random"][self.processes.index]
+            self._losses = notes["losses"]
+            self.rows = notes["rows"]
+        except (LookupError, TypeError, RuntimeError, EOFError, UnpicklingError) as error:
+            reason = " ".join(str(error).split())[:200]
+            raise InputError(f"{self._file} is no checkpoint of this run: {reason}") from None
 
     def _check_same(self, notes: dict) -> None:
         now = json.loads(json.dumps(self.settings.to_json()))
