@@ -54,9 +54,8 @@ from robotdiffuse.learning.encoders.networks import Encoder, fp32, wave_angles
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.training.batches import Batch, scene_clouds
 from robotdiffuse.learning.training.config import JOINT_POINT_COLLISION, EncoderTraining, PlannerTraining
-from robotdiffuse.learning.training.encoder import train_encoder
 from robotdiffuse.learning.training.loop import Processes, Validation, train
-from robotdiffuse.learning.training.planner import PlannerTask, model_settings
+from robotdiffuse.learning.training.tasks import PlannerTask, model_settings, train_encoder
 from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.planning.hybrid import smooth_noise
 from robotdiffuse.planning.search.rrt import AORRTC

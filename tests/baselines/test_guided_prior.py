@@ -45,7 +45,7 @@ from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.training.batches import Batches, TrajectoryData
 from robotdiffuse.learning.training.config import planner_training
 from robotdiffuse.learning.training.loop import Processes
-from robotdiffuse.learning.training.planner import PlannerLoss, model_settings, planning_success
+from robotdiffuse.learning.training.tasks import PlannerLoss, model_settings, planning_success
 from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot

@@ -26,7 +26,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[PlannerTraining]:
         trained.append(settings)
         return {}
 
-    monkeypatch.setattr("robotdiffuse.learning.training.planner.train_planner", train_planner)
+    monkeypatch.setattr("robotdiffuse.learning.training.tasks.train_planner", train_planner)
     return trained
 
 

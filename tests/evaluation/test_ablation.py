@@ -9,14 +9,14 @@ from helpers.example_robots import planar_arm
 from robotdiffuse.cli import main
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.evaluation import ablation
-from robotdiffuse.evaluation.metrics import Kinematics
+from robotdiffuse.evaluation.metrics import link_length
 from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.networks import TrajectoryTransformer
 from robotdiffuse.learning.encoders import make_encoder
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.training.config import CONFIGS, planner_training
-from robotdiffuse.learning.training.planner import model_settings
+from robotdiffuse.learning.training.tasks import model_settings
 from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.robots import load_robot
 
@@ -66,7 +66,7 @@ def test_link_path_length_by_hand() -> None:
     turn = np.linspace(0.0, 1.0, 2001)
     q = np.stack([turn, 0 * turn], axis=1)
     # l1 turns in place; l2's origin is 0.5 m from the axis; the tip is fixed to l2
-    np.testing.assert_allclose(Kinematics(arm).link_length(np.stack([q, q[::-1]])), 0.5, rtol=1e-6)
+    np.testing.assert_allclose(link_length(arm, np.stack([q, q[::-1]])), 0.5, rtol=1e-6)
 
 
 def test_bootstrap_covers_the_mean() -> None:

@@ -15,7 +15,7 @@ from helpers.box_arm import box_arm
 from helpers.toy_task import ToyTask
 from robotdiffuse.core.interrupts import exit_fast
 from robotdiffuse.learning.checkpoint import write_tensors
-from robotdiffuse.learning.training import planner as training
+from robotdiffuse.learning.training import tasks as training
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
 from robotdiffuse.learning.training.loop import Processes, TrainingRun
 

@@ -37,12 +37,11 @@ from robotdiffuse.learning.encoders.networks import (
 from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.learning.motion_model import MotionModelSettings
 from robotdiffuse.learning.motion_network import MotionNetwork
-from robotdiffuse.learning.training import encoder as encoder_training
-from robotdiffuse.learning.training import planner as training
+from robotdiffuse.learning.training import tasks as encoder_training
+from robotdiffuse.learning.training import tasks as training
 from robotdiffuse.learning.training.batches import Batches, load_data, random_scenes, scene_clouds
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
-from robotdiffuse.learning.training.encoder import linear_readout, train_encoder
-from robotdiffuse.learning.training.planner import train_planner
+from robotdiffuse.learning.training.tasks import linear_readout, train_encoder, train_planner
 from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.scenes.scene_arrays import SPHERE
 from robotdiffuse.scenes.surface_points import PANDA_REGION

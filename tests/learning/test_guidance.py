@@ -12,8 +12,7 @@ import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
-from robotdiffuse.learning.guidance_kernel import OFF
+from robotdiffuse.learning.guidance import OFF, CollisionGuidance, GuidanceSettings
 from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.problems.constraint_kernel import DISTANCE
 from robotdiffuse.problems.constraints import Constraint

@@ -182,7 +182,7 @@ def _given(arguments: argparse.Namespace, names: tuple[str, ...]) -> dict[str, o
 def run_encoder(arguments: argparse.Namespace) -> int:
     need_packages("training", "torch")
     from robotdiffuse.learning.training.config import EncoderTraining
-    from robotdiffuse.learning.training.encoder import train_encoder
+    from robotdiffuse.learning.training.tasks import train_encoder
 
     given = _given(arguments, ("name", "scenes", "device", *TRAINING_OPTIONS))
     if "samples" in given:
@@ -208,7 +208,7 @@ def run_planner(arguments: argparse.Namespace) -> int:
     need_packages("training", "torch")
     from robotdiffuse.learning.denoisers import DENOISERS
     from robotdiffuse.learning.training.config import CONFIGS, planner_training
-    from robotdiffuse.learning.training.planner import train_planner
+    from robotdiffuse.learning.training.tasks import train_planner
 
     if arguments.config not in CONFIGS:
         known = [f"{name}: {config.description}" for name, config in CONFIGS.items()]
@@ -264,9 +264,8 @@ def _run_for_robot(arguments: argparse.Namespace, given: dict[str, Any]) -> int:
 
 def run_baseline(arguments: argparse.Namespace) -> int:
     need_packages("training", "torch")
-    from robotdiffuse.learning.training.baseline import baseline_training, train_baseline
     from robotdiffuse.learning.training.config import planner_training
-    from robotdiffuse.learning.training.planner import train_planner
+    from robotdiffuse.learning.training.tasks import baseline_training, train_baseline, train_planner
 
     given = _given(arguments, ("data", "robot", *TRAINING_OPTIONS))
     if arguments.name == "trajectory_prior":
@@ -351,7 +350,7 @@ def train_for_robot(
     from robotdiffuse.cli.console import progress
     from robotdiffuse.generation import generate
     from robotdiffuse.learning.training.config import PlannerTraining
-    from robotdiffuse.learning.training.planner import train_planner
+    from robotdiffuse.learning.training.tasks import train_planner
     from robotdiffuse.learning.weight_files import user_weights
 
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:

@@ -41,7 +41,7 @@ Row = dict[str, ndarray | np.generic]
 def row_of(
     scene: PackedScenes,
     q: Float32[ndarray, "waypoints dof"],
-    clearances: Float[ndarray, "waypoints"],
+    clearances: Values,
     goals: Configurations,
     goal_costs: Values,
     goal_index: int,
@@ -52,7 +52,7 @@ def row_of(
     line_free: bool,
     seed: int,
     most_goals: int,
-    times: Float[ndarray, "waypoints"] | None = None,
+    times: Values | None = None,
 ) -> Row:
     """The row of a motion q in a packed scene.
 

@@ -7,17 +7,17 @@ without guidance, and by a control: guidance of trajectories that do not come fr
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from pathlib import Path as FilePath
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.core.settings import Count, OneOf, Settings
 from robotdiffuse.core.tables import Column, Figure, Table
+from robotdiffuse.core.types import Values
 from robotdiffuse.datasets.shards import read_manifest
 from robotdiffuse.evaluation.comparison import Mean
 from robotdiffuse.evaluation.methods import (
@@ -27,7 +27,7 @@ from robotdiffuse.evaluation.methods import (
     sampling_digest,
     without_network,
 )
-from robotdiffuse.evaluation.metrics import Kinematics
+from robotdiffuse.evaluation.metrics import link_length
 from robotdiffuse.evaluation.paper import paper_report, straight_line_shares
 from robotdiffuse.evaluation.problem_sets import hard_cases
 from robotdiffuse.evaluation.report import Report, share_cell
@@ -35,8 +35,7 @@ from robotdiffuse.evaluation.runs import Record, run_all
 from robotdiffuse.evaluation.statistics import bootstrap_interval, wilson_interval
 from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.training.config import CONFIGS, EncoderTraining, planner_training
-from robotdiffuse.learning.training.encoder import train_encoder
-from robotdiffuse.learning.training.planner import train_planner
+from robotdiffuse.learning.training.tasks import train_encoder, train_planner
 from robotdiffuse.planning.hybrid import RobotDiffuse
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.families.rop import ROP, Rop
@@ -102,15 +101,15 @@ class AblationSettings(Settings):
 class Evaluation:
     """Figures of a network, one value for each problem."""
 
-    single: Float[ndarray, "n"]
+    single: Values
     """Share of the sampled trajectories that passed the validator."""
-    best: Float[ndarray, "n"]
+    best: Values
     """1 if any of them passed."""
-    collided: Float[ndarray, "n"]
+    collided: Values
     """Share of the sampled trajectories in collision."""
-    length: Float[ndarray, "n"]
+    length: Values
     """Link path length of the shortest that passed [m]; NaN without one."""
-    seconds: Float[ndarray, "n"]
+    seconds: Values
     """CPU time of encoding and sampling on one thread [s]."""
 
     @classmethod
@@ -243,7 +242,7 @@ def _evaluate(
         planner = replace(planner, weights=str(folder), points=encoder.settings.cloud)
         draw = from_network(RobotDiffuse(planner))
     digest = sampling_digest(planner, None if training is None else folder)
-    method = {f"{'guided' if guided else 'unguided'} {digest}": sampled(draw, Kinematics(robot).link_length)}
+    method = {f"{'guided' if guided else 'unguided'} {digest}": sampled(draw, partial(link_length, robot))}
     (records,) = run_all(cases, method, seeds=(1,), folder=folder, bar=False).values()
     return Evaluation.of(records)
 
@@ -332,6 +331,6 @@ def straight_line_table(problems: int) -> Table:
     )
 
 
-def _share(values: Float[ndarray, "n"]) -> Figure:
+def _share(values: Values) -> Figure:
     """Mean of shares, with its 95 % interval."""
     return share_cell(float(values.mean()), bootstrap_interval(values))

@@ -12,13 +12,13 @@ from pathlib import Path as FilePath
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError, distinct
 from robotdiffuse.core.tables import Column, Table
-from robotdiffuse.core.types import Path
+from robotdiffuse.core.types import Configurations, Path
 from robotdiffuse.datasets.rows import path_of, problem_of, scenes_of
 from robotdiffuse.datasets.shards import (
     Manifest,
@@ -307,7 +307,7 @@ def _ends(shard: Shard, row: int) -> Iterator[tuple[str, str]]:
         yield "ends", f"the last waypoint differs from goal {goal} by {off:.3g}"
 
 
-def _limits(robot: Robot, q: Float[ndarray, "n dof"]) -> Iterator[tuple[str, str]]:
+def _limits(robot: Robot, q: Configurations) -> Iterator[tuple[str, str]]:
     excess = np.maximum(robot.lower - q, q - robot.upper)
     excess[:, robot.continuous] = 0.0
     if excess.max() > LIMIT_SLACK:

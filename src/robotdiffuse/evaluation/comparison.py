@@ -12,13 +12,11 @@ from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import JsonLines
 from robotdiffuse.core.tables import Figure
-from robotdiffuse.core.types import Status
+from robotdiffuse.core.types import Status, Values
 from robotdiffuse.evaluation.metrics import METRICS, Metric
 from robotdiffuse.evaluation.problem_sets import read_cases
 from robotdiffuse.evaluation.runs import (
@@ -293,11 +291,11 @@ class Curve:
     calls: int
     end: float
     """Results later than this [s] are known for some problems only."""
-    found: Float[ndarray, "solved"]
+    found: Values
     """Times of first paths [s], sorted."""
-    times: Float[ndarray, "t"]
+    times: Values
     """Times from which half of these problems are solved [s]."""
-    ratios: Float[ndarray, "t"]
+    ratios: Values
     """Median at these times of joint-space length over the best known one, on the non-trivial problems that
     the planner solves in the end; problems not solved yet count as infinite."""
 
@@ -455,7 +453,7 @@ def _indicators(outcomes: Sequence[Outcome]) -> Indicators:
     )
 
 
-def _problem_lengths(keys: Sequence[Key], outcomes: Sequence[Outcome]) -> Float[ndarray, "problems"]:
+def _problem_lengths(keys: Sequence[Key], outcomes: Sequence[Outcome]) -> Values:
     """The joint-space length of each problem [rad]: the median of its seeds, NaN if half or more of them
     failed."""
     lengths: dict[str, list[float]] = {}

@@ -22,7 +22,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Path, Status
+from robotdiffuse.core.types import Path, Status, Values
 from robotdiffuse.evaluation.metrics import Measure
 from robotdiffuse.evaluation.runs import (
     ENDED_EARLY,
@@ -179,7 +179,7 @@ def validated(problem: Problem, q: Float[ndarray, "n waypoints dof"]) -> Validat
     return Validated(np.array(passed), np.array(hit), reports, exact)
 
 
-def path_lengths(q: Float[ndarray, "n waypoints dof"]) -> Float[ndarray, "n"]:
+def path_lengths(q: Float[ndarray, "n waypoints dof"]) -> Values:
     """Joint-space lengths [rad]."""
     return np.linalg.norm(np.diff(q, axis=1), axis=2).sum(axis=1)
 

@@ -11,11 +11,13 @@ from numpy import ndarray
 
 from robotdiffuse.collision.exact_meshes import forward_frames
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Path, Trajectory
-from robotdiffuse.robots.kinematics import link_origins
+from robotdiffuse.core.types import Configurations, Path, State, Trajectory, Values
+from robotdiffuse.datasets.rows import resample
+from robotdiffuse.robots.kinematics import link_jacobians, link_origins
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.straight_line import straight_line_time
 from robotdiffuse.validation.report import Report
+from robotdiffuse.validation.tolerances import sample_path
 
 STEP = 0.02
 """Longest step for link paths [rad, joint-space L2]; arcs are then measured 2e-5 too short."""
@@ -39,56 +41,31 @@ Verdict = Report | PlanResult
 """Holds the clearances of a motion that passed the validator."""
 
 
-class Kinematics:
-    """Path lengths of the links of one robot."""
+def link_length(robot: Robot, q: Float[ndarray, "n waypoints dof"]) -> Values:
+    """The paper's path length: the sum over the links that joints move, such as links 1 to 7 of the Panda, of
+    the path lengths of their origins [m].
 
-    def __init__(self, robot: Robot) -> None:
-        self.robot = robot
-
-    def link_length(self, q: Float[ndarray, "n waypoints dof"]) -> Float[ndarray, "n"]:
-        """The paper's path length: the sum over the links that joints move, such as links 1 to 7 of the
-        Panda, of the path lengths of their origins [m].
-
-        Links that are fixed to these, such as hand and fingers, are left out: they would count the last link
-        several times. The paper's arm has no hand.
-        """
-        T = forward_frames(self.robot, np.asarray(q, np.float64).reshape(-1, q.shape[-1]))
-        at = T[:, 1:, :3, 3]
-        at = at.reshape(*q.shape[:2], *at.shape[1:])
-        return np.linalg.norm(np.diff(at, axis=1), axis=-1).sum(axis=(1, 2))
-
-    def tip_length(self, q: Float[ndarray, "waypoints dof"]) -> float:
-        """Path length of the origin of the robot's tip [m]."""
-        tip = link_origins(self.robot, q, self.robot.tip)
-        return float(np.linalg.norm(np.diff(tip, axis=0), axis=1).sum())
-
-    def tip_speed(self, motion: Trajectory) -> Float[ndarray, "n"]:
-        """Speed of the origin of the robot's tip at each row [m/s]."""
-        robot = self.robot
-        q = motion.positions
-        joints = list(robot.chain(robot.tip))
-        T = forward_frames(robot, q)[:, [j + 1 for j in joints]]
-        tip = link_origins(robot, q, robot.tip)
-        slides = np.array(robot.prismatic)[joints][:, None]
-        axes = T[..., :3, 2]
-        arms = tip[:, None] - T[..., :3, 3]
-        rates = np.where(slides, axes, np.cross(axes, arms))
-        return np.linalg.norm((rates * motion.velocities[:, joints, None]).sum(axis=1), axis=1)
+    Links that are fixed to these, such as hand and fingers, are left out: they would count the last link
+    several times. The paper's arm has no hand.
+    """
+    at = forward_frames(robot, np.asarray(q, np.float64).reshape(-1, q.shape[-1]))[:, 1:, :3, 3]
+    at = at.reshape(*q.shape[:2], *at.shape[1:])
+    return np.linalg.norm(np.diff(at, axis=1), axis=-1).sum(axis=(1, 2))
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
     """A motion to be measured; values that several metrics need are computed once."""
 
-    kinematics: Kinematics
+    robot: Robot
     path: Path
     trajectory: Trajectory | None
     """The timed motion; None for a path alone, which has no metrics of time."""
     verdict: Verdict | None
 
     @cached_property
-    def fine(self) -> Float[ndarray, "n dof"]:
-        return _fine(self.path.positions)
+    def fine(self) -> Configurations:
+        return sample_path(self.path.positions, STEP)[1]
 
 
 @dataclass(frozen=True)
@@ -117,15 +94,14 @@ def _clearance(name: str) -> Callable[[Motion], float | None]:
     return lambda motion: getattr(motion.verdict, name, None)
 
 
-def _timed(of: Callable[[Trajectory, Kinematics], float | None]) -> Callable[[Motion], float | None]:
+def _timed(of: Callable[[Trajectory, Robot], float | None]) -> Callable[[Motion], float | None]:
     """A metric of timed motions."""
-    return lambda motion: None if motion.trajectory is None else of(motion.trajectory, motion.kinematics)
+    return lambda motion: None if motion.trajectory is None else of(motion.trajectory, motion.robot)
 
 
-def _over_straight_line(trajectory: Trajectory, kinematics: Kinematics) -> float | None:
+def _over_straight_line(trajectory: Trajectory, robot: Robot) -> float | None:
     """Duration over the least time from the first row to the last along the straight line, obstacles and
     limits of jerk aside."""
-    robot = kinematics.robot
     if min(robot.velocity.min(), robot.acceleration.min()) <= 0:
         return None
     q = trajectory.positions
@@ -136,7 +112,7 @@ def _over_straight_line(trajectory: Trajectory, kinematics: Kinematics) -> float
 def _joint_jerk(of: Callable[[ndarray, ndarray], float]) -> Callable[[Motion], float | None]:
     """A metric of the jerks between rows, of the joint where each is largest, and of the steps' times."""
 
-    def value(trajectory: Trajectory, _: Kinematics) -> float | None:
+    def value(trajectory: Trajectory, _: Robot) -> float | None:
         steps = np.diff(trajectory.times)
         if not len(steps):
             return None
@@ -146,21 +122,31 @@ def _joint_jerk(of: Callable[[ndarray, ndarray], float]) -> Callable[[Motion], f
     return _timed(value)
 
 
-def _sparc_joint(trajectory: Trajectory, _: Kinematics) -> float:
-    even, step = _evenly(trajectory)
-    return spectral_arc_length(np.linalg.norm(even.velocities, axis=1), step)
+def _sparc(tip: bool) -> Callable[[Motion], float | None]:
+    """A metric of the spectral arc length of the speed of the joints, or of the tip."""
 
+    def value(trajectory: Trajectory, robot: Robot) -> float:
+        state, step = _evenly(trajectory)
+        rates = state.velocities
+        if tip:
+            jacobians = link_jacobians(robot, state.positions, robot.tip)[:, :3]
+            rates = (jacobians @ rates[..., None])[..., 0]
+        return spectral_arc_length(np.linalg.norm(rates, axis=1), step)
 
-def _sparc_tip(trajectory: Trajectory, kinematics: Kinematics) -> float:
-    even, step = _evenly(trajectory)
-    return spectral_arc_length(kinematics.tip_speed(even), step)
+    return _timed(value)
 
 
 _METRICS = (
     # Euclidean in joint space; the paper's: path lengths of the origins of all moving links together
     Metric("joint_length", "rad", "less", ".3f", lambda m: m.path.length),
-    Metric("link_length", "m", "less", ".2f", lambda m: m.kinematics.link_length(m.fine[None])[0]),
-    Metric("tip_length", "m", "less", ".2f", lambda m: m.kinematics.tip_length(m.fine)),
+    Metric("link_length", "m", "less", ".2f", lambda m: link_length(m.robot, m.fine[None])[0]),
+    Metric(
+        "tip_length",
+        "m",
+        "less",
+        ".2f",
+        lambda m: Path((), link_origins(m.robot, m.fine, m.robot.tip)).length,
+    ),
     # sum of the angles between successive segments in joint space; 0 for a straight line
     Metric("turning", "rad", "less", ".2f", lambda m: turning(m.path.positions)),
     Metric("bending", "", "less", ".0f", lambda m: bending(m.path.positions)),
@@ -175,8 +161,8 @@ _METRICS = (
     Metric("mean_jerk", "rad/s³", "less", ".0f", _joint_jerk(lambda j, dt: np.average(j, weights=dt))),
     # logarithm of the dimensionless jerk
     Metric("jerk", "", "less", ".2f", _timed(lambda t, _: log_dimensionless_jerk(t))),
-    Metric("sparc_joint", "", "more", ".2f", _timed(_sparc_joint)),
-    Metric("sparc_tip", "", "more", ".2f", _timed(_sparc_tip)),
+    Metric("sparc_joint", "", "more", ".2f", _sparc(tip=False)),
+    Metric("sparc_tip", "", "more", ".2f", _sparc(tip=True)),
 )
 METRICS = {metric.name: metric for metric in _METRICS}
 """Metrics by name, in the order of tables."""
@@ -186,32 +172,29 @@ class Measure:
     """Measures motions of one robot by all METRICS."""
 
     def __init__(self, robot: Robot) -> None:
-        self.kinematics = Kinematics(robot)
+        self.robot = robot
 
     def __call__(
         self, path: Path, trajectory: Trajectory | None = None, verdict: Verdict | None = None
     ) -> dict[str, float]:
         """Values of the metrics that the motion has, by name; lengths are 0 for one that stands still."""
-        motion = Motion(self.kinematics, path, trajectory, verdict)
+        motion = Motion(self.robot, path, trajectory, verdict)
         values = {name: metric.of(motion) for name, metric in METRICS.items()}
         return {name: float(f"{x:.{DIGITS}g}") for name, x in values.items() if x is not None}
 
 
-def bending(positions: Float[ndarray, "n dof"]) -> float:
+def bending(positions: Configurations) -> float:
     """The integral of |q''(u)|^2 du over u in [0, 1], over the squared length, of a path at BENDING_SAMPLES;
     0 for a straight line."""
-    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    length = float(steps.sum())
+    length = Path((), positions).length
     if length < STANDSTILL:
         return 0.0
-    at = np.concatenate([[0.0], np.cumsum(steps) / length])
-    u = np.linspace(0.0, 1.0, BENDING_SAMPLES)
-    even = np.stack([np.interp(u, at, column) for column in positions.T], axis=1)
+    even = resample(positions[None], BENDING_SAMPLES, exact=True)[0]
     second = np.diff(even, 2, axis=0) * (BENDING_SAMPLES - 1) ** 2
     return float((second**2).sum() / (BENDING_SAMPLES - 1) / length**2)
 
 
-def turning(positions: Float[ndarray, "n dof"]) -> float:
+def turning(positions: Configurations) -> float:
     """Sum of the angles between successive segments that have a length [rad]."""
     steps = np.diff(positions, axis=0)
     steps = steps[np.linalg.norm(steps, axis=1) > STANDSTILL]
@@ -230,7 +213,7 @@ def log_dimensionless_jerk(trajectory: Trajectory) -> float:
     time-optimal motions, the integral is inversely proportional to that time: compare only figures with the
     same one.
     """
-    length = float(np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1).sum())
+    length = Path((), trajectory.positions).length
     if length < STANDSTILL:
         return 0.0
     even, step = _evenly(trajectory)
@@ -239,7 +222,7 @@ def log_dimensionless_jerk(trajectory: Trajectory) -> float:
     return float(np.log(trajectory.duration**5 / length**2 * squared_jerk)) if squared_jerk > 0 else 0.0
 
 
-def spectral_arc_length(speed: Float[ndarray, "n"], step: float) -> float:
+def spectral_arc_length(speed: Values, step: float) -> float:
     """SPARC of a speed profile with rows `step` [s] apart (S. Balasubramanian, A. Melendez-Calderon, A.
     Roby-Brami and E. Burdet, "On the analysis of movement smoothness", 2015).
 
@@ -257,24 +240,7 @@ def spectral_arc_length(speed: Float[ndarray, "n"], step: float) -> float:
     return -float(np.hypot(1 / last, np.diff(amplitude[: last + 1])).sum())
 
 
-def _evenly(trajectory: Trajectory) -> tuple[Trajectory, float]:
-    """Resample with rows at even times about SAMPLE_TIME apart; the trajectory and the time between its rows
-    [s]."""
+def _evenly(trajectory: Trajectory) -> tuple[State, float]:
+    """The states at even times about SAMPLE_TIME apart, and the time between them [s]."""
     count = max(round(trajectory.duration / SAMPLE_TIME), 1)
-    times = np.linspace(0.0, trajectory.duration, count + 1)
-
-    def at(rows: Float[ndarray, "m dof"]) -> Float[ndarray, "n dof"]:
-        return np.stack([np.interp(times, trajectory.times, column) for column in rows.T], axis=1)
-
-    rows = (at(trajectory.positions), at(trajectory.velocities), at(trajectory.accelerations))
-    return Trajectory(trajectory.joint_names, times, *rows), trajectory.duration / count
-
-
-def _fine(positions: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
-    """Configurations along a path at most STEP apart, including its waypoints."""
-    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    counts = np.maximum(np.ceil(steps / STEP).astype(int), 1)
-    starts = np.repeat(np.arange(len(counts)), counts)
-    share = np.concatenate([np.arange(n) / n for n in counts]) if len(counts) else np.zeros(0)
-    between = positions[:-1][starts] + share[:, None] * np.diff(positions, axis=0)[starts]
-    return np.concatenate([between, positions[-1:]])
+    return trajectory.at(np.linspace(0.0, trajectory.duration, count + 1)), trajectory.duration / count

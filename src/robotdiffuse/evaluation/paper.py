@@ -13,13 +13,12 @@ from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.tables import Column, Table, plain
-from robotdiffuse.core.types import Path
+from robotdiffuse.core.types import Configurations, Path
 from robotdiffuse.evaluation import plots
 from robotdiffuse.evaluation.bench import BenchSettings, Done, run_bench
 from robotdiffuse.evaluation.bench_report import about, crashes, success_over_time
@@ -81,7 +80,7 @@ def draw_problem(number: int) -> dict[str, Problem]:
     }
 
 
-def goal_configurations(problem: Problem) -> Float[ndarray, "k dof"]:
+def goal_configurations(problem: Problem) -> Configurations:
     """The configurations of a problem's goal; for a pose at most ten free ones, those of a call with
     seed 0."""
     if isinstance(problem.goal, JointGoal):
@@ -91,7 +90,7 @@ def goal_configurations(problem: Problem) -> Float[ndarray, "k dof"]:
     return pose_configurations(problem, problem.goal, np.random.default_rng(0), checker.free)
 
 
-def free_lines(problem: Problem, goals: Float[ndarray, "k dof"]) -> list[float | None]:
+def free_lines(problem: Problem, goals: Configurations) -> list[float | None]:
     """Lengths of the straight lines from the start to goal configurations [rad], the nearest first; None for
     those that the validator refuses."""
     order = np.argsort(np.linalg.norm(goals - problem.start, axis=1))

@@ -16,14 +16,12 @@ from typing import Any
 from urllib.parse import quote, unquote
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 from rich.console import Console
 from rich.progress import Progress
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import JsonLines
-from robotdiffuse.core.types import Status
+from robotdiffuse.core.types import Configurations, Status
 from robotdiffuse.problems.held_out import SEED, Case
 from robotdiffuse.problems.problem import Problem
 
@@ -128,7 +126,7 @@ class Record:
         return not self.solved and self.refused.endswith("collision")
 
     @property
-    def waypoints(self) -> Float[ndarray, "n dof"]:
+    def waypoints(self) -> Configurations:
         return np.array(self.positions, np.float64)
 
     def row(self) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Values
 
 RESAMPLES = 2000
 TIE = 1e-6
@@ -30,7 +31,7 @@ def wilson_interval(successes: int, n: int) -> tuple[float, float]:
 
 
 def bootstrap_interval(
-    values: Float[ndarray, "n"], statistic: Callable[..., ndarray] = np.mean, seed: int = 0
+    values: Values, statistic: Callable[..., ndarray] = np.mean, seed: int = 0
 ) -> tuple[float, float]:
     """The 95 % interval of a statistic of independent values, by resampling them (B. Efron 1979).
 
@@ -62,7 +63,7 @@ class Paired:
     motions were longer: signed ranks (F. Wilcoxon 1945), two-sided, without ties; 1.0 if all are ties."""
 
 
-def compare(a: Float[ndarray, "n"], b: Float[ndarray, "n"]) -> Paired:
+def compare(a: Values, b: Values) -> Paired:
     """Compare two planners by the lengths of their motions [rad] or [m] on the same problems in the same
     order; NaN without a solution.
 
@@ -134,7 +135,7 @@ def normalized(rows: Sequence[Indicators]) -> Float[ndarray, "n 4"]:
     return np.where(np.isnan(values), 0.0, share)
 
 
-def comscores(rows: Sequence[Indicators]) -> Float[ndarray, "n"]:
+def comscores(rows: Sequence[Indicators]) -> Values:
     """The ComScore of each row, in [0, 1], with the paper's equal weights. It depends on which rows are
     compared."""
     return normalized(rows).mean(axis=1)

@@ -15,6 +15,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings
+from robotdiffuse.core.types import Configurations
 from robotdiffuse.planning.search.rrt import AnytimeSearch, SearchSettings
 from robotdiffuse.planning.start_goal import StartGoal, falling_clearances
 from robotdiffuse.robots.kinematic_tree import TURN
@@ -47,7 +48,7 @@ class AORRTCSearch:
         self,
         checker: CollisionChecker,
         start: Float[ndarray, "dof"],
-        goals: Float[ndarray, "k dof"],
+        goals: Configurations,
         settings: AORRTCSearchSettings,
         state: ndarray,
     ) -> None:
@@ -84,7 +85,7 @@ class AORRTCSearch:
         if search.best is not None:
             self._arrive(search.best)
 
-    def _arrive(self, path: Float[ndarray, "n dof"]) -> None:
+    def _arrive(self, path: Configurations) -> None:
         """Set `best_goal`; a continuous joint may end whole turns from its given value."""
         end = self._ends.complete(path)[-1]
         turns = np.abs(self.goals - end) / TURN
@@ -112,7 +113,7 @@ class AORRTCSearch:
         """Distance to obstacles that the path keeps except near closer ends [m]."""
         return self._search.clearance
 
-    def path(self) -> Float[ndarray, "n dof"] | None:
+    def path(self) -> Configurations | None:
         """Waypoints of the best path; None without one."""
         best = self._search.best
         return None if best is None else self._ends.complete(best).astype(np.float32)

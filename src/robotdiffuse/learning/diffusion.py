@@ -24,6 +24,7 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.registry import Entry, Registry
 from robotdiffuse.core.settings import Bound, NotNegative, Settings
+from robotdiffuse.core.types import Values
 
 
 @dataclass(frozen=True)
@@ -51,12 +52,12 @@ class NoiseSchedule:
         alpha_bar = curve / curve[0]
         alpha_bar = alpha_bar / (alpha_bar + (1 - alpha_bar) * np.exp(settings.log_snr_shift))
         alpha_bar = np.maximum(alpha_bar, settings.floor)
-        self.signal: Float[ndarray, "levels"] = np.sqrt(alpha_bar)
+        self.signal: Values = np.sqrt(alpha_bar)
         """Factor of the clean trajectory in x_t."""
-        self.noise: Float[ndarray, "levels"] = np.sqrt(1 - alpha_bar)
+        self.noise: Values = np.sqrt(1 - alpha_bar)
         """Factor of the unit noise in x_t."""
         with np.errstate(divide="ignore"):
-            self.half_log_snr: Float[ndarray, "levels"] = np.log(self.signal) - np.log(self.noise)
+            self.half_log_snr: Values = np.log(self.signal) - np.log(self.noise)
             """Half the logarithm of the signal-to-noise ratio; inf at level 0."""
 
     @property
@@ -64,7 +65,7 @@ class NoiseSchedule:
         """T."""
         return self.settings.steps
 
-    def weight(self, t: Int[ndarray, "n"], limit: float) -> Float[ndarray, "n"]:
+    def weight(self, t: Int[ndarray, "n"], limit: float) -> Values:
         """Weight of the loss on x_0 at level t: 1 + SNR, at most `limit`.
 
         With 1 + SNR the network's effective target has unit variance on every level (Karras et al. 2022,
@@ -135,9 +136,7 @@ class Objective:
         """d clean / d output: how an error of the output scales into the clean trajectory."""
         return 0 * signal + 1
 
-    def weight(
-        self, schedule: NoiseSchedule, t: Int[ndarray, "n"], limit: float | None
-    ) -> Float[ndarray, "n"]:
+    def weight(self, schedule: NoiseSchedule, t: Int[ndarray, "n"], limit: float | None) -> Values:
         """Weight of the squared error of the output at levels t >= 1, at most `limit`; None: 1 everywhere.
 
         The weight of `NoiseSchedule.weight` on x_0, converted to the output, so that objectives differ in

@@ -19,6 +19,7 @@ from robotdiffuse.collision.batched_clearances import packed_clearances_and_grad
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Bound, Count, OneOf, Settings, SettingsOf, Share
+from robotdiffuse.core.types import Configuration
 from robotdiffuse.learning.denoisers import DENOISERS, DenoiserSettings, TransformerSettings
 from robotdiffuse.learning.diffusion import (
     OBJECTIVES,
@@ -60,9 +61,9 @@ class Reference(NamedTuple):
 class Statistics(NamedTuple):
     """What a representation takes from the training data; float32."""
 
-    residual_scale: Float[ndarray, "dof"]
+    residual_scale: Configuration
     """Standard deviation of the trajectories about their reference, in units of the joint limits."""
-    residual_mean: Float[ndarray, "dof"]
+    residual_mean: Configuration
     """Their mean, for the target `absolute`; else zero."""
     noise_factor: Float[ndarray, "waypoints waypoints"]
     """The matrix that makes noise of white noise, see `diffusion.noise_factor`."""
@@ -370,8 +371,8 @@ class MotionModel(ABC):
 
     def sample(
         self,
-        start: Float[ndarray, "dof"],
-        goal: Float[ndarray, "dof"],
+        start: Configuration,
+        goal: Configuration,
         code: Float[ndarray, "code"] | None,
         clearances: ClearanceFn,
         rng: np.random.Generator,

@@ -43,9 +43,9 @@ from torch import Tensor, nn
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Count, NotNegative, Settings, Sizes
 from robotdiffuse.datasets.surface_clouds import surface_clouds
-from robotdiffuse.learning.training.baseline import BaselineNetwork
 from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16
 from robotdiffuse.learning.training.losses import ArmDistance, ForwardKinematics, SurfacePoints, hinge
+from robotdiffuse.learning.training.tasks import BaselineNetwork
 from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes

@@ -44,8 +44,8 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings, Sizes
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.encoders import curve_keys
-from robotdiffuse.learning.training.baseline import BaselineNetwork
 from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16
+from robotdiffuse.learning.training.tasks import BaselineNetwork
 from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.scenes.surface_points import PANDA_REGION, VisibleRegion
 

@@ -16,8 +16,8 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.registry import Entry
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.learning.checkpoint import load_network
-from robotdiffuse.learning.training.baseline import BaselineNetwork, baseline_training, train_baseline
 from robotdiffuse.learning.training.batches import TrajectoryData
+from robotdiffuse.learning.training.tasks import BaselineNetwork, baseline_training, train_baseline
 from robotdiffuse.learning.weight_files import NETWORKS, RobotIdentity
 from robotdiffuse.robots import load_robot
 

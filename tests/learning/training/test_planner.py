@@ -25,9 +25,9 @@ from robotdiffuse.learning.encoders import PointAutoencoderSettings, make_encode
 from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.learning.motion_model import SamplingSettings
 from robotdiffuse.learning.motion_network import MotionNetwork
-from robotdiffuse.learning.training import encoder as encoder_training
 from robotdiffuse.learning.training import loop as training_run
-from robotdiffuse.learning.training import planner as training
+from robotdiffuse.learning.training import tasks as encoder_training
+from robotdiffuse.learning.training import tasks as training
 from robotdiffuse.learning.training.batches import (
     Batch,
     Batches,
@@ -35,10 +35,9 @@ from robotdiffuse.learning.training.batches import (
     load_data,
 )
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
-from robotdiffuse.learning.training.encoder import train_encoder
 from robotdiffuse.learning.training.loop import Processes, TrainingRun
 from robotdiffuse.learning.training.losses import LossSettings
-from robotdiffuse.learning.training.planner import free_in_scene, train_planner
+from robotdiffuse.learning.training.tasks import free_in_scene, train_encoder, train_planner
 from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene

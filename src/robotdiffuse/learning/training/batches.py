@@ -15,6 +15,7 @@ from torch import Tensor
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.core.types import Values
 from robotdiffuse.datasets.rows import read_rows, turns_about_vertical
 from robotdiffuse.datasets.shards import SPLITS, shard_indices
 from robotdiffuse.datasets.surface_clouds import surface_clouds
@@ -214,7 +215,7 @@ class Batch:
     """Noisy trajectories and the clean ones they were made from; float32."""
 
     features: Float[ndarray, "n waypoints features"]
-    level: Float[ndarray, "n"]
+    level: Values
     """t / T"""
     condition: Float[ndarray, "n condition"]
     """With zeros for z if there are clouds."""
@@ -224,9 +225,9 @@ class Batch:
     noisy: Trajectories
     target: Trajectories
     """The output that the network is trained towards, by the model's objective."""
-    weight: Float[ndarray, "n"]
+    weight: Values
     """Weight of the squared error of the output, by level."""
-    clean_weight: Float[ndarray, "n"]
+    clean_weight: Values
     """Weight of the squared error of the clean trajectory that the output stands for."""
     base: Trajectories
     """`Reference.base` of the trajectories."""

@@ -1,9 +1,9 @@
-"""Training of the diffusion model, with a frozen encoder or one that is trained jointly."""
+"""The trainings: of an auto-encoder of point clouds, of the diffusion model, and of baselines' networks."""
 
 import copy
 from dataclasses import fields
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -12,10 +12,11 @@ from numpy import ndarray
 from torch import Tensor
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, save_network
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.encoders import encoder_name, make_encoder
-from robotdiffuse.learning.encoders.networks import Encoder
+from robotdiffuse.learning.encoders.networks import Autoencoder, Encoder
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.motion_model import (
     ModelParts,
@@ -25,9 +26,18 @@ from robotdiffuse.learning.motion_model import (
     packed_clearances,
 )
 from robotdiffuse.learning.motion_network import MotionNetwork
-from robotdiffuse.learning.training.batches import Batch, Batches, TrajectoryData, encode_scenes, fast_bf16
-from robotdiffuse.learning.training.config import PlannerTraining, block_at
-from robotdiffuse.learning.training.loop import MotionTask, Processes, on_cpu, train
+from robotdiffuse.learning.network import Network
+from robotdiffuse.learning.training.batches import (
+    Batch,
+    Batches,
+    TrajectoryData,
+    encode_scenes,
+    fast_bf16,
+    random_scenes,
+    scene_clouds,
+)
+from robotdiffuse.learning.training.config import BaselineTraining, EncoderTraining, PlannerTraining, block_at
+from robotdiffuse.learning.training.loop import MotionTask, Processes, TrainingTask, Validation, on_cpu, train
 from robotdiffuse.learning.training.losses import (
     POINT_UNIT,
     SAFE_DISTANCE,
@@ -36,9 +46,120 @@ from robotdiffuse.learning.training.losses import (
     SurfacePoints,
     hinge,
 )
-from robotdiffuse.learning.weight_files import RobotIdentity
+from robotdiffuse.learning.weight_files import NETWORKS, RobotIdentity
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene_arrays import PackedScenes
+
+# Scenes that a linear read-out is fitted to, and further ones that it is tested on.
+READOUT_SCENES = 2048
+TEST_SCENES = 512
+READOUT_POSITIONS = np.stack(
+    np.meshgrid([-0.6, -0.2, 0.2, 0.6], [-0.6, -0.2, 0.2, 0.6], [0.2, 0.5, 0.8], indexing="ij"), -1
+).reshape(-1, 3)
+"""Positions around the arm [m] whose distance to the obstacles is read out."""
+MAX_READOUT_DISTANCE = 0.3
+"""Distances are clipped to plus and minus this [m]."""
+REGULARIZATION = 1e-7
+"""The paper's lambda: weight of the sum of squared weights, in the unit of the reconstruction's loss."""
+RELATIVE_RIDGE = 1e-3
+"""Regularisation of the fit, relative to the mean variance of a code's numbers."""
+
+
+def train_encoder(settings: EncoderTraining, out: str) -> dict[str, float]:
+    """Train an auto-encoder; write encoder.safetensors and encoder.json into the folder `out`.
+
+    The same call continues a run that was interrupted. Returns errors on fresh clouds [m], those of the
+    reconstruction (see the encoder's `loss`) and of `linear_readout`, and `samples`. Raises as `task.train`.
+    """
+    return train(_EncoderTask(settings, Processes(settings.device)), out)
+
+
+class _EncoderTask(TrainingTask):
+    title = "encoder"
+    module: Autoencoder
+
+    def __init__(self, settings: EncoderTraining, processes: Processes) -> None:
+        self.settings = settings
+        self.processes = processes
+        self.identity = {}
+        torch.manual_seed(settings.seed)
+        module = make_encoder(settings.name, settings.encoder)
+        assert isinstance(module, Autoencoder)  # by EncoderTraining
+        self.module = self._trained = module.to(processes.device)
+        self._most = settings.points if module.settings.any_size else module.settings.cloud
+
+    def loss(self, fraction: float, rng: np.random.Generator) -> Float[Tensor, ""]:
+        settings = self.settings
+        module = self.module
+        most = self._most
+        points = int(rng.integers(max(1, most // 8), most + 1)) if module.settings.any_size else most
+        error, _ = self._reconstruction(settings.batch, points, rng)
+        theta = torch.stack([p.square().sum() for p in module.penalised()]).sum()
+        return error + REGULARIZATION * theta
+
+    def validate(self, fraction: float) -> Validation:
+        return Validation(self._validation(128, 123)[0].item())
+
+    def finish(self) -> dict[str, float]:
+        settings = self.settings
+        rng = np.random.default_rng(settings.seed + 1)
+        scenes = self._scenes(READOUT_SCENES, rng)
+        report = self._validation(512, settings.seed + 2)[1]
+        trained = self._trained = on_cpu(self.module)
+        with torch.no_grad():
+            clouds = scene_clouds(trained, scenes, rng).split(256)
+            trained.standardize(torch.cat([trained.encode(part) for part in clouds]))
+        return report | linear_readout(trained, self._scenes(READOUT_SCENES + TEST_SCENES, rng), rng)
+
+    def save(self, folder: FilePath, training: dict[str, Any]) -> None:
+        save_network("encoder", self._trained, folder, training)
+
+    def _scenes(self, count: int, rng: np.random.Generator) -> PackedScenes:
+        settings = self.settings
+        return random_scenes(count, settings.max_obstacles, rng, rop=settings.scenes == "rop")
+
+    def _validation(self, count: int, seed: int) -> tuple[Float[Tensor, ""], dict[str, float]]:
+        with torch.no_grad():
+            return self._reconstruction(count, self._most, np.random.default_rng(seed))
+
+    def _reconstruction(
+        self, count: int, points: int, rng: np.random.Generator
+    ) -> tuple[Float[Tensor, ""], dict[str, float]]:
+        scenes = self._scenes(count, rng)
+        cloud = scene_clouds(self.module, scenes, rng, points).to(self.processes.device)
+        with self.processes.autocast():
+            return self.module.loss(cloud, rng)
+
+
+def linear_readout(encoder: Encoder, scenes: PackedScenes, rng: np.random.Generator) -> dict[str, float]:
+    """Errors of a linear read-out of z, the same measure for all encoders.
+
+    A linear map from z to the signed distances of fixed positions around the arm to the obstacles is fitted
+    to the first READOUT_SCENES and tested on the others. `readout`: its mean error [m];
+    `readout_of_constant`: the error of the mean distances, without z.
+    """
+    with torch.no_grad():
+        clouds = scene_clouds(encoder, scenes, rng).split(256)
+        z = torch.cat([encoder(part) for part in clouds]).numpy().astype(np.float64)
+    wanted = (
+        scenes.distances(READOUT_POSITIONS)
+        .clip(-MAX_READOUT_DISTANCE, MAX_READOUT_DISTANCE)
+        .astype(np.float64)
+    )
+    z -= z[:READOUT_SCENES].mean(0)
+    mean = wanted[:READOUT_SCENES].mean(0)
+    gram = z[:READOUT_SCENES].T @ z[:READOUT_SCENES]
+    ridge = max(RELATIVE_RIDGE * np.trace(gram) / len(gram), np.finfo(np.float64).tiny)
+    weights = np.linalg.solve(
+        gram + ridge * np.eye(len(gram)), z[:READOUT_SCENES].T @ (wanted[:READOUT_SCENES] - mean)
+    )
+    error = wanted[READOUT_SCENES:] - mean
+    return {
+        "readout": float(np.abs(error - z[READOUT_SCENES:] @ weights).mean()),
+        "readout_of_constant": float(np.abs(error).mean()),
+    }
+
 
 SAMPLING_STEPS = 6
 """Sampling steps of every network, so that validation takes less time than the training."""
@@ -263,3 +384,76 @@ class PlannerLoss:
             near = hinge(self.arm(q, batch.scenes), SAFE_DISTANCE) / POINT_UNIT
             error = error + collision_weight * near.sum(-1).mean(1)
         return error
+
+
+class BaselineNetwork(Network):
+    """A network that `train_baseline` trains; `settings` are of the class that NETWORKS names."""
+
+    training_defaults: ClassVar[dict[str, Any]] = {}
+    """The network's own defaults of fields of `BaselineTraining`, for example batch."""
+
+    def __init__(self, robot: RobotIdentity, settings: Any) -> None:
+        super().__init__()
+        self.robot = robot
+        self.settings = settings
+        self.dof, self.normalizer = robot.dof, robot.normalizer()
+
+    def fit_statistics(self, data: TrajectoryData) -> None:
+        """Fill buffers with statistics of the training trajectories; called before a run."""
+
+    def loss(
+        self, data: TrajectoryData, count: int, fraction: float, rng: np.random.Generator
+    ) -> Float[Tensor, ""]:
+        """The loss of `count` samples drawn from the data; `fraction` of the training is done, 0 to 1."""
+        raise NotImplementedError
+
+
+def baseline_training(name: str, given: dict[str, Any]) -> BaselineTraining:
+    """The training settings of a baseline's network, with the given changes.
+
+    Raises InputError for an unknown name, listing the known ones, and for a network that is no baseline.
+    """
+    kind = NETWORKS.load(name)
+    if not issubclass(kind, BaselineNetwork):
+        raise InputError(f"{name} is no baseline; train it: robotdiffuse train {NETWORKS[name].kind}")
+    if given.get("samples") is not None:
+        given = given | {"minutes": None}
+    return BaselineTraining(name=name, **(kind.training_defaults | given))
+
+
+def train_baseline(settings: BaselineTraining, out: str) -> dict[str, float]:
+    """Train a network with its default settings; write NAME.safetensors and NAME.json into the folder `out`.
+
+    The same call continues a run that was interrupted. Returns `validation`, the loss on held-out
+    trajectories, and `samples`.
+    Raises as `task.train`, and InputError if the data do not fit.
+    """
+    return train(_BaselineTask(settings, Processes(settings.device)), out)
+
+
+class _BaselineTask(MotionTask):
+    module: BaselineNetwork
+
+    def __init__(self, settings: BaselineTraining, processes: Processes) -> None:
+        self.title, robot = settings.name, load_robot(settings.robot)
+        torch.manual_seed(settings.seed)
+        kind = NETWORKS.load(settings.name)
+        own = NETWORKS.defaults(settings.name)
+        self.module = kind(RobotIdentity.of(robot), own)
+        super().__init__(settings, robot, None, processes)
+        self.module.fit_statistics(self.train_data)
+        self.identity = {"robot": robot.name, "network": repr(own)}
+
+    def loss_of(
+        self, data: TrajectoryData, fraction: float, rng: np.random.Generator, validating: bool
+    ) -> Float[Tensor, ""]:
+        return self.module.loss(data, self.settings.batch, fraction, rng)
+
+    def validate(self, fraction: float) -> Validation:
+        self.module.eval()
+        validation = super().validate(fraction)
+        self.module.train()
+        return validation
+
+    def save(self, folder: FilePath, training: dict[str, Any]) -> None:
+        save_network(self.title, self.module, folder, training)
