@@ -1,12 +1,12 @@
 """Runs the whole package under jaxtyping and beartype: a wrong shape annotation fails the suite."""
 
-import ast
+import importlib
 import os
 import re
-import threading
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -31,21 +31,6 @@ def checked_modules() -> list[str]:
     ]
 
 
-def parse_in_one_thread_at_a_time() -> None:
-    """CPython 3.11 counts the depth of the syntax trees of all threads together (gh-106905): parsing in two
-    ended in "SystemError: AST constructor recursion depth mismatch", and the live page's first plan failed.
-    The hook parses each module, and NumPy and beartype parse too: a lock of the hook alone is not enough."""
-    parse = ast.parse
-    parsing = threading.RLock()
-
-    def alone(*args: Any, **kwargs: Any) -> Any:
-        with parsing:
-            return parse(*args, **kwargs)
-
-    ast.parse = alone
-
-
-parse_in_one_thread_at_a_time()
 install_import_hook(checked_modules(), "beartype.beartype")
 
 # the same examples at every run: a suite that fails by chance guards nothing
@@ -59,6 +44,26 @@ def apart_from_the_users_robots(tmp_path_factory: pytest.TempPathFactory) -> Ite
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path_factory.mktemp("robots")))
         yield
+
+
+@pytest.fixture(autouse=True)
+def cpu_clock(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Planners' limits are CPU time, so that a loaded machine changes no answer; pages play motions in real
+    time."""
+    if "visualization" not in request.path.parts:
+        monkeypatch.setattr(time, "perf_counter", time.process_time)
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Imports all that pages may import in their threads: the hook parses each module, and CPython 3.11
+    counts the depth of the syntax trees of all threads together (gh-106905): two parsers at once end in a
+    SystemError."""
+    from robotdiffuse.core.errors import InputError
+
+    if any(item.path.parent.name == "live" for item in session.items):
+        for name in checked_modules():
+            with suppress(ImportError, InputError):  # of extras that are not installed
+                importlib.import_module(name)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -4,8 +4,6 @@ The planners are tested with a prior whose denoiser has a closed form: bumps of 
 straight line. So the tests need no trained weights.
 """
 
-import os
-import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +15,7 @@ from numpy import ndarray
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
-from helpers.motion_stores import random_motions, write_motions
+from robotdiffuse import InputError, JointGoal, Problem, Scene, Sphere, Status, load_robot, verify
 from robotdiffuse.baselines.guided_prior import (
     EDMP,
     ENSEMBLE,
@@ -34,10 +32,7 @@ from robotdiffuse.baselines.guided_prior import (
     shared_out,
     state_precision,
 )
-from robotdiffuse.cli import main
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Status
 from robotdiffuse.learning.checkpoint import load_network, save_network
 from robotdiffuse.learning.denoisers import UNetSettings
 from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
@@ -47,12 +42,8 @@ from robotdiffuse.learning.training.config import planner_training
 from robotdiffuse.learning.training.loop import Processes
 from robotdiffuse.learning.training.tasks import PlannerLoss, model_settings, planning_success
 from robotdiffuse.learning.weight_files import RobotIdentity
-from robotdiffuse.problems.problem import JointGoal, Problem
-from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import PackedScenes
-from robotdiffuse.scenes.shapes import Sphere
-from robotdiffuse.validation.validator import verify, verify_trajectory
+from robotdiffuse.validation.validator import verify_trajectory
 
 PANDA = load_robot("panda")
 RANGES = RobotIdentity.of(PANDA)
@@ -390,35 +381,6 @@ def test_weights_survive_a_file(tmp_path: Path) -> None:
     exported = MPD(MPDSettings(weights=str(tmp_path))).network(PANDA)
     arrays = [part.numpy() for part in given]
     np.testing.assert_allclose(exported.denoised(*arrays), loaded.denoised(*arrays), atol=1e-5)
-
-
-@pytest.mark.slow
-def test_training_stopped_and_continued_ends_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_motions(tmp_path / "data", PANDA, random_motions(PANDA, 40))
-    asked = ["train", "baseline", "trajectory_prior", "--data", str(tmp_path / "data")]
-    asked += ["--samples", "80", "--batch", "8"]
-    original = PlannerLoss.__call__
-    steps = 0
-
-    def interrupted(self: PlannerLoss, *given):
-        nonlocal steps
-        steps += 1
-        if steps == 5:
-            os.kill(os.getpid(), signal.SIGINT)
-        return original(self, *given)
-
-    assert main([*asked, "--out", str(tmp_path / "whole")]) == 0
-    monkeypatch.setattr(PlannerLoss, "__call__", interrupted)
-    assert main([*asked, "--out", str(tmp_path / "parts")]) == 130
-    assert main([*asked, "--out", str(tmp_path / "parts")]) == 0
-    assert "success" in capsys.readouterr().out
-    whole, parts = (
-        load_network("trajectory_prior", str(tmp_path / name), PANDA).state_dict()
-        for name in ("whole", "parts")
-    )
-    assert all(torch.equal(whole[name], parts[name]) for name in whole)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """A* and D* Lite on a lattice: least-cost paths, also after changes, within memory and time limits."""
 
-import time
 from dataclasses import replace
 from itertools import product
 
@@ -10,6 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from helpers.box_arm import box_arm
+from robotdiffuse import Box, InputError, JointGoal, Problem, Scene, Sphere, Status, load_robot, verify
 from robotdiffuse.baselines.lattice import (
     AStar,
     AStarSearch,
@@ -24,13 +24,6 @@ from robotdiffuse.baselines.lattice import (
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Status
-from robotdiffuse.problems.problem import JointGoal, Problem
-from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.validation.validator import verify
 
 ARM = box_arm()
 PANDA = load_robot("panda")
@@ -234,20 +227,6 @@ def test_full_memory_is_reported(planner, settings):
     assert "memory is full" in result.reason and "coarser" in result.reason
 
 
-def test_memory_is_bounded():
-    checker = CollisionChecker(PANDA, WALL)
-    settings = AStarSettings(spacing=0.1, max_nodes=1000)
-    search = AStarSearch(checker, LEFT.astype(np.float32), RIGHT[None].astype(np.float32), settings)
-    assert search.run() is Outcome.FULL and search.nodes == 1000
-    assert search.path() is None and search.cost == np.inf
-
-
-def test_no_room_for_the_goal():
-    checker = CollisionChecker(PANDA, WALL)
-    ends = LEFT.astype(np.float32), RIGHT[None].astype(np.float32)
-    assert DStarLiteSearch(checker, *ends, DStarLiteSettings(max_nodes=50)).run() is Outcome.FULL
-
-
 @pytest.mark.parametrize("planner", [AStar, DStarLite])
 def test_no_path_on_the_lattice(planner):
     """The wall keeps the three boxes in their half of the plane."""
@@ -267,33 +246,8 @@ def test_no_path_on_the_lattice(planner):
 def test_time_limit(planner):
     problem = Problem(PANDA, WALL, LEFT, JointGoal(RIGHT[None]))
     planner.plan(problem, 0.1)
-    began = time.perf_counter()
     result = planner.plan(problem, time_limit=0.3)
-    assert time.perf_counter() - began < 20.0
     assert result.status is Status.TIMEOUT and "expansions" in result.reason
-
-
-@pytest.mark.parametrize(
-    ("wrong", "what"),
-    [
-        ({"spacing": 0.0}, "a_star.spacing is 0.0"),
-        ({"spacing": float("nan")}, "a_star.spacing is nan"),
-        ({"resolution": -1.0}, "a_star.resolution is -1.0"),
-        ({"joints_per_move": 0}, "a_star.joints_per_move is 0"),
-        ({"max_nodes": 0}, "a_star.max_nodes is 0"),
-        ({"max_nodes": 2**31}, "a_star.max_nodes is"),
-        ({"clearance": -0.1}, "a_star.clearance is -0.1"),
-        ({"inflation": 0.9}, "a_star.inflation is 0.9"),
-    ],
-)
-def test_bad_settings(wrong, what):
-    with pytest.raises(InputError, match=what):
-        AStarSettings(**wrong)
-
-
-def test_messages_on_settings_name_d_star_lite():
-    with pytest.raises(InputError, match=r"d_star_lite\.spacing"):
-        DStarLiteSettings(spacing=-1.0)
 
 
 def test_spacing_with_too_many_nodes():

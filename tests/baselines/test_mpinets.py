@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from robotdiffuse import Box, InputError, PoseGoal, Problem, Scene, Sphere, Status, load_robot, verify
 from robotdiffuse.baselines.mpinets import MPiNets, MPiNetsSettings
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Status
 from robotdiffuse.learning.checkpoint import load_network, save_network
 from robotdiffuse.learning.mpinets import (
     MPiNetsNetwork,
@@ -19,13 +18,8 @@ from robotdiffuse.learning.mpinets import (
 )
 from robotdiffuse.learning.training.batches import TrajectoryData
 from robotdiffuse.learning.weight_files import RobotIdentity
-from robotdiffuse.problems.problem import PoseGoal, Problem
-from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import BOX, PackedScenes
-from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.validation.validator import verify
 
 PANDA = load_robot("panda")
 RANGES = RobotIdentity.of(PANDA)
@@ -208,18 +202,3 @@ def test_missing_weights_name_the_command(tmp_path: Path) -> None:
 def test_bad_network_settings(values: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         MPiNetsNetworkSettings(**values)
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"steps": 0}, "mpinets.steps is 0"),
-        ({"batch": 0}, "mpinets.batch is 0"),
-        ({"near": -1.0}, "mpinets.near is -1.0"),
-        ({"noise": float("nan")}, "mpinets.noise is nan"),
-        ({"resolution": 0.0}, "mpinets.resolution is 0.0"),
-    ],
-)
-def test_bad_planner_settings(values: dict, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        MPiNetsSettings(**values)

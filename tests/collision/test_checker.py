@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy import ndarray
 
+import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.clearances import least_clearance
 from helpers.sphere_oracles import (
@@ -31,13 +32,8 @@ from robotdiffuse.collision.kernels.lane_clearance import block_clearances
 from robotdiffuse.collision.kernels.lane_collision import block_hits, free_many, make_workspace
 from robotdiffuse.collision.kernels.motions import motion_free
 from robotdiffuse.collision.point_cloud_grid import THINNING
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.families.family import base_spheres
 from robotdiffuse.problems.families.rop import ROP, ROP_DENSE
-from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere
 
 # -- distances -----------------------------------------------------------------------------------------------
 
@@ -79,7 +75,7 @@ def test_free_is_the_sign_of_the_clearance(name: str, padding: float) -> None:
 def test_every_shape_at_any_pose(kind: str, seed: int) -> None:
     robot = with_spheres("panda")
     rng = np.random.default_rng(seed)
-    scene = Scene([random_shape(kind, rng), random_shape(kind, rng)])
+    scene = rd.Scene([random_shape(kind, rng), random_shape(kind, rng)])
     q = rng.uniform(robot.lower, robot.upper, (33, robot.dof))
     checker = CollisionChecker(robot, scene)
     right = link_distances(robot, scene, q)
@@ -87,7 +83,7 @@ def test_every_shape_at_any_pose(kind: str, seed: int) -> None:
     hit = (right < 0).any(axis=1) | (pair_distances(robot, q) < 0).any(axis=1)
     if kind == "cloud":
         # joined points reach further, by less than the diagonal of a thinning voxel
-        radius = max(shape.point_radius for shape in scene.shapes if isinstance(shape, PointCloud))
+        radius = max(shape.point_radius for shape in scene.shapes if isinstance(shape, rd.PointCloud))
         blur = np.sqrt(3) * THINNING * radius
         near = right < 0.1
         assert (found <= right + TOLERANCE).all()
@@ -106,7 +102,7 @@ def test_any_number_of_obstacles(count: int) -> None:
     rng = np.random.default_rng(count)
     kinds = ("sphere", "box", "cylinder", "capsule")
     shapes = [random_shape(kinds[i % 4], rng) for i in range(count)]
-    scene = Scene([shape for shape in shapes if np.linalg.norm(shape.center) > 0.6])  # type: ignore[attr-defined]
+    scene = rd.Scene([shape for shape in shapes if np.linalg.norm(shape.center) > 0.6])  # type: ignore[attr-defined]
     q = rows(robot, 600)
     least = np.minimum(link_distances(robot, scene, q).min(axis=1), pair_distances(robot, q).min(axis=1))
     clear = np.abs(least) > TOLERANCE
@@ -159,7 +155,7 @@ def test_configurations_beyond_the_limits() -> None:
     q = np.random.default_rng(0).uniform(2 * robot.lower, 2 * robot.upper, (4000, robot.dof))
     least = pair_distances(robot, q).min(axis=1)
     clear = np.abs(least) > TOLERANCE
-    free = CollisionChecker(robot, Scene()).free(q)
+    free = CollisionChecker(robot, rd.Scene()).free(q)
     np.testing.assert_array_equal(free[clear], (least > 0)[clear])
     assert 0.05 < free.mean() < 0.95
 
@@ -183,7 +179,7 @@ def test_free_by_spheres_is_free_by_mesh(seed: int) -> None:
     rng = np.random.default_rng(seed)
     scene = (ROP if seed < 2 else ROP_DENSE).scene(rng, base_spheres(robot))
     shapes = [random_shape(kind, rng) for kind in ("cylinder", "capsule", "box", "cloud")]
-    scene = Scene([*scene.shapes, *shapes[: seed % 5]])
+    scene = rd.Scene([*scene.shapes, *shapes[: seed % 5]])
     q = rng.uniform(robot.lower, robot.upper, (600, robot.dof))
     free = CollisionChecker(robot, scene).free(q)
     assert not ExactCollision(robot, scene).collides(q[free]).any()
@@ -193,13 +189,13 @@ def test_free_by_spheres_is_free_by_mesh(seed: int) -> None:
 
 def test_self_collision() -> None:
     robot = with_spheres("panda")
-    q = rows(load_robot("panda"), 3000)
-    free = CollisionChecker(robot, Scene()).free(q)
-    meshes = ExactCollision(robot, Scene()).collides(q)
+    q = rows(rd.load_robot("panda"), 3000)
+    free = CollisionChecker(robot, rd.Scene()).free(q)
+    meshes = ExactCollision(robot, rd.Scene()).collides(q)
     assert not (free & meshes).any()
     assert (~free & ~meshes).mean() < 0.05
     allowed = replace(robot, allowed_collisions=frozenset(map(frozenset, combinations(robot.link_names, 2))))
-    checker = CollisionChecker(allowed, Scene())
+    checker = CollisionChecker(allowed, rd.Scene())
     assert checker.free(q).all()
     assert checker.pair_clearances(q).shape == (3000, 0)
     assert (least_clearance(checker, q) == 1).all()
@@ -219,7 +215,7 @@ def test_locked_fingers_change_the_result() -> None:
 
 def test_padding_holds_towards_the_scene_alone() -> None:
     robot = with_spheres("panda")
-    q = rows(load_robot("panda"), 300)
+    q = rows(rd.load_robot("panda"), 300)
     near = CollisionChecker(robot, solids())
     far = CollisionChecker(robot, solids(), 0.03)
     np.testing.assert_allclose(far.link_clearances(q), near.link_clearances(q) - 0.03, atol=1e-6)
@@ -230,7 +226,7 @@ def test_padding_holds_towards_the_scene_alone() -> None:
 def test_a_huge_floor_is_as_exact_as_a_small_one(size: float) -> None:
     robot = with_spheres("panda")
     q = rows(robot, 400)
-    scene = Scene([Box((0.3, 0.1, -size / 2 - 0.05), (size + 4, size + 4, size))])
+    scene = rd.Scene([rd.Box((0.3, 0.1, -size / 2 - 0.05), (size + 4, size + 4, size))])
     right = (
         np.stack(
             [
@@ -248,8 +244,10 @@ def test_a_huge_floor_is_as_exact_as_a_small_one(size: float) -> None:
 def test_long_poles_keep_their_precision() -> None:
     robot = with_spheres("panda")
     q = rows(robot, 200)
-    for make in (Cylinder, Capsule):
-        short, long = (CollisionChecker(robot, Scene([make((0.4, 0.3, 0.2), 0.05, h)])) for h in (6.0, 1e4))
+    for make in (rd.Cylinder, rd.Capsule):
+        short, long = (
+            CollisionChecker(robot, rd.Scene([make((0.4, 0.3, 0.2), 0.05, h)])) for h in (6.0, 1e4)
+        )
         np.testing.assert_allclose(long.link_clearances(q), short.link_clearances(q), atol=TOLERANCE)
 
 
@@ -258,7 +256,7 @@ def test_long_poles_keep_their_precision() -> None:
 
 def test_a_robot_without_spheres_is_free() -> None:
     robot = replace(box_arm(), spheres={})
-    checker = CollisionChecker(robot, Scene([Sphere((0, 0, 0), 5.0), PointCloud([[0.0, 0, 0]])]))
+    checker = CollisionChecker(robot, rd.Scene([rd.Sphere((0, 0, 0), 5.0), rd.PointCloud([[0.0, 0, 0]])]))
     q = rows(robot, 5)
     assert checker.links == checker.pairs == ()
     assert checker.free(q).all()
@@ -271,7 +269,7 @@ def test_a_robot_without_spheres_is_free() -> None:
 def test_links_with_an_empty_list_of_spheres_are_left_out() -> None:
     robot = box_arm()
     robot = replace(robot, spheres={"l1": robot.spheres["l1"], "l3": np.zeros((0, 4))})
-    checker = CollisionChecker(robot, Scene())
+    checker = CollisionChecker(robot, rd.Scene())
     assert checker.links == ("l1",)
     assert checker.pairs == ()
     assert checker.free(np.zeros((1, 3)))[0]
@@ -279,17 +277,17 @@ def test_links_with_an_empty_list_of_spheres_are_left_out() -> None:
 
 def test_fixed_links_do_not_count_against_the_scene() -> None:
     robot = box_arm().with_locked({"j0": 0.0})
-    checker = CollisionChecker(robot, Scene([Sphere((0.2, 0, 0), 0.1)]))
+    checker = CollisionChecker(robot, rd.Scene([rd.Sphere((0.2, 0, 0), 0.1)]))
     assert checker.links == ("l2", "l3")
     assert checker.free(np.zeros((1, 2)))[0]
 
 
 def test_wrong_configurations_are_refused() -> None:
-    checker = CollisionChecker(box_arm(), Scene())
+    checker = CollisionChecker(box_arm(), rd.Scene())
     for call in (checker.free, checker.link_clearances, checker.pair_clearances):
-        with pytest.raises(InputError, match="q has 4 columns; it must have the 3 planned joints"):
+        with pytest.raises(rd.InputError, match="q has 4 columns; it must have the 3 planned joints"):
             call(np.zeros((2, 4)))
-        with pytest.raises(InputError, match="not finite"):
+        with pytest.raises(rd.InputError, match="not finite"):
             call(np.array([[0.0, np.nan, 0.0]]))
 
 
@@ -297,7 +295,7 @@ def test_adding_an_obstacle_compiles_nothing() -> None:
     robot = with_spheres("panda")
     q = rows(robot, 20)
 
-    def use(scene: Scene) -> None:
+    def use(scene: rd.Scene) -> None:
         checker = CollisionChecker(robot, scene)
         checker.free(q)
         least_clearance(checker, q)
@@ -306,14 +304,14 @@ def test_adding_an_obstacle_compiles_nothing() -> None:
     def compiled() -> list[int]:
         return [len(f.signatures) for f in (free_many, block_hits, block_clearances, motion_free)]
 
-    use(Scene())
+    use(rd.Scene())
     before = compiled()
     vertices, faces = box_triangles((0.2, 0.2, 0.2))
     use(solids())
-    use(Scene([*solids().shapes, PointCloud([[0.5, 0.5, 0.5]]), Mesh(vertices, faces)]))
-    use(Scene([PointCloud(np.zeros((0, 3)))]))
+    use(rd.Scene([*solids().shapes, rd.PointCloud([[0.5, 0.5, 0.5]]), rd.Mesh(vertices, faces)]))
+    use(rd.Scene([rd.PointCloud(np.zeros((0, 3)))]))
     use(
-        Scene([shape for shape in solids().shapes for _ in range(3)])
+        rd.Scene([shape for shape in solids().shapes for _ in range(3)])
     )  # rows of several, whatever is taken of them
     assert compiled() == before
 
@@ -321,7 +319,7 @@ def test_adding_an_obstacle_compiles_nothing() -> None:
 # -- gradients -----------------------------------------------------------------------------------------------
 
 
-def cost(robot: Robot, scene: Scene, q: ndarray, margin: float, self_margin: float) -> ndarray:
+def cost(robot: rd.Robot, scene: rd.Scene, q: ndarray, margin: float, self_margin: float) -> ndarray:
     """The squared hinge loss over all spheres and pairs of spheres, by the oracles."""
     index = {link: i for i, link in enumerate(robot_groups(robot))}
     centres, radii = sphere_centres(robot, q)
@@ -359,10 +357,10 @@ def test_cost_gradients_of_a_cloud_point_away_from_it() -> None:
     robot = with_spheres("panda")
     rng = np.random.default_rng(0)
     points = rng.normal(0, 0.05, (200, 3)) + np.array([0.45, 0.0, 0.5])
-    checker = CollisionChecker(robot, Scene([PointCloud(points, 0.01)]))
+    checker = CollisionChecker(robot, rd.Scene([rd.PointCloud(points, 0.01)]))
     q = rows(robot, 3000)
     costs, gradients = checker.cost_gradients(q, 0.05, 0.0)
-    own = CollisionChecker(robot, Scene()).cost_gradients(q, 0.05, 0.0)[0]
+    own = CollisionChecker(robot, rd.Scene()).cost_gradients(q, 0.05, 0.0)[0]
     touched = (costs > 1e-5) & (own == 0)
     assert touched.sum() > 30
     q = q[touched]

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from robotdiffuse import Box, Capsule, Cylinder, InputError, PointCloud, Scene, Sphere, load_robot
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.batched_clearances import packed_clearances_and_gradients, packed_link_clearances
 from robotdiffuse.collision.kernel_arrays import compile_robot
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.denoisers import TransformerSettings
 from robotdiffuse.learning.motion_model import (
     GRADIENT_MARGIN,
@@ -23,10 +23,7 @@ from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.losses import ArmDistance, ForwardKinematics
 from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.problems.families.rop import ROP, ROP_DENSE
-from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import PackedScenes
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
 
 PANDA = load_robot("panda")
 LIMIT = 0.4

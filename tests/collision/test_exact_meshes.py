@@ -10,10 +10,9 @@ from hypothesis import strategies as st
 
 from helpers.box_arm import HALF_WIDTH, box_arm
 from helpers.example_robots import example_robot
+from robotdiffuse import Box, Capsule, Cylinder, Mesh, PointCloud, Scene, Sphere
 from robotdiffuse.collision.exact_meshes import ExactCollision, explain_collision, forward_frames
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere
 
 Q0 = np.zeros(3)
 

@@ -9,10 +9,8 @@ import pytest
 import robotdiffuse as rd
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.moving_obstacles import CONTACT_TIME_TOLERANCE, MovingCollision
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import rotation_about, transform
-from robotdiffuse.core.types import Trajectory
-from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
+from robotdiffuse.problems.files import problem_from_record, problem_record, save_problem
 
 PANDA = rd.load_robot("panda")
 START, END = np.array([-0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]), np.array([0.6, 0.2, 0, -2.0, 0, 2.2, 0.2])
@@ -110,7 +108,7 @@ def test_validator_names_link_obstacle_and_time() -> None:
     ball = rd.MovingObstacle(rd.Sphere([0.45, -0.8, 0.5], 0.1, name="ball"), velocity=[0, 0.4, 0])
     problem = rd.Problem(PANDA, rd.Scene(), START, START, moving=[ball])
     times = np.array([0.0, 3.0])
-    still = Trajectory(PANDA.joint_names, times, np.stack([START, START]), *np.zeros((2, 2, 7)))
+    still = rd.Trajectory(PANDA.joint_names, times, np.stack([START, START]), *np.zeros((2, 2, 7)))
     violation = verify_trajectory(problem, still).violation
     assert violation is not None
     assert violation.kind == "scene_collision"
@@ -152,12 +150,12 @@ STANDS = transform(BALL.center)
     ],
 )
 def test_motions_that_are_none(motion: dict, message: str) -> None:
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(rd.InputError, match=message):
         rd.MovingObstacle(BALL, **motion)
 
 
 def test_clouds_have_no_frame_to_move() -> None:
-    with pytest.raises(InputError, match="point_cloud"):
+    with pytest.raises(rd.InputError, match="point_cloud"):
         rd.MovingObstacle(rd.PointCloud([[0.5, 0, 0.5]]), velocity=[0, 1, 0])
 
 
@@ -172,7 +170,7 @@ def test_files_hold_every_motion(tmp_path: Path, base: np.ndarray | None) -> Non
     problem = rd.Problem(PANDA, rd.Scene([BALL]), START, END, T_world_base=base, moving=moving)
     assert [one.name for one in problem.moving] == ["sphere_2", "box", "hand"], "names are unique in a scene"
     save_problem(problem, tmp_path / "p.yaml")
-    for again in (load_problem(tmp_path / "p.yaml"), problem_from_record(problem_record(problem))):
+    for again in (rd.load_problem(tmp_path / "p.yaml"), problem_from_record(problem_record(problem))):
         for one, other in zip(problem.moving, again.moving, strict=True):
             assert one.name == other.name
             assert one.max_speed == other.max_speed
@@ -195,13 +193,13 @@ def test_files_hold_every_motion(tmp_path: Path, base: np.ndarray | None) -> Non
 )
 def test_files_name_the_field(entry: object, message: str) -> None:
     record = problem_record(rd.Problem(PANDA, rd.Scene(), START, END))
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(rd.InputError, match=message):
         problem_from_record(record | {"moving": entry})
 
 
 def test_moving_obstacles_stand_beside_neither_blends_nor_start_velocities() -> None:
     ball = rd.MovingObstacle(BALL, velocity=[0, 1, 0])
-    with pytest.raises(InputError, match="moving cannot be combined with blend: the motion stops"):
+    with pytest.raises(rd.InputError, match="moving cannot be combined with blend: the motion stops"):
         rd.Problem(PANDA, rd.Scene(), START, END, waypoints=[END], moving=[ball], blend=0.1)
-    with pytest.raises(InputError, match="start_velocity cannot be combined with moving"):
+    with pytest.raises(rd.InputError, match="start_velocity cannot be combined with moving"):
         rd.Problem(PANDA, rd.Scene(), START, END, moving=[ball], start_velocity=[0.1] * 7)

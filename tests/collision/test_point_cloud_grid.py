@@ -15,12 +15,11 @@ from helpers.sphere_oracles import (
     rows,
     with_spheres,
 )
+from robotdiffuse import Box, Mesh, PointCloud, Scene, Sphere
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.kernel_arrays import compile_scene
 from robotdiffuse.collision.point_cloud_grid import THINNING, build_grid, cover_triangles, thin_points
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Mesh, PointCloud, Sphere
 
 
 def test_a_point_cloud_is_many_spheres() -> None:

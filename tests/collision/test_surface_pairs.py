@@ -10,25 +10,19 @@ import trimesh
 
 import robotdiffuse as rd
 from helpers.example_robots import planar_arm
-from robotdiffuse.certificates.search import certify
 from robotdiffuse.collision.exact_meshes import ExactCollision, explain_collision
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.bodies import Surface
 from robotdiffuse.robots.fitting.convex_parts import convex_hull
 from robotdiffuse.robots.fitting.covering_spheres import cover
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.robot_folder import SURFACE_FILE, read_robot_folder, write_robot_folder
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.validation.validator import verify
 
 TURN = 0.6
 BESIDE = np.array([TURN, -TURN])
 """The second link is parallel to the wall, with a gap of GAP between the meshes."""
 GAP = 0.001
 LIP = 0.003
-EMPTY = Scene(())
+EMPTY = rd.Scene(())
 
 
 def boxes(*ends: tuple[tuple[float, ...], tuple[float, ...]]) -> Surface:
@@ -42,7 +36,7 @@ def boxes(*ends: tuple[tuple[float, ...], tuple[float, ...]]) -> Surface:
     return Surface(np.concatenate(vertices), np.concatenate(faces))
 
 
-def arm(wall: Surface, link: Surface, grazing: bool = True) -> Robot:
+def arm(wall: Surface, link: Surface, grazing: bool = True) -> rd.Robot:
     """Two joints about z, 0.5 m apart; the wall is fixed to the base. One convex part per link."""
     robot = planar_arm(0.5, 0.3)
     surfaces = {"l0": wall, "l2": link}
@@ -59,7 +53,7 @@ def arm(wall: Surface, link: Surface, grazing: bool = True) -> Robot:
 
 
 @cache
-def channel(grazing: bool = True) -> Robot:
+def channel(grazing: bool = True) -> rd.Robot:
     """A plate with lips at its ends: its convex part reaches LIP towards the arm, over the hollow between."""
     y = 0.5 * np.sin(TURN) + 0.02 + GAP
     plate = ((-0.6, y, -0.05), (0.9, y + 0.02, 0.05))
@@ -73,7 +67,7 @@ def closer(gap: float) -> np.ndarray:
     return np.array([turn, -turn])
 
 
-def between_links(robot: Robot, q: np.ndarray) -> float:
+def between_links(robot: rd.Robot, q: np.ndarray) -> float:
     [pair] = ExactCollision(robot, EMPTY).pair_distances(q)
     return pair.distance
 
@@ -95,7 +89,7 @@ def test_meshes_that_touch_collide() -> None:
     problem = rd.Problem(channel(), EMPTY, q, rd.JointGoal(np.zeros((1, 2))))
     assert rd.load_planner("rrt_connect").plan(problem, time_limit=5.0).status == rd.Status.INVALID_START
     path = rd.Path(channel().joint_names, np.stack([np.zeros(2), q]))
-    assert not verify(problem, path).valid
+    assert not rd.verify(problem, path).valid
 
 
 def test_a_body_inside_another_collides() -> None:
@@ -123,7 +117,7 @@ def test_motions_out_of_and_into_grazing_are_planned_and_certified(turned: bool)
     result = rd.load_planner("rrt_connect").plan(problem, time_limit=30.0)
     assert result.solved, result.reason
     assert result.path is not None
-    report = verify(problem, result.path)
+    report = rd.verify(problem, result.path)
     assert report.valid and report.self_clearance is not None and 0 < report.self_clearance <= GAP
 
 
@@ -132,18 +126,18 @@ def test_a_motion_within_grazing_is_certified_or_refused_as_the_meshes_are() -> 
     robot = channel()
     problem = rd.Problem(robot, EMPTY, closer(0.0005), rd.JointGoal(closer(0.004)[None]))
     along = np.stack([closer(0.0005), closer(0.0015), closer(0.004), [0.0, 0.0]])
-    assert verify(problem, rd.Path(robot.joint_names, along[:3])).valid
+    assert rd.verify(problem, rd.Path(robot.joint_names, along[:3])).valid
     mirrored = np.array([np.pi - TURN, TURN - np.pi])  # over the middle the arm reaches beyond the wall
     through = rd.Path(robot.joint_names, np.stack([closer(0.0005), mirrored]))
-    assert verify(problem, through).violation is not None
+    assert rd.verify(problem, through).violation is not None
 
 
 def test_proofs_refuse_grazing_and_name_the_pair() -> None:
     problem = rd.Problem(channel(), EMPTY, BESIDE, rd.JointGoal(np.zeros((1, 2))))
     path = rd.Path(channel().joint_names, np.stack([BESIDE, np.zeros(2)]))
-    assert verify(problem, path).valid
-    with pytest.raises(InputError, match="l2 and l0 are apart only by their exact surfaces"):
-        certify(problem, path)
+    assert rd.verify(problem, path).valid
+    with pytest.raises(rd.InputError, match="l2 and l0 are apart only by their exact surfaces"):
+        rd.certify(problem, path)
 
 
 def test_folders_keep_the_surfaces_and_refuse_those_of_other_meshes(tmp_path: Path) -> None:
@@ -159,7 +153,7 @@ def test_folders_keep_the_surfaces_and_refuse_those_of_other_meshes(tmp_path: Pa
     other = replace(channel(False), meshes={"l0": channel().meshes["l2"], "l2": channel().meshes["l0"]})
     write_robot_folder(other, tmp_path, {})
     (tmp_path / SURFACE_FILE).write_bytes(packed)
-    with pytest.raises(InputError, match=SURFACE_FILE):
+    with pytest.raises(rd.InputError, match=SURFACE_FILE):
         read_robot_folder(tmp_path)
 
 
@@ -178,7 +172,7 @@ FOREARM, *OTHERS = BAXTER
     "name, link", [FOREARM, *(pytest.param(*other, marks=pytest.mark.slow) for other in OTHERS)]
 )
 def test_baxters_torso_and_arms_graze_as_trimesh_finds_too(name: str, link: str) -> None:
-    robot = load_robot(name)
+    robot = rd.load_robot(name)
     q = np.array(BAXTER[name, link])
     links = ("torso", link)
     by_parts = replace(robot, surfaces={}, grazing=frozenset())

@@ -6,16 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from robotdiffuse.core.bounds import rigid_transform
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import transform
-from robotdiffuse.core.types import Path
-from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere
-from robotdiffuse.validation.validator import verify
+from robotdiffuse.scenes.shapes import Shape
 
 TRIANGLE = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]
 FAR = [1e20, 0, 0]
@@ -25,65 +20,68 @@ FAR = [1e20, 0, 0]
     ("make", "message"),
     [
         (
-            lambda: Sphere([0, 0, 0], 1e7),
+            lambda: rd.Sphere([0, 0, 0], 1e7),
             "sphere.radius is 10000000.0; it must be a number from 1e-09 to",
         ),
-        (lambda: Sphere([0, 0, 0], 1e-300), "sphere.radius is 1e-300"),
-        (lambda: Sphere(FAR, 1), r"sphere.center is \[1e\+20, 0, 0\]; its numbers must be within ±10000"),
-        (lambda: Box([0, 0, 0], [1, 1e5, 1]), "box.size"),
-        (lambda: Box([0, 0, 0], [1, 1, 1e-30]), "box.size .* at least 1e-09 m"),
-        (lambda: Box([0, 0, 0], [1, 1, 1], [1e200, 1e200, 0, 0]), "box.wxyz .* within ±10000"),
-        (lambda: Cylinder([0, 0, 0], 1, 1e9), "cylinder.height"),
-        (lambda: Capsule([0, 0, 0], 1e39, 1), "capsule.radius"),
-        (lambda: Mesh([*TRIANGLE, [5e37, 0, 0]], [[0, 1, 2]]), r"mesh.vertices\[3\] is .* within ±10000 m"),
-        (lambda: Mesh(TRIANGLE, [[0, 1, np.nan]]), "mesh.faces"),
-        (lambda: Mesh(TRIANGLE, [[0, 1, 2]], FAR), "mesh.xyz"),
-        (lambda: PointCloud([[0, 0, 0], [1e39, 0, 0], [0, 1e39, 0]]), r"points\[1\] and 1 more is"),
-        (lambda: PointCloud([[0, 0, 0]], 1e5), "point_cloud.point_radius"),
-        (lambda: PoseGoal("l3", transform(np.array(FAR))), "goal.T_base_frame .* within ±10000"),
-        (lambda: DepthView([[1.0]], (1, 1, 0, 0), transform(np.array(FAR))), "view.T_base_camera"),
+        (lambda: rd.Sphere([0, 0, 0], 1e-300), "sphere.radius is 1e-300"),
+        (lambda: rd.Sphere(FAR, 1), r"sphere.center is \[1e\+20, 0, 0\]; its numbers must be within ±10000"),
+        (lambda: rd.Box([0, 0, 0], [1, 1e5, 1]), "box.size"),
+        (lambda: rd.Box([0, 0, 0], [1, 1, 1e-30]), "box.size .* at least 1e-09 m"),
+        (lambda: rd.Box([0, 0, 0], [1, 1, 1], [1e200, 1e200, 0, 0]), "box.wxyz .* within ±10000"),
+        (lambda: rd.Cylinder([0, 0, 0], 1, 1e9), "cylinder.height"),
+        (lambda: rd.Capsule([0, 0, 0], 1e39, 1), "capsule.radius"),
+        (
+            lambda: rd.Mesh([*TRIANGLE, [5e37, 0, 0]], [[0, 1, 2]]),
+            r"mesh.vertices\[3\] is .* within ±10000 m",
+        ),
+        (lambda: rd.Mesh(TRIANGLE, [[0, 1, np.nan]]), "mesh.faces"),
+        (lambda: rd.Mesh(TRIANGLE, [[0, 1, 2]], FAR), "mesh.xyz"),
+        (lambda: rd.PointCloud([[0, 0, 0], [1e39, 0, 0], [0, 1e39, 0]]), r"points\[1\] and 1 more is"),
+        (lambda: rd.PointCloud([[0, 0, 0]], 1e5), "point_cloud.point_radius"),
+        (lambda: rd.PoseGoal("l3", transform(np.array(FAR))), "goal.T_base_frame .* within ±10000"),
+        (lambda: rd.DepthView([[1.0]], (1, 1, 0, 0), transform(np.array(FAR))), "view.T_base_camera"),
         (lambda: box_arm().with_locked({"j0": 1e20}), r"locked: j0 is 1e\+20; it must be a number within"),
-        (lambda: Problem(box_arm(), Scene(), [1e20, 0, 0], [0, 0, 0]), "start: j0"),
-        (lambda: Sphere([False, 0.5, 0], 1), r"sphere.center is \[False, 0.5, 0\]; it must be 3 finite"),
-        (lambda: PointCloud([[0, 0, 1], [0, True, 0]]), "points is not numbers"),
-        (lambda: Problem(box_arm(), Scene(), [0, 0, 0], [0, 0, 0], clearance=1e39), "clearance"),
+        (lambda: rd.Problem(box_arm(), rd.Scene(), [1e20, 0, 0], [0, 0, 0]), "start: j0"),
+        (lambda: rd.Sphere([False, 0.5, 0], 1), r"sphere.center is \[False, 0.5, 0\]; it must be 3 finite"),
+        (lambda: rd.PointCloud([[0, 0, 1], [0, True, 0]]), "points is not numbers"),
+        (lambda: rd.Problem(box_arm(), rd.Scene(), [0, 0, 0], [0, 0, 0], clearance=1e39), "clearance"),
     ],
 )
 def test_numbers_out_of_bounds(make: Callable[[], object], message: str) -> None:
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(rd.InputError, match=message):
         make()
 
 
 @pytest.mark.parametrize("distance", [10.0, 1e3, 9e3])
-@pytest.mark.parametrize("kind", [Sphere, Box, Cylinder, Capsule])
+@pytest.mark.parametrize("kind", [rd.Sphere, rd.Box, rd.Cylinder, rd.Capsule])
 def test_huge_shapes_are_never_called_valid(kind: type[Shape], distance: float) -> None:
     """The surface of each shape is 2 mm inside the arm, or 2 cm away from it."""
     robot = box_arm()
     rows = np.zeros((2, 3))
     rows[:, 0] = 0.0, 0.2
-    problem = Problem(robot, Scene(), rows[0], JointGoal(rows[1:]))
+    problem = rd.Problem(robot, rd.Scene(), rows[0], rd.JointGoal(rows[1:]))
     turn = [np.sqrt(0.5), 0, np.sqrt(0.5), 0]  # z along x
     for depth, valid in ((0.002, False), (-0.02, True)):
         half = distance - 1.2 + depth  # the arm ends at x = 1.2 m
         center = [distance, 0, 0]
         shape = {
-            Sphere: lambda half=half, center=center: Sphere(center, half),
-            Box: lambda half=half, center=center: Box(center, 2 * np.array([half, half, half])),
-            Cylinder: lambda half=half, center=center: Cylinder(center, half, 2 * half, turn),
-            Capsule: lambda half=half, center=center: Capsule(center, half / 2, half, turn),
+            rd.Sphere: lambda half=half, center=center: rd.Sphere(center, half),
+            rd.Box: lambda half=half, center=center: rd.Box(center, 2 * np.array([half, half, half])),
+            rd.Cylinder: lambda half=half, center=center: rd.Cylinder(center, half, 2 * half, turn),
+            rd.Capsule: lambda half=half, center=center: rd.Capsule(center, half / 2, half, turn),
         }[kind]
-        if max(2 * half, distance) > 1e4 and kind in (Box, Cylinder):
+        if max(2 * half, distance) > 1e4 and kind in (rd.Box, rd.Cylinder):
             return
-        validated = verify(replace(problem, scene=Scene([shape()])), Path(robot.joint_names, rows))
+        validated = rd.verify(replace(problem, scene=rd.Scene([shape()])), rd.Path(robot.joint_names, rows))
         assert validated.valid == valid, (depth, validated)
 
 
 def test_naming_is_not_quadratic() -> None:
-    scene = Scene([Sphere([0, 0, i], 0.1) for i in range(1000)])
+    scene = rd.Scene([rd.Sphere([0, 0, i], 0.1) for i in range(1000)])
     names = [shape.name for shape in scene.shapes]
     assert len({*names}) == 1000
     assert names[:3] == ["sphere", "sphere_2", "sphere_3"]
-    mixed = Scene([Sphere([0, 0, 0], 1, name) for name in ("a", "a_2", "a", "a", "a_2")])
+    mixed = rd.Scene([rd.Sphere([0, 0, 0], 1, name) for name in ("a", "a_2", "a", "a", "a_2")])
     assert [shape.name for shape in mixed.shapes] == ["a", "a_2", "a_3", "a_4", "a_2_2"]
 
 
@@ -92,5 +90,5 @@ def test_poses_with_rounding_errors_are_accepted() -> None:
     T[3] += 1e-12
     assert (rigid_transform("a pose", T)[3] == [0, 0, 0, 1]).all()
     T[3, 0] = 0.01
-    with pytest.raises(InputError, match=r"a pose is .* over a row 0 0 0 1"):
+    with pytest.raises(rd.InputError, match=r"a pose is .* over a row 0 0 0 1"):
         rigid_transform("a pose", T)

@@ -8,7 +8,6 @@ import pytest
 import robotdiffuse as rd
 from robotdiffuse.collision import exact_meshes, kernel_arrays
 from robotdiffuse.core.deadline import LONG, OutOfTimeError, check_time, check_timing, deadline
-from robotdiffuse.core.types import Status
 from robotdiffuse.planning.pipeline import waypoints
 from robotdiffuse.planning.planner import one_of_each
 from robotdiffuse.planning.search.rrt import RRTConnect
@@ -64,7 +63,7 @@ def test_a_motion_whose_timing_takes_too_long_is_a_time_out(
 ) -> None:
     monkeypatch.setattr(speed_limits, "SECONDS_PER_ROW", 1e3)
     result = RRTConnect().plan(problem(), 20.0, **more)
-    assert result.status is Status.TIMEOUT
+    assert result.status is rd.Status.TIMEOUT
     assert "time limit of 20 s is too short for timing: there was no time for the" in result.reason
     assert "rows of a motion of" in result.reason
 
@@ -80,7 +79,7 @@ def test_a_start_velocity_whose_timing_takes_too_long_is_a_time_out(monkeypatch:
 
     monkeypatch.setattr(waypoints, "attempt", then_slow)
     result = RRTConnect().plan(moving, 20.0)
-    assert result.status is Status.TIMEOUT and "too short for timing" in result.reason
+    assert result.status is rd.Status.TIMEOUT and "too short for timing" in result.reason
 
 
 def test_a_motion_too_long_to_be_validated_ends_the_search() -> None:
@@ -88,14 +87,14 @@ def test_a_motion_too_long_to_be_validated_ends_the_search() -> None:
     joints = tuple(replace(joint, velocity=1e-6) for joint in PANDA.joints)
     slow = rd.Problem(replace(PANDA, joints=joints), rd.Scene(), LEFT, RIGHT)
     result = RRTConnect().plan(slow, 600.0)
-    assert result.status is Status.NO_PATH
+    assert result.status is rd.Status.NO_PATH
     assert "the motion takes 1.8" in result.reason
 
 
 def test_a_grid_of_too_many_points_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kernel_arrays, "GRID_SECONDS_PER_POINT", 1e3)
     result = RRTConnect().plan(problem(wall()), time_limit=20.0)
-    assert result.status is Status.TIMEOUT
+    assert result.status is rd.Status.TIMEOUT
     assert "time limit of 20 s is too short to prepare the scene" in result.reason
     assert "the grid of" in result.reason
 
@@ -116,10 +115,10 @@ def test_a_tree_of_the_validator_that_takes_too_long_is_refused(
     asked = problem(rd.PointCloud(vertices, 0.01) if cloud else rd.Mesh(vertices, wall().faces))
     monkeypatch.setattr(exact_meshes, "TREE_SECONDS_PER_ELEMENT", 1e3)
     refused = RRTConnect().plan(asked, time_limit=20.0)
-    assert refused.status is Status.TIMEOUT
+    assert refused.status is rd.Status.TIMEOUT
     assert "the validator's tree over the" in refused.reason
     monkeypatch.undo()
-    assert RRTConnect().plan(asked, time_limit=20.0).status is Status.INVALID_START
+    assert RRTConnect().plan(asked, time_limit=20.0).status is rd.Status.INVALID_START
 
 
 def test_warming_up_prepares_no_large_scene() -> None:

@@ -19,7 +19,8 @@ from trimesh.exchange.gltf import export_gltf
 from trimesh.exchange.obj import export_obj
 from trimesh.exchange.ply import export_ply
 
-from robotdiffuse.core.errors import InputError, joined, shown, unknown_name
+from robotdiffuse import InputError, load_problem
+from robotdiffuse.core.errors import joined, shown, unknown_name
 from robotdiffuse.core.input_files import (
     MAX_SHOWN_NAME,
     input_file,
@@ -32,7 +33,6 @@ from robotdiffuse.core.input_files import (
 )
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.output_files import check_output
-from robotdiffuse.problems.files import load_problem
 
 SOURCE = Path(__file__).parents[2] / "src" / "robotdiffuse"
 DEEP = 100_000

@@ -4,11 +4,11 @@ from typing import ClassVar
 
 import pytest
 
-from robotdiffuse.core.errors import InputError, repeated
+from robotdiffuse import Box, InputError, Scene
+from robotdiffuse.core.errors import repeated
 from robotdiffuse.core.input_files import parse_json
 from robotdiffuse.core.types import check_motion_arrays
-from robotdiffuse.scenes.scene import MAX_CONTACT_LINKS, Scene
-from robotdiffuse.scenes.shapes import Box
+from robotdiffuse.scenes.scene import MAX_CONTACT_LINKS
 
 COUNT = 2000
 

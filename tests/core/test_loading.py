@@ -13,7 +13,6 @@ from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.core.loading import compile_seconds, compiled, loading, loading_seconds
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.robots.kinematic_tree import once_per_robot
-from robotdiffuse.robots.robot import Robot
 
 FIRST_CALLS = """
 import sys, time
@@ -84,7 +83,7 @@ def test_loading_takes_no_time_of_the_call(monkeypatch: pytest.MonkeyPatch) -> N
 
 def _built(clock: Clock):
     @once_per_robot
-    def build(robot: Robot) -> None:
+    def build(robot: rd.Robot) -> None:
         clock.now += 5.0
 
     return build

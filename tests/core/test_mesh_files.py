@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse import InputError
 from robotdiffuse.core.mesh_files import read_triangles
 
 TRIANGLES = '<triangles count="1"{}><input semantic="VERTEX" source="#v" offset="0"/><p>0 1 2</p></triangles>'

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse import InputError
 from robotdiffuse.core.registry import AddedEntries, Entry, Registry, added_entries, adopt_entries
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.problems.families import FAMILIES, load_family

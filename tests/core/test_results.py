@@ -8,10 +8,9 @@ from pathlib import Path as FilePath
 import numpy as np
 import pytest
 
-from robotdiffuse.core.errors import InputError, OutputError
+from robotdiffuse import InputError, Path, PlanResult, Status, Trajectory, load_result
+from robotdiffuse.core.errors import OutputError
 from robotdiffuse.core.output_files import check_output
-from robotdiffuse.core.results import PlanResult, load_result
-from robotdiffuse.core.types import Path, Status, Trajectory
 
 NAMES = ("shoulder", "elbow")
 
@@ -75,14 +74,6 @@ def test_fields_are_those_that_the_design_promises(solved: PlanResult, tmp_path:
     assert set(promised.split()) <= set(record)
     assert record["verified"] is True and record["status"] == "solved"
     assert len(record["times"]) == len(record["positions"]) == len(record["accelerations"]) == 4
-
-
-def test_progress_and_refused_survive_save_and_load(solved: PlanResult, tmp_path: FilePath) -> None:
-    """Reading a file lost them."""
-    for result in (solved, replace(solved, progress=(), refused="")):
-        result.save(tmp_path / "r.json")
-        read = load_result(tmp_path / "r.json").result
-        assert (read.progress, read.refused) == (result.progress, result.refused)
 
 
 def test_results_of_earlier_versions_lack_fields(solved: PlanResult, tmp_path: FilePath) -> None:
@@ -211,11 +202,6 @@ def test_not_a_result_file(text: str, message: str, tmp_path: FilePath) -> None:
     file.write_text(text)
     with pytest.raises(InputError, match=message):
         load_result(file)
-
-
-def test_missing_result_file(tmp_path: FilePath) -> None:
-    with pytest.raises(InputError, match="does not exist"):
-        load_result(tmp_path / "missing.json")
 
 
 def test_check_output_takes_capitals(tmp_path: FilePath) -> None:

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import numpy as np
 import pytest
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse import InputError
 from robotdiffuse.core.registry import Entry, Registry
 from robotdiffuse.core.settings import Bound, Count, NotNegative, OneOf, Positive, Settings, SettingsOf, Share
 from robotdiffuse.scenes.surface_points import VisibleRegion

@@ -14,15 +14,12 @@ from numpy import ndarray
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from robotdiffuse.core.bounds import Value, for_kernels, read_only
-from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Status
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
 from robotdiffuse.problems.constraints import FrameConstraint
 from robotdiffuse.robots.bodies import AttachedBody, ConvexMesh, Surface
 from robotdiffuse.robots.kinematic_tree import Joint
-from robotdiffuse.robots.robot import LinkPairTable, Robot
+from robotdiffuse.robots.robot import LinkPairTable
 from robotdiffuse.robots.visual_meshes import VisualMesh
-from robotdiffuse.validation.validator import verify
 
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
@@ -44,10 +41,10 @@ def problem() -> rd.Problem:
     return rd.Problem(box_arm(), rd.Scene([sphere()]), ROWS[0], ROWS, **more)
 
 
-def robot() -> Robot:
+def robot() -> rd.Robot:
     spheres = {link: np.array(rows) for link, rows in box_arm().spheres.items()}
     joints = tuple(Joint(j.name, j.kind, j.parent, j.child, POSE, UP) for j in box_arm().joints)
-    return Robot("arm", box_arm().base, box_arm().tip, joints, spheres, above={"root": POSE})
+    return rd.Robot("arm", box_arm().base, box_arm().tip, joints, spheres, above={"root": POSE})
 
 
 VALUES: dict[type[Value], Callable[[], Value]] = {
@@ -66,7 +63,7 @@ VALUES: dict[type[Value], Callable[[], Value]] = {
     rd.NextView: lambda: rd.NextView(POSE, 0.5),
     rd.ArmCamera: lambda: rd.ArmCamera("l3", POSE, (1.0, 1.0, 0.0, 0.0), (4, 3)),
     Joint: lambda: Joint("j", "revolute", "a", "b", POSE, UP),
-    Robot: robot,
+    rd.Robot: robot,
     ConvexMesh: lambda: ConvexMesh(CORNERS, FACES),
     Surface: lambda: Surface(CORNERS, FACES),
     VisualMesh: lambda: VisualMesh(CORNERS, FACES, np.zeros((4, 3), np.uint8)),
@@ -134,8 +131,10 @@ def test_the_text_of_a_value_is_one_line(kind: type[Value]) -> None:
 def test_large_arrays_are_shown_by_their_shape_and_defaults_not_at_all() -> None:
     assert repr(rd.Box(HALF, HALF)) == "Box(center=[0.5, 0.5, 0.5], size=[0.5, 0.5, 0.5])"
     assert repr(rd.PointCloud(np.zeros((5000, 3)))) == "PointCloud(points=<5000 x 3 array>)"
-    assert "solved" in repr(PlanResult(Status.SOLVED, "", "aorrtc", "arm", 0.1, 0, path=VALUES[rd.Path]()))  # type: ignore[arg-type]
-    assert repr(PlanResult(Status.TIMEOUT, "no path", "aorrtc", "arm", 0.1, 0)) == (
+    assert "solved" in repr(
+        rd.PlanResult(rd.Status.SOLVED, "", "aorrtc", "arm", 0.1, 0, path=VALUES[rd.Path]())
+    )  # type: ignore[arg-type]
+    assert repr(rd.PlanResult(rd.Status.TIMEOUT, "no path", "aorrtc", "arm", 0.1, 0)) == (
         "PlanResult(timeout, aorrtc in 100 ms: no path)"
     )
 
@@ -195,7 +194,7 @@ def test_a_verdict_is_of_the_scene_as_it_is() -> None:
     """A sphere cannot be moved into the way of a motion that was found free."""
     path = rd.Path(box_arm().joint_names, ROWS)
     task = rd.Problem(box_arm(), rd.Scene([rd.Sphere([-1, 0, 0], 0.1)]), ROWS[0], ROWS[1])
-    assert verify(task, path).valid
+    assert rd.verify(task, path).valid
     with pytest.raises(ValueError, match="read-only"):
         task.scene.shapes[0].center[:] = 0.5, 0.1, 0.0  # type: ignore[attr-defined]
     with pytest.raises(ValueError, match="read-only"):

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helpers import faulty_planner
+from helpers import faulty_planner, waiting
 from robotdiffuse.cli import main
 from robotdiffuse.core import registry
 from robotdiffuse.core.errors import InputError
@@ -130,7 +130,8 @@ def test_a_metric_of_an_imported_module_is_measured(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(registry, "imported", [])
     try:
         registry.import_modules(["counted"])
-        assert run_bench(settings(tmp_path / "run", "rrt_connect", count=1), quiet, quiet) == 1
+        asked = replace(settings(tmp_path / "run", "rrt_connect", count=1), time_limit=60.0)
+        assert run_bench(asked, quiet, quiet) == 1
         (record,) = read_records(tmp_path / "run")["rrt_connect"]
         assert record.measures["legs"] == len(record.waypoints) - 1
     finally:
@@ -216,12 +217,13 @@ def test_planners_take_turns_with_each_problem(tmp_path: Path, monkeypatch: pyte
     calls = []
     at_once = [0]
     most = [0]
+    wanted = [1]
 
     def plan(self: PlannerProcess, run: Run, restarts: bool) -> list[dict]:
         at_once[0] += 1
         most[0] = max(most[0], at_once[0])
         calls.append((run.case.name, run.method))
-        time.sleep(0.02)
+        waiting.until(lambda: most[0] >= wanted[0], 300.0)
         at_once[0] -= 1
         return [{"status": "timeout", "time": 2.0}]
 
@@ -231,6 +233,7 @@ def test_planners_take_turns_with_each_problem(tmp_path: Path, monkeypatch: pyte
     assert run_bench(settings(tmp_path / "a", planners), quiet, quiet) == 9
     assert calls == [(f"rop/{i}", name) for i in range(3) for name in planners.split(",")]
     assert most == [1]
+    wanted[0] = 2
     assert run_bench(replace(settings(tmp_path / "b", planners), workers=2), quiet, quiet) == 9
     assert most == [2]
     for name in planners.split(","):

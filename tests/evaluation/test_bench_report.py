@@ -330,14 +330,6 @@ def test_rows_that_were_timed_under_other_loads_are_told_in_the_table(tmp_path: 
     assert table.notes[0] == "All rows were timed alike: run a, 2 at once; load average 1.5 to 2.2."
 
 
-def test_planners_are_called_what_they_are() -> None:
-    assert bench_report.named("diffusion:guidance_steps=0:samples=4") == (
-        "diffusion, guidance_steps=0, samples=4"
-    )
-    assert bench_report.named("rrt_connect:step=0.5+restarts") == "rrt_connect, step=0.5, restarted"
-    assert bench_report.named("mpnet@mine") == "mpnet@mine"
-
-
 def test_a_metric_is_declared_in_one_place(
     small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

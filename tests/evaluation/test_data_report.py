@@ -1,6 +1,5 @@
 """The figures of a data set by hand, and the page that shows them."""
 
-import builtins
 import re
 
 import numpy as np
@@ -16,7 +15,6 @@ from robotdiffuse.evaluation.data_report import (
     SAMPLED_WAYPOINTS,
     facts,
     read_figures,
-    size_in_words,
     tables,
     write_page,
 )
@@ -117,21 +115,3 @@ def test_bad_input(tmp_path, rows):
         write_page(tmp_path, tmp_path / "report.pdf", ARM)
     with pytest.raises(InputError, match="fingerprint"):
         write_page(tmp_path, tmp_path / "report.html", load_robot("panda"))
-
-
-def test_missing_matplotlib_is_one_line(tmp_path, rows, monkeypatch):
-    write_motions(tmp_path, ARM, rows)
-    real = builtins.__import__
-
-    def refuse(name, *rest):
-        if name.partition(".")[0] == "matplotlib":
-            raise ImportError(name)
-        return real(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", refuse)
-    with pytest.raises(InputError, match=r'pip install "robotdiffuse\[data\]"'):
-        write_page(tmp_path, tmp_path / "report.html", ARM)
-
-
-def test_sizes_in_words():
-    assert size_in_words(1_234_567) == "1.2 MB" and size_in_words(2_340_000_000) == "2.34 GB"

@@ -24,7 +24,7 @@ class SlowPlanner(AORRTC):
     def plan(self, problem: Problem, *request: object, **more: object) -> PlanResult:
         if any(shape.name == "broken" for shape in problem.scene.shapes):
             raise RuntimeError("no such luck")
-        result = super().plan(problem, 2.0)
+        result = super().plan(problem, 60.0)
         self.calls.append(problem)
         assert self.go.acquire(timeout=MAX_WAIT)
         return result

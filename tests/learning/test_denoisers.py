@@ -304,18 +304,6 @@ def test_unknown_names_list_the_known():
             PlannerTraining.from_json(values | {"denoiser": bad}, "x")
 
 
-def test_bad_settings_of_a_run_are_named():
-    of_unet = {"data": "d", "encoder": "e", "denoiser": "unet", "denoiser_settings": SMALL["unet"]}
-    for field in ("width", "wings"):
-        values = PlannerTraining(**of_unet).to_json()
-        values["denoiser_settings"][field] = "wide"
-        with pytest.raises(InputError, match=f"x.denoiser_settings.{field}"):
-            PlannerTraining.from_json(values, "x")
-    for share in (-0.1, 1.0):
-        with pytest.raises(InputError, match="condition_drop"):
-            PlannerTraining(data="data", encoder="encoder", condition_drop=share)
-
-
 @pytest.mark.parametrize("name", DENOISERS)
 def test_dropped_conditions_have_no_effect(name):
     model = model_with(name, null_condition=True)

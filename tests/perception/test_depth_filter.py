@@ -3,14 +3,12 @@
 import numpy as np
 import pytest
 
+from robotdiffuse import Box, DepthView, Scene, load_robot
 from robotdiffuse.perception.depth_filter import depth_spread, filtered, grown_for_noise
-from robotdiffuse.perception.depth_view import DepthNoise, DepthView
+from robotdiffuse.perception.depth_view import DepthNoise
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.perception.seen_points import seen_points
-from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box
 
 PANDA = load_robot("panda")
 HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.perception.depth_view import DepthNoise, DepthView
+from robotdiffuse import DepthView, InputError
+from robotdiffuse.perception.depth_view import DepthNoise
 
 
 def test_noise_is_as_its_settings_say() -> None:

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse import DepthView, InputError, Scene
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_about, transform
-from robotdiffuse.perception.depth_view import DepthView, SeenPoints
+from robotdiffuse.perception.depth_view import SeenPoints
 from robotdiffuse.perception.depth_view_files import read_depth, read_views, view_entry
-from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.surface_points import sample_surface
 
 K = (50.0, 50.0, 31.5, 23.5)

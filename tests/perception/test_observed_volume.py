@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse import DepthView, InputError, load_robot
 from robotdiffuse.perception.observed_volume import ObservedVolume, observe
 from robotdiffuse.perception.voxel_grid import LOW, SHAPE, VOXEL
-from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose, placed_spheres
 
 PANDA = load_robot("panda")

@@ -5,15 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.perception.depth_view import DepthNoise, DepthView
+from robotdiffuse import Box, DepthView, InputError, Scene, load_robot
+from robotdiffuse.perception.depth_view import DepthNoise
 from robotdiffuse.perception.observed_volume import FREE, OUT, carve_view
 from robotdiffuse.perception.occupancy_map import OccupancyMap
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
 from robotdiffuse.perception.voxel_grid import MAP
-from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box
 
 PANDA = load_robot("panda")
 HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])

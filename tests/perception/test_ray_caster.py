@@ -5,13 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse import Box, Capsule, Cylinder, InputError, PointCloud, Scene, Sphere, load_robot
 from robotdiffuse.perception.ray_caster import MAX_RANGE, looking_at, ray_cast, voxels_within
 from robotdiffuse.perception.voxel_grid import VoxelGrid
-from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import placed_spheres
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere
+from robotdiffuse.scenes.shapes import Shape
 
 PANDA = load_robot("panda")
 SIZE = (64, 48)

@@ -16,7 +16,6 @@ from robotdiffuse.perception.visibility import (
     within_voxels,
 )
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.robots.robot import Robot
 
 PANDA = rd.load_robot("panda")
 Q = np.array([0.3, -0.5, 0.2, -2.0, 0.4, 1.7, 0.5])
@@ -123,7 +122,7 @@ def test_balls_cover_the_spheres_of_a_link_without_meshes() -> None:
         assert from_balls(bare, "panda_hand", points).max() <= BALL_RADIUS
 
 
-def from_balls(robot: Robot, link: str, points: np.ndarray) -> np.ndarray:
+def from_balls(robot: rd.Robot, link: str, points: np.ndarray) -> np.ndarray:
     """Distances of points in a link's frame to the nearest of the arm's balls at Q [m]."""
     T = link_pose(robot, Q, link)
     return KDTree(surface_balls(robot, Q)).query(points @ T[:3, :3].T + T[:3, 3])[0]

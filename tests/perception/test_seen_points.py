@@ -8,9 +8,9 @@ import pytest
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse import Box, DepthView, InputError, Problem, Scene, Sphere, load_problem, load_robot
 from robotdiffuse.core.transforms import transform
-from robotdiffuse.perception.depth_view import DepthView, SeenPoints
+from robotdiffuse.perception.depth_view import SeenPoints
 from robotdiffuse.perception.seen_points import (
     ARM_DISTANCE,
     CELL,
@@ -18,12 +18,8 @@ from robotdiffuse.perception.seen_points import (
     POINT_RADIUS,
     seen_points,
 )
-from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
-from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots import load_robot
+from robotdiffuse.problems.files import problem_from_record, problem_record, save_problem
 from robotdiffuse.robots.kinematics import placed_spheres
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Sphere
 
 PANDA = load_robot("panda")
 START = np.array([-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])

@@ -2,10 +2,9 @@
 
 import numpy as np
 
-from robotdiffuse.core.types import Path
+from robotdiffuse import Path, load_robot
 from robotdiffuse.perception.unknown_space import UnknownSpace
 from robotdiffuse.perception.voxel_grid import FINE, FINE_SHAPE
-from robotdiffuse.robots import load_robot
 
 PANDA = load_robot("panda")
 START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from robotdiffuse import load_robot
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.perception.voxel_grid import LOW, SHAPE, VOXEL, heaviest_part, summed, surface, sweep
-from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import placed_spheres
 
 PANDA = load_robot("panda")

@@ -8,15 +8,10 @@ import pytest
 from numba import njit
 
 from helpers.clock import stop_clock
+from robotdiffuse import Problem, Scene, Sphere, Status, load_planner, load_robot
 from robotdiffuse.core.deadline import TIMING, OutOfTimeError
-from robotdiffuse.core.types import Status
-from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.search.shared_tree import SharedTreeRRTStar, SharedTreeSettings
-from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Sphere
 
 START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 

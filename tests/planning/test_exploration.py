@@ -9,8 +9,7 @@ import pytest
 
 import robotdiffuse as rd
 from robotdiffuse.collision.kernel_arrays import compile_robot
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.perception.depth_view import DepthNoise, DepthView
+from robotdiffuse.perception.depth_view import DepthNoise
 from robotdiffuse.perception.occupancy_map import OccupancyMap, ViewMemory
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
 from robotdiffuse.perception.unknown_space import CARVING_MARGIN
@@ -25,9 +24,8 @@ from robotdiffuse.planning.exploration.simulated import (
     simulated_explorer,
     wrist_camera,
 )
-from robotdiffuse.planning.exploration.steps import DONE, ExplorerSettings
+from robotdiffuse.planning.exploration.steps import DONE
 from robotdiffuse.robots.kinematics import link_pose, placed_spheres
-from robotdiffuse.validation.validator import verify
 
 PANDA = rd.load_robot("panda")
 HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
@@ -41,7 +39,7 @@ PROBLEM = rd.Problem(PANDA, rd.Scene([FLOOR, WALL]), LEFT, RIGHT)
 
 
 def explorer(policy: str = "strict", seen: bool = True, noise: DepthNoise | None = None) -> rd.Explorer:
-    settings = ExplorerSettings(policy=policy, time_limit=1.0, look_attempts=2, max_looks=2)
+    settings = rd.ExplorerSettings(policy=policy, time_limit=1.0, look_attempts=2, max_looks=2)
     out = rd.Explorer(PANDA, [wrist_camera(PANDA)], rd.Scene([FLOOR]), ZONE, settings)
     if seen:
         out.observe(camera_beside(PROBLEM, noise, 0))
@@ -142,7 +140,7 @@ def test_looks_see_what_is_wanted() -> None:
     assert len(best) == 3
     for way in best:
         assert np.array_equal(way[0], HOME)
-        assert verify(rd.Problem(PANDA, scene, HOME, way[-1]), rd.Path(PANDA.joint_names, way)).valid
+        assert rd.verify(rd.Problem(PANDA, scene, HOME, way[-1]), rd.Path(PANDA.joint_names, way)).valid
     for T in camera.poses(PANDA, np.stack([way[-1] for way in best])):
         x, y, z = T[:3, :3].T @ (target - T[:3, 3])
         fx, fy, cx, cy = camera.intrinsics
@@ -151,21 +149,21 @@ def test_looks_see_what_is_wanted() -> None:
 
 def test_what_keeps_the_arm_from_going_is_said() -> None:
     blind = explorer(seen=False)
-    with pytest.raises(InputError, match="call set_goal first"):
+    with pytest.raises(rd.InputError, match="call set_goal first"):
         blind.next(HOME)
     blind.set_goal(HOME)
     assert blind.next(HOME).kind == "done"
     blind.set_goal(HOME + 0.3)
     step = blind.next(HOME)
     assert step.kind == "look" and step.motion is None and "nothing was seen yet" in step.reason
-    still = rd.Explorer(PANDA, (), rd.Scene([FLOOR]), settings=ExplorerSettings(time_limit=1.0))
+    still = rd.Explorer(PANDA, (), rd.Scene([FLOOR]), settings=rd.ExplorerSettings(time_limit=1.0))
     view = camera_beside(PROBLEM, None, 0)
     still.observe(replace(view, depth=np.zeros_like(view.depth)))
     still.set_goal(PROBLEM.goal)
     step = still.next(PROBLEM.start)
     assert step.kind == "stuck" and "no camera is on the arm" in step.reason
-    with pytest.raises(InputError, match=r"unknown explorer\.policy"):
-        replace(ExplorerSettings(), policy="bold")
+    with pytest.raises(rd.InputError, match=r"unknown explorer\.policy"):
+        replace(rd.ExplorerSettings(), policy="bold")
 
 
 def test_a_strict_arm_does_not_look_for_a_goal_outside_of_the_map() -> None:
@@ -225,7 +223,7 @@ def test_stray_points_that_other_views_see_through_are_no_obstacles() -> None:
 def test_where_no_look_can_be_reached_the_arm_leaves_a_goal_by_the_way_in() -> None:
     camera = replace(wrist_camera(PANDA), range=0.01)  # no look of it shows anything
     zone = ((-0.36, -0.36, 0.0), (0.9, 0.9, 1.1))  # all that is known; OUTSIDE reaches out of it
-    one = rd.Explorer(PANDA, [camera], rd.Scene([FLOOR]), zone, ExplorerSettings(time_limit=1.0))
+    one = rd.Explorer(PANDA, [camera], rd.Scene([FLOOR]), zone, rd.ExplorerSettings(time_limit=1.0))
     view = camera_beside(PROBLEM, None, 0)
     one.observe(replace(view, depth=np.zeros_like(view.depth)))
     inner = PROBLEM.start + np.array([0.1, 0.0, 0.0, -0.1, 0.0, 0.0, 0.0])
@@ -246,7 +244,7 @@ def test_where_no_look_can_be_reached_the_arm_leaves_a_goal_by_the_way_in() -> N
 
 def test_without_the_network_a_motion_through_space_seen_free_is_certain_enough() -> None:
     """Under `probabilistic` the arm never stopped looking: the highest confidence was a rate of 0.82."""
-    settings = ExplorerSettings(policy="probabilistic", predict=False, time_limit=1.0)
+    settings = rd.ExplorerSettings(policy="probabilistic", predict=False, time_limit=1.0)
     one = rd.Explorer(PANDA, [wrist_camera(PANDA)], rd.Scene([FLOOR]), ZONE, settings)
     one.observe(camera_beside(PROBLEM, None, 0))
     one.set_goal(PROBLEM.start + 0.02)
@@ -254,7 +252,7 @@ def test_without_the_network_a_motion_through_space_seen_free_is_certain_enough(
     assert (step.kind, step.policy, step.confidence) == ("go", "strict", None)
 
 
-def seen_from(position: tuple[float, float, float], *shapes: rd.Box) -> DepthView:
+def seen_from(position: tuple[float, float, float], *shapes: rd.Box) -> rd.DepthView:
     """A view of shapes and the floor, with the arm at LEFT."""
     T = looking_at(np.array(position), np.array([0.45, 0.25, 0.55]))
     intrinsics = (230.0, 230.0, 159.5, 119.5)
@@ -270,7 +268,7 @@ def test_a_goal_behind_a_plate_is_refused_until_views_show_it() -> None:
     goal = LEFT.copy()
     goal[0] += 0.12
     for see_goal in (False, True):
-        settings = ExplorerSettings(time_limit=1.0, see_goal=see_goal)
+        settings = rd.ExplorerSettings(time_limit=1.0, see_goal=see_goal)
         one = rd.Explorer(PANDA, (), rd.Scene([FLOOR]), ZONE, settings)
         one.observe(seen_from((1.3, 0.9, 0.6), plate))
         one.set_goal(goal)
@@ -303,8 +301,8 @@ def test_a_thing_at_the_surface_of_a_goal_is_seen_as_free_by_no_view() -> None:
 
 
 def test_a_goal_is_seen_by_strict_alone() -> None:
-    with pytest.raises(InputError, match=r"explorer.see_goal is true and explorer.policy 'probabilistic'"):
-        ExplorerSettings(policy="probabilistic", see_goal=True)
+    with pytest.raises(rd.InputError, match=r"explorer.see_goal is true and explorer.policy 'probabilistic'"):
+        rd.ExplorerSettings(policy="probabilistic", see_goal=True)
 
 
 @pytest.mark.parametrize("name", ["waypoints", "moving"])
@@ -312,4 +310,4 @@ def test_fields_that_exploring_would_ignore_are_refused(name: str) -> None:
     ball = rd.MovingObstacle(rd.Sphere([0.9, 0.0, 0.9], 0.05, name="ball"), velocity=[0.1, 0, 0])
     fields = {"waypoints": [PROBLEM.start], "moving": [ball]}
     with pytest.raises(rd.InputError, match=f"the problem has {name}, which explore does not support"):
-        simulated_explorer(replace(PROBLEM, **{name: fields[name]}), ExplorerSettings(), None, 0)
+        simulated_explorer(replace(PROBLEM, **{name: fields[name]}), rd.ExplorerSettings(), None, 0)

@@ -5,18 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from robotdiffuse import Box, InputError, PlanResult, Problem, Scene, load_planner, load_robot, next_view
 from robotdiffuse.cli import main
 from robotdiffuse.collision.kernel_arrays import compile_robot
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.perception.visibility import ARM_CELL, seen_weights
-from robotdiffuse.planning import load_planner
-from robotdiffuse.planning.exploration.looks import next_view, poses_around
-from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box
+from robotdiffuse.planning.exploration.looks import poses_around
 
 PANDA = load_robot("panda")
 START = np.array([-0.9, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])

@@ -10,7 +10,6 @@ import pytest
 
 import robotdiffuse as rd
 from robotdiffuse.core.registry import Entry
-from robotdiffuse.core.types import Status
 from robotdiffuse.planning import PLANNERS, SEARCH
 from robotdiffuse.planning.search.rrt import RRTConnect
 
@@ -32,7 +31,7 @@ def test_results_are_in_order_and_as_alone() -> None:
     results = list(rd.plan_many(problems(), "rrt_connect", workers=2, **request))
     assert counts == [(done, 6) for done in range(1, 7)]
     alone = [RRTConnect().plan(problem, 20.0, seed=3) for problem in problems()]
-    assert [result.status for result in results] == [Status.SOLVED] * 5 + [Status.INVALID_START]
+    assert [result.status for result in results] == [rd.Status.SOLVED] * 5 + [rd.Status.INVALID_START]
     for together, one in zip(results[:5], alone, strict=False):
         assert together.path is not None and one.path is not None
         assert np.array_equal(together.path.positions, one.path.positions)
@@ -54,7 +53,7 @@ def test_a_process_that_dies_costs_one_problem(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setitem(PLANNERS, "deadly", entry)
     results = list(rd.plan_many(asked, "deadly", workers=1, time_limit=20.0))
     ends = [result.status for result in results]
-    assert ends == [Status.SOLVED, Status.ERROR, Status.SOLVED, Status.ERROR, Status.SOLVED]
+    assert ends == [rd.Status.SOLVED, rd.Status.ERROR, rd.Status.SOLVED, rd.Status.ERROR, rd.Status.SOLVED]
     assert "died" in results[1].reason and "no such robot" in results[3].reason
 
 

@@ -9,18 +9,12 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Status
-from robotdiffuse.planning import PLANNERS, SEARCH, load_planner, plan
+from robotdiffuse.planning import PLANNERS, SEARCH
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.planning.search import rrt_kernel
 from robotdiffuse.problems.held_out import held_out_problem
-from robotdiffuse.problems.problem import JointGoal, Problem
-from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Sphere
-from robotdiffuse.validation.validator import verify, verify_trajectory
+from robotdiffuse.validation.validator import verify_trajectory
 
 START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 GOAL = START + np.array([1.2, 0.3, 0.0, 0.4, 0.0, 0.0, 0.0])
@@ -38,71 +32,73 @@ def name(request: pytest.FixtureRequest) -> str:
 @pytest.mark.parametrize("number", [0, 4])
 def test_solved_means_verified(name: str, number: int) -> None:
     problem = held_out_problem("rop", number)
-    result = load_planner(name).plan(problem, time_limit=1.0, seed=number)
+    result = rd.load_planner(name).plan(problem, time_limit=1.0, seed=number)
     assert result.planner == name and result.reason
     assert (result.path is not None) == (result.trajectory is not None) == result.solved
     if result.path is None or result.trajectory is None:
         assert result.progress == ()
         return
-    assert verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
+    assert rd.verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
     times, lengths = np.array(result.progress).T
     assert (np.diff(times) >= 0).all() and (np.diff(lengths) < 0).all()
     assert lengths[-1] == pytest.approx(result.path.length)
 
 
 def test_nothing_in_the_way_is_solved_by_all(name: str) -> None:
-    problem = Problem(load_robot("panda"), Scene([]), START, GOAL)
-    result = load_planner(name).plan(problem, time_limit=30.0)
+    problem = rd.Problem(rd.load_robot("panda"), rd.Scene([]), START, GOAL)
+    result = rd.load_planner(name).plan(problem, time_limit=30.0)
     assert result.solved, result.reason
     assert result.path_length is not None and result.path_length >= np.linalg.norm(GOAL - START) - 1e-6
 
 
 def test_a_goal_in_collision_is_reported(name: str) -> None:
-    problem = Problem(load_robot("panda"), Scene([Sphere((0.2, 0.5, 0.5), 0.3)]), START, GOAL)
-    result = load_planner(name).plan(problem, time_limit=1.0)
-    assert result.status is Status.INVALID_GOAL and "in collision" in result.reason
+    problem = rd.Problem(rd.load_robot("panda"), rd.Scene([rd.Sphere((0.2, 0.5, 0.5), 0.3)]), START, GOAL)
+    result = rd.load_planner(name).plan(problem, time_limit=30.0)
+    assert result.status is rd.Status.INVALID_GOAL and "in collision" in result.reason
 
 
 def test_any_of_several_goals_will_do(name: str) -> None:
     goals = np.stack([GOAL, START + np.array([-1.0, 0.2, 0.0, 0.3, 0.0, 0.2, 0.0])])
-    problem = Problem(load_robot("panda"), Scene([]), START, JointGoal(goals))
-    result = load_planner(name).plan(problem, time_limit=30.0)
+    problem = rd.Problem(rd.load_robot("panda"), rd.Scene([]), START, rd.JointGoal(goals))
+    result = rd.load_planner(name).plan(problem, time_limit=30.0)
     assert result.path is not None, result.reason
     assert np.abs(result.path.positions[-1] - goals).max(axis=1).min() < 1e-4
 
 
 def test_time_limit_and_seed_are_checked(name: str) -> None:
-    problem = Problem(load_robot("panda"), Scene([]), START, GOAL)
-    planner = load_planner(name)
-    with pytest.raises(InputError, match="time_limit is 0"):
+    problem = rd.Problem(rd.load_robot("panda"), rd.Scene([]), START, GOAL)
+    planner = rd.load_planner(name)
+    with pytest.raises(rd.InputError, match="time_limit is 0"):
         planner.plan(problem, time_limit=0.0)
-    with pytest.raises(InputError, match="seed is -1"):
+    with pytest.raises(rd.InputError, match="seed is -1"):
         planner.plan(problem, seed=-1)
 
 
 def test_weights_are_for_learned_planners_alone(name: str) -> None:
     learned = PLANNERS[name].kind != SEARCH
-    with pytest.raises(InputError, match="nowhere" if learned else "has no weights"):
-        load_planner(name, weights="nowhere").plan(Problem(load_robot("panda"), Scene([]), START, GOAL))
+    with pytest.raises(rd.InputError, match="nowhere" if learned else "has no weights"):
+        rd.load_planner(name, weights="nowhere").plan(
+            rd.Problem(rd.load_robot("panda"), rd.Scene([]), START, GOAL)
+        )
 
 
 def test_plan_takes_the_fields_of_a_request() -> None:
     """`rd.plan` names the arguments for help(); names and defaults are those of PlanRequest."""
     request = [(field.name, field.default) for field in fields(PlanRequest)]
-    arguments = list(inspect.signature(plan).parameters.values())
+    arguments = list(inspect.signature(rd.plan).parameters.values())
     arguments = [argument for argument in arguments if argument.name not in OTHER_ARGUMENTS]
     assert [(argument.name, argument.default) for argument in arguments] == request
 
 
 def test_plan_with_a_planner_and_settings_by_name() -> None:
-    problem = Problem(load_robot("panda"), Scene(), START, GOAL)
-    first = plan(problem, planner="aorrtc", settings={"range": 0.5, "keep_trees": True})
+    problem = rd.Problem(rd.load_robot("panda"), rd.Scene(), START, GOAL)
+    first = rd.plan(problem, planner="aorrtc", settings={"range": 0.5, "keep_trees": True})
     assert first.solved and first.planner == "aorrtc"
     assert (
-        plan(problem, planner="rrt_connect", settings=PLANNERS.defaults("rrt_connect")).planner
+        rd.plan(problem, planner="rrt_connect", settings=PLANNERS.defaults("rrt_connect")).planner
         == "rrt_connect"
     )
-    nested = load_planner("diffusion", {"guidance": {"margin": 0.03}, "guidance.self_margin": 0.02})
+    nested = rd.load_planner("diffusion", {"guidance": {"margin": 0.03}, "guidance.self_margin": 0.02})
     assert (nested.settings.guidance.margin, nested.settings.guidance.self_margin) == (0.03, 0.02)  # type: ignore[attr-defined]
     for wrong, message in (
         ({"planner": "moon"}, "unknown planner 'moon'; known: a_star"),
@@ -110,20 +106,17 @@ def test_plan_with_a_planner_and_settings_by_name() -> None:
         ({"planner": "aorrtc", "settings": {"range": -1.0}}, "aorrtc.range is -1.0"),
         ({"planner": "aorrtc", "settings": "range=1"}, "settings is 'range=1'; it must be a table"),
     ):
-        with pytest.raises(InputError, match=re.escape(message)):
-            plan(problem, **wrong)  # type: ignore[arg-type]
-
-
-def test_help_names_every_argument_of_plan() -> None:
-    text = inspect.getdoc(plan) or ""
-    assert all(name in text for name in inspect.signature(plan).parameters)
+        with pytest.raises(rd.InputError, match=re.escape(message)):
+            rd.plan(problem, **wrong)  # type: ignore[arg-type]
 
 
 def test_warming_up_loads_what_a_plan_needs_by_default() -> None:
     # it ended at first paths, and the first plan then compiled the search for the fastest motion (10 s)
     assert inspect.signature(Planner.warm_up).parameters["until"].default == PlanRequest().until
-    problem = Problem(load_robot("panda"), Scene([]), START, GOAL)
-    rows = [len(result.path.positions) for result in load_planner("aorrtc").warm_up(problem) if result.path]
+    problem = rd.Problem(rd.load_robot("panda"), rd.Scene([]), START, GOAL)
+    rows = [
+        len(result.path.positions) for result in rd.load_planner("aorrtc").warm_up(problem) if result.path
+    ]
     assert rows[0] == 2 and max(rows) > 2, "balls in the way make corners"
 
 

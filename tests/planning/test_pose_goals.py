@@ -17,25 +17,19 @@ from helpers.made_arms import chain, row, written
 from helpers.urdfs import read_urdf
 from robotdiffuse.certificates.checker import check
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import rotation_angle, rotation_from_rpy, transform
-from robotdiffuse.core.types import Path as JointPath
-from robotdiffuse.core.types import Status
 from robotdiffuse.planning import context, pose_goals
 from robotdiffuse.planning.pose_goals import pose_configurations
-from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record
-from robotdiffuse.problems.goals import PoseGoal, PosesGoal
+from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.robots.kinematics import link_jacobians, link_pose
-from robotdiffuse.robots.robot import Robot
 from robotdiffuse.validation.tolerances import goal_error
-from robotdiffuse.validation.validator import verify
 
 HANDS = ("left_gripper", "right_gripper")
 TABLE = rd.Box([0.75, 0.0, 0.05], [0.5, 1.2, 0.04], name="table")
 
 
 @cache
-def baxter() -> Robot:
+def baxter() -> rd.Robot:
     return rd.load_robot("baxter")
 
 
@@ -48,17 +42,17 @@ def free() -> ndarray:
     return drawn[CollisionChecker(robot, rd.Scene([TABLE])).free(drawn)]
 
 
-def poses_at(robot: Robot, q: ndarray, links: Sequence[str], *tolerances: Any) -> PosesGoal:
-    return PosesGoal([PoseGoal(link, link_pose(robot, q, link), *tolerances) for link in links])
+def poses_at(robot: rd.Robot, q: ndarray, links: Sequence[str], *tolerances: Any) -> rd.PosesGoal:
+    return rd.PosesGoal([rd.PoseGoal(link, link_pose(robot, q, link), *tolerances) for link in links])
 
 
-def off(robot: Robot, goal: PosesGoal, q: ndarray) -> float:
+def off(robot: rd.Robot, goal: rd.PosesGoal, q: ndarray) -> float:
     """The most that any link is off its pose [m], [rad]."""
     between = [np.linalg.inv(pose.T_base_frame) @ link_pose(robot, q, pose.frame) for pose in goal.poses]
     return max(max(float(np.linalg.norm(T[:3, 3])), rotation_angle(T[:3, :3])) for T in between)
 
 
-def both_hands() -> tuple[rd.Problem, PosesGoal]:
+def both_hands() -> tuple[rd.Problem, rd.PosesGoal]:
     start, there = free()[:2]
     goal = poses_at(baxter(), there, HANDS)
     return rd.Problem(baxter(), rd.Scene([TABLE]), start, goal), goal
@@ -105,7 +99,7 @@ def test_tolerances_of_each_pose_are_used_and_validated() -> None:
 def test_the_validator_names_the_hand_that_is_elsewhere() -> None:
     (problem, goal), (start, there) = both_hands(), free()[:2]
     left_only = np.where([name.startswith("left") for name in baxter().joint_names], there, start)
-    found = verify(problem, JointPath(baxter().joint_names, np.stack([start, left_only]))).violation
+    found = rd.verify(problem, rd.Path(baxter().joint_names, np.stack([start, left_only]))).violation
     assert found is not None
     error = goal_error(baxter(), goal, left_only)
     assert error is not None and error.subject == "right_gripper"
@@ -117,8 +111,8 @@ def test_constraints_are_kept_at_the_poses() -> None:
     start, there = free()[:2]
     right = link_pose(baxter(), there, "right_gripper")
     down = transform(np.array([0.7, 0.25, 0.4]), np.diag([1.0, -1.0, -1.0]))
-    goal = PosesGoal(
-        [PoseGoal("left_gripper", down, None, [0.4, 0.4, np.pi]), PoseGoal("right_gripper", right)]
+    goal = rd.PosesGoal(
+        [rd.PoseGoal("left_gripper", down, None, [0.4, 0.4, np.pi]), rd.PoseGoal("right_gripper", right)]
     )
     upright = rd.AxisCone("left_gripper", [0, 0, 1], [0, 0, -1], 0.1)
     problem = rd.Problem(baxter(), rd.Scene(), start, goal, constraints=[upright])
@@ -129,10 +123,10 @@ def test_constraints_are_kept_at_the_poses() -> None:
 
 def test_a_pose_out_of_reach_is_named_alone() -> None:
     start, there = free()[:2]
-    far = PoseGoal("left_gripper", transform(np.array([3.0, 0.0, 0.0])))
-    goal = PosesGoal([far, *poses_at(baxter(), there, HANDS[1:]).poses])
+    far = rd.PoseGoal("left_gripper", transform(np.array([3.0, 0.0, 0.0])))
+    goal = rd.PosesGoal([far, *poses_at(baxter(), there, HANDS[1:]).poses])
     result = rd.plan(rd.Problem(baxter(), rd.Scene(), start, goal), time_limit=60.0)
-    assert result.status is Status.UNREACHABLE_GOAL
+    assert result.status is rd.Status.UNREACHABLE_GOAL
     assert result.reason.endswith("brings left_gripper to the pose at (3.000, 0.000, 0.000) m")
 
 
@@ -144,19 +138,19 @@ def test_files_keep_them(tmp_path: Path) -> None:
         record["base"] = {"xyz": [0.1, 0.2, 0.3], "wxyz": [0.6, 0.0, 0.0, 0.8]}
         file = tmp_path / "problem.yaml"
         file.write_text(yaml.safe_dump(record))
-        problem = load_problem(file)
+        problem = rd.load_problem(file)
         kept = problem_record(problem)
         assert problem_record(problem_from_record(kept)) == kept
         each = problem.goal.goals[0] if isinstance(problem.goal, rd.AnyGoal) else problem.goal
-        assert isinstance(each, PosesGoal) and [one.frame for one in each.poses] == [*goal["poses"]]
+        assert isinstance(each, rd.PosesGoal) and [one.frame for one in each.poses] == [*goal["poses"]]
         T_world_base = problem.T_world_base
         np.testing.assert_allclose((T_world_base @ each.poses[0].T_base_frame)[:3, 3], pose["xyz"])
 
 
 T = np.eye(4)
 WRONG: dict[str, tuple[Any, str]] = {
-    "twice": (lambda: PosesGoal([PoseGoal("a", T), PoseGoal("a", T)]), "goal.poses names 'a' twice"),
-    "none": (lambda: PosesGoal([]), r"goal.poses is \[\]; it must be a list of rd.PoseGoal"),
+    "twice": (lambda: rd.PosesGoal([rd.PoseGoal("a", T), rd.PoseGoal("a", T)]), "goal.poses names 'a' twice"),
+    "none": (lambda: rd.PosesGoal([]), r"goal.poses is \[\]; it must be a list of rd.PoseGoal"),
     "unknown": (
         lambda: asked("left_gripper", "middle_gripper"),
         "unknown link in goal.poses: 'middle_gripper'",
@@ -170,13 +164,13 @@ WRONG: dict[str, tuple[Any, str]] = {
 
 
 def asked(*links: str) -> rd.Problem:
-    return rd.Problem(baxter(), rd.Scene(), free()[0], PosesGoal([PoseGoal(link, T) for link in links]))
+    return rd.Problem(baxter(), rd.Scene(), free()[0], rd.PosesGoal([rd.PoseGoal(link, T) for link in links]))
 
 
 @pytest.mark.parametrize("case", WRONG)
 def test_what_makes_no_sense_is_one_line(case: str) -> None:
     make, message = WRONG[case]
-    with pytest.raises(InputError, match=message) as refused:
+    with pytest.raises(rd.InputError, match=message) as refused:
         make()
     assert "\n" not in str(refused.value)
 
@@ -185,15 +179,15 @@ def test_a_link_twice_in_a_file_is_one_line(tmp_path: Path) -> None:
     file = tmp_path / "problem.yaml"
     pose = "{xyz: [0, 0, 0], wxyz: [1, 0, 0, 0]}"
     file.write_text(f"robot: baxter\ngoal: {{poses: {{left_gripper: {pose}, left_gripper: {pose}}}}}\n")
-    with pytest.raises(InputError, match="left_gripper appears twice in line 2"):
-        load_problem(file)
+    with pytest.raises(rd.InputError, match="left_gripper appears twice in line 2"):
+        rd.load_problem(file)
 
 
 ARMS = ("iiwa14", "gen3", "xarm7", "panda", "ur5e", "fr3")
 FREE = rd.Scene()
 
 
-def apart(robot: Robot, count: int, seed: int = 5) -> ndarray:
+def apart(robot: rd.Robot, count: int, seed: int = 5) -> ndarray:
     """Configurations without a collision, away from the limits and anywhere within them."""
     rng = np.random.default_rng(seed)
     middle = 0.5 * (robot.lower + robot.upper)
@@ -202,7 +196,7 @@ def apart(robot: Robot, count: int, seed: int = 5) -> ndarray:
     return drawn[CollisionChecker(robot, FREE).free(drawn)][:count]
 
 
-def followed(robot: Robot, start: ndarray, shift: ndarray) -> ndarray | None:
+def followed(robot: rd.Robot, start: ndarray, shift: ndarray) -> ndarray | None:
     """Where the joints are after the tip has moved straight on by `shift`, by the least motion; None if it
     cannot. Well-conditioned ways alone."""
     q = start.copy()
@@ -275,7 +269,7 @@ def test_hands_where_they_are_stay_there() -> None:
     assert result.path is not None and result.path.length < 1e-4
 
 
-def four_joints(folder: Path) -> Robot:
+def four_joints(folder: Path) -> rd.Robot:
     joints = chain("base", ["turn", "lift", "bend", "wrist"])
     robot = read_urdf(written(folder, joints), tip="wrist_link")
     balls = {link: np.array([[0.0, 0.0, 0.0, 0.045]]) for link in robot.meshes}
@@ -312,7 +306,7 @@ def test_a_pose_out_of_reach_by_more_than_the_validator_accepts_stays_so() -> No
     robot = rd.load_robot("panda")
     goal = rd.PoseGoal(robot.tip, transform(np.array([0.0, 0.0, 1.5])))
     result = rd.plan(rd.Problem(robot, FREE, apart(robot, 1)[0], goal))
-    assert result.status is Status.UNREACHABLE_GOAL
+    assert result.status is rd.Status.UNREACHABLE_GOAL
 
 
 def many_grasps() -> tuple[rd.Problem, ndarray]:
@@ -365,7 +359,7 @@ def test_if_none_of_several_goals_is_free_the_reason_is_that_of_the_first() -> N
     problem, _ = many_grasps()
     assert isinstance(problem.goal, rd.AnyGoal)
     result = rd.plan(replace(problem, goal=rd.AnyGoal(problem.goal.goals[:2])), 20.0)
-    assert result.status is Status.INVALID_GOAL
+    assert result.status is rd.Status.INVALID_GOAL
     assert result.reason.startswith("none of 2 goals can be reached, the first: all ")
 
 

@@ -5,8 +5,7 @@ from itertools import pairwise
 import numpy as np
 
 from helpers.explorations import FLOOR, ZONE, recorded
-from robotdiffuse.planning.exploration.explorer import Explorer
-from robotdiffuse.scenes.scene import Scene
+from robotdiffuse import Explorer, Scene
 
 
 def test_steps_and_views_are_kept_with_their_times() -> None:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.validation.report import Report, Violation
 from robotdiffuse.validation.validator import Verifier
 
@@ -76,7 +75,7 @@ def test_the_first_call_and_later_ones_give_the_same_path_although_paths_are_ref
 
     problem = rd.load_problem(SHELF)
 
-    def call() -> PlanResult:
+    def call() -> rd.PlanResult:
         return rd.plan(problem, 60.0, seed=1, planner=planner)
 
     monkeypatch.setattr(Verifier, "path", refuses_some)

@@ -12,14 +12,12 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
-from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS, PLANNERS, load_planner, planners_that_support
+from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS, PLANNERS, planners_that_support
 from robotdiffuse.planning.planner import Planner
-from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.validation.validator import verify, verify_trajectory
+from robotdiffuse.validation.validator import verify_trajectory
 
 PANDA = rd.load_robot("panda")
 START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
@@ -30,32 +28,32 @@ FAR = rd.Box([0.0, -0.8, 0.3], [0.2, 0.2, 0.6], name="crate")
 SCENE = rd.Scene([FAR])
 T_GOAL = link_pose(PANDA, GOAL, HAND)
 T_WORLD_BASE = transform(np.array([1.0, -2.0, 0.5]), rotation_about(np.array([0.0, 0.0, 1.0]), 2.0))
-PLAIN = Problem(PANDA, SCENE, START, GOAL)
+PLAIN = rd.Problem(PANDA, SCENE, START, GOAL)
 
 
 class Asked(NamedTuple):
-    problem: Callable[[], Problem]
+    problem: Callable[[], rd.Problem]
     request: Mapping[str, Any] = MappingProxyType({})
     needs: tuple[str, ...] = ()
     """What a planner must support."""
 
 
-def _goal(goal: object) -> Callable[[], Problem]:
+def _goal(goal: object) -> Callable[[], rd.Problem]:
     return lambda: replace(PLAIN, goal=goal)  # type: ignore[arg-type]
 
 
-def _constrained(*constraints: Any) -> Callable[[], Problem]:
+def _constrained(*constraints: Any) -> Callable[[], rd.Problem]:
     return lambda: replace(PLAIN, constraints=constraints)
 
 
-def _held() -> Problem:
+def _held() -> rd.Problem:
     robot = PANDA.with_tool(
         HAND, transform(np.array([0.0, 0.0, 0.12])), [rd.Cylinder([0, 0, 0.09], 0.01, 0.06)]
     )
     return replace(PLAIN, robot=robot.attach(rd.Box([0, 0, 0.04], [0.06] * 3, name="parcel"), "tool"))
 
 
-def _seen() -> Problem:
+def _seen() -> rd.Problem:
     view = ray_cast(
         SCENE,
         looking_at(np.array([1.7, 0.0, 0.3]), np.array([0.0, 0.0, 0.3])),
@@ -64,7 +62,7 @@ def _seen() -> Problem:
         PANDA,
         START,
     )
-    return Problem(PANDA, rd.Scene(), START, GOAL, views=[view], unknown="padded")
+    return rd.Problem(PANDA, rd.Scene(), START, GOAL, views=[view], unknown="padded")
 
 
 ASKED: dict[str, Asked] = {
@@ -83,7 +81,7 @@ ASKED: dict[str, Asked] = {
             blend=0.05,
         )
     ),
-    "base": Asked(lambda: Problem.in_world(T_WORLD_BASE, PANDA, SCENE.moved(T_WORLD_BASE), START, GOAL)),
+    "base": Asked(lambda: rd.Problem.in_world(T_WORLD_BASE, PANDA, SCENE.moved(T_WORLD_BASE), START, GOAL)),
     "tool and attached": Asked(_held),
     "views": Asked(_seen),
     "first": Asked(lambda: PLAIN, {"until": "first"}),
@@ -107,10 +105,10 @@ ASKED: dict[str, Asked] = {
 }
 
 
-def _all_of_it() -> Problem:
+def _all_of_it() -> rd.Problem:
     held = _held()
     cone = rd.AxisCone("parcel", [0, 0, 1], [0, 0, -1], 0.2).moved(T_WORLD_BASE)
-    return Problem.in_world(
+    return rd.Problem.in_world(
         T_WORLD_BASE,
         held.robot,
         SCENE.moved(T_WORLD_BASE),
@@ -144,20 +142,18 @@ ASKED["views and a cone"] = Asked(
 
 @cache
 def planner_named(name: str) -> Planner:
-    return load_planner(name)
+    return rd.load_planner(name)
 
 
 @cache
-def problem_of(asked: str) -> Problem:
+def problem_of(asked: str) -> rd.Problem:
     return ASKED[asked].problem()
 
 
-SEVERAL = ("blended", "waypoints", "moving", "moving and waypoints", "all of it")
-"""Requests for which planners are called several times by the pipeline that all share."""
-
-
 def marks_of(name: str, asked: str) -> list[pytest.MarkDecorator]:
-    return [pytest.mark.slow] if name in ("edmp", "mpd") and asked in SEVERAL else []
+    """These two take a second for each path; the pipeline is one for all planners."""
+    quick = ("pose", "any goal", "views", "cone", "clearance")
+    return [pytest.mark.slow] if name in ("edmp", "mpd") and asked not in quick else []
 
 
 @pytest.mark.parametrize(
@@ -174,14 +170,14 @@ def test_every_request_is_met_or_refused_by_one_line(name: str, asked: str) -> N
     lacking = next((what for what in needs if what not in planner.supports), None)
     if lacking is not None:
         with pytest.raises(
-            InputError, match=f"planner {name} does not support {lacking}; these do: "
+            rd.InputError, match=f"planner {name} does not support {lacking}; these do: "
         ) as refused:
             planner.plan(problem, time_limit=3.0, **request)
         assert "\n" not in str(refused.value)
         return
     result = planner.plan(problem, time_limit=40.0, **{"until": "first", **request})
     assert result.path is not None and result.trajectory is not None, result.reason
-    assert verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
+    assert rd.verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
 
 
 @pytest.mark.parametrize("what", [PATH_CONSTRAINTS, CLEARANCE])

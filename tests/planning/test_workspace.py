@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
-from robotdiffuse.core.errors import InputError
 
 READY = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 LEFT = np.array([-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
@@ -100,5 +99,5 @@ def test_a_grasped_obstacle_moves_with_the_arm_until_it_is_put_down() -> None:
 def test_bad_input(call: object, message: str) -> None:
     space = panda()
     space.add(rd.Sphere([0.5, 0.0, 0.6], 0.2, name="ball"))
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(rd.InputError, match=message):
         call(space)  # type: ignore[operator]

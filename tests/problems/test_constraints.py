@@ -13,15 +13,12 @@ from hypothesis import strategies as st
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.example_robots import example_robot
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import inverse, rotation_about, rotation_angle, transform
 from robotdiffuse.problems import constraint_kernel as kernel
 from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.problems.constraints import CONSTRAINTS, Constraint
-from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.problems.files import problem_from_record, problem_record, save_problem
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.robots.robot import Robot
 from robotdiffuse.validation.tolerances import goal_error
 
 PANDA = rd.load_robot("panda")
@@ -40,11 +37,11 @@ EACH: list[Constraint] = [
 ]
 
 
-def problem(*constraints: Constraint, robot: Robot = PANDA) -> Problem:
-    return Problem(robot, rd.Scene(), START, GOAL, constraints=list(constraints))
+def problem(*constraints: Constraint, robot: rd.Robot = PANDA) -> rd.Problem:
+    return rd.Problem(robot, rd.Scene(), START, GOAL, constraints=list(constraints))
 
 
-def true_values(made: Problem, constraint: Constraint, q: np.ndarray) -> list[float]:
+def true_values(made: rd.Problem, constraint: Constraint, q: np.ndarray) -> list[float]:
     """By the book: what `PathConstraints.values` says of one constraint at one configuration."""
     T = link_pose(made.robot, q, constraint.frame)
     p = T[:3, 3]
@@ -115,7 +112,7 @@ def test_proofs_hold_for_sliding_and_endless_joints_on_skew_axes() -> None:
         rd.PositionBox(frame, [-1, -0.2, 0], [1, 0.3, 0.4]),
         rd.CartesianLine(frame, 0.1, 1.0),
     ]
-    ready = PathConstraints(Problem(robot, rd.Scene(), start, goal, constraints=kept))
+    ready = PathConstraints(rd.Problem(robot, rd.Scene(), start, goal, constraints=kept))
     for _ in range(30):
         a, b = rng.uniform(lower, upper, (2, robot.dof))
         q = np.stack([a, a + rng.uniform(0.02, 1) * (b - a)])
@@ -152,7 +149,9 @@ def test_levers_are_within_reach() -> None:
     frame = robot.tip
     rng = np.random.default_rng(4)
     start, goal = rng.uniform(robot.lower, robot.upper, (2, robot.dof))
-    made = Problem(robot, rd.Scene(), start, goal, constraints=[rd.OnPlane(frame, [0, 0, 0], [0, 0, 1], 1.0)])
+    made = rd.Problem(
+        robot, rd.Scene(), start, goal, constraints=[rd.OnPlane(frame, [0, 0, 0], [0, 0, 1], 1.0)]
+    )
     rows = PathConstraints(made).rows
     work = kernel.make_work(rows)
     for q in rng.uniform(robot.lower, robot.upper, (100, robot.dof)):
@@ -166,13 +165,13 @@ def test_levers_are_within_reach() -> None:
 def test_constraints_move_with_the_world_and_survive_files(constraint: Constraint, tmp_path: Path) -> None:
     T = transform(np.array([0.3, -2.0, 0.7]), rotation_about(np.array([0.6, 0.0, 0.8]), 1.0))
     there = constraint.moved(T)
-    made = Problem.in_world(T, PANDA, rd.Scene(), START, GOAL, constraints=[there])
+    made = rd.Problem.in_world(T, PANDA, rd.Scene(), START, GOAL, constraints=[there])
     q = np.random.default_rng(5).uniform(PANDA.lower, PANDA.upper, (5, 7))
     values = PathConstraints(problem(constraint)).values(q)
     np.testing.assert_allclose(PathConstraints(made).values(q), values, atol=1e-9)
     for one in (made, problem(constraint)):
         save_problem(one, tmp_path / "again.yaml")
-        again = load_problem(tmp_path / "again.yaml")
+        again = rd.load_problem(tmp_path / "again.yaml")
         assert problem_record(again) == problem_record(problem_from_record(problem_record(one)))
         np.testing.assert_allclose(PathConstraints(again).values(q), values, atol=1e-9)
 
@@ -212,7 +211,7 @@ BAD: list[tuple[Callable[[], object], str]] = [
 
 @pytest.mark.parametrize(("make", "message"), BAD)
 def test_bad_input_is_refused_by_one_line(make: Callable[[], object], message: str) -> None:
-    with pytest.raises(InputError, match=message) as error:
+    with pytest.raises(rd.InputError, match=message) as error:
         make()
     assert "\n" not in str(error.value)
 
@@ -235,7 +234,7 @@ def test_bad_input_is_refused_by_one_line(make: Callable[[], object], message: s
 )
 def test_files_name_the_field(entry: object, message: str) -> None:
     record: dict[str, Any] = problem_record(problem()) | {"constraints": [entry]}
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(rd.InputError, match=message):
         problem_from_record(record)
 
 
@@ -251,12 +250,12 @@ def test_projection_onto_tolerances_of_goals_agrees_with_the_validator(seed: int
     xyz = rng.choice([0.0, 0.02, 0.3], 3)
     rpy = rng.choice([0.0, 0.1, 1.5, 3.0, np.pi], 3)
     goal = rd.PoseGoal(HAND, link_pose(PANDA, q[0], HAND), xyz, rpy)
-    ready = PathConstraints(Problem(PANDA, rd.Scene(), START, goal), [goal])
+    ready = PathConstraints(rd.Problem(PANDA, rd.Scene(), START, goal), [goal])
     at_goal = np.array([goal_error(PANDA, goal, row) is None for row in q])
     satisfied = ready.satisfied(q)
     assert satisfied[0] and not (satisfied & ~at_goal).any()
     roomy = rd.PoseGoal(HAND, goal.T_base_frame, 1.01 * xyz + 1e-4, 1.01 * rpy + 1e-4)
-    roomy_rows = PathConstraints(Problem(PANDA, rd.Scene(), START, roomy), [roomy])
+    roomy_rows = PathConstraints(rd.Problem(PANDA, rd.Scene(), START, roomy), [roomy])
     assert not (at_goal & ~roomy_rows.satisfied(q)).any()
     for row in ready.projected(q, 0.9):
         assert goal_error(PANDA, goal, row) is None
@@ -268,6 +267,6 @@ def test_most_projections_onto_tolerances_of_a_reachable_goal_succeed() -> None:
     share = []
     for there in rng.uniform(0.8 * PANDA.lower, 0.8 * PANDA.upper, (10, 7)):
         goal = rd.PoseGoal(HAND, link_pose(PANDA, there, HAND), [0.01] * 3, [0.1, 0.2, 0.3])
-        ready = PathConstraints(Problem(PANDA, rd.Scene(), START, goal), [goal])
+        ready = PathConstraints(rd.Problem(PANDA, rd.Scene(), START, goal), [goal])
         share.append(len(ready.projected(rng.uniform(PANDA.lower, PANDA.upper, (50, 7)), 0.9)) / 50)
     assert np.mean(share) > 0.3, share

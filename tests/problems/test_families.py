@@ -5,8 +5,8 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
+from robotdiffuse import InputError, load_robot
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.generation.factory import TARGETS, GenerationSettings, draw
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.problems.families import family as drawing
@@ -14,7 +14,6 @@ from robotdiffuse.problems.families.family import CONFIGURATION, POSITION
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.held_out import held_out_problem
-from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 

@@ -5,17 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Path as Motion
+from robotdiffuse import InputError, PoseGoal, Problem, Scene, load_robot
+from robotdiffuse import Path as Motion
 from robotdiffuse.problems.held_out import (
     Case,
     CaseFile,
     held_out_problem,
     line_length,
 )
-from robotdiffuse.problems.problem import PoseGoal, Problem
-from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.scene import Scene
 
 
 class Referee:

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
-from robotdiffuse.core.types import Path
 from robotdiffuse.robots.kinematics import link_pose
 
 PANDA = rd.load_robot("panda")
@@ -44,7 +43,7 @@ def test_it_agrees_with_the_validator() -> None:
     states = []
     for q in rng.uniform(PANDA.lower, PANDA.upper, (60, 7)):
         problem = rd.Problem(PANDA, scene, q, q)
-        report = rd.verify(problem, Path(PANDA.joint_names, q[None]))
+        report = rd.verify(problem, rd.Path(PANDA.joint_names, q[None]))
         states.append(bool(problem.is_free(q)))
         assert states[-1] == report.valid, report.violation
     assert 5 < sum(states) < 55

@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
-from robotdiffuse.core.types import Status
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
-from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.units import arm_in_cloud_note, unit_notes
 
 PANDA = rd.load_robot("panda")
@@ -51,7 +49,7 @@ def test_a_depth_image_in_millimetres_is_noted() -> None:
     [note] = _notes(views=wrong)
     assert "depths of views[0] begin at" in note and "millimeters" in note
     problem = rd.Problem(PANDA, rd.Scene(), START, GOAL, views=wrong, unknown="padded")
-    assert load_planner("aorrtc").plan(problem).notes.count(note) == 1
+    assert rd.load_planner("aorrtc").plan(problem).notes.count(note) == 1
 
 
 def test_what_views_see_in_reach_is_no_scene_beyond_it() -> None:
@@ -60,14 +58,14 @@ def test_what_views_see_in_reach_is_no_scene_beyond_it() -> None:
     view = ray_cast(scene, T_base_camera, (75.0, 75.0, 39.5, 29.5), (80, 60), PANDA, np.array(START))
     far = rd.Scene([rd.Sphere([0, 5, 0], 0.2)])
     problem = rd.Problem(PANDA, far, START, GOAL, views=[view], unknown="padded")
-    notes = load_planner("aorrtc").plan(problem).notes
+    notes = rd.load_planner("aorrtc").plan(problem).notes
     assert all(note.startswith("compiled for") for note in notes), notes
 
 
 def test_a_cloud_that_the_arm_stands_in_is_noted() -> None:
     points = np.random.default_rng(0).uniform(-0.5, 0.8, (3000, 3))
     scene = rd.Scene([rd.PointCloud(points, name="scan")])
-    result = load_planner("aorrtc").plan(rd.Problem(PANDA, scene, START, GOAL), time_limit=60.0)
-    assert result.status is Status.INVALID_START
+    result = rd.load_planner("aorrtc").plan(rd.Problem(PANDA, scene, START, GOAL), time_limit=60.0)
+    assert result.status is rd.Status.INVALID_START
     assert "points of scan are within the arm" in result.notes[0] and "millimeters" in result.notes[0]
     assert arm_in_cloud_note(PANDA, rd.Scene([rd.PointCloud(CUBE + 2)]), np.array(START)) == ""

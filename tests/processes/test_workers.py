@@ -19,10 +19,6 @@ HELD = 60
 """Longer than a worker may outlive its parent [s]."""
 
 
-def nothing() -> None:
-    pass
-
-
 def test_a_single_worker_is_replaced_when_it_dies_or_is_ended() -> None:
     worker = Worker()
     try:
@@ -79,7 +75,7 @@ def test_a_call_that_takes_too_long_is_killed_unless_it_is_allowed_more_time() -
     try:
         first = worker.call(os.getpid)
         worker.call(sleep_allowed, 0.0, float(HELD), 0.0)  # imports this module
-        assert worker.call(sleep_allowed, 0.0, float(HELD), 2.0, timeout=1.5) == "done"
+        assert worker.call(sleep_allowed, 0.0, float(HELD), 4.0, timeout=3.0) == "done"
         assert worker.call(os.getpid) == first
         with pytest.raises(OverrunError):
             worker.call(sleep_allowed, 0.0, 0.1, float(HELD), timeout=float(HELD))
@@ -114,18 +110,18 @@ def test_running_and_waiting_calls_are_cancelled() -> None:
     with Workers(1) as workers:
         first = workers.submit(os.getpid).result(HELD)
         running = workers.submit(wait_until_cancelled)
-        waiting = workers.submit(os.getpid)
-        time.sleep(0.2)
-        assert waiting.cancel() and not running.cancel()
+        later = workers.submit(os.getpid)
+        waiting.until(running.running, HELD)
+        assert later.cancel() and not running.cancel()
         assert running.result(HELD) is None
         assert workers.submit(os.getpid).result(HELD) == first
         deaf = workers.submit(time.sleep, float(HELD))
-        time.sleep(0.2)
+        waiting.until(deaf.running, HELD)
         deaf.cancel()
         with pytest.raises(OverrunError):
             deaf.result(HELD)
         last = workers.submit(time.sleep, float(HELD)), workers.submit(os.getpid)
-        time.sleep(0.2)
+        waiting.until(last[0].running, HELD)
     for call in last:
         with pytest.raises(EndedError, match="closed"):
             call.result(HELD)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse import InputError
 from robotdiffuse.trajectories.straight_line import straight_line_time
 
 START = np.zeros(2)

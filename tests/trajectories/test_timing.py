@@ -9,10 +9,8 @@ import toppra
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse import InputError, Path, Robot, Trajectory
 from robotdiffuse.robots.kinematic_tree import Joint
-from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories import speed_limits
 from robotdiffuse.trajectories.corner_rounding import BLEND_DEVIATION, BlendedPolyline, half_widths
 from robotdiffuse.trajectories.speed_limits import MIN_JERK, TimingSettings, symmetric_bounds, timing_grid

@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 import robotdiffuse as rd
-from robotdiffuse.validation.validator import Report, verify
+from robotdiffuse.validation.validator import Report
 
 
 def test_eight_threads_validate_motions_of_one_problem() -> None:
@@ -23,7 +23,7 @@ def test_eight_threads_validate_motions_of_one_problem() -> None:
     motions = [rd.Path(robot.joint_names, np.stack([start, end, start])) for end in ends[:, 0]]
 
     def validated(motion: rd.Path) -> Report:
-        return verify(problem, motion)
+        return rd.verify(problem, motion)
 
     alone = [validated(motion) for motion in motions]
     with ThreadPoolExecutor(8) as threads:

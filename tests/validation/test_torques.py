@@ -5,13 +5,9 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.heavy_arms import ROBOTS, TURNED, pendulum, wild
-from robotdiffuse.core.types import Path as JointPath
-from robotdiffuse.core.types import Trajectory
-from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots.bodies import Payload
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.validation.torques import Pieces, first_excess, static_pieces, trajectory_pieces
-from robotdiffuse.validation.validator import verify, verify_trajectory
+from robotdiffuse.validation.validator import verify_trajectory
 
 pytest.importorskip("pinocchio", reason="the extra `dynamics` (pin) is not installed")
 LOOKS = 41
@@ -32,7 +28,7 @@ def farthest_off(dynamics: Dynamics, pieces: Pieces) -> tuple[np.ndarray, np.nda
 def test_no_torque_leaves_its_chord_by_more_than_its_bound(name: str, step: float) -> None:
     robot = ROBOTS[name]()
     rng = np.random.default_rng(0)
-    dynamics = Dynamics(robot, Payload(1.5, [0.05, 0.0, 0.1], None, [0.01, 0.02, 0.03]), TURNED)
+    dynamics = Dynamics(robot, rd.Payload(1.5, [0.05, 0.0, 0.1], None, [0.01, 0.02, 0.03]), TURNED)
     for _ in range(20):
         motion = wild(robot, rng, step)
         for pieces in (trajectory_pieces(motion), static_pieces(motion.positions)):
@@ -43,7 +39,7 @@ def test_no_torque_leaves_its_chord_by_more_than_its_bound(name: str, step: floa
 def test_bounds_of_what_bends_most_are_near() -> None:
     """A pendulum near the horizontal, whose torque is a sine: the bound is almost tight."""
     robot = pendulum(10.0)
-    dynamics = Dynamics(robot, Payload(0.0))
+    dynamics = Dynamics(robot, rd.Payload(0.0))
     off, bulges = farthest_off(dynamics, static_pieces(np.array([[np.pi / 2 - 0.05], [np.pi / 2 + 0.05]])))
     assert off[0, 0] <= bulges[0, 0] <= 1.01 * off[0, 0]
 
@@ -52,9 +48,9 @@ def test_bounds_of_what_bends_most_are_near() -> None:
 def test_a_peak_between_two_rows_is_found(effort: float, valid: bool) -> None:
     """The torque is 9.81 N m in the horizontal, between two rows; the validator allows 1 % more."""
     robot = pendulum(effort)
-    path = JointPath(("hinge",), np.array([[0.3], [2.84], [2.9]]))
-    problem = Problem(robot, rd.Scene(), path.positions[0], path.positions[-1], payload=Payload(0.0))
-    violation = verify(problem, path).violation
+    path = rd.Path(("hinge",), np.array([[0.3], [2.84], [2.9]]))
+    problem = rd.Problem(robot, rd.Scene(), path.positions[0], path.positions[-1], payload=rd.Payload(0.0))
+    violation = rd.verify(problem, path).violation
     assert (violation is None) == valid
     if violation is not None:
         assert violation.kind == "torque" and 0 < violation.time < 1
@@ -65,9 +61,9 @@ def test_a_peak_between_two_rows_is_found(effort: float, valid: bool) -> None:
 def test_a_peak_between_two_times_is_found() -> None:
     """At a constant velocity, so that gravity alone counts; rows a second apart, none level."""
     rows = np.pi / 2 + np.array([[-0.375], [-0.125], [0.125], [0.375]])
-    motion = Trajectory(("hinge",), np.arange(4.0), rows, np.full((4, 1), 0.25), np.zeros((4, 1)))
+    motion = rd.Trajectory(("hinge",), np.arange(4.0), rows, np.full((4, 1), 0.25), np.zeros((4, 1)))
     for effort, beyond in ((9.66, True), (9.75, False)):
-        found = first_excess(Dynamics(pendulum(effort), Payload(0.0)), trajectory_pieces(motion), 0.01)
+        found = first_excess(Dynamics(pendulum(effort), rd.Payload(0.0)), trajectory_pieces(motion), 0.01)
         assert (found is not None) == beyond
         if found is not None:
             assert 1 < found.place < 2 and 1.01 * effort < found.torque < 9.82
@@ -77,16 +73,16 @@ def test_torques_are_those_of_the_cubics() -> None:
     """Two rows at rest: 12 rad/s² at both ends, whatever is written; gravity alone needs 2.4 N m."""
     rows = np.array([[-0.25], [0.25]])
     still = np.zeros((2, 1))
-    motion = Trajectory(("hinge",), np.array([0.0, 0.5]), rows, still, still)
-    assert first_excess(Dynamics(pendulum(5.3), Payload(0.0)), trajectory_pieces(motion), 0.01) is not None
-    assert first_excess(Dynamics(pendulum(6.0), Payload(0.0)), trajectory_pieces(motion), 0.01) is None
+    motion = rd.Trajectory(("hinge",), np.array([0.0, 0.5]), rows, still, still)
+    assert first_excess(Dynamics(pendulum(5.3), rd.Payload(0.0)), trajectory_pieces(motion), 0.01) is not None
+    assert first_excess(Dynamics(pendulum(6.0), rd.Payload(0.0)), trajectory_pieces(motion), 0.01) is None
 
 
 def test_a_motion_that_winds_on_and_on_is_refused_in_bounded_time() -> None:
-    winds = Trajectory(
+    winds = rd.Trajectory(
         ("hinge",), np.array([0.0, 1e5]), np.zeros((2, 1)), np.full((2, 1), 2.0), np.zeros((2, 1))
     )
-    assert first_excess(Dynamics(pendulum(9.9), Payload(0.0)), trajectory_pieces(winds), 0.01) is not None
+    assert first_excess(Dynamics(pendulum(9.9), rd.Payload(0.0)), trajectory_pieces(winds), 0.01) is not None
 
 
 def test_a_motion_of_one_row_is_held() -> None:
@@ -94,26 +90,26 @@ def test_a_motion_of_one_row_is_held() -> None:
     still = np.zeros((1, 1))
     for pieces in (
         static_pieces(row),
-        trajectory_pieces(Trajectory(("hinge",), np.zeros(1), row, still, still)),
+        trajectory_pieces(rd.Trajectory(("hinge",), np.zeros(1), row, still, still)),
     ):
-        assert first_excess(Dynamics(pendulum(10.0), Payload(0.0)), pieces, 0.01) is None
-        assert first_excess(Dynamics(pendulum(9.0), Payload(0.0)), pieces, 0.01) is not None
+        assert first_excess(Dynamics(pendulum(10.0), rd.Payload(0.0)), pieces, 0.01) is None
+        assert first_excess(Dynamics(pendulum(9.0), rd.Payload(0.0)), pieces, 0.01) is not None
 
 
 def test_a_torque_that_touches_its_limit_is_settled() -> None:
     """Halving ends at a thousandth of the limit."""
     limit = 9.81 / 1.01
     held = static_pieces(np.array([[1.0], [2.0]]))
-    assert first_excess(Dynamics(pendulum(limit), Payload(0.0)), held, 0.01) is not None
-    assert first_excess(Dynamics(pendulum(1.002 * limit), Payload(0.0)), held, 0.01) is None
+    assert first_excess(Dynamics(pendulum(limit), rd.Payload(0.0)), held, 0.01) is not None
+    assert first_excess(Dynamics(pendulum(1.002 * limit), rd.Payload(0.0)), held, 0.01) is None
 
 
 def test_what_is_proved_holds_at_every_look() -> None:
     panda = rd.load_robot("panda")
-    payload = Payload(3.0, [0.0, 0.0, 0.1])
+    payload = rd.Payload(3.0, [0.0, 0.0, 0.1])
     low = [-0.6, 0.2, 0, -1.2, 0, 2.2, 0.2]
     far = [0.6, 0.6, 0, -1.0, 0, 2.2, 0.2]
-    problem = Problem(panda, rd.Scene(), low, far, payload=payload)
+    problem = rd.Problem(panda, rd.Scene(), low, far, payload=payload)
     motion = rd.plan(problem, time_limit=10.0).trajectory
     assert motion is not None
     dynamics = Dynamics(panda, payload)

@@ -1,18 +1,17 @@
 """Surfaces, traces and visual meshes."""
 
 from dataclasses import replace
+from pathlib import Path as FilePath
 
 import numpy as np
 import pytest
 
 from helpers.three_bars import CORNERS, CUBE
-from helpers.visual_bundles import visual_meshes, write_visual
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path
 from robotdiffuse.drawables import creased
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.robots.visual_meshes import VisualMesh, has_visual, load_visual
+from robotdiffuse.robots.visual_meshes import UNIT, VisualMesh, has_visual, load_visual
 from robotdiffuse.visualization.arm import DrawnArm, dense, facts
 
 
@@ -47,6 +46,18 @@ def test_without_meshes_the_spheres_are_drawn(arm):
     assert np.linalg.norm(drawn["tip"][0].vertices - [0, 0, 0.1], axis=1).max() == pytest.approx(0.12)
 
 
+def write_visual(visual: dict[str, VisualMesh], file: FilePath) -> None:
+    """As in the bundles: vertices in units of UNIT, faces, a palette and its index by face."""
+    arrays = {}
+    for link, mesh in visual.items():
+        palette, color = np.unique(mesh.colors, axis=0, return_inverse=True)
+        arrays[f"{link}/vertices"] = np.round(mesh.vertices / UNIT).astype(np.int32)
+        arrays[f"{link}/faces"] = mesh.faces.astype(np.uint16)
+        arrays[f"{link}/palette"] = palette
+        arrays[f"{link}/color"] = color.reshape(-1).astype(np.uint8)
+    np.savez_compressed(file, **arrays)
+
+
 def test_visual_meshes_survive_the_file_and_must_agree(arm, tmp_path, monkeypatch):
     colors = np.tile(np.array([[10, 20, 30], [200, 100, 0]], np.uint8), (6, 1))
     written = VisualMesh(arm.meshes["tip"][0].vertices, CUBE, colors)
@@ -78,22 +89,6 @@ def test_the_caption_says_that_collision_geometry_is_drawn():
     motion = Path(("a",), np.zeros((2, 1)))
     assert ("drawn by", "collision geometry") in facts(motion, None, load_robot("iiwa14"))
     assert ("drawn by", "collision geometry") not in facts(motion, None, load_robot("ur5e"))
-
-
-def test_visual_meshes_of_a_urdf(tmp_path):
-    import trimesh
-
-    trimesh.Trimesh(CORNERS, CUBE, process=False).export(tmp_path / "cube.stl")
-    urdf = """<robot name="r"><link name="a"><visual><origin xyz="0 0 1" rpy="0 0 1.5707963267948966"/>
-      <geometry><mesh filename="{}" scale="1 2 3"/></geometry></visual></link></robot>"""
-    (tmp_path / "r.urdf").write_text(urdf.format("cube.stl"))
-    meshes = visual_meshes(tmp_path / "r.urdf")
-    assert list(meshes) == ["a"] and len(meshes["a"].vertices) == 8 and len(meshes["a"].faces) == 12
-    np.testing.assert_allclose(meshes["a"].vertices.min(0), [-2, -1, -2], atol=1e-6)
-    np.testing.assert_allclose(meshes["a"].vertices.max(0), [2, 1, 4], atol=1e-6)
-    (tmp_path / "r.urdf").write_text(urdf.format("package://gone/missing.stl"))
-    with pytest.raises(InputError, match=r"package://gone/missing\.stl"):
-        visual_meshes(tmp_path / "r.urdf")
 
 
 @pytest.mark.parametrize("flat", [[[1, 1, 1]] * 3, [[1, 1, 1], [2, 2, 2], [3, 3, 3]]])

@@ -12,6 +12,7 @@ from numpy import ndarray
 
 from helpers.box_arm import box_mesh
 from helpers.example_robots import example_robot
+from robotdiffuse import Box, Capsule, Cylinder, PointCloud, Robot, Scene, Sphere
 from robotdiffuse.collision.checker import CollisionChecker
 from robotdiffuse.collision.convex_geometry import checks_of, hulls_of, solid_arrays
 from robotdiffuse.collision.exact_meshes import ExactCollision
@@ -19,9 +20,6 @@ from robotdiffuse.collision.kernels import convex_bounds, motion_certificate, mo
 from robotdiffuse.collision.kernels.lane_clearance import make_clearance_workspace
 from robotdiffuse.collision.kernels.motion_pieces import Motion, Pieces
 from robotdiffuse.collision.motions import ContinuousCollision
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
 
 LINKS = {
     "awkward": (("turret", "arm", "wrist", "flange", "tool"),),

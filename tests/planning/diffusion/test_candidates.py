@@ -3,13 +3,9 @@
 import numpy as np
 import pytest
 
+from robotdiffuse import InputError, JointGoal, Problem, Scene, Sphere, load_robot
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.planning.hybrid import draw_candidates
-from robotdiffuse.problems.problem import JointGoal, Problem
-from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Sphere
 
 START, END = np.array([-1.2, 0.6, 0, -1.6, 0, 2.2, 0.785]), np.array([1.4, 0.5, 0, -1.5, 0, 2.0, 0.785])
 

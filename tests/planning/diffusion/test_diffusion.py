@@ -5,20 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from robotdiffuse import InputError, JointGoal, Path, Problem, Scene, Sphere, Status, load_robot, verify
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Path, Status
 from robotdiffuse.learning.encoders import DGCNNSettings
 from robotdiffuse.learning.exported_model import ExportedModel
 from robotdiffuse.learning.motion_model import MotionModelSettings
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.planning.diffusion import Diffusion, DiffusionSettings, encode
-from robotdiffuse.problems.problem import JointGoal, Problem
-from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Sphere
-from robotdiffuse.validation.validator import verify
 
 PANDA = load_robot("panda")
 LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
@@ -132,13 +126,6 @@ def test_a_robot_without_weights_is_refused() -> None:
         InputError, match="no weights of the network model come with the package for stranger"
     ):
         Diffusion().plan(Problem(stranger, Scene([BALL]), LEFT, JointGoal(RIGHT[None])))
-
-
-def test_settings_are_checked() -> None:
-    with pytest.raises(InputError, match=r"diffusion\.optimize_time is -1"):
-        DiffusionSettings(optimize_time=-1.0)
-    with pytest.raises(InputError, match=r"diffusion\.sampling_steps is 0; it must be at least 1"):
-        DiffusionSettings(sampling_steps=0)
 
 
 def test_an_encoder_of_one_size_gets_clouds_of_that_size(monkeypatch: pytest.MonkeyPatch) -> None:

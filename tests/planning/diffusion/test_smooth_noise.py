@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from robotdiffuse import load_robot
 from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.planning.hybrid import MAX_HALF_RANGE, SPREAD, smooth_noise
-from robotdiffuse.robots import load_robot
 
 PANDA = load_robot("panda")
 MIDDLE = 0.5 * (PANDA.lower + PANDA.upper)

@@ -9,7 +9,6 @@ import robotdiffuse as rd
 from robotdiffuse.certificates.checker import check
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.deadline import OutOfTimeError, deadline
-from robotdiffuse.core.types import Status
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.planning.pipeline.moving_obstacles import GRID_STEP, WAITED, earliest
 from robotdiffuse.robots.kinematics import link_pose
@@ -36,7 +35,7 @@ def test_motion_is_certified_in_time(obstacle: rd.MovingObstacle, jerk: float | 
     still = planner.plan(replace(task, moving=()), 10.0, until="first", jerk=jerk).trajectory
     assert still is not None
     found = planner.plan(task, 10.0, jerk=jerk)
-    assert found.status is Status.SOLVED, found.reason
+    assert found.status is rd.Status.SOLVED, found.reason
     assert found.trajectory is not None
     assert verify_trajectory(task, found.trajectory).valid
     motion = found.trajectory
@@ -53,24 +52,24 @@ def test_motion_is_certified_in_time(obstacle: rd.MovingObstacle, jerk: float | 
 def test_any_planner_finds_the_path(name: str) -> None:
     known = {"smooth": "a_star", "lattice": "d_star_lite"}
     found = rd.load_planner(known.get(name, name)).plan(problem(PASSING), 20.0, until="first")
-    assert found.status in (Status.SOLVED, Status.TIMEOUT, Status.NO_PATH)
+    assert found.status in (rd.Status.SOLVED, rd.Status.TIMEOUT, rd.Status.NO_PATH)
     if found.trajectory is not None:
         assert verify_trajectory(problem(PASSING), found.trajectory).valid
-    assert name in known or found.status is Status.SOLVED
+    assert name in known or found.status is rd.Status.SOLVED
     assert known.get(name, name) in PLANNERS
 
 
 def test_a_start_that_is_hit_at_once_is_invalid() -> None:
     at = rd.MovingObstacle(rd.Sphere([0.3, -0.45, 0.45], 0.2, name="ball"), velocity=[0, 0, 0.1])
     found = rd.load_planner("rrt_connect").plan(problem(at))
-    assert found.status is Status.INVALID_START
+    assert found.status is rd.Status.INVALID_START
     assert "touches ball" in found.reason
 
 
 def test_a_wall_that_comes_cannot_be_passed() -> None:
     wall = rd.MovingObstacle(rd.Box([0, 2.0, 0.5], [4, 0.1, 4], name="wall"), velocity=[0, -2.5, 0])
     found = rd.load_planner("rrt_connect").plan(problem(wall), 3.0)
-    assert found.status is Status.TIMEOUT
+    assert found.status is rd.Status.TIMEOUT
     assert "passes the moving obstacles" in found.reason
 
 

@@ -10,10 +10,9 @@ import pytest
 from jaxtyping import Float32
 from numpy import ndarray
 
+import robotdiffuse as rd
 from robotdiffuse.collision.kernel_arrays import compile_robot
-from robotdiffuse.core.results import load_result
-from robotdiffuse.core.types import FIRST, Status
-from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.core.types import FIRST
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
 from robotdiffuse.perception.unknown_space import (
@@ -32,7 +31,6 @@ from robotdiffuse.perception.voxel_grid import (
     VOXEL,
     sweep,
 )
-from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.pipeline import attempt
 from robotdiffuse.planning.pipeline.unknown_space import (
@@ -42,17 +40,12 @@ from robotdiffuse.planning.pipeline.unknown_space import (
     policy_for,
 )
 from robotdiffuse.planning.planner import Planner
-from robotdiffuse.problems.problem import PoseGoal, Problem
-from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose, placed_spheres
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box
-from robotdiffuse.validation.validator import verify
 
-PANDA = load_robot("panda")
+PANDA = rd.load_robot("panda")
 START = np.array([-0.9, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 GOAL = np.array([0.9, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
-DEEP = Scene([Box([0.55, 0.0, 0.3], [0.5, 0.2, 0.6])])
+DEEP = rd.Scene([rd.Box([0.55, 0.0, 0.3], [0.5, 0.2, 0.6])])
 """A deep box in front of the arm; a camera ahead sees only its front."""
 AHEAD = looking_at(np.array([1.7, 0.0, 0.3]), np.array([0.0, 0.0, 0.3]))
 REQUEST = PlanRequest(4.0)
@@ -60,15 +53,15 @@ REQUEST = PlanRequest(4.0)
 
 @pytest.fixture(scope="module")
 def planner() -> Planner:
-    return load_planner("aorrtc")
+    return rd.load_planner("aorrtc")
 
 
-def taken(scene: Scene, T: ndarray = AHEAD) -> DepthView:
+def taken(scene: rd.Scene, T: ndarray = AHEAD) -> rd.DepthView:
     return ray_cast(scene, T, (150.0, 150.0, 79.5, 59.5), (160, 120), PANDA, START)
 
 
-def partial(unknown: str, *views: DepthView) -> Problem:
-    return Problem(PANDA, Scene(), START, GOAL, views=views or (taken(DEEP),), unknown=unknown)
+def partial(unknown: str, *views: rd.DepthView) -> rd.Problem:
+    return rd.Problem(PANDA, rd.Scene(), START, GOAL, views=views or (taken(DEEP),), unknown=unknown)
 
 
 def true_voxels() -> Float32[ndarray, "nx ny nz"]:
@@ -81,7 +74,7 @@ def test_solved_means_free_of_what_was_seen(planner: Planner, unknown: str) -> N
     result = planner.plan(problem, time_limit=2.0)
     assert (result.assumption != "") == (result.confidence is not None) == result.solved
     if result.solved:
-        assert result.path is not None and verify(problem, result.path).valid
+        assert result.path is not None and rd.verify(problem, result.path).valid
     if unknown == "optimistic":
         assert result.assumption == AS_SEEN and result.unknown_region is not None
     if unknown == "occupied" and not result.solved:
@@ -90,12 +83,12 @@ def test_solved_means_free_of_what_was_seen(planner: Planner, unknown: str) -> N
 
 def test_predicted_obstacles_are_kept_clear_of(planner: Planner) -> None:
     """As seen, the path leads through the back of the box; with its voxels predicted, past it."""
-    truth = Problem(PANDA, DEEP, START, GOAL)
+    truth = rd.Problem(PANDA, DEEP, START, GOAL)
     through = planner.plan(partial("optimistic"), time_limit=2.0)
-    assert through.path is not None and not verify(truth, through.path).valid
+    assert through.path is not None and not rd.verify(truth, through.path).valid
     past = plan_with_unknown_space(planner, partial("predicted"), REQUEST, true_voxels())
     assert past.assumption == "predicted, p > 0.1" and past.swept_probability == 0
-    assert past.path is not None and verify(truth, past.path).valid
+    assert past.path is not None and rd.verify(truth, past.path).valid
     assert past.confidence is not None and through.confidence is not None
     assert past.confidence > through.confidence
 
@@ -114,7 +107,7 @@ def test_of_several_motions_the_one_that_sweeps_least_probability(planner: Plann
 
 def test_occupied_crosses_nothing_unknown_but_at_the_ends(planner: Planner) -> None:
     around = [(2.4, 0.0, 0.6), (-2.4, 0.0, 0.6), (0.0, 2.4, 0.6), (0.0, -2.4, 0.6), (0.1, 0.0, 3.2)]
-    behind = Scene([Box([-0.6, 0.0, 0.3], [0.3, 0.3, 0.3])])
+    behind = rd.Scene([rd.Box([-0.6, 0.0, 0.3], [0.3, 0.3, 0.3])])
     views = [taken(behind, looking_at(np.array(at), np.array([0.0, 0.0, 0.4]))) for at in around]
     near = START + 0.15 * (GOAL - START)
     problem = replace(partial("occupied", *views), goal=near)
@@ -131,16 +124,16 @@ def test_occupied_crosses_nothing_unknown_but_at_the_ends(planner: Planner) -> N
 
 
 def test_goals_given_as_a_pose(planner: Planner) -> None:
-    goal = PoseGoal(PANDA.tip, link_pose(PANDA, GOAL, PANDA.tip))
+    goal = rd.PoseGoal(PANDA.tip, link_pose(PANDA, GOAL, PANDA.tip))
     problem = replace(partial("padded"), goal=goal)
     result = planner.plan(problem, time_limit=3.0)
-    assert result.path is not None and verify(problem, result.path).valid
+    assert result.path is not None and rd.verify(problem, result.path).valid
 
 
 def test_an_end_in_what_was_seen_is_named(planner: Planner) -> None:
-    blocked = Scene([Box(link_pose(PANDA, GOAL, PANDA.tip)[:3, 3], [0.3, 0.3, 0.3])])
+    blocked = rd.Scene([rd.Box(link_pose(PANDA, GOAL, PANDA.tip)[:3, 3], [0.3, 0.3, 0.3])])
     result = planner.plan(partial("padded", taken(blocked)), time_limit=4.0)
-    assert result.status is Status.INVALID_GOAL and result.assumption == "" and result.confidence is None
+    assert result.status is rd.Status.INVALID_GOAL and result.assumption == "" and result.confidence is None
 
 
 def test_assumptions_are_carved_free_at_the_ends() -> None:
@@ -149,12 +142,12 @@ def test_assumptions_are_carved_free_at_the_ends() -> None:
     volume = observe([taken(DEEP)], PANDA, START)
     chain = [a for p in ("padded", "occupied") for a in assumptions_of(partial(p), volume, None)]
     assert [assumption.padding for assumption in chain if isinstance(assumption, Padded)] == list(PADDINGS)
-    for assumption in (*chain, OccupiedVoxels("all", solid, PANDA, Scene())):
+    for assumption in (*chain, OccupiedVoxels("all", solid, PANDA, rd.Scene())):
         cloud = assumption.obstacles(ends)
         away = np.linalg.norm(cloud.points[:, None] - ends[None, :, :3], axis=2) - ends[:, 3]
         assert len(cloud.points) and away.min() > cloud.point_radius
         assert assumption.touched(ends) > 0 or isinstance(assumption, Padded)
-    assert len(OccupiedVoxels("all", solid, PANDA, Scene()).obstacles(ends[:1]).points) < 0.15 * solid.size
+    assert len(OccupiedVoxels("all", solid, PANDA, rd.Scene()).obstacles(ends[:1]).points) < 0.15 * solid.size
 
 
 def test_later_assumptions_have_fewer_voxels() -> None:
@@ -188,7 +181,7 @@ def test_one_camera_that_sees_is_enough_for_a_confidence(planner: Planner) -> No
 def test_result_files_keep_the_assumption_and_its_confidence(planner: Planner, tmp_path: Path) -> None:
     result = plan_with_unknown_space(planner, partial("predicted"), REQUEST, true_voxels())
     result.save(tmp_path / "result.json")
-    again = load_result(tmp_path / "result.json").result
+    again = rd.load_result(tmp_path / "result.json").result
     for name in ("assumption", "confidence", "swept_probability", "unknown_region"):
         assert getattr(again, name) == getattr(result, name)
     assert again.unknown_region is not None and len(again.unknown_region[0]) == 3
@@ -198,8 +191,10 @@ def test_the_default_policy_is_prediction_where_the_network_covers_the_reach() -
     problem = replace(partial("padded"), unknown=None)
     assert policy_for(problem) == ("predicted", "")
     assert policy_for(partial("optimistic")) == ("optimistic", "")
-    arm = load_robot("ur10")
-    far = Problem(arm, Scene(), np.zeros(6), np.zeros(6), views=[replace(taken(DEEP), configuration=None)])
+    arm = rd.load_robot("ur10")
+    far = rd.Problem(
+        arm, rd.Scene(), np.zeros(6), np.zeros(6), views=[replace(taken(DEEP), configuration=None)]
+    )
     policy, note = policy_for(far)
     assert policy == "padded" and "ur10 reaches farther" in note
 

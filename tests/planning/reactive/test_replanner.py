@@ -12,7 +12,6 @@ import pytest
 
 import robotdiffuse as rd
 from robotdiffuse.collision.moving_obstacles import MovingCollision
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.trajectories.speed_limits import jerk_limits
 from robotdiffuse.validation.validator import verify_trajectory
 
@@ -121,7 +120,7 @@ def test_steps_of_two_threads_follow_each_other() -> None:
                 now = next(clock) * PERIOD
             try:
                 commands.append(replanner.step({}, now))
-            except InputError as error:
+            except rd.InputError as error:
                 refused.append(str(error))
 
     interval = sys.getswitchinterval()
@@ -176,12 +175,12 @@ def test_the_arm_waits_for_an_obstacle_at_the_goal() -> None:
 def test_invalid_steps_are_refused(observation: object, now: float, message: str) -> None:
     replanner = loop(np.array([[0.5, 1.6, 0.5]]))
     replanner.step({"sphere": [0.5, 1.6, 0.5]}, 0.0)
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(rd.InputError, match=message):
         replanner.step(observation, now)  # type: ignore[arg-type]
 
 
 def test_replanners_that_cannot_begin() -> None:
-    with pytest.raises(InputError, match=r"problem\.moving is empty"):
+    with pytest.raises(rd.InputError, match=r"problem\.moving is empty"):
         rd.Replanner(rd.Problem(PANDA, rd.Scene(), START, END))
     inside = rd.Problem(
         PANDA,
@@ -190,7 +189,7 @@ def test_replanners_that_cannot_begin() -> None:
         END,
         moving=[rd.MovingObstacle(rd.Sphere([3, 3, 3], 0.1), max_speed=1.0)],
     )
-    with pytest.raises(InputError, match="the replanner cannot begin: the start is in collision"):
+    with pytest.raises(rd.InputError, match="the replanner cannot begin: the start is in collision"):
         rd.Replanner(inside)
 
 
@@ -206,7 +205,7 @@ UNSUPPORTED: dict[str, dict[str, Any]] = {
 def test_the_replanner_refuses_what_it_does_not_support(what: str) -> None:
     ball = rd.MovingObstacle(rd.Sphere([3, 0, 0], 0.1, name="ball"), max_speed=0.1)
     problem = rd.Problem(PANDA, rd.Scene(), START, END, moving=[ball], **UNSUPPORTED[what])
-    with pytest.raises(InputError, match=rf"problem\.{what}: the replanner does not support it"):
+    with pytest.raises(rd.InputError, match=rf"problem\.{what}: the replanner does not support it"):
         rd.Replanner(problem)
 
 
@@ -237,6 +236,6 @@ def test_a_new_goal_is_reached_from_where_the_motion_ends(goal: str) -> None:
 
 def test_a_goal_in_collision_leaves_the_old_one() -> None:
     replanner = loop(np.array([[0.0, -3.0, 0.5]]))
-    with pytest.raises(InputError, match="cannot take this goal: the goal is in collision"):
+    with pytest.raises(rd.InputError, match="cannot take this goal: the goal is in collision"):
         replanner.set_goal([0, 1.5, 0, -0.5, 0, 2.1, 0.8])
     assert np.allclose(replanner.problem.goal.positions, END)  # type: ignore[union-attr]

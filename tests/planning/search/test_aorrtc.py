@@ -8,23 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from robotdiffuse import Box, InputError, JointGoal, Problem, Scene, Status, Trajectory, load_robot, verify
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.collision.kernels.random import random_state
 from robotdiffuse.collision.motions import search_space
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Status, Trajectory
 from robotdiffuse.planning import context
 from robotdiffuse.planning.search import rrt_kernel
 from robotdiffuse.planning.search.rrt import AORRTC, AORRTCSettings, RRTConnect, usual_clearances
 from robotdiffuse.problems.held_out import held_out_problem
-from robotdiffuse.problems.problem import JointGoal, Problem
-from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box
 from robotdiffuse.trajectories.simplification import simplify, tighten
 from robotdiffuse.trajectories.timing import time_parameterize
-from robotdiffuse.validation.validator import verify
 
 PANDA = load_robot("panda")
 WALL = Scene([Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.8], name="wall")])
@@ -66,12 +60,9 @@ def test_paths_are_below_the_bound_and_join_the_ends() -> None:
 
 
 @pytest.mark.parametrize("limit", [2.0, 0.05])
-def test_trees_that_are_kept_hold_free_edges_and_change_no_path(
-    limit: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_trees_that_are_kept_hold_free_edges_and_change_no_path(limit: float) -> None:
     """With a search that finds a path, and one that hardly can in its time: walls on both sides and one
-    above. The limit is CPU time: on a loaded machine 0.05 s of wall time ended before the first round."""
-    monkeypatch.setattr(time, "perf_counter", time.process_time)
+    above."""
     walls = [Box([x, 0.0, 0.6], [1.4, 0.05, 2.4], name=f"wall{x}") for x in (-0.95, 0.95)]
     scene = WALL if limit > 1 else Scene([*walls, Box([0.0, 0.0, 1.2], [0.6, 0.05, 0.6], name="above")])
     problem = replace(AROUND, scene=scene)
@@ -222,10 +213,13 @@ def test_one_slow_validation_does_not_use_up_later_calls(monkeypatch: pytest.Mon
     """Regression: a first call, which loaded kernels, validated for a second; shorter calls then ended at
     once."""
 
+    late = [0.0]
+
     def slow(*arguments: Any, **others: Any) -> Trajectory:
-        time.sleep(1.0)
+        late[0] += 1.0
         return time_parameterize(*arguments, **others)
 
+    monkeypatch.setattr(time, "perf_counter", lambda: time.process_time() + late[0])
     AORRTC().plan(AROUND)
     with monkeypatch.context() as patch:
         patch.setattr(context, "time_parameterize", slow)

@@ -9,13 +9,10 @@ import pytest
 
 import robotdiffuse as rd
 from robotdiffuse.core.transforms import rotation_angle, rotation_from_rpy, transform
-from robotdiffuse.core.types import Path, Status
-from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.search import rrt
 from robotdiffuse.problems.constraints import Constraint
-from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.kinematics import link_pose, link_poses
-from robotdiffuse.validation.validator import verify, verify_trajectory
+from robotdiffuse.validation.validator import verify_trajectory
 
 PANDA = rd.load_robot("panda")
 START = np.array([-0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2])
@@ -35,8 +32,8 @@ CASES: list[tuple[list[Constraint], rd.Scene]] = [
 ]
 
 
-def problem(constraints: list[Constraint], scene: rd.Scene | None = None) -> Problem:
-    return Problem(PANDA, scene or rd.Scene(), START, GOAL, constraints=constraints)
+def problem(constraints: list[Constraint], scene: rd.Scene | None = None) -> rd.Problem:
+    return rd.Problem(PANDA, scene or rd.Scene(), START, GOAL, constraints=constraints)
 
 
 def excess(constraint: Constraint, q: np.ndarray) -> float:
@@ -82,10 +79,10 @@ def test_motions_keep_constraints_at_every_millimetre(
 ) -> None:
     monkeypatch.setattr(rrt.RRTConnect, "follows_lines", False)
     made = problem(constraints, scene)
-    result = load_planner(name).plan(made, time_limit=20.0)
+    result = rd.load_planner(name).plan(made, time_limit=20.0)
     assert result.path is not None and result.trajectory is not None, result.reason
     assert result.stage == stage
-    assert verify(made, result.path).valid and verify_trajectory(made, result.trajectory).valid
+    assert rd.verify(made, result.path).valid and verify_trajectory(made, result.trajectory).valid
     for rows in (result.path.positions, result.trajectory.positions):
         for a, b in pairwise(rows):
             steps = int(np.abs(b - a).sum() / 1e-3) + 2  # lever arms are below 1 m
@@ -94,7 +91,7 @@ def test_motions_keep_constraints_at_every_millimetre(
 
 
 def test_speed_of_a_line_is_kept_and_used() -> None:
-    result = load_planner("aorrtc").plan(problem([LINE]), time_limit=20.0)
+    result = rd.load_planner("aorrtc").plan(problem([LINE]), time_limit=20.0)
     assert result.trajectory is not None, result.reason
     t = result.trajectory
     at = link_poses(PANDA, t.positions, HAND)[:, :3, 3]
@@ -107,24 +104,24 @@ def test_speed_of_a_line_is_kept_and_used() -> None:
 
 def test_validator_names_constraint_amount_and_place() -> None:
     """The straight line in joint space turns the base joint: the hand is 103 mm off in its middle."""
-    straight = Path(PANDA.joint_names, np.stack([START, GOAL]))
-    found = verify(problem([LINE]), straight).violation
+    straight = rd.Path(PANDA.joint_names, np.stack([START, GOAL]))
+    found = rd.verify(problem([LINE]), straight).violation
     assert found is not None and (found.kind, found.subject, found.other) == ("constraint", HAND, LINE.kind)
     assert found.excess == pytest.approx(0.1022, abs=1e-3) and 0 < found.time < 0.01
     assert found.message == "cartesian_line of panda_hand is exceeded: 103.2 mm, of 1 allowed"
-    assert verify(problem([UPRIGHT]), straight).valid, "turning the base joint keeps the hand upright"
+    assert rd.verify(problem([UPRIGHT]), straight).valid, "turning the base joint keeps the hand upright"
 
 
 def test_violations_at_start_and_goal_are_reported() -> None:
     tilted = START + np.array([0, 0, 0, 0, 0, 0.5, 0])
-    told = load_planner("aorrtc").plan(replace(problem([UPRIGHT]), start=tilted), 60.0)
-    assert told.status is Status.INVALID_START
+    told = rd.load_planner("aorrtc").plan(replace(problem([UPRIGHT]), start=tilted), 60.0)
+    assert told.status is rd.Status.INVALID_START
     assert "axis_cone of panda_hand is exceeded: 28.65 degrees, of 10 allowed" in told.reason
-    told = load_planner("aorrtc").plan(replace(problem([UPRIGHT]), goal=tilted), 60.0)  # type: ignore[arg-type]
-    assert told.status is Status.INVALID_GOAL and "28.65 degrees" in told.reason
+    told = rd.load_planner("aorrtc").plan(replace(problem([UPRIGHT]), goal=tilted), 60.0)  # type: ignore[arg-type]
+    assert told.status is rd.Status.INVALID_GOAL and "28.65 degrees" in told.reason
     pose = rd.PoseGoal(HAND, link_pose(PANDA, tilted, HAND))
-    told = load_planner("aorrtc").plan(replace(problem([UPRIGHT]), goal=pose), 60.0)
-    assert told.status is Status.INVALID_GOAL and "28.65 degrees" in told.reason
+    told = rd.load_planner("aorrtc").plan(replace(problem([UPRIGHT]), goal=pose), 60.0)
+    assert told.status is rd.Status.INVALID_GOAL and "28.65 degrees" in told.reason
 
 
 def test_a_goal_pose_with_tolerance_is_turned_until_it_keeps_the_constraint() -> None:
@@ -135,9 +132,9 @@ def test_a_goal_pose_with_tolerance_is_turned_until_it_keeps_the_constraint() ->
     )
     goal = rd.PoseGoal(HAND, T, [0.02] * 3, [0.7, 0.7, np.pi])
     made = replace(problem([UPRIGHT]), goal=goal)
-    result = load_planner("aorrtc").plan(made, time_limit=20.0)
+    result = rd.load_planner("aorrtc").plan(made, time_limit=20.0)
     assert result.path is not None, result.reason
-    assert verify(made, result.path).valid
+    assert rd.verify(made, result.path).valid
 
 
 @pytest.mark.parametrize("case", [0, 2, 4])
@@ -154,6 +151,6 @@ def test_more_iterations_give_no_slower_motion(case: int, monkeypatch: pytest.Mo
 
 def test_same_seed_same_path() -> None:
     made = problem([UPRIGHT], rd.Scene([WALL]))
-    a, b = (load_planner("aorrtc").plan(made, time_limit=20.0, seed=3) for _ in range(2))
+    a, b = (rd.load_planner("aorrtc").plan(made, time_limit=20.0, seed=3) for _ in range(2))
     assert a.path is not None and b.path is not None
     np.testing.assert_array_equal(a.path.positions, b.path.positions)

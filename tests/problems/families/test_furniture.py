@@ -6,8 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 
+from robotdiffuse import Box, InputError, Robot, Sphere, load_robot
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.families import furniture
 from robotdiffuse.problems.families.family import base_spheres
 from robotdiffuse.problems.families.furniture import (
@@ -25,11 +25,9 @@ from robotdiffuse.problems.families.furniture import (
     Region,
     sample_target,
 )
-from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
-from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import BOX, PackedScenes
-from robotdiffuse.scenes.shapes import Box, Shape, Sphere
+from robotdiffuse.scenes.shapes import Shape
 
 BASE = np.array([[0, 0, 0.1, 0.15], [-0.1, 0, 0.05, 0.1]])
 FURNITURE: dict[str, Furniture] = {

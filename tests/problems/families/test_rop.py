@@ -5,11 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse import Box, InputError, Scene, Sphere
 from robotdiffuse.problems.families.rop import ROP, ROP_DENSE, Rop
-from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import PackedScenes
-from robotdiffuse.scenes.shapes import Box, Sphere
 from robotdiffuse.scenes.surface_points import VisibleRegion, sample_surface
 
 FLOOR = 1

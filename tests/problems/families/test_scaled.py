@@ -3,15 +3,14 @@
 import numpy as np
 import pytest
 
+from robotdiffuse import Scene, load_robot
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.problems.families.family import POSE
 from robotdiffuse.problems.families.scaled import ScaledFamily, family_for, scale_for
 from robotdiffuse.problems.files import problem_record
-from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose, reach
 from robotdiffuse.robots.robot import scaled
-from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 
 SMALL, EMPTY = load_robot("so101"), Scene([])

@@ -12,28 +12,17 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robotdiffuse.core.errors import InputError
+import robotdiffuse as rd
 from robotdiffuse.core.transforms import rotation_about, rotation_from_rpy, transform
-from robotdiffuse.problems.files import (
-    load_problem,
-    load_problems,
-    problem_from_record,
-    problem_record,
-    save_problem,
-)
-from robotdiffuse.problems.problem import AnyGoal, JointGoal, PoseGoal, Problem
-from robotdiffuse.robots import load_robot
+from robotdiffuse.problems.files import load_problems, problem_from_record, problem_record, save_problem
 from robotdiffuse.robots.kinematic_tree import Joint
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere
 
 Z = np.array([0.0, 0.0, 1.0])
 READY = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
 DATA = Path(__file__).parents[2] / "files"
 
 
-def crane() -> Robot:
+def crane() -> rd.Robot:
     """A revolute, a continuous and a prismatic joint."""
     joints = (
         Joint("swing", "revolute", "base", "tower", np.eye(4), Z, lower=-1.0, upper=2.0),
@@ -41,21 +30,25 @@ def crane() -> Robot:
         Joint("lift", "prismatic", "jib", "hook", np.eye(4), Z, lower=0.0, upper=0.5),
         Joint("bolt", "fixed", "base", "plinth", np.eye(4), Z),
     )
-    return Robot("crane", "base", "hook", joints)
+    return rd.Robot("crane", "base", "hook", joints)
 
 
-def problem(start: Any = (0, 0, 0), goal: Any = (1, 1, 0.1)) -> Problem:
-    return Problem(crane(), Scene(), start, goal)
+def problem(start: Any = (0, 0, 0), goal: Any = (1, 1, 0.1)) -> rd.Problem:
+    return rd.Problem(crane(), rd.Scene(), start, goal)
 
 
 def test_forms_of_goals() -> None:
     one = problem([0, 0, 0], [1, 1, 0.1])
     assert one.start.dtype == np.float64 and one.start.tolist() == [0, 0, 0]
-    assert isinstance(one.goal, JointGoal) and one.goal.positions.tolist() == [[1, 1, 0.1]]
-    for two in ([[1, 1, 0], [0, 1, 0]], np.array([[1, 1, 0], [0, 1, 0]]), JointGoal([[1, 1, 0], [0, 1, 0]])):
+    assert isinstance(one.goal, rd.JointGoal) and one.goal.positions.tolist() == [[1, 1, 0.1]]
+    for two in (
+        [[1, 1, 0], [0, 1, 0]],
+        np.array([[1, 1, 0], [0, 1, 0]]),
+        rd.JointGoal([[1, 1, 0], [0, 1, 0]]),
+    ):
         goal = problem(goal=two).goal
-        assert isinstance(goal, JointGoal) and goal.positions.tolist() == [[1, 1, 0], [0, 1, 0]]
-    pose = PoseGoal("hook", transform(Z, rotation_about(Z, 0.4)))
+        assert isinstance(goal, rd.JointGoal) and goal.positions.tolist() == [[1, 1, 0], [0, 1, 0]]
+    pose = rd.PoseGoal("hook", transform(Z, rotation_about(Z, 0.4)))
     assert problem(goal=pose).goal is pose
     assert one.notes == ()
 
@@ -63,7 +56,7 @@ def test_forms_of_goals() -> None:
 def test_a_hair_over_a_limit_is_clamped_and_said() -> None:
     made = problem([2 + 1e-6, 0, -1e-8], [[0, 0, 0], [-1 - 9e-6, 0, 0]])
     assert made.start.tolist() == [2.0, 0.0, 0.0]
-    assert isinstance(made.goal, JointGoal) and made.goal.positions[1, 0] == -1.0
+    assert isinstance(made.goal, rd.JointGoal) and made.goal.positions[1, 0] == -1.0
     assert made.notes == (
         "start: swing clamped from 2.000001 to its limit 2.0 rad",
         "start: lift clamped from -1e-08 to its limit 0.0 m",
@@ -74,7 +67,7 @@ def test_a_hair_over_a_limit_is_clamped_and_said() -> None:
 def test_a_start_is_clamped_up_to_a_milliradian_beyond_a_limit() -> None:
     for beyond in (1e-5, float(np.float32(2 + 1e-5)) - 2, 9e-4):
         assert problem([2 + beyond, 0, 0]).start[0] == 2.0
-    with pytest.raises(InputError, match=r"start: swing is 2.0011 rad; its limits are -1 to 2"):
+    with pytest.raises(rd.InputError, match=r"start: swing is 2.0011 rad; its limits are -1 to 2"):
         problem([2.0011, 0, 0])
 
 
@@ -118,22 +111,22 @@ MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
         (lambda: problem(goal=None), "goal is None"),
         (lambda: problem(goal=[]), r"goal is \[\]; it must be a configuration or a list of them"),
         (
-            lambda: problem(goal=PoseGoal("claw", np.eye(4))),
+            lambda: problem(goal=rd.PoseGoal("claw", np.eye(4))),
             "unknown link in goal.frame: 'claw'; known: hook, jib, tower",
         ),
-        (lambda: problem(goal=PoseGoal("plinth", np.eye(4))), "no planned joint moves 'plinth'"),
-        (lambda: PoseGoal(7, np.eye(4)), "goal.frame is 7"),  # type: ignore[arg-type]
-        (lambda: PoseGoal("hook", np.eye(3)), "it must be 4 x 4 finite numbers"),
-        (lambda: PoseGoal("hook", np.eye(4) * np.nan), "it must be 4 x 4 finite numbers"),
-        (lambda: PoseGoal("hook", SKEWED), "it must be a rotation and a translation"),
-        (lambda: PoseGoal("hook", MIRROR), "it must be a rotation and a translation"),
-        (lambda: PoseGoal("hook", 2 * np.eye(4)), "it must be a rotation and a translation"),
-        (lambda: Problem("panda", Scene(), [0], [0]), "robot is 'panda'; it must be a Robot"),  # type: ignore[arg-type]
-        (lambda: Problem(crane(), [], [0], [0]), "scene is .*; it must be a Scene"),  # type: ignore[arg-type]
+        (lambda: problem(goal=rd.PoseGoal("plinth", np.eye(4))), "no planned joint moves 'plinth'"),
+        (lambda: rd.PoseGoal(7, np.eye(4)), "goal.frame is 7"),  # type: ignore[arg-type]
+        (lambda: rd.PoseGoal("hook", np.eye(3)), "it must be 4 x 4 finite numbers"),
+        (lambda: rd.PoseGoal("hook", np.eye(4) * np.nan), "it must be 4 x 4 finite numbers"),
+        (lambda: rd.PoseGoal("hook", SKEWED), "it must be a rotation and a translation"),
+        (lambda: rd.PoseGoal("hook", MIRROR), "it must be a rotation and a translation"),
+        (lambda: rd.PoseGoal("hook", 2 * np.eye(4)), "it must be a rotation and a translation"),
+        (lambda: rd.Problem("panda", rd.Scene(), [0], [0]), "robot is 'panda'; it must be a Robot"),  # type: ignore[arg-type]
+        (lambda: rd.Problem(crane(), [], [0], [0]), "scene is .*; it must be a Scene"),  # type: ignore[arg-type]
     ],
 )
 def test_wrong_problems(make: Callable[[], object], message: str) -> None:
-    with pytest.raises(InputError, match=message) as raised:
+    with pytest.raises(rd.InputError, match=message) as raised:
         make()
     assert "\n" not in str(raised.value)
 
@@ -159,22 +152,22 @@ def written(folder: Path, data: object, ending: str = "yaml") -> Path:
 
 @pytest.mark.parametrize("ending", ["yaml", "json", "jsonl"])
 def test_problem_file(ending: str, tmp_path: Path) -> None:
-    loaded = load_problem(written(tmp_path, GOOD, ending))
+    loaded = rd.load_problem(written(tmp_path, GOOD, ending))
     assert loaded.robot.name == "panda"
     assert loaded.robot.locked["panda_finger_joint1"] == 0.065
     assert [shape.name for shape in loaded.scene.shapes] == ["sphere", "box", "pole"]
     assert loaded.start.tolist() == READY
-    assert isinstance(loaded.goal, JointGoal) and loaded.goal.positions.shape == (1, 7)
-    assert Problem.load(tmp_path / f"problem.{ending}").start.tolist() == READY
+    assert isinstance(loaded.goal, rd.JointGoal) and loaded.goal.positions.shape == (1, 7)
+    assert rd.Problem.load(tmp_path / f"problem.{ending}").start.tolist() == READY
 
 
 def test_goal_sets_and_poses_in_files(tmp_path: Path) -> None:
     rows = [READY, GOOD["goal"]["joints"]]
-    goal = load_problem(written(tmp_path, GOOD | {"goal": {"joint_set": rows}})).goal
-    assert isinstance(goal, JointGoal) and goal.positions.tolist() == rows
+    goal = rd.load_problem(written(tmp_path, GOOD | {"goal": {"joint_set": rows}})).goal
+    assert isinstance(goal, rd.JointGoal) and goal.positions.tolist() == rows
     pose = {"frame": "panda_hand", "xyz": [0.4, 0.1, 0.5], "wxyz": [0, 2, 0, 0]}
-    goal = load_problem(written(tmp_path, GOOD | {"goal": {"pose": pose}})).goal
-    assert isinstance(goal, PoseGoal) and goal.frame == "panda_hand"
+    goal = rd.load_problem(written(tmp_path, GOOD | {"goal": {"pose": pose}})).goal
+    assert isinstance(goal, rd.PoseGoal) and goal.frame == "panda_hand"
     np.testing.assert_allclose(
         goal.T_base_frame, transform(np.array([0.4, 0.1, 0.5]), np.diag([1.0, -1, -1]))
     )
@@ -283,8 +276,8 @@ def test_wrong_problem_files(case: str, tmp_path: Path) -> None:
     data, message = WRONG[case]
     for ending in ("yaml", "json"):
         file = written(tmp_path, data, ending)
-        with pytest.raises(InputError, match=message) as raised:
-            load_problem(file)
+        with pytest.raises(rd.InputError, match=message) as raised:
+            rd.load_problem(file)
         assert str(raised.value).startswith(str(file)), "the file is named first"
         assert "\n" not in str(raised.value)
 
@@ -303,8 +296,8 @@ def test_wrong_problem_files(case: str, tmp_path: Path) -> None:
 def test_damaged_problem_files(name: str, content: bytes | None, message: str, tmp_path: Path) -> None:
     if content is not None:
         (tmp_path / name).write_bytes(content)
-    with pytest.raises(InputError, match=message) as raised:
-        load_problem(tmp_path / name)
+    with pytest.raises(rd.InputError, match=message) as raised:
+        rd.load_problem(tmp_path / name)
     assert "\n" not in str(raised.value)
 
 
@@ -316,14 +309,14 @@ def test_lines_of_problems(tmp_path: Path) -> None:
     assert [entry.name for entry in entries] == ["many:1", "many:3", "many:4"]
     assert [entry.load().start[0] for entry in entries] == [0, 0.1, 0.2]
     assert entries[0].load().robot is entries[2].load().robot
-    assert load_problem(file, 1).start[0] == 0.1
-    with pytest.raises(InputError, match=r"index is 3; .* holds 3 problems"):
-        load_problem(file, 3)
+    assert rd.load_problem(file, 1).start[0] == 0.1
+    with pytest.raises(rd.InputError, match=r"index is 3; .* holds 3 problems"):
+        rd.load_problem(file, 3)
     file.write_text(lines[0] + '\n{"robot": 3')
-    with pytest.raises(InputError, match=r"many\.jsonl, line 2 is not valid JSON"):
+    with pytest.raises(rd.InputError, match=r"many\.jsonl, line 2 is not valid JSON"):
         load_problems(file)
     file.write_text(lines[0] + "\n" + json.dumps(GOOD | {"start": []}) + "\n")
-    with pytest.raises(InputError, match=r"many\.jsonl, line 2: start has 0 values"):
+    with pytest.raises(rd.InputError, match=r"many\.jsonl, line 2: start has 0 values"):
         load_problems(file)
 
 
@@ -331,26 +324,26 @@ def test_one_problem_counts_as_many(tmp_path: Path) -> None:
     file = written(tmp_path, GOOD)
     [entry] = load_problems(file)
     assert entry.name == "problem" and entry.load().start.tolist() == READY
-    with pytest.raises(InputError, match=r"index is 2; .* holds one problem"):
-        load_problem(file, 2)
+    with pytest.raises(rd.InputError, match=r"index is 2; .* holds one problem"):
+        rd.load_problem(file, 2)
 
 
-def full_problem(goal: Any) -> Problem:
+def full_problem(goal: Any) -> rd.Problem:
     rng = np.random.default_rng(0)
-    ball = Sphere(rng.normal(size=3), 1 / 3)
+    ball = rd.Sphere(rng.normal(size=3), 1 / 3)
     shapes = [
         ball,
         ball,
-        Box(rng.normal(size=3), [0.1, 1e-7, 1e4], rng.normal(size=4), name="on off: {no}"),
-        Cylinder(rng.normal(size=3), 0.1, 1 / 7, rng.normal(size=4)),
-        Capsule(rng.normal(size=3), 0.1, 1 / 7),
-        Mesh(rng.normal(size=(4, 3)), [[0, 1, 2], [0, 1, 3]], wxyz=rng.normal(size=4)),
-        PointCloud(rng.normal(size=(20, 3)), 0.003),
-        PointCloud([]),
+        rd.Box(rng.normal(size=3), [0.1, 1e-7, 1e4], rng.normal(size=4), name="on off: {no}"),
+        rd.Cylinder(rng.normal(size=3), 0.1, 1 / 7, rng.normal(size=4)),
+        rd.Capsule(rng.normal(size=3), 0.1, 1 / 7),
+        rd.Mesh(rng.normal(size=(4, 3)), [[0, 1, 2], [0, 1, 3]], wxyz=rng.normal(size=4)),
+        rd.PointCloud(rng.normal(size=(20, 3)), 0.003),
+        rd.PointCloud([]),
     ]
-    robot = load_robot("panda", locked={"panda_finger_joint1": 0.01})
+    robot = rd.load_robot("panda", locked={"panda_finger_joint1": 0.01})
     start = rng.uniform(robot.lower, robot.upper)
-    return Problem(robot, Scene(shapes), start, goal if goal is not None else robot.lower)
+    return rd.Problem(robot, rd.Scene(shapes), start, goal if goal is not None else robot.lower)
 
 
 @pytest.mark.parametrize("ending", ["yaml", "yml", "json", "jsonl"])
@@ -359,9 +352,9 @@ def test_saved_problems_are_read_back_exactly(ending: str, goal: Any, tmp_path: 
     saved = full_problem(goal)
     file = tmp_path / f"problem.{ending}"
     save_problem(saved, file)
-    for back in (load_problem(file), problem_from_record(problem_record(saved))):
+    for back in (rd.load_problem(file), problem_from_record(problem_record(saved))):
         assert (back.start == saved.start).all()
-        assert isinstance(back.goal, JointGoal) and isinstance(saved.goal, JointGoal)
+        assert isinstance(back.goal, rd.JointGoal) and isinstance(saved.goal, rd.JointGoal)
         assert (back.goal.positions == saved.goal.positions).all()
         assert back.robot.locked == saved.robot.locked and back.notes == ()
         for one, other in zip(back.scene.shapes, saved.scene.shapes, strict=True):
@@ -372,10 +365,10 @@ def test_saved_problems_are_read_back_exactly(ending: str, goal: Any, tmp_path: 
 
 
 def test_saved_poses_are_read_back(tmp_path: Path) -> None:
-    pose = PoseGoal("panda_hand", transform(np.array([0.3, 0.2, 1 / 3]), rotation_about(Z, 2.0)))
+    pose = rd.PoseGoal("panda_hand", transform(np.array([0.3, 0.2, 1 / 3]), rotation_about(Z, 2.0)))
     save_problem(full_problem(pose), tmp_path / "pose.yaml")
-    back = load_problem(tmp_path / "pose.yaml").goal
-    assert isinstance(back, PoseGoal) and back.frame == "panda_hand"
+    back = rd.load_problem(tmp_path / "pose.yaml").goal
+    assert isinstance(back, rd.PoseGoal) and back.frame == "panda_hand"
     np.testing.assert_allclose(back.T_base_frame, pose.T_base_frame, atol=1e-15)
 
 
@@ -383,21 +376,21 @@ def test_lines_are_appended(tmp_path: Path) -> None:
     for i in range(3):
         save_problem(full_problem([0.1 * i, *READY[1:]]), tmp_path / "many.jsonl")
     goals = [entry.load().goal for entry in load_problems(tmp_path / "many.jsonl")]
-    assert [goal.positions[0, 0] for goal in goals if isinstance(goal, JointGoal)] == [0, 0.1, 0.2]
+    assert [goal.positions[0, 0] for goal in goals if isinstance(goal, rd.JointGoal)] == [0, 0.1, 0.2]
 
 
 def test_places_that_cannot_be_written_to(tmp_path: Path) -> None:
     made = full_problem(None)
     (tmp_path / "folder.json").mkdir()
     for file in (tmp_path / "none" / "a.yaml", tmp_path / "none" / "a.jsonl", tmp_path / "folder.json"):
-        with pytest.raises(InputError, match="cannot be written"):
+        with pytest.raises(rd.InputError, match="cannot be written"):
             save_problem(made, file)
-    with pytest.raises(InputError, match="problem file format"):
+    with pytest.raises(rd.InputError, match="problem file format"):
         save_problem(made, tmp_path / "a.txt")
 
 
 def test_a_robot_that_could_not_be_found_again() -> None:
-    with pytest.raises(InputError, match="'crane' is neither bundled nor read from a file"):
+    with pytest.raises(rd.InputError, match="'crane' is neither bundled nor read from a file"):
         problem_record(problem())
     assert problem_record(problem(), robot="crane.urdf")["robot"] == "crane.urdf"
 
@@ -408,7 +401,7 @@ def test_files_are_looked_up_from_the_problem(tmp_path: Path, monkeypatch: pytes
     entry = {"point_cloud": {"file": "clouds/a.npy", "point_radius": 0.02}}
     file = written(tmp_path, GOOD | {"scene": [entry]})
     monkeypatch.chdir("/")
-    loaded = load_problem(file)
+    loaded = rd.load_problem(file)
     assert len(loaded.notes) == 1 and "1 of 2 points are not finite" in loaded.notes[0]
     save_problem(loaded, tmp_path / "again.json")
     assert json.loads((tmp_path / "again.json").read_text())["scene"] == [entry]
@@ -420,13 +413,13 @@ def test_moveit_files_in_a_problem(tmp_path: Path) -> None:
     folder = DATA / "motion_bench_maker"
     scene = str(folder / "scene0001.yaml")
     request = str(folder / "request0001.yaml")
-    loaded = load_problem(written(tmp_path, GOOD | {"scene": scene}))
+    loaded = rd.load_problem(written(tmp_path, GOOD | {"scene": scene}))
     assert [shape.name for shape in loaded.scene.shapes] == ["can", "board"]
-    loaded = load_problem(written(tmp_path, {"robot": "panda", "scene": scene, "request": request}))
+    loaded = rd.load_problem(written(tmp_path, {"robot": "panda", "scene": scene, "request": request}))
     assert loaded.robot.locked["panda_finger_joint2"] == 0.065
-    assert isinstance(loaded.goal, JointGoal) and loaded.goal.positions[0, 0] == 1.2
-    with pytest.raises(InputError, match=r"(start|goal) cannot be combined with request"):
-        load_problem(written(tmp_path, GOOD | {"request": request}))
+    assert isinstance(loaded.goal, rd.JointGoal) and loaded.goal.positions[0, 0] == 1.2
+    with pytest.raises(rd.InputError, match=r"(start|goal) cannot be combined with request"):
+        rd.load_problem(written(tmp_path, GOOD | {"request": request}))
 
 
 @pytest.mark.parametrize(
@@ -451,21 +444,21 @@ def test_moveit_files_in_a_problem(tmp_path: Path) -> None:
 )
 def test_records_of_others_name_no_files_that_are_read(changed: dict[str, Any]) -> None:
     record = {"robot": "panda", "scene": [], "start": READY, "goal": {"joints": READY}} | changed
-    with pytest.raises(InputError, match="is a file, and files are not read here"):
-        problem_from_record(record, {"panda": load_robot("panda")})
+    with pytest.raises(rd.InputError, match="is a file, and files are not read here"):
+        problem_from_record(record, {"panda": rd.load_robot("panda")})
 
 
 @pytest.mark.parametrize("robot", ["ur5", "panda/robot.json", "../panda", "/etc/passwd", "a.urdf", 1, None])
 def test_records_of_others_have_the_robots_that_are_given(robot: object) -> None:
     record = {"robot": robot, "scene": [], "start": READY, "goal": {"joints": READY}}
-    with pytest.raises(InputError, match=r"unknown robot .*; known: panda"):
-        problem_from_record(record, {"panda": load_robot("panda")})
+    with pytest.raises(rd.InputError, match=r"unknown robot .*; known: panda"):
+        problem_from_record(record, {"panda": rd.load_robot("panda")})
 
 
 def test_a_request_of_others_is_a_file_too() -> None:
     record = {"robot": "panda", "scene": [], "request": "/etc/passwd"}
-    with pytest.raises(InputError, match="files are not read here"):
-        problem_from_record(record, {"panda": load_robot("panda")})
+    with pytest.raises(rd.InputError, match="files are not read here"):
+        problem_from_record(record, {"panda": rd.load_robot("panda")})
 
 
 NAMED = [0.0, -np.pi / 4, 0.0, -0.75 * np.pi, 0.0, np.pi / 2, np.pi / 4]
@@ -483,16 +476,16 @@ BASIC = {"robot": "panda", "scene": [], "start": "ready", "goal": [0.0] * 3 + [-
 )
 def test_goals_are_given_as_in_python(goal: object, rows: list[list[float]]) -> None:
     problem = problem_from_record(BASIC | {"goal": goal})
-    assert isinstance(problem.goal, JointGoal)
+    assert isinstance(problem.goal, rd.JointGoal)
     np.testing.assert_allclose(problem.goal.positions, rows)
     np.testing.assert_allclose(problem.start, NAMED)
-    assert np.array_equal(Problem(problem.robot, Scene(), "ready", "ready").start, problem.start)
+    assert np.array_equal(rd.Problem(problem.robot, rd.Scene(), "ready", "ready").start, problem.start)
 
 
 def test_any_of_a_list_of_goals() -> None:
     pose = {"pose": {"frame": "panda_hand", "xyz": [0.5, 0, 0.4], "rpy": [np.pi, 0, 0]}}
     goal = problem_from_record(BASIC | {"goal": [pose, "ready"]}).goal
-    assert isinstance(goal, AnyGoal)
+    assert isinstance(goal, rd.AnyGoal)
     np.testing.assert_allclose(goal.goals[0].T_base_frame[:3, :3], np.diag([1, -1, -1]), atol=1e-12)  # type: ignore[union-attr]
 
 
@@ -514,7 +507,7 @@ def test_any_of_a_list_of_goals() -> None:
     ],
 )
 def test_wrong_names_and_angles(changes: dict[str, object], message: str) -> None:
-    with pytest.raises(InputError, match=re.escape(message)):
+    with pytest.raises(rd.InputError, match=re.escape(message)):
         problem_from_record(BASIC | changes)
 
 

@@ -10,13 +10,10 @@ import yaml
 import robotdiffuse as rd
 from robotdiffuse.cli import main
 from robotdiffuse.collision.exact_meshes import ExactCollision
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import inverse, rotation_about, transform
-from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
-from robotdiffuse.problems.problem import PoseGoal, Problem
+from robotdiffuse.problems.files import problem_from_record, problem_record, save_problem
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.shapes import Shape
-from robotdiffuse.validation.validator import verify
 
 START = [-0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2]
 GOAL = [0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2]
@@ -54,22 +51,22 @@ def written(folder: Path, record: dict[str, Any]) -> Path:
 
 
 def test_a_held_cup_makes_the_arm_go_higher(tmp_path: Path) -> None:
-    bare = load_problem(written(tmp_path, PLAIN))
-    held = load_problem(written(tmp_path, PLAIN | {"attached": [CUP]}))
+    bare = rd.load_problem(written(tmp_path, PLAIN))
+    held = rd.load_problem(written(tmp_path, PLAIN | {"attached": [CUP]}))
     low, high = (rd.plan(problem, time_limit=10.0, objective="length") for problem in (bare, held))
     assert low.path is not None and high.path is not None
-    found = verify(held, low.path).violation
+    found = rd.verify(held, low.path).violation
     assert found is not None and (found.subject, found.other) == ("cup", "wall")
-    assert verify(held, high.path).valid and verify(bare, high.path).valid
+    assert rd.verify(held, high.path).valid and rd.verify(bare, high.path).valid
 
 
 @pytest.mark.parametrize(
     "extra", [{"attached": [CUP]}, {"tool": TOOL}, {"tool": TOOL, "attached": [CUP | {"link": "tool"}]}]
 )
 def test_files_keep_tools_and_objects(extra: dict[str, Any], tmp_path: Path) -> None:
-    problem = load_problem(written(tmp_path, PLAIN | extra))
+    problem = rd.load_problem(written(tmp_path, PLAIN | extra))
     save_problem(problem, tmp_path / "again.json")
-    again = load_problem(tmp_path / "again.json")
+    again = rd.load_problem(tmp_path / "again.json")
     assert again.robot is problem.robot, "the same content is the same robot"
     assert {key: problem_record(again)[key] for key in extra} == {
         key: problem_record(problem)[key] for key in extra
@@ -80,7 +77,7 @@ def test_a_goal_may_name_the_tool_and_what_is_held(tmp_path: Path) -> None:
     down = [0.0, 1.0, 0.0, 0.0]
     for frame, extra in (("tool", {"tool": TOOL}), ("cup", {"attached": [CUP]})):
         goal = {"pose": {"frame": frame, "xyz": [0.45, 0.3, 0.3], "wxyz": down}}
-        problem = load_problem(written(tmp_path, PLAIN | extra | {"goal": goal}))
+        problem = rd.load_problem(written(tmp_path, PLAIN | extra | {"goal": goal}))
         result = rd.plan(problem, time_limit=10.0)
         assert result.path is not None, result.reason
         T = link_pose(problem.robot, result.path.positions[-1], frame)
@@ -92,9 +89,9 @@ def test_base_moves_scene_goal_and_views_into_the_bases_frame() -> None:
     T_world_goal = T_WORLD_BASE @ link_pose(robot, np.array(GOAL), "panda_hand")
     view = rd.DepthView(np.full((4, 4), 5.0), (4, 4, 2, 2), T_WORLD_BASE)
     scene = rd.Scene(SHAPES).moved(T_WORLD_BASE)
-    goal = PoseGoal("panda_hand", T_world_goal)
-    problem = Problem.in_world(T_WORLD_BASE, robot, scene, START, goal, views=[view])
-    assert isinstance(problem.goal, PoseGoal)
+    goal = rd.PoseGoal("panda_hand", T_world_goal)
+    problem = rd.Problem.in_world(T_WORLD_BASE, robot, scene, START, goal, views=[view])
+    assert isinstance(problem.goal, rd.PoseGoal)
     assert np.allclose(problem.goal.T_base_frame, link_pose(robot, np.array(GOAL), "panda_hand"))
     assert np.allclose(problem.views[0].T_base_camera, np.eye(4))
     for given, moved in zip(SHAPES, problem.known_scene.shapes, strict=True):
@@ -104,7 +101,7 @@ def test_base_moves_scene_goal_and_views_into_the_bases_frame() -> None:
 def test_distances_are_the_same_in_the_world() -> None:
     robot = rd.load_robot("panda").attach(rd.Sphere([0, 0, 0.15], 0.04, name="ball"), "panda_hand")
     scene = rd.Scene(SHAPES)
-    problem = Problem.in_world(T_WORLD_BASE, robot, scene.moved(T_WORLD_BASE), START, GOAL)
+    problem = rd.Problem.in_world(T_WORLD_BASE, robot, scene.moved(T_WORLD_BASE), START, GOAL)
     standing, world = problem.standing()
     q = np.array(START)
     here = ExactCollision(robot, scene).link_distances(q)
@@ -123,7 +120,7 @@ def test_files_in_the_world_come_back_as_they_were_read(tmp_path: Path) -> None:
         "scene": [WALL | {}, {"sphere": {"center": [0.1, 0.2, 1.4], "radius": 0.1}}],
         "goal": {"pose": {"frame": "panda_hand", "xyz": [0.4, 0.3, 1.1], "wxyz": [0.0, 1.0, 0.0, 0.0]}},
     }
-    problem = load_problem(written(tmp_path, record))
+    problem = rd.load_problem(written(tmp_path, record))
     again = problem_record(problem_from_record(problem_record(problem)))
     assert again == problem_record(problem)
     assert again["base"] == base and again["goal"] == record["goal"]
@@ -141,7 +138,7 @@ def test_pybullet_sees_no_contact_where_the_robot_stands_in_the_world() -> None:
     T = transform(np.array([0.5, 0.2, 1.5]), rotation_about(np.array([1.0, 0.0, 0.0]), np.pi))
     robot = rd.load_robot("panda").attach(rd.Box([0, 0, 0.16], [0.05, 0.05, 0.12], name="cup"), "panda_hand")
     wall = rd.Box([0.5, 0.0, 0.25], [0.3, 0.06, 0.3], name="wall").moved(T)
-    problem = Problem.in_world(T, robot, rd.Scene([wall]), START, GOAL)
+    problem = rd.Problem.in_world(T, robot, rd.Scene([wall]), START, GOAL)
     result = rd.plan(problem, time_limit=10.0)
     assert result.path is not None, result.reason
     standing, _ = problem.standing()
@@ -190,6 +187,6 @@ WRONG = {
 @pytest.mark.parametrize("case", WRONG)
 def test_wrong_equipment_is_one_line(case: str, tmp_path: Path) -> None:
     extra, message = WRONG[case]
-    with pytest.raises(InputError, match=message) as raised:
-        load_problem(written(tmp_path, PLAIN | extra))
+    with pytest.raises(rd.InputError, match=message) as raised:
+        rd.load_problem(written(tmp_path, PLAIN | extra))
     assert "\n" not in str(raised.value)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers import waiting
 from helpers.explorations import BEYOND, FLOOR, HOME, WALL
-from helpers.waiting import state_when
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.planning.exploration.steps import DONE, LOOK, ExplorerSettings
 
@@ -33,7 +33,7 @@ from robotdiffuse.visualization.live.session import NO_MOTION, VALID
 PATIENCE = 300.0
 """[s]; a new machine compiles first."""
 SETTINGS = ExplorerSettings(time_limit=0.5)
-until = partial(state_when, patience=PATIENCE)
+until = partial(waiting.state_when, patience=PATIENCE)
 
 
 @pytest.fixture
@@ -67,10 +67,14 @@ def test_a_pause_holds_the_arm_and_a_restart_begins_anew(session: ExplorationSes
     session.set_mode(RUNNING)
     until(session, lambda state: state.phase == MOVING and (state.configuration != HOME).any())
     session.set_mode(PAUSED)
-    time.sleep(0.2)  # the frame that was being computed
-    held = session.state.configuration
-    time.sleep(0.2)
-    assert session.state.configuration is held
+
+    def rests() -> bool:
+        held = session.state.configuration
+        time.sleep(0.2)
+        return session.state.configuration is held
+
+    waiting.until(rests, PATIENCE)  # after the frame that was being computed
+    assert session.state.phase == MOVING
     with pytest.raises(InputError, match=r"unknown explorer\.policy 'bold'"):
         session.restart(policy="bold")
     session.restart(policy="probabilistic", noise=True)

@@ -8,11 +8,9 @@ import pytest
 import yaml
 
 from helpers.moveit_files import MOTION_BENCH_MAKER
-from robotdiffuse.core.errors import InputError
+from robotdiffuse import InputError, load_problem, load_robot
 from robotdiffuse.core.input_files import read_yaml
-from robotdiffuse.problems.files import load_problem
 from robotdiffuse.problems.moveit import matrix_contacts, read_moveit_scene
-from robotdiffuse.robots import load_robot
 
 LINKS = ("hand", "finger")
 

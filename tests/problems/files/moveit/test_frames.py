@@ -8,14 +8,12 @@ import pytest
 
 from helpers.moveit_files import MOUNTED, QUARTER, ball, scene_data
 from helpers.urdfs import read_urdf
-from robotdiffuse.core.errors import InputError
+from robotdiffuse import InputError, Robot, Sphere, load_robot
 from robotdiffuse.core.transforms import (
     rotation_about,
 )
 from robotdiffuse.problems.moveit import moveit_frames, moveit_scene
-from robotdiffuse.robots import Robot, load_robot
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
-from robotdiffuse.scenes.shapes import Sphere
 
 Z = np.array([0.0, 0.0, 1.0])
 WHEELED = """<robot name="wheeled">

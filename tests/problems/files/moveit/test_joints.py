@@ -7,14 +7,10 @@ import yaml
 
 from helpers.moveit_files import MOUNTED, change
 from helpers.urdfs import read_urdf
-from robotdiffuse.core.errors import InputError
+from robotdiffuse import InputError, load_problem, load_robot
 from robotdiffuse.core.input_files import read_yaml
-from robotdiffuse.problems.files import (
-    load_motion_bench_maker,
-    load_problem,
-)
+from robotdiffuse.problems.files import load_motion_bench_maker
 from robotdiffuse.problems.moveit import moveit_frames, object_shapes, read_moveit_scene, scene_robot_notes
-from robotdiffuse.robots import load_robot
 
 UR5_JOINTS = [
     *("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"),

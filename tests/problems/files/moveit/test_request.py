@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from helpers.moveit_files import MOTION_BENCH_MAKER, change, request_data
-from robotdiffuse.core.errors import InputError
+from robotdiffuse import InputError, PoseGoal, load_robot
 from robotdiffuse.core.transforms import (
     quaternion_from_rotation,
     rotation_from_quaternion,
@@ -20,8 +20,6 @@ from robotdiffuse.problems.files import (
     problem_record,
 )
 from robotdiffuse.problems.moveit import MoveItFrames, moveit_frames, moveit_request
-from robotdiffuse.problems.problem import PoseGoal
-from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 
 

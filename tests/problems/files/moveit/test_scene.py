@@ -9,15 +9,12 @@ import trimesh
 import yaml
 
 from helpers.moveit_files import MOTION_BENCH_MAKER, QUARTER, ball, scene_data
-from robotdiffuse.core.errors import InputError
+from robotdiffuse import Box, Cylinder, InputError, JointGoal, Mesh, PointCloud, Sphere, load_robot
 from robotdiffuse.problems.files import (
     load_motion_bench_maker,
     load_problems,
 )
 from robotdiffuse.problems.moveit import moveit_frames, moveit_scene, read_moveit_scene
-from robotdiffuse.problems.problem import JointGoal
-from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, PointCloud, Sphere
 
 
 def test_scene_as_motion_bench_maker_writes_it() -> None:
