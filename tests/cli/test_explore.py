@@ -75,11 +75,11 @@ def test_the_live_page_is_served_until_it_is_stopped(tmp_path: Path) -> None:
         assert server.stdout is not None
         found = re.search(r"http://127.0.0.1:\d+/", server.stdout.readline())
         assert found is not None
-        with urllib.request.urlopen(found[0], timeout=60) as page:
+        with urllib.request.urlopen(found[0], timeout=300) as page:
             assert b"viser" in page.read().lower()
     finally:
         server.send_signal(signal.SIGINT)
-        assert server.wait(timeout=30) == 130
+        assert server.wait(timeout=300) == 130
 
 
 @pytest.mark.slow

@@ -53,7 +53,7 @@ def hears(url: str, token: str = "", **fields: str) -> bool:
     speaks = [f"viser-v{pytest.importorskip('viser').__version__}"]
     with websockets.connect(f"{url}{token}", subprotocols=speaks, additional_headers=fields) as browser:
         try:
-            return bool(browser.recv(timeout=20))
+            return bool(browser.recv(timeout=200))
         except ConnectionClosed:
             return False
 
@@ -73,7 +73,7 @@ def test_elsewhere_no_browser_gets_data_without_the_token() -> None:
         assert not hears(url, token, Origin="http://evil.example")
     finally:
         server.send_signal(signal.SIGINT)
-        assert server.wait(timeout=30) == 130
+        assert server.wait(timeout=300) == 130
 
 
 def test_on_this_machine_pages_of_other_origins_get_no_data() -> None:

@@ -415,7 +415,7 @@ def test_it_stops_gracefully_and_leaves_no_worker() -> None:
             os.kill(int(worker), signal.SIGTERM)
         assert first.result().json()["status"] == "solved"
         assert second.result().status_code == 503 and "stopping" in error(second.result())
-        assert process.wait(30) == 0
+        assert process.wait(300) == 0
         until(lambda: not any(os.path.exists(f"/proc/{worker}") for worker in workers.split()))
 
 
