@@ -59,6 +59,7 @@ def add_bench(commands: argparse._SubParsersAction) -> None:
             "--equal-time",
             "also call planners that end early again until the time limit, as extra rows, to compare lengths",
         ),
+        ("--data FOLDER", "data set, for a row of its nearest motions"),
         ("--workers N", "planners that run at once (default: half of the cores)", count),
     )
     option(run, "--cluster", "use the Ray cluster at RAY_ADDRESS", choices=CLUSTERS)
@@ -293,6 +294,7 @@ def _add_planning(parser: argparse.ArgumentParser) -> None:
             "weights of `train planner --config paper`, or points, for rows of single samples without "
             "clearances, with and without guidance (default: a note says how to train them)",
         ),
+        ("--data FOLDER", "data set, for a row of its nearest motions"),
         ("--workers N", "planners that run at once (default: half of the cores)", count),
     )
     option(parser, "--cluster", "use the Ray cluster at RAY_ADDRESS", choices=CLUSTERS)
@@ -320,6 +322,7 @@ def _table1(arguments: argparse.Namespace) -> "tuple[Table1Settings, Bench]":
         problems=arguments.problems,
         time_limit=arguments.time_limit,
         paper_weights=arguments.paper_weights,
+        data=arguments.data,
         workers=arguments.workers or max(1, (os.cpu_count() or 1) // 2),
         cluster=arguments.cluster,
     )

@@ -1,7 +1,8 @@
 """The paper's Table 2: every row is trained with the same budget and evaluated on the same held-out problems.
 
 Collision guidance alone, without a network, solves many problems. What a row owes to its network is measured
-without guidance, and by a control: guidance of trajectories that do not come from a network.
+without guidance, and by controls: fixed vias, the nearest motions of the data, and smooth noise, with and
+without guidance.
 """
 
 import json
@@ -13,6 +14,13 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
+from robotdiffuse.baselines.controls import (
+    EQUAL_TIME_STEPS,
+    NEAREST,
+    NOISE,
+    VIAS,
+    ControlSettings,
+)
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.core.settings import Count, OneOf, Settings
@@ -22,10 +30,10 @@ from robotdiffuse.datasets.shards import read_manifest
 from robotdiffuse.evaluation.comparison import Mean
 from robotdiffuse.evaluation.methods import (
     NETWORK_ALONE,
+    from_control,
     from_network,
     sampled,
     sampling_digest,
-    without_network,
 )
 from robotdiffuse.evaluation.metrics import link_length
 from robotdiffuse.evaluation.paper import paper_report, straight_line_shares
@@ -44,10 +52,6 @@ from robotdiffuse.processes.workers import Workers
 from robotdiffuse.robots import load_robot
 
 ENCODER = "compression_autoencoder"
-CONTROL = "no network"
-"""Smooth noise about the straight line in place of a network's samples."""
-CONTROL_WAYPOINTS = 48
-"""As many as those of the rows' networks."""
 STOP_TIMEOUT = 20.0
 """A stopped training writes a checkpoint; it is killed after this time [s]."""
 
@@ -72,6 +76,22 @@ ROWS: dict[str, Row] = {
     "Joint&Point": Row("table2_joint_point", False, (74.0, 19.5, 14.762, 15)),
     "JPC": Row("table2_jpc", False, (79.1, 9.2, 14.571, 15)),
     "Ours": Row("table2_jpc", True, (84.9, 9.8, 14.218, 15)),
+}
+
+
+class ControlRow(NamedTuple):
+    source: str
+    """As for `ControlSettings`."""
+    samples: int | None
+    """None: as many as for the networks."""
+    guided: bool
+
+
+CONTROLS = {
+    "no network: one via": ControlRow(VIAS, 1, False),
+    "no network: 16 vias": ControlRow(VIAS, 16, False),
+    "no network: nearest motions": ControlRow(NEAREST, None, True),
+    "no network: smooth noise": ControlRow(NOISE, None, True),
 }
 
 
@@ -136,7 +156,7 @@ class RowResult(NamedTuple):
 
     @property
     def as_in_paper(self) -> Evaluation:
-        return self.guided if self.name not in ROWS or ROWS[self.name].guided else self.alone
+        return self.guided if (ROWS | CONTROLS)[self.name].guided else self.alone
 
 
 def run_ablation(
@@ -158,7 +178,7 @@ def run_ablation(
     out = FilePath(settings.out)
     configs = dict.fromkeys(ROWS[name].config for name in rows)
     trainings = [Training(config, seed) for config in configs for seed in range(settings.seeds)]
-    evaluations: dict[tuple[Training | None, bool], Evaluation] = {}
+    evaluations: dict[tuple[Training | str, bool], Evaluation] = {}
     with lock_folder(out), Workers(workers, patience=STOP_TIMEOUT) as pool:
         if not (out / ENCODER / "encoder.json").exists():
             report(f"training {ENCODER}: {settings.encoder_samples:,} clouds")
@@ -174,11 +194,13 @@ def run_ablation(
             found = ", ".join(f"{name} {digest}" for name, digest in digests.items())
             raise InputError(f"{out} holds networks of different data: {found}; use another folder")
         cases = hard_cases(settings.family, settings.problems, out / "problems", report)
-        todo = [(settings, which, guided, cases) for which in (*trainings, None) for guided in (False, True)]
+        todo = [
+            (settings, which, guided, cases) for which in (*trainings, *CONTROLS) for guided in (False, True)
+        ]
         for number, evaluation in pool.each(_evaluate, todo):
             _, which, guided, _ = todo[number]
             evaluations[which, guided] = evaluation
-            name = which.folder if which else CONTROL
+            name = which if isinstance(which, str) else which.folder
             how = "with" if guided else "without"
             report(f"evaluated {name} {how} guidance: {100 * evaluation.single.mean():.1f} % of samples")
     results = []
@@ -190,7 +212,8 @@ def run_ablation(
         )
         by_seed = tuple(float(of.single.mean()) for of in (guided if row.guided else alone))
         results.append(RowResult(name, Evaluation.mean(alone), Evaluation.mean(guided), by_seed))
-    return [*results, RowResult(CONTROL, evaluations[None, False], evaluations[None, True])]
+    controls = [RowResult(name, evaluations[name, False], evaluations[name, True]) for name in CONTROLS]
+    return [*results, *controls]
 
 
 class Training(NamedTuple):
@@ -228,20 +251,35 @@ def _train(settings: AblationSettings, training: Training) -> Training:
 
 
 def _evaluate(
-    settings: AblationSettings, training: Training | None, guided: bool, cases: list[Case]
+    settings: AblationSettings, which: Training | str, guided: bool, cases: list[Case]
 ) -> Evaluation:
+    """which: a training, or a name in CONTROLS."""
     robot = load_robot("panda")
-    folder = FilePath(settings.out) / (training.folder if training else CONTROL.replace(" ", "_"))
-    steps = NETWORK_ALONE.guidance_steps if guided else 0
-    planner = replace(NETWORK_ALONE, samples=settings.candidates, guidance_steps=steps)
-    if training is None:
-        draw = without_network(planner, CONTROL_WAYPOINTS)
+    out = FilePath(settings.out)
+    if isinstance(which, str):
+        folder = out / which.removeprefix("no network: ").replace(" ", "_")
+        row = CONTROLS[which]
+        planner = ControlSettings(
+            source=row.source,
+            samples=row.samples or settings.candidates,
+            guidance_steps=EQUAL_TIME_STEPS if guided else 0,
+            data=settings.data if row.source == NEAREST else None,
+        )
+        draw = from_control(planner)
     else:
+        folder = out / which.folder
         encoder = load_model(str(folder), robot).encoder
         assert encoder is not None  # every row has one
-        planner = replace(planner, weights=str(folder), points=encoder.settings.cloud)
+        steps = NETWORK_ALONE.guidance_steps if guided else 0
+        planner = replace(
+            NETWORK_ALONE,
+            samples=settings.candidates,
+            guidance_steps=steps,
+            weights=str(folder),
+            points=encoder.settings.cloud,
+        )
         draw = from_network(RobotDiffuse(planner))
-    digest = sampling_digest(planner, None if training is None else folder)
+    digest = sampling_digest(planner, None if isinstance(which, str) else folder)
     method = {f"{'guided' if guided else 'unguided'} {digest}": sampled(draw, partial(link_length, robot))}
     (records,) = run_all(cases, method, seeds=(1,), folder=folder, bar=False).values()
     return Evaluation.of(records)
@@ -252,7 +290,9 @@ NOTES = (
     "length: of the shortest such sample, over the problems that have one; to first: the mean ratio to that "
     "of the first row, over the problems that both solve. Intervals are over problems, not over trainings: "
     "another seed may move a row by more.",
-    f"{CONTROL}: smooth noise about the straight line, which networks start from, under the same guidance.",
+    "no network: fixed vias without guidance; and the nearest motions of the data, bent to start and goal, "
+    f"and smooth noise, which networks start from, with {EQUAL_TIME_STEPS} gradient steps, as many as take a "
+    "network's time. The straight line solves none of these problems, by their choice.",
 )
 LINE_FAMILIES = {"spheres and cubes": ROP, "spheres alone": Rop(kinds=("sphere",))}
 LINE_NOTES = (

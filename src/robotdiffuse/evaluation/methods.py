@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
+from robotdiffuse.baselines.controls import Control, ControlSettings
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path, Status, Values
@@ -209,7 +210,7 @@ def sampled(draw: Draw, lengths: Callable[[ndarray], ndarray] = path_lengths) ->
     return call
 
 
-def sampling_digest(settings: RobotDiffuseSettings, folder: FilePath | None) -> str:
+def sampling_digest(settings: RobotDiffuseSettings | ControlSettings, folder: FilePath | None) -> str:
     """Identifies in the names of methods what samples depend on: the settings, and the network's weights in a
     folder, if there is a network."""
     weights = None if folder is None else json.loads((folder / "model.json").read_text())["weights_sha256"]
@@ -236,6 +237,16 @@ def from_network(
         other = checker if encoded is None else CollisionChecker(problem.robot, encoded(run).scene)
         code = encode(model, other, sampler.settings.points, rng)
         return sampler.draw(model, checker, code, problem.start, goal_of(problem)[None], rng, clearances)
+
+    return draw
+
+
+def from_control(settings: ControlSettings) -> Draw:
+    """Candidates of a control."""
+    control = Control(settings)
+
+    def draw(run: Run, checker: CollisionChecker) -> ndarray:
+        return control.candidates(run.problem.start, goal_of(run.problem)[None], checker, run.rng())
 
     return draw
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy import ndarray
 
+from robotdiffuse.baselines.controls import NEAREST
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.tables import Column, Table, plain
@@ -227,6 +228,9 @@ ROWS = (
     Row("aorrtc", "aorrtc"),
     Row("no planner: line to the nearest goal", "straight_line:goals=nearest"),
     Row("no planner: line to any goal", "straight_line"),
+    Row("no planner: line, else one via", "control:source=vias:samples=1:guidance_steps=0"),
+    Row("no planner: line, else 16 vias", "control:source=vias:guidance_steps=0"),
+    Row("no network: line, else smooth noise under guidance", "control"),
 )
 MEASURES = ("link_length", "joint_length", "duration", "jerk", "turning")
 """Metrics of the solved motions that the table has."""
@@ -243,20 +247,28 @@ class Table1Settings:
     paper_weights: str | None = None
     """Folder with weights of config `paper`, `points` or another one without clearances as inputs, for two
     rows of single samples: under guidance, as the paper's own row, and without it."""
+    data: str | None = None
+    """Folder of a data set, for a row of its nearest motions."""
     workers: int = 1
     cluster: str | None = None
     """As for `BenchSettings`."""
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """The rows of the table; the one without clearances as inputs only with weights for it."""
+        """The rows of the table; those without clearances as inputs only with weights, nearest motions with
+        data."""
+        nearest = Row(
+            "no network: line, else nearest motions under guidance",
+            f"control:source={NEAREST}:data={self.data}",
+        )
+        controls = () if self.data is None else (nearest,)
         if self.paper_weights is None:
-            return ROWS
+            return ROWS + controls
         title = _title(self.paper_weights)
         diffusion = f"diffusion@{self.paper_weights}"
         guided = Row(title, ":".join([diffusion, *GUIDED_SAMPLE]))
         unguided = Row(f"{title}, no guidance", ":".join([diffusion, *ONE_SAMPLE]))
-        return (*ROWS[:5], guided, unguided, *ROWS[5:])
+        return (*ROWS[:5], guided, unguided, *ROWS[5:], *controls)
 
     @property
     def bench(self) -> BenchSettings:
@@ -319,6 +331,7 @@ def _check_paper_weights(folder: str, time_limit: float) -> None:
 def table1(settings: Table1Settings, bench: Bench) -> Report:
     """Table 1: for each kind of goal, on all problems and on those that are not trivial."""
     weights = "" if settings.paper_weights is None else " --paper-weights FOLDER"
+    weights += "" if settings.data is None else " --data DATA"
     command = (
         f"robotdiffuse reproduce table1 --out FOLDER --problems {settings.problems} "
         f"--time-limit {settings.time_limit:g}{weights}"

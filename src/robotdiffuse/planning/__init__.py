@@ -102,6 +102,12 @@ PLANNERS = Registry(
             SEARCH,
             "no planner: the straight line in joint space, the control of every other row",
         ),
+        "control": _entry(
+            "baselines.controls:Control",
+            "ControlSettings",
+            SEARCH,
+            "no planner: fixed vias, nearest motions of a data set or smooth noise, with or without guidance",
+        ),
         "a_star": _entry(
             "baselines.lattice:AStar", "AStarSettings", SEARCH, "A* on a lattice of joint values"
         ),

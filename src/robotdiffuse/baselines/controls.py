@@ -1,0 +1,131 @@
+"""Controls: motions that no network and no search has made, which every learned result stands beside."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import islice
+from pathlib import Path as FilePath
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.settings import Count, Natural, OneOf, Settings
+from robotdiffuse.core.types import Configuration, Configurations, Path
+from robotdiffuse.datasets.rows import read_rows
+from robotdiffuse.datasets.shards import SPLITS
+from robotdiffuse.learning.guidance import CollisionGuidance, Trajectories
+from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.hybrid import WAYPOINTS, smooth_noise
+from robotdiffuse.planning.learned import nearest_goals
+from robotdiffuse.planning.planner import Planner
+from robotdiffuse.planning.start_goal import StartGoal
+from robotdiffuse.robots.robot import Robot
+
+VIAS = "vias"
+NEAREST = "nearest_motions"
+NOISE = "smooth_noise"
+LIBRARY_SHARDS = 10
+"""Shards of a data set that the nearest motions are taken from, some thousand motions."""
+EQUAL_TIME_STEPS = 110
+"""Gradient steps of 16 candidates that take about as long as six guided denoising steps of 16 samples."""
+
+
+@dataclass(frozen=True)
+class ControlSettings(Settings, name="control"):
+    source: Annotated[str, OneOf((VIAS, NEAREST, NOISE))] = NOISE
+    """What candidates are: fixed vias, which only the Panda has; the motions of a data set with the nearest
+    ends, bent to start and goal; or smooth noise about the straight line."""
+    samples: Count = 16
+    """Candidates."""
+    guidance_steps: Natural = EQUAL_TIME_STEPS
+    """Gradient steps of guidance on them."""
+    data: str | None = None
+    """Folder of the data set of the nearest motions."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if (self.source == NEAREST) != (self.data is not None):
+            raise InputError(f"source is {self.source} and data is {self.data}; {NEAREST} alone needs data")
+
+
+class Control(Planner[ControlSettings]):
+    """The straight line, then the shortest candidate that passes the validator."""
+
+    name = "control"
+    settings_class = ControlSettings
+
+    def prepare(self, robot: Robot) -> None:
+        """Read the vias or motions."""
+        if self.settings.source == VIAS:
+            fixed_vias(robot)
+        if self.settings.data is not None:
+            library(self.settings.data, robot)
+
+    def candidates(
+        self, start: Configuration, goals: Configurations, checker: CollisionChecker, rng: np.random.Generator
+    ) -> Trajectories:
+        """Motions from the start to the nearest goals, after guidance; vias in their order, the most useful
+        first."""
+        settings = self.settings
+        goals = nearest_goals(start, goals, settings.samples)
+        robot = checker.robot
+        if settings.source == NOISE:
+            q = smooth_noise(start, goals, settings.samples, WAYPOINTS, robot, rng)
+        elif settings.source == VIAS:
+            vias = fixed_vias(robot)[: settings.samples]
+            legs = [np.linspace(*ends, WAYPOINTS // 2) for ends in ((start, vias), (vias, goals[:1]))]
+            q = np.concatenate(np.broadcast_arrays(*legs)).swapaxes(0, 1)
+        else:
+            assert settings.data is not None
+            q = bent(library(settings.data, robot), start, goals[0], settings.samples)
+            q = np.clip(q, robot.lower, robot.upper)
+        steps = settings.guidance_steps
+        return CollisionGuidance(checker)(q.astype(np.float32), steps)[0] if steps else q
+
+    def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
+        """See `planning.planner.Planner`."""
+        start, goals = start_goal.rows()
+        names = context.problem.robot.joint_names
+        lines = np.stack([np.broadcast_to(start, goals.shape), goals], axis=1)
+        for batch in (lines, self.candidates(start, goals, start_goal.checker, context.rng)):
+            paths = [Path(names, start_goal.complete(q)) for q in batch]
+            for path in sorted(paths, key=lambda path: path.length):
+                result = context.finish(path.positions, self.settings.source, "solved by a control")
+                if result is not None:
+                    return result
+                if context.ended:
+                    break
+        return context.unsolved(f"the straight line and {self.settings.samples} candidates are refused")
+
+
+@lru_cache
+def fixed_vias(robot: Robot) -> Configurations:
+    """The vias of the Panda, the most useful first. Raises InputError for another robot."""
+    if robot.name != "panda":
+        raise InputError(f"source is {VIAS} and the robot {robot.name}; only the panda has fixed vias")
+    return np.loadtxt(FilePath(__file__).with_name("panda_vias.csv"), delimiter=",")
+
+
+@lru_cache(maxsize=2)
+def library(data: str, robot: Robot) -> Trajectories:
+    """Motions for training of a data set's first shards, those with a free straight line left out."""
+    rows = islice(read_rows(data, robot, WAYPOINTS), LIBRARY_SHARDS)
+    train = SPLITS.index("train")
+    return np.concatenate([of.q[(of.split == train) & ~of.shard["line_free"]] for of in rows])
+
+
+def bent(
+    motions: Float[ndarray, "n waypoints dof"], start: Configuration, goal: Configuration, count: int
+) -> Float[ndarray, "count waypoints dof"]:
+    """The motions, forwards or backwards, whose ends are nearest to start and goal, the nearest first; the
+    difference of the ends is spread evenly along each."""
+    both = np.concatenate([motions, motions[:, ::-1]])
+    ends = np.stack([start, goal])
+    distance = np.square(both[:, [0, -1]] - ends).sum(axis=(1, 2))
+    nearest = both[np.argsort(distance)[:count]]
+    share = np.linspace(0.0, 1.0, nearest.shape[1])[:, None]
+    return nearest + (1 - share) * (start - nearest[:, :1]) + share * (goal - nearest[:, -1:])
