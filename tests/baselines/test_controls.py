@@ -41,7 +41,7 @@ def test_vias_are_free_and_on_the_candidates() -> None:
 
 def test_the_nearest_motions_are_bent_to_start_and_goal(monkeypatch: pytest.MonkeyPatch) -> None:
     ends = np.array([[[0.0, 0.0], [1.0, 1.0]], [[3.0, 0.0], [0.1, 0.0]]])
-    motions = np.stack([ends[:, 0], ends.mean(1) + [0.0, 0.5], ends[:, 1]], axis=1)
+    motions = np.stack([ends[:, 0], ends.mean(1) + np.array([0.0, 0.5]), ends[:, 1]], axis=1)
     start, goal = np.array([0.0, 0.1]), np.array([3.0, 0.0])
     first, second = controls.bent(motions, start, goal, 2)
     np.testing.assert_allclose(first, [start, [1.5, 0.55], goal])  # backwards, by half of each difference
