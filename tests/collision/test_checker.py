@@ -11,12 +11,12 @@ from numpy import ndarray
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
-from helpers.clearances import least_clearance
 from helpers.sphere_oracles import (
     ROBOTS,
     TOLERANCE,
     box_triangles,
     distance,
+    least_clearance,
     link_distances,
     pair_distances,
     random_shape,

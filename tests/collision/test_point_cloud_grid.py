@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from helpers.box_arm import box_arm
-from helpers.clearances import least_clearance
 from helpers.sphere_oracles import (
     TOLERANCE,
     box_triangles,
+    least_clearance,
     link_distances,
     pair_distances,
     rows,

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from numpy import ndarray
 
-from helpers.clearances import least_clearance
 from helpers.factory_runs import contents, in_this_process
+from helpers.sphere_oracles import least_clearance
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion

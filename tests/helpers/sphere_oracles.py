@@ -9,8 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from helpers.box_arm import box_arm
 from helpers.example_robots import example_robot
+from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import forward_frames
 from robotdiffuse.collision.kernel_arrays import robot_groups
+from robotdiffuse.collision.kernels.collision_cost import CLEARANCE_CAP
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -18,6 +20,12 @@ from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape
 
 TOLERANCE = 1e-5
 """Bound on float32 rounding at distances of a few metres [m]."""
+
+
+def least_clearance(checker: CollisionChecker, q: ndarray) -> ndarray:
+    """Least distance of each configuration to the scene and between links [m], at most 1 m."""
+    every = [checker.link_clearances(q), checker.pair_clearances(q), np.full((len(q), 1), CLEARANCE_CAP)]
+    return np.concatenate(every, axis=1).min(axis=1)
 
 
 def sphere_centres(robot: Robot, q: ndarray) -> tuple[list[ndarray], list[ndarray]]:

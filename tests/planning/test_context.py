@@ -11,7 +11,6 @@ from helpers.clock import stop_clock
 from robotdiffuse import Problem, Scene, Sphere, Status, load_planner, load_robot
 from robotdiffuse.core.deadline import TIMING, OutOfTimeError
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
-from robotdiffuse.planning.search.shared_tree import SharedTreeRRTStar, SharedTreeSettings
 
 START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 
@@ -65,15 +64,6 @@ def test_a_search_that_ended_differs_from_one_that_ran_out_of_time() -> None:
     assert ended.status is Status.NO_PATH and "the search ended" in ended.reason
     late = PlanningContext("test", blocked(), PlanRequest(time_limit=1e-9)).unsolved()
     assert late.status is Status.TIMEOUT and "longer time limit" in late.reason
-
-
-def test_anytime_planner_reports_its_progress() -> None:
-    planner = SharedTreeRRTStar(SharedTreeSettings(safety_distance=0.0, rounds=40, improvement=0.0))
-    result = planner.plan(blocked(), time_limit=20.0)
-    assert result.path is not None, result.reason
-    times, lengths = np.array(result.progress).T
-    assert (np.diff(times) > 0).all() and (np.diff(lengths) < 0).all()
-    assert lengths[-1] == result.path.length
 
 
 def test_a_result_notes_the_compile_time_once() -> None:

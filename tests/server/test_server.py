@@ -49,7 +49,7 @@ def problem(height: float = 0.4, **changed: Any) -> dict[str, Any]:
 
 
 def asked(seed: int = 0, planner: str = "rrt_connect", height: float = 0.4, **more: Any) -> dict[str, Any]:
-    return {"problem": problem(height), "planner": planner, "seed": seed, "time_limit": 2.0} | more
+    return {"problem": problem(height), "planner": planner, "seed": seed, "time_limit": 5.0} | more
 
 
 def gauge(server: httpx.Client, name: str) -> float:

@@ -3,13 +3,13 @@
 import base64
 import json
 import re
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from helpers.browsers import CHROMIUM, FLAGS
 from helpers.explorations import FLOOR, recorded
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.perception.voxel_grid import MAP
@@ -87,9 +87,6 @@ def test_each_moment_has_a_picture(tmp_path: Path) -> None:
         write_exploration_picture(explorer, problem.scene, tmp_path / "explore.html", SMALL)
 
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-FLAGS = ["--no-sandbox", "--disable-background-networking", "--use-angle=swiftshader"]
-FLAGS += ["--enable-unsafe-swiftshader"]
 PATIENCE = 300_000
 """WebGL without a graphics card is slow [ms]."""
 

@@ -40,18 +40,6 @@ def test_picture_shows_obstacles_in_their_colour(arm, scene, motion):
     assert r > g + 25 > b + 25
 
 
-def test_picture_is_the_same_twice(arm, scene, motion):
-    first, _ = render(arm, scene, motion, SMALL)
-    second, _ = render(arm, scene, motion, SMALL)
-    np.testing.assert_array_equal(first, second)
-
-
-@pytest.mark.parametrize("settings", [{"width": 0}, {"height": 3}, {"ghosts": -1}, {"shell": -0.1}])
-def test_bad_settings(settings):
-    with pytest.raises(InputError):
-        PictureSettings(**settings)
-
-
 def test_several_motions_have_traces_of_their_own_colours(arm, motion, tmp_path):
     back = Path(arm.joint_names, motion.positions[::-1].copy() * 0.7)
     few = replace(SMALL, ghosts=0)

@@ -100,11 +100,6 @@ def test_names_of_arms(first: str, second: str, names: str, tmp_path: Path) -> N
         read_urdf(written(tmp_path, chain("base", row(first, 6)), chain("base", row(second, 6))))
 
 
-def test_four_legs_are_no_arm(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="has 4 arms"):
-        read_urdf(written(tmp_path, *(chain("base", row(f"leg{i}_", 3)) for i in "abcd")))
-
-
 def test_published_arms_end_where_their_grippers_begin(tmp_path: Path) -> None:
     pytest.importorskip("pinocchio")
     data = urdf_file("panda", tmp_path).parents[2]

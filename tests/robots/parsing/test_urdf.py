@@ -312,18 +312,6 @@ def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.Mo
     assert (kept / "robot.json").stat().st_mtime_ns == stamp
 
 
-def test_add_refuses_what_cannot_work(tmp_path: Path) -> None:
-    joint = "<joint name='j' type='continuous'><parent link='a'/><child link='b'/></joint>"
-    bare = f"<robot name='bare'><link name='a'/><link name='b'/>{joint}</robot>"
-    with pytest.raises(InputError, match="no link has collision or visual geometry"):
-        add_robot(urdf(tmp_path, bare), out=tmp_path / "bare")
-    with pytest.raises(InputError, match="robot name"):
-        add_robot(urdf(tmp_path), name="../up")
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot be written"):
-        write_robot_folder(read_urdf(urdf(tmp_path)), tmp_path / "file" / "robot", {})
-
-
 def test_quaternions_of_joints_turn_what_follows(tmp_path: Path) -> None:
     """`quat_xyzw` was ignored."""
     wxyz = quaternion_from_rotation(rotation_from_rpy(0.3, -0.4, 0.5))
