@@ -1,10 +1,19 @@
 """Noise of depth images: its size as estimated, and what the filter leaves."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from robotdiffuse import Box, DepthView, Scene, load_robot
-from robotdiffuse.perception.depth_filter import depth_spread, filtered, grown_for_noise
+from robotdiffuse import Box, DepthView, InputError, Scene, load_robot
+from robotdiffuse.perception.depth_filter import (
+    empty_regions,
+    filtered,
+    grown_for_errors,
+    measure_noise,
+    measured_share,
+    patch_noise,
+)
 from robotdiffuse.perception.depth_view import DepthNoise
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
@@ -22,17 +31,82 @@ def view_from(distance: float) -> DepthView:
 
 @pytest.mark.parametrize("spread", (0.001, 0.0015, 0.004))
 @pytest.mark.parametrize("distance", (1.2, 2.5))
-def test_the_estimated_noise_is_that_of_the_sensor(spread: float, distance: float) -> None:
-    noisy = DepthNoise(spread=spread).applied(view_from(distance), np.random.default_rng(0))
-    assert 0.85 < depth_spread(noisy.depth) / spread < 1.35, "edges and stray pixels add to it"
+@pytest.mark.parametrize("correlation", (0.0, 1.5, 2.5))
+def test_the_estimated_noise_is_that_of_the_sensor(
+    spread: float, distance: float, correlation: float
+) -> None:
+    """Differences of neighbouring pixels showed an eighth of noise that is correlated as recorded."""
+    noise = DepthNoise(spread=spread, correlation=correlation)
+    noisy = noise.applied(view_from(distance), np.random.default_rng(0))
+    found, neighbours = patch_noise(noisy.depth)
+    assert 0.75 < found / spread < 1.2, "planes take away what goes together over a patch"
+    by_hand = np.exp(-0.5 / correlation**2) if correlation else 0.0
+    assert neighbours == pytest.approx(by_hand, abs=0.12)
+
+
+def test_noise_is_measured_on_images_of_a_still_scene() -> None:
+    view = view_from(1.2)
+    noise = DepthNoise(spread=0.004, correlation=1.5, missing=0.05)
+    images = [noise.applied(view, np.random.default_rng(i)).depth for i in range(4)]
+    found = measure_noise(images)
+    assert found.spread == pytest.approx(0.004, rel=0.15) and found.correlation == pytest.approx(1.5, rel=0.4)
+    assert 0.04 < found.missing < 0.12
+    stated = replace(noise.applied(view, np.random.default_rng(9)), noise=found)
+    margin = filtered(stated).spread
+    assert margin == pytest.approx(filtered(replace(stated, noise=None)).spread, rel=0.5)
+    with pytest.raises(InputError, match="at least two"):
+        measure_noise(images[:1])
+
+
+def test_zeros_are_told_from_nothing_in_range() -> None:
+    """An open world, seen by a sensor that gives 0 for both, was never seen free."""
+    clean = view_from(1.2)
+    clean = replace(clean, depth=np.where(clean.depth < 2.0, clean.depth, np.inf), range=2.0)
+    noisy = DepthNoise(spread=0.003, correlation=1.5, missing=0.02, zeros=True)
+    view = noisy.applied(clean, np.random.default_rng(0))
+    nothing = np.isinf(clean.depth)
+    found = empty_regions(view.depth, 2.0)
+    assert nothing.mean() > 0.2 and found is not None
+    assert found[nothing].mean() > 0.95 and found[~nothing].mean() < 0.01
+    hole = view.depth.copy()
+    hole[150:190, 100:160] = 0.0
+    assert not (empty_regions(hole, 2.0) & (clean.depth < 1.9))[150:190, 100:160].any(), "surrounded: a hole"
+    assert empty_regions(np.where(np.arange(320) < 160, view.depth, 0.0), 2.0) is None, (
+        "half an image is lost"
+    )
+    near = np.where(nothing, 0.0, 0.2 * clean.depth)
+    assert empty_regions(near, 2.0) is None, "a surface too near to be measured"
+    stated, silent = view, replace(view, range=None)
+    free = [observe([one], PANDA, HOME).free for one in (clean, stated, silent)]
+    assert free[1].sum() > 0.9 * free[0].sum() > 2 * free[2].sum()
+    assert measured_share(stated) > 0.9 > measured_share(silent)
+
+
+def test_rays_through_the_arm_are_not_empty() -> None:
+    """A gripper too near to be measured is 0 too; what is behind it was not seen."""
+    T = looking_at(np.array([0.9, 0.0, 0.8]), np.array([0.0, 0.0, 0.8]))
+    view = ray_cast(Scene([]), T, (290.0, 290.0, 159.5, 119.5), (320, 240), PANDA, HOME)
+    few = np.zeros((240, 320))
+    few[:20, :20] = 3.0
+    blank = DepthView(few, view.intrinsics, T, range=4.0)
+    freed = observe([blank], PANDA, HOME)
+    behind_arm = observe([view], PANDA, HOME).shadow
+    assert freed.free.any() and not (freed.free & behind_arm).any()
+
+
+def test_a_covered_lens_measures_nothing() -> None:
+    for value in (0.0, np.nan, 0.02, -1.0):
+        view = DepthView(np.full((240, 320), value), (290.0, 290.0, 159.5, 119.5), np.eye(4), range=3.0)
+        assert measured_share(view) == 0.0
+        assert not observe([view], PANDA, HOME).free.any()
 
 
 def test_images_without_noise_are_taken_as_they_are() -> None:
     view = view_from(1.5)
-    depth, spread = filtered(view)
+    depth, spread, _ = filtered(view)
     assert spread == 0.0
     np.testing.assert_array_equal(depth, view.depth)
-    assert depth_spread(np.zeros((240, 320), np.float32)) == 0.0, "without returns"
+    assert patch_noise(np.zeros((240, 320), np.float32))[0] == 0.0, "without returns"
 
 
 def test_the_filter_takes_the_median_of_the_returns_and_adds_none() -> None:
@@ -67,6 +141,17 @@ def test_spheres_grow_with_the_square_of_their_distance() -> None:
     T = looking_at(np.array([2.0, 0.0, 0.0]), np.zeros(3))
     near = np.array([1.0, 0.0, 0.0, 0.1])
     far = np.array([0.0, 0.0, 0.0, 0.1])
-    grown = grown_for_noise(np.stack([near, far]), T, 0.002)[:, 3] - 0.1
+    view = DepthView(np.ones((2, 2)), (1.0, 1.0, 0.0, 0.0), T)
+    spheres = np.stack([near, far])
+    grown = grown_for_errors(spheres, view, 0.002)[:, 3] - 0.1
     assert grown[1] == pytest.approx(4 * grown[0]) and grown[0] > 0
-    assert (grown_for_noise(np.stack([near, far]), T, 0.0)[:, 3] == 0.1).all()
+    assert (grown_for_errors(spheres, view, 0.0)[:, 3] == 0.1).all()
+    off = grown_for_errors(spheres, replace(view, pose_deviation=(0.005, 0.02)), 0.0)[:, 3] - 0.1
+    assert off == pytest.approx([0.005 + 0.02, 0.005 + 0.04])
+
+
+def test_a_pose_that_may_be_off_narrows_free_space() -> None:
+    view = view_from(1.2)
+    seen = observe([view], PANDA, HOME)
+    narrowed = observe([replace(view, pose_deviation=(0.005, 0.0175))], PANDA, HOME).free
+    assert not (narrowed & ~(seen.free | seen.occupied)).any() and narrowed.sum() < 0.8 * seen.free.sum()

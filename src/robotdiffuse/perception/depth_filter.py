@@ -1,16 +1,19 @@
 """Noise of depth images: how large it is, and images without most of it."""
 
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
+from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import for_kernels
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.kernels import kernel
-from robotdiffuse.core.types import Pose
-from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.core.types import Values
+from robotdiffuse.perception.depth_view import NEAREST, DepthNoise, DepthView
 
 MIN_RETURNS = 4
 """A pixel with fewer returns among its 3 x 3 counts as without a return."""
@@ -44,20 +47,25 @@ def median_filter(depth):
     return out
 
 
-ROW_STEP = 4
-"""Every so many rows are examined for noise."""
-ORDER = 4
-"""Order of the differences that noise is estimated from: those of a sphere a few pixels wide are near 0."""
-MIN_DIFFERENCES = 200
-"""Fewest differences that noise is estimated from."""
-DIFFERENCE_PER_SPREAD = 0.6745 * 70**0.5
-"""The median absolute fourth difference of normal numbers of standard deviation 1."""
+PATCH = 20
+"""Edge of the patches that noise is estimated on [pixels]: a few times the length over which the errors of
+recorded sensors go together."""
+MAX_PATCHES = 100
+"""Most patches, spread over the image."""
+MIN_PATCH_RETURNS = 0.7
+"""Patches with a smaller part of returns tell nothing."""
+FLAT_SHARE = 0.35
+"""The noise is that of the patch with this share of the patches below it: others hold edges and objects."""
+FIT_ROUNDS = 3
+"""Rounds of the fit of a plane, without pixels farther from it than OUTLIER_SPREADS after the first."""
+OUTLIER_SPREADS = 3.0
 MIN_SPREAD = 4e-4
 """Images with less noise are taken as they are: the filter takes away what is a pixel wide. At a distance of
 1 m [m]."""
-MARGIN_SPREADS = 1.5
-"""Points of the arm may lie this many standard deviations of a pixel's depth farther from it. The median of
-nine pixels has 0.4 of the deviation of one."""
+MARGIN_SPREADS = 3.75
+"""Points of the arm may lie this many standard deviations of filtered depth farther from it."""
+MEDIAN_SPREAD = 0.4
+"""Standard deviation of the median of nine independent numbers, as a part of theirs."""
 
 
 class FilteredDepth(NamedTuple):
@@ -66,8 +74,10 @@ class FilteredDepth(NamedTuple):
     depth: Float32[ndarray, "h w"]
     """Distance along the optical axis, as in DepthView [m]."""
     spread: float
-    """Standard deviation of a pixel's depth at a distance of 1 m before the filter [m]; it grows with the
-    square of the distance."""
+    """Standard deviation of a filtered pixel's depth at a distance of 1 m [m]; it grows with the square of the
+    distance."""
+    empty: Bool[ndarray, "h w"] | None = None
+    """Pixels of 0 that seem to have nothing in range; None: there are none."""
 
 
 @lru_cache(maxsize=32)
@@ -78,34 +88,167 @@ def filtered(view: DepthView) -> FilteredDepth:
     cached: a call with views asks for the same ones several times.
     """
     depth = for_kernels(view.depth, np.float32)
-    spread = 0.0 if view.cloud is not None else depth_spread(depth)
-    if spread < MIN_SPREAD:
+    if view.cloud is not None:
         return FilteredDepth(depth, 0.0)
-    return FilteredDepth(median_filter(depth), spread)
+    empty = empty_regions(depth, view.range)
+    spread = patch_noise(depth)[0] if view.noise is None else view.noise.spread
+    if spread < MIN_SPREAD:
+        return FilteredDepth(depth, 0.0, empty)
+    depth = median_filter(depth)
+    if view.noise is None:
+        return FilteredDepth(depth, patch_noise(depth)[0], empty)
+    # the errors of near pixels, as far as they go together, are not filtered out
+    together = np.exp(-1 / view.noise.correlation**2) if view.noise.correlation > 0 else 0.0
+    return FilteredDepth(depth, spread * (MEDIAN_SPREAD + (1 - MEDIAN_SPREAD) * float(together)), empty)
 
 
-def depth_spread(depth: Float32[ndarray, "h w"]) -> float:
-    """The standard deviation of an image's depth at a distance of 1 m [m], as its pixels show.
+def patch_noise(depth: Float32[ndarray, "h w"]) -> tuple[float, float]:
+    """The standard deviation of an image's depth at a distance of 1 m [m], as flat patches show, and the
+    correlation of the errors of neighbouring pixels.
 
-    Of a flat surface, inverse depth is linear in the pixels, and of a curved one nearly a polynomial; where
-    the error of depth grows with its square, that of inverse depth is the same everywhere. So differences of
-    high order of inverse depth show it. 0 for images with few returns.
+    Of a flat surface, inverse depth is linear in the pixels; where the error of depth grows with its square,
+    that of inverse depth is the same everywhere. 0, 0 for images with few returns.
     """
-    some = depth[::ROW_STEP]
-    seen = np.isfinite(some) & (some > 0)
-    differences = np.divide(1.0, some, out=np.zeros_like(some), where=seen)
-    for _ in range(ORDER):
-        differences = np.diff(differences, axis=1)
-        seen = seen[:, 1:] & seen[:, :-1]
-    found = np.abs(differences[seen])
-    return float(np.median(found)) / DIFFERENCE_PER_SPREAD if len(found) >= MIN_DIFFERENCES else 0.0
+    rows, columns = (n // PATCH for n in depth.shape)
+    cut = depth[: rows * PATCH, : columns * PATCH].reshape(rows, PATCH, columns, PATCH).swapaxes(1, 2)
+    patches = cut.reshape(rows * columns, PATCH**2)
+    seen = np.isfinite(patches) & (patches > 0)
+    usable = np.flatnonzero(seen.mean(axis=1) >= MIN_PATCH_RETURNS)
+    if not len(usable):
+        return 0.0, 0.0
+    usable = usable[:: -(-len(usable) // MAX_PATCHES)]
+    seen = seen[usable]
+    inverse = np.divide(1.0, patches[usable], out=np.zeros(seen.shape), where=seen)
+    v, u = (np.indices((PATCH, PATCH)).reshape(2, -1) - (PATCH - 1) / 2) / PATCH
+    basis = np.stack([np.ones(PATCH**2), u, v])
+    products = (basis[:, None] * basis[None]).reshape(9, -1)
+    errors = inverse
+    spreads = np.zeros(len(seen))
+    for _ in range(FIT_ROUNDS):
+        normal = (seen @ products.T).reshape(-1, 3, 3) + 1e-9 * np.eye(3)
+        fit = np.linalg.solve(normal, ((seen * inverse) @ basis.T)[..., None])[..., 0]
+        errors = inverse - fit @ basis
+        middle = np.nanmedian(np.where(seen, np.abs(errors), np.nan), axis=1)
+        spreads = np.sqrt((seen * errors**2).sum(axis=1) / np.maximum(seen.sum(axis=1) - 3, 1))
+        seen = seen & (np.abs(errors) <= OUTLIER_SPREADS * 1.4826 * middle[:, None] + 1e-7)
+    order = np.argsort(spreads)[: int(FLAT_SHARE * len(spreads)) + 1]
+    of_flat = np.where(seen[order], errors[order], 0.0).reshape(-1, PATCH, PATCH)
+    both = seen[order].reshape(-1, PATCH, PATCH)
+    both = both[:, :, 1:] & both[:, :, :-1]
+    products = (of_flat[:, :, 1:] * of_flat[:, :, :-1])[both]
+    squares = (0.5 * (of_flat[:, :, 1:] ** 2 + of_flat[:, :, :-1] ** 2))[both]
+    return float(spreads[order[-1]]), float(products.sum() / max(squares.sum(), 1e-30))
 
 
-def grown_for_noise(
-    spheres: Float[ndarray, "n 4"], T_base_camera: Pose, spread: float
-) -> Float[ndarray, "n 4"]:
-    """The arm's spheres, in the base frame, enlarged by the noise of depth where they are."""
-    ahead = (spheres[:, :3] - T_base_camera[:3, 3]) @ T_base_camera[:3, 2]
+EMPTY_EDGE = 6
+"""Regions of 0 count as empty where they are at least so wide and high [two pixels]: dropouts at edges, and of
+surfaces at a small angle, are thinner."""
+CUT_SHARE = 0.25
+"""Returns that end along one row, or column, over this part of the image are cut off: the edges of things
+are hardly ever so straight."""
+AT_RANGE = 0.8
+"""Surfaces farther than this part of the range may end there."""
+TOO_NEAR = 0.3
+"""A region of 0 beside returns nearer than this may be a surface that is too near to be measured [m]..."""
+NEAR_SHARE = 0.05
+"""... if it has this part of its border there."""
+
+
+def empty_regions(depth: Float32[ndarray, "h w"], reach: float | None = None) -> Bool[ndarray, "h w"] | None:
+    """The pixels of 0 (or NaN) that seem to have nothing in range: large regions that reach the border of the
+    image, and whose neighbours are not near. None if there are none, or if the image is cut.
+
+    Regions that returns surround are holes: what is dark or reflects may be there. reach: the sensor's range
+    [m], if it is known: a floor may end there along one row.
+    """
+    every = ~(depth > 0)
+    lost = every[::2, ::2]
+    if not lost.any() or every.all():
+        return None
+    from scipy.ndimage import binary_dilation, label, maximum_filter, minimum_filter
+
+    core = minimum_filter(lost.view(np.uint8), EMPTY_EDGE, mode="nearest")
+    wide = (maximum_filter(core, EMPTY_EDGE, mode="nearest", origin=-1) > 0) & lost
+    near = ~lost & (depth[::2, ::2] < AT_RANGE * (np.inf if reach is None else reach))
+    kinds = wide + 2 * near
+    for across in (kinds, kinds.T):
+        if (across[:-1] + across[1:] == 3).mean(axis=1).max(initial=0.0) > CUT_SHARE:
+            return None
+    parts, count = label(wide)
+    inside = np.zeros(count + 1, np.bool_)
+    for border in (parts[0], parts[-1], parts[:, 0], parts[:, -1]):
+        inside[border] = True
+    inside[0] = False
+    for part in np.flatnonzero(inside):
+        of_part = parts == part
+        around = depth[::2, ::2][binary_dilation(of_part) & ~lost]
+        inside[part] = (around < TOO_NEAR).mean() < NEAR_SHARE if len(around) else False
+    height, width = depth.shape
+    return inside[parts].repeat(2, 0).repeat(2, 1)[:height, :width] & every if inside.any() else None
+
+
+def measured_share(view: DepthView) -> float:
+    """The part of an image's pixels that measure something: a surface, or that nothing is in range."""
+    depth, _, empty = filtered(view)
+    told = depth >= NEAREST
+    return float((told if empty is None or view.range is None else told | empty).mean())
+
+
+def measure_noise(images: Sequence[ArrayLike]) -> DepthNoise:
+    """The noise of a sensor, from a few depth images of a still scene, for `DepthView.noise`.
+
+    Args:
+        images: Depth images [m], at least two of the same size, of a camera and a scene at rest.
+
+    Returns:
+        Spread, correlation length and dropouts, as the larger of what changes from image to image and what
+        bends flat surfaces.
+
+    Raises:
+        InputError: For fewer than two images, and images without returns in common.
+    """
+    arrays = [np.asarray(image, np.float32) for image in images]
+    if len(arrays) < 2 or len({image.shape for image in arrays}) > 1 or arrays[0].ndim != 2:
+        raise InputError(f"images has {len(arrays)} images; at least two of the same size are needed")
+    stack = np.stack(arrays)
+    seen = np.isfinite(stack) & (stack > 0)
+    always = seen.all(axis=0)
+    if not always.any():
+        raise InputError("images: no pixel has a return in all of them")
+    inverse = np.divide(1.0, stack, out=np.zeros(stack.shape), where=seen)
+    changes = (inverse - inverse.mean(axis=0)) * np.sqrt(len(stack) / (len(stack) - 1))
+    both = always[:, 1:] & always[:, :-1]
+    variances = (changes**2).mean(axis=0)
+    over_time = float(np.sqrt(np.median(variances[always])))
+    clipped = np.clip(changes, -3 * over_time, 3 * over_time)
+    products = (clipped[:, :, 1:] * clipped[:, :, :-1])[:, both].sum()
+    correlated = products / max((clipped**2)[:, always].mean() * len(stack) * both.sum(), 1e-30)
+    still = [patch_noise(image) for image in arrays]
+    spread, neighbours = max((over_time, float(correlated)), *still)
+    neighbours = min(neighbours, 0.98)
+    length = 1 / np.sqrt(-2 * np.log(neighbours)) if neighbours > np.exp(-2) else 0.0
+    ever = seen.any(axis=0)
+    return DepthNoise(spread=spread, missing=float(1 - seen[:, ever].mean()), correlation=float(length))
+
+
+def pose_error(view: DepthView, distance: ArrayLike) -> Values:
+    """How far off a point may be by the deviation of the camera's pose, at distances from the camera [m]."""
+    position, angle = view.pose_deviation
+    return position + angle * np.asarray(distance)
+
+
+def points_error(views: Iterable[DepthView]) -> float:
+    """How far off observed points near the base may be, by pose and noise [m]: the most of all views."""
+    far = [(view, float(np.linalg.norm(view.T_base_camera[:3, 3]))) for view in views]
+    return max((float(pose_error(view, d)) + filtered(view).spread * d**2 for view, d in far), default=0.0)
+
+
+def grown_for_errors(spheres: Float[ndarray, "n 4"], view: DepthView, spread: float) -> Float[ndarray, "n 4"]:
+    """The arm's spheres, in the base frame, enlarged by the noise of depth where they are, and by what the
+    camera's pose may be off."""
+    T = view.T_base_camera
+    offset = spheres[:, :3] - T[:3, 3]
+    ahead = np.maximum(offset @ T[:3, 2], 0.0)
     grown = spheres.copy()
-    grown[:, 3] += MARGIN_SPREADS * spread * np.maximum(ahead, 0.0) ** 2
+    grown[:, 3] += MARGIN_SPREADS * spread * ahead**2 + pose_error(view, np.linalg.norm(offset, axis=1))
     return grown

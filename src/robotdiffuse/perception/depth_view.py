@@ -23,8 +23,10 @@ from robotdiffuse.scenes.shapes import PointCloud
 
 MIN_FOCAL_LENGTH = 1e-3
 """Minimum focal length [pixels]: smaller values underflow in float32, or are meaningless."""
-MIN_RETURNS = 1e-3
-"""Share of the pixels with a return below which an image measures nothing."""
+NEAREST = 0.05
+"""Nearer returns are of what covers the lens: they measure nothing [m]."""
+MAX_ANGLE = 0.5
+"""Largest deviation of a pose [rad]."""
 INTRINSICS = ("fx", "fy", "cx", "cy")
 # Maximum size of the image that is made of a point cloud; sparse clouds get coarser images [pixels].
 MAX_CLOUD_WIDTH = 320
@@ -54,6 +56,13 @@ class DepthView(Value):
     """The original points [m] of an image that was made of a cloud; the image keeps only the nearest ones."""
     source: dict[str, str | float] | None = None
     """The image's entry in problem files: `depth`, a file name, and its `scale`, or `cloud`, a file name."""
+    range: float | None = None
+    """Farthest surface that the sensor measures [m]. If it is given, large regions of 0 that reach the border
+    of the image mean that nothing is within it, unless the image is cut there; None: 0 says nothing."""
+    noise: "DepthNoise | None" = None
+    """Noise of the sensor, as `measure_noise` finds it; None: estimated from the image."""
+    pose_deviation: tuple[float, float] = (0.0, 0.0)
+    """By how much T_base_camera may be off, with the arm's own error: position [m] and angle [rad]."""
 
     def __post_init__(self) -> None:
         depth = numbers(self.depth)
@@ -68,6 +77,12 @@ class DepthView(Value):
         if configuration is not None:
             array = numbers(configuration)
             configuration = vector("view", "configuration", configuration, 1 if array is None else array.size)
+        deviation = vector("view", "pose_deviation", self.pose_deviation, 2)
+        if min(deviation) < 0 or deviation[1] > MAX_ANGLE or (self.range is not None and not self.range > 0):
+            raise InputError(
+                f"view.pose_deviation is {shown(self.pose_deviation)} and view.range {shown(self.range)}; they"
+                f" must be a position [m] and an angle of at most {MAX_ANGLE:g} [rad], and positive [m] or None"
+            )
         with np.errstate(over="ignore"):  # values beyond float32 become +inf
             depth = np.ascontiguousarray(depth, np.float32)
         for key, value in {
@@ -75,6 +90,7 @@ class DepthView(Value):
             "intrinsics": tuple(intrinsics.tolist()),
             "T_base_camera": rigid_transform("view.T_base_camera", self.T_base_camera),
             "configuration": configuration,
+            "pose_deviation": tuple(deviation.tolist()),
         }.items():
             object.__setattr__(self, key, value)
         super().__post_init__()
@@ -89,13 +105,10 @@ class DepthView(Value):
             configuration: ArrayLike | None = None,
             cloud: Points | None = None,
             source: dict[str, str | float] | None = None,
+            range: float | None = None,
+            noise: "DepthNoise | None" = None,
+            pose_deviation: ArrayLike = (0.0, 0.0),
         ) -> None: ...
-
-    @property
-    def is_blind(self) -> bool:
-        """Whether hardly a pixel has a return: the camera is covered, broken, or faces nothing."""
-        returns = np.isfinite(self.depth) & (self.depth > 0)
-        return bool(returns.mean() < MIN_RETURNS)
 
     def points(self) -> Points:
         """The points in the base frame [m]: those of the cloud, or one for each pixel with a return, row by
@@ -213,6 +226,11 @@ class DepthNoise(Settings, name="depth_noise"):
     """Neighbouring pixels whose depths differ by more than this are at an edge [m]."""
     grazing: Angle = 0.17
     """Surfaces at a smaller angle to the line of sight give no return [rad]."""
+    correlation: NotNegative = 0.0
+    """Distance at which the correlation of the errors of two pixels has fallen to exp(-1/2) [pixels]; recorded
+    sensors have 1 to 3."""
+    zeros: bool = False
+    """Whether pixels are 0, not infinite, where nothing is in range, as those of most sensors are."""
 
     def applied(self, view: DepthView, rng: Generator) -> DepthView:
         """The view with noise."""
@@ -229,10 +247,18 @@ class DepthNoise(Settings, name="depth_noise"):
             depth[flies] = clean[flies] + rng.random(int(flies.sum())) * step[flies]
             lost |= edge & (rng.random(clean.shape) < self.edge_missing)
         seen = np.isfinite(depth) & (depth > 0)
-        depth[seen] += self.spread * depth[seen] ** 2 * rng.standard_normal(int(seen.sum()))
+        errors = rng.standard_normal(depth.shape)
+        if self.correlation > 0:
+            from scipy.ndimage import gaussian_filter
+
+            errors = gaussian_filter(errors, self.correlation / np.sqrt(2), mode="wrap")
+            errors /= errors.std()
+        depth[seen] += self.spread * depth[seen] ** 2 * errors[seen]
         stray = seen & (rng.random(depth.shape) < self.stray)
         depth[stray] *= rng.random(int(stray.sum()))
         depth[lost | (rng.random(depth.shape) < self.missing)] = 0.0
+        if self.zeros:
+            depth[np.isinf(depth)] = 0.0
         return replace(view, depth=depth)
 
     def _grazed(self, view: DepthView) -> Bool[ndarray, "h w"]:

@@ -15,22 +15,25 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import Configuration
-from robotdiffuse.perception.depth_filter import filtered, grown_for_noise
-from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.depth_filter import filtered, grown_for_errors
+from robotdiffuse.perception.depth_view import NEAREST, DepthView
 from robotdiffuse.perception.ray_caster import in_camera, rectangle
 from robotdiffuse.perception.voxel_grid import COARSE, SHAPE, VoxelGrid
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 
 # States of a voxel in a view: not observed, entirely free, behind a surface, behind the arm, outside the
-# image.
+# image, on rays without a return.
 HIDDEN = 0
 FREE = 1
 BEHIND = 2
 SHADOW = 3
 OUT = 4
+LOST = 5
 NO_RETURN = np.float32(-1.0)
 """Depth of a pixel without a return."""
+EMPTY = np.float32(-2.0)
+"""The same where nothing seems to be in range."""
 MAX_DEPTH = np.float32(1e6)
 """Depth of a pixel without an obstacle in range, and of unknown pixels [m]."""
 POOLED_FOCAL_LENGTH = 250.0
@@ -52,18 +55,19 @@ PIXEL_SLACK, DEPTH_SLACK = np.float32(0.01), np.float32(1e-4)
 FASTMATH = {"contract", "reassoc", "arcp", "nsz"}
 """All fastmath flags except those that assume finite numbers."""
 _HALF, _ONE, _ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
+_NEAREST = np.float32(NEAREST)
 
 
 @kernel(fastmath=FASTMATH)
 def usable_depth(depth, focal):
-    """The depths, with MAX_DEPTH for rays without an obstacle and NO_RETURN for missing returns and flying
-    pixels."""
+    """The depths, with MAX_DEPTH for rays without an obstacle, NO_RETURN for missing returns and flying pixels,
+    and EMPTY for -inf."""
     h, w = depth.shape
     out = np.empty((h, w), np.float32)
     for v in range(h):
         for u in range(w):
             d = depth[v, u]
-            out[v, u] = min(d, MAX_DEPTH) if d > _ZERO else NO_RETURN
+            out[v, u] = min(d, MAX_DEPTH) if d >= _NEAREST else (EMPTY if d == -np.inf else NO_RETURN)
     flying = np.zeros((h, w), np.bool_)
     for v in range(1, h - 1):
         for u in range(1, w - 1):
@@ -102,6 +106,46 @@ def _arm_pixels(depth, intrinsics, spheres):
                 if dx * dx + dy * dy + dz * dz < r * r:
                     mask[v, u] = True
     return mask
+
+
+@kernel(fastmath=FASTMATH)
+def _hide_arm(depth, empty, intrinsics, spheres):
+    """Take back as empty the pixels whose rays meet one of the spheres, but for those around the camera."""
+    h, w = depth.shape
+    fx, fy, cx, cy = intrinsics
+    for s in range(len(spheres)):
+        x, y, z, r = spheres[s]
+        square = x * x + y * y + z * z - r * r
+        if square <= _ZERO:
+            continue
+        v0, v1, u0, u1 = rectangle(x, y, z, r, intrinsics, h, w)
+        for v in range(v0, v1 + 1):
+            b = (np.float32(v) - cy) / fy
+            for u in range(u0, u1 + 1):
+                a = (np.float32(u) - cx) / fx
+                along = a * x + b * y + z
+                if empty[v, u] and along > _ZERO and square * (a * a + b * b + _ONE) < along * along:
+                    depth[v, u] = NO_RETURN
+
+
+def usable_image(
+    view: DepthView, robot: Robot, q: Configuration, margin: float
+) -> tuple[Float32[ndarray, "h w"], float, Float32[ndarray, "n 4"]]:
+    """The view's filtered image, its noise, and the arm's spheres in the camera's frame, enlarged by the margin
+    [m], by noise and by what the camera's pose may be off.
+
+    Where nothing seems to be in range, the image is infinite if the view states its range and the arm is not
+    there, else -inf.
+    """
+    T, (depth, spread, empty) = view.T_base_camera, filtered(view)
+    spheres = grown_for_errors(placed_spheres(robot, q), view, spread)
+    spheres[:, :3] = (spheres[:, :3] - T[:3, 3]) @ T[:3, :3]
+    spheres[:, 3] += margin
+    spheres = spheres.astype(np.float32)
+    if empty is not None:
+        depth = np.where(empty, np.float32(-np.inf if view.range is None else np.inf), depth)
+        _hide_arm(depth, empty, np.array(view.intrinsics, np.float32), spheres)
+    return depth, spread, spheres
 
 
 @kernel(fastmath=FASTMATH)
@@ -208,12 +252,13 @@ def _count_points(depth, arm, intrinsics, T, low, voxel, counts):
 
 
 @kernel(fastmath=FASTMATH)
-def carve(depth, intrinsics, T, spheres, low, voxel, state, behind, counts):
+def carve(depth, intrinsics, T, spheres, low, voxel, errors, state, behind, counts):
     """Writes the state of each voxel [nx ny nz], its depth behind a surface [m], and its number of points.
 
     intrinsics: fx, fy, cx, cy; T: T_base_camera [4 4]; spheres: those of the arm in the camera's frame; low:
-    lower corner of the grid; counts: number of points in each voxel in excess of outliers. All arrays are
-    float32, except state, uint8, and counts, int32.
+    lower corner of the grid; errors: by how much free space is narrowed [m], at the camera and for each metre
+    from it, the noise of depth at 1 m, and the sensor's range; counts: number of points in each voxel in excess
+    of outliers. All arrays are float32, except state, uint8, and counts, int32.
     """
     nx, ny, nz = state.shape
     raw = usable_depth(depth, intrinsics[0])
@@ -228,7 +273,9 @@ def carve(depth, intrinsics, T, spheres, low, voxel, state, behind, counts):
             for k in range(0, nz, BLOCK):
                 first = (i, j, k)
                 end = (min(i + BLOCK, nx), min(j + BLOCK, ny), min(k + BLOCK, nz))
-                whole = _state_of_block(first, intrinsics, T, low, voxel, raw.shape, factor, table, missing)
+                whole = _state_of_block(
+                    first, intrinsics, T, low, voxel, errors, raw.shape, factor, table, missing
+                )
                 if whole >= 0:
                     state[i : end[0], j : end[1], k : end[2]] = whole
                     behind[i : end[0], j : end[1], k : end[2]] = _ZERO
@@ -242,6 +289,7 @@ def carve(depth, intrinsics, T, spheres, low, voxel, state, behind, counts):
                         T,
                         low,
                         voxel,
+                        errors,
                         factor,
                         table,
                         missing,
@@ -252,7 +300,7 @@ def carve(depth, intrinsics, T, spheres, low, voxel, state, behind, counts):
 
 
 @kernel(fastmath=FASTMATH)
-def _state_of_block(first, intrinsics, T, low, voxel, size, factor, table, missing):
+def _state_of_block(first, intrinsics, T, low, voxel, errors, size, factor, table, missing):
     """OUT or FREE if all voxels of a block are so, by the rectangle that it covers in the image, else -1.
 
     first: indices of its first voxel.
@@ -278,7 +326,9 @@ def _state_of_block(first, intrinsics, T, low, voxel, size, factor, table, missi
         du += abs(T[c, 0] - x * T[c, 2])
         dv += abs(T[c, 1] - y * T[c, 2])
     # no rectangle of a voxel, which is a little larger than the voxel in the image, reaches beyond this
-    wide = middle * voxel / near * (_ONE + ez / near)
+    more = errors[0] + errors[1] * far
+    wide = (middle * voxel + more) / near * (_ONE + ez / near)
+    far = far + more * ez / (_HALF * voxel) + errors[2] * far * far
     u = fx * x + cx
     v = fy * y + cy
     du = fx * wide * du + PIXEL_SLACK
@@ -300,12 +350,14 @@ def _state_of_block(first, intrinsics, T, low, voxel, size, factor, table, missi
         return -1
     if missing[v1 + 1, u1 + 1] - missing[v0, u1 + 1] - missing[v1 + 1, u0] + missing[v0, u0]:
         return -1
+    if far > errors[3]:
+        return -1
     return FREE if _rectangle_minimum(table, v0, v1, u0, u1) > far + DEPTH_SLACK else -1
 
 
 @kernel(fastmath=FASTMATH)
 def _carve_block(
-    first, end, raw, arm, intrinsics, T, low, voxel, factor, table, missing, state, behind, counts
+    first, end, raw, arm, intrinsics, T, low, voxel, errors, factor, table, missing, state, behind, counts
 ):
     """Does for the voxels of a block what `carve` does for all."""
     fx, fy, cx, cy = intrinsics
@@ -336,15 +388,18 @@ def _carve_block(
                     pixels = fx * fy * (voxel / z) ** 2
                     counts[i, j, k] = max(0, counts[i, j, k] - int(MIN_POINT_FRACTION * pixels))
                 front = raw[row, column]
+                nothing = front
                 if front > z + ez or front <= _ZERO:
+                    grown = half + errors[0] + errors[1] * z
+                    beyond = z + ez * grown / half + errors[2] * z * z
                     # half the width and height of the rectangle that the voxel covers in the image
                     du = _ZERO
                     dv = _ZERO
                     for c in range(3):
                         du += abs(T[c, 0] - x * T[c, 2])
                         dv += abs(T[c, 1] - y * T[c, 2])
-                    du = fx * half * du / (z - ez)
-                    dv = fy * half * dv / (z - ez)
+                    du = fx * grown * du / (z - ez)
+                    dv = fy * grown * dv / (z - ez)
                     u0 = int((u - du + _HALF) * share)
                     u1 = int((u + du + _HALF) * share)
                     v0 = int((v - dv + _HALF) * share)
@@ -357,11 +412,12 @@ def _carve_block(
                     lost = (
                         missing[v1 + 1, u1 + 1] - missing[v0, u1 + 1] - missing[v1 + 1, u0] + missing[v0, u0]
                     )
-                    pixels = np.float32((v1 + 1 - v0) * (u1 + 1 - u0) * factor * factor)
+                    pixels = np.float32((v1 + 1 - v0) * (u1 + 1 - u0) * factor * factor) * (half / grown) ** 2
                     nearest = _rectangle_minimum(table, v0, v1, u0, u1)
                     if (
                         inside
-                        and nearest > z + ez
+                        and nearest > beyond
+                        and beyond < errors[3]
                         and np.float32(lost) <= (_ONE - MIN_RETURN_FRACTION) * pixels
                     ):
                         state[i, j, k] = FREE
@@ -373,6 +429,8 @@ def _carve_block(
                 elif front < z:
                     state[i, j, k] = BEHIND
                     behind[i, j, k] = z - front
+                elif nothing == NO_RETURN:
+                    state[i, j, k] = LOST
 
 
 @kernel()
@@ -395,7 +453,7 @@ def add_evidence(state, counts, evidence, hit, miss, largest):
 
 ARM_MARGIN = 0.015
 """Points within this distance of the arm's covering spheres are points of the arm [m]; more with noise: see
-`grown_for_noise`."""
+`grown_for_errors`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -412,6 +470,8 @@ class ObservedVolume:
     """Outside all images."""
     behind: Float32[ndarray, "56 56 32"]
     """Depth behind an observed surface, the minimum over all views [m]; 0 if it is behind none."""
+    lost: Bool[ndarray, "56 56 32"]
+    """Unknown, on rays of some view that should have a return and have none."""
 
     @cached_property
     def unknown(self) -> Bool[ndarray, "56 56 32"]:
@@ -432,19 +492,20 @@ def observe(views: Sequence[DepthView], robot: Robot, start: Configuration) -> O
 
 def merged(volumes: Sequence[ObservedVolume]) -> ObservedVolume:
     """What several volumes tell together: a voxel is occupied, or else free, if any of them says so."""
-    occupied, free, shadow = (np.zeros(SHAPE, np.bool_) for _ in range(3))
+    occupied, free, shadow, lost = (np.zeros(SHAPE, np.bool_) for _ in range(4))
     out = np.ones(SHAPE, np.bool_)
     behind = np.full(SHAPE, np.inf, np.float32)
     for volume in volumes:
         occupied |= volume.occupied
         free |= volume.free
         shadow |= volume.shadow
+        lost |= volume.lost
         out &= volume.out_of_view
         np.copyto(behind, volume.behind, where=(volume.behind > 0) & (volume.behind < behind))
     free &= ~occupied
     known = free | occupied
     behind[~np.isfinite(behind) | known] = 0.0
-    return ObservedVolume(occupied, free, shadow & ~known, out, behind)
+    return ObservedVolume(occupied, free, shadow & ~known, out, behind, lost & ~known & (behind == 0))
 
 
 def _observed(view: DepthView, robot: Robot, start: Configuration) -> ObservedVolume:
@@ -455,9 +516,8 @@ def _observed(view: DepthView, robot: Robot, start: Configuration) -> ObservedVo
     state, depth, counts = carve_view(view, robot, q, ARM_MARGIN, COARSE)
     occupied = counts > 0
     depth[(state != BEHIND) | occupied] = 0.0
-    return ObservedVolume(
-        occupied, (state == FREE) & ~occupied, (state == SHADOW) & ~occupied, state == OUT, depth
-    )
+    free, shadow, out, lost = ((state == one) & ~occupied for one in (FREE, SHADOW, OUT, LOST))
+    return ObservedVolume(occupied, free, shadow, out, depth, lost)
 
 
 def carve_view(
@@ -473,19 +533,17 @@ def carve_view(
     q: the arm's configuration in the view. arm_margin: points within this distance of its covering spheres
     are points of the arm; more with noise [m].
     """
-    T, (depth, spread) = view.T_base_camera, filtered(view)
-    spheres = grown_for_noise(placed_spheres(robot, q), T, spread)
-    spheres[:, :3] = (spheres[:, :3] - T[:3, 3]) @ T[:3, :3]
-    spheres[:, 3] += arm_margin
+    depth, spread, spheres = usable_image(view, robot, q, arm_margin)
     state = np.empty(grid.shape, np.uint8)
     behind = np.empty(grid.shape, np.float32)
     counts = np.empty(grid.shape, np.int32)
     carve(
         depth,
         np.array(view.intrinsics, np.float32),
-        T.astype(np.float32),
-        spheres.astype(np.float32),
+        view.T_base_camera.astype(np.float32),
+        spheres,
         *grid.frame,
+        np.array([*view.pose_deviation, spread, MAX_DEPTH if view.range is None else view.range], np.float32),
         state,
         behind,
         counts,

@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.locked import locked
 from robotdiffuse.core.types import Configuration, Points
-from robotdiffuse.perception.depth_filter import filtered
+from robotdiffuse.perception.depth_filter import filtered, points_error
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import (
     ARM_MARGIN,
@@ -199,6 +199,11 @@ class ViewMemory:
     def views(self) -> list[DepthView]:
         """The kept views."""
         return [memory.view for memory in self._kept]
+
+    @property
+    def error(self) -> float:
+        """How far off observed points may be [m]."""
+        return points_error(self.views)
 
     def volume(self) -> ObservedVolume:
         """What the kept views together tell of each voxel of 4 cm."""

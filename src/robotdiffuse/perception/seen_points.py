@@ -10,8 +10,8 @@ from robotdiffuse.collision.kernels.collision_cost import scene_distance
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import Configuration, Configurations, Points
-from robotdiffuse.perception.depth_filter import filtered, grown_for_noise
-from robotdiffuse.perception.depth_view import DepthView, SeenPoints
+from robotdiffuse.perception.depth_filter import filtered, grown_for_errors, points_error
+from robotdiffuse.perception.depth_view import NEAREST, DepthView, SeenPoints
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -21,7 +21,7 @@ SAME_SURFACE_PIXELS, SAME_SURFACE_FRACTION = np.float32(4.0), np.float32(0.01)
 at that depth, or by less than this fraction of the depth."""
 MAX_DEPTH = np.float32(1e6)
 """Larger depths are no returns [m]."""
-_ZERO = np.float32(0.0)
+_NEAREST = np.float32(NEAREST)
 
 
 @kernel(nogil=True, inline="always")
@@ -173,7 +173,7 @@ def _place_row(around, b, fx, cx, T, reach, voxel, x, y, z, kept, cell):
             alike += np.int32(abs(row[u + 2] - d) < jump)
         x[u], y[u], z[u], cell[u] = px, py, pz, _key(px, py, pz, voxel)
         # the pixel itself is one of three
-        kept[u] = (alike > 2) & (d > _ZERO) & (d < MAX_DEPTH) & (px * px + py * py + pz * pz <= most)
+        kept[u] = (alike > 2) & (d >= _NEAREST) & (d < MAX_DEPTH) & (px * px + py * py + pz * pz <= most)
 
 
 @kernel(nogil=True)
@@ -260,7 +260,7 @@ MIN_POINT_RADIUS = 0.001
 """Radius of points that would otherwise collide at start or goal [m]."""
 ARM_DISTANCE = 0.02
 """Points within this distance of the arm, at its configuration in the view, are points of the arm [m]; more
-with noise: see `grown_for_noise`."""
+with noise: see `grown_for_errors`."""
 KNOWN_DISTANCE = 0.01
 """Points within this distance of a known shape are points of the shape [m]."""
 REACH_MARGIN = 0.3
@@ -289,8 +289,8 @@ def seen_points(
         count = 0
         for view in views:
             spheres = placed_spheres(robot, start if view.configuration is None else view.configuration)
-            depth, spread = filtered(view)
-            spheres = grown_for_noise(spheres, view.T_base_camera, spread)
+            depth, spread, _ = filtered(view)
+            spheres = grown_for_errors(spheres, view, spread)
             spheres = (spheres + np.array([0, 0, 0, ARM_DISTANCE])).astype(np.float32)
             rest = (
                 np.float32(reach_bound(robot) + REACH_MARGIN),
@@ -329,7 +329,7 @@ def seen_shapes(
     goals: Configurations,
 ) -> tuple[SeenPoints, ...]:
     """The points that views observed as obstacles; see `point_shapes`."""
-    return point_shapes(seen_points(views, robot, start), robot, known, start, goals)
+    return point_shapes(seen_points(views, robot, start), robot, known, start, goals, points_error(views))
 
 
 def point_shapes(
@@ -338,17 +338,32 @@ def point_shapes(
     known: Scene,
     start: Configuration,
     goals: Configurations,
+    error: float = 0.0,
 ) -> tuple[SeenPoints, ...]:
     """Observed points as obstacles, without those of known shapes.
 
-    Points get POINT_RADIUS, but those that the arm's spheres at start or goals would then touch get
-    MIN_POINT_RADIUS: this safety margin must not make a free start or goal invalid. Points within
-    KNOWN_DISTANCE of a known shape are left out.
+    Points get POINT_RADIUS and the error, but those that the arm's spheres at start or goals would then touch
+    get less, at least MIN_POINT_RADIUS: this safety margin must not make a free start or goal invalid. Points
+    that are no deeper than the error within the arm there, and those within KNOWN_DISTANCE of a known shape,
+    and the error, are left out.
+
+    error: how far off points may be [m], see `points_error`.
     """
     points = points.astype(np.float32)
     if known.shapes:
-        points = points[~near_scene(compile_scene_for(robot, known), points, np.float32(KNOWN_DISTANCE))]
+        points = points[
+            ~near_scene(compile_scene_for(robot, known), points, np.float32(KNOWN_DISTANCE + error))
+        ]
     ends = np.concatenate([placed_spheres(robot, q) for q in (start, *goals)]).astype(np.float32)
-    close = sphere_distances(points, ends) < POINT_RADIUS + MIN_POINT_RADIUS
-    parts = (~close, POINT_RADIUS, "seen"), (close, MIN_POINT_RADIUS, "seen_at_ends")
-    return tuple(SeenPoints(points[part], radius, name=name) for part, radius, name in parts if part.any())
+    distances = sphere_distances(points, ends)
+    left = (distances >= MIN_POINT_RADIUS) | (distances < -error) if error else np.ones(len(points), np.bool_)
+    shapes = list[SeenPoints]()
+    name = "seen"
+    for radius in dict.fromkeys(
+        (POINT_RADIUS + error, POINT_RADIUS + error / 2, POINT_RADIUS, MIN_POINT_RADIUS)
+    ):
+        part = left & (distances >= radius + MIN_POINT_RADIUS) if radius > MIN_POINT_RADIUS else left
+        left = left & ~part
+        shapes += [SeenPoints(points[part], radius, name=name)] if part.any() else []
+        name = "seen_at_ends"
+    return tuple(shapes)

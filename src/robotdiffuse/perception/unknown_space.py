@@ -245,22 +245,29 @@ class UnknownSpace:
         predicted: Probabilities | None,
         margin: float = CARVING_MARGIN,
         grid: VoxelGrid = FINE,
+        lost: Voxels | None = None,
     ) -> None:
         """
         occupied_by_arm: configurations at which the arm is known to be free: the start and the goals.
         unknown: the voxels of the grid that no view saw.
         predicted: the probability that each voxel is occupied; None without a prediction.
         margin: voxels nearer than this to the arm at those configurations count as occupied by it [m].
+        lost: the unknown voxels on rays without a return.
         """
         self._robot = robot
         self._grid = grid
-        self.unknown = unknown & ~grid.filled(robot, occupied_by_arm, margin)
+        self._lost = lost
+        self._elsewhere = ~grid.filled(robot, occupied_by_arm, margin)
+        self.unknown = unknown & self._elsewhere
         self.probability = None if predicted is None else np.where(self.unknown, predicted, np.float32(0))
 
     def crossed(self, path: Path) -> "CrossedSpace":
         """The unknown voxels that the arm passes through on a path."""
-        swept = self._grid.swept(self._robot, path)
-        return CrossedSpace(swept & self.unknown, self.probability, self._grid)
+        swept = self._grid.swept(self._robot, path) & self._elsewhere
+        crossed = swept & self.unknown
+        every = max(int(swept.sum()), 1)
+        lost = 0.0 if self._lost is None else float((crossed & self._lost).sum()) / every
+        return CrossedSpace(crossed, self.probability, self._grid, lost, float(crossed.sum()) / every)
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,6 +278,10 @@ class CrossedSpace:
     probability: Probabilities | None
     """That each voxel is occupied."""
     grid: VoxelGrid = FINE
+    lost_share: float = 0.0
+    """The part of all space that the motion passes through which lies on rays without a return."""
+    unseen_share: float = 0.0
+    """The part of it that no view saw."""
 
     @cached_property
     def risk(self) -> float | None:
@@ -304,6 +315,10 @@ RATES: dict[str, float] = {
 """Part of the motions under an assumption that were free in the true scene, without a prediction, as
 `python benchmarks/cameras.py --fit` prints it for the calibration half of its problems."""
 
+UNSEEN_CONFIDENCE = 0.5
+"""Most confidence of a motion of which views saw no more than ..."""
+MAX_UNSEEN_SHARE = 0.99
+"""... all but this part."""
 MAX_CONFIDENCE = 0.995
 """Of a motion that is free in every sampled world: the network and 256 worlds cannot tell more."""
 
@@ -312,10 +327,14 @@ def confidence(assumption: str, crossed: CrossedSpace) -> float:
     """The probability that a motion under an assumption is free in the true scene.
 
     It is the share of sampled worlds in which the motion is free; see `sampled_worlds`. Without a prediction,
-    it is the assumption's rate.
+    it is the assumption's rate. Either falls with the part of the motion of which rays should tell and do not,
+    whatever the network predicts there; where views saw nothing of it, it is no more than UNSEEN_CONFIDENCE.
     """
     share = crossed.free_share
-    return RATES[assumption] if share is None else min(share, MAX_CONFIDENCE)
+    stated = RATES[assumption] if share is None else min(share, MAX_CONFIDENCE)
+    if crossed.unseen_share > MAX_UNSEEN_SHARE:
+        stated = min(stated, UNSEEN_CONFIDENCE)
+    return stated * (1 - crossed.lost_share)
 
 
 EXPLORED = (4.05, -1.15)

@@ -116,13 +116,14 @@ _HALF, _ZERO = np.float32(0.5), np.float32(0.0)
 
 
 @kernel(nogil=True)
-def see_through(depth, intrinsics, T, balls, radius, noise, border, seen):
+def see_through(depth, intrinsics, T, balls, radius, errors, border, seen):
     """Mark the balls that an image sees through: their projection lies within the image, and all returns of
     its pixels are behind the ball; a few pixels may have none.
 
     depth: float32[h, w], infinite where nothing is in range, and not above 0 without a return; intrinsics fx,
-    fy, cx, cy; T [4, 4]: T_base_camera; balls [n, 3]: their centres, and their radius [m]; noise: how far
-    behind a ball a return must lie, at a distance of 1 m; it grows with the square of the distance [m];
+    fy, cx, cy; T [4, 4]: T_base_camera; balls [n, 3]: their centres, and their radius [m]; errors: by
+    how much a ball counts as larger at the camera and for each metre from it, and how far behind it a return
+    must lie at a distance of 1 m, which grows with the square of the distance [m];
     border: pixels around the projection that count too. All numbers are float32; seen bool[n].
     """
     raw = usable_depth(depth, intrinsics[0])
@@ -135,17 +136,18 @@ def see_through(depth, intrinsics, T, balls, radius, noise, border, seen):
         dy = balls[n, 1] - T[1, 3]
         dz = balls[n, 2] - T[2, 3]
         x, y, z = in_camera(T, dx, dy, dz)
-        near = z - radius
-        far = z + radius
+        grown = radius + errors[0] + errors[1] * z
+        near = z - grown
+        far = z + grown
         if near <= _ZERO:
             continue
-        u0 = np.floor(fx * (x - radius) / (near if x < radius else far) + cx) - border
-        u1 = np.ceil(fx * (x + radius) / (near if x > -radius else far) + cx) + border
-        v0 = np.floor(fy * (y - radius) / (near if y < radius else far) + cy) - border
-        v1 = np.ceil(fy * (y + radius) / (near if y > -radius else far) + cy) + border
+        u0 = np.floor(fx * (x - grown) / (near if x < grown else far) + cx) - border
+        u1 = np.ceil(fx * (x + grown) / (near if x > -grown else far) + cx) + border
+        v0 = np.floor(fy * (y - grown) / (near if y < grown else far) + cy) - border
+        v1 = np.ceil(fy * (y + grown) / (near if y > -grown else far) + cy) + border
         if u0 < _ZERO or v0 < _ZERO or u1 > np.float32(w - 1) or v1 > np.float32(h - 1):
             continue
-        behind = min(far + noise * far * far, MAX_DEPTH * _HALF)
+        behind = min(far + errors[2] * far * far, MAX_DEPTH * _HALF)
         seen[n] = _all_behind(raw, int(v0), int(v1), int(u0), int(u1), behind)
 
 

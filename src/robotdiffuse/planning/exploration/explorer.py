@@ -31,7 +31,7 @@ from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.occupancy_map import Corners, OccupancyMap, ViewMemory
 from robotdiffuse.perception.seen_points import point_shapes
 from robotdiffuse.perception.unknown_space import UnknownSpace, explored_confidence
-from robotdiffuse.perception.voxel_grid import LAYERS_BELOW, MAP, Probabilities, Voxels, surface
+from robotdiffuse.perception.voxel_grid import LAYERS_BELOW, MAP, Probabilities, Voxels, refined, surface
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.exploration.looks import ReachableTree, best_looks, first_parts, swept_unseen
@@ -173,7 +173,9 @@ class Explorer:
         if not len(self._views):
             return Step(LOOK, "nothing was seen yet: observe a view from here")
         goals = self._goal.positions if isinstance(self._goal, JointGoal) else q[None]
-        seen = point_shapes(self._views.points(self.map.free), self.robot, self.scene, q, goals)
+        seen = point_shapes(
+            self._views.points(self.map.free), self.robot, self.scene, q, goals, self._views.error
+        )
         scene = self.scene.with_shapes([*self.scene.shapes, *seen])
         problem = Problem(self.robot, scene, q, self._goal)
         self._seed += TENTATIVE_MOTIONS  # what one step's searches did not find, those of the next one may
@@ -439,13 +441,17 @@ class Explorer:
         if motion.path is None or predicted is None:
             return motion
         ends = motion.path.positions[[0, -1] if to_goal else [0]]
-        swept = self._unknown(ends, predicted).crossed(motion.path).risk
-        stated = None if swept is None or self.map.is_blind else explored_confidence(swept)
+        crossed = self._unknown(ends, predicted).crossed(motion.path)
+        swept = crossed.risk
+        stated = None
+        if swept is not None and not self.map.is_blind:
+            stated = explored_confidence(swept) * (1 - crossed.lost_share)
         return replace(motion, swept_probability=swept, confidence=stated)
 
     def _unknown(self, ends: Iterable[Configuration], predicted: Probabilities | None) -> UnknownSpace:
         """What the map does not know, without the voxels that the arm fills at these configurations."""
-        return UnknownSpace(self.robot, ends, self.map.unknown, predicted, 0.0, MAP)
+        lost = np.pad(refined(self._views.volume().lost), ((0, 0), (0, 0), (LAYERS_BELOW, 0)))
+        return UnknownSpace(self.robot, ends, self.map.unknown, predicted, 0.0, MAP, lost)
 
     def _planned(self, problem: Problem, limit: float, seed: int | None = None) -> PlanResult:
         """A first motion in the problem's scene as it is, found within a time limit [s]."""

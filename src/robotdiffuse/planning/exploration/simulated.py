@@ -15,7 +15,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Configuration, Configurations, Pose, Trajectory
 from robotdiffuse.perception.depth_view import DepthNoise, DepthView
-from robotdiffuse.perception.ray_caster import looking_at, ray_cast
+from robotdiffuse.perception.ray_caster import MAX_RANGE, looking_at, ray_cast
 from robotdiffuse.perception.seen_points import near_scene
 from robotdiffuse.perception.voxel_grid import Probabilities, Voxels
 from robotdiffuse.planning.exploration.explorer import Explorer
@@ -232,7 +232,7 @@ def taken(
 def measured(view: DepthView, reach: float, noise: DepthNoise | None, rng: np.random.Generator) -> DepthView:
     """An image as a sensor of a range gives it: without a return where it is too near, infinite beyond."""
     depth = np.where(view.depth > reach, np.inf, np.where(view.depth < MIN_DEPTH, 0.0, view.depth))
-    view = DepthView(depth, view.intrinsics, view.T_base_camera, view.configuration)
+    view = replace(view, depth=depth, range=reach if np.isfinite(reach) else MAX_RANGE)
     return view if noise is None else noise.applied(view, rng)
 
 

@@ -24,10 +24,12 @@ import numpy as np
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import FIRST, Configurations
+from robotdiffuse.core.types import FIRST, Configurations, Status
+from robotdiffuse.perception.depth_filter import measured_share
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
 from robotdiffuse.perception.observed_volume import ObservedVolume, observe
 from robotdiffuse.perception.unknown_space import (
+    MAX_UNSEEN_SHARE,
     Assumption,
     OccupiedVoxels,
     UnknownSpace,
@@ -61,7 +63,10 @@ MIN_TIME_FRACTION = 0.1
 PICTURE_THRESHOLD = 0.2
 """Pictures show voxels with a probability above this."""
 FREE_UNKNOWN_SPACE = "unknown space taken as free"
-BLIND = "views: hardly a pixel has a return, so nothing was measured and no confidence is stated"
+MIN_MEASURED_SHARE = 0.01
+"""No motion is planned on views none of which measures something at this part of its pixels."""
+NOTED_SHARE = 0.8
+"""A note names views that measure something at a smaller part."""
 AS_SEEN = "as seen"
 """Name of the assumption without additional obstacles."""
 
@@ -98,8 +103,16 @@ def plan_with_unknown_space(
         predicted = predict(volume) if predict is not None else predicted
         unknown = unknown_space_of(problem, volume, predicted)
     prepared = context.elapsed
-    if problem.views and all(view.is_blind for view in problem.views):
-        context.note(BLIND)
+    shares = [measured_share(view) for view in problem.views]
+    if shares and max(shares) < MIN_MEASURED_SHARE:
+        why = "the views measured nothing: hardly a pixel has a return; is the camera covered or broken?"
+        return _with_notes(context, context.fail(Status.NO_PATH, why))
+    for i, share in enumerate(shares):
+        if share < NOTED_SHARE:
+            context.note(
+                f"views[{i}]: {100 * (1 - share):.0f} % of the pixels measure nothing, which lowers the"
+                " confidence; if the sensor gives 0 where nothing is in range, state the view's range"
+            )
     attempts = _Attempts(solver, context, unknown)
     as_seen = replace(problem, views=())
     limit = request.time_limit
@@ -156,8 +169,6 @@ def _lesser(failed: list[str], used: str) -> str:
 
 def _with_notes(context: PlanningContext, result: PlanResult, *notes: str) -> PlanResult:
     """The result with the notes of the call, which an attempt does not have, and with more."""
-    if BLIND in context.notes:
-        result = replace(result, confidence=None)
     every = (*context.notes, *result.notes, *(note for note in notes if note))
     return replace(result, notes=tuple(dict.fromkeys(every)))
 
@@ -188,7 +199,9 @@ def unknown_space_of(
 ) -> UnknownSpace:
     """The space that no view of the problem saw, with its start and given goal configurations free."""
     goals = problem.goal.positions if isinstance(problem.goal, JointGoal) else ()
-    return UnknownSpace(problem.robot, (problem.start, *goals), refined(volume.unknown), predicted)
+    lost = refined(volume.lost)
+    ends = (problem.start, *goals)
+    return UnknownSpace(problem.robot, ends, refined(volume.unknown), predicted, lost=lost)
 
 
 def predicted_obstacles(problem: Problem) -> AssumedPoints:
@@ -285,8 +298,11 @@ class _Motion:
     @property
     def result(self) -> PlanResult:
         """The result with its assumption, its confidence and the unknown space that it crosses."""
+        result = self._result
+        if self._crossed.unseen_share > MAX_UNSEEN_SHARE:
+            result = replace(result, notes=(*result.notes, "the views see nothing of the motion's way"))
         return replace(
-            self._result,
+            result,
             assumption=self._assumption,
             confidence=self.confidence,
             swept_probability=self.risk,
