@@ -111,9 +111,9 @@ def test_images_without_noise_are_taken_as_they_are() -> None:
 
 def test_the_filter_takes_the_median_of_the_returns_and_adds_none() -> None:
     rng = np.random.default_rng(2)
-    depth = rng.uniform(1.0, 2.0, (60, 50)).astype(np.float32)
+    depth = rng.uniform(1.0, 2.0, (120, 100)).astype(np.float32)
     depth[rng.random(depth.shape) < 0.2] = 0.0
-    found = filtered(DepthView(depth, (40.0, 40.0, 25.0, 30.0), np.eye(4))).depth
+    found = filtered(DepthView(depth, (80.0, 80.0, 50.0, 60.0), np.eye(4))).depth
     for v, u in np.ndindex(depth.shape):
         around = depth[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2]
         returns = np.sort(around[around > 0])

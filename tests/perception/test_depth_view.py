@@ -10,7 +10,7 @@ from PIL import Image
 
 from robotdiffuse import DepthView, InputError, Scene
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_about, transform
-from robotdiffuse.perception.depth_view import SeenPoints
+from robotdiffuse.perception.depth_view import DepthNoise, SeenPoints
 from robotdiffuse.perception.depth_view_files import read_depth, read_views, view_entry
 from robotdiffuse.scenes.surface_points import sample_surface
 
@@ -100,9 +100,12 @@ def test_views_survive_their_files(tmp_path: Path) -> None:
         {"depth": "a.png", "scale": 0.002, "intrinsics": list(K), "camera": camera},
         {"cloud": "cloud.npy", "camera": camera, "configuration": [0.5, 1.0]},
     ]
+    entries[0] |= {"range": 4.0, "noise": {"spread": 0.006}, "pose_deviation": [0.005, 0.02]}
     views, _ = read_views(entries, tmp_path)
     assert np.allclose(views[0].depth, 3.0) and views[1].cloud is not None
     written = [view_entry(view, tmp_path) for view in views]
+    assert written[0].items() >= {"range": 4.0, "pose_deviation": [0.005, 0.02]}.items()
+    assert read_views(written, tmp_path)[0][0].noise == DepthNoise(spread=0.006)
     assert [w["depth" if "depth" in w else "cloud"] for w in written] == ["a.png", "cloud.npy"]
     inline = [DepthView(views[0].depth, K, T), DepthView.from_cloud(points, T)]
     for view in (

@@ -5,7 +5,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Int32
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
@@ -50,11 +50,12 @@ def median_filter(depth):
 PATCH = 20
 """Edge of the patches that noise is estimated on [pixels]: a few times the length over which the errors of
 recorded sensors go together."""
+# Fewest patches that tell, and most that are used, spread over the image.
+MIN_PATCHES = 12
 MAX_PATCHES = 100
-"""Most patches, spread over the image."""
 MIN_PATCH_RETURNS = 0.7
 """Patches with a smaller part of returns tell nothing."""
-FLAT_SHARE = 0.35
+FLAT_SHARE = 0.3
 """The noise is that of the patch with this share of the patches below it: others hold edges and objects."""
 FIT_ROUNDS = 3
 """Rounds of the fit of a plane, without pixels farther from it than OUTLIER_SPREADS after the first."""
@@ -74,8 +75,8 @@ class FilteredDepth(NamedTuple):
     depth: Float32[ndarray, "h w"]
     """Distance along the optical axis, as in DepthView [m]."""
     spread: float
-    """Standard deviation of a filtered pixel's depth at a distance of 1 m [m]; it grows with the square of the
-    distance."""
+    """Standard deviation of a filtered pixel's depth at a distance of 1 m [m]; it grows with the square of
+    the distance."""
     empty: Bool[ndarray, "h w"] | None = None
     """Pixels of 0 that seem to have nothing in range; None: there are none."""
 
@@ -114,7 +115,7 @@ def patch_noise(depth: Float32[ndarray, "h w"]) -> tuple[float, float]:
     patches = cut.reshape(rows * columns, PATCH**2)
     seen = np.isfinite(patches) & (patches > 0)
     usable = np.flatnonzero(seen.mean(axis=1) >= MIN_PATCH_RETURNS)
-    if not len(usable):
+    if len(usable) < MIN_PATCHES:
         return 0.0, 0.0
     usable = usable[:: -(-len(usable) // MAX_PATCHES)]
     seen = seen[usable]
@@ -141,8 +142,8 @@ def patch_noise(depth: Float32[ndarray, "h w"]) -> tuple[float, float]:
 
 
 EMPTY_EDGE = 6
-"""Regions of 0 count as empty where they are at least so wide and high [two pixels]: dropouts at edges, and of
-surfaces at a small angle, are thinner."""
+"""Regions of 0 count as empty where they are at least so wide and high [two pixels]: dropouts at edges, and
+of surfaces at a small angle, are thinner."""
 CUT_SHARE = 0.25
 """Returns that end along one row, or column, over this part of the image are cut off: the edges of things
 are hardly ever so straight."""
@@ -168,29 +169,36 @@ def empty_regions(depth: Float32[ndarray, "h w"], reach: float | None = None) ->
     from scipy.ndimage import binary_dilation, label, maximum_filter, minimum_filter
 
     core = minimum_filter(lost.view(np.uint8), EMPTY_EDGE, mode="nearest")
-    wide = (maximum_filter(core, EMPTY_EDGE, mode="nearest", origin=-1) > 0) & lost
+    wide = np.asarray(maximum_filter(core, EMPTY_EDGE, mode="nearest", origin=-1) > 0) & lost
     near = ~lost & (depth[::2, ::2] < AT_RANGE * (np.inf if reach is None else reach))
     kinds = wide + 2 * near
     for across in (kinds, kinds.T):
         if (across[:-1] + across[1:] == 3).mean(axis=1).max(initial=0.0) > CUT_SHARE:
             return None
-    parts, count = label(wide)
-    inside = np.zeros(count + 1, np.bool_)
+    parts: Int32[ndarray, "h w"] = label(wide)[0]  # type: ignore[assignment,index]
+    inside = np.zeros(int(parts.max()) + 1, np.bool_)
     for border in (parts[0], parts[-1], parts[:, 0], parts[:, -1]):
         inside[border] = True
     inside[0] = False
     for part in np.flatnonzero(inside):
         of_part = parts == part
-        around = depth[::2, ::2][binary_dilation(of_part) & ~lost]
+        around = depth[::2, ::2][np.logical_and(binary_dilation(of_part), ~lost)]
         inside[part] = (around < TOO_NEAR).mean() < NEAR_SHARE if len(around) else False
     height, width = depth.shape
     return inside[parts].repeat(2, 0).repeat(2, 1)[:height, :width] & every if inside.any() else None
 
 
+MIN_RETURN_SHARE = 1e-3
+"""Images with a smaller part of returns measure nothing: the camera is covered, broken, or faces nothing."""
+
+
 def measured_share(view: DepthView) -> float:
-    """The part of an image's pixels that measure something: a surface, or that nothing is in range."""
+    """The part of an image's pixels that measure something: a surface, or that nothing is in range. 0 if there
+    is hardly a surface."""
     depth, _, empty = filtered(view)
     told = depth >= NEAREST
+    if (told & np.isfinite(depth)).mean() < MIN_RETURN_SHARE:
+        return 0.0
     return float((told if empty is None or view.range is None else told | empty).mean())
 
 
@@ -212,7 +220,7 @@ def measure_noise(images: Sequence[ArrayLike]) -> DepthNoise:
         raise InputError(f"images has {len(arrays)} images; at least two of the same size are needed")
     stack = np.stack(arrays)
     seen = np.isfinite(stack) & (stack > 0)
-    always = seen.all(axis=0)
+    always = np.equal(seen.sum(axis=0), len(stack))
     if not always.any():
         raise InputError("images: no pixel has a return in all of them")
     inverse = np.divide(1.0, stack, out=np.zeros(stack.shape), where=seen)
@@ -227,8 +235,8 @@ def measure_noise(images: Sequence[ArrayLike]) -> DepthNoise:
     spread, neighbours = max((over_time, float(correlated)), *still)
     neighbours = min(neighbours, 0.98)
     length = 1 / np.sqrt(-2 * np.log(neighbours)) if neighbours > np.exp(-2) else 0.0
-    ever = seen.any(axis=0)
-    return DepthNoise(spread=spread, missing=float(1 - seen[:, ever].mean()), correlation=float(length))
+    missing = 1 - seen.sum() / max(len(stack) * int((seen.sum(axis=0) > 0).sum()), 1)
+    return DepthNoise(spread=spread, missing=float(missing), correlation=float(length))
 
 
 def pose_error(view: DepthView, distance: ArrayLike) -> Values:

@@ -80,8 +80,8 @@ class DepthView(Value):
         deviation = vector("view", "pose_deviation", self.pose_deviation, 2)
         if min(deviation) < 0 or deviation[1] > MAX_ANGLE or (self.range is not None and not self.range > 0):
             raise InputError(
-                f"view.pose_deviation is {shown(self.pose_deviation)} and view.range {shown(self.range)}; they"
-                f" must be a position [m] and an angle of at most {MAX_ANGLE:g} [rad], and positive [m] or None"
+                f"view.pose_deviation is {shown(self.pose_deviation)} and view.range {shown(self.range)};"
+                f" it must be a position [m] and an angle up to {MAX_ANGLE:g} [rad]; a range [m], positive"
             )
         with np.errstate(over="ignore"):  # values beyond float32 become +inf
             depth = np.ascontiguousarray(depth, np.float32)
@@ -227,8 +227,8 @@ class DepthNoise(Settings, name="depth_noise"):
     grazing: Angle = 0.17
     """Surfaces at a smaller angle to the line of sight give no return [rad]."""
     correlation: NotNegative = 0.0
-    """Distance at which the correlation of the errors of two pixels has fallen to exp(-1/2) [pixels]; recorded
-    sensors have 1 to 3."""
+    """Distance at which the correlation of the errors of two pixels has fallen to exp(-1/2) [pixels];
+    recorded sensors have 1 to 3."""
     zeros: bool = False
     """Whether pixels are 0, not infinite, where nothing is in range, as those of most sensors are."""
 

@@ -2,9 +2,12 @@
 
 - {depth: shelf.png, scale: 0.001, intrinsics: [fx, fy, cx, cy], camera: {xyz: [...], wxyz: [...]}}
 - {cloud: shelf.ply, camera: {...}, configuration: [...]}
+
+Further fields are range, noise and pose_deviation, as of DepthView.
 """
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +20,7 @@ from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
 from robotdiffuse.core.input_files import input_file, read_arrays
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
 from robotdiffuse.core.types import Points
-from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.depth_view import DepthNoise, DepthView
 from robotdiffuse.scenes.files import check_fields, name_from
 from robotdiffuse.scenes.point_cloud import read_points
 
@@ -134,7 +137,11 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
     source: dict[str, str | float] | None = None
     cloud = isinstance(entry, dict) and "cloud" in entry
     required = ("cloud", "camera") if cloud else ("depth", "intrinsics", "camera")
-    values = check_fields(where, entry, required, ("configuration",) if cloud else ("scale", "configuration"))
+    optional = ("configuration", "pose_deviation", *(() if cloud else ("scale", "range", "noise")))
+    values = check_fields(where, entry, required, optional)
+    given = {name: values[name] for name in ("range", "pose_deviation") if values.get(name) is not None}
+    if values.get("noise") is not None:
+        given["noise"] = DepthNoise.from_json(values["noise"], f"{where}.noise")
     camera = check_fields(f"{where}.camera", values["camera"], ("xyz", "wxyz"))
     rotation = rotation_from_quaternion(unit_quaternion("camera", camera["wxyz"]))
     T_base_camera = transform(vector("camera", "xyz", camera["xyz"], 3), rotation)
@@ -148,7 +155,8 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
             points, new_notes = read_points(file)
             notes.extend(new_notes)
             source = {"cloud": file}
-        return DepthView.from_cloud(_rows(where, points), T_base_camera, configuration, source)
+        view = DepthView.from_cloud(_rows(where, points), T_base_camera, configuration, source)
+        return replace(view, **given)
     image = values["depth"]
     scale = positive("view", "scale", values["scale"]) if "scale" in values else None
     if isinstance(image, str):
@@ -159,7 +167,7 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
         raise InputError(
             "view.scale cannot be combined with an image in the problem file, which is in meters"
         )
-    return DepthView(image, values["intrinsics"], T_base_camera, configuration, source=source)
+    return DepthView(image, values["intrinsics"], T_base_camera, configuration, source=source, **given)
 
 
 def _rows(where: str, points: Any) -> Points:
@@ -189,4 +197,10 @@ def view_entry(view: DepthView, folder: Path | None) -> dict[str, Any]:
     entry["camera"] = pose_entry(view.T_base_camera)
     if view.configuration is not None:
         entry["configuration"] = view.configuration.tolist()
+    if any(view.pose_deviation):
+        entry["pose_deviation"] = list(view.pose_deviation)
+    if view.range is not None:
+        entry["range"] = view.range
+    if view.noise is not None:
+        entry["noise"] = view.noise.to_json()
     return entry

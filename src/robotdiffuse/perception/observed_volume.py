@@ -60,8 +60,8 @@ _NEAREST = np.float32(NEAREST)
 
 @kernel(fastmath=FASTMATH)
 def usable_depth(depth, focal):
-    """The depths, with MAX_DEPTH for rays without an obstacle, NO_RETURN for missing returns and flying pixels,
-    and EMPTY for -inf."""
+    """The depths, with MAX_DEPTH for rays without an obstacle, NO_RETURN for missing returns and flying
+    pixels, and EMPTY for -inf."""
     h, w = depth.shape
     out = np.empty((h, w), np.float32)
     for v in range(h):
@@ -131,8 +131,8 @@ def _hide_arm(depth, empty, intrinsics, spheres):
 def usable_image(
     view: DepthView, robot: Robot, q: Configuration, margin: float
 ) -> tuple[Float32[ndarray, "h w"], float, Float32[ndarray, "n 4"]]:
-    """The view's filtered image, its noise, and the arm's spheres in the camera's frame, enlarged by the margin
-    [m], by noise and by what the camera's pose may be off.
+    """The view's filtered image, its noise, and the arm's spheres in the camera's frame, enlarged by the
+    margin [m], by noise and by what the camera's pose may be off.
 
     Where nothing seems to be in range, the image is infinite if the view states its range and the arm is not
     there, else -inf.
@@ -257,8 +257,8 @@ def carve(depth, intrinsics, T, spheres, low, voxel, errors, state, behind, coun
 
     intrinsics: fx, fy, cx, cy; T: T_base_camera [4 4]; spheres: those of the arm in the camera's frame; low:
     lower corner of the grid; errors: by how much free space is narrowed [m], at the camera and for each metre
-    from it, the noise of depth at 1 m, and the sensor's range; counts: number of points in each voxel in excess
-    of outliers. All arrays are float32, except state, uint8, and counts, int32.
+    from it, the noise of depth at 1 m, and the sensor's range; counts: number of points in each voxel in
+    excess of outliers. All arrays are float32, except state, uint8, and counts, int32.
     """
     nx, ny, nz = state.shape
     raw = usable_depth(depth, intrinsics[0])
@@ -516,8 +516,8 @@ def _observed(view: DepthView, robot: Robot, start: Configuration) -> ObservedVo
     state, depth, counts = carve_view(view, robot, q, ARM_MARGIN, COARSE)
     occupied = counts > 0
     depth[(state != BEHIND) | occupied] = 0.0
-    free, shadow, out, lost = ((state == one) & ~occupied for one in (FREE, SHADOW, OUT, LOST))
-    return ObservedVolume(occupied, free, shadow, out, depth, lost)
+    free, shadow, lost = ((state == one) & ~occupied for one in (FREE, SHADOW, LOST))
+    return ObservedVolume(occupied, free, shadow, state == OUT, depth, lost)
 
 
 def carve_view(

@@ -327,8 +327,8 @@ def confidence(assumption: str, crossed: CrossedSpace) -> float:
     """The probability that a motion under an assumption is free in the true scene.
 
     It is the share of sampled worlds in which the motion is free; see `sampled_worlds`. Without a prediction,
-    it is the assumption's rate. Either falls with the part of the motion of which rays should tell and do not,
-    whatever the network predicts there; where views saw nothing of it, it is no more than UNSEEN_CONFIDENCE.
+    it is the assumption's rate. Either falls with the part of the motion of which rays should tell and do
+    not, whatever the network predicts there; where views saw nothing of it, it is at most UNSEEN_CONFIDENCE.
     """
     share = crossed.free_share
     stated = RATES[assumption] if share is None else min(share, MAX_CONFIDENCE)
