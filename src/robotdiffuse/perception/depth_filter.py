@@ -193,8 +193,8 @@ MIN_RETURN_SHARE = 1e-3
 
 
 def measured_share(view: DepthView) -> float:
-    """The part of an image's pixels that measure something: a surface, or that nothing is in range. 0 if there
-    is hardly a surface."""
+    """The part of an image's pixels that measure something: a surface, or that nothing is in range. 0 if
+    there is hardly a surface."""
     depth, _, empty = filtered(view)
     told = depth >= NEAREST
     if (told & np.isfinite(depth)).mean() < MIN_RETURN_SHARE:
