@@ -47,7 +47,7 @@ START = np.array([-0.9, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 GOAL = np.array([0.9, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 DEEP = rd.Scene([rd.Box([0.55, 0.0, 0.3], [0.5, 0.2, 0.6])])
 """A deep box in front of the arm; a camera ahead sees only its front."""
-FLOOR = Box([0.0, 0.0, -0.1], [8.0, 8.0, 0.1])
+FLOOR = rd.Box([0.0, 0.0, -0.1], [8.0, 8.0, 0.1])
 AHEAD = looking_at(np.array([1.7, 0.0, 0.3]), np.array([0.0, 0.0, 0.3]))
 REQUEST = PlanRequest(4.0)
 
@@ -169,7 +169,7 @@ def test_images_without_returns_are_refused(planner: Planner, unknown: str, dept
     """A covered lens got a confidence of 0.995, and no note."""
     covered = replace(taken(DEEP), depth=np.full((60, 80), depth))
     result = plan_with_unknown_space(planner, partial(unknown, covered), REQUEST)
-    assert result.status is Status.NO_PATH and result.confidence is None
+    assert result.status is rd.Status.NO_PATH and result.confidence is None
     assert "measured nothing" in result.reason
 
 
@@ -213,7 +213,7 @@ def test_a_fallback_to_another_assumption_is_a_note(planner: Planner) -> None:
 
 def test_confidence_falls_with_what_rays_do_not_tell(planner: Planner) -> None:
     """With half an image lost 0.88 was stated, and 28 % were free."""
-    view = taken(Scene([FLOOR]))
+    view = taken(rd.Scene([FLOOR]))
     lost = view.depth.copy()
     lost[:, :100] = 0.0
     whole, half = (
@@ -223,7 +223,7 @@ def test_confidence_falls_with_what_rays_do_not_tell(planner: Planner) -> None:
     assert whole.confidence is not None and half.confidence is not None
     assert half.confidence < 0.6 * whole.confidence
     assert any("of the pixels measure nothing" in note for note in half.notes)
-    away = taken(Scene([FLOOR]), looking_at(np.array([1.7, 0.0, 0.3]), np.array([3.0, 0.0, 0.0])))
+    away = taken(rd.Scene([FLOOR]), looking_at(np.array([1.7, 0.0, 0.3]), np.array([3.0, 0.0, 0.0])))
     blind = plan_with_unknown_space(planner, partial("optimistic", away), REQUEST)
     assert blind.confidence is not None and blind.confidence <= 0.5
     assert any("see nothing of the motion's way" in note for note in blind.notes)
