@@ -99,11 +99,13 @@ def add_bench(commands: argparse._SubParsersAction) -> None:
 def run_run(arguments: argparse.Namespace) -> int:
     from robotdiffuse.evaluation.bench import run_bench
 
-    made = 0
+    calls_made = 0
     for settings in _bench_settings(arguments):
-        with calls_shown(settings) as (report, done):
-            made += run_bench(settings, report, done)
-    print(f"{made} calls made; for tables, plots and replays: robotdiffuse bench report {arguments.out}")
+        with calls_shown(settings) as (report, on_progress):
+            calls_made += run_bench(settings, report, on_progress)
+    print(
+        f"{calls_made} calls made; for tables, plots and replays: robotdiffuse bench report {arguments.out}"
+    )
     return 0
 
 
@@ -138,9 +140,9 @@ def _bench_settings(arguments: argparse.Namespace) -> "list[BenchSettings]":
     problems = () if arguments.problems is None else tuple(arguments.problems.split(","))
     if arguments.preset is not None:
         fixed = ("planners", "time_limit", "seeds", "equal_time")
-        given = [f"--{name.replace('_', '-')}" for name in fixed if getattr(arguments, name)]
-        if given:
-            raise InputError(f"--preset cannot be combined with {', '.join(given)}: the preset fixes these")
+        options = [f"--{name.replace('_', '-')}" for name in fixed if getattr(arguments, name)]
+        if options:
+            raise InputError(f"--preset cannot be combined with {', '.join(options)}: the preset fixes these")
         return preset_settings(arguments.preset, out, problems, arguments.count, workers, arguments.cluster)
     if arguments.planners is None or arguments.problems is None:
         raise InputError("name --planners and --problems, or a --preset")
@@ -188,15 +190,15 @@ def _write_replays(bench: "Bench", parts: "list[Section]", file: "Path") -> str 
     from robotdiffuse.evaluation.bench_report import motions_to_replay
     from robotdiffuse.visualization.gallery import GalleryEntry, write_gallery
 
-    shown = motions_to_replay(bench, parts)
-    if not shown:
+    motions = motions_to_replay(bench, parts)
+    if not motions:
         return None
-    robot = shown[0].case.problem.robot
+    robot = motions[0].case.problem.robot
     entries = [
         GalleryEntry(
             motion.title, motion.caption, problem.scene, Waypoints(robot.joint_names, motion.positions)
         )
-        for motion in shown
+        for motion in motions
         if (problem := motion.case.problem).robot.name == robot.name
     ]
     write_gallery(robot, entries, file, "Motions")
@@ -217,11 +219,11 @@ def run_confirm(arguments: argparse.Namespace) -> int:
     from robotdiffuse.evaluation.checks import confirm
 
     with progress("checking problems") as update:
-        found = confirm(Path(arguments.folder), arguments.count, update)
-    refuted = [record.planner for record, _ in found.refuted]
-    rows = [(planner, checked, refuted.count(planner)) for planner, checked in found.checked.items()]
+        confirmation = confirm(Path(arguments.folder), arguments.count, update)
+    refuted = [record.planner for record, _ in confirmation.refuted]
+    rows = [(planner, checked, refuted.count(planner)) for planner, checked in confirmation.checked.items()]
     show(Table.of("", ("planner", "motions", "in collision (PyBullet)"), rows))
-    for record, contact in found.refuted:
+    for record, contact in confirmation.refuted:
         print(
             f"{record.planner}, {record.problem_set} {record.name}, seed {record.seed}: {contact.link} and "
             f"{contact.other}, {-1000 * contact.distance:.1f} mm deep"
@@ -326,8 +328,8 @@ def _table1(arguments: argparse.Namespace) -> "tuple[Table1Settings, Bench]":
         workers=arguments.workers or max(1, (os.cpu_count() or 1) // 2),
         cluster=arguments.cluster,
     )
-    with calls_shown(settings.bench) as (report, done):
-        return settings, run_table1(settings, report, done)
+    with calls_shown(settings.bench) as (report, on_progress):
+        return settings, run_table1(settings, report, on_progress)
 
 
 def run_table2(arguments: argparse.Namespace) -> int:
@@ -339,9 +341,11 @@ def run_table2(arguments: argparse.Namespace) -> int:
     need_packages("the ablation", "torch")
     from robotdiffuse.evaluation.ablation import ROWS, AblationSettings, run_ablation, table2
 
-    known = {field.name for field in fields(AblationSettings)}
-    given = {name: value for name, value in vars(arguments).items() if name in known and value is not None}
-    settings = AblationSettings(**given)
+    field_names = {field.name for field in fields(AblationSettings)}
+    options = {
+        name: value for name, value in vars(arguments).items() if name in field_names and value is not None
+    }
+    settings = AblationSettings(**options)
     rows = list(ROWS) if arguments.rows is None else arguments.rows.split(",")
     results = run_ablation(
         settings, rows, arguments.workers, lambda text: print(text, file=sys.stderr, flush=True)

@@ -175,8 +175,8 @@ def _add_device(parser: argparse.ArgumentParser) -> None:
 
 def _given(arguments: argparse.Namespace, names: tuple[str, ...]) -> dict[str, object]:
     """The options that were given; the others keep the defaults of the settings."""
-    given: dict[str, object] = {name: getattr(arguments, name) for name in names}
-    return {name: value for name, value in given.items() if value is not None}
+    options: dict[str, object] = {name: getattr(arguments, name) for name in names}
+    return {name: value for name, value in options.items() if value is not None}
 
 
 def run_encoder(arguments: argparse.Namespace) -> int:
@@ -184,10 +184,10 @@ def run_encoder(arguments: argparse.Namespace) -> int:
     from robotdiffuse.learning.training.config import EncoderTraining
     from robotdiffuse.learning.training.tasks import train_encoder
 
-    given = _given(arguments, ("name", "scenes", "device", *TRAINING_OPTIONS))
-    if "samples" in given:
-        given["minutes"] = None
-    settings = EncoderTraining(**given)  # type: ignore[arg-type]
+    options = _given(arguments, ("name", "scenes", "device", *TRAINING_OPTIONS))
+    if "samples" in options:
+        options["minutes"] = None
+    settings = EncoderTraining(**options)  # type: ignore[arg-type]
     _print_report(train_encoder(settings, arguments.out), arguments.out)
     return 0
 
@@ -196,10 +196,10 @@ def run_completion(arguments: argparse.Namespace) -> int:
     need_packages("training", "torch")
     from robotdiffuse.learning.training.completion import CompletionTraining, train_completion
 
-    given = _given(arguments, ("families", "robot", "workers", "weights", "device", *TRAINING_OPTIONS))
-    if "minutes" in given:
-        given["samples"] = None
-    settings = CompletionTraining(**given)  # type: ignore[arg-type]
+    options = _given(arguments, ("families", "robot", "workers", "weights", "device", *TRAINING_OPTIONS))
+    if "minutes" in options:
+        options["samples"] = None
+    settings = CompletionTraining(**options)  # type: ignore[arg-type]
     _print_report(train_completion(settings, arguments.out), arguments.out)
     return 0
 
@@ -211,34 +211,34 @@ def run_planner(arguments: argparse.Namespace) -> int:
     from robotdiffuse.learning.training.tasks import train_planner
 
     if arguments.config not in CONFIGS:
-        known = [f"{name}: {config.description}" for name, config in CONFIGS.items()]
-        raise InputError(f"unknown config {shown(arguments.config)}; known:", known)
-    given = _given(arguments, ("data", "encoder", "robot", "device", *TRAINING_OPTIONS, *MODEL_OPTIONS))
+        descriptions = [f"{name}: {config.description}" for name, config in CONFIGS.items()]
+        raise InputError(f"unknown config {shown(arguments.config)}; known:", descriptions)
+    options = _given(arguments, ("data", "encoder", "robot", "device", *TRAINING_OPTIONS, *MODEL_OPTIONS))
     config = CONFIGS[arguments.config].changes
-    if "denoiser" in given and config.get("denoiser_settings") is not None:
+    if "denoiser" in options and config.get("denoiser_settings") is not None:
         # the config's settings are for its own denoiser; another one gets settings of the same size
-        given["denoiser_settings"] = DENOISERS.defaults(arguments.denoiser).paper_size()
-    if {"denoiser", "objective", "waypoints"} & set(given):
-        given["progressive"] = False  # the stages are for the config's own parts
+        options["denoiser_settings"] = DENOISERS.defaults(arguments.denoiser).paper_size()
+    if {"denoiser", "objective", "waypoints"} & set(options):
+        options["progressive"] = False  # the stages are for the config's own parts
     if "encoder" in config:
-        given.setdefault("encoder", config["encoder"])
-    if arguments.config == "paper" and "encoder" not in given:
+        options.setdefault("encoder", config["encoder"])
+    if arguments.config == "paper" and "encoder" not in options:
         raise InputError(
             "--config paper needs --encoder: a folder of "
             "`robotdiffuse train encoder --encoder compression_autoencoder --scenes rop`, the paper's encoder"
         )
     if arguments.data is None:
-        return _run_for_robot(arguments, given)
+        return _run_for_robot(arguments, options)
     if arguments.out is None:
         raise InputError("--data needs --out, a folder for the weights")
     for name in ("trajectories", "workers"):
         if getattr(arguments, name) is not None:
             raise InputError(f"--{name} is for data to be generated; --data names existing data")
     # several processes would write it at once
-    bundled = "encoder" not in given and int(os.environ.get("WORLD_SIZE", "1")) == 1
+    bundled = "encoder" not in options and int(os.environ.get("WORLD_SIZE", "1")) == 1
     if bundled:
-        given["encoder"] = str(Path(arguments.out) / "encoder")
-    settings = planner_training(arguments.config, given)
+        options["encoder"] = str(Path(arguments.out) / "encoder")
+    settings = planner_training(arguments.config, options)
     if bundled:
         copy_bundled_encoder(Path(arguments.out) / "encoder")
     _print_report(train_planner(settings, arguments.out), arguments.out)
@@ -250,7 +250,7 @@ def _run_for_robot(arguments: argparse.Namespace, given: dict[str, Any]) -> int:
 
     if arguments.robot is None:
         raise InputError("give --robot to generate data for an arm, or --data to use existing data")
-    report, kept = train_for_robot(
+    report, weights = train_for_robot(
         arguments.robot,
         given,
         partial(planner_training, arguments.config),
@@ -258,7 +258,7 @@ def _run_for_robot(arguments: argparse.Namespace, given: dict[str, Any]) -> int:
         arguments.trajectories,
         arguments.workers,
     )
-    _print_report(report, str(kept))
+    _print_report(report, str(weights))
     return 0
 
 
@@ -267,11 +267,11 @@ def run_baseline(arguments: argparse.Namespace) -> int:
     from robotdiffuse.learning.training.config import planner_training
     from robotdiffuse.learning.training.tasks import baseline_training, train_baseline, train_planner
 
-    given = _given(arguments, ("data", "robot", *TRAINING_OPTIONS))
+    options = _given(arguments, ("data", "robot", *TRAINING_OPTIONS))
     if arguments.name == "trajectory_prior":
-        report = train_planner(planner_training(arguments.name, given), arguments.out)
+        report = train_planner(planner_training(arguments.name, options), arguments.out)
     else:
-        report = train_baseline(baseline_training(arguments.name, given), arguments.out)
+        report = train_baseline(baseline_training(arguments.name, options), arguments.out)
     _print_report(report, arguments.out)
     return 0
 
@@ -357,8 +357,8 @@ def train_for_robot(
         raise InputError("torchrun only trains: generate the data first, then give --data")
     robot = load_robot(source)
     source = str(Path(source).resolve()) if Path(source).exists() else source
-    kept = user_weights(robot)
-    work = kept.with_name("training") if out is None else Path(out)
+    weights_dir = user_weights(robot)
+    work = weights_dir.with_name("training") if out is None else Path(out)
     data = data_settings(source, robot, motions, given.get("seed"))
     _check_disk(work, data.trajectories)
     defaults: dict[str, Any] = {"samples": SAMPLES} if given.get("minutes") is None else {}
@@ -373,19 +373,19 @@ def train_for_robot(
     network = "trajectory_prior" if settings.encoder is None else "model"
     # the description last: its presence means that the weights are complete
     for file in sorted(work.glob(f"{network}.*"), key=lambda file: file.suffix == ".json"):
-        write_atomically(kept / file.name, file.read_bytes(), make_folder=True)
-    return report, kept
+        write_atomically(weights_dir / file.name, file.read_bytes(), make_folder=True)
+    return report, weights_dir
 
 
 def _check_disk(work: Path, motions: int) -> None:
     """Raises InputError if the disk has too little space."""
-    there = next(folder for folder in (work, *work.absolute().parents) if folder.exists())
-    made = sum(file.stat().st_size for file in work.rglob("*") if file.is_file()) if work.is_dir() else 0
-    free = shutil.disk_usage(there).free
-    needed = motions * BYTES_PER_MOTION + BYTES_PER_TRAINING - made
+    existing = next(folder for folder in (work, *work.absolute().parents) if folder.exists())
+    written = sum(file.stat().st_size for file in work.rglob("*") if file.is_file()) if work.is_dir() else 0
+    free = shutil.disk_usage(existing).free
+    needed = motions * BYTES_PER_MOTION + BYTES_PER_TRAINING - written
     if free < needed:
         raise InputError(
-            f"{motions:,} motions and the training need {needed / 1e6:,.0f} MB more, and {there} has "
+            f"{motions:,} motions and the training need {needed / 1e6:,.0f} MB more, and {existing} has "
             f"{free / 1e6:,.0f} MB left; free some space, or name another folder with --out"
         )
 

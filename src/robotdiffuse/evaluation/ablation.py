@@ -191,18 +191,20 @@ def run_ablation(
             digests[training.folder] = about["data"]
             report(f"trained {training.folder}")
         if len(set(digests.values())) > 1:
-            found = ", ".join(f"{name} {digest}" for name, digest in digests.items())
-            raise InputError(f"{out} holds networks of different data: {found}; use another folder")
+            digests_text = ", ".join(f"{name} {digest}" for name, digest in digests.items())
+            raise InputError(f"{out} holds networks of different data: {digests_text}; use another folder")
         cases = hard_cases(settings.family, settings.problems, out / "problems", report)
         todo = [
-            (settings, which, guided, cases) for which in (*trainings, *CONTROLS) for guided in (False, True)
+            (settings, row_training, guided, cases)
+            for row_training in (*trainings, *CONTROLS)
+            for guided in (False, True)
         ]
         for number, evaluation in pool.each(_evaluate, todo):
-            _, which, guided, _ = todo[number]
-            evaluations[which, guided] = evaluation
-            name = which if isinstance(which, str) else which.folder
-            how = "with" if guided else "without"
-            report(f"evaluated {name} {how} guidance: {100 * evaluation.single.mean():.1f} % of samples")
+            _, row_training, guided, _ = todo[number]
+            evaluations[row_training, guided] = evaluation
+            name = row_training if isinstance(row_training, str) else row_training.folder
+            guidance = "with" if guided else "without"
+            report(f"evaluated {name} {guidance} guidance: {100 * evaluation.single.mean():.1f} % of samples")
     results = []
     for name in rows:
         row = ROWS[name]
@@ -243,10 +245,10 @@ def _training(file: FilePath, name: str, budget: int) -> dict[str, Any]:
 def _train(settings: AblationSettings, training: Training) -> Training:
     out = FilePath(settings.out) / training.folder
     if not (out / "model.json").exists():
-        given = {"data": settings.data, "samples": settings.samples, "seed": training.seed}
+        options = {"data": settings.data, "samples": settings.samples, "seed": training.seed}
         if "encoder" not in CONFIGS[training.config].changes:
-            given["encoder"] = str(FilePath(settings.out) / ENCODER)
-        train_planner(planner_training(training.config, given), str(out))
+            options["encoder"] = str(FilePath(settings.out) / ENCODER)
+        train_planner(planner_training(training.config, options), str(out))
     return training
 
 
@@ -317,9 +319,11 @@ def table2(settings: AblationSettings, results: list[RowResult]) -> Report:
 
 def table(settings: AblationSettings, results: list[RowResult]) -> Table:
     """The rows of Table 2, with the paper's figures beside ours."""
-    known = asdict(settings)
+    settings_by_name = asdict(settings)
     budget = ("samples", "encoder_samples", "problems", "candidates")
-    title = f"Table 2 on {settings.family}: {', '.join(f'{name} {known[name]:,}' for name in budget)}"
+    title = (
+        f"Table 2 on {settings.family}: {', '.join(f'{name} {settings_by_name[name]:,}' for name in budget)}"
+    )
     several = settings.seeds > 1
     columns = (
         *("row", "guided"),

@@ -111,7 +111,7 @@ def tables(section: Section, comparison: Comparison, reference: str) -> list[Tab
     """All tables of a comparison, without empty ones."""
     name = title(section, comparison)
     reasons = [reason for reason in FAILURES if any(reason in row.failures for row in comparison.rows)]
-    others = [row for row in comparison.rows if row.paired is not None]
+    compared_rows = [row for row in comparison.rows if row.paired is not None]
     quality: Spec = (
         *map(_metric, comparison.metrics),
         (Column("memory", "MB", ".0f", "less"), lambda row: row.memory),
@@ -133,14 +133,14 @@ def tables(section: Section, comparison: Comparison, reference: str) -> list[Tab
         (Column("failures"), lambda row: row.failures.total()),
         *((Column(reason), lambda row, reason=reason: row.failures.get(reason)) for reason in reasons),
     )
-    made = [
+    all_tables = [
         main_table(section, comparison, reference),
         _table(f"Quality of the motions; {name}", comparison.rows, quality),
-        _table(f"Against {named(reference)}, in pairs; {name}", others, pairs),
+        _table(f"Against {named(reference)}, in pairs; {name}", compared_rows, pairs),
         _table(f"Failures by reason; {name}", comparison.rows, failures),
         _table(f"Success by family [%]; {name}", comparison.rows, families),
     ]
-    return [table for table in made if table.rows and len(table.columns) > 2]
+    return [table for table in all_tables if table.rows and len(table.columns) > 2]
 
 
 def main_table(section: Section, comparison: Comparison, reference: str) -> Table:
@@ -278,11 +278,11 @@ def bench_report(bench: Bench, parts: Sequence[Section], replays: str | None = N
             caption = "Length over time, median over the best known, of non-trivial problems"
             report.plot(f"length_{file}.svg", caption, length_over_time(section, planners))
         for comparison in section.comparisons:
-            main, *others = tables(section, comparison, bench.reference)
+            main, *further_tables = tables(section, comparison, bench.reference)
             report.table(main)
             if comparison.missing:
                 report.add(plain(missing_line(comparison)))
-            for table in others:
+            for table in further_tables:
                 report.table(table, level=4)
     if broken := crashes(bench):
         report.add("## Crashes and exceptions")
@@ -375,8 +375,8 @@ def motions_to_replay(bench: Bench, parts: Sequence[Section]) -> list[Replay]:
     replays = []
     for case, solved, _ in tries[:SOLVED_PROBLEMS]:
         for record in solved[:1] + solved[1:][-1:]:
-            which = "shortest" if record is solved[0] else "longest"
-            caption = f"{record.joint_length:.2f} rad, {which}, in {seconds(record.time)} s"
+            extreme = "shortest" if record is solved[0] else "longest"
+            caption = f"{record.joint_length:.2f} rad, {extreme}, in {seconds(record.time)} s"
             replays.append(Replay(f"{record.planner} · {case.name}", caption, case, record.waypoints))
     rest = sorted(tries[SOLVED_PROBLEMS:], key=lambda of: (bench.reference not in of[2], len(of[1])))
     replays += [replay for of in rest for replay in _failure(*of, bench.reference)]

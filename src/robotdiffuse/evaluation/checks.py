@@ -173,8 +173,8 @@ def check_data(
     task = _Task(str(folder), manifest, robot, pybullet)
     motions = min(manifest.trajectories, sys.maxsize if count is None else count)
     workers = min(workers, max(len(indices), -(-motions // MOTIONS_PER_TASK)))
-    done = 0
-    least = np.inf
+    checked = 0
+    least_clearance = np.inf
     with Workers(workers if workers > 1 else 0) as processes:
         sizes = dict(zip(indices, in_order(processes.each(task.size, [(i,) for i in indices])), strict=True))
         findings = [Finding("damaged", i, None, size) for i, size in sizes.items() if isinstance(size, str)]
@@ -185,22 +185,22 @@ def check_data(
             for i in range(0, len(chosen), MOTIONS_PER_TASK)
         ]
         total = sum(len(chosen) for _, chosen in parts)
-        progress(done, total)
+        progress(checked, total)
         results = in_order(processes.each(task.validate, parts))
         for (_, chosen), (part, clearance) in zip(parts, results, strict=True):
             findings += part
-            least = min(least, clearance)
-            done += len(chosen)
-            progress(done, total)
+            least_clearance = min(least_clearance, clearance)
+            checked += len(chosen)
+            progress(checked, total)
     return DataCheck(
         robot=robot.name,
         shards=len(indices),
         motions=sum(rows.values()),
         planned=manifest.trajectories,
-        checked=done,
+        checked=checked,
         pybullet=pybullet,
         findings=tuple(findings),
-        least_clearance=least if done else float("nan"),
+        least_clearance=least_clearance if checked else float("nan"),
         seconds=time.perf_counter() - began,
     )
 
@@ -244,8 +244,8 @@ class _Task:
         ]
         if self.pybullet:
             findings += self._pybullet_findings(shard, rows)
-        least = float(shard["clearance"][rows].min(initial=np.inf))
-        return sorted(findings, key=lambda finding: finding.row or 0), least
+        least_clearance = float(shard["clearance"][rows].min(initial=np.inf))
+        return sorted(findings, key=lambda finding: finding.row or 0), least_clearance
 
     def _pybullet_findings(self, shard: Shard, rows: Int[ndarray, "n"]) -> Iterator[Finding]:
         with _pybullet()(self.robot, Scene([])) as oracle:
@@ -285,9 +285,9 @@ def _defects(task: _Task, shard: Shard, row: int) -> Iterator[tuple[str, str]]:
     recorded = {"clearance": shard["clearance"][row, None], "end_clearance": shard["end_clearance"][row]}
     measured = {"clearance": clearances.min(keepdims=True), "end_clearance": clearances[[0, -1]]}
     for name, values in recorded.items():
-        worst = int(np.abs(values - measured[name]).argmax())
-        stated = float(values[worst])
-        value = float(measured[name][worst])
+        worst_row = int(np.abs(values - measured[name]).argmax())
+        stated = float(values[worst_row])
+        value = float(measured[name][worst_row])
         if abs(stated - value) > CLEARANCE_TOLERANCE:
             yield "clearance", f"{name} is {1e3 * stated:.2f} mm; measured: {1e3 * value:.2f} mm"
 
@@ -364,7 +364,7 @@ def confirm(out: FilePath, count: int | None, progress: Callable[[int, int], Non
     chosen = [case for cases in sets.values() for case in cases[:count] if case.key in solved]
     checked = {record.planner: 0 for record in records}
     refuted: list[tuple[Record, OracleContact]] = []
-    for done, case in enumerate(chosen, start=1):
+    for number, case in enumerate(chosen, start=1):
         robot = case.problem.robot
         with oracle(robot, case.problem.scene) as validator:
             for record in solved[case.key]:
@@ -372,5 +372,5 @@ def confirm(out: FilePath, count: int | None, progress: Callable[[int, int], Non
                 checked[record.planner] += 1
                 if contact is not None:
                     refuted.append((record, contact))
-        progress(done, len(chosen))
+        progress(number, len(chosen))
     return Confirmation(checked, refuted)

@@ -208,17 +208,17 @@ class Mean(NamedTuple):
     @classmethod
     def of(cls, values: Iterable[float | None]) -> "Mean":
         """The mean of the values that are neither None nor NaN."""
-        known = np.array([value for value in values if value is not None and value == value])
-        if not len(known):
+        finite = np.array([value for value in values if value is not None and value == value])
+        if not len(finite):
             return cls(np.nan, np.nan)
-        half = 1.96 * float(known.std(ddof=1)) / len(known) ** 0.5 if len(known) > 1 else np.nan
-        return cls(float(known.mean()), half)
+        half = 1.96 * float(finite.std(ddof=1)) / len(finite) ** 0.5 if len(finite) > 1 else np.nan
+        return cls(float(finite.mean()), half)
 
     def cell(self, metric: Metric) -> Figure | None:
         """The mean of a metric with its interval."""
         value, half = (f"{metric.scale * x:{metric.format}}" for x in self)
-        known = value if np.isnan(self.half) else f"{value} ± {half}"
-        return None if np.isnan(self.value) else Figure(known.replace("-", "−"), self.value)
+        text = value if np.isnan(self.half) else f"{value} ± {half}"
+        return None if np.isnan(self.value) else Figure(text.replace("-", "−"), self.value)
 
 
 @dataclass(frozen=True)
@@ -367,7 +367,7 @@ def _counted(
     counted = {key: record for key, of in calls.items() if (record := deciding_record(of, limit)) is not None}
     if len(counted) == len(calls):
         return counted
-    given = [
+    counts = [
         (run["seeds"], run["count"] or len(places))
         for run in bench.sessions
         if plain_name(planner) in run["planners"]
@@ -377,7 +377,7 @@ def _counted(
     return {
         key: record
         for key, record in counted.items()
-        if any(key[1] < seeds and places[key[0]] < count for seeds, count in given)
+        if any(key[1] < seeds and places[key[0]] < count for seeds, count in counts)
     }
 
 
@@ -480,7 +480,7 @@ def _curve(planner: str, records: dict[Key, Record], best: dict[Key, float], lon
     """The curve of a planner. `longest`: the longest limit of any planner [s], where the plot ends."""
     end = min([longest, *(r.time_limit for r in records.values() if not r.ended_by_itself)])
     solved = {key: r for key, r in records.items() if outcome(r, r.time_limit).found <= end}
-    found = np.sort([min(r.progress[0][0], end) for r in solved.values()])
+    first_times = np.sort([min(r.progress[0][0], end) for r in solved.values()])
     hard = {key: r for key, r in solved.items() if not r.trivial}
     times = np.geomspace(1e-4, end, 240)
     ratios = np.full((max(len(hard), 1), len(times)), np.inf)
@@ -489,5 +489,5 @@ def _curve(planner: str, records: dict[Key, Record], best: dict[Key, float], lon
             row[times >= min(at, end)] = length / best[key]
     with np.errstate(invalid="ignore"):
         medians = np.median(ratios, axis=0)
-    known = np.isfinite(medians)
-    return Curve(planner, len(records), end, found, times[known], medians[known])
+    finite = np.isfinite(medians)
+    return Curve(planner, len(records), end, first_times, times[finite], medians[finite])

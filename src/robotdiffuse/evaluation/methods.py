@@ -118,8 +118,8 @@ def restarted(
     progress = list(first.progress)
     while limit - spent > shortest_call and _length(best) > SHORTEST_FACTOR * straight:
         count += 1
-        fresh = int(np.random.SeedSequence([seed, count]).generate_state(1)[0])
-        result = planner.plan(problem, time_limit=limit - spent, seed=fresh, **request)
+        call_seed = int(np.random.SeedSequence([seed, count]).generate_state(1)[0])
+        result = planner.plan(problem, time_limit=limit - spent, seed=call_seed, **request)
         for at, length in result.progress:
             if not progress or length < progress[-1][1]:
                 progress.append((spent + at, length))
@@ -136,7 +136,7 @@ def _length(result: PlanResult) -> float:
 
 def fields_of(result: PlanResult, measure: Measure) -> Fields:
     """The fields of a result's record."""
-    found: dict[str, Any] = {
+    record: dict[str, Any] = {
         "status": result.status.value,
         "reason": result.reason,
         "time": round(result.planning_time, 6),
@@ -145,9 +145,9 @@ def fields_of(result: PlanResult, measure: Measure) -> Fields:
         "progress": [[round(at, 6), round(length, 6)] for at, length in result.progress],
     }
     if result.path is not None and result.trajectory is not None:
-        found |= measure(result.path, result.trajectory, result)
-        found["positions"] = np.round(result.path.positions, 9).tolist()
-    return found
+        record |= measure(result.path, result.trajectory, result)
+        record["positions"] = np.round(result.path.positions, 9).tolist()
+    return record
 
 
 # Sampled trajectories
@@ -194,17 +194,17 @@ def sampled(draw: Draw, lengths: Callable[[ndarray], ndarray] = path_lengths) ->
         with Clock() as clock:
             q = draw(run, checker)
         verdict = validated(problem, q)
-        found = {}
+        measures = {}
         if verdict.passed.any():
             best = int(np.where(verdict.passed, lengths(verdict.waypoints), np.inf).argmin())
             path = Path(problem.robot.joint_names, verdict.waypoints[best])
-            found = measure_of(problem.robot)(path, None, verdict.reports[best])
+            measures = measure_of(problem.robot)(path, None, verdict.reports[best])
         yield {
-            "status": SOLVED if found else UNSOLVED,
+            "status": SOLVED if measures else UNSOLVED,
             "passed": float(verdict.passed.mean()),
             "collided": float(verdict.hit.mean()),
             **clock.fields,
-            **found,
+            **measures,
         }
 
     return call
@@ -234,8 +234,8 @@ def from_network(
         rng = run.rng()
         model = sampler.model(problem.robot)
         assert model is not None
-        other = checker if encoded is None else CollisionChecker(problem.robot, encoded(run).scene)
-        code = encode(model, other, sampler.settings.points, rng)
+        scene_checker = checker if encoded is None else CollisionChecker(problem.robot, encoded(run).scene)
+        code = encode(model, scene_checker, sampler.settings.points, rng)
         return sampler.draw(model, checker, code, problem.start, goal_of(problem)[None], rng, clearances)
 
     return draw

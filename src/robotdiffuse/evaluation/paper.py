@@ -74,10 +74,10 @@ def draw_problem(number: int) -> dict[str, Problem]:
     """The Panda's problem of this number, by problem set."""
     robot = load_robot("panda")
     rng = np.random.default_rng([SEED, STREAM, number])
-    drawn = ROP.draw(robot, rng, 1, POSITION)
+    sample = ROP.draw(robot, rng, 1, POSITION)
     return {
-        POSE: Problem(robot, drawn.scene, drawn.start, PoseGoal(robot.tip, drawn.T_base_tip)),
-        JOINT: drawn.problem(robot),
+        POSE: Problem(robot, sample.scene, sample.start, PoseGoal(robot.tip, sample.T_base_tip)),
+        JOINT: sample.problem(robot),
     }
 
 
@@ -132,9 +132,9 @@ def straight_line_shares(count: int, family: Rop = ROP) -> dict[str, int]:
     shares: dict[str, int] = dict.fromkeys(names, 0)
     for number in range(count):
         rng = np.random.default_rng([SEED, STREAM + 1, number])
-        drawn = family.draw(robot, rng, GOAL_COUNT, POSITION)
-        problem = drawn.problem(robot)
-        goals = drawn.goals.astype(np.float64)
+        sample = family.draw(robot, rng, GOAL_COUNT, POSITION)
+        problem = sample.problem(robot)
+        goals = sample.goals.astype(np.float64)
         lines = free_lines(problem, goals)
         single = free_lines(problem, goals[:1])[0]
         free = (single is not None, lines[0] is not None, any(line is not None for line in lines))
@@ -358,20 +358,22 @@ def table1(settings: Table1Settings, bench: Bench) -> Report:
 def scores(rows: Sequence[Row], of: dict[str, Indicators]) -> dict[str, float]:
     """ComScores among the paper's five rows; each further row takes the place of the paper's method."""
     ours = next(row.name for row in rows if row.paper == OURS)
-    others = [row.name for row in rows if row.paper and row.paper != OURS]
+    other_rows = [row.name for row in rows if row.paper and row.paper != OURS]
     among = {
-        name: comscores([of[other] for other in others] + [of[name]]).tolist()
+        name: comscores([of[row_name] for row_name in other_rows] + [of[name]]).tolist()
         for name in of
-        if name not in others
+        if name not in other_rows
     }
-    return dict(zip(others, among[ours], strict=False)) | {name: values[-1] for name, values in among.items()}
+    return dict(zip(other_rows, among[ours], strict=False)) | {
+        name: values[-1] for name, values in among.items()
+    }
 
 
 def _table(section: Section, rows: dict[str, Row]) -> Table:
     """The table of a problem set or of its part; `rows` by planner."""
     comparison = section.main
-    whole = section.name == section.problem_set
-    part = "all problems" if whole else "not trivial, and solved by some row"
+    is_whole = section.name == section.problem_set
+    part = "all problems" if is_whole else "not trivial, and solved by some row"
     title = f"Goal: {GOALS[section.problem_set]}; {part}: {comparison.problems}"
     indicators = {
         rows[of.planner].name: Indicators(100 * of.success, 100 * of.collision, of.link_length, of.time)
@@ -379,7 +381,7 @@ def _table(section: Section, rows: dict[str, Row]) -> Table:
     }
     comscore = scores(tuple(rows.values()), indicators)
     printed = {row.name: (*astuple(row.indicators), row.comscore) for row in PAPER_TABLE_1}
-    beside = section.name == POSE
+    printed_beside = section.name == POSE
     table = []
     for of in comparison.rows:
         row = rows[of.planner]
@@ -392,7 +394,7 @@ def _table(section: Section, rows: dict[str, Row]) -> Table:
             of.time,
             comscore[row.name],
         )
-        table.append([*cells, *(printed.get(row.paper, (None,) * 5) if beside else ())])
+        table.append([*cells, *(printed.get(row.paper, (None,) * 5) if printed_beside else ())])
     columns = (
         "row",
         Column("success", "%", better="more"),
@@ -404,7 +406,7 @@ def _table(section: Section, rows: dict[str, Row]) -> Table:
         Column("turning", "rad"),
         Column("time", "s", ".3g", "less"),
         Column("ComScore", "", ".3f", "more"),
-        *(("paper: suc", "col", "len", "time", "ComScore") if beside else ()),
+        *(("paper: suc", "col", "len", "time", "ComScore") if printed_beside else ()),
     )
     five = sorted((row.name for row in rows.values() if row.paper), key=lambda name: -comscore[name])
     order = "Order of the paper's five rows by ComScore: " + ", ".join(f"{x} {comscore[x]:.3f}" for x in five)

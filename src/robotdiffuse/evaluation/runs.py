@@ -290,14 +290,14 @@ def keep_records(
     on_progress: OnProgress = lambda method, left: None,
 ) -> int:
     """Keep the records of runs as they come; returns the number of runs made."""
-    left = Counter(run.method for run in runs)
+    remaining = Counter(run.method for run in runs)
     with closing(results):  # Ctrl-C ends the processes of runs too
         for run, records in results:
             for record in records:
                 files[record.planner].append(record)
-            left[run.method] -= 1
-            on_progress(run.method, left[run.method])
-    return len(runs) - left.total()
+            remaining[run.method] -= 1
+            on_progress(run.method, remaining[run.method])
+    return len(runs) - remaining.total()
 
 
 def in_this_process(methods: Mapping[str, Method], runs: Sequence[Run]) -> Results:

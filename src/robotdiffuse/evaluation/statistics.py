@@ -91,8 +91,8 @@ def compare(a: Values, b: Values) -> Paired:
         ratio_interval = bootstrap_interval(ratios, np.median)
         if logs.any():
             p_length = float(wilcoxon(logs).pvalue)  # pyright: ignore[reportAttributeAccessIssue]
-    neither = int((~solved_a & ~solved_b).sum())
-    return Paired(a_only, b_only, int(both.sum()), neither, p_success, ratio, ratio_interval, p_length)
+    neither_solved = int((~solved_a & ~solved_b).sum())
+    return Paired(a_only, b_only, int(both.sum()), neither_solved, p_success, ratio, ratio_interval, p_length)
 
 
 # The paper's ComScore
@@ -127,11 +127,11 @@ def normalized(rows: Sequence[Indicators]) -> Float[ndarray, "n 4"]:
     if not len(rows):
         return values
     gains = np.where(HIGHER_IS_BETTER, values, -values)
-    worst = np.fmin.reduce(gains, axis=0)
+    minimum = np.fmin.reduce(gains, axis=0)
     best = np.fmax.reduce(gains, axis=0)
-    span = best - worst
+    span = best - minimum
     with np.errstate(invalid="ignore"):
-        share = np.where(span > 0, (gains - worst) / np.where(span > 0, span, 1.0), 1.0)
+        share = np.where(span > 0, (gains - minimum) / np.where(span > 0, span, 1.0), 1.0)
     return np.where(np.isnan(values), 0.0, share)
 
 

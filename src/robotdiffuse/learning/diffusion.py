@@ -253,9 +253,9 @@ def _step(
     signal, signal_low = schedule.signal[[level, lower]].tolist()
     noise, noise_low = schedule.noise[[level, lower]].tolist()
     added = max(noise**2 - (signal / signal_low * noise_low) ** 2, 0.0) ** 0.5
-    fresh = eta * noise_low / noise * added
-    found = (x - signal * clean) / noise
-    return signal_low * clean + (noise_low**2 - fresh**2) ** 0.5 * found, fresh
+    added_noise = eta * noise_low / noise * added
+    predicted_noise = (x - signal * clean) / noise
+    return signal_low * clean + (noise_low**2 - added_noise**2) ** 0.5 * predicted_noise, added_noise
 
 
 SAMPLERS = Registry(

@@ -310,10 +310,10 @@ class MotionModel(ABC):
             return np.zeros(0, np.float32)
         points = np.asarray(points, np.float32).reshape(-1, 3)
         points = points[of_encoder.region.holds(points)]
-        most = MAX_POINTS if of_encoder.any_size else of_encoder.cloud
-        if len(points) > most:
+        max_points = MAX_POINTS if of_encoder.any_size else of_encoder.cloud
+        if len(points) > max_points:
             rng = np.random.default_rng(0) if rng is None else rng
-            points = points[rng.choice(len(points), most, replace=False)]
+            points = points[rng.choice(len(points), max_points, replace=False)]
         return self.code_of(of_encoder.prepared(points))
 
     def features(
@@ -480,8 +480,11 @@ def _carriers(checker: CollisionChecker) -> tuple[int, list[int]]:
     def carrier(link: str) -> int:
         while link in fixed_to:
             link = fixed_to[link]
-        order = [(link == other, min(robot.link_frame(other) - robot.link_frame(link), 0)) for other in arm]
-        before = [i for i, other in enumerate(arm) if robot.link_frame(other) <= robot.link_frame(link)]
+        order = [
+            (link == arm_link, min(robot.link_frame(arm_link) - robot.link_frame(link), 0))
+            for arm_link in arm
+        ]
+        before = [i for i, arm_link in enumerate(arm) if robot.link_frame(arm_link) <= robot.link_frame(link)]
         return max(before or range(len(arm)), key=lambda i: (*order[i], i))
 
     return len(arm), [carrier(link) for link in checker.links[len(arm) :]]

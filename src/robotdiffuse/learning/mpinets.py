@@ -180,13 +180,13 @@ def group_points(
     distances = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist")
     clouds = torch.arange(len(points))
     chosen = (points - points.mean(1, keepdim=True)).norm(dim=-1).argmax(1)
-    least = torch.full_like(distances[:, 0], torch.inf)
-    found: list[Tensor] = []
+    min_distances = torch.full_like(distances[:, 0], torch.inf)
+    center_indices: list[Tensor] = []
     for _ in range(count):
-        found.append(chosen)
-        least = torch.minimum(least, distances[clouds, chosen])
-        chosen = least.argmax(1)
-    centres = torch.stack(found, 1)
+        center_indices.append(chosen)
+        min_distances = torch.minimum(min_distances, distances[clouds, chosen])
+        chosen = min_distances.argmax(1)
+    centres = torch.stack(center_indices, 1)
     nearest = _rows(distances, centres).topk(min(neighbours, points.shape[1]), largest=False)
     return centres, torch.where(nearest.values < radius, nearest.indices, centres[..., None])
 
@@ -238,12 +238,12 @@ class MPiNetsNetwork(BaselineNetwork):
         )
         # all points together; named as in the weights
         self.together = nn.ModuleDict({"layers": PooledLayers(3 + s.second_widths[-1], s.all_widths)})
-        wide, code = s.cloud_widths
+        cloud_width, code = s.cloud_widths
         self.cloud_code = nn.Sequential(
-            nn.Linear(s.all_widths[-1], wide),
-            nn.GroupNorm(GROUPS, wide),
+            nn.Linear(s.all_widths[-1], cloud_width),
+            nn.GroupNorm(GROUPS, cloud_width),
             nn.LeakyReLU(),
-            nn.Linear(wide, code),
+            nn.Linear(cloud_width, code),
         )
         self.joint_code = _leaky(2 * self.dof, JOINT_WIDTHS)
         last = nn.Linear(DECODER_WIDTHS[-1], self.dof)
@@ -315,8 +315,8 @@ class MPiNetsNetwork(BaselineNetwork):
         q = self.normalizer.from_unit(np.clip(self.normalizer.to_unit(q), -1, 1))
         scenes = data.scenes[rows]
         clouds = self.clouds(scenes, rng)
-        here, after, end = (torch.from_numpy(part) for part in (q, expert, goal))
-        return Steps(here, after, end, clouds, scenes)
+        current, after, end = (torch.from_numpy(part) for part in (q, expert, goal))
+        return Steps(current, after, end, clouds, scenes)
 
     def clouds(self, scenes: PackedScenes, rng: np.random.Generator) -> Clouds:
         """Random clouds of scenes for the network's input [m]; zeros where nothing is in reach."""

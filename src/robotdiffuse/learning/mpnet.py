@@ -120,8 +120,8 @@ class MPNetNetwork(BaselineNetwork):
         if len(data):
             rng = np.random.default_rng(0)
             rows = data.draw(5_000, TRIVIAL_SHARE, rng)
-            here, following, _ = self.training_samples(data.q[rows], rng)
-            step = self.normalizer.to_unit(following) - self.normalizer.to_unit(here)
+            current, following, _ = self.training_samples(data.q[rows], rng)
+            step = self.normalizer.to_unit(following) - self.normalizer.to_unit(current)
             self.step_scale.fill_(max(float(np.sqrt(np.mean(step**2))), 1e-3))
 
     def encode(self, cloud: Clouds) -> Float[Tensor, "batch code"]:
@@ -186,8 +186,8 @@ class MPNetNetwork(BaselineNetwork):
             x = self.to_unit(q)
             target = self.to_unit(goal)
             step = self.policy(torch.cat([z, x.to(z), target.to(z)], 1), generator)
-        wanted = (self.to_unit(following) - x) / self.step_scale
-        return (step.float() - wanted).square().mean()
+        target_step = (self.to_unit(following) - x) / self.step_scale
+        return (step.float() - target_step).square().mean()
 
     @torch.enable_grad()
     def autoencoder_loss(self, cloud: Clouds, generator: Generator) -> Float[Tensor, ""]:
@@ -224,8 +224,8 @@ class MPNetNetwork(BaselineNetwork):
         at = (rng.random(n) * goal).astype(np.int64)
         places = at, np.minimum(at + stride[rows], goal), goal
         back = rng.random(n) < 0.5
-        here, following, end = (q[rows, np.where(back, last - place, place)] for place in places)
-        return here, following, end
+        current, following, end = (q[rows, np.where(back, last - place, place)] for place in places)
+        return current, following, end
 
 
 class Perceptron(nn.Module):

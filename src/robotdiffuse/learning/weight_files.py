@@ -92,11 +92,11 @@ class RobotIdentity(Settings):
     def check(self, robot: Robot, where: str) -> None:
         """Raises InputError unless the weights are for this robot. where: names the weights in the
         message."""
-        other = self.difference(robot)
-        if other:
+        difference = self.difference(robot)
+        if difference:
             raise InputError(
                 f"{where} was trained for {shortened(self.source)} with joints {joined(self.joint_names)}; "
-                f"the robot {robot.name} has {other}"
+                f"the robot {robot.name} has {difference}"
             )
 
 
@@ -197,10 +197,10 @@ def read_arrays(
     file = folder / f"{name}.safetensors"
     data = checked_bytes(file, about.get("weights_sha256"), f"{name}.json")
     try:
-        held = load(data)
+        tensors = load(data)
     except (SafetensorError, ValueError, struct.error) as error:
         raise InputError(f"{file} is no safetensors file: {str(error).splitlines()[0]}") from None
-    return {key: held[key] for key in keys if key in held}
+    return {key: tensors[key] for key in keys if key in tensors}
 
 
 BUNDLED = FilePath(__file__).parent / "weights"
@@ -247,8 +247,8 @@ def check_weights(name: str, folder: str | FilePath | None) -> None:
     """Raises InputError if a folder is given that holds no weights of this network."""
     NETWORKS.entry(name)
     if folder is not None and not is_file(folder_of(folder) / f"{name}.json"):
-        what = f"{folder} holds no {name}" if os.path.isdir(folder) else f"there are no weights {folder}"
-        raise no_weights_error(name, what)
+        message = f"{folder} holds no {name}" if os.path.isdir(folder) else f"there are no weights {folder}"
+        raise no_weights_error(name, message)
 
 
 def weights_folder(name: str, folder: str | FilePath | None, robot: Robot) -> FilePath:
@@ -259,14 +259,14 @@ def weights_folder(name: str, folder: str | FilePath | None, robot: Robot) -> Fi
     check_weights(name, folder)
     if folder is not None:
         return folder_of(folder)
-    found = weights_for(name, robot)
-    if found is None and (BUNDLED / robot.name / f"{name}.json").is_file():
+    folder_found = weights_for(name, robot)
+    if folder_found is None and (BUNDLED / robot.name / f"{name}.json").is_file():
         return BUNDLED / robot.name  # made for another arm of that name, which the caller finds
-    if found is None:
+    if folder_found is None:
         raise no_weights_error(
             name, f"no weights of the network {name} come with the package for {robot.name}"
         )
-    return found
+    return folder_found
 
 
 def completion_folder(folder: str | FilePath | None) -> FilePath:
@@ -285,5 +285,5 @@ def completion_folder(folder: str | FilePath | None) -> FilePath:
 
 def no_weights_error(name: str, what: str) -> InputError:
     """The error for missing weights: `what` is missing, and the command that trains it."""
-    how = NETWORKS[name].kind or f"baseline {name} --data FOLDER --out FOLDER"
-    return InputError(f"{what}; train them: robotdiffuse train {how}")
+    command = NETWORKS[name].kind or f"baseline {name} --data FOLDER --out FOLDER"
+    return InputError(f"{what}; train them: robotdiffuse train {command}")

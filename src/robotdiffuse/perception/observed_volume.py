@@ -153,7 +153,7 @@ def _min_pooled(depth, factor):
     """Minimum depth of blocks of pixels, and the summed-area table of missing returns."""
     h = (depth.shape[0] + factor - 1) // factor
     w = (depth.shape[1] + factor - 1) // factor
-    least = np.full((h, w), MAX_DEPTH, np.float32)
+    min_depth = np.full((h, w), MAX_DEPTH, np.float32)
     missing = np.zeros((h + 1, w + 1), np.int32)
     nearest = np.empty(depth.shape[1], np.float32)
     lost = np.empty(depth.shape[1], np.int32)
@@ -163,16 +163,16 @@ def _min_pooled(depth, factor):
         for v in range(block * factor, min((block + 1) * factor, depth.shape[0])):
             row = depth[v]
             for u in range(depth.shape[1]):
-                known = row[u] > _ZERO
-                nearest[u] = min(nearest[u], row[u] if known else MAX_DEPTH)
-                lost[u] += np.int32(0) if known else np.int32(1)
+                measured = row[u] > _ZERO
+                nearest[u] = min(nearest[u], row[u] if measured else MAX_DEPTH)
+                lost[u] += np.int32(0) if measured else np.int32(1)
         total = np.int32(0)
         for u in range(depth.shape[1]):
             cell = u // factor
-            least[block, cell] = min(least[block, cell], nearest[u])
+            min_depth[block, cell] = min(min_depth[block, cell], nearest[u])
             total += lost[u]
             missing[block + 1, cell + 1] = missing[block, cell + 1] + total
-    return least, missing
+    return min_depth, missing
 
 
 @kernel(fastmath=FASTMATH)
@@ -203,12 +203,12 @@ def _rectangle_minimum(table, v0, v1, u0, u1):
     while 2 << k <= min(v1 - v0, u1 - u0) + 1 and k + 1 < len(table):
         k += 1
     step = 1 << k
-    least = MAX_DEPTH
+    min_depth = MAX_DEPTH
     for v in range(v0, v1 + step, step):
         row = table[k, max(v0, min(v, v1 - step + 1))]
         for u in range(u0, u1 + step, step):
-            least = min(least, row[max(u0, min(u, u1 - step + 1))])
-    return least
+            min_depth = min(min_depth, row[max(u0, min(u, u1 - step + 1))])
+    return min_depth
 
 
 @kernel(fastmath=FASTMATH)
@@ -266,8 +266,8 @@ def carve(depth, intrinsics, T, spheres, low, voxel, errors, state, behind, coun
     counts[:] = 0
     _count_points(raw, arm, intrinsics, T, low, voxel, counts)
     factor = max(1, int(intrinsics[0] / POOLED_FOCAL_LENGTH))
-    least, missing = _min_pooled(raw, factor)
-    table = _minimum_table(least, 6)
+    min_depth, missing = _min_pooled(raw, factor)
+    table = _minimum_table(min_depth, 6)
     for i in range(0, nx, BLOCK):
         for j in range(0, ny, BLOCK):
             for k in range(0, nz, BLOCK):
@@ -535,7 +535,7 @@ def carve_view(
     """
     depth, spread, spheres = usable_image(view, robot, q, arm_margin)
     state = np.empty(grid.shape, np.uint8)
-    behind = np.empty(grid.shape, np.float32)
+    depth_behind = np.empty(grid.shape, np.float32)
     counts = np.empty(grid.shape, np.int32)
     carve(
         depth,
@@ -545,7 +545,7 @@ def carve_view(
         *grid.frame,
         np.array([*view.pose_deviation, spread, MAX_DEPTH if view.range is None else view.range], np.float32),
         state,
-        behind,
+        depth_behind,
         counts,
     )
-    return state, behind, counts
+    return state, depth_behind, counts

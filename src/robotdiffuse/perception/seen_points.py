@@ -119,26 +119,26 @@ def gather_image(depth, intrinsics, T, reach, spheres, voxel, keys, cells, sums,
     x = np.empty(w, np.float32)
     y = np.empty(w, np.float32)
     z = np.empty(w, np.float32)
-    kept = np.empty(w, np.bool_)
+    valid = np.empty(w, np.bool_)
     cell = np.empty(w, np.int64)
     # cells of the row of pixels above: most points are in the cell of a neighbouring pixel
-    known = np.full(w + 1, -1, np.int64)
+    slots = np.full(w + 1, -1, np.int64)
     rows = np.zeros(w + 1, np.int32)
     for v in range(h):
         b = (np.float32(v) - cy) / fy
-        _place_row(around[v : v + 3], b, fx, cx, T, reach, voxel, x, y, z, kept, cell)
+        _place_row(around[v : v + 3], b, fx, cx, T, reach, voxel, x, y, z, valid, cell)
         for u in range(w):
-            if not kept[u]:
+            if not valid[u]:
                 continue
             if count >= len(sums):
                 return -1
             if _in_box(box, x[u], y[u], z[u]) and _within(x[u], y[u], z[u], *columns):
                 continue
-            if known[u] == cell[u]:
+            if slots[u] == cell[u]:
                 rows[u + 1] = rows[u]
-            elif known[u + 1] != cell[u]:
+            elif slots[u + 1] != cell[u]:
                 rows[u + 1], count = _row(keys, cells, count, cell[u])
-            known[u + 1] = cell[u]
+            slots[u + 1] = cell[u]
             _add(sums, rows[u + 1], x[u], y[u], z[u])
     return count
 
@@ -183,14 +183,14 @@ def supported(keys, cells, sums, count, least):
     for at in range(len(keys)):
         if keys[at] == -1:
             continue
-        enough = sums[cells[at], 3] >= least
+        is_supported = sums[cells[at], 3] >= least
         for i in range(-1, 2):
             for j in range(-1, 2):
                 for k in range(-1, 2):
-                    if not enough:
+                    if not is_supported:
                         near = _slot(keys, keys[at] + (i << 42) + (j << 21) + k)
-                        enough = keys[near] != -1 and sums[cells[near], 3] >= least
-        out[cells[at]] = enough
+                        is_supported = keys[near] != -1 and sums[cells[near], 3] >= least
+        out[cells[at]] = is_supported
     return out
 
 
@@ -231,13 +231,13 @@ def sphere_distances(points, spheres):
 
 @kernel(nogil=True, fastmath={"contract", "reassoc", "nnan", "nsz"})
 def _nearest(at, x, y, z, radii):
-    least = np.float32(np.inf)
+    distance = np.float32(np.inf)
     for s in range(len(x)):
         dx = at[0] - x[s]
         dy = at[1] - y[s]
         dz = at[2] - z[s]
-        least = min(least, np.sqrt(dx * dx + dy * dy + dz * dz) - radii[s])
-    return least
+        distance = min(distance, np.sqrt(dx * dx + dy * dy + dz * dz) - radii[s])
+    return distance
 
 
 @kernel(nogil=True)
@@ -309,8 +309,8 @@ def seen_points(
             if count < 0:
                 break
         if count >= 0:
-            kept = supported(keys, cells, sums, count, np.float32(_min_cell_points(views, voxel)))
-            return sums[:count, :3][kept] / sums[:count, 3:][kept]
+            supported_cells = supported(keys, cells, sums, count, np.float32(_min_cell_points(views, voxel)))
+            return sums[:count, :3][supported_cells] / sums[:count, 3:][supported_cells]
         capacity *= 4
 
 

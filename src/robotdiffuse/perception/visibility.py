@@ -53,14 +53,14 @@ def seen_weights(robot, configurations, poses, intrinsics, size, reach, voxels, 
             dy = oy - y
             dz = oz - z
             x_away, y_away, z_away = in_camera(T, dx, dy, dz)
-            ahead = -z_away
-            if ahead <= one or ahead * edge > reach:
+            forward = -z_away
+            if forward <= one or forward * edge > reach:
                 continue
-            u = -fx * x_away / ahead + cx
-            v = -fy * y_away / ahead + cy
+            u = -fx * x_away / forward + cx
+            v = -fy * y_away / forward + cy
             if not (-half <= u < size[1] - half and -half <= v < size[0] - half):
                 continue
-            if arm[int(v + half) // ARM_CELL, int(u + half) // ARM_CELL] < ahead * edge:
+            if arm[int(v + half) // ARM_CELL, int(u + half) // ARM_CELL] < forward * edge:
                 continue
             far = np.sqrt(dx * dx + dy * dy + dz * dz)
             dx = dx / far
@@ -156,13 +156,13 @@ def _all_behind(depth, v0, v1, u0, u1, least):
     """Whether all returns of a rectangle of pixels, whose bounds are inclusive, are deeper than `least`, and
     no more pixels than may are without one."""
     lost = 0
-    most = MAX_LOST_FRACTION * (v1 + 1 - v0) * (u1 + 1 - u0)
+    max_lost = MAX_LOST_FRACTION * (v1 + 1 - v0) * (u1 + 1 - u0)
     for v in range(v0, v1 + 1):
         for u in range(u0, u1 + 1):
             if depth[v, u] > least:
                 continue
             lost += 1
-            if depth[v, u] > _ZERO or lost > most:
+            if depth[v, u] > _ZERO or lost > max_lost:
                 return False
     return True
 

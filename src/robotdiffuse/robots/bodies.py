@@ -112,8 +112,8 @@ def inertia_of(values: ArrayLike) -> Inertia:
         raise ValueError("ten finite numbers expected")
     xx, xy, xz, yy, yz, zz = row[4:]
     moments = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    least = float(np.linalg.eigvalsh(moments)[0])
-    if not row[0] > 0 or least < -SLACK * np.abs(moments).max():
+    min_moment = float(np.linalg.eigvalsh(moments)[0])
+    if not row[0] > 0 or min_moment < -SLACK * np.abs(moments).max():
         raise ValueError("a mass above 0 and moments of inertia of at least 0 expected")
     return read_only(Inertia(float(row[0]), row[1:4], moments))
 
@@ -142,15 +142,15 @@ class Payload(Value):
                 f"payload.mass is {shown(self.mass)}; it must be a number from 0 to {MAX_COORDINATE:g} kg"
             )
         object.__setattr__(self, "mass", float(mass))
-        for name, least in (("com", -MAX_COORDINATE), ("moments", 0.0)):
+        for name, lower in (("com", -MAX_COORDINATE), ("moments", 0.0)):
             value = numbers(getattr(self, name))
             if (
                 value is None
                 or value.shape != (3,)
-                or not ((value >= least) & (value <= MAX_COORDINATE)).all()
+                or not ((value >= lower) & (value <= MAX_COORDINATE)).all()
             ):
                 raise InputError(
-                    f"payload.{name} is {shown(getattr(self, name))}; it must be 3 numbers from {least:g} to "
+                    f"payload.{name} is {shown(getattr(self, name))}; it must be 3 numbers from {lower:g} to "
                     f"{MAX_COORDINATE:g}"
                 )
             object.__setattr__(self, name, value)

@@ -92,20 +92,22 @@ def second_derivative_bounds(bodies: list[Body], gravity: float, along: Stretche
         arms.append(arm)
     forces = [still] * len(bodies)
     moments = [still] * len(bodies)
-    found = np.empty(along.q.shape)
+    bounds = np.empty(along.q.shape)
     for j in reversed(range(len(bodies))):
         body, (turn, spin, angular, linear) = bodies[j], frames[j]
         lever = _fixed(body.lever, turn)
-        own = body.mass * (linear + product(angular, lever) + product(spin, product(spin, lever)))
+        body_force = body.mass * (linear + product(angular, lever) + product(spin, product(spin, lever)))
         inertia = body.moment * np.stack([np.ones_like(turn[0]), 2 * turn[0], 2 * turn[1] + 4 * turn[0] ** 2])
-        moment = product(inertia, angular) + product(spin, product(inertia, spin)) + product(lever, own)
-        forces[j] = forces[j] + own
+        moment = (
+            product(inertia, angular) + product(spin, product(inertia, spin)) + product(lever, body_force)
+        )
+        forces[j] = forces[j] + body_force
         moments[j] = moments[j] + moment
-        found[:, j] = product(axes[j], forces[j] if body.slides else moments[j])[2]
+        bounds[:, j] = product(axes[j], forces[j] if body.slides else moments[j])[2]
         if body.parent >= 0:
             forces[body.parent] = forces[body.parent] + forces[j]
             moments[body.parent] = moments[body.parent] + moments[j] + product(arms[j], forces[j])
-    return found
+    return bounds
 
 
 def _fixed(length: float, turn: Jet) -> Jet:
@@ -154,15 +156,15 @@ class Dynamics:
         up = np.array([0.0, 0.0, 1.0]) if T_world_base is None else T_world_base[2, :3]
         model.gravity.linear = -GRAVITY * up
         self._model, self._data = model, model.createData()
-        inner = model.inertias.tolist()[1:]
+        link_inertias = model.inertias.tolist()[1:]
         self._bodies = [
             Body(
                 int(robot.parents[j]) - 1,
                 bool(robot.prismatic[j]),
                 float(np.linalg.norm(T[:3, 3])),
-                float(inner[j].mass),
-                float(np.linalg.norm(inner[j].lever)),
-                float(np.linalg.eigvalsh(inner[j].inertia)[-1]),
+                float(link_inertias[j].mass),
+                float(np.linalg.norm(link_inertias[j].lever)),
+                float(np.linalg.eigvalsh(link_inertias[j].inertia)[-1]),
             )
             for j, T in enumerate(robot.frame_offsets)
         ]

@@ -117,7 +117,7 @@ def inverse_kinematics(
         settings.max_iterations,
         float(settings.min_distance),
     )
-    idle = 0
+    stale_rounds = 0
     for i in range(settings.max_rounds):
         seeds = random_seeds(robot, lower, upper, settings.seeds_per_round, rng, near)
         if i == 0 and near is not None:
@@ -129,14 +129,14 @@ def inverse_kinematics(
             new, used = solve_seeds(seeds, known, count - len(accepted), joints, target, parameters)
             seeds = seeds[used:]
             if len(arm) < robot.dof:
-                found = new
+                new_arm = new
                 shape = (len(new), robot.dof)
                 new = rng.uniform(lower, upper, shape) if rest is None else np.tile(rest, (len(new), 1))
-                new[:, arm] = found
+                new[:, arm] = new_arm
             if len(new):
                 accepted = np.concatenate([accepted, new if accept is None else new[accept(new)]])
-        idle = 0 if len(accepted) > before else idle + 1
-        if len(accepted) >= count or (len(accepted) and idle >= settings.patience):
+        stale_rounds = 0 if len(accepted) > before else stale_rounds + 1
+        if len(accepted) >= count or (len(accepted) and stale_rounds >= settings.patience):
             break
     if near is None:
         return accepted

@@ -113,11 +113,11 @@ class KinematicTree(Value):
     @cached_property
     def links_fixed_to_base(self) -> dict[str, Float[ndarray, "4 4"]]:
         """T_base_link of the base and of the links that only fixed joints connect to it."""
-        found = {self.base: np.eye(4)}
+        fixed_links = {self.base: np.eye(4)}
         for joint in self.joints:
-            if joint.kind == "fixed" and joint.parent in found:
-                found[joint.child] = found[joint.parent] @ joint.T_parent_joint
-        return read_only(found)
+            if joint.kind == "fixed" and joint.parent in fixed_links:
+                fixed_links[joint.child] = fixed_links[joint.parent] @ joint.T_parent_joint
+        return read_only(fixed_links)
 
     @property
     def tips(self) -> tuple[str, ...]:
@@ -223,10 +223,10 @@ class KinematicTree(Value):
         nearest = self._turned(q, start, many)
         rows = [nearest]
         for j in np.flatnonzero(many):
-            other = nearest.copy()
-            other[j] -= np.copysign(TURN, nearest[j] - start[j])
-            if self.lower[j] <= other[j] <= self.upper[j]:
-                rows.append(other)
+            image = nearest.copy()
+            image[j] -= np.copysign(TURN, nearest[j] - start[j])
+            if self.lower[j] <= image[j] <= self.upper[j]:
+                rows.append(image)
         return np.stack(rows)
 
     def nearest_turns(

@@ -55,15 +55,15 @@ class LinkPairTable(Value):
 
     def at(self, *values: Float[ndarray, "n"]) -> Bool[ndarray, "n"]:
         """Whether the links are known to be apart at joint values, one array per joint."""
-        known = np.ones(len(values[0]), dtype=bool)
+        inside = np.ones(len(values[0]), dtype=bool)
         index = []
         for axis, value in enumerate(values):
             cell = np.floor((value - self.lower[axis]) / self._edge(axis)).astype(int)
             count = self.apart.shape[axis]
             if not self._whole(axis):
-                known &= (cell >= 0) & (cell < count)
+                inside &= (cell >= 0) & (cell < count)
             index.append(cell % count)
-        return known & self.apart[tuple(index)]
+        return inside & self.apart[tuple(index)]
 
     def throughout(
         self, *intervals: tuple[Float[ndarray, "n"], Float[ndarray, "n"]]
@@ -97,9 +97,9 @@ class LinkPairTable(Value):
         steps = np.arange((last - first).max(initial=0) + 1)
         cell = np.minimum(first[:, None] + steps, last[:, None])
         cell = cell % count if self._whole(axis) else np.clip(cell, 0, count - 1)
-        found = np.zeros((len(low), count), dtype=bool)
-        np.put_along_axis(found, cell, True, axis=1)
-        return found
+        overlaps = np.zeros((len(low), count), dtype=bool)
+        np.put_along_axis(overlaps, cell, True, axis=1)
+        return overlaps
 
 
 LOCKED_CACHE = 256
@@ -274,19 +274,21 @@ class Robot(KinematicTree):
                 raise InputError(
                     f"locked: {name} is {shown(value)}; it must be a number within ±{MAX_COORDINATE:g}"
                 )
-        held = with_mimics(self.joints, self.locked | {name: float(value) for name, value in locked.items()})
+        values_locked = with_mimics(
+            self.joints, self.locked | {name: float(value) for name, value in locked.items()}
+        )
         for name, value in locked.items():
             mimic = movable[name].mimic
-            if mimic is not None and abs(held[name] - value) > MIMIC_SLACK:
+            if mimic is not None and abs(values_locked[name] - value) > MIMIC_SLACK:
                 raise InputError(
                     f"locked: {name} is {value:g}; it follows {mimic.joint}, which puts it at "
-                    f"{held[name]:g}; lock {mimic.joint}"
+                    f"{values_locked[name]:g}; lock {mimic.joint}"
                 )
-        if held == self.locked:
+        if values_locked == self.locked:
             return self
         if self.attached:
             return reduce(Robot.with_body, self.attached, self.arm.with_locked(locked))
-        return _variant(self.unlocked, tuple(sorted(held.items())))
+        return _variant(self.unlocked, tuple(sorted(values_locked.items())))
 
     @property
     def arm(self) -> "Robot":
@@ -360,22 +362,22 @@ class Robot(KinematicTree):
                 shapes that
                 cannot be held.
         """
-        what = TOOL if body.tool else "attached"
+        field = TOOL if body.tool else "attached"
         moved = [link for link in self.link_names if self.link_frame(link) > 0]
         if body.link not in self.link_names:
-            raise unknown_name(f"link in {what}.link:", str(body.link), moved)
+            raise unknown_name(f"link in {field}.link:", str(body.link), moved)
         if body.link not in moved:
             raise InputError(
-                f"{what}.link is {body.link}, which no planned joint moves; these are moved: "
+                f"{field}.link is {body.link}, which no planned joint moves; these are moved: "
                 f"{', '.join(moved)}"
             )
         if body.name in self.link_names:
             raise InputError(
-                f"{what}.name is {body.name!r}, which is a link of {self.name}; give it another name"
+                f"{field}.name is {body.name!r}, which is a link of {self.name}; give it another name"
             )
         for link in body.touch_links:
             if link not in self.link_names:
-                raise unknown_name(f"link in {what}.touch_links:", str(link), self.link_names)
+                raise unknown_name(f"link in {field}.touch_links:", str(link), self.link_names)
         return _with_body(self, BodyContent(body))
 
     def detach(self, name: str) -> "Robot":
@@ -393,12 +395,12 @@ class Robot(KinematicTree):
         holds = [body.name for body in self.attached if body.link == name]
         if holds:
             raise InputError(f"{name} cannot be detached: it holds {', '.join(holds)}; detach that first")
-        left = [
+        remaining = [
             replace(body, touch_links=tuple(link for link in body.touch_links if link != name))
             for body in self.attached
             if body.name != name
         ]
-        return reduce(Robot.with_body, left, self.arm)
+        return reduce(Robot.with_body, remaining, self.arm)
 
     def placed_in_world(self, T_world_base: Float[ndarray, "4 4"]) -> "Robot":
         """The robot with a new base link, the world, that carries the old one: for pictures and simulators.
@@ -428,14 +430,14 @@ class Robot(KinematicTree):
 
         joints = ", ".join(self.joint_names)
         spheres = sum(len(rows) for rows in self.spheres.values())
-        held = ", ".join(f"{name} = {value:g}" for name, value in list(self.locked.items())[:6])
+        locked_text = ", ".join(f"{name} = {value:g}" for name, value in list(self.locked.items())[:6])
         more = f" and {len(self.locked) - 6} more" if len(self.locked) > 6 else ""
         lines = [
             f"Robot {self.name!r}: {self.dof} planned joints from {self.base} to {' and '.join(self.tips)}",
             f"  joints  {joints}",
             f"  lower   {row(self.lower)}",
             f"  upper   {row(self.upper)}",
-            f"  locked  {held}{more}" if held else "",
+            f"  locked  {locked_text}{more}" if locked_text else "",
             f"  {spheres} spheres on {len(self.spheres)} of {len(self.link_names)} links, "
             f"{len(self.checked_pairs())} checked pairs of links",
             f"  holds   {', '.join(body.name for body in self.attached)}" if self.attached else "",
@@ -470,7 +472,7 @@ def _with_body(robot: Robot, content: BodyContent) -> Robot:
     geometry = {body.name: body_geometry(body)} if body.shapes else {}
     # goals and pictures refer to the tip; a tool on another branch than the tip's does not replace it
     frame = robot.link_frame(body.link) if body.tool and robot.at_end(body.link) else -1
-    tip, *others = [body.name if robot.link_frame(tip) == frame else tip for tip in robot.tips]
+    tip, *remaining_tips = [body.name if robot.link_frame(tip) == frame else tip for tip in robot.tips]
     return replace(
         robot,
         joints=(*robot.joints, joint),
@@ -479,7 +481,7 @@ def _with_body(robot: Robot, content: BodyContent) -> Robot:
         allowed_collisions=robot.allowed_collisions
         | {frozenset((body.name, link)) for link in body.touch_links},
         tip=tip,
-        other_tips=tuple(others),
+        other_tips=tuple(remaining_tips),
         attached=(*robot.attached, body),
         bare=robot.arm,
     )
@@ -530,17 +532,17 @@ def named_pose(robot: Robot, field: str, name: str) -> list[float]:
     Raises InputError, naming the field, for an unknown name (the message lists those that hold all planned
     joints) and for a pose that lacks some.
     """
-    whole = [pose for pose, values in robot.poses.items() if {*robot.joint_names} <= values.keys()]
-    if not whole:
+    complete = [pose for pose, values in robot.poses.items() if {*robot.joint_names} <= values.keys()]
+    if not complete:
         values = f"a list of {robot.dof} numbers: {', '.join(robot.joint_names)}"
         raise InputError(f"{field} is {shown(name)}; it must be {values} ({robot.name} has no named poses)")
     if name not in robot.poses:
-        raise unknown_name(f"pose in {field}:", name, whole)
+        raise unknown_name(f"pose in {field}:", name, complete)
     values = robot.poses[name]
     missing = [joint for joint in robot.joint_names if joint not in values]
     if missing:
         raise InputError(
-            f"{field}: the pose {name!r} has no {', '.join(missing)}; whole poses: {', '.join(whole)}"
+            f"{field}: the pose {name!r} has no {', '.join(missing)}; whole poses: {', '.join(complete)}"
         )
     return [values[joint] for joint in robot.joint_names]
 

@@ -219,15 +219,15 @@ def _table_to_json(table: LinkPairTable) -> dict:
 
 def _table_from_json(data: dict) -> LinkPairTable:
     joints = tuple(map(str, data["joints"]))
-    apart = np.array([np.frombuffer(bytes.fromhex(row), np.uint8) for row in data["apart"]])
-    apart = np.unpackbits(apart, axis=1).astype(bool)
+    separated = np.array([np.frombuffer(bytes.fromhex(row), np.uint8) for row in data["apart"]])
+    separated = np.unpackbits(separated, axis=1).astype(bool)
     lower, upper = (tuple(map(float, data[end])) for end in ("lower", "upper"))
-    ends = (len(lower), len(upper), 1 if len(apart) == 1 else 2)
+    ends = (len(lower), len(upper), 1 if len(separated) == 1 else 2)
     spans = [0 < high - low <= MAX_COORDINATE for low, high in zip(lower, upper, strict=False)]
     if ends != (len(joints),) * 3 or not all(spans):
         raise ValueError("a table over one or two joints expected, lower below upper")
     a, b = map(str, data["links"])
-    return LinkPairTable((a, b), joints, lower, upper, apart[0] if len(joints) == 1 else apart)
+    return LinkPairTable((a, b), joints, lower, upper, separated[0] if len(joints) == 1 else separated)
 
 
 def _joint_to_json(joint: Joint) -> dict:

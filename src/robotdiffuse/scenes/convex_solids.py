@@ -39,8 +39,8 @@ def capsule_polyhedron(radius: float, height: float) -> ConvexMesh:
     # scaled up until the sphere is inside all faces
     a, b, c = np.moveaxis(hull.vertices[hull.faces], 1, 0)
     normals = np.cross(b - a, c - a)
-    inner = (np.einsum("fd,fd->f", normals, a) / np.linalg.norm(normals, axis=1)).min()
-    corners *= radius / inner
+    inradius = (np.einsum("fd,fd->f", normals, a) / np.linalg.norm(normals, axis=1)).min()
+    corners *= radius / inradius
     if height == 0:
         return convex_hull(corners)
     half = np.array([0.0, 0.0, height / 2])

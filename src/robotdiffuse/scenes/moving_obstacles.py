@@ -66,10 +66,10 @@ class MovingObstacle(Value):
             "times and poses": self.times is not None or self.poses is not None,
             "max_speed": self.max_speed is not None,
         }
-        given = [name for name, has in motions.items() if has]
-        if len(given) != 1:
+        motions_set = [name for name, has in motions.items() if has]
+        if len(motions_set) != 1:
             raise InputError(
-                f"moving obstacle {self.name!r} has {' and '.join(given) or 'no motion'}; it must have "
+                f"moving obstacle {self.name!r} has {' and '.join(motions_set) or 'no motion'}; it must have "
                 "exactly one of velocity, times and poses, max_speed"
             )
         if self.velocity is not None:
@@ -197,9 +197,9 @@ def track_speeds(
     times: Float[ndarray, "k"], poses: Float[ndarray, "k 4 4"], radius: float
 ) -> Float[ndarray, "intervals"]:
     """Bounds of the speed between the times [m/s], for points up to `radius` [m] from the origin."""
-    apart = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    distances_between = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     turns = [rotation_angle(a.T @ b) for a, b in zip(poses[:-1, :3, :3], poses[1:, :3, :3], strict=True)]
-    return (apart + radius * np.array(turns)) / np.diff(times)
+    return (distances_between + radius * np.array(turns)) / np.diff(times)
 
 
 def _slerp(a: Float[ndarray, "4"], b: Float[ndarray, "4"], fraction: float) -> Float[ndarray, "4"]:

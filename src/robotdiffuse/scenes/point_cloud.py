@@ -32,8 +32,8 @@ def read_octomap(file: str | Path) -> tuple[Float[ndarray, "n 3"], float]:
     is not of this format, or damaged.
     """
     content = read_bytes(file, "octomap")
-    header, found, data = content.partition(b"\ndata\n")
-    if not content.startswith(FIRST_LINE) or not found:
+    header, separator, data = content.partition(b"\ndata\n")
+    if not content.startswith(FIRST_LINE) or not separator:
         raise InputError(f"octomap {file} is no binary OctoMap file (.bt), as octomap_saver writes it")
     fields = dict(
         line.split(maxsplit=1)
@@ -74,20 +74,20 @@ def occupied_voxels(data: bytes, edge: float) -> Float[ndarray, "n 3"]:
             )
         bits = int.from_bytes(data[at : at + 2], "little")
         at += 2
-        inner = []
+        inner_nodes = []
         for child in range(8):
             state = (bits >> 2 * child) & 3
             upper = np.array([child & 1, child >> 1 & 1, child >> 2 & 1])
             middle = center + (upper - 0.5) * edge * 2 ** (level - 1)
             if state == INNER:
-                inner.append((middle, level - 1))
+                inner_nodes.append((middle, level - 1))
             elif state == OCCUPIED:
                 voxels = _shell(level - 1) * edge + middle
                 count += len(voxels)
                 if count > MAX_VOXELS:
                     raise InputError(f"the tree has more than {MAX_VOXELS:,} occupied voxels")
                 centers.append(voxels)
-        waiting += reversed(inner)
+        waiting += reversed(inner_nodes)
     return np.concatenate(centers) if centers else np.zeros((0, 3))
 
 
@@ -98,8 +98,8 @@ def _shell(level: int) -> Float[ndarray, "n 3"]:
         raise InputError(f"the tree has more than {MAX_VOXELS:,} occupied voxels")
     at = np.arange(n) - (n - 1) / 2
     ends = np.unique(at[[0, -1]])
-    inner = at[1:-1]
-    blocks = [(ends, at, at), (inner, ends, at), (inner, inner, ends)]
+    interior = at[1:-1]
+    blocks = [(ends, at, at), (interior, ends, at), (interior, interior, ends)]
     return np.concatenate([np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3) for axes in blocks])
 
 
@@ -125,10 +125,10 @@ def voxel_thin(points: Float[ndarray, "n 3"], voxel: float) -> Float[ndarray, "m
         cell = (cells @ np.array([extent[1] * extent[2], extent[2], 1.0])).astype(np.int64)
         packed = np.sort((cell << bits) | np.arange(len(points)))
         first = np.flatnonzero(np.diff(packed >> bits, prepend=-1))
-        kept = packed[first] & ((1 << bits) - 1)
+        first_indices = packed[first] & ((1 << bits) - 1)
     else:
-        kept = np.unique(cells, axis=0, return_index=True)[1]
-    return points[np.sort(kept)]
+        first_indices = np.unique(cells, axis=0, return_index=True)[1]
+    return points[np.sort(first_indices)]
 
 
 def distinct(points: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:
@@ -139,10 +139,10 @@ def distinct(points: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:
     hashes = (np.ascontiguousarray(points, np.float64) + 0.0).view(np.uint64) @ MIXERS
     if len(np.unique(hashes)) == len(points):
         return points
-    kept, which = np.unique(hashes, return_index=True, return_inverse=True)[1:]
-    if not np.array_equal(points[kept][which], points):  # two points have one hash
-        kept = np.unique(points, axis=0, return_index=True)[1]
-    return points[np.sort(kept)]
+    first_indices, inverse_indices = np.unique(hashes, return_index=True, return_inverse=True)[1:]
+    if not np.array_equal(points[first_indices][inverse_indices], points):  # two points have one hash
+        first_indices = np.unique(points, axis=0, return_index=True)[1]
+    return points[np.sort(first_indices)]
 
 
 def crop(points: Float[ndarray, "n 3"], center: Float[ndarray, "3"], reach: float) -> Float[ndarray, "m 3"]:

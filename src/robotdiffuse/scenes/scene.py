@@ -48,9 +48,9 @@ class Scene(Value):
         allowed_contacts: Mapping[str, Sequence[str] | str] | Iterable[tuple[str, Sequence[str] | str]] = (),
     ) -> None:
         named: list[Shape] = []
-        taken = set[str]()
+        names_in_use = set[str]()
         last = dict[str, int]()
-        given = dict[str, list[str]]()
+        names_of = dict[str, list[str]]()
         if not isinstance(shapes, Iterable):
             raise InputError(f"scene is {shown(shapes)}; it must be a list of shapes, e.g. [rd.Sphere(...)]")
         for i, shape in enumerate(shapes):
@@ -60,15 +60,15 @@ class Scene(Value):
                 )
             name = shape.name
             number = last.get(shape.name, 1)
-            while name in taken:
+            while name in names_in_use:
                 number += 1
                 name = f"{shape.name}_{number}"
-            taken.add(name)
+            names_in_use.add(name)
             last[shape.name] = number
-            given.setdefault(shape.name, []).append(name)
+            names_of.setdefault(shape.name, []).append(name)
             named.append(shape if name == shape.name else dataclass_replace(shape, name=name))  # type: ignore[type-var]
         object.__setattr__(self, "shapes", tuple(named))
-        object.__setattr__(self, "allowed_contacts", _contacts(allowed_contacts, given, taken))
+        object.__setattr__(self, "allowed_contacts", _contacts(allowed_contacts, names_of, names_in_use))
 
     def __repr__(self) -> str:
         count = f"{len(self.shapes)} shape" + ("" if len(self.shapes) == 1 else "s")
@@ -112,8 +112,8 @@ class Scene(Value):
         scene = Scene(shapes)
         if self.allowed_contacts:
             names = {shape.name for shape in scene.shapes}
-            kept = tuple(contact for contact in self.allowed_contacts if contact[0] in names)
-            object.__setattr__(scene, "allowed_contacts", kept)
+            contacts = tuple(contact for contact in self.allowed_contacts if contact[0] in names)
+            object.__setattr__(scene, "allowed_contacts", contacts)
         return scene
 
     def may_touch(self, link: str, obstacle: str) -> bool:
@@ -158,9 +158,11 @@ class Scene(Value):
             raise unknown_name("obstacle to attach:", name, names)
         link = robot.tip if link is None else link
         robot.link_frame(link)  # raises InputError, with the known links, for an unknown one
-        held = self.shapes[names.index(name)].moved(inverse(link_pose(robot, np.asarray(q, float), link)))
-        left = self.with_shapes([shape for shape in self.shapes if shape.name != name])
-        return left, robot.attach(held, link, touch_links)
+        taken_shape = self.shapes[names.index(name)].moved(
+            inverse(link_pose(robot, np.asarray(q, float), link))
+        )
+        remaining_scene = self.with_shapes([shape for shape in self.shapes if shape.name != name])
+        return remaining_scene, robot.attach(taken_shape, link, touch_links)
 
     def detach(self, name: str, robot: Robot, q: Float[ndarray, "dof"]) -> tuple["Scene", Robot]:
         """The robot puts a held object down.
@@ -179,8 +181,8 @@ class Scene(Value):
         freed = robot.detach(name)
         [body] = [body for body in robot.attached if body.name == name]
         T_base_link = link_pose(robot, np.asarray(q, float), body.link)
-        left = [shape.moved(T_base_link) for shape in body.shapes if isinstance(shape, Shape)]
-        return self.with_shapes([*self.shapes, *left]), freed
+        released = [shape.moved(T_base_link) for shape in body.shapes if isinstance(shape, Shape)]
+        return self.with_shapes([*self.shapes, *released]), freed
 
 
 def contact_notes(scene: Scene) -> tuple[str, ...]:

@@ -574,8 +574,8 @@ class HeightMap(PosedTriangles):
             raise InputError(
                 f"height_map.heights is {form(heights)}; it must be rows x columns, at least 2 x 2"
             )
-        known = np.abs(heights[~np.isnan(heights)])
-        if not (known <= MAX_COORDINATE).all():
+        finite = np.abs(heights[~np.isnan(heights)])
+        if not (finite <= MAX_COORDINATE).all():
             raise InputError(f"height_map.heights has numbers that are not within ±{MAX_COORDINATE:g} m")
         set_fields(
             self,
@@ -603,9 +603,9 @@ class HeightMap(PosedTriangles):
     def _faces(self) -> ndarray:
         rows, columns = self.heights.shape
         corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
-        whole = ~np.isnan(self.heights)
-        whole = (whole[:-1, :-1] & whole[1:, :-1] & whole[:-1, 1:] & whole[1:, 1:]).ravel()
-        a = corner[whole]
+        complete = ~np.isnan(self.heights)
+        complete = (complete[:-1, :-1] & complete[1:, :-1] & complete[:-1, 1:] & complete[1:, 1:]).ravel()
+        a = corner[complete]
         b = a + 1
         c = a + columns
         d = a + columns + 1

@@ -268,14 +268,14 @@ class PointAutoencoder(Autoencoder):
         truth = torch.where(near.any(1)[:, None], truth, DISTANCE_CAP)
         code = self.encode(cloud)
         guess = self.distance(code, at)
-        apart = chamfer(self.decode(code), cloud, near)
+        chamfer_loss = chamfer(self.decode(code), cloud, near)
         field = functional.smooth_l1_loss(guess, truth, beta=0.01)
         errors = {
-            "chamfer": apart.item(),
+            "chamfer": chamfer_loss.item(),
             "distance": (guess - truth).abs().mean().item(),
             "distance_of_constant": (truth - truth.median()).abs().mean().item(),
         }
-        return apart + DISTANCE_WEIGHT * field, errors
+        return chamfer_loss + DISTANCE_WEIGHT * field, errors
 
     def _query_positions(self, cloud: Cloud, rng: Generator) -> Float[Tensor, "batch queries 3"]:
         """Positions at which the distance is reconstructed: half of them close to the surfaces."""
@@ -404,11 +404,11 @@ def neighbours(x: Features, near: Near, count: int) -> Int64[Tensor, "batch poin
         x = x.detach().float()
         squared = x.square().sum(-1)
         # |a - b|^2 without |a|^2, which is the same for all neighbours of a
-        apart = torch.baddbmm(squared[:, None], x, x.mT, alpha=-2.0)
-        apart = apart.masked_fill(~near[:, None], IGNORED_DISTANCE)
-        found = apart.topk(min(count, x.shape[1]), dim=-1, largest=False, sorted=False)
+        squared_distances = torch.baddbmm(squared[:, None], x, x.mT, alpha=-2.0)
+        squared_distances = squared_distances.masked_fill(~near[:, None], IGNORED_DISTANCE)
+        nearest = squared_distances.topk(min(count, x.shape[1]), dim=-1, largest=False, sorted=False)
         itself = torch.arange(x.shape[1], device=x.device)[:, None]
-        return torch.where(found.values < IGNORED_DISTANCE, found.indices, itself)
+        return torch.where(nearest.values < IGNORED_DISTANCE, nearest.indices, itself)
 
 
 class EdgeConvolution(nn.Module):
@@ -428,10 +428,12 @@ class EdgeConvolution(nn.Module):
 
     def forward(self, x: Features, near: Near) -> Float[Tensor, "batch points out"]:
         index = neighbours(x, near, self.count)
-        other = self.other(x)
-        offset = other.shape[1] * torch.arange(len(other), device=x.device)[:, None, None]
-        joined = other.flatten(0, 1)[(index + offset).flatten(0, 1)]
-        pooled = joined.amax(1).view_as(other)
+        neighbor_features = self.other(x)
+        offset = (
+            neighbor_features.shape[1] * torch.arange(len(neighbor_features), device=x.device)[:, None, None]
+        )
+        joined = neighbor_features.flatten(0, 1)[(index + offset).flatten(0, 1)]
+        pooled = joined.amax(1).view_as(neighbor_features)
         return functional.leaky_relu(self.norm(self.own(x) + pooled), NEGATIVE_SLOPE)
 
 
@@ -455,10 +457,10 @@ class DGCNN(Encoder):
 
     def forward(self, cloud: Cloud) -> Codes:
         near = self.near(cloud)
-        first, *others = self.edges
+        first, *further_layers = self.edges
         with fp32(cloud):
             features = [first(cloud, near)]
-        for layer in others:
+        for layer in further_layers:
             features.append(layer(features[-1], near))
         x = self.embed(torch.cat(features, -1))
         pooled = torch.cat([pool_max(x, near).float(), pool_mean(x, near)], -1)

@@ -140,9 +140,9 @@ def load_data(
         prints += [rows.shard.fingerprint] * (rows.turn == 0)
         key = f"{rows.shard.fingerprint}-{encoder_fingerprint}" + (f"-turn{rows.turn}" if rows.turn else "")
         codes = _codes(FilePath(folder), rows.scenes, encoder, key)
-        for name, found in parts.items():
+        for name, collected in parts.items():
             of = rows.split == SPLITS.index(name)
-            found.append((rows.q[of], rows.scenes[of], rows.shard["line_free"][of], codes[of]))
+            collected.append((rows.q[of], rows.scenes[of], rows.shard["line_free"][of], codes[of]))
             count += int(of.sum())
         if rows.turn == turned_copies:
             report(f"data: {len(prints)} of {shards} shards, {count:,} trajectories")
@@ -286,9 +286,9 @@ class Batches:
         target = model.objective.target(clean, noise, signal, noise_level)
         weight = model.objective.weight(schedule, levels, self.weight_limit)
         per_output = model.objective.clean_per_output(schedule.signal[levels], schedule.noise[levels])
-        held = model.hold_ends(noisy.copy(), reference)
+        clamped = model.hold_ends(noisy.copy(), reference)
         return Batch(
-            features=model.features(held, reference, lambda at: self.clearances(scenes, at)),
+            features=model.features(clamped, reference, lambda at: self.clearances(scenes, at)),
             level=(levels / schedule.steps).astype(np.float32),
             condition=model.condition(codes, q[:, 0], q[:, -1]),
             clouds=clouds,

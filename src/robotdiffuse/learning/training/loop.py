@@ -60,12 +60,12 @@ class Processes:
             raise InputError('training needs accelerate: pip install "robotdiffuse[train]"') from None
         cpu = device == "cpu" or not cuda
         bf16 = fast_bf16() if cpu else torch.cuda.is_bf16_supported(including_emulation=False)
-        wanted = "cpu" if cpu else "cuda"
+        device_type = "cpu" if cpu else "cuda"
         # Accelerate keeps one state per interpreter, that of its first use
         begun = PartialState().device if PartialState._shared_state else None
-        if begun is not None and begun.type != wanted:
+        if begun is not None and begun.type != device_type:
             raise InputError(
-                f"device is {wanted}, but this process has trained on {begun.type}; start a new process"
+                f"device is {device_type}, but this process has trained on {begun.type}; start a new process"
             )
         self._accelerator = Accelerator(cpu=cpu, mixed_precision="bf16" if bf16 else "no")
         self.device: torch.device = self._accelerator.device
@@ -106,8 +106,8 @@ class Processes:
 
     def _mean(self, values: Tensor) -> Tensor:
         # Accelerate's types allow more than tensors
-        found: Any = self._accelerator.reduce(values, "mean")
-        return found
+        mean: Any = self._accelerator.reduce(values, "mean")
+        return mean
 
     def gather(self, value: Value) -> list[Value]:
         """The values of all processes, in their order."""

@@ -170,37 +170,37 @@ def _split(triangles, squares):
     open_ones = np.empty((MAX_SPLITS + 2, 3, 3))
     for t in range(len(triangles)):
         open_ones[0] = triangles[t]
-        left = 1
-        while left > 0:
-            left -= 1
+        open_count = 1
+        while open_count > 0:
+            open_count -= 1
             longest = -1.0
             k = 0
             for i in range(3):
                 j = (i + 1) % 3
                 square = 0.0
                 for d in range(3):
-                    square += (open_ones[left, i, d] - open_ones[left, j, d]) ** 2
+                    square += (open_ones[open_count, i, d] - open_ones[open_count, j, d]) ** 2
                 if square > longest:
                     longest = square
                     k = i
-            if longest <= squares[t] or left >= MAX_SPLITS:
+            if longest <= squares[t] or open_count >= MAX_SPLITS:
                 if count == len(out):
                     out = np.concatenate((out, np.empty_like(out)))
-                out[count] = open_ones[left]
+                out[count] = open_ones[open_count]
                 count += 1
                 continue
             for d in range(3):
-                a = open_ones[left, k, d]
-                b = open_ones[left, (k + 1) % 3, d]
-                c = open_ones[left, (k + 2) % 3, d]
+                a = open_ones[open_count, k, d]
+                b = open_ones[open_count, (k + 1) % 3, d]
+                c = open_ones[open_count, (k + 2) % 3, d]
                 middle = 0.5 * (a + b)
-                open_ones[left, 0, d] = a
-                open_ones[left, 1, d] = middle
-                open_ones[left, 2, d] = c
-                open_ones[left + 1, 0, d] = middle
-                open_ones[left + 1, 1, d] = b
-                open_ones[left + 1, 2, d] = c
-            left += 2
+                open_ones[open_count, 0, d] = a
+                open_ones[open_count, 1, d] = middle
+                open_ones[open_count, 2, d] = c
+                open_ones[open_count + 1, 0, d] = middle
+                open_ones[open_count + 1, 1, d] = b
+                open_ones[open_count + 1, 2, d] = c
+            open_count += 2
     return out[:count].copy()
 
 
@@ -283,10 +283,10 @@ def _cut(parts: list["Part"], space: DistanceGrid, settings: PartSettings, most:
     `most`."""
     parts = list(parts)
     while len(parts) < most:
-        worst = max(range(len(parts)), key=lambda i: parts[i].concavity)
-        if parts[worst].concavity <= settings.concavity:
+        most_concave = max(range(len(parts)), key=lambda i: parts[i].concavity)
+        if parts[most_concave].concavity <= settings.concavity:
             break
-        parts[worst : worst + 1] = parts[worst].halves(space, settings)
+        parts[most_concave : most_concave + 1] = parts[most_concave].halves(space, settings)
     return parts
 
 
@@ -343,20 +343,20 @@ class Part:
         small to cut."""
         low = self.hull.vertices.min(0)
         size = np.ptp(self.hull.vertices, axis=0)
-        points, apart = _thinned(self.points, space.pitch)
+        points, pitch = _thinned(self.points, space.pitch)
         best = None
-        least = np.inf
+        min_volume = np.inf
         for axis in sorted(np.flatnonzero(size > 6 * space.pitch), key=lambda axis: -size[axis]):
             for at in (*_wall_cuts(points[:, axis], space.pitch), *(low[axis] + CUT_FRACTIONS * size[axis])):
                 height = points[:, axis] - at
                 volume = 0.0
                 for side in (points[height <= 0], points[height > 0]):
-                    edge = side[np.abs(side[:, axis] - at) <= apart]
+                    edge = side[np.abs(side[:, axis] - at) <= pitch]
                     edge[:, axis] = at  # approximates the intersection of surface and plane
                     volume += hull_volume(np.concatenate([side, edge]))
-                if volume < IMPROVEMENT * least:
+                if volume < IMPROVEMENT * min_volume:
                     best = (int(axis), float(at))
-                    least = volume
+                    min_volume = volume
         halves = _sides(self.triangles, *best) if best else ()
         if best is None or not all(map(len, halves)):
             return [replace(self, concavity=0.0)]
@@ -368,10 +368,10 @@ class Part:
 def _wall_cuts(heights: Float[ndarray, "n"], pitch: float) -> list[float]:
     """Cuts just before and after surfaces perpendicular to an axis, where parts often meet."""
     counts, edges = np.histogram(heights, max(int(np.ptp(heights) / pitch), 1))
-    most = np.argsort(-counts)[:MAX_WALLS]
+    fullest = np.argsort(-counts)[:MAX_WALLS]
     middles = [
         float(np.median(heights[(heights >= edges[k]) & (heights <= edges[k + 1])]))
-        for k in most
+        for k in fullest
         if counts[k] > 2 * np.median(counts)
     ]
     return [middle + step for middle in middles for step in (-WALL_OFFSET, WALL_OFFSET)]
@@ -425,30 +425,30 @@ def _sides(
 def _merged(hulls: list[ConvexMesh], space: DistanceGrid, settings: PartSettings) -> list[ConvexMesh]:
     """Hulls merged pairwise, least common concavity first, while it is within `settings.concavity`."""
     hulls = list(hulls)
-    known: dict[tuple[int, int], tuple[float, ConvexMesh]] = {}
+    merged: dict[tuple[int, int], tuple[float, ConvexMesh]] = {}
     while len(hulls) > 1:
         for i, a in enumerate(hulls):
             for b in hulls[i + 1 :]:
-                if (id(a), id(b)) not in known:
+                if (id(a), id(b)) not in merged:
                     both = convex_hull(np.concatenate([a.vertices, b.vertices]))
                     both = simplified(both, settings)
-                    known[id(a), id(b)] = (space.concavity(both), both)
+                    merged[id(a), id(b)] = (space.concavity(both), both)
         pairs = [
-            (known[id(a), id(b)][0], i, j) for i, a in enumerate(hulls) for j, b in enumerate(hulls) if i < j
+            (merged[id(a), id(b)][0], i, j) for i, a in enumerate(hulls) for j, b in enumerate(hulls) if i < j
         ]
-        least, i, j = min(pairs)
-        if least > settings.concavity:
+        min_concavity, i, j = min(pairs)
+        if min_concavity > settings.concavity:
             break
-        both = known[id(hulls[i]), id(hulls[j])][1]
+        both = merged[id(hulls[i]), id(hulls[j])][1]
         hulls = [hull for k, hull in enumerate(hulls) if k not in (i, j)] + [both]
     return hulls
 
 
 def _without_contained(hulls: list[ConvexMesh]) -> list[ConvexMesh]:
     """Hulls without those contained in another one."""
-    kept = sorted(hulls, key=lambda hull: float(np.prod(np.ptp(hull.vertices, axis=0))))
-    for hull in tuple(kept):
-        others = [planes_of(other) for other in kept if other is not hull]
-        if any((hull.vertices @ normals.T <= offsets).all() for normals, offsets in others):
-            kept.remove(hull)
-    return kept
+    remaining = sorted(hulls, key=lambda hull: float(np.prod(np.ptp(hull.vertices, axis=0))))
+    for hull in tuple(remaining):
+        other_planes = [planes_of(neighbor) for neighbor in remaining if neighbor is not hull]
+        if any((hull.vertices @ normals.T <= offsets).all() for normals, offsets in other_planes):
+            remaining.remove(hull)
+    return remaining

@@ -35,15 +35,15 @@ def cover(mesh: ConvexMesh) -> Float[ndarray, "n 4"]:
     vertices = mesh.vertices @ axes.T
     low = vertices.min(axis=0)
     high = vertices.max(axis=0)
-    whole = _around(vertices)
-    if whole[3] - (high - low).min() / 2 <= _tolerance(high - low):
-        spheres = whole[None]
+    bounding = _around(vertices)
+    if bounding[3] - (high - low).min() / 2 <= _tolerance(high - low):
+        spheres = bounding[None]
     else:
-        pieces = [vertices]
+        slabs = [vertices]
         for axis, count in enumerate(_lattice(high - low)):
             cuts = np.linspace(low[axis], high[axis], count + 1)[1:-1]
-            pieces = [piece for whole in pieces for piece in _slices(whole, axis, cuts)]
-        spheres = np.stack([_around(piece) for piece in pieces if len(piece)])
+            slabs = [slab for bounding in slabs for slab in _slices(bounding, axis, cuts)]
+        spheres = np.stack([_around(slab) for slab in slabs if len(slab)])
     return np.column_stack([spheres[:, :3] @ axes, spheres[:, 3] + MARGIN])
 
 
@@ -58,9 +58,9 @@ def _tolerance(size: Float[ndarray, "3"]) -> float:
 def _axes(vertices: Float[ndarray, "v 3"]) -> Float[ndarray, "3 3"]:
     """Axes as rows: those of the mesh's frame, or the principal axes if a box along these is smaller."""
     principal = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
-    own = np.ptp(vertices, axis=0).prod()
-    other = np.ptp(vertices @ principal.T, axis=0).prod()
-    return principal if other < 0.9 * own else np.eye(3)
+    frame_volume = np.ptp(vertices, axis=0).prod()
+    principal_volume = np.ptp(vertices @ principal.T, axis=0).prod()
+    return principal if principal_volume < 0.9 * frame_volume else np.eye(3)
 
 
 def _lattice(size: Float[ndarray, "3"]) -> tuple[int, ...]:

@@ -78,7 +78,7 @@ class Neighbour:
 def neighbours(robot: Robot, link: str) -> tuple[Neighbour, ...]:
     """Links with geometry that a joint connects to this one; skips fixed links without geometry in
     between."""
-    found = []
+    adjacent = []
     for joint in robot.joints:
         above = joint.parent
         T_above_parent = np.eye(4)
@@ -94,25 +94,25 @@ def neighbours(robot: Robot, link: str) -> tuple[Neighbour, ...]:
         ends = (-np.pi, np.pi) if endless else (joint.lower, joint.upper)
         values = np.linspace(*ends, JOINT_SAMPLES) if joint.kind in MOVING_KINDS else [0.0]
         T = np.stack([T_above_parent @ joint.T_parent_joint @ joint.motion(float(q)) for q in values])
-        other = joint.child if link == above else above
-        found.append(Neighbour(other, T if link == above else np.stack([inverse(t) for t in T])))
-    return tuple(found)
+        next_link = joint.child if link == above else above
+        adjacent.append(Neighbour(next_link, T if link == above else np.stack([inverse(t) for t in T])))
+    return tuple(adjacent)
 
 
 def hidden_by_neighbours(robot: Robot, link: str) -> Callable[[Float[ndarray, "n 3"]], Bool[ndarray, "n"]]:
     """A function that tells which points, in the link's frame [m], are inside one neighbour at all joint
     values."""
     neighbour_planes: list[tuple[Neighbour, tuple[ndarray, ndarray], Planes]] = []
-    for other in neighbours(robot, link):
-        corners = np.concatenate([mesh.vertices for mesh in robot.meshes[other.link]])
+    for near_link in neighbours(robot, link):
+        corners = np.concatenate([mesh.vertices for mesh in robot.meshes[near_link.link]])
         box = corners.min(0) - BOX_PADDING, corners.max(0) + BOX_PADDING
-        neighbour_planes.append((other, box, stacked_planes(robot.meshes[other.link])))
+        neighbour_planes.append((near_link, box, stacked_planes(robot.meshes[near_link.link])))
 
     def hidden(points: Float[ndarray, "n 3"]) -> Bool[ndarray, "n"]:
         found = np.zeros(len(points), dtype=bool)
-        for other, (low, high), planes in neighbour_planes:
+        for near_link, (low, high), planes in neighbour_planes:
             left = np.flatnonzero(~found)
-            for T in other.T_link_neighbour:
+            for T in near_link.T_link_neighbour:
                 local = (points[left] - T[:3, 3]) @ T[:3, :3]
                 near = ((local >= low) & (local <= high)).all(axis=1)
                 left = left[near]
@@ -129,7 +129,7 @@ def with_grazing_links(
 ) -> Robot:
     """The robot with the surfaces of all pairs of links whose parts collided falsely in any measurement."""
     grazing = frozenset(
-        frozenset(pair.links) for found in measured for pair in found.pairs if pair.by_parts > 0
+        frozenset(pair.links) for measurement in measured for pair in measurement.pairs if pair.by_parts > 0
     )
     links = sorted({link for pair in grazing for link in pair})
     return replace(robot, surfaces={link: _joined(surfaces[link]) for link in links}, grazing=grazing)
@@ -302,11 +302,11 @@ def prepare(
     _, _, robot, false_collisions = min(tried, key=lambda one: one[:2])  # refinement can add false collisions
     closer = with_finer_parts(robot, links, false_collisions, settings, seed)
     if closer is not None:
-        again = measure_false_collisions(closer, surfaces, settings.samples, np.random.default_rng(seed))
-        worst = max(false_collisions.by_spheres, settings.max_false_collisions)
-        if again.by_parts < false_collisions.by_parts and again.by_spheres <= worst:
+        remeasured = measure_false_collisions(closer, surfaces, settings.samples, np.random.default_rng(seed))
+        max_by_spheres = max(false_collisions.by_spheres, settings.max_false_collisions)
+        if remeasured.by_parts < false_collisions.by_parts and remeasured.by_spheres <= max_by_spheres:
             robot = closer
-            false_collisions = again
+            false_collisions = remeasured
     measured = (
         measure_false_collisions(robot, surfaces, settings.samples, np.random.default_rng((seed, k)))
         for k in range(GRAZING_ROUNDS)
@@ -338,18 +338,18 @@ def _refined(
     seed: int,
 ) -> Robot:
     """The robot with finer parts and spheres for pairs of links with many false collisions."""
-    worst = _worst(false_collisions, settings.max_false_collisions)
-    close = {pair.links for pair in worst if _beyond_spheres(robot, pair, settings)}
-    coarse = {
+    worst_pairs = _worst(false_collisions, settings.max_false_collisions)
+    close = {pair.links for pair in worst_pairs if _beyond_spheres(robot, pair, settings)}
+    coarse_links = {
         name
-        for pair in worst
+        for pair in worst_pairs
         if pair.by_parts > settings.max_false_collisions / 5
         for name in pair.links
         if pair.links not in close or len(pair.coarse[name])
     }
-    for name in sorted(coarse):
+    for name in sorted(coarse_links):
         link = links[name]
-        places = [pair.coarse[name] for pair in worst if pair.links in close and name in pair.links]
+        places = [pair.coarse[name] for pair in worst_pairs if pair.links in close and name in pair.links]
         tight = np.concatenate([*places, np.zeros((0, 3))])
         if len(tight):
             link.tight = tight if link.tight is None else np.concatenate([link.tight, tight])
@@ -358,10 +358,12 @@ def _refined(
                 link.parts, concavity=link.parts.concavity * CONCAVITY_SHRINKAGE, most=2 * link.parts.most
             )
         robot = link.decompose(robot)
-    again = coarse | {name for pair in worst if pair.links not in close for name in pair.links}
-    for name in sorted(again):
+    affected = coarse_links | {name for pair in worst_pairs if pair.links not in close for name in pair.links}
+    for name in sorted(affected):
         link = links[name]
-        tight = [_shared(pair, name) for pair in worst if name in pair.links and pair.links not in close]
+        tight = [
+            _shared(pair, name) for pair in worst_pairs if name in pair.links and pair.links not in close
+        ]
         if tight:
             places = np.concatenate(tight)
             gaps = GAP_FRACTION * GAP_SHRINKAGE**k * places[:, 3]
@@ -369,8 +371,8 @@ def _refined(
             known = [] if link.bounds.tight is None else [link.bounds.tight]
             link.bounds = replace(link.bounds, tight=np.concatenate([*known, places]))
         robot = link.fit(robot, settings.spheres, seed)
-    stale = {table.links for table in robot.tables if coarse & {*table.links}}
-    return _with_tables(robot, close | stale, settings)
+    stale_tables = {table.links for table in robot.tables if coarse_links & {*table.links}}
+    return _with_tables(robot, close | stale_tables, settings)
 
 
 def with_finer_parts(
@@ -391,13 +393,15 @@ def with_finer_parts(
                 places.setdefault(name, []).append(pair.coarse[name])
     if not places:
         return None
-    coarse = set(places)
-    for name in sorted(coarse):
+    coarse_links = set(places)
+    for name in sorted(coarse_links):
         link = links[name]
         known = [] if link.tight is None else [link.tight]
         link.tight = np.concatenate([*known, *places[name]])
         robot = link.fit(link.decompose(robot), settings.spheres, seed)
-    return _with_tables(robot, {table.links for table in robot.tables if coarse & {*table.links}}, settings)
+    return _with_tables(
+        robot, {table.links for table in robot.tables if coarse_links & {*table.links}}, settings
+    )
 
 
 def _with_tables(robot: Robot, pairs: set[tuple[str, str]], settings: PreparationSettings) -> Robot:
@@ -412,8 +416,8 @@ def _with_tables(robot: Robot, pairs: set[tuple[str, str]], settings: Preparatio
 def _beyond_spheres(robot: Robot, pair: PairFalseCollisions, settings: PreparationSettings) -> bool:
     """Whether even the finest spheres of a pair collide falsely too often, and a table over one or two joints
     can help."""
-    narrow = (pair.gaps < 2 * settings.finest).mean() if len(pair.gaps) else 0.0
-    hopeless = narrow * (pair.by_spheres - pair.by_parts) > settings.max_false_collisions / 3
+    narrow_fraction = (pair.gaps < 2 * settings.finest).mean() if len(pair.gaps) else 0.0
+    hopeless = narrow_fraction * (pair.by_spheres - pair.by_parts) > settings.max_false_collisions / 3
     return bool(hopeless) and len(robot.joints_between(*pair.links)) in (1, 2)
 
 
@@ -429,14 +433,14 @@ def _shared(pair: PairFalseCollisions, link: str) -> Float[ndarray, "n 4"]:
 
 def _worst(false_collisions: FalseCollisions, allowed: float) -> list[PairFalseCollisions]:
     """The fewest pairs without which the others are well below the allowed fraction of false collisions."""
-    left = sum(pair.by_spheres for pair in false_collisions.pairs)
-    worst = []
+    remaining = sum(pair.by_spheres for pair in false_collisions.pairs)
+    worst_pairs = []
     for pair in false_collisions.pairs:
-        if left <= UNREFINED_FRACTION * allowed:
+        if remaining <= UNREFINED_FRACTION * allowed:
             break
-        worst.append(pair)
-        left -= pair.by_spheres
-    return worst
+        worst_pairs.append(pair)
+        remaining -= pair.by_spheres
+    return worst_pairs
 
 
 def _floor(robot: Robot, link: str) -> tuple[ndarray, float] | None:
@@ -512,29 +516,29 @@ class AddReport:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Problems that will limit planning, and allowed pairs of links whose meshes collide."""
-        found = []
+        warnings = []
         of = self.false_collisions
-        worst = "; ".join(f"{' against '.join(p.links)} {p.by_spheres:.1%}" for p in of.pairs[:3])
+        worst_text = "; ".join(f"{' against '.join(p.links)} {p.by_spheres:.1%}" for p in of.pairs[:3])
         if of.free < MIN_FREE:
             often = sorted(of.pairs, key=lambda pair: -pair.colliding)[:3]
             names = "; ".join(f"{' against '.join(pair.links)} {pair.colliding:.1%}" for pair in often)
-            found.append(
+            warnings.append(
                 f"only {of.free:.1%} of the configurations are free of self-collision by the URDF's meshes "
                 f"({names}); allow pairs that may touch with --allow"
             )
         if of.by_spheres > MAX_FALSE_COLLISIONS:
-            found.append(
+            warnings.append(
                 f"covering spheres collide falsely in {of.by_spheres:.1%} of the free configurations, more "
-                f"than {MAX_FALSE_COLLISIONS:.0%} ({worst}); planning cannot use these"
+                f"than {MAX_FALSE_COLLISIONS:.0%} ({worst_text}); planning cannot use these"
             )
-        found += [
+        warnings += [
             f"{' against '.join(pair.links)} is not checked, though the URDF's meshes collide in "
             f"{pair.colliding:.1%} of the configurations, {ASSUMED_SAFE[pair.reason]}; make "
             f"sure that the arm cannot hit itself there"
             for pair in self.pairs
             if pair.reason in ASSUMED_SAFE and pair.colliding
         ]
-        return (*found, *(f"spheres do not cover {link.link}" for link in self.links if not link.covered))
+        return (*warnings, *(f"spheres do not cover {link.link}" for link in self.links if not link.covered))
 
 
 def never_free(false_collisions: FalseCollisions) -> bool:
@@ -601,8 +605,8 @@ def add_robot(
     """
     begin = time.process_time()
     tree = UrdfTree(Path(urdf), packages or {}, compile_xacro=True)
-    found = Path(srdf) if srdf is not None else None if tree.semantics else srdf_beside(urdf, tree.name)
-    semantics = tree.semantics if found is None else read_srdf(found)
+    srdf_file = Path(srdf) if srdf is not None else None if tree.semantics else srdf_beside(urdf, tree.name)
+    semantics = tree.semantics if srdf_file is None else read_srdf(srdf_file)
     robot = tree.robot(base, tip, locked, group, semantics)
     for link in {link for pair in allow for link in pair} - {*robot.link_names}:
         raise unknown_name("link in allow", link, robot.link_names)
@@ -618,8 +622,8 @@ def add_robot(
             f"{urdf}: no link has collision or visual geometry, so collisions cannot be checked; add "
             f"<collision> elements to its links"
         )
-    known = {} if semantics is None else semantics.allowed
-    allowed = {pair: BY_SRDF for pair in known} if srdf is not None or found is None else {}
+    srdf_allowed = {} if semantics is None else semantics.allowed
+    allowed = {pair: BY_SRDF for pair in srdf_allowed} if srdf is not None or srdf_file is None else {}
     allowed |= {frozenset(pair): NAMED for pair in allow}
     surfaces = {link: tree.surfaces(link) for link in robot.meshes}
     settings = settings or PreparationSettings()
@@ -629,9 +633,11 @@ def add_robot(
     if never_free(made.false_collisions):
         raise never_free_error(urdf, made.false_collisions)
     differences = tuple(
-        PairDifference(pair.links, pair.reason, pair.colliding, known.get(frozenset(pair.links), CHECKED))
+        PairDifference(
+            pair.links, pair.reason, pair.colliding, srdf_allowed.get(frozenset(pair.links), CHECKED)
+        )
         for pair in made.sampled
-        if semantics is not None and (pair.reason == CHECKED) == (frozenset(pair.links) in known)
+        if semantics is not None and (pair.reason == CHECKED) == (frozenset(pair.links) in srdf_allowed)
     )
     folder = user_robots() / name if out is None else Path(out)
     source = {"urdf": Path(urdf).name, "sha256": tree.digest, "licence": license}
@@ -645,5 +651,5 @@ def add_robot(
     write_robot_folder(replace(made.robot, notes=(*robot.notes, note)), folder, source | shares)
     seconds = time.process_time() - begin
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * BYTES_PER_UNIT
-    shown = (made.links, made.pairs, made.false_collisions, seconds, memory, found, differences)
-    return AddReport(read_robot_folder(folder), folder, *shown)
+    summary = (made.links, made.pairs, made.false_collisions, seconds, memory, srdf_file, differences)
+    return AddReport(read_robot_folder(folder), folder, *summary)

@@ -88,9 +88,9 @@ class Links:
         place = np.minimum((share * BINS).astype(int), BINS - 1)
         count = np.maximum(np.bincount(place, minlength=BINS), 1)
         often = np.bincount(place, colliding, minlength=BINS) / count
-        left = (often * (1 - often) * count).sum() / len(q)
-        whole = colliding.mean() * (1 - colliding.mean())
-        return bool(max(often[0], often[-1]) > 0.99 and left < MAX_UNEXPLAINED * whole)
+        unexplained = (often * (1 - often) * count).sum() / len(q)
+        variance = colliding.mean() * (1 - colliding.mean())
+        return bool(max(often[0], often[-1]) > 0.99 and unexplained < MAX_UNEXPLAINED * variance)
 
     def poses(
         self, q: Float[ndarray, "n d"], wanted: frozenset[str] | None = None
@@ -229,13 +229,13 @@ class Links:
             np.einsum("nij,nj->ni", poses[link][rows, :3, :3], ball[:, :3]) + poses[link][rows, :3, 3]
             for link, ball in zip((a, b), balls, strict=True)
         ]
-        found = np.linalg.norm(middles[0] - middles[1], axis=1) - balls[0][:, 3] - balls[1][:, 3]
-        near = np.flatnonzero(found <= limit)
+        part_gaps = np.linalg.norm(middles[0] - middles[1], axis=1) - balls[0][:, 3] - balls[1][:, 3]
+        near = np.flatnonzero(part_gaps <= limit)
         places = {int(row): (coal_pose(poses[a][row]), coal_pose(poses[b][row])) for row in set(rows[near])}
         for k in near:
             T_a, T_b = places[int(rows[k])]
             self.distance_result.clear()
-            found[k] = coal.distance(
+            part_gaps[k] = coal.distance(
                 self.hulls[a][parts[0, k]],
                 T_a,
                 self.hulls[b][parts[1, k]],
@@ -243,7 +243,7 @@ class Links:
                 self.distance_request,
                 self.distance_result,
             )
-        return found
+        return part_gaps
 
 
 def _ball(mesh: ConvexMesh) -> Float[ndarray, "4"]:
@@ -257,8 +257,12 @@ def _inner(mesh: ConvexMesh) -> Float[ndarray, "4"]:
     """Centre and radius of a largest ball inside a convex mesh [m]."""
     normals, offsets = planes_of(mesh)
     planes = np.column_stack([normals, np.ones(len(normals))])
-    found = linprog([0, 0, 0, -1], planes, offsets, bounds=[(None, None)] * 3 + [(0, None)])
-    return np.append(found.x[:3], found.x[3] - BALL_MARGIN) if found.success else np.array([0, 0, 0, -np.inf])
+    solution = linprog([0, 0, 0, -1], planes, offsets, bounds=[(None, None)] * 3 + [(0, None)])
+    return (
+        np.append(solution.x[:3], solution.x[3] - BALL_MARGIN)
+        if solution.success
+        else np.array([0, 0, 0, -np.inf])
+    )
 
 
 CELLS = 128
@@ -282,15 +286,15 @@ def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float
     upper = robot.upper[list(joints)]
     upper = np.where(slides, upper, np.minimum(upper, lower + TURN))
     columns = [[j.name for j in links.joints].index(robot.joint_names[joint]) for joint in joints]
-    held = links.named({})
+    nominal = links.named({})
     edge = (upper - lower) / CELLS
-    apart = np.ones((CELLS,) * len(joints), dtype=bool)
+    separated = np.ones((CELLS,) * len(joints), dtype=bool)
     size = np.full(len(joints), float(CELLS))
     parts = np.indices([len(robot.meshes[link]) for link in pair]).reshape(2, -1)
     low = np.zeros((parts.shape[1], len(joints)))  # one row per pair of parts and cell where they may touch
     while len(low):
         cells, cell = np.unique(low, axis=0, return_inverse=True)
-        q = np.tile(held, (len(cells), 1))
+        q = np.tile(nominal, (len(cells), 1))
         q[:, columns] = lower + edge * (cells + size / 2)
         travel = float(lever @ (edge * size) / 2) + ROUNDING
         poses = links.poses(q, frozenset(pair))
@@ -298,7 +302,7 @@ def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float
         touch = distance <= travel
         given_up = touch & ((size <= 1).all() & (distance <= 0) | (distance < -travel) | (travel < finest))
         for first, last in zip(*_cells(np.unique(low[given_up], axis=0), size), strict=True):
-            apart[tuple(slice(*ends) for ends in zip(first, last, strict=True))] = False
+            separated[tuple(slice(*ends) for ends in zip(first, last, strict=True))] = False
         axis = int((lever * edge * size).argmax())
         size = size.copy()
         size[axis] /= 2
@@ -307,11 +311,11 @@ def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float
         low = np.concatenate([low, low + size * (np.arange(len(size)) == axis)])
         parts = np.tile(parts, 2)
         if (size <= 1).all():  # one contact decides a cell, so drop its other pairs
-            is_open = apart[tuple(_cells(low, size)[0].T)]
+            is_open = separated[tuple(_cells(low, size)[0].T)]
             low = low[is_open]
             parts = parts[:, is_open]
     names = tuple(robot.joint_names[joint] for joint in joints)
-    return LinkPairTable(pair, names, tuple(lower.tolist()), tuple(upper.tolist()), apart)
+    return LinkPairTable(pair, names, tuple(lower.tolist()), tuple(upper.tolist()), separated)
 
 
 def _cells(low: Float[ndarray, "n joints"], size: Float[ndarray, "joints"]) -> tuple[ndarray, ndarray]:

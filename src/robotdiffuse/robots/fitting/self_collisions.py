@@ -153,21 +153,21 @@ def allowed_pairs(reports: tuple[PairReport, ...]) -> frozenset[frozenset[str]]:
 def _descend(links: "Links", a: str, b: str, starts: Float[ndarray, "n d"], rng: np.random.Generator) -> bool:
     """Whether random descents on the distance between the meshes find a collision of two links."""
 
-    wanted = frozenset((a, b))
+    pair = frozenset((a, b))
     for start in starts:
         q = start
         step = 0.1 * (links.upper - links.lower)
-        least = links.mesh_distance(links.poses(q[None], wanted), a, b)
+        min_distance = links.mesh_distance(links.poses(q[None], pair), a, b)
         for _ in range(15):
             around = np.clip(q + step * rng.normal(size=(8, len(q))), links.lower, links.upper)
-            at = links.poses(around, wanted)
+            at = links.poses(around, pair)
             distances = [links.mesh_distance(at, a, b, i) for i in range(len(around))]
             i = int(np.argmin(distances))
             if distances[i] <= 0:
                 return True
-            if distances[i] < least:
+            if distances[i] < min_distance:
                 q = around[i]
-                least = distances[i]
+                min_distance = distances[i]
             else:
                 step = step / 2
     return False
@@ -188,15 +188,15 @@ def _own_between(robot: Robot, a: str, b: str, max_held: int = 0) -> list[Joint]
         """Whether a link belongs to the arm; true for what its links carry, except for the last one."""
         planned = [joint for joint in above[link] if joint in robot.planned_joints][:1]
         carried = above[link][: above[link].index(planned[0])] if planned else above[link]
-        held = [joint for joint in carried if joint.kind in MOVING_KINDS]
+        moving = [joint for joint in carried if joint.kind in MOVING_KINDS]
         tool = robot.at_end(link) and above[link][:1] != planned
-        return not tool and len(held) <= max_held
+        return not tool and len(moving) <= max_held
 
     above = {link: joints_above(link) for link in (a, b)}
     if not own(a) or not own(b):
         return None
-    either = {joint.name: joint for joint in (*above[a], *above[b])}.values()
-    return [j for j in either if (j in above[a]) != (j in above[b]) and j.kind in MOVING_KINDS]
+    chain_joints = {joint.name: joint for joint in (*above[a], *above[b])}.values()
+    return [j for j in chain_joints if (j in above[a]) != (j in above[b]) and j.kind in MOVING_KINDS]
 
 
 def _moving_pairs(robot: Robot) -> list[tuple[str, str]]:
@@ -310,11 +310,11 @@ def measure_false_collisions(
         gaps = np.array([links.mesh_distance(poses, a, b, int(i)) for i in false_spheres])
         every = gaps
         # tolerate the narrowest few
-        wide = gaps >= np.sort(gaps)[
+        far_enough = gaps >= np.sort(gaps)[
             : int(samples * NARROWEST_FRACTION * len(false_spheres) / max(spheres.sum(), 1)) + 1
         ].max(initial=0.0)
-        false_spheres = false_spheres[wide]
-        gaps = gaps[wide]
+        false_spheres = false_spheres[far_enough]
+        gaps = gaps[far_enough]
         T_base_a = poses[a][false_spheres]
         T_base_b = poses[b][false_spheres]
         at = np.einsum("nij,nj->ni", T_base_a[:, :3, :3], middle[false_spheres]) + T_base_a[:, :3, 3]
@@ -343,7 +343,7 @@ def _sticking_out(
 ) -> dict[str, Float[ndarray, "places 3"]]:
     """Places where parts of two links overlap in configurations `rows`, each listed for the link whose true
     meshes are further from it, in that link's frame."""
-    found: dict[str, list[ndarray]] = {link: [] for link in pair}
+    places_by_link: dict[str, list[ndarray]] = {link: [] for link in pair}
     request = coal.DistanceRequest()
     point = coal.Sphere(1e-6)
     for i in rows:
@@ -359,8 +359,8 @@ def _sticking_out(
             ]
             link = pair[int(np.argmax(far))]
             T = poses[link][i]
-            found[link].append((at - T[:3, 3]) @ T[:3, :3])
-    return {link: np.reshape(places, (-1, 3)) for link, places in found.items()}
+            places_by_link[link].append((at - T[:3, 3]) @ T[:3, :3])
+    return {link: np.reshape(places, (-1, 3)) for link, places in places_by_link.items()}
 
 
 def _one_per_cube(points: Float[ndarray, "n 3"], gaps: Float[ndarray, "n"]) -> Float[ndarray, "m 4"]:

@@ -94,8 +94,8 @@ class Bounds:
             far = KDTree(places[:, :3]).query(
                 points, distance_upper_bound=TIGHT_RADIUS + self.tolerance / TIGHT_SLOPE
             )[0]
-            least = places[:, 3].min() + TIGHT_SLOPE * np.maximum(far - TIGHT_RADIUS, 0.0)
-            np.minimum(allowed, least, out=allowed)
+            tight_bound = places[:, 3].min() + TIGHT_SLOPE * np.maximum(far - TIGHT_RADIUS, 0.0)
+            np.minimum(allowed, tight_bound, out=allowed)
         return allowed
 
 
@@ -132,10 +132,10 @@ class Solid:
         corners = np.concatenate([mesh.vertices for mesh in meshes])
         low = corners.min(0)
         high = corners.max(0)
-        beside = max(MIN_PADDING, tolerance)
-        spacing = max(float(np.prod(high - low + 2 * beside) / GRID_POINTS) ** (1 / 3), MIN_SPACING)
-        low = low - beside - 2 * spacing
-        high = high + beside + 2 * spacing
+        padding = max(MIN_PADDING, tolerance)
+        spacing = max(float(np.prod(high - low + 2 * padding) / GRID_POINTS) ** (1 / 3), MIN_SPACING)
+        low = low - padding - 2 * spacing
+        high = high + padding + 2 * spacing
         shape = np.ceil((high - low) / spacing).astype(int) + 1
         planes = stacked_planes(meshes)
         depth = plane_depths(_grid_points(shape, low, spacing), *planes).reshape(shape)
@@ -173,8 +173,8 @@ class Solid:
         allowed[near] = bounds.tolerances(points[near])
         beyond = distance - allowed
         if bounds.hidden is not None:
-            asked = np.flatnonzero((beyond > 0) & (allowed >= bounds.tolerance))
-            hidden = asked[bounds.hidden(points[asked])]
+            queried = np.flatnonzero((beyond > 0) & (allowed >= bounds.tolerance))
+            hidden = queried[bounds.hidden(points[queried])]
             beyond[hidden] = -self.spacing / 2
         if bounds.floor is not None:
             normal, offset = bounds.floor
@@ -192,8 +192,8 @@ def _distance_inside(
     minus `value` there, the distance of that point from the surface."""
     if not mask.any() or mask.all():
         return np.where(mask, spacing * sum(mask.shape), 0.0)
-    found: Any = ndimage.distance_transform_edt(mask, return_indices=True)
-    far, at = found
+    transform: Any = ndimage.distance_transform_edt(mask, return_indices=True)
+    far, at = transform
     return np.maximum(far * spacing - value[tuple(at)], 0.0)
 
 
@@ -321,8 +321,8 @@ def covered(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"]) -> b
     single = [stacked_planes((mesh,)) for mesh in meshes] if len(meshes) > 1 else []
     while len(triangles):
         corners = triangles.reshape(-1, 3)
-        held, bare = held_by_one(triangles, spheres)
-        is_open = ~held
+        contained, bare = held_by_one(triangles, spheres)
+        is_open = ~contained
         for planes in single:
             hidden = within(corners, *planes, BURIED_DEPTH)
             is_open &= ~hidden.reshape(-1, 3).all(1)
@@ -462,12 +462,14 @@ def _with_enough_spheres(
 ) -> Float[ndarray, "m 3"]:
     """Improved centres, with spheres added until none exceeds its largest radius, or there are
     `settings.most`."""
-    enough = sizes.spacing * EXCESS_TOLERANCE
-    centers, worst = _relax(sizes, cells, centers, settings.rounds, enough)
-    while worst > enough and len(centers) < settings.most:
+    max_excess = sizes.spacing * EXCESS_TOLERANCE
+    centers, largest_excess = _relax(sizes, cells, centers, settings.rounds, max_excess)
+    while largest_excess > max_excess and len(centers) < settings.most:
         excess = cells.assigned(sizes, centers).owner_excess
         extra = _farthest_apart(cells.points[cells.corners].mean(1), excess, len(centers) // 20 + 1)
-        centers, worst = _relax(sizes, cells, np.concatenate([centers, extra]), settings.rounds, enough)
+        centers, largest_excess = _relax(
+            sizes, cells, np.concatenate([centers, extra]), settings.rounds, max_excess
+        )
     return centers
 
 
@@ -491,28 +493,28 @@ def _thin_out(
 
     Only the spheres that take over cells are moved.
     """
-    enough = sizes.spacing * EXCESS_TOLERANCE
-    centers, kept = centers.copy(), np.zeros(len(centers), dtype=bool)
+    max_excess = sizes.spacing * EXCESS_TOLERANCE
+    centers, required = centers.copy(), np.zeros(len(centers), dtype=bool)
     while len(centers) > 1:
-        given = cells.assigned(sizes, centers)
+        assignment = cells.assigned(sizes, centers)
         loss = np.full(len(centers), -np.inf)
-        np.maximum.at(loss, given.owner, given.second_excess)
-        dropped = np.zeros_like(kept)
-        moved = np.zeros_like(kept)
+        np.maximum.at(loss, assignment.owner, assignment.second_excess)
+        dropped = np.zeros_like(required)
+        moved = np.zeros_like(required)
         failures = 0
         for i in np.argsort(loss):
-            takers = np.unique(given.runner_up[given.owner == i])
-            if kept[i] or moved[i] or moved[takers].any():
+            takers = np.unique(assignment.runner_up[assignment.owner == i])
+            if required[i] or moved[i] or moved[takers].any():
                 continue
             if not len(takers):
                 dropped[i] = True
                 continue
             among = np.zeros(len(centers), dtype=bool)
             among[i] = among[takers] = True
-            part = cells.part(among[given.owner])
-            rest, worst = _relax(sizes, part, centers[takers], settings.rounds, enough)
-            if worst > enough:
-                kept[i] = True
+            part = cells.part(among[assignment.owner])
+            rest, excess = _relax(sizes, part, centers[takers], settings.rounds, max_excess)
+            if excess > max_excess:
+                required[i] = True
                 failures = failures + 1
                 if failures == settings.tries:
                     break
@@ -522,9 +524,9 @@ def _thin_out(
             moved |= among
         if not dropped.any():
             break
-        kept &= ~moved
+        required &= ~moved
         centers = centers[~dropped]
-        kept = kept[~dropped]
+        required = required[~dropped]
     return centers
 
 

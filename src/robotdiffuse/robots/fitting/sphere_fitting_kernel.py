@@ -40,12 +40,14 @@ def plane_depths(points, normals, offsets, starts):
         x, y, z = points[i]
         best = -1e9
         for part in range(len(starts) - 1):
-            least = 1e9
+            face_distance = 1e9
             for f in range(starts[part], starts[part + 1]):
-                least = min(least, offsets[f] - normals[f, 0] * x - normals[f, 1] * y - normals[f, 2] * z)
-                if least <= best:
+                face_distance = min(
+                    face_distance, offsets[f] - normals[f, 0] * x - normals[f, 1] * y - normals[f, 2] * z
+                )
+                if face_distance <= best:
                     break
-            best = max(best, least)
+            best = max(best, face_distance)
         depths[i] = best
     return depths
 
@@ -152,18 +154,18 @@ def greedy_cover(points, corners, places, depths):
     holds = np.zeros((len(corners), len(places)), np.bool_)
     counts = np.zeros(len(places), np.int64)
     for c in range(len(corners)):
-        least = 1e9
+        min_excess = 1e9
         for i in range(len(places)):
-            if depths[i] + max(least, 0.0) <= 0.0:
+            if depths[i] + max(min_excess, 0.0) <= 0.0:
                 continue
             far = squared_distance(points, corners[c, 0], places, i)
             far = max(far, squared_distance(points, corners[c, 1], places, i))
             far = max(far, squared_distance(points, corners[c, 2], places, i))
             lacks = math.sqrt(far) - depths[i]
-            if least > 0.0 and lacks < least:
-                least = max(lacks, 0.0)
+            if min_excess > 0.0 and lacks < min_excess:
+                min_excess = max(lacks, 0.0)
                 holds[c, :i] = False
-            holds[c, i] = lacks <= least
+            holds[c, i] = lacks <= min_excess
         for i in range(len(places)):
             counts[i] += holds[c, i]
     is_open = np.ones(len(corners), np.bool_)
@@ -207,7 +209,7 @@ def relative(A, B, T):
 def ball_distances(T_base_a, T_base_b, first, second):
     """Signed distances [a, b] between the balls of two sets, each set at its pose [4, 4] [m]."""
     T = np.empty((3, 4))
-    found = np.empty((len(first), len(second)))
+    gaps_between = np.empty((len(first), len(second)))
     relative(T_base_a, T_base_b, T)
     for j in range(len(second)):
         x = T[0, 0] * second[j, 0] + T[0, 1] * second[j, 1] + T[0, 2] * second[j, 2] + T[0, 3]
@@ -218,8 +220,8 @@ def ball_distances(T_base_a, T_base_b, first, second):
             dy = first[i, 1] - y
             dz = first[i, 2] - z
             far = math.sqrt(dx * dx + dy * dy + dz * dz)
-            found[i, j] = far - first[i, 3] - second[j, 3]
-    return found
+            gaps_between[i, j] = far - first[i, 3] - second[j, 3]
+    return gaps_between
 
 
 @kernel()
@@ -279,13 +281,13 @@ def gaps(points, spheres):
     """Signed distance of points from a union of spheres [m]; inside, only a bound."""
     out = np.empty(len(points))
     for n in range(len(points)):
-        least = 1e9
+        gap = 1e9
         for i in range(len(spheres)):
-            reach = least + spheres[i, 3]
+            reach = gap + spheres[i, 3]
             square = squared_distance(points, n, spheres, i)
             if reach > 0.0 and square < reach * reach:
-                least = math.sqrt(square) - spheres[i, 3]
-        out[n] = least
+                gap = math.sqrt(square) - spheres[i, 3]
+        out[n] = gap
     return out
 
 
@@ -293,7 +295,7 @@ def gaps(points, spheres):
 def held_by_one(triangles, spheres):
     """Whether a single sphere contains each triangle [t]; and whether each corner [3 t] is outside all
     spheres."""
-    held = np.zeros(len(triangles), np.bool_)
+    contained = np.zeros(len(triangles), np.bool_)
     bare = np.ones(3 * len(triangles), np.bool_)
     for t in range(len(triangles)):
         for i in range(len(spheres)):
@@ -307,11 +309,11 @@ def held_by_one(triangles, spheres):
                     inside += 1
                     bare[3 * t + k] = False
             if inside == 3:
-                held[t] = True
+                contained[t] = True
                 break
-        if held[t]:
+        if contained[t]:
             bare[3 * t : 3 * t + 3] = False
-    return held, bare
+    return contained, bare
 
 
 @kernel(fastmath=True)
@@ -329,9 +331,9 @@ def excess_radius(x, y, z, own, count, grid, origin, spacing):
 @kernel(fastmath=True)
 def move_center(center, own, count, step, grid, origin, spacing, directions):
     """Pattern search for the centre of least excess radius, in place."""
-    least = excess_radius(center[0], center[1], center[2], own, count, grid, origin, spacing)
+    min_radius = excess_radius(center[0], center[1], center[2], own, count, grid, origin, spacing)
     while step > MIN_STEP:
-        best = least - MIN_GAIN
+        best = min_radius - MIN_GAIN
         way = -1
         for k in range(len(directions)):
             x = center[0] + step * directions[k, 0]
@@ -344,7 +346,7 @@ def move_center(center, own, count, step, grid, origin, spacing, directions):
         if way < 0:
             step /= 2
         else:
-            least = best
+            min_radius = best
             center += step * directions[way]
 
 
@@ -363,7 +365,7 @@ def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing
     first = np.empty(len(points), np.int64)
     stamp = np.empty(len(points), np.int64)
     rim = np.empty(len(points), np.bool_)
-    own = np.empty((len(points), 3))
+    assigned_points = np.empty((len(points), 3))
     order = np.empty(cells, np.int64)
     ends = np.empty(count + 1, np.int64)
     centers = centers.copy()
@@ -400,15 +402,17 @@ def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing
             fill[owner[c]] += 1
         stamp[:] = -1
         for i in range(count):
-            found = 0
+            assigned_count = 0
             for j in range(ends[i], ends[i + 1]):
                 for k in range(3):
                     p = corners[order[j], k]
                     if rim[p] and stamp[p] != i:
                         stamp[p] = i
-                        own[found] = points[p]
-                        found += 1
-            if found > 0:
-                move_center(centers[i], own, found, step, grid, origin, spacing, directions)
+                        assigned_points[assigned_count] = points[p]
+                        assigned_count += 1
+            if assigned_count > 0:
+                move_center(
+                    centers[i], assigned_points, assigned_count, step, grid, origin, spacing, directions
+                )
         step = max(STEP_SHRINKAGE * step, MIN_INITIAL_STEP)
     return best, best_value

@@ -80,15 +80,22 @@ def robot_bodies(model: Any) -> list[int]:
     for body in range(1, model.nbody):
         trees.setdefault(int(model.body_rootid[body]), []).append(body)
     joints = {root: _joints_of(model, bodies) for root, bodies in trees.items()}
-    kinds = {root: {kind_of("Joint", model.jnt_type[joint]) for joint in own} for root, own in joints.items()}
+    kinds = {
+        root: {kind_of("Joint", model.jnt_type[joint]) for joint in tree_joints}
+        for root, tree_joints in joints.items()
+    }
     driven = {
         int(model.actuator_trnid[k, 0])
         for k in range(model.nu)
         if kind_of("Trn", model.actuator_trntype[k]) in ("joint", "jointinparent")
     }
-    chosen = [root for root, own in joints.items() if driven & set(own)]
+    chosen = [root for root, tree_joints in joints.items() if driven & set(tree_joints)]
     if not chosen:
-        chosen = [root for root, own in kinds.items() if own.intersection(MOVABLE) and "free" not in own]
+        chosen = [
+            root
+            for root, tree_joints in kinds.items()
+            if tree_joints.intersection(MOVABLE) and "free" not in tree_joints
+        ]
     return [body for root in chosen for body in trees[root]]
 
 
@@ -360,8 +367,8 @@ def mesh_of(model: Any, mesh: int) -> trimesh.Trimesh:
 def ellipsoid(radii: Float[ndarray, "3"]) -> trimesh.Trimesh:
     """A polyhedron around an ellipsoid."""
     ball = trimesh.creation.icosphere(subdivisions=2)
-    inner = np.einsum("fd,fd->f", ball.face_normals, ball.triangles[:, 0]).min()
-    ball.apply_scale(radii / inner)
+    inradius = np.einsum("fd,fd->f", ball.face_normals, ball.triangles[:, 0]).min()
+    ball.apply_scale(radii / inradius)
     return ball
 
 
@@ -381,10 +388,10 @@ def _colliding(model: Any, body: int) -> list[int]:
 
 def _related(model: Any, first: int, second: int, unfiltered: bool) -> bool:
     """Whether two bodies are joined rigidly, or by the joints of one of them, and not to the world."""
-    own = [int(model.body_weldid[body]) for body in (first, second)]
-    above = [int(model.body_weldid[model.body_parentid[body]]) for body in own]
-    carried = own[0] == above[1] or own[1] == above[0]
-    return own[0] == own[1] or (carried and WORLD not in own and not unfiltered)
+    welded = [int(model.body_weldid[body]) for body in (first, second)]
+    above = [int(model.body_weldid[model.body_parentid[body]]) for body in welded]
+    carried = welded[0] == above[1] or welded[1] == above[0]
+    return welded[0] == welded[1] or (carried and WORLD not in welded and not unfiltered)
 
 
 def _masks_meet(model: Any, first: int, second: int) -> bool:

@@ -166,8 +166,8 @@ def _mesh(path: Path, shape: ET.Element, link: str, packages: Packages, notes: l
 def _ball() -> Float[ndarray, "n 3"]:
     """Vertices of a polyhedron around the unit ball."""
     ball = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
-    inner = np.einsum("fd,fd->f", ball.face_normals, ball.triangles[:, 0]).min()
-    return np.array(ball.vertices) / inner
+    inradius = np.einsum("fd,fd->f", ball.face_normals, ball.triangles[:, 0]).min()
+    return np.array(ball.vertices) / inradius
 
 
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -324,14 +324,14 @@ class UrdfTree:
         }
         robot = replace(robot, locked=with_mimics(robot.joints, rest)).with_locked(locked or {})
         if robot.dof == 0:
-            held = [
+            fixed_joints = [
                 joint.name for joint in joints if joint.kind in MOVING_KINDS and joint.lower == joint.upper
             ]
             raise InputError(
                 f"{self.path}: no movable joint between {base} and {ends[0]}; "
                 + (
-                    f"the limits of {joined(held)} leave no range"
-                    if held
+                    f"the limits of {joined(fixed_joints)} leave no range"
+                    if fixed_joints
                     else "choose another --base or --tip"
                 )
             )
@@ -463,12 +463,12 @@ class UrdfTree:
         joint = self._with_limits(joint, element.find("limit"))
         safety = element.find("safety_controller")
         soft = {} if safety is None else safety.attrib
-        given = [
+        soft_limits = [
             f"{end} {soft[f'soft_{end}_limit']}" for end in ("lower", "upper") if f"soft_{end}_limit" in soft
         ]
-        if given:
+        if soft_limits:
             self.notes.append(
-                f"{what}: the soft limits of its safety_controller ({', '.join(given)}) are ignored; "
+                f"{what}: the soft limits of its safety_controller ({', '.join(soft_limits)}) are ignored; "
                 f"set limits with --limits"
             )
         return joint
@@ -592,11 +592,13 @@ class UrdfTree:
         if self.kind == "visual" and any(parts.values()):
             self.notes.append("no link has collision geometry; the visual geometry is used")
         elif any(parts.values()):
-            shown = [
+            without_collision = [
                 link for link in links if not parts[link] and self.links[link].find("visual") is not None
             ]
-            if shown:
-                self.notes.append(f"links without collision geometry are not checked: {', '.join(shown)}")
+            if without_collision:
+                self.notes.append(
+                    f"links without collision geometry are not checked: {', '.join(without_collision)}"
+                )
         return parts
 
     def surfaces(self, link: str) -> tuple[Surface, ...]:
@@ -678,10 +680,10 @@ def _fields(file: str, joint: str, entry: object) -> dict[str, float]:
         kind = "position" if key.endswith("position") else key.removeprefix("max_")
         if entry.get(f"has_{kind}_limits") is False:
             continue
-        most = MAX_COORDINATE if kind == "position" else MAX_RATE
+        max_value = MAX_COORDINATE if kind == "position" else MAX_RATE
         number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-        if not number or abs(value) > most or (kind != "position" and value < MIN_RATE):
-            rule = f"within ±{most:g}" if kind == "position" else f"from {MIN_RATE:g} to {most:g}"
+        if not number or abs(value) > max_value or (kind != "position" and value < MIN_RATE):
+            rule = f"within ±{max_value:g}" if kind == "position" else f"from {MIN_RATE:g} to {max_value:g}"
             raise InputError(f"{file}: {key} of {joint} is {shown(value)}; it must be a number {rule}")
         fields[FIELDS[key]] = float(value)
     return fields
