@@ -113,7 +113,7 @@ def write_dataset(
         raise InputError(
             "no scene falls into the training split, which takes most of them, by a hash; give more scenes"
         )
-    q = np.stack([resample(motion[None].astype(np.float32), waypoints, exact=True)[0] for motion in motions])
+    q = np.stack([resample(motion[None].astype(np.float32), waypoints)[0] for motion in motions])
     about = {"families": {FAMILY: {}}, "floors": {FAMILY: floor}, "slots": slots}
     about["settings"] = {"imported": "write_dataset"}
     return _write(FilePath(folder), arm, arm.source or arm.name, around, q, about)

@@ -188,14 +188,9 @@ def read_rows(
             yield Rows(shard, turn, even, around, np.where(usable, split, -1).astype(np.int8))
 
 
-def resample(
-    q: Float[ndarray, "n stored dof"], waypoints: int, exact: bool = False
-) -> Float[ndarray, "n {waypoints} dof"]:
+def resample(q: Float[ndarray, "n stored dof"], waypoints: int) -> Float[ndarray, "n {waypoints} dof"]:
     """Resample each motion to `waypoints` places evenly spaced in joint-space length; the ends are kept
     exactly.
-
-    exact: whether to interpolate in double precision, as `numpy.interp`, and round then. Stored data are made
-    so; reading uses the faster way.
     """
     n, stored = q.shape[:2]
     steps = np.linalg.norm(np.diff(q, axis=1), axis=2)
@@ -209,10 +204,7 @@ def resample(
     below, above = (np.take_along_axis(q, i[..., None], 1) for i in (after - 1, after))
     into = target_lengths[..., None] - low
     interval = np.maximum(high - low, np.finfo(np.float64).tiny)
-    if exact:
-        even = ((above.astype(np.float64) - below) / interval * into + below).astype(q.dtype)
-    else:
-        even = below + (into / interval).clip(0, 1).astype(q.dtype) * (above - below)
+    even = ((above.astype(np.float64) - below) / interval * into + below).astype(q.dtype)
     even[:, 0] = q[:, 0]
     even[:, -1] = q[:, -1]
     return even

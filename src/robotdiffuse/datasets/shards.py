@@ -264,11 +264,10 @@ def write_shard(
         name: np.ascontiguousarray(arrays[name], ARRAYS[name][0]).reshape(arrays[name].shape)
         for name in sorted(arrays)
     }
-    fingerprints = {name: _array_fingerprint(array) for name, array in ready.items()}
     attributes = {
         "format": FORMAT,
         "index": index,
-        "fingerprint": _shard_fingerprint(fingerprints),
+        "fingerprint": _fingerprint(ready),
         "counts": {name: int(counts[name]) for name in sorted(counts)},
     }
     scratch_folder: str | None = None
@@ -287,7 +286,6 @@ def write_shard(
                 if name == "trajectories"
                 else zarr.codecs.ZstdCodec(level=COMPRESSION_LEVEL),
                 filters=None,
-                attributes={"fingerprint": fingerprints[name]},
                 # write chunks of zeros too, so that a missing file means damage
                 config={"write_empty_chunks": True},
             )
@@ -301,16 +299,14 @@ def write_shard(
             shutil.rmtree(scratch_folder, ignore_errors=True)
 
 
-def _array_fingerprint(array: ndarray) -> str:
-    digest = hashlib.sha256(f"{array.dtype.str} {array.shape}".encode())
-    digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
-    return digest.hexdigest()[:16]
-
-
-def _shard_fingerprint(fingerprints: dict[str, str]) -> str:
+def _fingerprint(arrays: dict[str, ndarray]) -> str:
     """The fingerprint of the arrays' fingerprints, in the order of their names."""
-    text = json.dumps([(name, fingerprints[name]) for name in sorted(fingerprints)])
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    found = []
+    for name, array in sorted(arrays.items()):
+        digest = hashlib.sha256(f"{array.dtype.str} {array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
+        found.append((name, digest.hexdigest()[:16]))
+    return hashlib.sha256(json.dumps(found).encode()).hexdigest()[:16]
 
 
 def read_shard(folder: str | FilePath, index: int, names: tuple[str, ...] | None = None) -> Shard:
@@ -391,17 +387,10 @@ def check_shard(folder: str | FilePath, index: int, manifest: Manifest) -> Shard
     if ("times" in shard.arrays) != (manifest.timing == "time"):
         raise InputError(f"shard {path}, array times: it must be there only where timing is time")
     check_shapes(folder, shard, manifest)
-    group = _open(path)
-    fingerprints = {}
     for name, array in shard.arrays.items():
-        location = f"shard {path}, array {name}"
-        fingerprints[name] = _array_fingerprint(array)
-        attributes = group[name].metadata.attributes
-        if not isinstance(attributes, dict) or fingerprints[name] != attributes.get("fingerprint"):
-            raise InputError(f"{location} is damaged: its fingerprint is not the one that was written")
         if name not in UNBOUNDED and not np.isfinite(array).all():
-            raise InputError(f"{location} holds numbers that are not finite")
-    if _shard_fingerprint(fingerprints) != shard.fingerprint:
+            raise InputError(f"shard {path}, array {name} holds numbers that are not finite")
+    if _fingerprint(shard.arrays) != shard.fingerprint:
         raise InputError(f"shard {path} is damaged: its fingerprint is not that of its arrays")
     return shard
 

@@ -9,14 +9,11 @@ import torch
 from jaxtyping import Float32
 from torch import Generator, Tensor
 
+from robotdiffuse.collision.kernels.frames import write_rotation
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.scenes.scene_arrays import NONE, SPHERE, PackedScenes
 from robotdiffuse.scenes.surface_points import VisibleRegion
 
-SORTED_POINTS = 1 << 15
-"""Points that are sorted at once: their arrays fit the second-level cache."""
-COORDINATE_BITS = 21
-"""Bits of each coordinate in the 63-bit integers by which clouds are sorted."""
 # Points sampled at most for each requested one, if some may be hidden or outside the region.
 _OVERSAMPLING = 8
 # Relative depth inside a shape beyond which it hides a point, so that rounding errors do not count.
@@ -49,8 +46,7 @@ def surface_clouds(
     region: only points inside it.
     camera: a position for each scene [m]; only points that are visible from it, on faces turned towards it
         and neither behind nor inside another shape.
-    ordered: sorted by x, then y, then z, and rounded to a millionth of the scene's largest coordinate, for
-        encoders that depend on the order.
+    ordered: sorted by x, then y, then z, for encoders that depend on the order.
     """
     clouds = torch.zeros(len(scenes), count, 3)
     if scenes.kinds.size and count:
@@ -66,29 +62,10 @@ def surface_clouds(
             clouds.numpy(),
         )
         if ordered:
-            for part in clouds.split(max(1, SORTED_POINTS // count)):
-                sort_points(list(part.unbind(-1)))
+            points = clouds.numpy()
+            order = np.lexsort(np.moveaxis(points, -1, 0)[::-1])
+            clouds = torch.from_numpy(np.take_along_axis(points, order[..., None], 1))
     return clouds.to(generator.device)
-
-
-def sort_points(points: list[Tensor]) -> None:
-    """Sorts each scene's points, coordinates x, y and z of shape [b, m], in place by x, then y, then z, using
-    integers that contain all three.
-
-    Coordinates are rounded to a millionth of the scene's largest one.
-    """
-    middle = 1 << (COORDINATE_BITS - 1)
-    largest = torch.stack([p.abs().amax(1) for p in points]).amax(0)
-    scale = ((middle - 1) / largest.clamp(min=1e-12))[:, None]
-    key = torch.zeros_like(points[0], dtype=torch.int64)
-    for p in points:
-        key = (key << COORDINATE_BITS) | ((p * scale).round_().long() + middle)
-    if key.device.type == "cpu":
-        key.numpy().sort(axis=1)  # several times faster than PyTorch's sort, which also computes indices
-    else:
-        key = key.sort(1).values
-    for i, p in enumerate(points):
-        torch.div(((key >> (2 - i) * COORDINATE_BITS) & ((1 << COORDINATE_BITS) - 1)) - middle, scale, out=p)
 
 
 @kernel(inline="always")
@@ -146,16 +123,14 @@ def fill_clouds(kinds, params, seeds, region, eyes, out):
             j = 0
             while j < last and pick >= ends[j]:
                 j += 1
-            x = _next(x)
-            u = np.float32(x >> np.uint64(40)) * _UNIT - _HALF
-            v = np.float32((x >> np.uint64(16)) & _MASK) * _UNIT - _HALF
-            if kinds[i, j] == SPHERE:
+            while True:
+                x = _next(x)
+                u = np.float32(x >> np.uint64(40)) * _UNIT - _HALF
+                v = np.float32((x >> np.uint64(16)) & _MASK) * _UNIT - _HALF
                 s = u * u + v * v
-                while s >= _QUARTER:
-                    x = _next(x)
-                    u = np.float32(x >> np.uint64(40)) * _UNIT - _HALF
-                    v = np.float32((x >> np.uint64(16)) & _MASK) * _UNIT - _HALF
-                    s = u * u + v * v
+                if kinds[i, j] != SPHERE or s < _QUARTER:
+                    break
+            if kinds[i, j] == SPHERE:
                 # G. Marsaglia 1972: a direction from a point of the disc
                 ring = _FOUR * np.sqrt(_ONE - _FOUR * s)
                 radius = params[i, j, 3]
@@ -165,21 +140,11 @@ def fill_clouds(kinds, params, seeds, region, eyes, out):
             else:
                 offset = pick - (ends[j - 1] if j > 0 else _ZERO)
                 side = _HALF if x & np.uint64(1) else -_HALF
-                if offset < faces[j, 0]:
-                    a = side
-                    b = u
-                    c = v
-                elif offset < faces[j, 1]:
-                    a = u
-                    b = side
-                    c = v
-                else:
-                    a = u
-                    b = v
-                    c = side
+                face = int(offset >= faces[j, 0]) + int(offset >= faces[j, 1])
                 for r in range(3):
+                    axis = axes[j, r]
                     out[i, filled, r] = (
-                        params[i, j, r] + axes[j, r, 0] * a + axes[j, r, 1] * b + axes[j, r, 2] * c
+                        params[i, j, r] + axis[face] * side + axis[face - 1] * u + axis[face - 2] * v
                     )
             if bounded and not _inside(region, out[i, filled]):
                 continue
@@ -200,10 +165,9 @@ def _prepare(kind, row, faces, axes, into):
     if kind == NONE:
         return _ZERO
     if kind == SPHERE:
-        area = _PI * _FOUR * row[3] * row[3]
-        axes[:] = _ZERO
-        for r in range(3):
-            axes[r, r] = _TWO * row[3]
+        a = b = c = _TWO * row[3]
+        area = _PI * a * a
+        write_rotation(_ONE, _ZERO, _ZERO, _ZERO, axes)
     else:
         a = row[3]
         b = row[4]
@@ -212,23 +176,11 @@ def _prepare(kind, row, faces, axes, into):
         faces[1] = faces[0] + _TWO * c * a
         area = faces[1] + _TWO * a * b
         norm = np.sqrt(row[6] * row[6] + row[7] * row[7] + row[8] * row[8] + row[9] * row[9])
-        w = row[6] / norm
-        x = row[7] / norm
-        y = row[8] / norm
-        z = row[9] / norm
-        axes[0, 0] = a * (_ONE - _TWO * (y * y + z * z))
-        axes[0, 1] = b * _TWO * (x * y - w * z)
-        axes[0, 2] = c * _TWO * (x * z + w * y)
-        axes[1, 0] = a * _TWO * (x * y + w * z)
-        axes[1, 1] = b * (_ONE - _TWO * (x * x + z * z))
-        axes[1, 2] = c * _TWO * (y * z - w * x)
-        axes[2, 0] = a * _TWO * (x * z - w * y)
-        axes[2, 1] = b * _TWO * (y * z + w * x)
-        axes[2, 2] = c * (_ONE - _TWO * (x * x + y * y))
-    for c in range(3):
-        size = axes[0, c] * axes[0, c] + axes[1, c] * axes[1, c] + axes[2, c] * axes[2, c]
+        write_rotation(row[6] / norm, row[7] / norm, row[8] / norm, row[9] / norm, axes)
+    for i, size in enumerate((a, b, c)):
         for r in range(3):
-            into[c, r] = axes[r, c] * _TWO / size
+            into[i, r] = axes[r, i] * _TWO / size
+            axes[r, i] *= size
     return area
 
 

@@ -189,7 +189,7 @@ def bending(positions: Configurations) -> float:
     length = Path((), positions).length
     if length < STANDSTILL:
         return 0.0
-    even = resample(positions[None], BENDING_SAMPLES, exact=True)[0]
+    even = resample(positions[None], BENDING_SAMPLES)[0]
     second = np.diff(even, 2, axis=0) * (BENDING_SAMPLES - 1) ** 2
     return float((second**2).sum() / (BENDING_SAMPLES - 1) / length**2)
 

@@ -243,7 +243,7 @@ def _resampled(
 ) -> tuple[ndarray, Float32[ndarray, "waypoints dof"]] | None:
     """Times and joint values of the waypoints; None if the validator rejects the timed motion."""
     if settings.timing == "arc":
-        return np.zeros(0), resample(path[None], settings.waypoints, exact=True)[0]
+        return np.zeros(0), resample(path[None], settings.waypoints)[0]
     waypoints = Path(robot.joint_names, path.astype(np.float64))
     if not validator.path(waypoints).valid:
         return None
