@@ -231,7 +231,7 @@ def _over_time(
     label: str,
     of: Callable[[Curve], tuple[ndarray, ndarray]],
 ) -> str:
-    """Curves of planners, solid with a network and dashed for search; restarts have the planner's colour."""
+    """Curves of planners, solid with a network and dashed for search; restarts have the planner's color."""
     names = list(dict.fromkeys(map(plain_name, planners)))
 
     def fill(figure: "PlotFigure") -> None:

@@ -426,7 +426,11 @@ def _comparison(
             paired=None
             if planner == bench.reference or reference is None
             else compare(lengths[planner], reference),
-            full=all(o.full(limit, least) for o, least in zip(of, shortest, strict=True) if o.solved),
+            full=all(
+                o.full(limit, shortest_time)
+                for o, shortest_time in zip(of, shortest, strict=True)
+                if o.solved
+            ),
             timed=" or ".join(timed),
             measures={name: Mean.of(o.record.measures.get(name) for o in solved) for name in METRICS},
             memory=max((record.memory for record in records if record.memory is not None), default=np.nan),

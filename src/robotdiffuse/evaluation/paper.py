@@ -193,16 +193,16 @@ The order of the rows is the printed one, except for RRT* and MPiNets, which are
 the differences is unknown. These explanations were tried:
 
 - Rounding: four times each printed score has no more than two decimals (1.67, 0.76, 1.67, 2.58, 3.06), so
-  normalised values were probably first rounded to two. Then MPD is 0.645 exactly; MPiNets is 0.4150, and
+  normalized values were probably first rounded to two. Then MPD is 0.645 exactly; MPiNets is 0.4150, and
   MPNet 0.1975, of which 0.19 is the first two decimals; RRT* (0.4475) and RobotDiffuse (0.7750) are one
   digit away from print. So slips of the pen in three rows, and one score cut short, would explain it all.
-- Columns normalised otherwise (shares of the maximum, logarithms, ranks; all combinations): the largest
+- Columns normalized otherwise (shares of the maximum, logarithms, ranks; all combinations): the largest
   difference stays at 0.025 or more.
 - Other weights: the best that sum to 1 leave 0.011. (0.24, 0.19, 0.29, 0.22), which sum to 0.94, leave 0.002;
   four free numbers for five scores prove little, and the paper says that its weights are equal.
 - Other figures than the printed ones, as of an earlier state of the table: no change of a single cell leaves
   less than 0.012. RRT*'s length 15.6 in place of 15.037, and MPiNets' success 88.0 in place of 87.4, leave
-  0.004. At equal weights RRT*'s score can only mean a normalised length of 0.67 for it: it is worst in
+  0.004. At equal weights RRT*'s score can only mean a normalized length of 0.67 for it: it is worst in
   success and time and best in collision.
 """
 

@@ -11,12 +11,12 @@ h = max(S - D, 0) of a safe distance S and a distance D:
 | length         | sum of |q_(i+1) - q_i|^2 / 2: velocities                            | length      |
 
 The first two concern single waypoints. Each waypoint is pushed by the smallest motion that clears a contact
-(a Gauss-Newton step), and a kernel spreads the pushes over the neighbouring waypoints, as the metric of CHOMP
+(a Gauss-Newton step), and a kernel spreads the pushes over the neighboring waypoints, as the metric of CHOMP
 does (Zucker et al., IJRR 2013). Length is the smoothness of CHOMP; it moves one waypoint after the other
-towards its optimum between its neighbours.
+towards its optimum between its neighbors.
 
 A problem's path constraints are one more cost: the sum of h^2 / 2 over their rows, where h is how far a row's
-value exceeds a share of its tolerance [m]; a radian counts as `projection_kernel.ANGLE_WEIGHT` metres.
+value exceeds a share of its tolerance [m]; a radian counts as `projection_kernel.ANGLE_WEIGHT` meters.
 """
 
 from dataclasses import dataclass
@@ -50,7 +50,7 @@ class Steps(NamedTuple):
     push: np.float32
     """[rad]"""
     kernel: Float[ndarray, "waypoints waypoints"]
-    """Weights by which pushes spread over neighbouring waypoints."""
+    """Weights by which pushes spread over neighboring waypoints."""
     length: np.float32
 
 
@@ -59,7 +59,7 @@ def descend(robot, scene, q, lower, upper, steps, rounds):
     """Moves trajectories q [batch, waypoints, dof] by some rounds, in place; the first and the last waypoint
     stay. Returns the costs of the margins [batch] that the last round found.
 
-    Each waypoint within a margin is pushed out of it, the pushes are spread over its neighbours, then the
+    Each waypoint within a margin is pushed out of it, the pushes are spread over its neighbors, then the
     step of length follows. A trajectory without a waypoint within a margin is left as it is,
     unless no margin is enabled.
     """
@@ -116,7 +116,7 @@ def _push_away(cost, gradient, push, pushed):
 
 @allocation_free(fastmath=True)
 def _spread(q, first, last, pushes, active, kernel, lower, upper):
-    """Moves each waypoint by a weighted mean of its neighbours' pushes, less where no neighbour is pushed."""
+    """Moves each waypoint by a weighted mean of its neighbors' pushes, less where no neighbor is pushed."""
     dof = q.shape[1]
     for i in range(first, last):
         weight = _ZERO
@@ -136,7 +136,7 @@ def _spread(q, first, last, pushes, active, kernel, lower, upper):
 
 @allocation_free(fastmath=True)
 def _shorten(q, first, last, share):
-    """Moves each waypoint by a share of the way to the middle of its neighbours, which is Newton's step in
+    """Moves each waypoint by a share of the way to the middle of its neighbors, which is Newton's step in
     that waypoint alone. Every second waypoint at a time: these share no segment."""
     dof = q.shape[1]
     for parity in range(2):
@@ -160,7 +160,7 @@ class GuidanceSettings(Settings, name="guidance"):
     width: Positive = 4.0
     """Waypoints over which a push spreads: the standard deviation of the kernel."""
     length: Share = 0.2
-    """After the pushes, waypoints move by this fraction towards the middle of their neighbours; 0: no
+    """After the pushes, waypoints move by this fraction towards the middle of their neighbors; 0: no
     cost."""
 
 

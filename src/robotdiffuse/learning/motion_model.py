@@ -51,7 +51,7 @@ class Reference(NamedTuple):
     """The trajectory that x is relative to, and the ends of x that stay fixed."""
 
     base: Trajectories
-    """Normalised joint values; the trajectory is `base + scale * x`."""
+    """Normalized joint values; the trajectory is `base + scale * x`."""
     start: Float[ndarray, "*batch 1 dof"]
     """The first waypoint of x."""
     goal: Float[ndarray, "*batch 1 dof"]
@@ -200,7 +200,7 @@ class MotionModelSettings(ModelParts, name="model"):
 class MotionModel(ABC):
     """The diffusion model over trajectories.
 
-    The numbers x that are diffused are the waypoints of a trajectory, normalised, relative to a reference,
+    The numbers x that are diffused are the waypoints of a trajectory, normalized, relative to a reference,
     scaled. With the targets `residual` and `absolute`, x is in units of the training data's standard
     deviation, and relative to the straight line from start to goal (residual) or to the mean of the data
     (absolute, the paper's). With the target `limits`, x is the joint values in units of their limits, the
@@ -217,7 +217,7 @@ class MotionModel(ABC):
         self.schedule = NoiseSchedule(settings.schedule)
         self.objective: Objective = OBJECTIVES.make(settings.objective)
         self.is_unit_joints = settings.target == "limits"
-        """Whether x is the normalised joint values themselves."""
+        """Whether x is the normalized joint values themselves."""
 
     @property
     @abstractmethod
@@ -319,7 +319,7 @@ class MotionModel(ABC):
     def features(
         self, x: Float[ndarray, "batch waypoints dof"], reference: Reference, clearances: ClearanceFn
     ) -> Features:
-        """The denoiser's input for a noisy x: x, the normalised joint values where x is something else, and
+        """The denoiser's input for a noisy x: x, the normalized joint values where x is something else, and
         the clearances of the links and their gradients if the settings include them."""
         unit = self.unit_joints(x, reference)
         parts = [x] if self.is_unit_joints else [x, unit]
@@ -341,7 +341,7 @@ class MotionModel(ABC):
         start: Joints,
         goal: Joints,
     ) -> Float[ndarray, "*batch condition"]:
-        """C = [z, start, goal], normalised; a single zero without an encoder, since denoisers need a
+        """C = [z, start, goal], normalized; a single zero without an encoder, since denoisers need a
         number."""
         if self.settings.encoder is None:
             return np.zeros((*np.shape(start)[:-1], 1), np.float32)

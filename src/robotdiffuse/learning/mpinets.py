@@ -1,31 +1,31 @@
-"""MPiNets: a policy from a labelled point cloud to the arm's next step.
+"""MPiNets: a policy from a labeled point cloud to the arm's next step.
 
 A. Fishman et al., "Motion Policy Networks", CoRL 2022. PointNet++ encodes one cloud of points of the scene,
 of the robot at its current configuration q_t and of the target; a few layers encode q_t; both together are
-decoded to a displacement, q_{t+1} = clamp(q_t + dq). Trained by behaviour cloning on the steps of planned
+decoded to a displacement, q_{t+1} = clamp(q_t + dq). Trained by behavior cloning on the steps of planned
 motions, with the paper's two losses: the mean L1 and squared distances between points of the arm at the
 predicted and at the expert's next configuration, and a hinge on the signed distance to the scene.
 
 Settings as in the paper: displacements in units of the joint ranges, clamped at the limits; weights 1 and 5
 of point match and collision; hinge at 3 cm; noise of 0.015 rad on the input; LeakyReLU in encoder and
-decoder, group normalisation in the layers after PointNet++ and none within it; layers 32, 64, 128, 128, 64
+decoder, group normalization in the layers after PointNet++ and none within it; layers 32, 64, 128, 128, 64
 for the configuration and 512, 256, 128 for the decoder.
 
 Differences from the paper:
 
 - *Size*, for training on one core: a cloud of 256 + 12 + 6 per link points (for a Panda 256 scene, 120 robot,
-  60 target; paper 4,096, 2,048 and 128); set abstraction with 96 and 24 centres of 16 neighbours each and
+  60 target; paper 4,096, 2,048 and 128); set abstraction with 96 and 24 centers of 16 neighbors each and
   balls of 0.2 and 0.6 m for the sparser cloud (512 and 128 of 128; 0.05 and 0.3 m); narrower layers (the
   paper's end in 1,024, then 4,096, 2,048, 2,048 features); batches of 128 at a rate of 2e-3 (10 at 1e-4);
   losses on the robot's points of the cloud (1,024).
 - *Target*: a configuration, to be reached within 1e-4 rad, where the paper's is a pose of the hand. So the
   target's points are those of the whole arm at the goal, the direction to the goal configuration is a further
-  input of the configuration encoder, and points are labelled by link, not only as scene, robot or target.
+  input of the configuration encoder, and points are labeled by link, not only as scene, robot or target.
 - The floor, which is part of every scene, is in the collision loss but not in the cloud.
 - The collision loss is on the arm's covering spheres, which protrude a little, not on points.
 - The expert's motions are those of our data, of 48 waypoints (paper: 50), forwards or backwards, with one
   step at rest at the end.
-- Displacements are output in units of the experts' mean step, and weights are initialised as in K. He et al.
+- Displacements are output in units of the experts' mean step, and weights are initialized as in K. He et al.
   (ICCV 2015): with PyTorch's defaults signals fade over the many layers, and learning takes many times as
   long.
 """
@@ -60,7 +60,7 @@ direction fades near the goal."""
 LOSS_UNIT = 0.01
 """Losses are divided by this [m], so that they are near 1."""
 RADII = (0.2, 0.6)
-"""Radii of the balls around centres [m] (paper: 0.05, 0.3)."""
+"""Radii of the balls around centers [m] (paper: 0.05, 0.3)."""
 JOINT_WIDTHS = (32, 64, 128, 128, 64)
 """Widths of the configuration encoder (the paper's)."""
 DECODER_WIDTHS = (512, 256, 128)
@@ -84,9 +84,9 @@ class MPiNetsNetworkSettings(Settings, name="mpinets"):
     region: VisibleRegion = field(default_factory=VisibleRegion)
     """The region in which points of the scene count."""
     centres: tuple[Count, Count] = (96, 24)
-    """Centres of the two set abstractions (paper: 512, 128)."""
+    """Centers of the two set abstractions (paper: 512, 128)."""
     neighbours: tuple[Count, Count] = (16, 16)
-    """Points around each centre (paper: 128, 128)."""
+    """Points around each center (paper: 128, 128)."""
     first_widths: Sizes = (32, 32, 64)
     """Widths of the layers of the first set abstraction (paper: 64, 64, 64)."""
     second_widths: Sizes = (96, 128, 192)
@@ -110,7 +110,7 @@ class MPiNetsNetworkSettings(Settings, name="mpinets"):
                 raise InputError(f"mpinets.{name} is {getattr(self, name)}; it must be two numbers")
         if self.centres[0] > self.scene_points or self.centres[1] > self.centres[0]:
             raise InputError(
-                f"mpinets.centres is {self.centres}; it must fall, from at most scene_points, "
+                f"mpinets.centers is {self.centres}; it must fall, from at most scene_points, "
                 f"{self.scene_points}"
             )
         if len(self.cloud_widths) != 2 or self.cloud_widths[0] % GROUPS:
@@ -121,7 +121,7 @@ class MPiNetsNetworkSettings(Settings, name="mpinets"):
 
 
 GROUPS = 16
-"""Groups of the group normalisation (the paper's)."""
+"""Groups of the group normalization (the paper's)."""
 
 
 class PooledLayers(nn.Module):
@@ -141,10 +141,10 @@ class PooledLayers(nn.Module):
 
 class SetAbstraction(nn.Module):
     """Selects some of the points, with features computed from the points around each: a layer of PointNet++
-    without normalisation (C. Qi et al., "PointNet++: Deep hierarchical feature learning on point sets in a
+    without normalization (C. Qi et al., "PointNet++: Deep hierarchical feature learning on point sets in a
     metric space", NeurIPS 2017).
 
-    Around each centre the nearest points of the ball are taken; the authors take the first in the cloud's
+    Around each center the nearest points of the ball are taken; the authors take the first in the cloud's
     order.
     """
 
@@ -161,7 +161,7 @@ class SetAbstraction(nn.Module):
     def forward(
         self, points: Float[Tensor, "b n 3"], features: Float[Tensor, "b n channels"]
     ) -> tuple[Float[Tensor, "b m 3"], Float[Tensor, "b m width"]]:
-        """The centres and their features; points and centres in [m]."""
+        """The centers and their features; points and centers in [m]."""
         centres, around = group_points(points.detach(), self.centres, self.neighbours, self.radius)
         at = _rows(points, centres)
         offsets = (_rows(points, around) - at[:, :, None]) / self.radius
@@ -171,11 +171,11 @@ class SetAbstraction(nn.Module):
 def group_points(
     points: Float[Tensor, "b n 3"], count: int, neighbours: int, radius: float
 ) -> tuple[Int64[Tensor, "b m"], Int64[Tensor, "b m k"]]:
-    """Indices of centres, by furthest point sampling, and of the points around each.
+    """Indices of centers, by furthest point sampling, and of the points around each.
 
-    The first centre is the point farthest from the mean, each further one the point farthest from the centres
-    so far. Around a centre: the nearest points within the radius, beginning with the centre itself; where
-    there are fewer, the centre repeats. So the order of the points makes no difference.
+    The first center is the point farthest from the mean, each further one the point farthest from the centers
+    so far. Around a center: the nearest points within the radius, beginning with the center itself; where
+    there are fewer, the center repeats. So the order of the points makes no difference.
     """
     distances = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist")
     clouds = torch.arange(len(points))

@@ -2,7 +2,7 @@
 
 A. Qureshi, Y. Miao, A. Simeonov and M. Yip, "Motion Planning Networks: Bridging the Gap Between
 Learning-based and Classical Motion Planners", T-RO 2020. Enet is a contractive auto-encoder of the obstacles'
-point cloud. Pnet is a perceptron from (z, a configuration, the goal) to the next waypoint, learnt from the
+point cloud. Pnet is a perceptron from (z, a configuration, the goal) to the next waypoint, learned from the
 waypoints of planned paths in both directions. Its dropout stays on while it plans: that is where MPNet's
 randomness comes from. The planner around it is `baselines.mpnet`.
 
@@ -13,7 +13,7 @@ Differences from the paper:
   of an auto-encoder alone loses what decides about collisions, and training end to end is cheap, as
   the waypoints of a trajectory share their z.
 - The paper's clouds list the obstacles in a fixed order, which a sensed cloud lacks. So points are sorted
-  along a space-filling curve: neighbours in the list are neighbours in space, and a perceptron can average
+  along a space-filling curve: neighbors in the list are neighbors in space, and a perceptron can average
   them.
 - The contractive penalty is that of S. Rifai et al., "Contractive auto-encoders", ICML 2011, which the paper
   names; its equation has the squared weights in that place.
@@ -22,7 +22,7 @@ Differences from the paper:
 - A quarter of Pnet's outputs is dropped, not half: its narrower layers then keep about as many as in the
   paper. With half, Pnet learns far less in this shorter training.
 - Waypoints are 0.7 rad apart on our demonstrations, from a random waypoint on; those of the paper are the
-  vertices of optimised RRT* paths. A step is a sixth of a path on average, and the chords are 0.3 % shorter
+  vertices of optimized RRT* paths. A step is a sixth of a path on average, and the chords are 0.3 % shorter
   than the paths. All steps have this length, so that the target is unambiguous; steps of a share of the
   path's length would not be.
 - Half of the samples have as their goal a later waypoint other than the last one: bidirectional planning and
@@ -258,7 +258,7 @@ class Perceptron(nn.Module):
 def sorted_along_curve(cloud: Clouds, region: VisibleRegion) -> Clouds:
     """The points in the order of a space-filling curve (G. Morton 1966), in the region's frame [m].
 
-    Positions are relative to the region's centre; an empty cloud, all zeros, stays zero.
+    Positions are relative to the region's center; an empty cloud, all zeros, stays zero.
     """
     filled: Bool[Tensor, "batch 1 1"] = (cloud != 0).flatten(1).any(1)[:, None, None]
     local = (cloud - torch.tensor(region.center).to(cloud)) * filled

@@ -39,7 +39,7 @@ class RobotIdentity(Settings):
     """Bundled name, or path to its URDF."""
     joint_names: tuple[str, ...]
     lower: tuple[float, ...]
-    """Limits that joint values are normalised by [rad], [m] for prismatic joints. The weights serve robots
+    """Limits that joint values are normalized by [rad], [m] for prismatic joints. The weights serve robots
     with other limits too: validation uses the limits of the robot itself."""
     upper: tuple[float, ...]
     frame_offsets: tuple[tuple[tuple[float, ...], ...], ...]

@@ -105,7 +105,7 @@ def filtered(view: DepthView) -> FilteredDepth:
 
 def patch_noise(depth: Float32[ndarray, "h w"]) -> tuple[float, float]:
     """The standard deviation of an image's depth at a distance of 1 m [m], as flat patches show, and the
-    correlation of the errors of neighbouring pixels.
+    correlation of the errors of neighboring pixels.
 
     Of a flat surface, inverse depth is linear in the pixels; where the error of depth grows with its square,
     that of inverse depth is the same everywhere. 0, 0 for images with few returns.
@@ -157,7 +157,7 @@ NEAR_SHARE = 0.05
 
 def empty_regions(depth: Float32[ndarray, "h w"], reach: float | None = None) -> Bool[ndarray, "h w"] | None:
     """The pixels of 0 (or NaN) that seem to have nothing in range: large regions that reach the border of the
-    image, and whose neighbours are not near. None if there are none, or if the image is cut.
+    image, and whose neighbors are not near. None if there are none, or if the image is cut.
 
     Regions that returns surround are holes: what is dark or reflects may be there. reach: the sensor's range
     [m], if it is known: a floor may end there along one row.
@@ -169,13 +169,13 @@ def empty_regions(depth: Float32[ndarray, "h w"], reach: float | None = None) ->
     from scipy.ndimage import binary_dilation, label, maximum_filter, minimum_filter
 
     core = minimum_filter(lost.view(np.uint8), EMPTY_EDGE, mode="nearest")
-    wide = np.asarray(maximum_filter(core, EMPTY_EDGE, mode="nearest", origin=-1) > 0) & lost
+    large_regions = np.asarray(maximum_filter(core, EMPTY_EDGE, mode="nearest", origin=-1) > 0) & lost
     near = ~lost & (depth[::2, ::2] < AT_RANGE * (np.inf if reach is None else reach))
-    kinds = wide + 2 * near
+    kinds = large_regions + 2 * near
     for across in (kinds, kinds.T):
         if (across[:-1] + across[1:] == 3).mean(axis=1).max(initial=0.0) > CUT_SHARE:
             return None
-    parts: Int32[ndarray, "h w"] = label(wide)[0]  # type: ignore[assignment,index]
+    parts: Int32[ndarray, "h w"] = label(large_regions)[0]  # type: ignore[assignment,index]
     inside = np.zeros(int(parts.max()) + 1, np.bool_)
     for border in (parts[0], parts[-1], parts[:, 0], parts[:, -1]):
         inside[border] = True
@@ -196,10 +196,10 @@ def measured_share(view: DepthView) -> float:
     """The part of an image's pixels that measure something: a surface, or that nothing is in range. 0 if
     there is hardly a surface."""
     depth, _, empty = filtered(view)
-    told = depth >= NEAREST
-    if (told & np.isfinite(depth)).mean() < MIN_RETURN_SHARE:
+    measured = depth >= NEAREST
+    if (measured & np.isfinite(depth)).mean() < MIN_RETURN_SHARE:
         return 0.0
-    return float((told if empty is None or view.range is None else told | empty).mean())
+    return float((measured if empty is None or view.range is None else measured | empty).mean())
 
 
 def measure_noise(images: Sequence[ArrayLike]) -> DepthNoise:
@@ -256,7 +256,7 @@ def grown_for_errors(spheres: Float[ndarray, "n 4"], view: DepthView, spread: fl
     camera's pose may be off."""
     T = view.T_base_camera
     offset = spheres[:, :3] - T[:3, 3]
-    ahead = np.maximum(offset @ T[:3, 2], 0.0)
+    forward = np.maximum(offset @ T[:3, 2], 0.0)
     grown = spheres.copy()
-    grown[:, 3] += MARGIN_SPREADS * spread * ahead**2 + pose_error(view, np.linalg.norm(offset, axis=1))
+    grown[:, 3] += MARGIN_SPREADS * spread * forward**2 + pose_error(view, np.linalg.norm(offset, axis=1))
     return grown

@@ -46,7 +46,7 @@ class DepthView(Value):
     depth: Float32[ndarray, "h w"]
     """Distance along the optical axis [m]."""
     intrinsics: tuple[float, float, float, float]
-    """fx, fy, cx, cy [pixels]; pixel centres have integer coordinates. A mapping of these names, and a camera
+    """fx, fy, cx, cy [pixels]; pixel centers have integer coordinates. A mapping of these names, and a camera
     matrix of 3 x 3, are taken too."""
     T_base_camera: Pose
     """x to the right in the image, y down, z ahead: the optical frame of ROS and OpenCV."""
@@ -223,7 +223,7 @@ class DepthNoise(Settings, name="depth_noise"):
     edge_missing: ShareBelowOne = 0.3
     """Fraction of the pixels at edges without a return."""
     edge: Positive = 0.05
-    """Neighbouring pixels whose depths differ by more than this are at an edge [m]."""
+    """Neighboring pixels whose depths differ by more than this are at an edge [m]."""
     grazing: Angle = 0.17
     """Surfaces at a smaller angle to the line of sight give no return [rad]."""
     correlation: NotNegative = 0.0
@@ -238,7 +238,7 @@ class DepthNoise(Settings, name="depth_noise"):
         depth = view.depth.astype(np.float64)
         lost = self._grazed(view)
         for axis in (0, 1):
-            # of two neighbours with an edge between them, the first becomes a flying pixel
+            # of two neighbors with an edge between them, the first becomes a flying pixel
             neighbor = clean.take(np.arange(1, clean.shape[axis] + 1), axis, mode="clip")
             both = np.isfinite(clean) & np.isfinite(neighbor)
             step = np.where(both, neighbor, 0.0) - np.where(both, clean, 0.0)

@@ -139,9 +139,11 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
     required = ("cloud", "camera") if cloud else ("depth", "intrinsics", "camera")
     optional = ("configuration", "pose_deviation", *(() if cloud else ("scale", "range", "noise")))
     values = check_fields(where, entry, required, optional)
-    given = {name: values[name] for name in ("range", "pose_deviation") if values.get(name) is not None}
+    optional_fields = {
+        name: values[name] for name in ("range", "pose_deviation") if values.get(name) is not None
+    }
     if values.get("noise") is not None:
-        given["noise"] = DepthNoise.from_json(values["noise"], f"{where}.noise")
+        optional_fields["noise"] = DepthNoise.from_json(values["noise"], f"{where}.noise")
     camera = check_fields(f"{where}.camera", values["camera"], ("xyz", "wxyz"))
     rotation = rotation_from_quaternion(unit_quaternion("camera", camera["wxyz"]))
     T_base_camera = transform(vector("camera", "xyz", camera["xyz"], 3), rotation)
@@ -156,7 +158,7 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
             notes.extend(new_notes)
             source = {"cloud": file}
         view = DepthView.from_cloud(_rows(where, points), T_base_camera, configuration, source)
-        return replace(view, **given)
+        return replace(view, **optional_fields)
     image = values["depth"]
     scale = positive("view", "scale", values["scale"]) if "scale" in values else None
     if isinstance(image, str):
@@ -167,7 +169,9 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
         raise InputError(
             "view.scale cannot be combined with an image in the problem file, which is in meters"
         )
-    return DepthView(image, values["intrinsics"], T_base_camera, configuration, source=source, **given)
+    return DepthView(
+        image, values["intrinsics"], T_base_camera, configuration, source=source, **optional_fields
+    )
 
 
 def _rows(where: str, points: Any) -> Points:

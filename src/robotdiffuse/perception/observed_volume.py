@@ -45,7 +45,7 @@ MIN_POINT_FRACTION = np.float32(0.03)
 """Minimum fraction of a voxel's pixels with points in it for it to be observed occupied: excludes
 outliers."""
 FLYING_PIXEL_STEP = np.float32(0.03)
-"""A flying pixel is nearer than one neighbour and farther than the opposite one by at least this [m]..."""
+"""A flying pixel is nearer than one neighbor and farther than the opposite one by at least this [m]..."""
 FLYING_PIXEL_WIDTHS = np.float32(4.0)
 """... or, if that is more, by this many widths of a pixel at its distance."""
 BLOCK = 4
@@ -256,7 +256,7 @@ def carve(depth, intrinsics, T, spheres, low, voxel, errors, state, behind, coun
     """Writes the state of each voxel [nx ny nz], its depth behind a surface [m], and its number of points.
 
     intrinsics: fx, fy, cx, cy; T: T_base_camera [4 4]; spheres: those of the arm in the camera's frame; low:
-    lower corner of the grid; errors: by how much free space is narrowed [m], at the camera and for each metre
+    lower corner of the grid; errors: by how much free space is narrowed [m], at the camera and for each meter
     from it, the noise of depth at 1 m, and the sensor's range; counts: number of points in each voxel in
     excess of outliers. All arrays are float32, except state, uint8, and counts, int32.
     """
@@ -273,11 +273,11 @@ def carve(depth, intrinsics, T, spheres, low, voxel, errors, state, behind, coun
             for k in range(0, nz, BLOCK):
                 first = (i, j, k)
                 end = (min(i + BLOCK, nx), min(j + BLOCK, ny), min(k + BLOCK, nz))
-                whole = _state_of_block(
+                block_state = _state_of_block(
                     first, intrinsics, T, low, voxel, errors, raw.shape, factor, table, missing
                 )
-                if whole >= 0:
-                    state[i : end[0], j : end[1], k : end[2]] = whole
+                if block_state >= 0:
+                    state[i : end[0], j : end[1], k : end[2]] = block_state
                     behind[i : end[0], j : end[1], k : end[2]] = _ZERO
                 else:
                     _carve_block(
@@ -327,12 +327,12 @@ def _state_of_block(first, intrinsics, T, low, voxel, errors, size, factor, tabl
         dv += abs(T[c, 1] - y * T[c, 2])
     # no rectangle of a voxel, which is a little larger than the voxel in the image, reaches beyond this
     more = errors[0] + errors[1] * far
-    wide = (middle * voxel + more) / near * (_ONE + ez / near)
+    half_width = (middle * voxel + more) / near * (_ONE + ez / near)
     far = far + more * ez / (_HALF * voxel) + errors[2] * far * far
     u = fx * x + cx
     v = fy * y + cy
-    du = fx * wide * du + PIXEL_SLACK
-    dv = fy * wide * dv + PIXEL_SLACK
+    du = fx * half_width * du + PIXEL_SLACK
+    dv = fy * half_width * dv + PIXEL_SLACK
     h, w = size
     if (
         u + du < -_HALF
@@ -494,18 +494,20 @@ def merged(volumes: Sequence[ObservedVolume]) -> ObservedVolume:
     """What several volumes tell together: a voxel is occupied, or else free, if any of them says so."""
     occupied, free, shadow, lost = (np.zeros(SHAPE, np.bool_) for _ in range(4))
     out = np.ones(SHAPE, np.bool_)
-    behind = np.full(SHAPE, np.inf, np.float32)
+    depth_behind = np.full(SHAPE, np.inf, np.float32)
     for volume in volumes:
         occupied |= volume.occupied
         free |= volume.free
         shadow |= volume.shadow
         lost |= volume.lost
         out &= volume.out_of_view
-        np.copyto(behind, volume.behind, where=(volume.behind > 0) & (volume.behind < behind))
+        np.copyto(depth_behind, volume.behind, where=(volume.behind > 0) & (volume.behind < depth_behind))
     free &= ~occupied
-    known = free | occupied
-    behind[~np.isfinite(behind) | known] = 0.0
-    return ObservedVolume(occupied, free, shadow & ~known, out, behind, lost & ~known & (behind == 0))
+    observed = free | occupied
+    depth_behind[~np.isfinite(depth_behind) | observed] = 0.0
+    return ObservedVolume(
+        occupied, free, shadow & ~observed, out, depth_behind, lost & ~observed & (depth_behind == 0)
+    )
 
 
 def _observed(view: DepthView, robot: Robot, start: Configuration) -> ObservedVolume:

@@ -17,7 +17,7 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
 SAME_SURFACE_PIXELS, SAME_SURFACE_FRACTION = np.float32(4.0), np.float32(0.01)
-"""Neighbouring pixels are on the same surface if their depths differ by less than this many widths of a pixel
+"""Neighboring pixels are on the same surface if their depths differ by less than this many widths of a pixel
 at that depth, or by less than this fraction of the depth."""
 MAX_DEPTH = np.float32(1e6)
 """Larger depths are no returns [m]."""
@@ -121,7 +121,7 @@ def gather_image(depth, intrinsics, T, reach, spheres, voxel, keys, cells, sums,
     z = np.empty(w, np.float32)
     valid = np.empty(w, np.bool_)
     cell = np.empty(w, np.int64)
-    # cells of the row of pixels above: most points are in the cell of a neighbouring pixel
+    # cells of the row of pixels above: most points are in the cell of a neighboring pixel
     slots = np.full(w + 1, -1, np.int64)
     rows = np.zeros(w + 1, np.int32)
     for v in range(h):
@@ -147,7 +147,7 @@ def gather_image(depth, intrinsics, T, reach, spheres, voxel, keys, cells, sums,
 def _place_row(around, b, fx, cx, T, reach, voxel, x, y, z, kept, cell):
     """Computes the points of a row of pixels, their cells, and which of them to keep.
 
-    Points within reach are kept, except flying pixels: those with fewer than two of their eight neighbours on
+    Points within reach are kept, except flying pixels: those with fewer than two of their eight neighbors on
     the same surface. At edges, sensors mix the depths of the near and the far surface.
     around [3, w + 2]: the row above, the row and the row below, with one more pixel at either end.
     """
@@ -158,7 +158,7 @@ def _place_row(around, b, fx, cx, T, reach, voxel, x, y, z, kept, cell):
     ry = T[1, 1] * b + T[1, 2]
     rz = T[2, 1] * b + T[2, 2]
     pixel = SAME_SURFACE_PIXELS / fx
-    most = reach * reach
+    max_square = reach * reach
     for u in range(len(x)):
         d = middle[u + 1]
         a = (np.float32(u) - cx) / fx
@@ -173,7 +173,9 @@ def _place_row(around, b, fx, cx, T, reach, voxel, x, y, z, kept, cell):
             alike += np.int32(abs(row[u + 2] - d) < jump)
         x[u], y[u], z[u], cell[u] = px, py, pz, _key(px, py, pz, voxel)
         # the pixel itself is one of three
-        kept[u] = (alike > 2) & (d >= _NEAREST) & (d < MAX_DEPTH) & (px * px + py * py + pz * pz <= most)
+        kept[u] = (
+            (alike > 2) & (d >= _NEAREST) & (d < MAX_DEPTH) & (px * px + py * py + pz * pz <= max_square)
+        )
 
 
 @kernel(nogil=True)
@@ -356,14 +358,16 @@ def point_shapes(
         ]
     ends = np.concatenate([placed_spheres(robot, q) for q in (start, *goals)]).astype(np.float32)
     distances = sphere_distances(points, ends)
-    left = (distances >= MIN_POINT_RADIUS) | (distances < -error) if error else np.ones(len(points), np.bool_)
+    outside = (
+        (distances >= MIN_POINT_RADIUS) | (distances < -error) if error else np.ones(len(points), np.bool_)
+    )
     shapes = list[SeenPoints]()
     name = "seen"
     for radius in dict.fromkeys(
         (POINT_RADIUS + error, POINT_RADIUS + error / 2, POINT_RADIUS, MIN_POINT_RADIUS)
     ):
-        part = left & (distances >= radius + MIN_POINT_RADIUS) if radius > MIN_POINT_RADIUS else left
-        left = left & ~part
+        part = outside & (distances >= radius + MIN_POINT_RADIUS) if radius > MIN_POINT_RADIUS else outside
+        outside = outside & ~part
         shapes += [SeenPoints(points[part], radius, name=name)] if part.any() else []
         name = "seen_at_ends"
     return tuple(shapes)

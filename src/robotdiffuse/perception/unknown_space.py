@@ -124,7 +124,7 @@ class OccupiedVoxels(Assumption):
 
 
 def without_known(centers: Points, edge: float, robot: Robot, known_scene: Scene) -> Points:
-    """The centres of voxels with this edge, without those of voxels in the known scene [m]."""
+    """The centers of voxels with this edge, without those of voxels in the known scene [m]."""
     if not known_scene.shapes:
         return centers
     scene = compile_scene_for(robot, known_scene)

@@ -16,7 +16,7 @@ from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot
 
 OCCLUSION_START = np.float32(2.0)
-"""Voxels nearer to a voxel than this do not hide it, in edges: its neighbours are as unknown as it is."""
+"""Voxels nearer to a voxel than this do not hide it, in edges: its neighbors are as unknown as it is."""
 MIN_VISIBILITY = np.float32(0.02)
 """Smaller probabilities of seeing through count as zero."""
 ARM_CELL = 16
@@ -121,8 +121,8 @@ def see_through(depth, intrinsics, T, balls, radius, errors, border, seen):
     its pixels are behind the ball; a few pixels may have none.
 
     depth: float32[h, w], infinite where nothing is in range, and not above 0 without a return; intrinsics fx,
-    fy, cx, cy; T [4, 4]: T_base_camera; balls [n, 3]: their centres, and their radius [m]; errors: by
-    how much a ball counts as larger at the camera and for each metre from it, and how far behind it a return
+    fy, cx, cy; T [4, 4]: T_base_camera; balls [n, 3]: their centers, and their radius [m]; errors: by
+    how much a ball counts as larger at the camera and for each meter from it, and how far behind it a return
     must lie at a distance of 1 m, which grows with the square of the distance [m];
     border: pixels around the projection that count too. All numbers are float32; seen bool[n].
     """
@@ -147,8 +147,8 @@ def see_through(depth, intrinsics, T, balls, radius, errors, border, seen):
         v1 = np.ceil(fy * (y + grown) / (near if y > -grown else far) + cy) + border
         if u0 < _ZERO or v0 < _ZERO or u1 > np.float32(w - 1) or v1 > np.float32(h - 1):
             continue
-        behind = min(far + errors[2] * far * far, MAX_DEPTH * _HALF)
-        seen[n] = _all_behind(raw, int(v0), int(v1), int(u0), int(u1), behind)
+        min_return = min(far + errors[2] * far * far, MAX_DEPTH * _HALF)
+        seen[n] = _all_behind(raw, int(v0), int(v1), int(u0), int(u1), min_return)
 
 
 @kernel(nogil=True)
@@ -200,7 +200,7 @@ BALL_RADIUS = BALL_CELL * 3**0.5 / 2 + SAMPLE_DISTANCE
 
 
 def surface_balls(robot: Robot, q: Configuration) -> Points:
-    """The centres of balls of BALL_RADIUS that cover the surface of moving links and of what they hold, at a
+    """The centers of balls of BALL_RADIUS that cover the surface of moving links and of what they hold, at a
     configuration, in the base frame [m]."""
     placed = [
         points @ T[:3, :3].T + T[:3, 3]
@@ -211,7 +211,7 @@ def surface_balls(robot: Robot, q: Configuration) -> Points:
 
 @once_per_robot
 def _balls_by_frame(robot: Robot) -> list[Points]:
-    """The balls' centres by frame, in its coordinates; none in that of the base."""
+    """The balls' centers by frame, in its coordinates; none in that of the base."""
     parts = [part for of_link in parts_of(robot).values() for part in of_link]
     out = [np.zeros((0, 3)) for _ in range(robot.dof + 1)]
     for frame in range(1, robot.dof + 1):

@@ -499,16 +499,16 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
     return MoveItRequest(start, joint_goals, pose_goal, attached, tuple(notes))
 
 
-def _attached(where: str, entry: dict[str, Any], frames: MoveItFrames, folder: Path) -> MoveItAttached:
+def _attached(location: str, entry: dict[str, Any], frames: MoveItFrames, folder: Path) -> MoveItAttached:
     link = str(entry.get("link_name") or "")
-    where, given = f"{where}.object", mapping_of(where, entry, "object")
-    in_link = frame_name(where, given) == link
+    location, object_entry = f"{location}.object", mapping_of(location, entry, "object")
+    in_link = frame_name(location, object_entry) == link
     if in_link:  # the shapes are already in the frame of the link
         frames = MoveItFrames(None, np.eye(4), (link,))
-    with located(where):
-        shapes = tuple(object_shapes(given, frames, folder))
-    touch = tuple(map(str, list_of(f"{where}.", entry, "touch_links")))
-    return MoveItAttached(str(given.get("id") or "object"), link, shapes, in_link, touch)
+    with located(location):
+        shapes = tuple(object_shapes(object_entry, frames, folder))
+    touch = tuple(map(str, list_of(f"{location}.", entry, "touch_links")))
+    return MoveItAttached(str(object_entry.get("id") or "object"), link, shapes, in_link, touch)
 
 
 def _joint_goal(where: str, goal: dict[str, Any]) -> dict[str, float]:

@@ -57,8 +57,8 @@ SPREADS = (
 
 
 def curve_keys(points: Any) -> Any:
-    """Places of points [..., 3] in metres along the Z-order curve (Morton 1966), as 63-bit integers, of an
-    array or a tensor. Neighbours along the curve are close to each other."""
+    """Places of points [..., 3] in meters along the Z-order curve (Morton 1966), as 63-bit integers, of an
+    array or a tensor. Neighbors along the curve are close to each other."""
     key = 0
     for axis in range(3):
         bits = (points[..., axis] / CURVE_STEP).round() + 2**20
@@ -152,7 +152,7 @@ class PointNetSettings(EncoderSettings):
 class DGCNNSettings(EncoderSettings):
     """Sizes for training on a CPU; the original's are in brackets."""
 
-    any_size = False  # distances to neighbours depend on the density of the cloud
+    any_size = False  # distances to neighbors depend on the density of the cloud
     cloud: Count = 128
     """Points of an input cloud (1024)."""
     neighbours: Count = 8

@@ -1,6 +1,6 @@
 """The encoders: auto-encoders that are trained alone, and networks that are trained with the planner.
 
-PointNet and DGCNN normalise features over the channels of a point (layer norm), unlike the originals, and not
+PointNet and DGCNN normalize features over the channels of a point (layer norm), unlike the originals, and not
 over the batch: a code must not depend on the other clouds, clouds may hold points that do not count, and
 averaged weights have no averaged batch statistics.
 """
@@ -83,7 +83,7 @@ class Autoencoder(Encoder):
         self.register_buffer("scale", torch.ones(settings.code))
 
     def forward(self, cloud: Cloud) -> Codes:
-        """z of each cloud, standardised once `standardize` was called. A cloud may be empty.
+        """z of each cloud, standardized once `standardize` was called. A cloud may be empty.
 
         Points outside the region are ignored, so that clouds of different size can share a batch.
         """
@@ -91,7 +91,7 @@ class Autoencoder(Encoder):
 
     @abstractmethod
     def encode(self, cloud: Cloud) -> Codes:
-        """z before standardisation."""
+        """z before standardization."""
 
     def standardize(self, codes: Codes) -> None:
         """Scale z so that each number of these codes has mean 0 and variance 1."""
@@ -104,7 +104,7 @@ class Autoencoder(Encoder):
 
     @abstractmethod
     def penalised(self) -> Iterable[Tensor]:
-        """The weights theta of the paper's regulariser, lambda * sum theta^2."""
+        """The weights theta of the paper's regularizer, lambda * sum theta^2."""
 
 
 def fp32(tensor: Tensor) -> torch.autocast:
@@ -159,7 +159,7 @@ class CompressionAutoencoder(Autoencoder):
         return (self.encoder(cloud.flatten(1)) - self.mean) / self.scale
 
     def decode(self, code: Codes) -> Ordered:
-        """Reconstructed points [m], in the order of `arrange`, from z before standardisation."""
+        """Reconstructed points [m], in the order of `arrange`, from z before standardization."""
         with fp32(code):
             return self.decoder(code.float()).view(len(code), -1, 3)
 
@@ -191,7 +191,7 @@ def _perceptron(sizes: tuple[int, ...]) -> nn.Sequential:
 DISTANCE_QUERIES = 96
 """Positions per cloud at which the distance field is reconstructed."""
 DISTANCE_WEIGHT = 4.0
-"""In training: weight of the error of the distance field relative to the Chamfer distance, both in metres."""
+"""In training: weight of the error of the distance field relative to the Chamfer distance, both in meters."""
 DISTANCE_CAP = 0.5
 """Reconstructed distances are capped at this [m]."""
 
@@ -229,7 +229,7 @@ class PointAutoencoder(Autoencoder):
         )  # fmt: skip
 
     def encode(self, cloud: Cloud) -> Codes:
-        """z before standardisation."""
+        """z before standardization."""
         near = self.near(cloud)[..., None]
         with fp32(cloud):
             x = functional.relu(self.points[0](self._waves(cloud)))
@@ -246,11 +246,11 @@ class PointAutoencoder(Autoencoder):
         return torch.cat([points, *(part for a in angles for part in (a.sin(), a.cos()))], -1)
 
     def decode(self, code: Codes) -> Float[Tensor, "batch decoded 3"]:
-        """Reconstructed points [m], from z before standardisation."""
+        """Reconstructed points [m], from z before standardization."""
         return self.decoder(code).float().view(len(code), -1, 3)
 
     def distance(self, code: Codes, at: Float[Tensor, "batch queries 3"]) -> Float[Tensor, "batch queries"]:
-        """Reconstructed distance [m] of positions to the cloud, from z before standardisation."""
+        """Reconstructed distance [m] of positions to the cloud, from z before standardization."""
         return (
             self.query(self.query_code(code)[:, None] + self.query_point(self._waves(at))).float().squeeze(-1)
         )
@@ -397,13 +397,13 @@ IGNORED_DISTANCE = 1e9
 """Squared distance that is given to points that do not count."""
 
 
-def neighbours(x: Features, near: Near, count: int) -> Int64[Tensor, "batch points neighbours"]:
-    """Indices of each point's `count` nearest neighbours, itself included; where there are fewer, itself
+def neighbours(x: Features, near: Near, count: int) -> Int64[Tensor, "batch points neighbors"]:
+    """Indices of each point's `count` nearest neighbors, itself included; where there are fewer, itself
     again."""
     with torch.no_grad(), fp32(x):
         x = x.detach().float()
         squared = x.square().sum(-1)
-        # |a - b|^2 without |a|^2, which is the same for all neighbours of a
+        # |a - b|^2 without |a|^2, which is the same for all neighbors of a
         squared_distances = torch.baddbmm(squared[:, None], x, x.mT, alpha=-2.0)
         squared_distances = squared_distances.masked_fill(~near[:, None], IGNORED_DISTANCE)
         nearest = squared_distances.topk(min(count, x.shape[1]), dim=-1, largest=False, sorted=False)
@@ -412,7 +412,7 @@ def neighbours(x: Features, near: Near, count: int) -> Int64[Tensor, "batch poin
 
 
 class EdgeConvolution(nn.Module):
-    """max over neighbours j of h(x_i, x_j - x_i).
+    """max over neighbors j of h(x_i, x_j - x_i).
 
     The original's h is a linear layer, batch norm and leaky ReLU. Here the norm comes after the maximum. So
     the maximum commutes with the rest: with h = W [x_i, x_j - x_i] = (A - B) x_i + B x_j, it is over B x_j
@@ -441,7 +441,7 @@ class DGCNN(Encoder):
     """z = MLP(max-pool and mean-pool of MLP(outputs of all edge convolutions)).
 
     After Wang et al. 2019, "Dynamic Graph CNN for Learning on Point Clouds": each layer joins every point
-    with its nearest neighbours, in the space of that layer's own input.
+    with its nearest neighbors, in the space of that layer's own input.
     """
 
     def __init__(self, settings: DGCNNSettings) -> None:

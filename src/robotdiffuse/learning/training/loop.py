@@ -1,4 +1,4 @@
-"""The loop of all training runs: optimiser, learning rate, checkpoints, log, bad steps, interruption."""
+"""The loop of all training runs: optimizer, learning rate, checkpoints, log, bad steps, interruption."""
 
 import atexit
 import copy
@@ -215,7 +215,7 @@ class TrainingRun:
     """Trains a module's parameters; continues an earlier run in the same folder.
 
     A resumed run gives the same result as an uninterrupted one: weights, their average, moments of the
-    optimiser and the random states come from the checkpoint.
+    optimizer and the random states come from the checkpoint.
 
     Several processes, started by torchrun, are one run: each draws its own batches of the settings' size, and
     all step by their mean gradient. The first one validates, shows progress and writes all files; the others
@@ -296,7 +296,7 @@ class TrainingRun:
             torch.set_num_threads(threads)
 
     def step(self) -> None:
-        """One step of the optimiser, which is skipped if the loss or the gradient is not finite."""
+        """One step of the optimizer, which is skipped if the loss or the gradient is not finite."""
         self.optimizer.param_groups[0]["lr"] = self.settings.learning_rate * self._lr()
         self.optimizer.zero_grad(set_to_none=True)
         value = self.task.loss(self.fraction, self.rng)

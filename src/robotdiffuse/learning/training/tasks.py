@@ -63,7 +63,7 @@ MAX_READOUT_DISTANCE = 0.3
 REGULARIZATION = 1e-7
 """The paper's lambda: weight of the sum of squared weights, in the unit of the reconstruction's loss."""
 RELATIVE_RIDGE = 1e-3
-"""Regularisation of the fit, relative to the mean variance of a code's numbers."""
+"""Regularization of the fit, relative to the mean variance of a code's numbers."""
 
 
 def train_encoder(settings: EncoderTraining, out: str) -> dict[str, float]:
@@ -92,8 +92,12 @@ class _EncoderTask(TrainingTask):
     def loss(self, fraction: float, rng: np.random.Generator) -> Float[Tensor, ""]:
         settings = self.settings
         module = self.module
-        most = self._most
-        points = int(rng.integers(max(1, most // 8), most + 1)) if module.settings.any_size else most
+        max_points = self._most
+        points = (
+            int(rng.integers(max(1, max_points // 8), max_points + 1))
+            if module.settings.any_size
+            else max_points
+        )
         error, _ = self._reconstruction(settings.batch, points, rng)
         theta = torch.stack([p.square().sum() for p in module.penalised()]).sum()
         return error + REGULARIZATION * theta
@@ -142,19 +146,19 @@ def linear_readout(encoder: Encoder, scenes: PackedScenes, rng: np.random.Genera
     with torch.no_grad():
         clouds = scene_clouds(encoder, scenes, rng).split(256)
         z = torch.cat([encoder(part) for part in clouds]).numpy().astype(np.float64)
-    wanted = (
+    targets = (
         scenes.distances(READOUT_POSITIONS)
         .clip(-MAX_READOUT_DISTANCE, MAX_READOUT_DISTANCE)
         .astype(np.float64)
     )
     z -= z[:READOUT_SCENES].mean(0)
-    mean = wanted[:READOUT_SCENES].mean(0)
+    mean = targets[:READOUT_SCENES].mean(0)
     gram = z[:READOUT_SCENES].T @ z[:READOUT_SCENES]
     ridge = max(RELATIVE_RIDGE * np.trace(gram) / len(gram), np.finfo(np.float64).tiny)
     weights = np.linalg.solve(
-        gram + ridge * np.eye(len(gram)), z[:READOUT_SCENES].T @ (wanted[:READOUT_SCENES] - mean)
+        gram + ridge * np.eye(len(gram)), z[:READOUT_SCENES].T @ (targets[:READOUT_SCENES] - mean)
     )
-    error = wanted[READOUT_SCENES:] - mean
+    error = targets[READOUT_SCENES:] - mean
     return {
         "readout": float(np.abs(error - z[READOUT_SCENES:] @ weights).mean()),
         "readout_of_constant": float(np.abs(error).mean()),
@@ -270,14 +274,14 @@ class PlannerTask(MotionTask):
     def loss_of(
         self, data: TrajectoryData, fraction: float, rng: np.random.Generator, validating: bool
     ) -> Float[Tensor, ""]:
-        own = self.settings
-        if own.progressive:
+        settings = self.settings
+        if settings.progressive:
             self.model.coarsen(block_at(fraction))
-        batches = Batches(data, self._on_cpu, self.clearances, own.trivial_share, own.weight_limit)
-        batch = batches.draw(own.batch, rng)
+        batches = Batches(data, self._on_cpu, self.clearances, settings.trivial_share, settings.weight_limit)
+        batch = batches.draw(settings.batch, rng)
         dropped = None
-        if own.condition_drop > 0 and not validating:
-            dropped = torch.from_numpy(rng.random(own.batch) < own.condition_drop)
+        if settings.condition_drop > 0 and not validating:
+            dropped = torch.from_numpy(rng.random(settings.batch) < settings.condition_drop)
         return self._loss(batch, fraction, rng, dropped)
 
     def success(self, rng: np.random.Generator) -> float:
@@ -438,11 +442,11 @@ class _BaselineTask(MotionTask):
         self.title, robot = settings.name, load_robot(settings.robot)
         torch.manual_seed(settings.seed)
         kind = NETWORKS.load(settings.name)
-        own = NETWORKS.defaults(settings.name)
-        self.module = kind(RobotIdentity.of(robot), own)
+        default_settings = NETWORKS.defaults(settings.name)
+        self.module = kind(RobotIdentity.of(robot), default_settings)
         super().__init__(settings, robot, None, processes)
         self.module.fit_statistics(self.train_data)
-        self.identity = {"robot": robot.name, "network": repr(own)}
+        self.identity = {"robot": robot.name, "network": repr(default_settings)}
 
     def loss_of(
         self, data: TrajectoryData, fraction: float, rng: np.random.Generator, validating: bool
