@@ -142,7 +142,7 @@ def test_nothing_moves_further_than_its_displacement(seed: int) -> None:
         seen = np.linalg.inv(places[:, base]) @ places[:, link]
         balls = robot.spheres[claim.link]
         centers = balls[:, :3] @ np.swapaxes(seen[:, :3, :3], 1, 2) + seen[:, None, :3, 3]
-        # a point of a ball goes at least as far as its centre, at most by the turning of its radius more
+        # a point of a ball goes at least as far as its center, at most by the turning of its radius more
         assert np.linalg.norm(centers[1:] - centers[0], axis=-1).max() <= displacement + 1e-12
 
 

@@ -168,7 +168,7 @@ def still_row(record: Record) -> None:
 
 
 def bulge(record: Record) -> None:
-    """A velocity that the positions do not have, opposite at the two neighbours, on a joint at rest."""
+    """A velocity that the positions do not have, opposite at the two neighbors, on a joint at rest."""
     motion = record["motion"]
     for row, sign in ((40, 1.0), (41, -1.0)):
         motion["velocities"][row][6] = sign * 0.5

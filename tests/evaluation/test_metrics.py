@@ -278,7 +278,7 @@ def test_self_collision_between_valid_ends_fails() -> None:
 
 @pytest.mark.parametrize(("gap", "kind"), [(1e-3, None), (-1e-3, "scene_collision")])
 def test_scene_collision_fails_from_contact_on(gap: float, kind: str | None) -> None:
-    """A ball beside the hand's way, a millimetre clear of the nearest link or in it."""
+    """A ball beside the hand's way, a millimeter clear of the nearest link or in it."""
     middle = link_pose(PANDA, (START + END) / 2, "panda_hand")[:3, 3] + np.array([0.3, -0.1, 0.1])
     small = ExactCollision(PANDA, Scene([Sphere(middle, 0.01)]))
     way = np.linspace(START, END, 120)

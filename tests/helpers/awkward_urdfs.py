@@ -104,7 +104,7 @@ WORKS: dict[str, tuple[Callable[[Path], Path], int]] = {
     "links without geometry": (text(robot(ARM).replace(link("j3_link"), link("j3_link", ""))), 4),
     "a mesh of 200,000 triangles": (solid(fine()), 5),
     "a mesh with degenerate triangles": (solid(degenerate(), "part.obj"), 5),
-    "a mesh in millimetres": (solid(trimesh.creation.box([60, 60, 60]), more='scale="0.001 0.001 0.001"'), 5),
+    "a mesh in millimeters": (solid(trimesh.creation.box([60, 60, 60]), more='scale="0.001 0.001 0.001"'), 5),
     "a mirrored mesh": (solid(box(), more='scale="1 -1 1"'), 5),
     "a mesh with an ending in capitals": (solid(box(), "PART.STL"), 5),
     "another encoding": (
@@ -193,7 +193,7 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
         arm(ARM, link("ball"), joint("free", "base", "ball", "floating")),
         "remove it with what it carries",
     ),
-    "a hand in millimetres": (
+    "a hand in millimeters": (
         solid(trimesh.creation.box([50, 100, 300])),
         'link end is 300 m long; .* scale="0.001 0.001 0.001"',
     ),

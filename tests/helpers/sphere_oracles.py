@@ -19,7 +19,7 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere
 
 TOLERANCE = 1e-5
-"""Bound on float32 rounding at distances of a few metres [m]."""
+"""Bound on float32 rounding at distances of a few meters [m]."""
 
 
 def least_clearance(checker: CollisionChecker, q: ndarray) -> ndarray:
@@ -29,7 +29,7 @@ def least_clearance(checker: CollisionChecker, q: ndarray) -> ndarray:
 
 
 def sphere_centres(robot: Robot, q: ndarray) -> tuple[list[ndarray], list[ndarray]]:
-    """Centres [n, k, 3] and radii [k] of the spheres of each group, base frame."""
+    """Centers [n, k, 3] and radii [k] of the spheres of each group, base frame."""
     frames = forward_frames(robot, q)
     centres = []
     radii = []

@@ -207,7 +207,7 @@ def test_temperature_and_calibration() -> None:
 
 
 def test_nothing_is_predicted_beyond_reach() -> None:
-    """Training covers no voxels there, so the network would predict walls a metre around the arm."""
+    """Training covers no voxels there, so the network would predict walls a meter around the arm."""
     unknown = np.zeros(SHAPE, np.uint8)
     p = exported_completion()(unknown, unknown)
     reachable = training.reachable().repeat(2, 0).repeat(2, 1).repeat(2, 2)

@@ -35,7 +35,7 @@ def view_from(distance: float) -> DepthView:
 def test_the_estimated_noise_is_that_of_the_sensor(
     spread: float, distance: float, correlation: float
 ) -> None:
-    """Differences of neighbouring pixels showed an eighth of noise that is correlated as recorded."""
+    """Differences of neighboring pixels showed an eighth of noise that is correlated as recorded."""
     noise = DepthNoise(spread=spread, correlation=correlation)
     noisy = noise.applied(view_from(distance), np.random.default_rng(0))
     found, neighbours = patch_noise(noisy.depth)
