@@ -1,4 +1,4 @@
-"""Runs: every case by every method with every seed, each validated and kept as a record, a line of JSON.
+"""Runs: every case with every method and seed. Each run is validated and stored as a record, a JSON line.
 
 A method takes a run and yields the fields of its records, with the validator's verdict; `methods` has those
 of planners and networks. An executor calls methods: in this process, one after the other (`in_this_process`),
@@ -55,7 +55,7 @@ class Record:
     trivial: bool
     seed: int
     time_limit: float
-    """[s]"""
+    """Time limit of the call [s]."""
     status: str
     """A value of `types.Status`, or crashed, overran, exception."""
     reason: str

@@ -23,18 +23,18 @@ GOAL_COUNT = 10
 SEEDS = 64
 """Seeds of a round."""
 ROUND = InverseKinematicsSettings(seeds_per_round=SEEDS, max_rounds=1)
-"""For a pose without tolerances."""
+"""Settings of one round of inverse kinematics for a pose without tolerances."""
 # Most rounds, most rounds in a row without a new configuration once there is one, and rounds after which a
 # pose that none reached is given up.
 MAX_ROUNDS = 64
 PATIENCE = 2
 REACH_ROUNDS = 16
 TOLERANCE_FRACTION = 0.9
-"""Part of the tolerances of path constraints that goals keep."""
+"""Fraction of the tolerances of path constraints that goals keep."""
 MIN_DIFFERENCE = 0.1
 """Configurations differ by more than this in at least one joint [rad] or [m]."""
-# Part of the way to the start that a configuration is moved before it is projected onto the goal again; how
-# often; and the part of its distance by which this must bring it nearer.
+# To bring a configuration nearer to the start, it is moved by a fraction PULL of the way there and projected
+# onto the goal again, at most MAX_PULLS times, as long as its distance falls by the fraction MIN_PULL_GAIN.
 PULL = 0.5
 MAX_PULLS = 12
 MIN_PULL_GAIN = 0.01
@@ -67,7 +67,7 @@ def pose_configurations(
     robot = problem.robot
     start = problem.start
     poses = poses_of(goal)
-    together = PathConstraints(problem, poses, exact)
+    all_constraints = PathConstraints(problem, poses, exact)
     solutions = [np.zeros((0, robot.dof))] * len(poses)
     configurations = np.zeros((0, robot.dof))
     reached = False
@@ -84,7 +84,7 @@ def pose_configurations(
         solutions = [np.concatenate([before, more]) for before, more in zip(solutions, new, strict=True)]
         seeds = new[0] if len(poses) == 1 else _combined(problem, poses, solutions, rng)
         if len(poses) > 1 or problem.constraints:
-            seeds = together.projected(np.concatenate([start[None], seeds]), TOLERANCE_FRACTION)
+            seeds = all_constraints.projected(np.concatenate([start[None], seeds]), TOLERANCE_FRACTION)
         reached = reached or len(seeds) > 0
         accepted = _accepted(robot.nearest_turns(seeds, start), accept)
         before = len(configurations)
@@ -96,9 +96,11 @@ def pose_configurations(
             or (k >= REACH_ROUNDS and not reached)
         ):
             break
-    nearer = _accepted(_pulled(together, configurations, start), accept)
-    every = np.concatenate([nearer, configurations])
-    return _distinct(every[np.argsort(np.linalg.norm(every - start, axis=1), kind="stable")])[:count]
+    nearer = _accepted(_pulled(all_constraints, configurations, start), accept)
+    candidates = np.concatenate([nearer, configurations])
+    return _distinct(candidates[np.argsort(np.linalg.norm(candidates - start, axis=1), kind="stable")])[
+        :count
+    ]
 
 
 def at_pose(
@@ -115,8 +117,8 @@ def at_pose(
     seeds = random_seeds(robot, robot.lower, robot.upper, SEEDS, rng, start)
     seeds = np.where(beside(robot, pose.frame), start, seeds)
     seeds[0] = start
-    alone = PathConstraints(replace(problem, constraints=()), [pose], exact)
-    return alone.projected(seeds, TOLERANCE_FRACTION, count)
+    pose_constraints = PathConstraints(replace(problem, constraints=()), [pose], exact)
+    return pose_constraints.projected(seeds, TOLERANCE_FRACTION, count)
 
 
 def _within(pose: PoseGoal, part: float) -> PoseGoal:
@@ -143,12 +145,12 @@ def _combined(
     return seeds
 
 
-def _pulled(together: PathConstraints, q: Configurations, start: Configuration) -> Configurations:
+def _pulled(constraints: PathConstraints, q: Configurations, start: Configuration) -> Configurations:
     """The configurations drawn towards the start, as far as the goal allows."""
-    robot = together.robot
+    robot = constraints.robot
     nearest = q
     for _ in range(MAX_PULLS):
-        moved, reached = together.project(nearest + PULL * (start - nearest), TOLERANCE_FRACTION)
+        moved, reached = constraints.project(nearest + PULL * (start - nearest), TOLERANCE_FRACTION)
         moved = robot.nearest_turns(moved, start)
         before = np.linalg.norm(nearest - start, axis=1)
         nearer = reached & (np.linalg.norm(moved - start, axis=1) < (1 - MIN_PULL_GAIN) * before)

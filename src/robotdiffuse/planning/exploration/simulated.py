@@ -34,7 +34,7 @@ class RecordedView:
     """A view, and what was known of each voxel after it."""
 
     time: float
-    """Since the first step, without pauses [s]."""
+    """Time since the first step, without pauses [s]."""
     act: int
     """The number of the step under way; -1 before the first."""
     view: DepthView
@@ -53,7 +53,7 @@ class RecordedAct:
     """A step, and where the arm was."""
 
     begins: float
-    """[s]"""
+    """When the step begins, since the first step [s]."""
     step: Step
     configuration: Configuration
     """Configuration of the arm before the step."""
@@ -73,12 +73,12 @@ class RecordedAct:
 
     @property
     def duration(self) -> float:
-        """[s]; 0 for a step without a motion."""
+        """Duration of the motion [s]; 0 without one."""
         return 0.0 if self.trajectory is None else self.trajectory.duration
 
 
 class RecordedExplorer(Explorer):
-    """An Explorer that keeps all views, and all steps, which are taken as executed at once and to the end.
+    """An Explorer that records all views and steps. Steps count as executed at once and to the end.
 
     A view counts as taken where the motion comes nearest to its configuration.
     """
