@@ -98,9 +98,8 @@ def pose_configurations(
             break
     nearer = _accepted(_pulled(all_constraints, configurations, start), accept)
     candidates = np.concatenate([nearer, configurations])
-    return _distinct(candidates[np.argsort(np.linalg.norm(candidates - start, axis=1), kind="stable")])[
-        :count
-    ]
+    nearest_first = np.argsort(np.linalg.norm(candidates - start, axis=1), kind="stable")
+    return _distinct(candidates[nearest_first])[:count]
 
 
 def at_pose(
