@@ -50,6 +50,6 @@ from .scenes.shapes import Mesh as Mesh
 from .scenes.shapes import PointCloud as PointCloud
 from .scenes.shapes import Sphere as Sphere
 from .validation.validator import verify as verify
-from .visualization.notebook import show as show
+from .visualization.replay_page import show as show
 
 __version__: str

@@ -13,6 +13,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import inverse, transform
+from robotdiffuse.core.types import Points, Pose
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.visual_meshes import load_visual
@@ -47,7 +48,7 @@ class Surface:
     colors: Float[ndarray, "v 3"]
     faces: Int[ndarray, "f 3"]
 
-    def moved(self, T: Float[ndarray, "4 4"]) -> "Surface":
+    def moved(self, T: Pose) -> "Surface":
         """The surface after a rigid transform."""
         vertices = self.vertices @ T[:3, :3].T + T[:3, 3]
         return Surface(vertices, self.normals @ T[:3, :3].T, self.colors, self.faces)
@@ -78,7 +79,7 @@ def join(surfaces: Sequence[Surface]) -> Surface:
     )
 
 
-def painted(color: Color, count: int) -> Float[ndarray, "n 3"]:
+def painted(color: Color, count: int) -> Points:
     """A color for each of `count` vertices or faces."""
     return np.tile(np.array(color) / 255.0, (count, 1))
 
@@ -138,7 +139,7 @@ class Drawable:
         """Where it is at time 0, in the base frame; a point cloud becomes octahedra."""
         return _surface(self.shape, self.color)
 
-    def frame(self, time: float = 0.0) -> Float[ndarray, "4 4"]:
+    def frame(self, time: float = 0.0) -> Pose:
         """The pose of its own frame in the base frame at a time [s]."""
         return own_frame(self.shape) if self.moving is None else self.moving.pose(time)
 
@@ -166,7 +167,7 @@ def drawables(scene: Scene, moving: Sequence[MovingObstacle] = ()) -> list[Drawa
     ]
 
 
-def own_frame(shape: Shape) -> Float[ndarray, "4 4"]:
+def own_frame(shape: Shape) -> Pose:
     """The pose of a shape's own frame; of clouds the middle of their bounds, else the base."""
     if isinstance(shape, PointCloud):
         return transform(shape.bounds.mean(axis=0))
@@ -224,7 +225,7 @@ def _point_surface(cloud: PointCloud, color: Color) -> Surface:
     return Surface(vertices, np.tile(axes, (len(points), 1)), painted(color, len(vertices)), many)
 
 
-def thinned(points: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:
+def thinned(points: Points) -> Float[ndarray, "m 3"]:
     """At most MAX_SIZE of the points: every k-th one."""
     return points[:: -(-len(points) // MAX_SIZE)] if len(points) else points
 

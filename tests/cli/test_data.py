@@ -14,7 +14,7 @@ from helpers.motion_stores import line, random_motions, record, write_motions
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere
-from robotdiffuse.visualization import gallery
+from robotdiffuse.visualization import replay_page
 from robotdiffuse.visualization.picture import PictureSettings
 
 PANDA = load_robot("panda")
@@ -62,7 +62,7 @@ def test_check_finds_a_collision(folder, capsys):
 
 
 def test_view_shows_samples_in_one_page(folder, capsys, monkeypatch):
-    monkeypatch.setattr(gallery, "THUMBNAIL", PictureSettings(64, 40, ghosts=1))
+    monkeypatch.setattr(replay_page, "THUMBNAIL", PictureSettings(64, 40, ghosts=1))
     out = folder.parent / "samples.html"
     assert run("data", "view", folder, "--count", 2, "--seed", 3, "--out", out) == 0
     assert f"wrote {out}" in capsys.readouterr().out.replace("\n", "")

@@ -10,7 +10,7 @@ from PIL import Image
 
 import robotdiffuse as rd
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.visualization.problem_drawing import COLLIDING, write_problem
+from robotdiffuse.visualization.replay_page import COLLIDING, write_problem
 
 PANDA = rd.load_robot("panda")
 START = np.array([-1.0, 0.3, 0, -1.8, 0, 2.1, 0.8])

@@ -188,7 +188,7 @@ def _write_replays(bench: "Bench", parts: "list[Section]", file: "Path") -> str 
     """The name of the written file; None if there is no motion to replay."""
     from robotdiffuse.core.types import Path as Waypoints
     from robotdiffuse.evaluation.bench_report import motions_to_replay
-    from robotdiffuse.visualization.gallery import GalleryEntry, write_gallery
+    from robotdiffuse.visualization.replay_page import GalleryEntry, write_gallery
 
     motions = motions_to_replay(bench, parts)
     if not motions:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from robotdiffuse.robots.robot import Robot
-    from robotdiffuse.visualization.gallery import GalleryEntry
+    from robotdiffuse.visualization.replay_page import GalleryEntry
 
 CLEAN = 0
 VIOLATIONS = 1
@@ -241,7 +241,7 @@ def run_view(arguments: argparse.Namespace) -> int:
     from robotdiffuse.core.output_files import check_output
     from robotdiffuse.datasets.shards import read_manifest
     from robotdiffuse.robots import load_robot
-    from robotdiffuse.visualization.gallery import write_gallery
+    from robotdiffuse.visualization.replay_page import write_gallery
 
     folder = Path(arguments.folder)
     manifest = read_manifest(folder)
@@ -263,7 +263,7 @@ def _gallery_entries(folder: Path, robot: "Robot", number: int, seed: int) -> "I
     """Random motions, in the order of the shards."""
     from robotdiffuse.datasets.rows import motion_of, scenes_of
     from robotdiffuse.datasets.shards import random_rows, read_manifest
-    from robotdiffuse.visualization.gallery import GalleryEntry
+    from robotdiffuse.visualization.replay_page import GalleryEntry
 
     manifest = read_manifest(folder)
     for shard, rows in random_rows(folder, number, seed):

@@ -31,7 +31,7 @@ def draw(problem: "Problem", result: "PlanResult | None", file: Path) -> None:
     For a problem with views and the policy `predicted`, the predicted obstacles are drawn too.
     """
     if result is None or result.path is None:
-        from robotdiffuse.visualization.problem_drawing import write_problem
+        from robotdiffuse.visualization.replay_page import write_problem
 
         return write_problem(problem, file, result)
     if file.suffix.lower() == ".html":
@@ -51,7 +51,7 @@ def draw_several(problem: "Problem", results: "Mapping[str, PlanResult]", file: 
     robot, scene = _shown(problem)
     motions = {name: _motion(result) for name, result in results.items()}
     if file.suffix.lower() == ".html":
-        from robotdiffuse.visualization.gallery import GalleryEntry, write_gallery
+        from robotdiffuse.visualization.replay_page import GalleryEntry, write_gallery
 
         entries = [
             GalleryEntry(name, results[name].planner, scene, motion, problem.moving_in_world)

@@ -15,12 +15,10 @@ from typing import Annotated
 
 import numpy as np
 import pybullet
-from jaxtyping import Float
-from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Bound, Positive, Settings
-from robotdiffuse.core.types import Trajectory
+from robotdiffuse.core.types import Configuration, Configurations, Points, Trajectory, Values
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
@@ -72,13 +70,13 @@ class Replay:
     """The result of a replay."""
 
     joint_names: tuple[str, ...]
-    times: Float[ndarray, "n"]
+    times: Values
     """Simulated times, from 0 [s]."""
-    positions: Float[ndarray, "n dof"]
+    positions: Configurations
     """Simulated positions [rad], [m] for prismatic joints."""
-    reference: Float[ndarray, "n dof"]
+    reference: Configurations
     """Positions of the trajectory at the same times."""
-    tip_errors: Float[ndarray, "n"]
+    tip_errors: Values
     """Distance of the robot's tip from its reference position [m]."""
     contacts: tuple[ReplayContact, ...]
     """Contacts in order of their first time."""
@@ -89,12 +87,12 @@ class Replay:
         return not self.contacts
 
     @property
-    def max_errors(self) -> Float[ndarray, "dof"]:
+    def max_errors(self) -> Configuration:
         """Largest tracking error of each joint [rad]."""
         return np.abs(self.positions - self.reference).max(axis=0)
 
     @property
-    def rms_errors(self) -> Float[ndarray, "dof"]:
+    def rms_errors(self) -> Configuration:
         """Root mean square tracking error of each joint [rad]."""
         return np.sqrt(((self.positions - self.reference) ** 2).mean(axis=0))
 
@@ -128,10 +126,10 @@ def replay(
 
 def _simulate(
     world: World,
-    times: Float[ndarray, "n"],
-    reference: Float[ndarray, "n dof"],
+    times: Values,
+    reference: Configurations,
     settings: ReplaySettings,
-) -> tuple[Float[ndarray, "n dof"], tuple[ReplayContact, ...]]:
+) -> tuple[Configurations, tuple[ReplayContact, ...]]:
     bullet = world.bullet
     body = world.body
     dof = len(world.joints)
@@ -170,7 +168,7 @@ def _simulate(
     return positions, tuple(contacts.values())
 
 
-def _tips(world: World, positions: Float[ndarray, "n dof"]) -> Float[ndarray, "n 3"]:
+def _tips(world: World, positions: Configurations) -> Points:
     """Positions of the tip link [m]."""
     tip = world.links[world.robot.tip]
     at = []

@@ -8,11 +8,9 @@ which is subtracted here; the remaining difference to exact distances is below 1
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Path
+from robotdiffuse.core.types import Configuration, Configurations, Path
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.simulation.world import World
@@ -60,7 +58,7 @@ class PyBulletOracle:
         loaded."""
         self._world.set_scene(scene)
 
-    def nearest(self, q: Float[ndarray, "dof"], within: float = MAX_DISTANCE) -> OracleContact | None:
+    def nearest(self, q: Configuration, within: float = MAX_DISTANCE) -> OracleContact | None:
         """The closest pair, link and obstacle or two links; None if its distance exceeds `within` [m]."""
         world = self._world
         world.place(q)
@@ -73,16 +71,16 @@ class PyBulletOracle:
             best = self._closer(best, within, a, b, world.body, world.links[b])
         return best
 
-    def distance(self, q: Float[ndarray, "dof"]) -> float:
+    def distance(self, q: Configuration) -> float:
         """The smallest signed distance to the scene or between links [m], at most MAX_DISTANCE."""
         nearest = self.nearest(q)
         return MAX_DISTANCE if nearest is None else nearest.distance
 
-    def collides(self, q: Float[ndarray, "dof"], tolerance: float = 0.0) -> bool:
+    def collides(self, q: Configuration, tolerance: float = 0.0) -> bool:
         """Whether any pair penetrates deeper than the tolerance [m]."""
         return self.nearest(q, -tolerance) is not None
 
-    def check_frames(self, q: Float[ndarray, "n dof"], tolerance: float = 0.001) -> OracleContact | None:
+    def check_frames(self, q: Configurations, tolerance: float = 0.001) -> OracleContact | None:
         """The first contact deeper than the tolerance [m] among these configurations, or None.
 
         Its `at` is the row. Each configuration takes one call of Bullet's broad phase for all pairs (20 us

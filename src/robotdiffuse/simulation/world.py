@@ -17,6 +17,7 @@ from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.settings import Bound, NotNegative, Positive, Settings
 from robotdiffuse.core.transforms import inverse, quaternion_from_rotation, rpy_from_rotation
+from robotdiffuse.core.types import Configuration, Pose, Rotation, Vector
 from robotdiffuse.drawables import Drawable, Surface, drawables, link_surfaces
 from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Robot
@@ -151,7 +152,7 @@ class World:
                 if self.robot.link_frame(link) == 0 or scene.may_touch(link, name):
                     self.bullet.setCollisionFilterPair(self.body, body, index, -1, 0)
 
-    def place(self, q: Float[ndarray, "dof"]) -> None:
+    def place(self, q: Configuration) -> None:
         """Place the arm in a configuration, at rest."""
         self.bullet.resetJointStatesMultiDof(self.body, self.joints, q[:, None].tolist())
 
@@ -221,7 +222,7 @@ class World:
         return self.mesh_shapes[key]
 
 
-def _pose(T: Float[ndarray, "4 4"]) -> tuple[list[float], list[float]]:
+def _pose(T: Pose) -> tuple[list[float], list[float]]:
     """Position and quaternion xyzw."""
     w, *xyz = quaternion_from_rotation(T[:3, :3]).tolist()
     return T[:3, 3].tolist(), [*xyz, w]
@@ -278,9 +279,7 @@ def write_obj(file: Path, mesh: Surface | ConvexMesh | Mesh) -> None:
     file.write_text("\n".join(lines) + "\n")
 
 
-def mass_properties(
-    meshes: tuple[ConvexMesh, ...], density: float
-) -> tuple[float, Float[ndarray, "3"], Float[ndarray, "3 3"]]:
+def mass_properties(meshes: tuple[ConvexMesh, ...], density: float) -> tuple[float, Vector, Rotation]:
     """Mass [kg], center of mass [m] and inertia about it [kg m^2] of solids in the link frame.
 
     Overlapping solids count twice where they overlap.
@@ -392,7 +391,7 @@ class DepthCamera(Settings, name="camera"):
             raise InputError(f"camera.near is {self.near} and far {self.far}; it must be 0 < near < far")
 
     @property
-    def rotation(self) -> Float[ndarray, "3 3"]:
+    def rotation(self) -> Rotation:
         """Unit vectors to the right, upwards and forwards in the base frame, as columns."""
         forward = np.subtract(self.target, self.position)
         forward = forward / np.linalg.norm(forward)

@@ -1,7 +1,6 @@
 """Pictures, HTML replays and the interactive page. Only the command line imports this package."""
 
 from robotdiffuse.visualization.picture import PictureSettings, write_comparison, write_picture
-from robotdiffuse.visualization.problem_drawing import write_problem
-from robotdiffuse.visualization.replay_page import write_replay
+from robotdiffuse.visualization.replay_page import write_problem, write_replay
 
 __all__ = ["PictureSettings", "write_comparison", "write_picture", "write_problem", "write_replay"]

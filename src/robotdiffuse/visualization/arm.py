@@ -6,7 +6,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision.exact_meshes import forward_frames
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.core.types import Configuration, Path, Trajectory
 from robotdiffuse.drawables import Surface, join, link_surfaces
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.visual_meshes import has_visual
@@ -42,7 +42,7 @@ class DrawnArm:
         T = forward_frames(self.robot, q.reshape(-1, self.robot.dof))
         return T.reshape(*q.shape[:-1], *T.shape[1:])
 
-    def posed(self, q: Float[ndarray, "dof"], begin: int = 0) -> Surface:
+    def posed(self, q: Configuration, begin: int = 0) -> Surface:
         """The arm in a configuration, from frame `begin` on; 1 leaves out the base."""
         poses = zip(self.surfaces[begin:], self.frames(q)[begin:], strict=True)
         return join([surface.moved(T) for surface, T in poses])

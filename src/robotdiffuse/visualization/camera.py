@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial import ConvexHull
 
+from robotdiffuse.core.types import Configurations, Points, Rotation, Vector
 from robotdiffuse.drawables import Drawable, Surface, join
 from robotdiffuse.visualization.arm import TRACE_POINTS, DrawnArm, dense
 from robotdiffuse.visualization.rasterizer import draw
@@ -25,8 +26,8 @@ MAX_FRAMING_DISTANCE = 1.3
 class Camera:
     """A pinhole camera that looks at `target`, with z up."""
 
-    eye: Float[ndarray, "3"]
-    target: Float[ndarray, "3"]
+    eye: Vector
+    target: Vector
     width: int
     height: int
 
@@ -36,21 +37,21 @@ class Camera:
         return self.height / (2 * np.tan(VERTICAL_FIELD / 2))
 
     @property
-    def rotation(self) -> Float[ndarray, "3 3"]:
+    def rotation(self) -> Rotation:
         """R_camera_base: right, down, forward."""
         forward = (self.target - self.eye) / np.linalg.norm(self.target - self.eye)
         right = np.cross(forward, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
         return np.stack([right, np.cross(forward, right), forward])
 
-    def project(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
+    def project(self, points: Points) -> Points:
         """Pixel x and y, and 1 / depth (0 behind the camera)."""
         x, y, z = ((points - self.eye) @ self.rotation.T).T
         near = np.where(z > 0.05, 1 / np.maximum(z, 0.05), 0.0)
         columns = [0.5 * self.width + self.focal * x * near, 0.5 * self.height + self.focal * y * near, near]
         return np.stack(columns, axis=1).astype(np.float32)
 
-    def rays(self) -> Float[ndarray, "3 3"]:
+    def rays(self) -> Rotation:
         """Matrix from (x, y, 1) in pixels to the direction in the base frame with depth 1."""
         f = self.focal
         pixel = np.array([[1 / f, 0, -0.5 * self.width / f], [0, 1 / f, -0.5 * self.height / f], [0, 0, 1]])
@@ -68,14 +69,14 @@ def drawn_by(
     return near, ident, screen
 
 
-def _direction(azimuth: float, elevation: float) -> Float[ndarray, "3"]:
+def _direction(azimuth: float, elevation: float) -> Vector:
     c = np.cos(elevation)
     return np.array([c * np.cos(azimuth), c * np.sin(azimuth), np.sin(elevation)])
 
 
 def framed(
-    points: Float[ndarray, "n 3"],
-    toward: Float[ndarray, "3"],
+    points: Points,
+    toward: Vector,
     size: tuple[int, int],
     free: tuple[float, float],
 ) -> Camera:
@@ -103,7 +104,7 @@ def framed(
 def best_view(
     arm: Surface,
     ghosts: Surface,
-    trace: Float[ndarray, "n 3"],
+    trace: Points,
     obstacles: Surface,
     size: tuple[int, int],
     free: tuple[float, float],
@@ -135,7 +136,7 @@ def best_view(
 def view_of_motion(
     arm: DrawnArm,
     obstacles: Sequence[Drawable],
-    q: Float[ndarray, "n dof"],
+    q: Configurations,
     size: tuple[int, int],
     free: tuple[float, float],
 ) -> Camera:
@@ -146,9 +147,7 @@ def view_of_motion(
     return best_view(arm.posed(q[-1]), ghosts, arm.tool_points(q), surfaces, size, free)
 
 
-def _score(
-    camera: Camera, arm: Surface, ghosts: Surface, trace: Float[ndarray, "n 3"], obstacles: Surface
-) -> float:
+def _score(camera: Camera, arm: Surface, ghosts: Surface, trace: Points, obstacles: Surface) -> float:
     """Visible fraction of the arm, plus half that of the ghosts, plus the visible length of the trace."""
     hidden, _, _ = drawn_by(camera, obstacles)
     score = 0.0

@@ -7,13 +7,13 @@ from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from numpy import ndarray
 from PIL import Image
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.output_files import check_output, write_atomically
-from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.core.types import Path, Points, Trajectory
 from robotdiffuse.drawables import ASSUMED, OBSERVED, Color, Surface, drawables, painted
 from robotdiffuse.perception.seen_points import near_scene
 from robotdiffuse.perception.voxel_grid import MAP
@@ -140,7 +140,7 @@ def in_known_scene(explorer: RecordedExplorer) -> Voxels:
     return near.reshape(MAP.shape)
 
 
-def frustum(explorer: RecordedExplorer, act: RecordedAct) -> list[Float[ndarray, "n 3"]]:
+def frustum(explorer: RecordedExplorer, act: RecordedAct) -> list[Points]:
     """The edges of the pyramid that the arm's first camera sees at the end of a look, as polylines in the
     base frame [m]; none for other acts."""
     if act.T_base_camera is None:

@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.core.types import Configuration, Path, Points, Rotation, Trajectory, Vector
 from robotdiffuse.drawables import GOAL, START, Color, Surface, drawables, join, painted
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
@@ -61,7 +61,7 @@ class ClearSurface:
     """A see-through surface, of which the part nearest to the camera is drawn."""
 
     surface: Surface
-    tint: Float[ndarray, "3"]
+    tint: Vector
     """Linear color."""
     alpha: float
 
@@ -211,7 +211,7 @@ def render(
     return _to_srgb(image), camera
 
 
-def _shell(arm: DrawnArm, q: Float[ndarray, "dof"], thickness: float) -> Surface:
+def _shell(arm: DrawnArm, q: Configuration, thickness: float) -> Surface:
     """The covering spheres of the arm, enlarged by the thickness of the shell [m]."""
     robot = arm.robot
     T_base_frame = arm.frames(q)
@@ -224,7 +224,7 @@ def _shell(arm: DrawnArm, q: Float[ndarray, "dof"], thickness: float) -> Surface
     return join(balls)
 
 
-def _ball(center: Float[ndarray, "3"], radius: float, color: Color, subdivisions: int) -> Surface:
+def _ball(center: Vector, radius: float, color: Color, subdivisions: int) -> Surface:
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions=subdivisions)
@@ -245,18 +245,17 @@ def _paint(camera: Camera, solid: Surface, clear: Sequence[ClearSurface]) -> Flo
     sky = _light_maps(solid, _hemisphere(SKY_LIGHTS), SKY_MAP)
     key = _light_maps(solid, _cone(toward, KEY_LIGHTS), KEY_MAP)
     light = (np.array([0.72, 0.70, 0.66]), np.array([0.80, 0.82, 0.86]), np.array([0.16, 0.15, 0.14]))
-    colors = _linear_array(solid.colors)
-    seen = (near, ident, screen, solid.faces, solid.normals)
-    lattice = light_lattice(LIGHT_SPACING, *seen, view, ground[0], sky, key)
-    shade(image, lattice, LIGHT_SPACING, *seen, colors, view, ground, background, sky, key, light)
+    seen = (ident, screen, solid.faces, solid.normals, _linear_array(solid.colors))
+    lattice = light_lattice(LIGHT_SPACING, near, seen, view, ground[0], sky, key)
+    shade(image, lattice, LIGHT_SPACING, near, seen, view, ground, background, sky, key, light)
     for one in clear:
-        nearness, face_ids, screen = drawn_by(camera, one.surface)
+        nearness, *shown = drawn_by(camera, one.surface)
         arrays = one.surface.faces, one.surface.normals, _linear_array(one.surface.colors)
-        blend_ghost(image, near, nearness, face_ids, screen, *arrays, view, toward, one.tint, one.alpha)
+        blend_ghost(image, near, nearness, (*shown, *arrays), view, toward, one.tint, one.alpha)
     return image
 
 
-def _key_direction(camera: Camera) -> Float[ndarray, "3"]:
+def _key_direction(camera: Camera) -> Vector:
     back = -camera.rotation[2] * [1, 1, 0]
     back /= np.linalg.norm(back)
     toward = KEY_DIRECTION[0] * back + KEY_DIRECTION[1] * np.cross([0, 0, 1], back)
@@ -264,7 +263,7 @@ def _key_direction(camera: Camera) -> Float[ndarray, "3"]:
     return toward / np.linalg.norm(toward)
 
 
-def _hemisphere(count: int) -> Float[ndarray, "n 3"]:
+def _hemisphere(count: int) -> Points:
     """Evenly spread directions over the upper hemisphere (Fibonacci lattice)."""
     i = np.arange(count)
     z = (i + 0.5) / count
@@ -272,7 +271,7 @@ def _hemisphere(count: int) -> Float[ndarray, "n 3"]:
     return np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
 
 
-def _cone(toward: Float[ndarray, "3"], count: int) -> Float[ndarray, "n 3"]:
+def _cone(toward: Vector, count: int) -> Points:
     """Evenly spread directions within KEY_SPREAD of a direction (sunflower pattern)."""
     i = np.arange(count)
     radius = KEY_SPREAD * np.sqrt((i + 0.5) / count)
@@ -283,14 +282,14 @@ def _cone(toward: Float[ndarray, "3"], count: int) -> Float[ndarray, "n 3"]:
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def _axes(toward: Float[ndarray, "3"]) -> Float[ndarray, "3 3"]:
+def _axes(toward: Vector) -> Rotation:
     """Right-handed axes whose third is the direction."""
     right = np.cross([0.0, 1.0, 0.0] if abs(toward[1]) < 0.9 else [1.0, 0.0, 0.0], toward)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(toward, right), toward])
 
 
-def _light_maps(solid: Surface, toward: Float[ndarray, "n 3"], size: int) -> tuple:
+def _light_maps(solid: Surface, toward: Points, size: int) -> tuple:
     """Orthographic shadow maps of all lights, in the layout of `rasterizer.shade`."""
     center = np.zeros(3)
     radius = 0.1
@@ -313,7 +312,7 @@ def _light_maps(solid: Surface, toward: Float[ndarray, "n 3"], size: int) -> tup
     return maps, axes, scale, center, size, 2.0 / scale
 
 
-def tube(points: Float[ndarray, "n 3"], first: Color, last: Color) -> Surface:
+def tube(points: Points, first: Color, last: Color) -> Surface:
     """A round tube along a polyline, colored from the first to the last color, with spheres at both
     ends."""
     balls = [_ball(points[i], 2.2 * TUBE_RADIUS, color, 2) for i, color in ((0, first), (-1, last))]
@@ -345,7 +344,7 @@ def tube(points: Float[ndarray, "n 3"], first: Color, last: Color) -> Surface:
     return join([pipe, *balls])
 
 
-def linear(rgb: Color) -> Float[ndarray, "3"]:
+def linear(rgb: Color) -> Vector:
     """The linear color of an sRGB color."""
     return _linear_array(np.array(rgb) / 255.0)
 

@@ -7,6 +7,17 @@ from robotdiffuse.core.kernels import kernel
 
 
 @kernel()
+def _row(rows, i):
+    """The three numbers of a row."""
+    return rows[i, 0], rows[i, 1], rows[i, 2]
+
+
+@kernel()
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@kernel()
 def draw(near, ident, screen, faces):
     """Draw triangles into a z-buffer.
 
@@ -16,18 +27,10 @@ def draw(near, ident, screen, faces):
     """
     h, w = near.shape
     for f in range(faces.shape[0]):
-        a = faces[f, 0]
-        b = faces[f, 1]
-        c = faces[f, 2]
-        x0 = screen[a, 0]
-        y0 = screen[a, 1]
-        z0 = screen[a, 2]
-        x1 = screen[b, 0]
-        y1 = screen[b, 1]
-        z1 = screen[b, 2]
-        x2 = screen[c, 0]
-        y2 = screen[c, 1]
-        z2 = screen[c, 2]
+        a, b, c = _row(faces, f)
+        x0, y0, z0 = _row(screen, a)
+        x1, y1, z1 = _row(screen, b)
+        x2, y2, z2 = _row(screen, c)
         if z0 <= 0 or z1 <= 0 or z2 <= 0:
             continue
         area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
@@ -52,46 +55,29 @@ def draw(near, ident, screen, faces):
 
 
 @kernel()
-def _corner_weights(screen, a, b, c, px, py):
-    """Perspective-correct weights of the three corners at a pixel (nearness is 1/z)."""
-    x0, y0, x1, y1, x2, y2 = (
-        screen[a, 0], screen[a, 1], screen[b, 0], screen[b, 1], screen[c, 0], screen[c, 1],
-    )  # fmt: skip
-    area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
-    u = ((x1 - px) * (y2 - py) - (x2 - px) * (y1 - py)) / area * screen[a, 2]
-    v = ((x2 - px) * (y0 - py) - (x0 - px) * (y2 - py)) / area * screen[b, 2]
-    t = ((x0 - px) * (y1 - py) - (x1 - px) * (y0 - py)) / area * screen[c, 2]
-    total = u + v + t
-    return u / total, v / total, t / total
-
-
-@kernel()
-def _lit(light, x, y, z, nx, ny, nz, offset, stride):
+def _lit(light, at, n, offset, stride):
     """Cosine-weighted fraction of directional lights that reach a point; uses every stride-th light.
 
     Each light has an orthographic map of the surfaces nearest to it. The point is moved along its normal by
     `bias` so that surfaces do not shadow themselves.
     """
     maps, directions, scale, center, size, bias = light
-    x = x + nx * bias - center[0]
-    y = y + ny * bias - center[1]
-    z = z + nz * bias - center[2]
+    x = at[0] + n[0] * bias - center[0], at[1] + n[1] * bias - center[1], at[2] + n[2] * bias - center[2]
     got = 0.0
     total = 0.0
     for k in range(offset, maps.shape[0], stride):
         d = directions[k]
-        cosine = nx * d[2, 0] + ny * d[2, 1] + nz * d[2, 2]
+        cosine = _dot(n, d[2])
         total += 1.0
         if cosine <= 0:
             continue
-        column = int((x * d[0, 0] + y * d[0, 1] + z * d[0, 2]) * scale + 0.5 * size)
-        row = int((x * d[1, 0] + y * d[1, 1] + z * d[1, 2]) * scale + 0.5 * size)
-        if 0 <= column < size and 0 <= row < size:
-            depth = x * d[2, 0] + y * d[2, 1] + z * d[2, 2]
-            # a texel of a surface seen edge-on spans more depth
-            if maps[k, row, column] > depth + bias * min(4.0, 0.5 / cosine) + 100.0:
-                continue
-        got += cosine
+        column = int(_dot(x, d[0]) * scale + 0.5 * size)
+        row = int(_dot(x, d[1]) * scale + 0.5 * size)
+        # a texel of a surface seen edge-on spans more depth
+        beyond = _dot(x, d[2]) + bias * min(4.0, 0.5 / cosine) + 100.0
+        inside = 0 <= column < size and 0 <= row < size
+        if not (inside and maps[k, row, column] > beyond):
+            got += cosine
     return got / total
 
 
@@ -107,78 +93,77 @@ def _grid(x, y, spacing, width, footprint):
 
 
 @kernel()
-def _ray(rays, row, column):
-    """The ray through the middle of a pixel, with depth 1."""
-    px = column + 0.5
-    py = row + 0.5
-    rx = rays[0, 0] * px + rays[0, 1] * py + rays[0, 2]
-    ry = rays[1, 0] * px + rays[1, 1] * py + rays[1, 2]
-    rz = rays[2, 0] * px + rays[2, 1] * py + rays[2, 2]
-    return rx, ry, rz
+def _surface(row, column, near, seen, camera, height):
+    """The surface at a pixel: depth (0 for none), the ray with depth 1 through its middle, the normal towards
+    the eye, the perspective-correct weights of the face's corners, and whether it is solid.
 
-
-@kernel()
-def _normal(normals, i, j, k, u, v, t):
-    """The normal between three corners, and its length."""
-    nx = u * normals[i, 0] + v * normals[j, 0] + t * normals[k, 0]
-    ny = u * normals[i, 1] + v * normals[j, 1] + t * normals[k, 1]
-    nz = u * normals[i, 2] + v * normals[j, 2] + t * normals[k, 2]
-    return nx, ny, nz, np.sqrt(nx * nx + ny * ny + nz * nz) + 1e-9
-
-
-@kernel()
-def _surface(row, column, near, ident, screen, faces, normals, camera, height):
-    """The surface at a pixel: depth (0 for none), ray, normal towards the eye, corner weights, whether
-    solid."""
+    height: of the ground [m].
+    """
+    ident, screen, faces, normals, _ = seen
     eye, rays = camera
-    px = column + 0.5
-    py = row + 0.5
-    rx, ry, rz = _ray(rays, row, column)
-    if rz < 0 and eye[2] > height and rz / (height - eye[2]) > near[row, column]:
-        return (height - eye[2]) / rz, rx, ry, rz, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, False
+    pixel = column + 0.5, row + 0.5, 1.0
+    ray = _dot(rays[0], pixel), _dot(rays[1], pixel), _dot(rays[2], pixel)
+    none = 0.0, 0.0, 0.0
+    up = 0.0, 0.0, 1.0
+    if ray[2] < 0 and eye[2] > height and ray[2] / (height - eye[2]) > near[row, column]:
+        return (height - eye[2]) / ray[2], ray, up, none, False
     if near[row, column] <= 0:
-        return 0.0, rx, ry, rz, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, False
-    f = ident[row, column]
-    i = faces[f, 0]
-    j = faces[f, 1]
-    k = faces[f, 2]
-    u, v, t = _corner_weights(screen, i, j, k, px, py)
-    nx, ny, nz, length = _normal(normals, i, j, k, u, v, t)
-    if nx * rx + ny * ry + nz * rz > 0:
+        return 0.0, ray, up, none, False
+    i, j, k = _row(faces, ident[row, column])
+    x0, y0, z0 = _row(screen, i)
+    x1, y1, z1 = _row(screen, j)
+    x2, y2, z2 = _row(screen, k)
+    px, py, _ = pixel
+    area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
+    u = ((x1 - px) * (y2 - py) - (x2 - px) * (y1 - py)) / area * z0
+    v = ((x2 - px) * (y0 - py) - (x0 - px) * (y2 - py)) / area * z1
+    t = ((x0 - px) * (y1 - py) - (x1 - px) * (y0 - py)) / area * z2
+    total = u + v + t
+    weights = u / total, v / total, t / total
+    n = _mixed(normals, (i, j, k), weights)
+    length = np.sqrt(_dot(n, n)) + 1e-9
+    if _dot(n, ray) > 0:
         length = -length
-    return 1 / near[row, column], rx, ry, rz, nx / length, ny / length, nz / length, u, v, t, True
+    return 1 / near[row, column], ray, (n[0] / length, n[1] / length, n[2] / length), weights, True
 
 
 @kernel()
-def light_lattice(spacing, near, ident, screen, faces, normals, camera, height, sky, key):
+def _mixed(rows, corners, weights):
+    """The weighted mean of the rows of three corners."""
+    a = _row(rows, corners[0])
+    b = _row(rows, corners[1])
+    c = _row(rows, corners[2])
+    u, v, t = weights
+    return u * a[0] + v * b[0] + t * c[0], u * a[1] + v * b[1] + t * c[1], u * a[2] + v * b[2] + t * c[2]
+
+
+@kernel()
+def light_lattice(spacing, near, seen, camera, height, sky, key):
     """Light at every `spacing`-th pixel, [rows, columns, 7]: depth, normal, sky, key, whether solid."""
     rows = near.shape[0] // spacing
     columns = near.shape[1] // spacing
     lattice = np.zeros((rows, columns, 7), np.float32)
-    eye = camera[0]
     for row in range(rows):
         for column in range(columns):
-            depth, rx, ry, rz, nx, ny, nz, _, _, _, solid = _surface(
-                row * spacing, column * spacing, near, ident, screen, faces, normals, camera, height
-            )
-            if depth <= 0:
-                continue
-            x = eye[0] + depth * rx
-            y = eye[1] + depth * ry
-            z = eye[2] + depth * rz
-            at = lattice[row, column]
-            at[0] = depth
-            at[1] = nx
-            at[2] = ny
-            at[3] = nz
-            at[6] = 1.0 if solid else 0.0
-            at[4] = _lit(sky, x, y, z, nx, ny, nz, 0, 1)
-            at[5] = _lit(key, x, y, z, nx, ny, nz, 0, 1)
+            depth, ray, n, _, solid = _surface(row * spacing, column * spacing, near, seen, camera, height)
+            if depth > 0:
+                x = _point(camera[0], depth, ray)
+                at = lattice[row, column]
+                at[0] = depth
+                at[1], at[2], at[3] = n
+                at[4] = _lit(sky, x, n, 0, 1)
+                at[5] = _lit(key, x, n, 0, 1)
+                at[6] = 1.0 if solid else 0.0
     return lattice
 
 
 @kernel()
-def _gathered(lattice, spacing, row, column, depth, nx, ny, nz, solid):
+def _point(eye, depth, ray):
+    return eye[0] + depth * ray[0], eye[1] + depth * ray[1], eye[2] + depth * ray[2]
+
+
+@kernel()
+def _gathered(lattice, spacing, row, column, depth, n, solid):
     """Light interpolated from the surrounding lattice points that show the same smooth surface."""
     y = row / spacing
     x = column / spacing
@@ -187,15 +172,13 @@ def _gathered(lattice, spacing, row, column, depth, nx, ny, nz, solid):
     sky = 0.0
     key = 0.0
     total = 0.0
-    for i in range(2):
-        for j in range(2):
-            if top + i >= lattice.shape[0] or first_column + j >= lattice.shape[1]:
+    for i in range(top, min(top + 2, lattice.shape[0])):
+        for j in range(first_column, min(first_column + 2, lattice.shape[1])):
+            at = lattice[i, j]
+            far = solid and abs(at[0] - depth) > 0.015 * depth
+            if (at[6] > 0.5) != solid or _dot(n, at[1:]) < 0.96 or far:
                 continue
-            at = lattice[top + i, first_column + j]
-            alike = nx * at[1] + ny * at[2] + nz * at[3]
-            if (at[6] > 0.5) != solid or alike < 0.96 or (solid and abs(at[0] - depth) > 0.015 * depth):
-                continue
-            weight = (1 - abs(y - top - i)) * (1 - abs(x - first_column - j))
+            weight = (1 - abs(y - i)) * (1 - abs(x - j))
             sky += weight * at[4]
             key += weight * at[5]
             total += weight
@@ -203,109 +186,78 @@ def _gathered(lattice, spacing, row, column, depth, nx, ny, nz, solid):
 
 
 @kernel()
-def shade(
-    image,
-    lattice,
-    spacing,
-    near,
-    ident,
-    screen,
-    faces,
-    normals,
-    colors,
-    camera,
-    ground,
-    background,
-    sky,
-    key,
-    light,
-):
+def shade(image, lattice, spacing, near, seen, camera, ground, background, sky, key, light):
     """Compute the linear color of every pixel of the solid surfaces and the ground.
 
     camera: (eye[3], rays[3, 3]) so that the ray through pixel (x, y) is rays @ (x, y, 1), with z-depth 1.
-    lattice, spacing: from light_lattice. At edges, where the lattice does not fit, a pixel uses a quarter of
-    the lights itself, a different quarter for each pixel in a square of four. ground: (height, radius, base
-    color[3], line color[3]); background: (top color[3], bottom color[3]); sky, key: (maps, axes, scale,
-    center, size, bias); light: colors[3] of key, sky and bounce.
+    seen: (ident, screen, faces, normals, colors) of the surfaces. lattice, spacing: from light_lattice. At
+    edges, where the lattice does not fit, a pixel uses a quarter of the lights itself, a different quarter
+    for each pixel in a square of four. ground: (height, radius, base color[3], line color[3]); background:
+    (top color[3], bottom color[3]); sky, key: (maps, axes, scale, center, size, bias); light: colors[3] of
+    key, sky and bounce.
     """
     h, w = near.shape
     eye, rays = camera
     height, radius, base, line = ground
     toward = key[1][0, 2]
+    ident, _, faces, _, colors = seen
     for row in range(h):
         for column in range(w):
-            depth, rx, ry, rz, nx, ny, nz, u, v, t, solid = _surface(
-                row, column, near, ident, screen, faces, normals, camera, height
-            )
-            norm = np.sqrt(rx * rx + ry * ry + rz * rz)
-            up = min(1.0, max(0.0, 0.5 + 1.1 * rz / norm))
+            depth, ray, n, weights, solid = _surface(row, column, near, seen, camera, height)
+            norm = np.sqrt(_dot(ray, ray))
+            up = min(1.0, max(0.0, 0.5 + 1.1 * ray[2] / norm))
             for c in range(3):
                 image[row, column, c] = background[0][c] * up + background[1][c] * (1 - up)
             if depth <= 0:
                 continue
-            x = eye[0] + depth * rx
-            y = eye[1] + depth * ry
-            z = eye[2] + depth * rz
-            far = min(1.0, np.sqrt(x * x + y * y) / radius)
+            x = _point(eye, depth, ray)
+            far = min(1.0, np.sqrt(x[0] * x[0] + x[1] * x[1]) / radius)
             mix = 1.0 if solid else (1 - far * far) ** 2
             if mix <= 0:
                 continue
-            s, q, total = _gathered(lattice, spacing, row, column, depth, nx, ny, nz, solid)
+            s, q, total = _gathered(lattice, spacing, row, column, depth, n, solid)
             if total > 0.25:
                 s = s / total
                 q = q / total
             else:
                 part = (row % 2) * 2 + column % 2
-                s = _lit(sky, x, y, z, nx, ny, nz, part, 4)
-                q = _lit(key, x, y, z, nx, ny, nz, part, 4)
+                s = _lit(sky, x, n, part, 4)
+                q = _lit(key, x, n, part, 4)
+            base_color = base[0], base[1], base[2]
             stripe = 0.0
             gloss = 0.0
             if solid:
-                f = ident[row, column]
-                hx = toward[0] - rx / norm
-                hy = toward[1] - ry / norm
-                hz = toward[2] - rz / norm
-                half = max(0.0, (nx * hx + ny * hy + nz * hz) / np.sqrt(hx * hx + hy * hy + hz * hz))
-                edge = 1 + (nx * rx + ny * ry + nz * rz) / norm
+                base_color = _mixed(colors, _row(faces, ident[row, column]), weights)
+                middle = toward[0] - ray[0] / norm, toward[1] - ray[1] / norm, toward[2] - ray[2] / norm
+                half = max(0.0, _dot(n, middle) / np.sqrt(_dot(middle, middle)))
+                edge = 1 + _dot(n, ray) / norm
                 gloss = 0.20 * min(1.0, 3 * q) * half**60 + 0.12 * s * edge**4
             else:
                 pixel = depth * np.sqrt(rays[0, 0] ** 2 + rays[1, 0] ** 2)
-                footprint = pixel * norm / max(0.1 * norm, -rz)
-                stripe = max(0.4 * _grid(x, y, 0.25, 0.003, footprint), _grid(x, y, 1.0, 0.005, footprint))
+                footprint = pixel * norm / max(0.1 * norm, -ray[2])
+                fine = 0.4 * _grid(x[0], x[1], 0.25, 0.003, footprint)
+                stripe = max(fine, _grid(x[0], x[1], 1.0, 0.005, footprint))
             for c in range(3):
-                if solid:
-                    base_color = (
-                        u * colors[faces[f, 0], c] + v * colors[faces[f, 1], c] + t * colors[faces[f, 2], c]
-                    )
-                else:
-                    base_color = base[c] + stripe * (line[c] - base[c])
-                lit = light[0][c] * q + light[1][c] * s + light[2][c] * (0.5 - 0.5 * nz)
-                image[row, column, c] += mix * (base_color * lit + gloss - image[row, column, c])
+                flat = base_color[c] + stripe * (line[c] - base_color[c])
+                lit = light[0][c] * q + light[1][c] * s + light[2][c] * (0.5 - 0.5 * n[2])
+                image[row, column, c] += mix * (flat * lit + gloss - image[row, column, c])
 
 
 @kernel()
-def blend_ghost(image, solid, near, ident, screen, faces, normals, colors, camera, toward, tint, alpha):
+def blend_ghost(image, solid, near, seen, camera, toward, tint, alpha):
     """Blend one see-through arm over the image: its nearest surface, more opaque where it is seen edge-on."""
     h, w = near.shape
-    _, rays = camera
+    ident, _, faces, _, colors = seen
     for row in range(h):
         for column in range(w):
             # It must be slightly nearer than the solid arm: links that only turn about their axis coincide.
             if near[row, column] <= 1.003 * solid[row, column]:
                 continue
-            px = column + 0.5
-            py = row + 0.5
-            f = ident[row, column]
-            i = faces[f, 0]
-            j = faces[f, 1]
-            k = faces[f, 2]
-            u, v, t = _corner_weights(screen, i, j, k, px, py)
-            rx, ry, rz = _ray(rays, row, column)
-            nx, ny, nz, length = _normal(normals, i, j, k, u, v, t)
-            facing = (nx * rx + ny * ry + nz * rz) / (length * np.sqrt(rx * rx + ry * ry + rz * rz))
-            bright = 0.62 + 0.38 * max(0.0, (nx * toward[0] + ny * toward[1] + nz * toward[2]) / length)
+            _, ray, n, weights, _ = _surface(row, column, near, seen, camera, -np.inf)
+            facing = _dot(n, ray) / np.sqrt(_dot(ray, ray))
+            bright = 0.62 + 0.38 * max(0.0, _dot(n, toward))
             cover = min(1.0, alpha * (0.7 + 1.1 * (1 - abs(facing)) ** 2))
+            base_color = _mixed(colors, _row(faces, ident[row, column]), weights)
             for c in range(3):
-                base_color = u * colors[i, c] + v * colors[j, c] + t * colors[k, c]
-                value = bright * tint[c] * (0.45 + 0.55 * base_color)
+                value = bright * tint[c] * (0.45 + 0.55 * base_color[c])
                 image[row, column, c] += cover * (value - image[row, column, c])

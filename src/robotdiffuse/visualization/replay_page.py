@@ -1,29 +1,59 @@
-"""Writes 3D replays of motions as single HTML files, for any browser with WebGL, offline."""
+"""Writes 3D replays of motions as single HTML files, for any browser with WebGL, offline: of one motion, of
+problems without one, galleries of several, and replays in notebook cells."""
 
 import base64
 import html
+import io
 import json
 import re
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path as FilePath
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
+from PIL import Image
 
+from robotdiffuse.core.errors import InputError, check_type, shortened
 from robotdiffuse.core.output_files import check_output, write_atomically
-from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.transforms import inverse, quaternion_from_rotation
-from robotdiffuse.core.types import Path, Trajectory
-from robotdiffuse.drawables import GOAL, START, Color, Drawable, Surface, drawables, thinned
+from robotdiffuse.core.results import PlanResult, ResultFile
+from robotdiffuse.core.transforms import IDENTITY, inverse, quaternion_from_rotation
+from robotdiffuse.core.types import Configuration, Configurations, Path, Points, Pose, Trajectory, Values
+from robotdiffuse.drawables import (
+    GOAL,
+    START,
+    Color,
+    Drawable,
+    Surface,
+    drawables,
+    link_surfaces,
+    painted,
+    thinned,
+)
+from robotdiffuse.planning.pose_goals import pose_configurations
+from robotdiffuse.problems.files import problem_from_record
+from robotdiffuse.problems.goals import AnyGoal, JointGoal, poses_of
+from robotdiffuse.problems.problem import Problem, StateValidity, check_problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import PointCloud, Triangulated
+from robotdiffuse.scenes.shapes import PointCloud, Sphere, Triangulated
 from robotdiffuse.visualization.arm import DrawnArm, facts, interpolated, timed
 from robotdiffuse.visualization.camera import VERTICAL_FIELD, view_of_motion
+from robotdiffuse.visualization.picture import (
+    MARGINS,
+    ClearSurface,
+    PictureSettings,
+    linear,
+    render,
+    tube,
+    write_captioned,
+)
 
 MAX_ROW_RATE = 60.0
 """Most rows of the motion per second; the page interpolates between them."""
@@ -127,9 +157,7 @@ def page_data(
     }
 
 
-def _thinned(
-    times: Float[ndarray, "n"], positions: Float[ndarray, "n dof"]
-) -> tuple[Float[ndarray, "m"], Float[ndarray, "m dof"]]:
+def _thinned(times: Values, positions: Configurations) -> tuple[Float[ndarray, "m"], Float[ndarray, "m dof"]]:
     """At most MAX_ROW_RATE rows per second and MAX_ROWS in all; shorter motions stay unchanged."""
     max_rows = int(min(MAX_ROWS, max(2, np.ceil(MAX_ROW_RATE * times[-1]) + 1)))
     if len(times) <= max_rows:
@@ -207,7 +235,7 @@ def _packed(surface: Surface, colored: bool = True) -> dict[str, Any]:
     )
 
 
-def _quantized(points: Float[ndarray, "n 3"]) -> tuple[list[float], float, str]:
+def _quantized(points: Points) -> tuple[list[float], float, str]:
     """Lowest corner, step and the points as 16-bit multiples of the step in base64."""
     if len(points) == 0:
         return [0.0, 0.0, 0.0], 1.0, ""
@@ -222,3 +250,289 @@ def _base64(array: np.ndarray) -> str:
 
 def _rounded(values: np.ndarray | float, digits: int) -> Any:
     return np.round(values, digits).tolist()
+
+
+COLLIDING = (0xD0, 0x1F, 0x2B)
+"""sRGB color of links that collide."""
+OFFSET = 0.0015
+"""Offset of these along their normals, so that they cover the arm in its own colors [m]."""
+START_ALPHA = 0.5
+AXES = ((0xC9, 0x3C, 0x3C), (0x3C, 0x9A, 0x4B), (0x3C, 0x64, 0xC9))
+"""sRGB colors of the axes of goal poses."""
+AXIS_LENGTH = 0.12
+"""[m]"""
+UNREACHED = StateValidity("no configuration within the joint limits")
+
+
+def write_problem(problem: Problem, file: str | FilePath, result: PlanResult | None = None) -> None:
+    """Write a problem without a motion as .html or .png.
+
+    The arm is drawn at the start and at the goal; in pictures the start is see-through, on pages the goal.
+    Links that collide are red, and goal poses have axes. Of several goals, the first free one is drawn, or
+    else the first. Moving obstacles are where they begin. `result` holds the reason for the missing
+    motion. Raises InputError for another ending or a file that cannot be written.
+    """
+    target = check_output(file, (".html", ".htm", ".png"))
+    goal, validity = _goal_state(problem)
+    validities = {"start": problem.is_free(problem.start), "goal": validity}
+    states = np.stack([problem.start] if goal is None else [problem.start, goal])
+    scene = problem.scene.with_shapes([*problem.scene.shapes, *(moving.shape for moving in problem.moving)])
+    robot, scene = replace(problem, scene=scene, moving=()).standing()
+    T_world_poses = _goal_poses(problem)
+    near_poses = [Sphere(T[:3, 3], AXIS_LENGTH) for T in T_world_poses]
+    framed = scene.with_shapes([*scene.shapes, *near_poses])  # what the camera shows
+    arm = DrawnArm(robot)
+    marks = [*_colliding_links(arm, states, list(validities.values())), *_axes(T_world_poses)]
+    facts = [(label, state.reason or "free") for label, state in validities.items()]
+    if result is not None and all(validities.values()):
+        facts = [("reason", shortened(result.reason))]
+    status = "" if result is None else f" · {result.status.value.replace('_', ' ')}"
+    title = f"{robot.name}{status}"
+    if target.suffix.lower() == ".png":
+        settings = PictureSettings()
+        size = settings.width, settings.height
+        camera = view_of_motion(arm, drawables(framed), states, size, MARGINS)
+        start = ClearSurface(arm.posed(states[0], 1), linear(START), START_ALPHA)
+        ghost = [start] if len(states) > 1 else []
+        end = Path(robot.joint_names, states[-1:])
+        surfaces = [surface for surface, _ in marks]
+        pixels, _ = render(robot, scene, end, settings, camera, added=surfaces, clear=ghost)
+        return write_captioned(pixels, target, title, facts)
+    data = page_data(robot, framed, Path(robot.joint_names, states))
+    data["scene"] = [*page_shapes(scene), *(page_surface("mark", *mark) for mark in marks)]
+    data["times"] = [0.0] * len(states)  # nothing moves
+    data["facts"] = facts
+    return write_atomically(target, page_text(title, data))
+
+
+def _goal_state(problem: Problem) -> tuple[Configuration | None, StateValidity]:
+    """The first free configuration of the goal, or else the first one; None if none reaches it."""
+    goals = problem.goal.goals if isinstance(problem.goal, AnyGoal) else (problem.goal,)
+    rng = np.random.default_rng(0)
+    first = None
+    for goal in goals:
+        joints = isinstance(goal, JointGoal)
+        for q in goal.positions if joints else pose_configurations(problem, goal, rng):
+            validity = problem.is_free(q)
+            if validity:
+                return q, validity
+            first = first or (q, validity)
+    return first or (None, UNREACHED)
+
+
+def _colliding_links(
+    arm: DrawnArm, states: Configurations, validities: list[StateValidity]
+) -> list[tuple[Surface, Color]]:
+    """The surfaces of the links that collide in each state, and their color."""
+    robot = arm.robot
+    links = link_surfaces(arm.robot)
+    marks = []
+    for q, validity in zip(states, validities, strict=False):  # there may be no goal state
+        T_base_frame = arm.frames(q)
+        for link in validity.links:
+            T_base_link = T_base_frame[robot.link_frame(link)] @ robot.T_frame_link(link)
+            marks.append((_raised(links[link]).moved(T_base_link), COLLIDING))
+    return marks
+
+
+def _raised(surface: Surface) -> Surface:
+    """The surface in the color of collisions, a little larger."""
+    _, corner = np.unique(surface.vertices, axis=0, return_inverse=True)  # edges have a vertex on each side
+    corner = corner.reshape(-1)
+    normals = np.stack([np.bincount(corner, column) for column in surface.normals.T], axis=1)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    vertices = surface.vertices + OFFSET * normals[corner]
+    return replace(surface, vertices=vertices, colors=painted(COLLIDING, len(vertices)))
+
+
+def _goal_poses(problem: Problem) -> list[Pose]:
+    """All goal poses in the world's frame."""
+    goals = problem.goal.goals if isinstance(problem.goal, AnyGoal) else (problem.goal,)
+    T_world_base = IDENTITY if problem.T_world_base is None else problem.T_world_base
+    return [T_world_base @ pose.T_base_frame for goal in goals for pose in poses_of(goal)]
+
+
+def _axes(poses: list[Pose]) -> list[tuple[Surface, Color]]:
+    """The axes of poses, and their colors."""
+    axes = []
+    for T in poses:
+        for axis, color in enumerate(AXES):
+            ends = np.stack([T[:3, 3], T[:3, 3] + AXIS_LENGTH * T[:3, axis]])
+            axes.append((tube(ends, color, color), color))
+    return axes
+
+
+THUMBNAIL = PictureSettings(480, 300, ghosts=3)
+
+PAGE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{{title}}</title>
+<style>
+* { box-sizing: border-box; }
+html, body { margin: 0; height: 100%; overflow: hidden; background: #eceef1; color: #222b38;
+  font: 13px/1.4 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
+body { display: flex; }
+nav { flex: none; width: 262px; padding: 16px 14px; overflow-y: auto; background: #f7f8fa;
+  border-right: 1px solid rgba(34, 43, 56, .1); }
+h1 { margin: 2px 4px 13px; font-size: 17px; font-weight: 650; letter-spacing: -.01em; }
+button { display: block; width: 100%; margin: 0 0 12px; padding: 0 0 8px; overflow: hidden; border: 0;
+  border-radius: 12px; background: white; color: inherit; font: inherit; text-align: left; cursor: pointer;
+  box-shadow: 0 0 0 1px rgba(34, 43, 56, .08), 0 3px 12px rgba(30, 40, 60, .06); }
+button:hover { box-shadow: 0 0 0 1px rgba(34, 43, 56, .22), 0 3px 12px rgba(30, 40, 60, .1); }
+button[aria-current=true] { box-shadow: 0 0 0 2.5px #10a37f, 0 3px 12px rgba(30, 40, 60, .1); }
+img { display: block; width: 100%; aspect-ratio: 8 / 5; }
+b { display: block; margin: 8px 12px 0; font-weight: 600; }
+span { display: block; margin: 1px 12px 0; color: #6b7684; font-size: 12px;
+  font-variant-numeric: tabular-nums; }
+iframe { flex: 1; min-width: 0; height: 100%; border: 0; }
+@media (max-width: 760px) { body { flex-direction: column; }
+  nav { width: 100%; display: flex; gap: 10px; padding: 8px; overflow-x: auto; } h1 { display: none; }
+  button { flex: none; width: 150px; margin: 2px; } }
+</style>
+</head>
+<body>
+<nav><h1>{{title}}</h1>{{buttons}}</nav>
+<iframe title="replay"></iframe>
+<script type="application/json" id="replays">{{replays}}</script>
+<script>
+const replays = JSON.parse(document.getElementById("replays").textContent);
+const buttons = [...document.querySelectorAll("button")], frame = document.querySelector("iframe");
+let shown = -1;
+function show(i, scroll = true) {
+  if (i === shown || !replays.pages[i]) return;
+  shown = i;
+  buttons.forEach((button, j) => button.setAttribute("aria-current", i === j));
+  // not at first: in an iframe it would scroll the outer page
+  if (scroll) buttons[i].scrollIntoView({ block: "nearest", inline: "nearest" });
+  frame.srcdoc = replays.pages[i].map((part) => replays.parts[part]).join("");
+}
+buttons.forEach((button, i) => button.addEventListener("click", () => show(i)));
+addEventListener("keydown", (event) => {
+  const step = { ArrowDown: 1, ArrowUp: -1 }[event.key];
+  if (step) { event.preventDefault(); show(shown + step); }
+});
+show(0, false);
+</script>
+</body>
+</html>
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class GalleryEntry:
+    """A motion in a gallery."""
+
+    title: str
+    caption: str
+    """One line below the title."""
+    scene: Scene
+    motion: Path | Trajectory
+    moving: tuple[MovingObstacle, ...] = ()
+
+
+def write_gallery(
+    robot: Robot,
+    entries: Sequence[GalleryEntry],
+    file: str | FilePath,
+    title: str,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Write a gallery as .html; it opens offline.
+
+    `progress` is called with the number of motions drawn so far and in all. Raises InputError for another
+    ending or a file that cannot be written.
+    """
+    target = check_output(file, (".html", ".htm"))
+    replays = []
+    buttons = []
+    for i, entry in enumerate(entries):
+        data = page_data(robot, entry.scene, entry.motion, moving=entry.moving)
+        replays.append(page_text(entry.title, data))
+        buttons.append(
+            f'<button><img alt="" src="data:image/jpeg;base64,{_thumbnail(robot, entry)}">'
+            f"<b>{html.escape(entry.title)}</b><span>{html.escape(entry.caption)}</span></button>"
+        )
+        if progress is not None:
+            progress(i + 1, len(entries))
+    # in JSON '<' occurs only in strings; escaped, it cannot end the script element
+    data = json.dumps(_shared(replays)).replace("<", "\\u003c")
+    page = PAGE.replace("{{title}}", html.escape(title)).replace("{{buttons}}", "".join(buttons))
+    write_atomically(target, page.replace("{{replays}}", data))
+
+
+def _shared(pages: list[str]) -> dict[str, list]:
+    """Pages split into parts, each stored once, because all share the 3D library and the robot."""
+    cut = [re.split(r'(?=<script)|(?="scene":)', page) for page in pages]
+    places = {part: i for i, part in enumerate(dict.fromkeys(part for parts in cut for part in parts))}
+    return {"parts": list(places), "pages": [[places[part] for part in parts] for parts in cut]}
+
+
+def _thumbnail(robot: Robot, entry: GalleryEntry) -> str:
+    """A small JPEG in base64."""
+    pixels, _ = render(robot, entry.scene, entry.motion, THUMBNAIL, moving=entry.moving)
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "JPEG", quality=88)
+    return base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+class Replay:
+    """The output of a notebook cell: a replay in an iframe."""
+
+    def __init__(self, page: str, height: int) -> None:
+        self._page = page
+        self._height = height
+
+    def _repr_html_(self) -> str:
+        style = "width: 100%; border: 0; border-radius: 8px"
+        page = html.escape(self._page)
+        return f'<iframe srcdoc="{page}" height="{self._height}" style="{style}"></iframe>'
+
+
+def show(result: PlanResult | ResultFile, problem: Problem | None = None, height: int = 560) -> Replay:
+    """The replay of a result, for the last line of a notebook cell.
+
+    Elsewhere in a cell, use `display(rd.show(result))`. Without a motion it shows the start, the goal and the
+    links
+    that collide.
+
+    Args:
+        result: A result of `plan`, or a result file.
+        problem: Needed only if the result does not contain it; results of `plan`, and files saved with their
+            problem, do.
+        height: Height of the cell [pixels].
+
+    Raises:
+        InputError: Outside a notebook, and if the problem is unknown.
+    """
+    check_type("result", result, (PlanResult, ResultFile), "a result, as of rd.plan or rd.load_result")
+    if problem is not None:
+        check_problem(problem)
+    if isinstance(result, ResultFile):
+        if problem is None and result.problem is not None:
+            problem = problem_from_record(result.problem)
+        result = result.result
+    problem = problem or result.problem
+    if problem is None:
+        raise InputError("the result does not contain its problem; use rd.show(result, problem)")
+    if not _in_notebook():
+        raise InputError(
+            "rd.show is for notebooks; elsewhere save the result and use `robotdiffuse view`, or "
+            "robotdiffuse.visualization.write_replay"
+        )
+    motion = result.trajectory or result.path
+    with TemporaryDirectory() as folder:
+        file = FilePath(folder) / "replay.html"
+        if motion is None:
+            write_problem(problem, file, result)
+        else:
+            write_replay(*problem.standing(), motion, file, result=result, moving=problem.moving_in_world)
+        return Replay(file.read_text("utf-8"), height)
+
+
+def _in_notebook() -> bool:
+    """Whether this runs in a Jupyter kernel; does not import IPython."""
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return hasattr(shell, "kernel")

@@ -29,6 +29,7 @@ from robotdiffuse.visualization.live.session import (
     NEW_OBSTACLES,
     NO_MOTION,
     VALID,
+    LatestTask,
     PageOptions,
     Session,
     State,
@@ -37,7 +38,6 @@ from robotdiffuse.visualization.live.session import (
     resized,
     validity,
 )
-from robotdiffuse.visualization.live.threads import LatestTask
 
 START = np.array([0.0, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8])
 END = np.array([1.2, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8])

@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 import viser
-from jaxtyping import Float
-from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, shortened
 from robotdiffuse.core.transforms import quaternion_from_rotation
+from robotdiffuse.core.types import Configuration
 from robotdiffuse.drawables import ASSUMED, GOAL, OBSERVED, drawables
 from robotdiffuse.perception.depth_view import DepthNoise
 from robotdiffuse.planning.exploration.simulated import (
@@ -50,19 +49,28 @@ from robotdiffuse.visualization.exploration import (
     shown_voxels,
     title,
 )
-from robotdiffuse.visualization.live.drawing import (
+from robotdiffuse.visualization.live.page import (
     GHOST_OPACITY,
     TRACE_WIDTH,
     Arm,
+    LivePage,
     Obstacles,
     add_surface,
+    badge_html,
     draw_lines,
     draw_trace,
+    set_value,
 )
-from robotdiffuse.visualization.live.page import badge_html, set_value
 from robotdiffuse.visualization.live.server import PageServer
-from robotdiffuse.visualization.live.session import INVALID, NO_MOTION, PENDING, VALID, Validity
-from robotdiffuse.visualization.live.threads import FRAME_RATE, Changes, LatestTask
+from robotdiffuse.visualization.live.session import (
+    FRAME_RATE,
+    INVALID,
+    NO_MOTION,
+    PENDING,
+    VALID,
+    LatestTask,
+    Validity,
+)
 
 # Phases: at rest until a visitor lets it go on, choosing a step, executing it, and after the last step.
 WAITING = "waiting"
@@ -96,7 +104,7 @@ class ExplorationState:
 
     settings: ExplorerSettings
     noise: bool
-    configuration: Float[ndarray, "dof"]
+    configuration: Configuration
     mode: str = PAUSED
     phase: str = WAITING
     speed: float = 1.0
@@ -253,17 +261,15 @@ class ExplorationSession:
         return paused
 
 
-class ExplorationPage:
-    """Shows an exploration to all browsers that the server lets in, until it is closed. It runs from when
-    the first one opens the page."""
+class ExplorationPage(LivePage):
+    """The page of an exploration, which runs from when the first browser opens it."""
+
+    session: ExplorationSession
 
     def __init__(self, session: ExplorationSession, server: PageServer) -> None:
-        self.session = session
-        self.server = server
-        self._changes = Changes()
         problem = session.problem
-        robot = session.problem.robot
-        server.add_stage(reach(robot))
+        robot = problem.robot
+        super().__init__(session, server, robot)
         self._drawn = DrawnArm(robot)
         self._arm = Arm(server, "arm", self._drawn)
         self._look = Arm(server, "look", self._drawn, LOOK_COLOR, GHOST_OPACITY)
@@ -273,11 +279,7 @@ class ExplorationPage:
         server.set_first_view(self._drawn, problem, ends)
         self._obstacles = Obstacles(server)
         self._add_panel()
-        self._lock = threading.Lock()
-        self._closed = False
-        self._drawing = LatestTask[None](lambda _: self._draw_unless_closed(), "draw")
-        session.on_change = self._redraw
-        self._redraw()
+        self._begin()
         opened = threading.Event()
 
         @server.on_client_connect
@@ -285,14 +287,6 @@ class ExplorationPage:
             if not opened.is_set():
                 opened.set()
                 session.set_mode(RUNNING)
-
-    def close(self) -> None:
-        """Stop serving and end all threads."""
-        self.session.close()
-        self._drawing.close()
-        with self._lock:  # what is being drawn is still sent
-            self._closed = True
-        self.server.stop()
 
     def _add_panel(self) -> None:
         gui = self.server.gui
@@ -334,18 +328,9 @@ class ExplorationPage:
             # changes by the page itself have no client
             widget.on_update(lambda event, do=do: event.client and do(event.target.value))
 
-    def _redraw(self) -> None:
-        self._drawing.submit(None)
-
-    def _draw_unless_closed(self) -> None:
-        with self._lock:
-            if not self._closed:
-                self._draw()
-
     def _draw(self) -> None:
-        """Draw what has changed; only this task draws."""
         state = self.session.state
-        explorer = self.session.state.explorer
+        explorer = state.explorer
         act = state.acts[-1] if state.acts else None
         under_way = act if state.phase == MOVING else None
         with self.server.atomic():

@@ -3,8 +3,8 @@
 import contextlib
 import html
 import threading
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -12,29 +12,20 @@ import numpy as np
 import viser
 from jaxtyping import Float
 from numpy import ndarray
+from scipy.spatial.transform import Rotation
 from viser import uplot
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.transforms import rotation_from_quaternion, transform
-from robotdiffuse.core.types import Path, Trajectory
-from robotdiffuse.drawables import GOAL, START, drawables, own_frame
+from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
+from robotdiffuse.core.types import Configuration, Path, Pose, Trajectory, Tree, Vector
+from robotdiffuse.drawables import GOAL, START, Color, Drawable, Surface, drawables, own_frame, thinned
 from robotdiffuse.planning import PLANNERS
+from robotdiffuse.planning.hybrid import Candidates
 from robotdiffuse.robots.kinematics import link_pose, reach
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape
 from robotdiffuse.visualization.arm import DrawnArm, interpolated
-from robotdiffuse.visualization.live.drawing import (
-    GHOST_OPACITY,
-    POSE_RATE,
-    RED,
-    Arm,
-    Obstacles,
-    draw_candidates,
-    draw_trace,
-    draw_trees,
-    place,
-    sampled_frames,
-)
 from robotdiffuse.visualization.live.server import PageServer
 from robotdiffuse.visualization.live.session import (
     COLLISIONS,
@@ -46,6 +37,9 @@ from robotdiffuse.visualization.live.session import (
     PENDING,
     TREE_SETTINGS,
     VALID,
+    Changes,
+    LatestTask,
+    Player,
     Session,
     State,
     Validity,
@@ -55,7 +49,6 @@ from robotdiffuse.visualization.live.session import (
     uploaded_problem,
     validity,
 )
-from robotdiffuse.visualization.live.threads import Changes, LatestTask, Player
 
 # Sizes of gizmos, as fractions of the arm's reach.
 GIZMO_SIZE = 0.23
@@ -70,29 +63,63 @@ NOTIFICATION_TIME = 8.0
 """Time that notifications stay [s]."""
 
 
-class Page:
-    """Shows a session to all browsers that the server lets in, until it is closed."""
+class LivePage:
+    """Shows the state of a session to all browsers that the server lets in, until it is closed."""
 
-    def __init__(self, session: Session, server: PageServer) -> None:
+    def __init__(self, session: Any, server: PageServer, robot: Robot) -> None:
         self.session = session
         self.server = server
-        self._selected = ""
         self._changes = Changes()
-        server.add_stage(reach(session.state.problem.robot))
+        self._open = threading.Lock()
+        self._closed = False
+        self._drawing = LatestTask(self._draw_if_open, "draw")
+        server.add_stage(reach(robot))
+
+    def close(self) -> None:
+        """Stop serving and end all threads."""
+        self.session.close()
+        self._drawing.close()
+        with self._open:  # what is being drawn is still sent
+            self._closed = True
+        self.server.stop()
+
+    def _begin(self) -> None:
+        self.session.on_change = self._redraw
+        self._redraw()
+
+    def _redraw(self) -> None:
+        self._drawing.submit(None)
+
+    def _draw_if_open(self, _: None) -> None:
+        with self._open:
+            if not self._closed:
+                self._draw()
+
+    def _draw(self) -> None:
+        """Draw what has changed; only this task draws."""
+        raise NotImplementedError
+
+
+class Page(LivePage):
+    """The page on which visitors plan."""
+
+    session: Session
+
+    def __init__(self, session: Session, server: PageServer) -> None:
+        super().__init__(session, server, session.state.problem.robot)
+        self._selected = ""
         self.goal_gizmo = _Gizmo(server, "/drag/goal", GIZMO_SIZE, session.move_goal)
         self._start_gizmo = _Gizmo(server, "/drag/start", SMALL_GIZMO_SIZE, session.move_start)
         self._obstacle_gizmo = _Gizmo(server, "/drag/obstacle", GIZMO_SIZE, self._move_selected)
         self._gizmos = self.goal_gizmo, self._start_gizmo, self._obstacle_gizmo
-        self._panel = Panel(server, session, PanelCallbacks(self.select, self._seek, self._set_playing))
+        self._panel = Panel(self)
         self._obstacles = Obstacles(server, self.select)
         self._moving = Obstacles(server)
         self._arms: dict[str, Arm] = {}
         self._frames: Float[ndarray, "n frames 4 4"] | None = None
         self._lock = threading.Lock()
         self.player = Player(self._show_time)
-        self._drawing = LatestTask[None](lambda _: self._draw(), "draw")
-        session.on_change = self._redraw
-        self._redraw()
+        self._begin()
         session.start()
 
     def select(self, name: str) -> None:
@@ -102,22 +129,16 @@ class Page:
 
     def close(self) -> None:
         """Stop serving and end all threads."""
-        self.session.close()
         self.player.close()
         for gizmo in self._gizmos:
             gizmo.close()
-        self._drawing.close()
-        self.server.stop()
+        super().close()
 
-    def _move_selected(self, T_base_handle: Float[ndarray, "4 4"]) -> None:
+    def _move_selected(self, T_base_handle: Pose) -> None:
         if self._selected:
             self.session.move_obstacle(self._selected, T_base_handle)
 
-    def _redraw(self) -> None:
-        self._drawing.submit(None)
-
     def _draw(self) -> None:
-        """Draw what has changed; only this task and the player draw."""
         state = self.session.state
         selected = self._selected
         new = self._changes.new
@@ -130,7 +151,7 @@ class Page:
             self._panel.show(state, validity(state), selected)
             if new("scene", problem.scene, selected):
                 self._obstacles.show(drawables(problem.scene), selected)
-                shapes = {shape.name: shape for shape in problem.known_scene.shapes}
+                shapes = state.obstacles
                 self._obstacle_gizmo.show(own_frame(shapes[selected]) if selected in shapes else None)
             if new("moving", problem.moving):
                 self._show_moving(0.0)
@@ -197,11 +218,13 @@ class Page:
         with self._lock:
             self._moving.show(obstacles, time=at)
 
-    def _seek(self, at: float) -> None:
-        self._set_playing(False)
+    def seek(self, at: float) -> None:
+        """Stop at a time of the motion [s]."""
+        self.set_playing(False)
         self.player.seek(at)
 
-    def _set_playing(self, playing: bool) -> None:
+    def set_playing(self, playing: bool) -> None:
+        """Play the motion, or stop."""
         (self.player.play if playing else self.player.pause)()
         self._panel.show_playing(playing)
 
@@ -224,7 +247,7 @@ class _Gizmo:
                 rotation = rotation_from_quaternion(np.array(event.target.wxyz))
                 self._moving.submit(transform(np.array(event.target.position), rotation))
 
-    def _move(self, T: Float[ndarray, "4 4"]) -> None:
+    def _move(self, T: Pose) -> None:
         with contextlib.suppress(InputError):  # another visitor has deleted the obstacle
             self._moved(T)
 
@@ -232,7 +255,7 @@ class _Gizmo:
         """End its thread."""
         self._moving.close()
 
-    def show(self, T: Float[ndarray, "4 4"] | None) -> None:
+    def show(self, T: Pose | None) -> None:
         """Move to a pose, unless it is being dragged; hide for None."""
         if T is not None and not self._held:
             place(self.handle, T)
@@ -246,7 +269,7 @@ def _starts_at_start(state: State) -> bool:
     return motion is None or np.allclose(motion.positions[0], state.problem.start)
 
 
-def _first_collision(state: State) -> Float[ndarray, "dof"] | None:
+def _first_collision(state: State) -> Configuration | None:
     """The configuration at the first collision of the motion; None if there is none."""
     violation = None if state.validation is None else state.validation.report.violation
     motion = None if state.motion is None else state.motion.trajectory
@@ -255,23 +278,14 @@ def _first_collision(state: State) -> Float[ndarray, "dof"] | None:
     return interpolated(np.array([violation.time]), motion.times, motion.positions)[0]
 
 
-@dataclass(frozen=True)
-class PanelCallbacks:
-    """Functions of the page that the panel calls."""
-
-    select: Callable[[str], None]
-    seek: Callable[[float], None]
-    play: Callable[[bool], None]
-
-
 class Panel:
     """The widgets of the control panel."""
 
-    def __init__(self, server: viser.ViserServer, session: Session, callbacks: PanelCallbacks) -> None:
-        self._server = server
-        self._session = session
-        self._callbacks = callbacks
-        gui = server.gui
+    def __init__(self, page: Page) -> None:
+        self._page = page
+        self._server = page.server
+        self._session = page.session
+        gui = self._server.gui
         self._changes = Changes()
         self._badge = gui.add_html("")
         self._slider = gui.add_slider("Time", min=0.0, max=1.0, step=0.01, initial_value=0.0)
@@ -286,8 +300,8 @@ class Panel:
             self._joints: list[viser.GuiInputHandle[float]] = []
         with tabs.add_tab("Files"):
             self._files_tab()
-        self._on(self._slider, lambda event: callbacks.seek(event.target.value))
-        self._play.on_click(lambda _event: callbacks.play(self._play.label == "Play"))
+        self._on(self._slider, lambda event: page.seek(event.target.value))
+        self._play.on_click(lambda _event: page.set_playing(self._play.label == "Play"))
 
     def _on(self, widget: Any, do: Callable[[Any], object]) -> None:
         """Call `do` when a visitor changes a widget; show its InputError as a notification."""
@@ -295,9 +309,9 @@ class Panel:
         @widget.on_update
         def _(event: viser.GuiEvent) -> None:
             if event.client is not None:
-                self.guarded(event, lambda: do(event))
+                self._guarded(event, lambda: do(event))
 
-    def guarded(self, event: viser.GuiEvent, do: Callable[[], object]) -> None:
+    def _guarded(self, event: viser.GuiEvent, do: Callable[[], object]) -> None:
         """Call `do`; show its InputError as a notification to the visitor."""
         try:
             do()
@@ -337,7 +351,7 @@ class Panel:
         for name, widget in {**self._options, "time_limit": limit}.items():
             self._on(widget, lambda event, name=name: session.set_options(**{name: event.target.value}))
         self._on(self._kind, lambda _event: self._show_plot(session.state))
-        self._now.on_click(lambda event: self.guarded(event, session.plan_now))
+        self._now.on_click(lambda event: self._guarded(event, session.plan_now))
 
     def _obstacles_tab(self) -> None:
         gui = self._server.gui
@@ -348,14 +362,14 @@ class Panel:
         self._delete = gui.add_button("Delete", icon=viser.Icon.TRASH, visible=False)
         self._new = gui.add_dropdown("New obstacle", tuple(NEW_OBSTACLES), initial_value="sphere")
         self._add = gui.add_button("Add", icon=viser.Icon.PLUS)
-        self._on(self._selected, lambda event: self._callbacks.select(_name(event.target.value)))
+        self._on(self._selected, lambda event: self._page.select(event.target.value))
         self._delete.on_click(
-            lambda event: self.guarded(event, lambda: self._session.delete_obstacle(self._selected.value))
+            lambda event: self._guarded(event, lambda: self._session.delete_obstacle(self._selected.value))
         )
-        self._add.on_click(lambda event: self.guarded(event, self._add_obstacle))
+        self._add.on_click(lambda event: self._guarded(event, self._add_obstacle))
 
     def _add_obstacle(self) -> None:
-        self._callbacks.select(self._session.add_obstacle(self._new.value))
+        self._page.select(self._session.add_obstacle(self._new.value))
 
     def _files_tab(self) -> None:
         gui = self._server.gui
@@ -368,10 +382,10 @@ class Panel:
         def _(event: viser.GuiEvent) -> None:
             file = load.value
             robot = session.state.problem.robot
-            self.guarded(event, lambda: session.open(uploaded_problem(file.content, file.name, robot)))
+            self._guarded(event, lambda: session.open(uploaded_problem(file.content, file.name, robot)))
 
-        save.on_click(lambda event: self.guarded(event, lambda: _send(event, *self._problem_file())))
-        share.on_click(lambda event: self.guarded(event, lambda: _send(event, *self._replay_file())))
+        save.on_click(lambda event: self._guarded(event, lambda: _send(event, *self._problem_file())))
+        share.on_click(lambda event: self._guarded(event, lambda: _send(event, *self._replay_file())))
 
     def _problem_file(self) -> tuple[str, bytes]:
         return "problem.yaml", problem_text(self._session.state.problem)
@@ -404,7 +418,7 @@ class Panel:
         self._show_obstacle(state, selected)
 
     def _show_obstacle(self, state: State, selected: str) -> None:
-        shapes = {shape.name: shape for shape in state.problem.known_scene.shapes}
+        shapes = state.obstacles
         options: tuple[str, ...] = (NO_OBSTACLE, *shapes)
         if self._changes.new("options", options):
             self._selected.options = options
@@ -515,10 +529,6 @@ def set_value(widget: Any, value: object) -> None:
         widget.value = value
 
 
-def _name(option: str) -> str:
-    return "" if option == NO_OBSTACLE else option
-
-
 def _send(event: viser.GuiEvent, name: str, content: bytes) -> None:
     if event.client is not None:
         event.client.send_file_download(name, content, save_immediately=True)
@@ -542,3 +552,212 @@ def _stages_html(seconds: tuple[tuple[str, float], ...]) -> str:
         for stage, took in seconds
     )
     return f'<table style="margin: 0 0.8em; width: calc(100% - 1.6em); font-size: 0.85em">{rows}</table>'
+
+
+POSE_RATE = 30.0
+"""Poses of a motion that are precomputed per second."""
+RED = (0xD6, 0x3B, 0x3B)
+AMBER = (0xE0, 0x9A, 0x2F)
+GAMMA = 2.2
+SAFE_CLEARANCE = 0.05
+"""Candidates with at least this clearance are green [m]."""
+# Points of the tool's trace along an edge of a tree; most edges drawn per tree, the first ones.
+EDGE_POINTS = 6
+MAX_EDGES = 4000
+TREES = ("/trees/start", "/trees/goal")
+GHOST_OFFSET = 0.002
+"""Offset of a see-through arm along its normals, so that it covers the solid arm at the same place [m];
+scaled by its opacity over GHOST_OPACITY."""
+# Line widths, as fractions of the arm's reach.
+TRACE_WIDTH = 0.0094
+CANDIDATE_WIDTH = 0.0035
+TREE_WIDTH = 0.0028
+GHOST_OPACITY = 0.3
+"""Opacity of the start and goal arms."""
+HIGHLIGHT = 0.35
+"""Amount of white in the color of the selected obstacle."""
+
+
+def add_surface(
+    server: viser.ViserServer,
+    name: str,
+    surface: Surface,
+    color: Color,
+    opacity: float | None = None,
+) -> viser.MeshHandle:
+    """Draw a surface in one color."""
+    vertices = surface.vertices.astype(np.float32)
+    faces = surface.faces.astype(np.uint32)
+    return server.scene.add_mesh_simple(name, vertices, faces, color=color, opacity=opacity)
+
+
+class Arm:
+    """A robot in the 3D scene."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        name: str,
+        drawn: DrawnArm,
+        color: Color | None = None,
+        opacity: float | None = None,
+    ) -> None:
+        """Draw in the robot's own colors, or in one color, see-through and without the base."""
+        self._server = server
+        self._drawn = drawn
+        self.root = server.scene.add_frame(f"/{name}", show_axes=False, visible=False)
+        self._frames = []
+        for i, surface in enumerate(drawn.surfaces):
+            self._frames.append(server.scene.add_frame(f"/{name}/{i}", show_axes=False))
+            if len(surface.faces) == 0 or (i == 0 and color is not None):
+                continue
+            parts = surface.by_color if color is None else [(color, surface)]
+            for k, (part_color, part) in enumerate(parts):
+                if opacity is not None:
+                    vertices = part.vertices + opacity / GHOST_OPACITY * GHOST_OFFSET * part.normals
+                    part = replace(part, vertices=vertices)
+                add_surface(server, f"/{name}/{i}/{k}", part, part_color, opacity)
+
+    def show(self, q: Configuration | None) -> None:
+        """Show the arm in a configuration; hide it for None."""
+        self.show_frames(None if q is None else self._drawn.frames(q))
+
+    def show_frames(self, T_base_frame: Float[ndarray, "frames 4 4"] | None) -> None:
+        """Show the arm with its frames at these poses; hide it for None."""
+        if T_base_frame is not None:
+            turns = Rotation.from_matrix(T_base_frame[:, :3, :3]).as_quat(scalar_first=True)
+            with self._server.atomic():
+                for frame, T, wxyz in zip(self._frames, T_base_frame, turns, strict=True):
+                    frame.position = T[:3, 3]
+                    frame.wxyz = wxyz
+        if self.root.visible is not (T_base_frame is not None):
+            self.root.visible = T_base_frame is not None
+
+
+def sampled_frames(arm: DrawnArm, motion: Trajectory) -> Float[ndarray, "n frames 4 4"]:
+    """Poses of the frames along a motion, POSE_RATE per second, and the last one."""
+    at = np.append(np.arange(0.0, motion.duration, 1 / POSE_RATE), motion.duration)
+    return arm.frames(interpolated(at, motion.times, motion.positions))
+
+
+def place(node: Any, T: Pose) -> None:
+    """Move a node, without a message to browsers if it is there."""
+    wxyz = quaternion_from_rotation(T[:3, :3])
+    if not (np.allclose(node.position, T[:3, 3]) and np.allclose(node.wxyz, wxyz)):
+        node.position = T[:3, 3]
+        node.wxyz = wxyz
+
+
+class Obstacles:
+    """The obstacles in the 3D scene. Moved obstacles are moved; changed ones are drawn again."""
+
+    def __init__(self, server: viser.ViserServer, clicked: Callable[[str], None] = lambda _: None) -> None:
+        self._server = server
+        self._clicked = clicked
+        self._nodes: dict[str, tuple[object, Any]] = {}
+
+    def show(self, obstacles: Sequence[Drawable], selected: str = "", time: float = 0.0) -> None:
+        """Update to obstacles where they are at a time [s], and highlight the selected one."""
+        names = {one.name for one in obstacles}
+        for name in [name for name in self._nodes if name not in names]:
+            self._nodes.pop(name)[1].remove()
+        for one in obstacles:
+            key = _appearance(one.shape), one.color, one.name == selected
+            drawn_node = self._nodes.get(one.name)
+            if drawn_node is None or drawn_node[0] != key:
+                if drawn_node is not None:
+                    drawn_node[1].remove()
+                self._nodes[one.name] = key, self._draw(one, one.name == selected)
+            place(self._nodes[one.name][1], one.frame(time))
+
+    def _draw(self, obstacle: Drawable, selected: bool) -> Any:
+        """A node in the obstacle's own frame."""
+        color = obstacle.color
+        name = obstacle.name
+        if selected:
+            r, g, b = (round(c + HIGHLIGHT * (255 - c)) for c in color)
+            color = r, g, b
+        obstacle_frame = obstacle.own
+        node = f"/obstacles/{name.encode().hex()}"  # viser takes slashes in names for a tree
+        if isinstance(obstacle_frame.shape, PointCloud):
+            points = thinned(obstacle_frame.shape.points).astype(np.float32)
+            return self._server.scene.add_point_cloud(
+                node, points, color, point_size=2 * obstacle_frame.shape.point_radius
+            )
+        handle = add_surface(self._server, node, obstacle_frame.surface, color)
+        handle.on_click(lambda _event: self._clicked(name))
+        return handle
+
+
+def _appearance(shape: Shape) -> object:
+    """A key of the shape's geometry without its pose."""
+    if isinstance(shape, Mesh):
+        return "mesh", shape.vertices.tobytes(), shape.faces.tobytes()
+    if isinstance(shape, PointCloud):
+        points = shape.points - shape.bounds.mean(axis=0)
+        return "points", shape.point_radius, np.round(points, 6).tobytes()
+    sizes = dimensions(shape)
+    return (shape.kind, *sizes.items()) if sizes else id(shape)
+
+
+def draw_trace(server: viser.ViserServer, arm: DrawnArm, motion: Trajectory | None) -> None:
+    """Draw the trace of the tool, colored from start to goal."""
+    if motion is None:
+        server.scene.remove_by_name("/trace")
+        return
+    points = arm.trace(motion.positions)
+    share = np.linspace(0, 1, len(points))[:, None]
+    colors = (1 - share) * np.array(START) + share * np.array(GOAL)
+    draw_lines(server, "/trace", [points], [colors], TRACE_WIDTH * reach(arm.robot))
+
+
+def draw_candidates(server: viser.ViserServer, arm: DrawnArm, candidates: Candidates | None) -> None:
+    """Draw the tool traces of all candidates: red in collision, else amber to green by clearance."""
+    traces = []
+    colors = []
+    if candidates is not None:
+        traces = [arm.trace(q) for q in candidates.positions]
+        colors = [candidate_color(clearance) for clearance in candidates.clearances]
+    draw_lines(server, "/candidates", traces, colors, CANDIDATE_WIDTH * reach(arm.robot))
+
+
+def draw_trees(server: viser.ViserServer, arm: DrawnArm, trees: tuple[Tree, ...]) -> None:
+    """Draw the tool traces along the edges of both search trees, in the colors of start and goal."""
+    for name, color, tree in zip(TREES, (START, GOAL), trees or (None, None), strict=True):
+        edges = [] if tree is None else _edges(arm, tree)
+        colors = [np.array(color, float)] * len(edges)
+        draw_lines(server, name, edges, colors, TREE_WIDTH * reach(arm.robot))
+
+
+def _edges(arm: DrawnArm, tree: Tree) -> list[Float[ndarray, "points 3"]]:
+    children = np.flatnonzero(tree.parents >= 0)[:MAX_EDGES]
+    begin = tree.nodes[tree.parents[children]]
+    end = tree.nodes[children]
+    share = np.linspace(0, 1, EDGE_POINTS)[:, None]
+    q = (begin[:, None] + share * (end - begin)[:, None]).astype(np.float64)
+    return list(arm.tool_points(q.reshape(-1, arm.robot.dof)).reshape(-1, EDGE_POINTS, 3))
+
+
+def candidate_color(clearance: float) -> Vector:
+    """Color of a candidate by its clearance [m]; sRGB, 0 to 255."""
+    if clearance <= 0:
+        return np.array(RED, float)
+    share = min(clearance / SAFE_CLEARANCE, 1.0)
+    return (1 - share) * np.array(AMBER) + share * np.array(GOAL)
+
+
+def draw_lines(
+    server: viser.ViserServer, name: str, lines: list[ndarray], colors: list[ndarray], width: float
+) -> None:
+    """Draw polylines, each in one color or with a color for each point; remove the node without any.
+
+    `width` [m]; colors in sRGB, converted because viser expects linear ones.
+    """
+    if not lines:
+        server.scene.remove_by_name(name)
+        return
+    points = np.concatenate([np.stack([line[:-1], line[1:]], axis=1) for line in lines])
+    along = [np.broadcast_to(color, line.shape) for color, line in zip(colors, lines, strict=True)]
+    ends = np.concatenate([np.stack([color[:-1], color[1:]], axis=1) for color in along])
+    linear = np.round(255 * (ends / 255) ** GAMMA).astype(np.uint8)
+    server.scene.add_line_segments(name, points.astype(np.float32), linear, thickness=width)

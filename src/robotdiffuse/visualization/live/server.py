@@ -14,11 +14,10 @@ from urllib.parse import urlsplit
 import numpy as np
 import rich
 import viser
-from jaxtyping import Float
-from numpy import ndarray
 from viser import infra
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Configurations
 from robotdiffuse.drawables import drawables
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.visualization.arm import DrawnArm
@@ -151,7 +150,7 @@ class PageServer(viser.ViserServer):
             section_color=(214, 218, 224),
         )
 
-    def set_first_view(self, arm: DrawnArm, problem: Problem, q: Float[ndarray, "n dof"]) -> None:
+    def set_first_view(self, arm: DrawnArm, problem: Problem, q: Configurations) -> None:
         """Set the view of new browsers so that the arm is visible in all configurations, beside the panel."""
         view = view_of_motion(arm, drawables(problem.scene), q, VIEW_SIZE, VIEW_MARGINS)
         height = 2 * np.tan(VERTICAL_FIELD / 2) * np.linalg.norm(view.target - view.eye)

@@ -5,6 +5,7 @@ work, each on its most recent request: one plans, one validates the motion shown
 solve inverse kinematics for dragged goal and start poses.
 """
 
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -12,11 +13,9 @@ from dataclasses import dataclass, field, replace
 from importlib.resources import as_file, files
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any
+from typing import Annotated, Any, Generic, TypeVar
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from robotdiffuse.collision.kernels.collision_cost import CLEARANCE_CAP
 from robotdiffuse.core.errors import InputError, distinct, shortened, shown, unknown_name
@@ -24,6 +23,7 @@ from robotdiffuse.core.input_files import parse_json, parse_yaml
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, OneOf, Settings
 from robotdiffuse.core.transforms import inverse, transform
+from robotdiffuse.core.types import Configuration, Pose, Vector
 from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.drawables import own_frame
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, load_planner, planner_settings
@@ -41,10 +41,9 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
 from robotdiffuse.validation.report import Report
 from robotdiffuse.validation.validator import verify, verify_trajectory
-from robotdiffuse.visualization.live.threads import LatestTask
 from robotdiffuse.visualization.replay_page import write_replay
 
-NEW_OBSTACLES: dict[str, Callable[[Float[ndarray, "3"], float], Shape]] = {
+NEW_OBSTACLES: dict[str, Callable[[Vector, float], Shape]] = {
     "sphere": lambda center, size: Sphere(center, size),
     "box": lambda center, size: Box(center, (2 * size, 2 * size, 2 * size)),
     "cylinder": lambda center, size: Cylinder(center, 0.75 * size, 3 * size),
@@ -137,10 +136,15 @@ class State:
     candidates: Candidates | None = None
     goal_frame: str = ""
     """The link that represents the goal."""
-    goal_pose: Float[ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
+    goal_pose: Pose = field(default_factory=lambda: np.eye(4))
     """T_base_frame of this link, which is dragged; of the first goal if there are several."""
-    goal_configuration: Float[ndarray, "dof"] | None = None
+    goal_configuration: Configuration | None = None
     """A configuration at the goal; None if none was found."""
+
+    @property
+    def obstacles(self) -> dict[str, Shape]:
+        """The known obstacles by name."""
+        return {shape.name: shape for shape in self.problem.known_scene.shapes}
 
 
 class Session:
@@ -203,7 +207,7 @@ class Session:
             self._planning_task.submit(self._state.version)
         self.on_change()
 
-    def move_goal(self, T_base_frame: Float[ndarray, "4 4"]) -> None:
+    def move_goal(self, T_base_frame: Pose) -> None:
         """Set the goal to a pose of the goal's link, or of the tip."""
         with self._lock:
             state = self._state
@@ -213,17 +217,17 @@ class Session:
             self._goal_task.submit(T_base_frame)
             self._changed()
 
-    def set_start(self, q: Float[ndarray, "dof"]) -> None:
+    def set_start(self, q: Configuration) -> None:
         """Set the start configuration."""
         with self._lock:
             self._state = replace(self._state, problem=replace(self._state.problem, start=q))
             self._changed()
 
-    def move_start(self, T_base_tip: Float[ndarray, "4 4"]) -> None:
+    def move_start(self, T_base_tip: Pose) -> None:
         """Set the start to the nearest configuration with the tip at a pose, if there is one."""
         self._start_task.submit(T_base_tip)
 
-    def add_obstacle(self, kind: str, center: Float[ndarray, "3"] | None = None) -> str:
+    def add_obstacle(self, kind: str, center: Vector | None = None) -> str:
         """Add an obstacle and return its name. Default center [m]: in front of the arm, at half its reach."""
         with self._lock:
             if kind not in NEW_OBSTACLES:
@@ -231,10 +235,10 @@ class Session:
             length = reach(self._state.problem.robot)
             center = length * NEW_POSITION if center is None else center
             obstacle = NEW_OBSTACLES[kind](center, round(NEW_RADIUS * length, 2))
-            self._set_scene([*self._state.problem.known_scene.shapes, obstacle])
-            return self._state.problem.known_scene.shapes[-1].name
+            self._set_scene([*self._state.obstacles.values(), obstacle])
+            return [*self._state.obstacles][-1]
 
-    def move_obstacle(self, name: str, T_base_handle: Float[ndarray, "4 4"]) -> None:
+    def move_obstacle(self, name: str, T_base_handle: Pose) -> None:
         """Move the handle of an obstacle to a pose."""
         self._change_obstacle(name, lambda shape: moved_to(shape, T_base_handle))
 
@@ -244,22 +248,20 @@ class Session:
 
     def delete_obstacle(self, name: str) -> None:
         """Delete an obstacle. Raises InputError for an unknown name."""
-        with self._lock:
-            self.obstacle(name)
-            self._set_scene([shape for shape in self._state.problem.known_scene.shapes if shape.name != name])
+        self._change_obstacle(name, lambda _: None)
 
     def obstacle(self, name: str) -> Shape:
         """The obstacle of a name. Raises InputError for an unknown one."""
-        shapes = {shape.name: shape for shape in self._state.problem.known_scene.shapes}
-        if name not in shapes:
-            raise unknown_name("obstacle", name, shapes)
-        return shapes[name]
+        obstacles = self._state.obstacles
+        if name not in obstacles:
+            raise unknown_name("obstacle", name, obstacles)
+        return obstacles[name]
 
-    def _change_obstacle(self, name: str, change: Callable[[Shape], Shape]) -> None:
+    def _change_obstacle(self, name: str, change: Callable[[Shape], Shape | None]) -> None:
+        """Replace an obstacle; delete it for None."""
         with self._lock:
-            self.obstacle(name)
-            shapes = self._state.problem.known_scene.shapes
-            self._set_scene([change(shape) if shape.name == name else shape for shape in shapes])
+            changed = {**self._state.obstacles, name: change(self.obstacle(name))}
+            self._set_scene([shape for shape in changed.values() if shape is not None])
 
     def _set_scene(self, shapes: list[Shape]) -> None:
         problem = self._state.problem
@@ -297,7 +299,7 @@ class Session:
             self._state = replace(self._state, validation=validation)
         self.on_change()
 
-    def _find_goal_configuration(self, T_base_frame: Float[ndarray, "4 4"]) -> None:
+    def _find_goal_configuration(self, T_base_frame: Pose) -> None:
         """Find a configuration at the goal, close to the previous one."""
         state = self._state
         previous = state.goal_configuration
@@ -310,7 +312,7 @@ class Session:
             self._state = replace(self._state, goal_configuration=q)
         self.on_change()
 
-    def _move_start(self, T_base_tip: Float[ndarray, "4 4"]) -> None:
+    def _move_start(self, T_base_tip: Pose) -> None:
         problem = self._state.problem
         q = _configuration_at(problem.robot, problem.robot.tip, T_base_tip, problem.start)
         if q is not None and self._state.problem.robot is problem.robot:
@@ -381,8 +383,8 @@ class Session:
 
 
 def _configuration_at(
-    robot: Robot, link: str, T_base_link: Float[ndarray, "4 4"], near: Float[ndarray, "dof"]
-) -> Float[ndarray, "dof"] | None:
+    robot: Robot, link: str, T_base_link: Pose, near: Configuration
+) -> Configuration | None:
     rng = np.random.default_rng(0)
     solutions = inverse_kinematics(
         robot, link, T_base_link, 1, rng=rng, settings=QUICK_IK, near=near, rest=near
@@ -395,7 +397,7 @@ def _opened(problem: Problem, options: PageOptions) -> State:
     return State(problem, options, goal_pose=T, goal_frame=frame, goal_configuration=q)
 
 
-def _target(problem: Problem) -> tuple[str, Float[ndarray, "4 4"], Float[ndarray, "dof"] | None]:
+def _target(problem: Problem) -> tuple[str, Pose, Configuration | None]:
     """The link that represents the goal, its pose, and the configuration of a joint goal."""
     goal = problem.goal
     robot = problem.robot
@@ -408,7 +410,7 @@ def _target(problem: Problem) -> tuple[str, Float[ndarray, "4 4"], Float[ndarray
     return robot.tip, link_pose(robot, q, robot.tip), q
 
 
-def _posed(goal: Goal, frame: str, T_base_frame: Float[ndarray, "4 4"]) -> PoseGoal | PosesGoal:
+def _posed(goal: Goal, frame: str, T_base_frame: Pose) -> PoseGoal | PosesGoal:
     """The goal with another pose of one link; tolerances and the poses of other links stay."""
     if isinstance(goal, PoseGoal):
         return replace(goal, T_base_frame=T_base_frame)
@@ -431,7 +433,7 @@ def _free(validation: Validation) -> bool:
     return violation is None or violation.kind == "goal"
 
 
-def moved_to(shape: Shape, T_base_handle: Float[ndarray, "4 4"]) -> Shape:
+def moved_to(shape: Shape, T_base_handle: Pose) -> Shape:
     """The shape with its handle at a pose; shapes without an orientation are not rotated."""
     if not isinstance(shape, ORIENTED):
         T_base_handle = transform(T_base_handle[:3, 3])
@@ -618,3 +620,133 @@ def replay_page(problem: Problem, result: PlanResult, candidates: tuple[JointPat
         file = Path(folder) / "replay.html"
         write_replay(*problem.standing(), motion, file, result=result, candidates=candidates)
         return file.read_bytes()
+
+
+FRAME_RATE = 30.0
+"""Calls of `Player.show` per second while playing."""
+END_PAUSE = 0.7
+"""Pause at the end of a motion before it repeats [s]."""
+Work = TypeVar("Work")
+
+
+class LatestTask(Generic[Work]):
+    """Calls `do` in a thread of its own with the most recent request.
+
+    A request that has not begun is dropped when a newer one arrives. Errors of `do` are logged.
+    """
+
+    def __init__(self, do: Callable[[Work], None], name: str) -> None:
+        self._do = do
+        self._pending = list[Work]()
+        self._closed = False
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def submit(self, work: Work) -> None:
+        """Replace the pending request; returns at once."""
+        with self._changed:
+            self._pending[:] = [work]
+            self._changed.notify()
+
+    def close(self) -> None:
+        """Start no more requests; the running one continues to its end."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._pending or self._closed)
+                if self._closed:
+                    return
+                work = self._pending.pop()
+            try:
+                self._do(work)
+            except Exception:
+                logging.getLogger(__name__).exception("%s failed", self._thread.name)
+
+
+class Changes:
+    """The values that were last shown, by name."""
+
+    def __init__(self) -> None:
+        self._shown: dict[str, tuple[object, ...]] = {}
+
+    def new(self, what: str, *values: object) -> bool:
+        """Whether values differ from the last ones; of arrays and such the identity counts."""
+        last_values = self._shown.get(what)
+        self._shown[what] = values
+        return last_values is None or not all(map(_same, last_values, values))
+
+    def forget(self, *names: str) -> None:
+        """Values of these names are new the next time."""
+        for name in names:
+            self._shown.pop(name, None)
+
+
+def _same(known: object, value: object) -> bool:
+    plain = isinstance(value, str | bytes | bool | float | tuple)
+    return known is value or (plain and known == value)
+
+
+class Player:
+    """Calls `show` with the time in the motion [s]; while playing, from a thread of its own, in a loop."""
+
+    def __init__(self, show: Callable[[float], None]) -> None:
+        self._show = show
+        self._lock = threading.RLock()
+        self._playing = threading.Event()
+        self._ended = False
+        self.duration = 0.0
+        self.time = 0.0
+        self._thread = threading.Thread(target=self._run, name="player", daemon=True)
+        self._thread.start()
+
+    @property
+    def playing(self) -> bool:
+        """Whether the motion is playing."""
+        return self._playing.is_set()
+
+    def play(self) -> None:
+        """Start or resume playing."""
+        self._playing.set()
+
+    def pause(self) -> None:
+        """Stop at the current time."""
+        with self._lock:
+            self._playing.clear()
+
+    def load(self, duration: float) -> None:
+        """Switch to a motion of this duration [s], at the same fraction of it."""
+        with self._lock:
+            share = self.time / self.duration if self.duration else 0.0
+            self.duration = duration
+            self.seek(min(share, 1.0) * duration)
+
+    def seek(self, at: float) -> None:
+        """Go to a time [s], clipped to the motion."""
+        with self._lock:
+            self.time = min(max(at, 0.0), self.duration)
+            self._show(self.time)
+
+    def close(self) -> None:
+        """End the thread."""
+        self._ended = True
+        self._playing.set()
+
+    def _run(self) -> None:
+        last = time.perf_counter()
+        while not self._ended:
+            if not self._playing.wait(0.0):
+                self._playing.wait()
+                last = time.perf_counter()
+            now = time.perf_counter()
+            with self._lock:
+                if self._playing.is_set():
+                    at = self.time + now - last
+                    self.time = at if at <= self.duration + END_PAUSE else 0.0
+                    self._show(min(self.time, self.duration))
+            last = now
+            time.sleep(1 / FRAME_RATE)
