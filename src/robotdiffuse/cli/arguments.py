@@ -1,8 +1,10 @@
 """Types of command-line values, for argparse."""
 
-import argparse
 import math
-from collections.abc import Callable
+from argparse import ArgumentParser, ArgumentTypeError, Namespace
+from argparse import _ActionsContainer as ActionsContainer
+from argparse import _SubParsersAction as Commands
+from collections.abc import Callable, Iterable
 from typing import Any
 
 # Exit statuses: done; no valid motion; bad input; the output could not be written; stopped by the user.
@@ -15,20 +17,32 @@ IGNORE_JOINTS = "ignore joints of MoveIt files that the robot does not have, wit
 
 
 def command(
-    commands: argparse._SubParsersAction,
+    commands: Commands,
     name: str,
     help: str,
     description: str,
-    run: Callable[[argparse.Namespace], int] | None = None,
-) -> argparse.ArgumentParser:
-    """The parser of a command. run: what the command does; None: it has commands of its own."""
+    run: Callable[[Namespace], int | None] | None = None,
+    *rows: tuple[Any, ...],
+) -> ArgumentParser:
+    """The parser of a command with its options, each a row of the arguments of `option`.
+
+    run: what the command does; it returns the exit status, or None for 0.
+    """
     parser = commands.add_parser(name, help=help, description=description)
     parser.set_defaults(run=run)
+    options(parser, *rows)
     return parser
 
 
+def group(
+    commands: Commands, name: str, help: str, description: str, title: str = "actions", kind: str = "ACTION"
+) -> Commands:
+    """Where the commands of a command are added. title, kind: what the help calls them."""
+    return command(commands, name, help, description).add_subparsers(title=title, metavar=kind, required=True)
+
+
 def option(
-    parser: argparse._ActionsContainer,
+    parser: ActionsContainer,
     spec: str,
     help: str,
     kind: Callable[[str], Any] | None = None,
@@ -55,13 +69,20 @@ def option(
     parser.add_argument(name, help=help, **more)
 
 
-def options(parser: argparse._ActionsContainer, *rows: tuple[Any, ...]) -> None:
-    """Add options, each a row of the arguments of `option`."""
+def options(parser: ActionsContainer, *rows: tuple[Any, ...]) -> None:
+    """Add options, each a row of the arguments of `option`; keywords of argparse stand in a dictionary at its
+    end."""
     for row in rows:
-        option(parser, *row)
+        *values, more = row if isinstance(row[-1], dict) else (*row, {})
+        option(parser, *values, **more)
 
 
-def add_import_option(parser: argparse.ArgumentParser) -> None:
+def chosen(arguments: Namespace, names: Iterable[str]) -> dict[str, Any]:
+    """The options of these names that were given; the others keep the defaults of the settings."""
+    return {name: value for name, value in vars(arguments).items() if name in names and value is not None}
+
+
+def add_import_option(parser: ArgumentParser) -> None:
     """Add the option --import; `main` imports the modules before it runs the command."""
     option(
         parser,
@@ -84,7 +105,7 @@ def positive(text: str) -> float:
     """A positive, finite number."""
     value = _number(text)
     if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
+        raise ArgumentTypeError(f"{text!r} is not a positive number")
     return value
 
 
@@ -96,14 +117,14 @@ def jerk_limit(text: str) -> float:
 def natural(text: str) -> int:
     """An integer of at least 0."""
     if not (text.isascii() and text.isdecimal()):
-        raise argparse.ArgumentTypeError(f"{text!r} is not an integer of at least 0")
+        raise ArgumentTypeError(f"{text!r} is not an integer of at least 0")
     return int(text)
 
 
 def count(text: str) -> int:
     """An integer of at least 1."""
     if not (text.isascii() and text.isdecimal() and int(text) > 0):
-        raise argparse.ArgumentTypeError(f"{text!r} is not an integer of at least 1")
+        raise ArgumentTypeError(f"{text!r} is not an integer of at least 1")
     return int(text)
 
 
@@ -112,7 +133,7 @@ def assignment(text: str) -> tuple[str, float]:
     name, _, number = text.partition("=")
     value = _number(number)
     if not name or not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=NUMBER")
+        raise ArgumentTypeError(f"{text!r} is not NAME=NUMBER")
     return name, value
 
 
@@ -120,7 +141,7 @@ def folder(text: str) -> tuple[str, str]:
     """NAME=FOLDER."""
     name, _, path = text.partition("=")
     if not name or not path:
-        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=FOLDER")
+        raise ArgumentTypeError(f"{text!r} is not NAME=FOLDER")
     return name, path
 
 
@@ -128,7 +149,7 @@ def not_negative(text: str) -> float:
     """A finite number of at least 0."""
     value = _number(text)
     if not 0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of at least 0")
+        raise ArgumentTypeError(f"{text!r} is not a number of at least 0")
     return value
 
 
@@ -136,7 +157,7 @@ def share(text: str) -> float:
     """A number from 0 to 1."""
     value = not_negative(text)
     if value > 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not between 0 and 1")
+        raise ArgumentTypeError(f"{text!r} is not between 0 and 1")
     return value
 
 
@@ -144,7 +165,7 @@ def shares(text: str) -> dict[str, float]:
     """NAME=FRACTION,NAME=FRACTION,... with fractions of at least 0."""
     pairs = [part.strip().partition("=") for part in text.split(",")]
     if len({name for name, _, _ in pairs}) < len(pairs):
-        raise argparse.ArgumentTypeError(f"{text!r} names a family twice")
+        raise ArgumentTypeError(f"{text!r} names a family twice")
     return {name: not_negative(number) for name, _, number in pairs}
 
 

@@ -1,13 +1,24 @@
 """The commands `robotdiffuse bench` and `reproduce`, which makes the paper's tables and figures again."""
 
-import argparse
 import os
+from argparse import ArgumentParser, ArgumentTypeError
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import add_import_option, command, count, option, options, positive
+from robotdiffuse.cli.arguments import (
+    Commands,
+    Namespace,
+    add_import_option,
+    chosen,
+    command,
+    count,
+    group,
+    option,
+    options,
+    positive,
+)
 from robotdiffuse.cli.console import progress
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.problems.families import FAMILIES
@@ -20,9 +31,8 @@ if TYPE_CHECKING:
     from robotdiffuse.evaluation.paper import Table1Settings
 
 
-def add_bench(commands: argparse._SubParsersAction) -> None:
-    parser = command(commands, "bench", "benchmark planners", "Benchmark planners and networks.")
-    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+def add_bench(commands: Commands) -> None:
+    actions = group(commands, "bench", "benchmark planners", "Benchmark planners and networks.")
     run = command(
         actions,
         "run",
@@ -32,9 +42,6 @@ def add_bench(commands: argparse._SubParsersAction) -> None:
         "the same command again to continue; with a longer --time-limit it repeats only calls that could "
         "improve.",
         run_run,
-    )
-    options(
-        run,
         (
             "--planners NAME,...",
             "names that `planner list` shows, or all. NAME:SETTING=VALUE:SETTING=VALUE changes settings, "
@@ -61,8 +68,8 @@ def add_bench(commands: argparse._SubParsersAction) -> None:
         ),
         ("--data FOLDER", "data set, for a row of its nearest motions"),
         ("--workers N", "planners that run at once (default: half of the cores)", count),
+        ("--cluster", "use the Ray cluster at RAY_ADDRESS", {"choices": CLUSTERS}),
     )
-    option(run, "--cluster", "use the Ray cluster at RAY_ADDRESS", choices=CLUSTERS)
     add_import_option(run)
     report = command(
         actions,
@@ -71,9 +78,6 @@ def add_bench(commands: argparse._SubParsersAction) -> None:
         "Write report.md with its plots as .svg, the same as index.html, and replays.html "
         "(motions in 3D), and print the table of each problem set.",
         run_report,
-    )
-    options(
-        report,
         ("folder FOLDER", "folder of `robotdiffuse bench run`"),
         ("--limits S,...", "time limits [s] (default: those of the run, and 0.1, 1, 10, 60 below them)"),
         ("--planners NAME,...", "planners to include (default: all)"),
@@ -81,22 +85,19 @@ def add_bench(commands: argparse._SubParsersAction) -> None:
         ("--no-replays", "do not write replays.html"),
     )
     add_import_option(report)
-    confirm = command(
+    command(
         actions,
         "confirm",
         "check the motions of a run with PyBullet",
         "Check every solved motion of `bench run` with PyBullet, on meshes, as a second "
         "validator. The exit status is 1 if it finds a collision.",
         run_confirm,
-    )
-    options(
-        confirm,
         ("folder FOLDER", "folder of `bench run`"),
         ("--count N", "check only the first N problems of each set (default: all)", count),
     )
 
 
-def run_run(arguments: argparse.Namespace) -> int:
+def run_run(arguments: Namespace) -> None:
     from robotdiffuse.evaluation.bench import run_bench
 
     calls_made = 0
@@ -106,7 +107,6 @@ def run_run(arguments: argparse.Namespace) -> int:
     print(
         f"{calls_made} calls made; for tables, plots and replays: robotdiffuse bench report {arguments.out}"
     )
-    return 0
 
 
 @contextmanager
@@ -129,7 +129,7 @@ def calls_shown(settings: "BenchSettings") -> "Iterator[tuple[Report, Done]]":
         yield lambda text: print(text, file=sys.stderr, flush=True), done
 
 
-def _bench_settings(arguments: argparse.Namespace) -> "list[BenchSettings]":
+def _bench_settings(arguments: Namespace) -> "list[BenchSettings]":
     """The settings of each pass: of the preset, or one from the options."""
     from robotdiffuse.evaluation.bench import BenchSettings, preset_settings
 
@@ -161,7 +161,7 @@ def _bench_settings(arguments: argparse.Namespace) -> "list[BenchSettings]":
     ]
 
 
-def run_report(arguments: argparse.Namespace) -> int:
+def run_report(arguments: Namespace) -> None:
     from robotdiffuse.core.output_files import write_atomically
     from robotdiffuse.core.tables import show
     from robotdiffuse.evaluation.bench_report import bench_report, main_table, missing_line
@@ -181,7 +181,6 @@ def run_report(arguments: argparse.Namespace) -> int:
         print(missing_line(section.main), end="\n\n" if section.main.missing else "\n")
     files = ["index.html", *([replays] if replays else []), "report.md"]
     print(f"wrote {', '.join(str(out / name) for name in files)} and {len(report.plots)} plots as .svg")
-    return 0
 
 
 def _write_replays(bench: "Bench", parts: "list[Section]", file: "Path") -> str | None:
@@ -208,13 +207,13 @@ def _write_replays(bench: "Bench", parts: "list[Section]", file: "Path") -> str 
 def _limits(text: str) -> list[float]:
     try:
         return [positive(part) for part in text.split(",")]
-    except (argparse.ArgumentTypeError, ValueError):
+    except (ArgumentTypeError, ValueError):
         raise InputError(
             f"limits are {shown(text)}; they must be positive times [s], such as 0.1,1,10"
         ) from None
 
 
-def run_confirm(arguments: argparse.Namespace) -> int:
+def run_confirm(arguments: Namespace) -> int:
     from robotdiffuse.core.tables import Table, show
     from robotdiffuse.evaluation.checks import confirm
 
@@ -237,15 +236,16 @@ FIGURE_AZIMUTH = -0.9
 """Azimuth of the camera of figure 1, the same for all noise levels [rad]."""
 
 
-def add_reproduce(commands: argparse._SubParsersAction) -> None:
-    parser = command(
+def add_reproduce(commands: Commands) -> None:
+    actions = group(
         commands,
         "reproduce",
         "make the paper's tables and figures again, beside the printed ones",
         "Draw the paper's problems, plan, validate, and write one page. Ctrl-C stops; run the "
         "same command again to continue.",
+        "parts",
+        "PART",
     )
-    actions = parser.add_subparsers(title="parts", metavar="PART", required=True)
     table1 = command(
         actions,
         "table1",
@@ -254,16 +254,13 @@ def add_reproduce(commands: argparse._SubParsersAction) -> None:
         run_table1,
     )
     _add_planning(table1)
-    table2 = command(
+    command(
         actions,
         "table2",
         "train and compare the rows of the ablation",
         "Train every row of the paper's Table 2 on the same number of samples, test it on the "
         "same held-out problems, and write table2.md in the folder.",
         run_table2,
-    )
-    options(
-        table2,
         ("--data DATA !", "data set of `data generate`"),
         ("--out FOLDER !", "folder for networks and page"),
         ("--samples N", "training samples per row (default: 300000)", count),
@@ -285,7 +282,7 @@ def add_reproduce(commands: argparse._SubParsersAction) -> None:
     _add_planning(figures)
 
 
-def _add_planning(parser: argparse.ArgumentParser) -> None:
+def _add_planning(parser: ArgumentParser) -> None:
     options(
         parser,
         ("--out FOLDER !", "folder for problems, results, page"),
@@ -302,7 +299,7 @@ def _add_planning(parser: argparse.ArgumentParser) -> None:
     option(parser, "--cluster", "use the Ray cluster at RAY_ADDRESS", choices=CLUSTERS)
 
 
-def run_table1(arguments: argparse.Namespace) -> int:
+def run_table1(arguments: Namespace) -> int:
     from robotdiffuse.evaluation.paper import table1
 
     settings, bench = _table1(arguments)
@@ -315,7 +312,7 @@ def _write(page: "report.Report", file: Path) -> int:
     return 0
 
 
-def _table1(arguments: argparse.Namespace) -> "tuple[Table1Settings, Bench]":
+def _table1(arguments: Namespace) -> "tuple[Table1Settings, Bench]":
     """The settings of table 1, and its calls, of which the missing ones are made."""
     from robotdiffuse.evaluation.paper import Table1Settings, run_table1
 
@@ -332,20 +329,15 @@ def _table1(arguments: argparse.Namespace) -> "tuple[Table1Settings, Bench]":
         return settings, run_table1(settings, report, on_progress)
 
 
-def run_table2(arguments: argparse.Namespace) -> int:
+def run_table2(arguments: Namespace) -> int:
     import sys
-    from dataclasses import fields
 
     from robotdiffuse.learning import need_packages
 
     need_packages("the ablation", "torch")
     from robotdiffuse.evaluation.ablation import ROWS, AblationSettings, run_ablation, table2
 
-    field_names = {field.name for field in fields(AblationSettings)}
-    options = {
-        name: value for name, value in vars(arguments).items() if name in field_names and value is not None
-    }
-    settings = AblationSettings(**options)
+    settings = AblationSettings(**chosen(arguments, AblationSettings.__dataclass_fields__))
     rows = list(ROWS) if arguments.rows is None else arguments.rows.split(",")
     results = run_ablation(
         settings, rows, arguments.workers, lambda text: print(text, file=sys.stderr, flush=True)
@@ -353,7 +345,7 @@ def run_table2(arguments: argparse.Namespace) -> int:
     return _write(table2(settings, results), Path(settings.out) / "table2.md")
 
 
-def run_figures(arguments: argparse.Namespace) -> int:
+def run_figures(arguments: Namespace) -> int:
     from robotdiffuse.evaluation import paper
     from robotdiffuse.evaluation.bench_report import about
     from robotdiffuse.evaluation.problem_sets import hard_cases

@@ -1,15 +1,14 @@
 """The commands `robotdiffuse planner`, `schema` and `completion`: what can be named."""
 
-import argparse
 import json
+from argparse import ArgumentParser
 from collections.abc import Iterator
 
-from robotdiffuse.cli.arguments import add_import_option, command, option
+from robotdiffuse.cli.arguments import Commands, Namespace, add_import_option, command, group, option
 
 
-def add_planner(commands: argparse._SubParsersAction) -> None:
-    parser = command(commands, "planner", "list or show planners", "List the planners, or show one.")
-    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+def add_planner(commands: Commands) -> None:
+    actions = group(commands, "planner", "list or show planners", "List the planners, or show one.")
     listing = command(actions, "list", "list the planners", "List the planners.", run_planner_list)
     add_import_option(listing)
     info = command(
@@ -18,21 +17,20 @@ def add_planner(commands: argparse._SubParsersAction) -> None:
         "show the settings of a planner",
         "Show the settings of a planner, for `robotdiffuse plan --set`.",
         run_planner_info,
+        ("planner NAME", "a planner that `planner list` shows"),
     )
-    option(info, "planner NAME", "a planner that `planner list` shows")
     add_import_option(info)
 
 
-def run_planner_list(arguments: argparse.Namespace) -> int:
+def run_planner_list(arguments: Namespace) -> None:
     from robotdiffuse.core.tables import Column, Table, show
     from robotdiffuse.planning import PLANNERS
 
     rows = [(name, one.kind, one.description) for name, one in PLANNERS.load_installed().items()]
     show(Table.of("", ("planner", Column("kind", left=True), Column("description", left=True)), rows))
-    return 0
 
 
-def run_planner_info(arguments: argparse.Namespace) -> int:
+def run_planner_info(arguments: Namespace) -> None:
     from robotdiffuse.core.tables import Column, Table, show
     from robotdiffuse.planning import PLANNERS, planner_settings
 
@@ -40,7 +38,6 @@ def run_planner_info(arguments: argparse.Namespace) -> int:
     rows = [(one.name, one.value, one.rule, one.description) for one in settings.describe()]
     columns = ("setting", *(Column(name, left=True) for name in ("default", "values", "description")))
     show(Table.of(f"{arguments.planner}: {PLANNERS[arguments.planner].description}", columns, rows))
-    return 0
 
 
 SHELLS = ("bash", "zsh")
@@ -63,7 +60,7 @@ complete -o default -F _robotdiffuse robotdiffuse
 Where no word fits, the shell completes names of files."""
 
 
-def add_schema(commands: argparse._SubParsersAction) -> None:
+def add_schema(commands: Commands) -> None:
     command(
         commands,
         "schema",
@@ -73,7 +70,7 @@ def add_schema(commands: argparse._SubParsersAction) -> None:
     )
 
 
-def add_completion(commands: argparse._SubParsersAction) -> None:
+def add_completion(commands: Commands) -> None:
     parser = commands.add_parser(
         "completion",
         help="print a script that completes commands and options in bash or zsh",
@@ -84,14 +81,13 @@ def add_completion(commands: argparse._SubParsersAction) -> None:
     parser.set_defaults(run=run_completion, parsers=commands.choices)
 
 
-def run_schema(arguments: argparse.Namespace) -> int:
+def run_schema(arguments: Namespace) -> None:
     from robotdiffuse.problems.fields import problem_schema
 
     print(json.dumps(problem_schema(), indent=1))
-    return 0
 
 
-def run_completion(arguments: argparse.Namespace) -> int:
+def run_completion(arguments: Namespace) -> None:
     words_by_command = {"": (list(arguments.parsers), ["--help", "--version"])}
     for name, parser in arguments.parsers.items():
         words_by_command |= _words(parser, f" {name}")
@@ -105,16 +101,15 @@ def run_completion(arguments: argparse.Namespace) -> int:
         script if arguments.shell == "bash" else f"autoload -U +X bashcompinit && bashcompinit\n{script}",
         end="",
     )
-    return 0
 
 
-def _words(parser: argparse.ArgumentParser, path: str) -> Iterator[tuple[str, tuple[list[str], list[str]]]]:
+def _words(parser: ArgumentParser, path: str) -> Iterator[tuple[str, tuple[list[str], list[str]]]]:
     """Each command by its path, such as " data info", with its subcommands or choices, and its options."""
     words: list[str] = []
     options: list[str] = []
-    below: dict[str, argparse.ArgumentParser] = {}
+    below: dict[str, ArgumentParser] = {}
     for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
+        if isinstance(action, Commands):
             below |= action.choices
         elif not action.option_strings:
             words += map(str, action.choices or ())

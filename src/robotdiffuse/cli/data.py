@@ -1,17 +1,19 @@
 """The commands `robotdiffuse data generate`, `info`, `check`, `view`, `export` and `import`."""
 
-import argparse
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robotdiffuse.cli.arguments import (
+    Commands,
+    Namespace,
     add_import_option,
+    chosen,
     command,
     count,
+    group,
     natural,
     not_negative,
-    option,
     options,
     positive,
     share,
@@ -33,16 +35,15 @@ FOLDER_HELP = "folder of `robotdiffuse data generate`"
 ROBOT_HELP = "the robot of the data, if the name in the manifest is not known here"
 
 
-def add(commands: argparse._SubParsersAction) -> None:
-    parser = command(
+def add(commands: Commands) -> None:
+    actions = group(
         commands, "data", "generate and inspect training data", "Generate and inspect training data."
     )
-    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     for add_action in (add_generate, add_info, add_check, add_view, add_export, add_import):
         add_action(actions)
 
 
-def add_generate(actions: argparse._SubParsersAction) -> None:
+def add_generate(actions: Commands) -> None:
     parser = command(
         actions,
         "generate",
@@ -51,9 +52,6 @@ def add_generate(actions: argparse._SubParsersAction) -> None:
         "write the motions that pass the validator to shards. Ctrl-C or a crash loses at most the "
         "unfinished shards; run the same command again to continue.",
         run_generate,
-    )
-    options(
-        parser,
         ("--out FOLDER !", "folder for the data"),
         ("--robot NAME", "bundled name or URDF (default: panda)"),
         ("--trajectories N", "motions to make (default: 140000)", count),
@@ -86,33 +84,27 @@ def add_generate(actions: argparse._SubParsersAction) -> None:
     add_import_option(parser)
 
 
-def add_info(actions: argparse._SubParsersAction) -> None:
-    parser = command(
+def add_info(actions: Commands) -> None:
+    command(
         actions,
         "info",
         "print statistics and write a page of plots",
         "Print the statistics of a data set and write a page of plots.",
         run_info,
-    )
-    options(
-        parser,
         ("folder FOLDER", FOLDER_HELP),
         ("--page FILE.html", "page of plots (default: FOLDER/report.html)"),
         ("--robot NAME", ROBOT_HELP),
     )
 
 
-def add_check(actions: argparse._SubParsersAction) -> None:
-    parser = command(
+def add_check(actions: Commands) -> None:
+    command(
         actions,
         "check",
         "check all shards and validate their motions again",
         "Check the structure of all shards and validate their motions again, with RobotDiffuse's "
         "validator and with PyBullet on meshes. Exit status: 0 clean, 1 violations found, 2 bad input.",
         run_check,
-    )
-    options(
-        parser,
         ("folder FOLDER", FOLDER_HELP),
         ("--count N", "validate N random motions (default: all)", count),
         ("--seed N", "random seed (default: 0)", natural, 0),
@@ -122,17 +114,14 @@ def add_check(actions: argparse._SubParsersAction) -> None:
     )
 
 
-def add_view(actions: argparse._SubParsersAction) -> None:
-    parser = command(
+def add_view(actions: Commands) -> None:
+    command(
         actions,
         "view",
         "show random motions as 3D replays",
         "Write random motions of a data set as 3D replays in one page. Without --out, the page "
         "opens in the browser.",
         run_view,
-    )
-    options(
-        parser,
         ("folder FOLDER", FOLDER_HELP),
         ("--count N", "motions (default: 6)", count, 6),
         ("--seed N", "random seed (default: 0)", natural, 0),
@@ -141,38 +130,32 @@ def add_view(actions: argparse._SubParsersAction) -> None:
     )
 
 
-def add_export(actions: argparse._SubParsersAction) -> None:
-    parser = command(
+def add_export(actions: Commands) -> None:
+    command(
         actions,
         "export",
         "write the data in the format of the paper's robot.npz",
         "Write the motions among exactly two spheres in the layout of the paper's robot.npz: "
         "x_train n x 254 x 7, y_train n x 23.",
         run_export,
-    )
-    options(
-        parser,
         ("folder FOLDER", FOLDER_HELP),
         ("file FILE.npz", "file to write"),
     )
 
 
-def add_import(actions: argparse._SubParsersAction) -> None:
-    parser = command(
+def add_import(actions: Commands) -> None:
+    command(
         actions,
         "import",
         "make a data set from the paper's robot.npz",
         "Make a data set from a file in the layout of the paper's robot.npz, to check and "
         "train on like any other. The file does not contain the radius of its spheres.",
         run_import,
-    )
-    options(
-        parser,
         ("file FILE.npz", "x_train n x 254 x 7, y_train n x 23"),
         ("--out FOLDER !", "folder for the data"),
+        ("--robot NAME", "bundled name or URDF (default: panda)", None, "panda"),
+        ("--radius M", "radius of the spheres [m] (default: 0.25)", positive, 0.25),
     )
-    option(parser, "--robot NAME", "bundled name or URDF (default: panda)", default="panda")
-    option(parser, "--radius M", "radius of the spheres [m] (default: 0.25)", positive, 0.25)
 
 
 def _robot(name: str | None) -> "Robot | None":
@@ -181,8 +164,8 @@ def _robot(name: str | None) -> "Robot | None":
     return None if name is None else load_robot(name)
 
 
-def run_generate(arguments: argparse.Namespace) -> int:
-    from dataclasses import fields, replace
+def run_generate(arguments: Namespace) -> None:
+    from dataclasses import replace
 
     from robotdiffuse.generation import GenerationSettings, generate
     from robotdiffuse.generation.factory import SEARCHES
@@ -191,10 +174,7 @@ def run_generate(arguments: argparse.Namespace) -> int:
         raise InputError(
             "--workers sets the processes on this machine; --cluster always uses all cores of the cluster"
         )
-    field_names = {field.name for field in fields(GenerationSettings)}
-    options = {
-        name: value for name, value in vars(arguments).items() if name in field_names and value is not None
-    }
+    options = chosen(arguments, GenerationSettings.__dataclass_fields__)
     if arguments.planner is not None and arguments.planner != GenerationSettings.planner:
         options["search"] = SEARCHES.defaults(arguments.planner)
     settings = GenerationSettings(**options)
@@ -205,20 +185,18 @@ def run_generate(arguments: argparse.Namespace) -> int:
         workers = arguments.workers or os.cpu_count() or 1
         count = generate(settings, Path(arguments.out), workers, arguments.cluster, update)
     print(f"{count:,} trajectories of {settings.waypoints} waypoints in {arguments.out}")
-    return 0
 
 
-def run_info(arguments: argparse.Namespace) -> int:
+def run_info(arguments: Namespace) -> None:
     from robotdiffuse.core.tables import show
     from robotdiffuse.evaluation.data_report import tables, write_page
 
     page = Path(arguments.page or Path(arguments.folder) / "report.html")
     show(*tables(write_page(arguments.folder, page, _robot(arguments.robot))))
     print(f"wrote {page}")
-    return 0
 
 
-def run_check(arguments: argparse.Namespace) -> int:
+def run_check(arguments: Namespace) -> int:
     from robotdiffuse.core.tables import show
     from robotdiffuse.evaluation.checks import check_data
 
@@ -236,7 +214,7 @@ def run_check(arguments: argparse.Namespace) -> int:
     return VIOLATIONS if check.findings else CLEAN
 
 
-def run_view(arguments: argparse.Namespace) -> int:
+def run_view(arguments: Namespace) -> None:
     from robotdiffuse.cli.view import show
     from robotdiffuse.core.output_files import check_output
     from robotdiffuse.datasets.shards import read_manifest
@@ -256,7 +234,6 @@ def run_view(arguments: argparse.Namespace) -> int:
     print(f"wrote {out}")
     if not arguments.out:
         show(out)
-    return 0
 
 
 def _gallery_entries(folder: Path, robot: "Robot", number: int, seed: int) -> "Iterator[GalleryEntry]":
@@ -277,16 +254,15 @@ def _gallery_entries(folder: Path, robot: "Robot", number: int, seed: int) -> "I
             yield GalleryEntry(title, caption, scene, motion_of(robot, shard, row))
 
 
-def run_export(arguments: argparse.Namespace) -> int:
+def run_export(arguments: Namespace) -> None:
     from robotdiffuse.datasets.external import export_npz
 
     count, left_out = export_npz(arguments.folder, arguments.file)
     left_out_text = f"; left out {left_out:,}, whose scenes are not exactly two spheres" if left_out else ""
     print(f"wrote {arguments.file}: {count:,} motions{left_out_text}")
-    return 0
 
 
-def run_import(arguments: argparse.Namespace) -> int:
+def run_import(arguments: Namespace) -> None:
     from robotdiffuse.datasets.external import import_npz
 
     with progress("importing motions") as update:
@@ -294,4 +270,3 @@ def run_import(arguments: argparse.Namespace) -> int:
     print(
         f"{count:,} motions in {arguments.out}; validate them with: robotdiffuse data check {arguments.out}"
     )
-    return 0

@@ -1,14 +1,25 @@
 """The commands `robotdiffuse live` and `explore`."""
 
-import argparse
 import os
 import signal
 import sys
 import threading
+from argparse import ArgumentTypeError
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from robotdiffuse.cli.arguments import NO_PLAN, SOLVED, STOPPED, command, option, options, positive
+from robotdiffuse.cli.arguments import (
+    NO_PLAN,
+    SOLVED,
+    STOPPED,
+    ActionsContainer,
+    Commands,
+    Namespace,
+    command,
+    option,
+    options,
+    positive,
+)
 from robotdiffuse.cli.view import ENDINGS, show
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.interop import WRITERS
@@ -25,7 +36,7 @@ LOOPBACK = "127.0.0.1"
 PORT = 8080
 
 
-def add_live(commands: argparse._SubParsersAction) -> None:
+def add_live(commands: Commands) -> None:
     parser = command(
         commands,
         "live",
@@ -34,10 +45,7 @@ def add_live(commands: argparse._SubParsersAction) -> None:
         "page plans again after each change and shows at once whether the current motion is still valid. "
         "Without PROBLEM, it shows the demo problem.",
         run_live,
-    )
-    option(parser, "problem PROBLEM", "problem file (.yaml or .json) to open", nargs="?")
-    options(
-        parser,
+        ("problem PROBLEM", "problem file (.yaml or .json) to open", {"nargs": "?"}),
         ("--robot NAME", "instead of PROBLEM: name or URDF file of an arm"),
         ("--planner NAME", "planner; see `robotdiffuse planner list` (default: robotdiffuse)"),
         ("--time-limit S", "time limit of each plan (default: 1 s)", positive, 1.0),
@@ -45,7 +53,7 @@ def add_live(commands: argparse._SubParsersAction) -> None:
     add_address(parser)
 
 
-def add_address(parser: argparse._ActionsContainer) -> None:
+def add_address(parser: ActionsContainer) -> None:
     """Add the options that say where a page is served."""
     option(
         parser,
@@ -60,11 +68,11 @@ def add_address(parser: argparse._ActionsContainer) -> None:
 def port(text: str) -> int:
     """An integer from 0 to 65535."""
     if not (text.isascii() and text.isdecimal() and int(text) < 2**16):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a port, an integer from 0 to 65535")
+        raise ArgumentTypeError(f"{text!r} is not a port, an integer from 0 to 65535")
     return int(text)
 
 
-def run_live(arguments: argparse.Namespace) -> NoReturn:
+def run_live(arguments: Namespace) -> NoReturn:
     require_viser("live")
     from rich.console import Console
 
@@ -107,7 +115,7 @@ def serve_until_stopped(page: "Page | ExplorationPage") -> NoReturn:
 RECORDING = ".mcap"
 
 
-def add_explore(commands: argparse._SubParsersAction) -> None:
+def add_explore(commands: Commands) -> None:
     parser = command(
         commands,
         "explore",
@@ -117,17 +125,14 @@ def add_explore(commands: argparse._SubParsersAction) -> None:
         "named floor are known. Each motion is validated in the true scene. Exit status: 0 at the goal, 1 "
         "not, 2 bad input.",
         run_explore,
-    )
-    option(parser, "problem PROBLEM", "problem file")
-    option(
-        parser,
-        "--policy POLICY",
-        "strict: only through space that was seen free; probabilistic: where the stated confidence is high; "
-        "strict_then_probabilistic (default: strict)",
-        default="strict",
-    )
-    options(
-        parser,
+        ("problem PROBLEM", "problem file"),
+        (
+            "--policy POLICY",
+            "strict: only through space that was seen free; probabilistic: where the stated confidence is "
+            "high; strict_then_probabilistic (default: strict)",
+            None,
+            "strict",
+        ),
         ("--confidence P", "minimum confidence for policy probabilistic (default: 0.98)", float, 0.98),
         (
             "--see-goal",
@@ -160,7 +165,7 @@ def add_explore(commands: argparse._SubParsersAction) -> None:
     add_address(live)
 
 
-def run_explore(arguments: argparse.Namespace) -> int:
+def run_explore(arguments: Namespace) -> int:
     from robotdiffuse.core.output_files import check_output
     from robotdiffuse.perception.depth_view import DepthNoise
     from robotdiffuse.planning.exploration.steps import ExplorerSettings
@@ -196,7 +201,7 @@ def run_explore(arguments: argparse.Namespace) -> int:
     return SOLVED if arrived else NO_PLAN
 
 
-def show_live(arguments: argparse.Namespace, settings: "ExplorerSettings") -> NoReturn:
+def show_live(arguments: Namespace, settings: "ExplorerSettings") -> NoReturn:
     """Serve the page of an exploration until Ctrl-C."""
     require_viser("explore --live")
     from robotdiffuse.problems.files import load_problem

@@ -1,9 +1,9 @@
 """The commands `robotdiffuse export` and `publish`."""
 
-import argparse
+from argparse import ArgumentTypeError
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import command, option, options, positive
+from robotdiffuse.cli.arguments import Commands, Namespace, command, positive
 from robotdiffuse.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from robotdiffuse.problems.problem import Problem
 
 
-def add_export(commands: argparse._SubParsersAction) -> None:
-    parser = command(
+def add_export(commands: Commands) -> None:
+    command(
         commands,
         "export",
         "write a result for ROS 2, Foxglove or Rerun",
@@ -20,16 +20,13 @@ def add_export(commands: argparse._SubParsersAction) -> None:
         "scene that Foxglove opens, with ROS 2 messages), .rosbag2 (a ROS 2 bag, a folder), .rrd (Rerun), "
         ".yaml (a ROS 2 JointTrajectory), .csv and .json.",
         run_export,
-    )
-    options(
-        parser,
         ("result RESULT", "result file (.json) of `robotdiffuse plan --out`"),
         ("--out FILE * !", "file to write; repeatable"),
         ("--rate HZ", "resample the motion, and validate it so, for a controller", float),
     )
 
 
-def run_export(arguments: argparse.Namespace) -> int:
+def run_export(arguments: Namespace) -> None:
     from robotdiffuse.interop import check_export, write_motion
 
     outputs = [check_export(file) for file in arguments.out]
@@ -37,7 +34,6 @@ def run_export(arguments: argparse.Namespace) -> int:
     for file in outputs:
         write_motion(problem, trajectory, file)
         print(f"wrote {file}")
-    return 0
 
 
 def validated_motion(file: str, rate: float | None = None) -> "tuple[Problem, Trajectory]":
@@ -64,26 +60,18 @@ PORT = 9090
 """Default port of rosbridge."""
 
 
-def add_publish(commands: argparse._SubParsersAction) -> None:
-    parser = command(
+def add_publish(commands: Commands) -> None:
+    command(
         commands,
         "publish",
         "publish a result to ROS through rosbridge",
         "Validate the motion of a result file again, and publish it as a ROS JointTrajectory.",
         run_publish,
-    )
-    options(
-        parser,
         ("result RESULT", "result file (.json) of `robotdiffuse plan --out`"),
         ("--to HOST[:PORT] !", f"rosbridge server (port: {PORT})", address),
+        ("--topic NAME", "topic to publish on (default: /joint_trajectory)", None, "/joint_trajectory"),
+        ("--timeout S", "timeout of the connection (default: 5 s)", positive, 5.0),
     )
-    option(
-        parser,
-        "--topic NAME",
-        "topic to publish on (default: /joint_trajectory)",
-        default="/joint_trajectory",
-    )
-    option(parser, "--timeout S", "timeout of the connection (default: 5 s)", positive, 5.0)
 
 
 def address(text: str) -> tuple[str, int]:
@@ -93,15 +81,14 @@ def address(text: str) -> tuple[str, int]:
         host = text
         port = str(PORT)
     if not host or not (port.isascii() and port.isdecimal() and 0 < int(port) < 65536):
-        raise argparse.ArgumentTypeError(f"{text!r} is not HOST or HOST:PORT")
+        raise ArgumentTypeError(f"{text!r} is not HOST or HOST:PORT")
     return host, int(port)
 
 
-def run_publish(arguments: argparse.Namespace) -> int:
+def run_publish(arguments: Namespace) -> None:
     from robotdiffuse.interop.recorded_motion import publish
 
     host, port = arguments.to
     _, trajectory = validated_motion(arguments.result)
     publish(trajectory, host, port, arguments.topic, arguments.timeout)
     print(f"published {len(trajectory.times)} rows on {arguments.topic} at {host}:{port}")
-    return 0

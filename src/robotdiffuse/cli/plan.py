@@ -1,6 +1,5 @@
 """The commands `robotdiffuse plan` and `demo`."""
 
-import argparse
 from dataclasses import fields, replace
 from importlib import resources
 from pathlib import Path
@@ -10,6 +9,8 @@ from robotdiffuse.cli.arguments import (
     IGNORE_JOINTS,
     NO_PLAN,
     SOLVED,
+    Commands,
+    Namespace,
     add_import_option,
     command,
     jerk_limit,
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 RESULT_ENDINGS = (".json", ".csv", *ENDINGS, *WRITERS)
 
 
-def add_plan(commands: argparse._SubParsersAction) -> None:
+def add_plan(commands: Commands) -> None:
     parser = command(
         commands,
         "plan",
@@ -41,9 +42,6 @@ def add_plan(commands: argparse._SubParsersAction) -> None:
         "Plan a motion for a problem file; every motion found is verified. Exit status: 0 "
         "solved, 1 no plan, 2 bad input.",
         run_plan,
-    )
-    options(
-        parser,
         ("problem PROBLEM", "problem file (.yaml, .json or .jsonl)"),
         ("--index INDEX", "which problem of a .jsonl file (default: 0)", natural, 0),
         ("--planner NAME", "see `robotdiffuse planner list` (default: robotdiffuse)"),
@@ -52,23 +50,19 @@ def add_plan(commands: argparse._SubParsersAction) -> None:
             "weights of `robotdiffuse train`, for a learned planner, or panda_points, those of the package "
             "without clearances as inputs (default: the bundled ones)",
         ),
-    )
-    option(
-        parser,
-        "--set NAME=VALUE *",
-        "a setting of the planner; see `robotdiffuse planner info NAME`; repeatable",
-        dest="settings",
-    )
-    option(parser, "--time-limit S", "time limit for planning (default: 1 s)", positive, 1.0)
-    option(
-        parser,
-        "--until",
-        "stop at the first motion, when more time hardly improves it (default), or at the time limit",
-        default=CONVERGED,
-        choices=UNTIL,
-    )
-    options(
-        parser,
+        (
+            "--set NAME=VALUE *",
+            "a setting of the planner; see `robotdiffuse planner info NAME`; repeatable",
+            {"dest": "settings"},
+        ),
+        ("--time-limit S", "time limit for planning (default: 1 s)", positive, 1.0),
+        (
+            "--until",
+            "stop at the first motion, when more time hardly improves it (default), or at the time limit",
+            None,
+            CONVERGED,
+            {"choices": UNTIL},
+        ),
         (
             "--clearance M",
             "distance to obstacles to keep where possible, up to 0.5 m (default: the problem's, or 0.01 m)",
@@ -123,7 +117,7 @@ def add_plan(commands: argparse._SubParsersAction) -> None:
     add_import_option(parser)
 
 
-def run_plan(arguments: argparse.Namespace) -> int:
+def run_plan(arguments: Namespace) -> int:
     from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, planner_settings
     from robotdiffuse.planning.context import PlanRequest
 
@@ -146,7 +140,7 @@ def run_plan(arguments: argparse.Namespace) -> int:
     return SOLVED if result.solved else NO_PLAN
 
 
-def _outputs(arguments: argparse.Namespace) -> list[Path]:
+def _outputs(arguments: Namespace) -> list[Path]:
     """All files to write. Raises InputError for one that cannot be written."""
     from robotdiffuse.core.output_files import check_output
     from robotdiffuse.interop import check_export
@@ -160,7 +154,7 @@ def _outputs(arguments: argparse.Namespace) -> list[Path]:
     return files
 
 
-def _problem(arguments: argparse.Namespace) -> "Problem":
+def _problem(arguments: Namespace) -> "Problem":
     """The problem of the file, changed by --unknown and --blend."""
     from robotdiffuse.problems.files import load_problem
 
@@ -259,7 +253,7 @@ IMAGE_SIZE = (640, 480)
 FOCAL_LENGTH = 460.0
 
 
-def add_demo(commands: argparse._SubParsersAction) -> None:
+def add_demo(commands: Commands) -> None:
     parser = command(
         commands,
         "demo",
@@ -289,7 +283,7 @@ def add_demo(commands: argparse._SubParsersAction) -> None:
     )
 
 
-def run_demo(arguments: argparse.Namespace) -> int:
+def run_demo(arguments: Namespace) -> int:
     from robotdiffuse.core.output_files import check_output
     from robotdiffuse.planning import DEFAULT_PLANNER
     from robotdiffuse.problems.files import load_problem

@@ -1,11 +1,19 @@
 """The commands `robotdiffuse robot list`, `info` and `add`."""
 
-import argparse
 import sys
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import assignment, command, folder, natural, option, options
+from robotdiffuse.cli.arguments import (
+    Commands,
+    Namespace,
+    assignment,
+    command,
+    folder,
+    group,
+    natural,
+    options,
+)
 from robotdiffuse.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,11 +28,10 @@ MAX_PAIRS = 8
 """Most pairs of links in the report of `robot add`."""
 
 
-def add(commands: argparse._SubParsersAction) -> None:
-    parser = command(
+def add(commands: Commands) -> None:
+    actions = group(
         commands, "robot", "list, show or prepare robots", "List or show robots, or prepare a new one."
     )
-    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
 
     command(
         actions,
@@ -34,14 +41,14 @@ def add(commands: argparse._SubParsersAction) -> None:
         run_list,
     )
 
-    info = command(
+    command(
         actions,
         "info",
         "show joints, limits and collision model",
         "Show joints, limits and collision model of a robot.",
         run_info,
+        ("robot ROBOT", "a bundled name, a prepared folder or a URDF file"),
     )
-    option(info, "robot ROBOT", "a bundled name, a prepared folder or a URDF file")
 
     make = command(
         actions,
@@ -51,9 +58,6 @@ def add(commands: argparse._SubParsersAction) -> None:
         "URDF, find the pairs of links that need no collision check, and write a folder that problems can "
         "name.",
         run_add,
-    )
-    options(
-        make,
         ("urdf URDF", "URDF of an arm, or xacro file, which is compiled: this runs code in it"),
         ("--name NAME", "name that problems use (default: the URDF's)"),
         ("--out FOLDER", "folder to write (default: one in the user's robots)"),
@@ -93,7 +97,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
 
 
-def run_list(arguments: argparse.Namespace) -> int:
+def run_list(arguments: Namespace) -> None:
     from robotdiffuse.core.tables import Column, Table, show
     from robotdiffuse.learning.weight_files import weights_for
     from robotdiffuse.robots import known_robots, load_robot
@@ -114,17 +118,15 @@ def run_list(arguments: argparse.Namespace) -> int:
     refused = Column("false collisions", "%", ".1f", scale=100.0)
     columns = ("robot", "joints", "spheres", "checked pairs", refused, "weights", Column("folder", left=True))
     show(Table.of("", columns, rows))
-    return 0
 
 
-def run_info(arguments: argparse.Namespace) -> int:
+def run_info(arguments: Namespace) -> None:
     from robotdiffuse.robots import load_robot
 
     print_robot(load_robot(arguments.robot))
-    return 0
 
 
-def run_add(arguments: argparse.Namespace) -> int:
+def run_add(arguments: Namespace) -> None:
     from rich.console import Console
     from rich.progress import Progress
 
@@ -163,7 +165,6 @@ def run_add(arguments: argparse.Namespace) -> int:
     _print_pairs(report)
     print_robot(report.robot)
     print(f"wrote {report.folder}")
-    return 0
 
 
 def print_preparation(report: "AddReport") -> None:

@@ -1,11 +1,10 @@
 """The command `robotdiffuse serve`."""
 
-import argparse
 import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import command, count, natural, option, options, positive
+from robotdiffuse.cli.arguments import Commands, Namespace, command, count, natural, positive
 
 if TYPE_CHECKING:
     from robotdiffuse.robots.robot import Robot
@@ -13,8 +12,8 @@ if TYPE_CHECKING:
 TOKEN = "ROBOTDIFFUSE_TOKEN"
 
 
-def add(commands: argparse._SubParsersAction) -> None:
-    parser = command(
+def add(commands: Commands) -> None:
+    command(
         commands,
         "serve",
         "plan and validate over HTTP",
@@ -22,15 +21,11 @@ def add(commands: argparse._SubParsersAction) -> None:
         "waiting ones are answered with 503. The server's address in a browser lists all endpoints. A server "
         f"that other machines can reach needs a token in the environment variable {TOKEN}.",
         run,
-    )
-    option(
-        parser,
-        "--robot NAME *",
-        "another robot that requests may name: one of `robot add`, or a URDF file; repeatable",
-    )
-    option(parser, "--host HOST", "address to listen on (default: 127.0.0.1)", default="127.0.0.1")
-    options(
-        parser,
+        (
+            "--robot NAME *",
+            "another robot that requests may name: one of `robot add`, or a URDF file; repeatable",
+        ),
+        ("--host HOST", "address to listen on (default: 127.0.0.1)", None, "127.0.0.1"),
         ("--port PORT", "port; 0 for any free one (default: 8000)", natural, 8000),
         ("--workers N", "processes that plan (default: one per core)", count),
         (
@@ -50,7 +45,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: Namespace) -> None:
     from robotdiffuse.core.errors import InputError, shown
     from robotdiffuse.core.input_files import MEGABYTE
 
@@ -75,7 +70,6 @@ def run(arguments: argparse.Namespace) -> int:
     if not settings.on_loopback and not settings.token:
         raise InputError(f"host is {shown(settings.host)}, which others can reach: set a token in {TOKEN}")
     serve(served_robots(arguments.robot), settings, lambda line: print(line, flush=True))
-    return 0
 
 
 def served_robots(names: Sequence[str]) -> "dict[str, Robot]":

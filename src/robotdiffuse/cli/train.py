@@ -1,15 +1,28 @@
 """The commands `robotdiffuse train encoder`, `completion`, `planner`, `baseline` and `export`."""
 
-import argparse
 import os
 import shutil
 import sys
+from argparse import ArgumentParser
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robotdiffuse.cli.arguments import command, count, names, natural, option, options, positive, share
+from robotdiffuse.cli.arguments import (
+    Commands,
+    Namespace,
+    chosen,
+    command,
+    count,
+    group,
+    names,
+    natural,
+    option,
+    options,
+    positive,
+    share,
+)
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.learning import need_packages
@@ -31,16 +44,17 @@ MODEL_OPTIONS = (
 """Options of `train planner` that replace parts of its config."""
 
 
-def add(commands: argparse._SubParsersAction) -> None:
-    parser = command(
+def add(commands: Commands) -> None:
+    kinds = group(
         commands,
         "train",
         "train networks",
         "Train a network. Ctrl-C stops after writing a checkpoint; run the same command again to "
         "continue. To train with N processes, on a GPU each if there are enough: "
         "torchrun --nproc-per-node N -m robotdiffuse train ...",
+        "networks",
+        "NETWORK",
     )
-    kinds = parser.add_subparsers(title="networks", metavar="NETWORK", required=True)
 
     encoder = command(
         kinds,
@@ -48,9 +62,9 @@ def add(commands: argparse._SubParsersAction) -> None:
         "train an auto-encoder of point clouds",
         "Train an auto-encoder of point clouds on random scenes. The planner's training keeps it frozen.",
         run_encoder,
+        ("--encoder NAME", "encoder to train (default: point_autoencoder)", {"dest": "name"}),
+        ("--scenes NAME", "training scenes: mixed (default), or rop, those of the paper's data"),
     )
-    option(encoder, "--encoder NAME", "encoder to train (default: point_autoencoder)", dest="name")
-    option(encoder, "--scenes NAME", "training scenes: mixed (default), or rop, those of the paper's data")
     _add_shared(encoder)
     _add_device(encoder)
 
@@ -61,9 +75,6 @@ def add(commands: argparse._SubParsersAction) -> None:
         "Train the occupancy completion network, which predicts the obstacles that depth "
         "cameras do not see, on random scenes.",
         run_completion,
-    )
-    options(
-        completion,
         ("--families NAMES", "families of the scenes (default: all)", names),
         ("--robot NAME", "bundled name or URDF of the arm in the images"),
         ("--workers N", "processes that draw samples (default: 1)", natural),
@@ -80,19 +91,14 @@ def add(commands: argparse._SubParsersAction) -> None:
         "without --data, generate data for the arm, train on them, and install the weights where planners "
         "find them; this takes about two hours on two cores.",
         run_planner,
-    )
-    option(
-        planner, "--data FOLDER", "folder with shards of trajectories (default: generate them for --robot)"
-    )
-    option(
-        planner,
-        "--config NAME",
-        "compact (default), paper, points (no clearances as inputs), trajectory_prior (for MPD and "
-        "EDMP), or a row of the paper's Table 2: table2_jpc, table2_unet, ...",
-        default="compact",
-    )
-    options(
-        planner,
+        ("--data FOLDER", "folder with shards of trajectories (default: generate them for --robot)"),
+        (
+            "--config NAME",
+            "compact (default), paper, points (no clearances as inputs), trajectory_prior (for MPD and "
+            "EDMP), or a row of the paper's Table 2: table2_jpc, table2_unet, ...",
+            None,
+            "compact",
+        ),
         (
             "--encoder FOLDER",
             "folder of a trained encoder; pointnet or dgcnn, which are trained with the planner; or points, "
@@ -125,27 +131,24 @@ def add(commands: argparse._SubParsersAction) -> None:
         "train the network of a learned baseline: mpnet, mpinets, trajectory_prior",
         "Train the network of a learned baseline on planned trajectories.",
         run_baseline,
-    )
-    options(
-        baseline,
         ("name NAME", "mpnet, mpinets or trajectory_prior (for MPD and EDMP)"),
         ("--data FOLDER !", "data set of `data generate`"),
         ("--robot NAME", "bundled name or URDF of the data's robot"),
     )
     _add_shared(baseline)
 
-    export = command(
+    command(
         kinds,
         "export",
         "write the ONNX files of trained weights anew",
         "Write the ONNX files that planning runs, from trained weights. Training writes them "
         "too; weights of earlier versions lack them.",
         run_export,
+        ("folder FOLDER", "folder with weights"),
     )
-    option(export, "folder FOLDER", "folder with weights")
 
 
-def _add_shared(parser: argparse.ArgumentParser, out_required: bool = True) -> None:
+def _add_shared(parser: ArgumentParser, out_required: bool = True) -> None:
     default = "" if out_required else "; without --data also for the data (default: beside the user's robots)"
     parser.add_argument(
         "--out",
@@ -169,42 +172,34 @@ def _add_shared(parser: argparse.ArgumentParser, out_required: bool = True) -> N
     )
 
 
-def _add_device(parser: argparse.ArgumentParser) -> None:
+def _add_device(parser: ArgumentParser) -> None:
     option(parser, "--device NAME", "cpu or cuda (default: cuda if there is one)")
 
 
-def _given(arguments: argparse.Namespace, names: tuple[str, ...]) -> dict[str, object]:
-    """The options that were given; the others keep the defaults of the settings."""
-    options: dict[str, object] = {name: getattr(arguments, name) for name in names}
-    return {name: value for name, value in options.items() if value is not None}
-
-
-def run_encoder(arguments: argparse.Namespace) -> int:
+def run_encoder(arguments: Namespace) -> None:
     need_packages("training", "torch")
     from robotdiffuse.learning.training.config import EncoderTraining
     from robotdiffuse.learning.training.tasks import train_encoder
 
-    options = _given(arguments, ("name", "scenes", "device", *TRAINING_OPTIONS))
+    options = chosen(arguments, ("name", "scenes", "device", *TRAINING_OPTIONS))
     if "samples" in options:
         options["minutes"] = None
-    settings = EncoderTraining(**options)  # type: ignore[arg-type]
+    settings = EncoderTraining(**options)
     _print_report(train_encoder(settings, arguments.out), arguments.out)
-    return 0
 
 
-def run_completion(arguments: argparse.Namespace) -> int:
+def run_completion(arguments: Namespace) -> None:
     need_packages("training", "torch")
     from robotdiffuse.learning.training.completion import CompletionTraining, train_completion
 
-    options = _given(arguments, ("families", "robot", "workers", "weights", "device", *TRAINING_OPTIONS))
+    options = chosen(arguments, ("families", "robot", "workers", "weights", "device", *TRAINING_OPTIONS))
     if "minutes" in options:
         options["samples"] = None
-    settings = CompletionTraining(**options)  # type: ignore[arg-type]
+    settings = CompletionTraining(**options)
     _print_report(train_completion(settings, arguments.out), arguments.out)
-    return 0
 
 
-def run_planner(arguments: argparse.Namespace) -> int:
+def run_planner(arguments: Namespace) -> int:
     need_packages("training", "torch")
     from robotdiffuse.learning.denoisers import DENOISERS
     from robotdiffuse.learning.training.config import CONFIGS, planner_training
@@ -213,7 +208,7 @@ def run_planner(arguments: argparse.Namespace) -> int:
     if arguments.config not in CONFIGS:
         descriptions = [f"{name}: {config.description}" for name, config in CONFIGS.items()]
         raise InputError(f"unknown config {shown(arguments.config)}; known:", descriptions)
-    options = _given(arguments, ("data", "encoder", "robot", "device", *TRAINING_OPTIONS, *MODEL_OPTIONS))
+    options = chosen(arguments, ("data", "encoder", "robot", "device", *TRAINING_OPTIONS, *MODEL_OPTIONS))
     config = CONFIGS[arguments.config].changes
     if "denoiser" in options and config.get("denoiser_settings") is not None:
         # the config's settings are for its own denoiser; another one gets settings of the same size
@@ -245,7 +240,7 @@ def run_planner(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _run_for_robot(arguments: argparse.Namespace, given: dict[str, Any]) -> int:
+def _run_for_robot(arguments: Namespace, given: dict[str, Any]) -> int:
     from robotdiffuse.learning.training.config import planner_training
 
     if arguments.robot is None:
@@ -262,26 +257,24 @@ def _run_for_robot(arguments: argparse.Namespace, given: dict[str, Any]) -> int:
     return 0
 
 
-def run_baseline(arguments: argparse.Namespace) -> int:
+def run_baseline(arguments: Namespace) -> None:
     need_packages("training", "torch")
     from robotdiffuse.learning.training.config import planner_training
     from robotdiffuse.learning.training.tasks import baseline_training, train_baseline, train_planner
 
-    options = _given(arguments, ("data", "robot", *TRAINING_OPTIONS))
+    options = chosen(arguments, ("data", "robot", *TRAINING_OPTIONS))
     if arguments.name == "trajectory_prior":
         report = train_planner(planner_training(arguments.name, options), arguments.out)
     else:
         report = train_baseline(baseline_training(arguments.name, options), arguments.out)
     _print_report(report, arguments.out)
-    return 0
 
 
-def run_export(arguments: argparse.Namespace) -> int:
+def run_export(arguments: Namespace) -> None:
     need_packages("the export", "torch")
     from robotdiffuse.learning.checkpoint import export_weights
 
     print(f"wrote the ONNX files of {', '.join(export_weights(arguments.folder))} into {arguments.folder}")
-    return 0
 
 
 def _print_report(figures: dict[str, float], out: str) -> None:

@@ -1,11 +1,18 @@
 """The commands `robotdiffuse verify` and `certificate check`."""
 
-import argparse
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import IGNORE_JOINTS, command, natural, option, options
+from robotdiffuse.cli.arguments import (
+    IGNORE_JOINTS,
+    Commands,
+    Namespace,
+    command,
+    group,
+    natural,
+    options,
+)
 from robotdiffuse.cli.console import clearances
 from robotdiffuse.core.errors import InputError
 
@@ -18,7 +25,7 @@ VALID = 0
 NOT_VALID = 1
 
 
-def add_verify(commands: argparse._SubParsersAction) -> None:
+def add_verify(commands: Commands) -> None:
     parser = command(
         commands,
         "verify",
@@ -27,8 +34,8 @@ def add_verify(commands: argparse._SubParsersAction) -> None:
         "JointTrajectory or MoveIt RobotTrajectory, a ROS 2 bag or MCAP. Exit status: 0 valid, 1 not valid, "
         "2 bad input.",
         run_verify,
+        ("motion MOTION", "file (.json, .csv, .yaml, .mcap), or the folder of a ROS 2 bag"),
     )
-    option(parser, "motion MOTION", "file (.json, .csv, .yaml, .mcap), or the folder of a ROS 2 bag")
     group = parser.add_mutually_exclusive_group()
     options(
         group,
@@ -53,7 +60,7 @@ def add_verify(commands: argparse._SubParsersAction) -> None:
     )
 
 
-def run_verify(arguments: argparse.Namespace) -> int:
+def run_verify(arguments: Namespace) -> int:
     from robotdiffuse.core.output_files import check_output
     from robotdiffuse.scenes.scene import contact_notes
 
@@ -113,7 +120,7 @@ def _stored_problem(file: str) -> "Problem":
 
 
 def _read(
-    arguments: argparse.Namespace,
+    arguments: Namespace,
 ) -> "tuple[Problem, dict[str, types.Path | types.Trajectory], tuple[str, ...]]":
     """The problem, the motions to validate by name, and notes on changes made to read them."""
     from robotdiffuse.core.types import Trajectory
@@ -157,27 +164,23 @@ MAX_CHANGES = 4
 """Differences from the bundled robot in a line at most."""
 
 
-def add_certificate(commands: argparse._SubParsersAction) -> None:
-    parser = command(
+def add_certificate(commands: Commands) -> None:
+    actions = group(
         commands, "certificate", "re-check a certificate of a motion", "Re-check the certificate of a motion."
     )
-    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
-    check = command(
+    command(
         actions,
         "check",
         "re-check a certificate, without search",
         "Re-check a certificate with code that shares nothing with the validator. Exit status: "
         "0 if it holds, 1 if not, 2 for bad input.",
         run_check,
-    )
-    options(
-        check,
         ("file FILE", "certificate of `robotdiffuse verify --certificate`"),
         ("--problem FILE", "problem file to check it for (default: the problem in the certificate)"),
     )
 
 
-def run_check(arguments: argparse.Namespace) -> int:
+def run_check(arguments: Namespace) -> int:
     from robotdiffuse.certificates.certificate import load_certificate
     from robotdiffuse.certificates.requirements import not_checked
     from robotdiffuse.cli.console import clearances

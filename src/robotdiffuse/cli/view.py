@@ -1,6 +1,5 @@
 """The commands `robotdiffuse view` and `simulate`; results as replays (.html) and pictures (.png)."""
 
-import argparse
 import os
 import sys
 from collections.abc import Mapping
@@ -9,7 +8,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import NO_PLAN, SOLVED, command, not_negative, option, options
+from robotdiffuse.cli.arguments import (
+    NO_PLAN,
+    SOLVED,
+    Commands,
+    Namespace,
+    command,
+    not_negative,
+)
 from robotdiffuse.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -97,8 +103,8 @@ def show(file: Path) -> None:
         webbrowser.open(file.resolve().as_uri())
 
 
-def add_view(commands: argparse._SubParsersAction) -> None:
-    parser = command(
+def add_view(commands: Commands) -> None:
+    command(
         commands,
         "view",
         "draw results and problems as a replay (.html) or a picture (.png)",
@@ -106,16 +112,12 @@ def add_view(commands: argparse._SubParsersAction) -> None:
         "result without a motion, the start, the goal and the links that collide. Without --out, write a "
         "page and open it in the browser.",
         run_view,
-    )
-    option(
-        parser,
-        "results RESULT",
-        "result file (.json) of `robotdiffuse plan --out`, or a problem file; several results must be "
-        "of one problem",
-        nargs="+",
-    )
-    options(
-        parser,
+        (
+            "results RESULT",
+            "result file (.json) of `robotdiffuse plan --out`, or a problem file; several results must be "
+            "of one problem",
+            {"nargs": "+"},
+        ),
         (
             "--out FILE *",
             "replay (.html) or picture (.png); repeatable (default: the name of RESULT with .html)",
@@ -168,7 +170,7 @@ def _read(file: str) -> "tuple[PlanResult | None, Problem]":
     return read_result(file)
 
 
-def run_view(arguments: argparse.Namespace) -> int:
+def run_view(arguments: Namespace) -> None:
     from robotdiffuse.core.output_files import check_output
 
     files = arguments.out or [f"{Path(arguments.results[0]).stem}.html"]
@@ -184,7 +186,6 @@ def run_view(arguments: argparse.Namespace) -> int:
         print(f"wrote {file}")
     if not arguments.out:
         show(outputs[0])
-    return 0
 
 
 def _read_several(files: list[str]) -> "tuple[Problem, dict[str, PlanResult]]":
@@ -205,23 +206,20 @@ def _read_several(files: list[str]) -> "tuple[Problem, dict[str, PlanResult]]":
     return problem, dict(zip(names, (result, *(one for one, _ in further_results)), strict=True))
 
 
-def add_simulate(commands: argparse._SubParsersAction) -> None:
-    parser = command(
+def add_simulate(commands: Commands) -> None:
+    command(
         commands,
         "simulate",
         "replay a result in the PyBullet simulator",
         "Replay the motion of a result file in PyBullet with position control, and print "
         "tracking errors and contacts. Exit status: 0 no contacts, 1 contacts, 2 bad input.",
         run_simulate,
-    )
-    options(
-        parser,
         ("result RESULT", "result file (.json) of `robotdiffuse plan --out`"),
         ("--out FILE *", "replay (.html) or picture (.png) of the simulated motion; repeatable"),
     )
 
 
-def run_simulate(arguments: argparse.Namespace) -> int:
+def run_simulate(arguments: Namespace) -> int:
     import numpy as np
 
     from robotdiffuse.core.output_files import check_output
