@@ -3,14 +3,14 @@
 import asyncio
 import secrets
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from html import escape
 from importlib.util import find_spec
 from ipaddress import ip_address
 from math import ceil
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
 
 from fastapi import FastAPI, Header, Request, Response
@@ -19,7 +19,7 @@ from fastapi.openapi.docs import get_swagger_ui_html
 from fastapi.responses import HTMLResponse, JSONResponse, PlainTextResponse
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CONTENT_TYPE_LATEST
-from pydantic import BaseModel
+from pydantic import BaseModel, ConfigDict, Field
 from pydantic.json_schema import models_json_schema
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
@@ -27,33 +27,174 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import shown
+from robotdiffuse.core.types import CONVERGED, MAX_SAMPLE_RATE, TIME, Status
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.server.answers import (
-    CLIENT_GONE,
-    LINES,
-    StreamedResponse,
-    answer_of,
-    plan_tasks,
-    send_lines,
-    wait_for_disconnect,
-)
 from robotdiffuse.server.connection import REFUSED, log_access
-from robotdiffuse.server.schemas import (
-    Cancelled,
-    Error,
-    Health,
-    JointInfo,
-    PlanAnswer,
-    PlannerInfo,
-    PlanRequest,
-    RobotInfo,
-    VerifyAnswer,
-    VerifyRequest,
-)
 from robotdiffuse.server.settings import MAX_ARRIVING, ServeSettings
 from robotdiffuse.server.worker import PLAN, VERIFY, Answer, failed
 from robotdiffuse.server.worker_pool import QueueFullError, WorkerPool
+
+PROBLEM: dict[str, Any] = {
+    "robot": "panda",
+    "scene": [{"box": {"center": [0.45, 0.0, 0.3], "size": [0.3, 0.05, 0.6], "name": "wall"}}],
+    "start": [0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785],
+    "goal": {"joints": [-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785]},
+}
+WAYPOINTS = [PROBLEM["start"], PROBLEM["goal"]["joints"]]
+JOINT_NAMES = [f"panda_joint{i}" for i in range(1, 8)]
+VERIFY_EXAMPLE: Any = {"problem": PROBLEM, "path": {"joint_names": JOINT_NAMES, "positions": WAYPOINTS}}
+
+Rows = list[list[float]]
+Scaling = Annotated[float, Field(gt=0, le=1)]
+ProblemField = Annotated[dict[str, Any], Field(description="as in a problem file", examples=[PROBLEM])]
+
+
+class Error(BaseModel):
+    """Any error."""
+
+    error: str = Field(description="one line that says what is wrong")
+
+
+class _Request(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class PlanRequest(_Request):
+    """A problem, and the arguments of `plan`."""
+
+    problem: ProblemField
+    planner: str = Field(DEFAULT_PLANNER, description="a name of /planners")
+    time_limit: float = Field(1.0, gt=0, description="[s]")
+    seed: int = Field(0, ge=0)
+    until: Literal["first", "converged", "time_limit"] = CONVERGED
+    clearance: float | None = Field(None, ge=0, le=0.5, description="distance to keep where possible [m]")
+    velocity_scaling: Scaling = 1.0
+    acceleration_scaling: Scaling = 1.0
+    objective: Literal["length", "time"] = TIME
+    jerk: float | None = Field(
+        None, gt=0, description="largest jerk of any joint [rad/s³]; null: the robot's limits"
+    )
+    rate: float | None = Field(
+        None,
+        gt=0,
+        le=MAX_SAMPLE_RATE,
+        description="rows per second of the answer's motion, which is validated so [Hz]; null: its own rows",
+    )
+
+
+class PathMotion(_Request):
+    """Waypoints; radians, meters for prismatic joints."""
+
+    joint_names: list[str] = Field(examples=[JOINT_NAMES])
+    positions: Rows = Field(examples=[WAYPOINTS])
+
+
+class TrajectoryMotion(PathMotion):
+    """A timed motion; each array has a row for each time [s]."""
+
+    times: list[float]
+    velocities: Rows
+    accelerations: Rows
+
+
+class VerifyRequest(_Request):
+    """A problem, and a path, a trajectory or both."""
+
+    model_config = ConfigDict(json_schema_extra={"example": VERIFY_EXAMPLE})
+    problem: ProblemField
+    path: PathMotion | None = None
+    trajectory: TrajectoryMotion | None = None
+
+
+class PlanAnswer(BaseModel):
+    """A result, as in a result file of `robotdiffuse plan --out`."""
+
+    model_config = ConfigDict(extra="allow")
+    status: Status
+    reason: str
+    verified: bool
+    goal_index: int | None
+    joint_names: list[str]
+    waypoints: Rows | None
+    times: list[float]
+    positions: Rows
+    velocities: Rows
+    accelerations: Rows
+
+
+class Violation(BaseModel):
+    """The first thing that is wrong with a motion."""
+
+    model_config = ConfigDict(extra="allow")
+    kind: str
+    message: str
+    time: float
+
+
+class MotionReport(BaseModel):
+    """The validator's report on one motion; clearances are lower bounds [m]."""
+
+    valid: bool
+    min_clearance: float | None
+    scene_clearance: float | None
+    self_clearance: float | None
+    violation: Violation | None
+
+
+class VerifyAnswer(BaseModel):
+    """The validator's report on each motion of the request."""
+
+    valid: bool
+    path: MotionReport | None = None
+    trajectory: MotionReport | None = None
+
+
+class JointInfo(BaseModel):
+    """A planned joint: limits in rad, m, rad/s and so on; null for the limits of a continuous joint."""
+
+    name: str
+    kind: str
+    lower: float | None
+    upper: float | None
+    velocity: float
+    acceleration: float
+
+
+class RobotInfo(BaseModel):
+    """A robot that problems may name."""
+
+    name: str
+    base: str
+    tip: str
+    joints: list[JointInfo]
+    links: list[str]
+
+
+class PlannerInfo(BaseModel):
+    """A planner that requests may name."""
+
+    name: str
+    kind: str
+    description: str
+    default: bool
+
+
+class Health(BaseModel):
+    """State of the server."""
+
+    status: Literal["starting", "ok", "stopping"]
+    workers: int
+    workers_ready: int
+    workers_busy: int
+    requests_waiting: int
+
+
+class Cancelled(BaseModel):
+    """The request that was cancelled."""
+
+    cancelled: str = Field(description="its X-Request-ID")
+
 
 ABOUT = (
     "Motion planning for redundant robot arms; every motion in an answer passed the validator.\n\n"
@@ -448,3 +589,65 @@ def _http_error(request: Request, error: Exception) -> Response:
     if error.status_code == 404:
         return _error(404, f"there is no {shown(request.url.path)}; see /docs")
     return _error(error.status_code, str(error.detail), **(error.headers or {}))
+
+
+LINES = "application/x-ndjson"
+CLIENT_GONE = 499
+"""Status code of a request whose client closed the connection; nobody reads it."""
+
+
+async def wait_for_disconnect(request: Request) -> None:
+    """Returns when the client has closed the connection."""
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
+
+
+async def answer_of(task: asyncio.Task[Answer], disconnected: asyncio.Future[None]) -> Answer:
+    """The answer of the task, or an error if it is cancelled or the client disconnects first."""
+    try:
+        await asyncio.wait({task, disconnected}, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        disconnected.cancel()
+    if not task.done():
+        return failed(CLIENT_GONE, "the client closed the connection")
+    return failed(409, "the request was cancelled") if task.cancelled() else task.result()
+
+
+def plan_tasks(pool: WorkerPool, lines: list[bytes], at_once: int) -> list[asyncio.Task[Answer]]:
+    """A task for each line; at most `at_once` of them are in the pool at a time."""
+    limit = asyncio.Semaphore(at_once)
+
+    async def one(line: bytes) -> Answer:
+        async with limit:
+            return await pool.run(PLAN, line)
+
+    return [asyncio.ensure_future(one(line)) for line in lines]
+
+
+async def send_lines(
+    send: Send, tasks: list[asyncio.Task[Answer]], disconnected: asyncio.Future[None]
+) -> None:
+    """Send the answers in the order of the tasks."""
+    try:
+        headers = [(b"content-type", LINES.encode())]
+        await send({"type": "http.response.start", "status": 200, "headers": headers})
+        for task in tasks:
+            await asyncio.wait({task, disconnected}, return_when=asyncio.FIRST_COMPLETED)
+            if disconnected.done():
+                return
+            answer = failed(409, "the request was cancelled") if task.cancelled() else task.result()
+            await send({"type": "http.response.body", "body": answer.body, "more_body": True})
+        await send({"type": "http.response.body", "body": b""})
+    finally:
+        disconnected.cancel()
+
+
+class StreamedResponse(Response):
+    """A response that `write` sends piece by piece; errors before the first piece still get a status code."""
+
+    def __init__(self, write: Callable[[Send], Awaitable[None]]) -> None:
+        self.write = write
+        self.background = None
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        await self.write(send)

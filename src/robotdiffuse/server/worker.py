@@ -7,9 +7,9 @@ import signal
 import sys
 import time
 import traceback
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from functools import lru_cache
-from pathlib import Path
+from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
 import orjson
@@ -19,7 +19,7 @@ from robotdiffuse.core.deadline import cancel_check, check_cancelled
 from robotdiffuse.core.errors import InputError, shortened, shown
 from robotdiffuse.core.input_files import MEGABYTE, parse_json
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Trajectory, check_sample_rate
+from robotdiffuse.core.types import RATES, Path, Trajectory, check_motion_arrays, check_sample_rate
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, load_planner
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.planner import Planner
@@ -30,12 +30,12 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.files import check_fields
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
-from robotdiffuse.server.motions import MOTIONS, read_motion, report_record
 from robotdiffuse.server.settings import (
     COMPILE_TIMEOUT,
     GRACE_TIME,
     MAX_ANSWER_ROWS,
     MAX_ENTRIES,
+    MAX_ROWS,
     MAX_SEED,
     WARM_UP_TIMEOUT,
     ServeSettings,
@@ -148,7 +148,7 @@ def _raise_if_cancelled() -> None:
 def _memory() -> int:
     """Memory of this process [bytes]; 0 if the system does not report it."""
     try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        pages = int(FilePath("/proc/self/statm").read_text().split()[1])
     except OSError:
         return 0
     return pages * os.sysconf("SC_PAGE_SIZE")
@@ -265,3 +265,33 @@ def answer_verify(state: _State, body: bytes) -> Answer:
 
 def _answer(record: dict[str, Any], status: str) -> Answer:
     return Answer(200, orjson.dumps(record, option=orjson.OPT_APPEND_NEWLINE), status)
+
+
+MOTIONS = ("path", "trajectory")
+
+
+def read_motion(name: str, data: object) -> Path | Trajectory:
+    """The motion in a request: `name` is path (joint_names, positions) or trajectory (also times, velocities
+    and accelerations).
+
+    Raises InputError, naming the field, for anything else. The validator checks that times increase.
+    """
+    fields = ("positions", "times", *RATES) if name == "trajectory" else ("positions",)
+    values = check_fields(name, data, ("joint_names", *fields))
+    rows = values["positions"]
+    if isinstance(rows, list) and len(rows) > MAX_ROWS:
+        raise InputError(f"{name}.positions has {len(rows)} rows; a request may have {MAX_ROWS}")
+    arrays = {field: values[field] for field in fields}
+    names, checked = check_motion_arrays(values["joint_names"], arrays, f"{name}.")
+    return Trajectory(names, **checked) if name == "trajectory" else Path(names, **checked)
+
+
+def report_record(report: Report) -> dict[str, Any]:
+    """A validation report as JSON values."""
+    return {
+        "valid": report.valid,
+        "min_clearance": report.min_clearance,
+        "scene_clearance": report.scene_clearance,
+        "self_clearance": report.self_clearance,
+        "violation": None if report.violation is None else asdict(report.violation),
+    }
