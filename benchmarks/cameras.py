@@ -87,7 +87,7 @@ METHODS = {
     HYBRID: PREDICTED,
 }
 TRUE = "true voxels"
-"""As `predicted`, with the voxels of 2 cm that obstacles fill in truth."""
+"""As `predicted`, with the voxels of 2 cm that obstacles fill in the true scene."""
 BY = "predicted by "
 """As `predicted`, with the weights of the folder of this name."""
 # Of the network.
@@ -205,7 +205,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def table(rows: list[Row], title: str) -> None:
-    """Print the methods on the same problems: free in truth, plans, first assumption, times, each family."""
+    """Print the methods on the same problems: free in the true scene, plans, assumption, times, families."""
     families = list(dict.fromkeys(row["family"] for row in rows))
     lines = []
     others = dict.fromkeys(row["method"] for row in rows if row["method"].startswith(BY))
@@ -231,7 +231,7 @@ def table(rows: list[Row], title: str) -> None:
                 *(f"{100 * share:.0f}" for share in shares),
             )
         )
-    columns = ["%", "problems", "free in truth", "plans", "of them free"]
+    columns = ["%", "problems", "free in the true scene", "plans", "of them free"]
     columns += ["first assumption", "of it free", "ms", *(Path(family).name for family in families)]
     print_table(title, columns, lines)
     base = {name: _free(rows, name) for name in [*METHODS, *others, TRUE]}
@@ -366,7 +366,7 @@ def _plan_on(problem: Problem, *seen: DepthView) -> tuple[Problem, PlanResult]:
 
 
 def report_next_view(rows: list[Row]) -> None:
-    """Print the shares free in truth, of all motions and of those that one view leaves unsure."""
+    """Print the shares free in the true scene, of all motions and of those that one view leaves unsure."""
     rows = [row for row in rows if SECOND_VIEWS[0] in row]
     unsure = [row for row in rows if row["confidence"] < UNSURE]
     for title, some in (("All", rows), (f"Stated confidence of one view below {UNSURE}", unsure)):
@@ -378,7 +378,7 @@ def report_next_view(rows: list[Row]) -> None:
 
         lines = [("one view", len(some), share("one"), share("confidence"))]
         lines += [(name, len(some), share(name), share(f"{name} confidence")) for name in SECOND_VIEWS]
-        print_table(title, ["second view", "problems", "free in truth, %", "stated, %"], lines)
+        print_table(title, ["second view", "problems", "free in the true scene, %", "stated, %"], lines)
         proposed = np.array([1.0 if row[SECOND_VIEWS[0]] else np.nan for row in some])
         for other in SECOND_VIEWS[1:]:
             pair = compare(proposed, np.array([1.0 if row[other] else np.nan for row in some]))

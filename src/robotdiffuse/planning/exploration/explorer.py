@@ -73,7 +73,8 @@ QUICK_FRACTION = 0.2
 """Part of the time limit for a search that a look, or another search, may follow. Within space seen free it
 doubles with each look: the more was seen, the less likely a search fails for lack of it."""
 TENTATIVE_MOTIONS = 2
-"""Motions among what was seen, of which looks are made for the one that sweeps the least unseen."""
+"""Number of tentative motions among seen obstacles; views are planned for the one that sweeps the least
+unseen space."""
 AT_GOAL = 1e-3
 """Largest distance of any joint to a goal that the arm is at [rad], [m] for prismatic joints."""
 ARRIVED = VerifySettings(goal_tolerance=AT_GOAL)
@@ -113,7 +114,7 @@ class Explorer:
         self._goal: Goal | None = None
         self._looks = 0
         self._looked_for = np.zeros(MAP.shape, np.bool_)
-        """The voxels that looks were to show."""
+        """The voxels that views were to show."""
         self._way_in: Configurations | None = None
         """Waypoints of the latest motion that was returned."""
         self._news: list[DepthView] = []
@@ -365,10 +366,11 @@ class Explorer:
         return PlanningContext(self._planner.name, problem, PlanRequest(limit, seed, FIRST))
 
     def _least_unseen(self, as_seen: Problem) -> tuple[PlanResult, Voxels]:
-        """A motion among what was seen, and what looks are to show of it: the least of several. Without any,
-        the result that says why.
+        """A motion among seen obstacles, and the unseen space on it that views are to show.
 
-        They avoid occupied voxels, and those that looks were made for in vain, if they can."""
+        Of several motions, the one with the least unseen space; without any, a failed result. Motions avoid
+        occupied voxels, and those that views failed to show, if they can.
+        """
         goals = as_seen.goal.positions if isinstance(as_seen.goal, JointGoal) else ()
         ends = near_ends(self.map, (as_seen.start, *goals))
         in_vain = self._looked_for & self.map.unknown
@@ -462,7 +464,7 @@ class Explorer:
         """The goal configurations, or the result that says why there is none."""
         if isinstance(problem.goal, JointGoal):
             return problem.goal.positions
-        seed = 0 if self.settings.see_goal else self._seed  # looks are made for the same ones again
+        seed = 0 if self.settings.see_goal else self._seed  # views are planned for the same ones again
         usable = usable_start_goal(self._context(problem, self.settings.time_limit, seed))
         return usable if isinstance(usable, PlanResult) else np.stack(usable.goals)
 

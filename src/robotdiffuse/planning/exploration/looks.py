@@ -102,7 +102,7 @@ REFINEMENTS = (0.25, 0.1)
 REFINED = 12
 NEIGHBORS = 15
 MAX_VOXELS = 1500
-"""Most swept voxels from which looks are scored."""
+"""Maximum number of swept voxels by which views are scored."""
 FULL_COST_LENGTH = 8.0
 """A look this far away counts half [rad, joint-space L2]."""
 UNSEEN_WEIGHT = 0.05

@@ -155,7 +155,7 @@ class GoalSeen:
         return balls[~within]
 
     def wanted(self, path: Path) -> Voxels:
-        """The voxels that looks are to show of the surface where a path ends."""
+        """The voxels that views are to show of the surface where a path ends."""
         out = np.zeros(MAP.shape, np.bool_)
         if self._required:
             at = MAP.indices(self.unseen(path.positions[0], path.positions[-1]))

@@ -72,15 +72,15 @@ class ExplorerSettings(Settings, name="explorer"):
     time_limit: Positive = 1.0
     """Time limit of each search [s]."""
     max_looks: Natural = 8
-    """Most looks on the way to a goal."""
+    """Maximum number of views on the way to a goal."""
     look_attempts: Count = 4
-    """Looks to which a motion is searched for in a step, the most useful first."""
+    """Viewpoints to which a step searches a motion, the most useful first."""
     predict: bool = True
     """Whether the occupancy completion network weighs views and gives confidences; it does so where it covers
     the arm's reach."""
     see_goal: bool = False
     """Whether all of the arm's surface at the goal must have been seen free before it goes there; for policy
-    strict. It takes more looks, and fails where something is nearer to the goal than about 1 cm."""
+    strict. It takes more views, and fails where something is nearer to the goal than about 1 cm."""
     max_age: Positive | None = None
     """What was seen longer ago than this is forgotten [s]; None: never."""
 
