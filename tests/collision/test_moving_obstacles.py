@@ -146,7 +146,7 @@ STANDS = transform(BALL.center)
             {"times": [0.0, 1.0], "poses": [transform(BALL.center + 1)] * 2},
             r"sphere.poses\[0\] is at .*; it must be the pose of the shape",
         ),
-        ({"times": [0.0, 1.0], "poses": [STANDS, 2 * STANDS]}, r"sphere.poses\[1\] is not a rigid transform"),
+        ({"times": [0.0, 1.0], "poses": [STANDS, 2 * STANDS]}, r"sphere.poses\[1\] is .*must be a rotation"),
     ],
 )
 def test_motions_that_are_none(motion: dict, message: str) -> None:

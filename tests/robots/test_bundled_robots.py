@@ -11,8 +11,8 @@ from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.problem import PoseGoal, Problem
 from robotdiffuse.robots import DATA, ROBOTS, load_robot
-from robotdiffuse.robots.fitting.sphere_fitting import stacked_planes
-from robotdiffuse.robots.fitting.sphere_fitting_kernel import gaps, within
+from robotdiffuse.robots.fitting.sphere_fitting import is_inside, stacked_planes
+from robotdiffuse.robots.fitting.sphere_fitting_kernel import gaps
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot_folder import read_source
 from robotdiffuse.scenes.scene import Scene
@@ -29,7 +29,7 @@ def test_no_sampled_point_of_the_meshes_is_outside_the_spheres(name: str) -> Non
             points = np.asarray(trimesh.sample.sample_surface(mesh, 200, seed=0)[0])
             others = parts[:k] + parts[k + 1 :]
             if others:  # points inside another part are not on the surface
-                points = points[~within(points, *stacked_planes(others), 1e-9)]
+                points = points[~is_inside(points, stacked_planes(others), 1e-9)]
             assert (gaps(points, robot.spheres[link].copy()) <= 0).all(), link
 
 

@@ -173,8 +173,6 @@ def test_bad_input() -> None:
         inverse_kinematics(robot, "panda_hand", 2 * T, rng=rng)
     with pytest.raises(InputError, match="max_rounds is 0"):
         InverseKinematicsSettings(max_rounds=0)
-    with pytest.raises(InputError, match="position_tolerance is 0"):
-        InverseKinematicsSettings(position_tolerance=0.0)
 
 
 def test_the_seed_nearby_gives_a_solution_nearby() -> None:

@@ -196,7 +196,7 @@ def unit_quaternion(owner: str, value: object, name: str = "wxyz") -> ndarray:
     return wxyz if abs(norm - 1) < 1e-15 else wxyz / norm
 
 
-def rigid_transform(what: str, value: object) -> ndarray:
+def rigid_transform(what: str, value: object, slack: float = RIGID_SLACK) -> ndarray:
     """The value as a 4 x 4 pose. Raises InputError, naming `what`, for anything else."""
     T = numbers(value)
     if T is None or T.shape != (4, 4) or not within(T):
@@ -205,7 +205,7 @@ def rigid_transform(what: str, value: object) -> ndarray:
         )
     rotation = T[:3, :3]
     off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(T[3] - LAST_ROW).max())
-    if off > RIGID_SLACK or np.linalg.det(rotation) < 0:
+    if off > slack or np.linalg.det(rotation) < 0:
         raise InputError(f"{what} is {shown(T)}; it must be a rotation and a translation over a row 0 0 0 1")
     T[3] = LAST_ROW
     return T

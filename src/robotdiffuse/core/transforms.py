@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import unit_quaternion, vector
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Pose, Rotation, Vector
+from robotdiffuse.core.types import Points, Pose, Rotation, Vector
 
 IDENTITY = np.eye(4)
 
@@ -73,8 +73,8 @@ def rpy_from_rotation(rotation: Rotation) -> tuple[float, float, float]:
     return float(roll), float(pitch), float(np.arctan2(rotation[1, 0], rotation[0, 0]))
 
 
-def rotation_about(axis: Vector, angle: float) -> Rotation:
-    """Rotation by an angle [rad] about a unit axis (Rodrigues)."""
+def rotation_about(axis: Vector, angle: Any) -> Float[ndarray, "*n 3 3"]:
+    """Rotation by an angle [rad], or by angles [*n, 1, 1], about a unit axis (Rodrigues)."""
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
@@ -128,6 +128,11 @@ def pose_entry(T: Pose) -> dict[str, list[float]]:
 def inverse(T: Pose) -> Pose:
     """Inverse of a rigid transform."""
     return transform(-T[:3, :3].T @ T[:3, 3], T[:3, :3].T)
+
+
+def placed(T: Pose, points: Points) -> Points:
+    """Points of a frame in the frame in which its pose is T."""
+    return points @ T[:3, :3].T + T[:3, 3]
 
 
 def rotation_angle(rotation: Rotation) -> float:

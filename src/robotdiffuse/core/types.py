@@ -10,7 +10,7 @@ from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
@@ -36,6 +36,10 @@ Rotation = Float[ndarray, "3 3"]
 """A rotation matrix."""
 Pose = Float[ndarray, "4 4"]
 """A rigid transform."""
+Poses = Float[ndarray, "_ 4 4"]
+Spheres = Float[ndarray, "_ 4"]
+"""Centres and radii in rows [m]."""
+Mask = Bool[ndarray, "_"]
 if TYPE_CHECKING:  # fields of values, whose constructors take all that NumPy reads as arrays
 
     class _Given:
@@ -49,14 +53,18 @@ if TYPE_CHECKING:  # fields of values, whose constructors take all that NumPy re
     GivenVector = _Given
     GivenPose = _Given
     GivenConfigurations = _Given
+    GivenArray = _Given
     VectorOrNone = _GivenOrNone
     PoseOrNone = _GivenOrNone
+    ArrayOrNone = _GivenOrNone
 else:
     GivenVector = Vector
     GivenPose = Pose
     GivenConfigurations = Configurations
+    GivenArray = ndarray
     VectorOrNone = Vector | None
     PoseOrNone = Pose | None
+    ArrayOrNone = ndarray | None
 ROWS = ("positions", "velocities", "accelerations")
 """Arrays of a trajectory with a row for each time."""
 REST = 1e-3

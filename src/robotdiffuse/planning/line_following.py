@@ -20,6 +20,8 @@ from robotdiffuse.problems.goals import JointGoal, PoseGoal
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.ik_kernel import IKParameters, follow
 from robotdiffuse.robots.inverse_kinematics import (
+    MAX_ITERATIONS,
+    ROTATION_WEIGHT,
     InverseKinematicsSettings,
     ik_chain,
     inverse_kinematics,
@@ -150,9 +152,7 @@ def _followed(
         lower=np.minimum(joints.lower, np.minimum(start, goal)[arm]),
         upper=np.maximum(joints.upper, np.maximum(start, goal)[arm]),
     )
-    parameters = IKParameters(
-        line.angle is None, ROUND.rotation_weight, *TOLERANCES, ROUND.max_iterations, 0.0
-    )
+    parameters = IKParameters(line.angle is None, ROTATION_WEIGHT, *TOLERANCES, MAX_ITERATIONS, 0.0)
     rows = follow(start[arm], goal[arm], steer, MAX_JOINT_STEP, targets, joints, parameters)
     q = start + np.linspace(0, 1, len(targets) + 1)[: len(rows), None] * (goal - start)
     q[:, arm] = rows

@@ -1,34 +1,31 @@
 """Bodies of links: convex meshes, surfaces, inertias, and what is attached to links."""
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, no_type_check, runtime_checkable
+from typing import Any, NamedTuple, Protocol, no_type_check, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import MAX_COORDINATE, Value, numbers, read_only, within
 from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.types import GivenVector, Points, Pose, Rotation, Vector
 
 TOOL = "tool"
 """Default name of a tool."""
 
 
 @dataclass(frozen=True, eq=False)
-class ConvexMesh(Value):
-    """A convex polyhedron in the frame of its link [m]."""
-
-    vertices: Float[ndarray, "v 3"]
-    faces: Int[ndarray, "f 3"]
-
-
-@dataclass(frozen=True, eq=False)
 class Surface(Value):
     """A triangle mesh in the frame of its link [m]; it may be open."""
 
-    vertices: Float[ndarray, "v 3"]
+    vertices: Points
     faces: Int[ndarray, "f 3"]
+
+
+class ConvexMesh(Surface):
+    """A convex polyhedron in the frame of its link [m]."""
 
 
 @runtime_checkable
@@ -38,7 +35,7 @@ class RigidShape(Protocol):
     @property
     def name(self) -> str: ...
 
-    def solid(self) -> tuple[Float[ndarray, "4 4"], tuple[ConvexMesh, ...]]:
+    def solid(self) -> tuple[Pose, tuple[ConvexMesh, ...]]:
         """The shape's pose in the frame in which it is given, and convex meshes in its own frame that contain
         it."""
         ...
@@ -51,7 +48,7 @@ class AttachedBody(Value):
     name: str
     link: str
     """Link to which the body is fixed."""
-    T_link_body: Float[ndarray, "4 4"]
+    T_link_body: Pose
     shapes: tuple[RigidShape, ...] = ()
     """Shapes, posed in the frame of `link`. Without any, the body is only a frame."""
     touch_links: tuple[str, ...] = ()
@@ -92,9 +89,9 @@ class Inertia(NamedTuple):
 
     mass: float
     """[kg]"""
-    com: Float[ndarray, "3"]
+    com: Vector
     """Centre of mass [m]."""
-    moments: Float[ndarray, "3 3"]
+    moments: Rotation
     """Inertia matrix about the centre of mass, along the frame's axes [kg m²]."""
 
     @property
@@ -128,11 +125,11 @@ class Payload(Value):
 
     mass: float
     """[kg]"""
-    com: Float[ndarray, "3"] = (0.0, 0.0, 0.0)  # pyright: ignore[reportAssignmentType]
+    com: GivenVector = (0.0, 0.0, 0.0)  # pyright: ignore[reportAssignmentType]
     """Centre of mass, in the frame of the link [m]."""
     link: str | None = None
     """Link that carries the mass; None: the robot's tip."""
-    moments: Float[ndarray, "3"] = (0.0, 0.0, 0.0)  # pyright: ignore[reportAssignmentType]
+    moments: GivenVector = (0.0, 0.0, 0.0)  # pyright: ignore[reportAssignmentType]
     """Moments of inertia about the centre of mass, along the frame's axes [kg m²]; 0 for a point mass."""
 
     def __post_init__(self) -> None:
@@ -157,13 +154,3 @@ class Payload(Value):
         if self.link is not None and not isinstance(self.link, str):
             raise InputError(f"payload.link is {shown(self.link)}; it must be the name of a link")
         super().__post_init__()
-
-    if TYPE_CHECKING:
-
-        def __init__(
-            self,
-            mass: float,
-            com: ArrayLike = (0.0, 0.0, 0.0),
-            link: str | None = None,
-            moments: ArrayLike = (0.0, 0.0, 0.0),
-        ) -> None: ...

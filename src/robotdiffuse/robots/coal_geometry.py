@@ -5,16 +5,18 @@
 
 import coal
 import numpy as np
-from jaxtyping import Float, Integer
+from jaxtyping import Integer
 from numpy import ndarray
 
+from robotdiffuse.core.types import Points, Pose
 
-def coal_pose(T: Float[ndarray, "4 4"]) -> coal.Transform3s:
+
+def coal_pose(T: Pose) -> coal.Transform3s:
     """A pose as a Coal transform."""
     return coal.Transform3s(T[:3, :3], T[:3, 3])
 
 
-def coal_convex(vertices: Float[ndarray, "v 3"], faces: Integer[ndarray, "f 3"]) -> coal.Convex:
+def coal_convex(vertices: Points, faces: Integer[ndarray, "f 3"]) -> coal.Convex:
     """A convex solid from the vertices and triangles of its hull."""
     points = coal.StdVec_Vec3s()
     triangles = coal.StdVec_Triangle()
@@ -25,7 +27,7 @@ def coal_convex(vertices: Float[ndarray, "v 3"], faces: Integer[ndarray, "f 3"])
     return coal.Convex(points, triangles)
 
 
-def coal_surface(vertices: Float[ndarray, "v 3"], faces: Integer[ndarray, "f 3"]) -> coal.BVHModelOBBRSS:
+def coal_surface(vertices: Points, faces: Integer[ndarray, "f 3"]) -> coal.BVHModelOBBRSS:
     """A triangle mesh, possibly open, in a bounding volume hierarchy."""
     model = coal.BVHModelOBBRSS()
     model.beginModel(len(faces), len(vertices))

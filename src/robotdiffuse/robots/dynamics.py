@@ -15,6 +15,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, distinct
+from robotdiffuse.core.types import Configuration, Configurations
 from robotdiffuse.robots.bodies import Inertia, Payload
 from robotdiffuse.robots.robot import Robot
 
@@ -26,7 +27,7 @@ motion."""
 class Stretches(NamedTuple):
     """Bounds for n stretches of a motion, on each of which the motion is smooth."""
 
-    q: Float[ndarray, "n dof"]
+    q: Configurations
     """Largest absolute joint positions."""
     v: Float[ndarray, "3 n dof"]
     """Largest absolute values of their first three derivatives."""
@@ -59,7 +60,7 @@ def product(a: Jet, b: Jet) -> Jet:
     return np.stack([a[0] * b[0], a[1] * b[0] + a[0] * b[1], a[2] * b[0] + 2 * a[1] * b[1] + a[0] * b[2]])
 
 
-def second_derivative_bounds(bodies: list[Body], gravity: float, along: Stretches) -> Float[ndarray, "n dof"]:
+def second_derivative_bounds(bodies: list[Body], gravity: float, along: Stretches) -> Configurations:
     """Upper bounds on the second derivatives of torques, by the parameter of the stretches."""
     still = np.zeros((3, len(along.q)))
     weight = still.copy()
@@ -169,25 +170,23 @@ class Dynamics:
             for j, T in enumerate(robot.frame_offsets)
         ]
 
-    def torques(
-        self, q: Float[ndarray, "n dof"], v: Float[ndarray, "n dof"], a: Float[ndarray, "n dof"]
-    ) -> Float[ndarray, "n dof"]:
+    def torques(self, q: Configurations, v: Configurations, a: Configurations) -> Configurations:
         """Joint torques at configurations with velocities and accelerations, row by row [N m] or [N]."""
         out = np.empty(q.shape)
         for i in range(len(q)):
             out[i] = self._rnea(self._model, self._data, q[i], v[i], a[i])
         return out
 
-    def second_derivatives(self, along: Stretches) -> Float[ndarray, "n dof"]:
+    def second_derivatives(self, along: Stretches) -> Configurations:
         """Bounds on the second derivatives of torques along stretches, by the parameter of the stretches."""
         return second_derivative_bounds(self._bodies, GRAVITY, along)
 
-    def holding_torques(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:
+    def holding_torques(self, q: Configurations) -> Configurations:
         """Torques at rest [N m] or [N]."""
         still = np.zeros_like(q)
         return self.torques(q, still, still)
 
-    def overload_message(self, q: Float[ndarray, "dof"]) -> str | None:
+    def overload_message(self, q: Configuration) -> str | None:
         """A message about the joint whose torque at rest exceeds its limit most; None if none does."""
         torques = np.abs(self.holding_torques(q[None])[0])
         j = int((torques / self.limits).argmax())

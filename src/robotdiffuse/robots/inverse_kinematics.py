@@ -4,70 +4,59 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import for_kernels, rigid_transform
 from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.settings import Count, Settings
+from robotdiffuse.core.types import Configuration, Configurations, Mask, Pose
 from robotdiffuse.robots.ik_kernel import CONTINUOUS, PRISMATIC, REVOLUTE, IKChain, IKParameters, solve_seeds
 from robotdiffuse.robots.kinematic_tree import KinematicTree
 
 KINDS = {"revolute": REVOLUTE, "prismatic": PRISMATIC, "continuous": CONTINUOUS}
 
 
+POSITION_TOLERANCE = 1e-6
+"""Largest position error of a solution [m]."""
+ROTATION_TOLERANCE = 1e-6
+"""Largest orientation error of a solution [rad]."""
+MIN_DISTANCE = 0.1
+"""Distinct solutions differ by more than this in at least one joint [rad or m]."""
+LIMIT_MARGIN = 1e-6
+"""Distance kept from the joint limits [rad or m]."""
+MAX_ITERATIONS = 60
+"""Damped Newton steps per seed."""
+ROTATION_WEIGHT = 0.3
+"""Weight of orientation errors against position errors [m/rad]."""
+
+
 @dataclass(frozen=True)
-class InverseKinematicsSettings:
-    """Tolerances and effort of `inverse_kinematics`."""
+class InverseKinematicsSettings(Settings, name="inverse kinematics"):
+    """Effort of `inverse_kinematics`."""
 
     position_only: bool = False
     """Ignore the orientation of the pose, as in the paper's ROP problems."""
-    position_tolerance: float = 1e-6
-    """Largest position error of a solution [m]."""
-    rotation_tolerance: float = 1e-6
-    """Largest orientation error of a solution [rad]."""
-    min_distance: float = 0.1
-    """Distinct solutions differ by more than this in at least one joint [rad or m]."""
-    limit_margin: float = 1e-6
-    """Distance kept from the joint limits [rad or m]."""
-    seeds_per_round: int = 64
+    seeds_per_round: Count = 64
     """Random start configurations drawn per round."""
-    max_rounds: int = 64
+    max_rounds: Count = 64
     """Rounds of seeds after which the search ends in any case."""
-    patience: int = 4
+    patience: Count = 4
     """Rounds without a new solution after which the search ends, if it has found one."""
-    max_iterations: int = 60
-    """Damped Newton steps per seed."""
-    rotation_weight: float = 0.3
-    """Weight of orientation errors against position errors [m/rad]."""
-
-    def __post_init__(self) -> None:
-        for name in ("position_tolerance", "rotation_tolerance", "rotation_weight"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"inverse kinematics: {name} is {getattr(self, name)}; it must be positive")
-        for name in ("seeds_per_round", "max_rounds", "patience", "max_iterations"):
-            if getattr(self, name) < 1:
-                raise InputError(
-                    f"inverse kinematics: {name} is {getattr(self, name)}; it must be at least 1"
-                )
-        for name in ("min_distance", "limit_margin"):
-            if not getattr(self, name) >= 0:
-                raise InputError(
-                    f"inverse kinematics: {name} is {getattr(self, name)}; it must not be negative"
-                )
 
 
 def inverse_kinematics(
     robot: KinematicTree,
     frame: str,
-    T_base_frame: Float[ndarray, "4 4"],
+    T_base_frame: Pose,
     count: int = 10,
     *,
     rng: np.random.Generator,
-    accept: Callable[[Float[ndarray, "n dof"]], Bool[ndarray, "n"]] | None = None,
+    accept: Callable[[Configurations], Mask] | None = None,
     settings: InverseKinematicsSettings | None = None,
-    near: Float[ndarray, "dof"] | None = None,
-    rest: Float[ndarray, "dof"] | None = None,
-) -> Float[ndarray, "k dof"]:
+    near: Configuration | None = None,
+    rest: Configuration | None = None,
+) -> Configurations:
     """Up to `count` distinct configurations that bring link `frame` to the pose, inside the joint limits.
 
     Damped Newton steps (Levenberg-Marquardt) start from uniformly random seeds. Steps are clipped to the
@@ -93,29 +82,27 @@ def inverse_kinematics(
             not a finite rigid transform.
     """
     settings = settings or InverseKinematicsSettings()
-    last = robot.link_frame(frame)
-    if last == 0:
+    if robot.link_frame(frame) == 0:
         raise InputError(f"inverse kinematics: no planned joint moves the link {shown(frame)}")
     if count < 1:
         raise InputError(f"inverse kinematics: count is {count}; it must be at least 1")
-    T_base_frame = rigid_transform("inverse kinematics: T_base_frame", T_base_frame)
-    lower = robot.lower + settings.limit_margin
-    upper = robot.upper - settings.limit_margin
-    tool = for_kernels(robot.T_frame_link(frame))
+    target = rigid_transform("inverse kinematics: T_base_frame", T_base_frame)
+    arm, chain = ik_chain(robot, frame, LIMIT_MARGIN)
     accepted = np.zeros((0, robot.dof))
-    chain = list(robot.chain(frame))
-    distance = np.linalg.norm(T_base_frame[:3, 3] - robot.frame_offsets[chain[0], :3, 3])
-    if distance > _longest_reach(robot, chain, tool):
+    joints = chain.length
+    travel = np.maximum(abs(chain.lower), abs(chain.upper))[chain.kinds == PRISMATIC].sum()
+    reach = np.linalg.norm(chain.offsets[1:joints, :3, 3], axis=1).sum() + np.linalg.norm(chain.tool[:3, 3])
+    if np.linalg.norm(target[:3, 3] - chain.offsets[0, :3, 3]) > reach + travel + POSITION_TOLERANCE:
         return accepted
-    target = np.array(T_base_frame, dtype=np.float64)
-    arm, joints = ik_chain(robot, frame, settings.limit_margin)
+    lower = robot.lower + LIMIT_MARGIN
+    upper = robot.upper - LIMIT_MARGIN
     parameters = IKParameters(
         settings.position_only,
-        float(settings.rotation_weight),
-        float(settings.position_tolerance),
-        float(settings.rotation_tolerance),
-        settings.max_iterations,
-        float(settings.min_distance),
+        ROTATION_WEIGHT,
+        POSITION_TOLERANCE,
+        ROTATION_TOLERANCE,
+        MAX_ITERATIONS,
+        MIN_DISTANCE,
     )
     stale_rounds = 0
     for i in range(settings.max_rounds):
@@ -126,7 +113,7 @@ def inverse_kinematics(
         before = len(accepted)
         while len(seeds) and len(accepted) < count:
             known = np.ascontiguousarray(accepted[:, arm])
-            new, used = solve_seeds(seeds, known, count - len(accepted), joints, target, parameters)
+            new, used = solve_seeds(seeds, known, count - len(accepted), chain, target, parameters)
             seeds = seeds[used:]
             if len(arm) < robot.dof:
                 new_arm = new
@@ -156,12 +143,12 @@ def ik_chain(robot: KinematicTree, frame: str, limit_margin: float) -> tuple[Int
 
 def random_seeds(
     robot: KinematicTree,
-    lower: Float[ndarray, "dof"],
-    upper: Float[ndarray, "dof"],
+    lower: Configuration,
+    upper: Configuration,
     count: int,
     rng: np.random.Generator,
-    near: Float[ndarray, "dof"] | None = None,
-) -> Float[ndarray, "n dof"]:
+    near: Configuration | None = None,
+) -> Configurations:
     """Uniformly random configurations; or, with `near`, random places on the way from there to such ones,
     with joints that turn within half a turn of it."""
     if near is None:
@@ -180,12 +167,3 @@ def beside(robot: KinematicTree, link: str) -> Bool[ndarray, "dof"]:
     before = robot.moved_by[frame]
     behind = robot.moved_by[1:, frame - 1] if frame else np.ones(robot.dof, bool)
     return ~(before | behind)
-
-
-def _longest_reach(robot: KinematicTree, chain: list[int], tool: Float[ndarray, "4 4"]) -> float:
-    """Upper bound on the distance of the tool from the first joint's origin over all configurations [m]."""
-    lengths = np.linalg.norm(robot.frame_offsets[chain[1:], :3, 3], axis=1).sum()
-    lengths += np.linalg.norm(tool[:3, 3])
-    slides = np.array(robot.prismatic, float)[chain]
-    travel = np.maximum(abs(robot.lower), abs(robot.upper))[chain] @ slides
-    return float(lengths + travel) + 1e-6

@@ -1,9 +1,9 @@
 """Joints and links of a robot, and what follows from them: limits, frames, chains."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, wraps
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -13,6 +13,7 @@ from robotdiffuse.core.bounds import Value, read_only
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.loading import loading
 from robotdiffuse.core.transforms import inverse, rotation_about, rotation_z_to, transform
+from robotdiffuse.core.types import Configuration, Configurations, JointValues, Pose, Spheres, Vector
 
 MOVING_KINDS = ("revolute", "continuous", "prismatic")
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
@@ -40,8 +41,8 @@ class Joint(Value):
     """revolute, continuous, prismatic or fixed."""
     parent: str
     child: str
-    T_parent_joint: Float[ndarray, "4 4"]
-    axis: Float[ndarray, "3"]
+    T_parent_joint: Pose
+    axis: Vector = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     """Unit axis in the joint frame."""
     lower: float = 0.0
     """[rad] or [m]; -`CONTINUOUS_LIMIT` for a continuous joint."""
@@ -55,20 +56,22 @@ class Joint(Value):
     effort: float = 0.0
     """Largest torque [N m] or force [N]; 0 if the URDF gives none."""
 
-    def motion(self, q: float) -> Float[ndarray, "4 4"]:
-        """T_joint_child at the joint value q [rad] or [m]."""
+    def motion(self, q: Any) -> Float[ndarray, "*n 4 4"]:
+        """T_joint_child at joint values q [*n] [rad] or [m]."""
+        values = np.asarray(q)[..., None, None]
+        T = np.zeros((*values.shape[:-2], 4, 4)) + np.eye(4)
         if self.kind == "prismatic":
-            return transform(self.axis * q)
-        if self.kind == "fixed":
-            return np.eye(4)
-        return transform(np.zeros(3), rotation_about(self.axis, q))
+            T[..., :3, 3] = self.axis * values[..., 0]
+        elif self.kind != "fixed":
+            T[..., :3, :3] = rotation_about(self.axis, values)
+        return T
 
 
-def with_mimics(joints: tuple[Joint, ...], locked: dict[str, float]) -> dict[str, float]:
+def with_mimics(joints: tuple[Joint, ...], locked: dict[str, Any]) -> dict[str, Any]:
     """The values of locked joints, including the joints that mimic them, by name [rad] or [m]."""
     by_name = {joint.name: joint for joint in joints}
 
-    def value(name: str) -> float | None:
+    def value(name: str) -> Any:
         mimic = by_name[name].mimic if name in by_name else None
         leader = None if mimic is None else value(mimic.joint)
         return (
@@ -89,6 +92,21 @@ R = TypeVar("R", bound="KinematicTree")
 TURN = 2 * np.pi
 
 
+def chain(above: dict[str, Joint], link: str) -> list[Joint]:
+    """The joints from the base to a link; `above` maps links to their parent joints."""
+    joints: list[Joint] = []
+    while link in above:
+        joints.append(above[link])
+        link = above[link].parent
+    return joints[::-1]
+
+
+def _limit(name: str) -> "cached_property[JointValues]":
+    return cached_property(
+        lambda tree: read_only(np.array([getattr(joint, name) for joint in tree.planned_joints]))
+    )
+
+
 class KinematicTree(Value):
     """Base of `Robot`, which has the fields and describes the frames."""
 
@@ -97,21 +115,21 @@ class KinematicTree(Value):
     joints: tuple[Joint, ...]
     locked: dict[str, float]
     root: str
-    above: dict[str, Float[ndarray, "4 4"]]
+    above: dict[str, Pose]
     other_tips: tuple[str, ...]
-    spheres: dict[str, Float[ndarray, "n 4"]]
+    spheres: dict[str, Spheres]
 
     @cached_property
     def link_names(self) -> tuple[str, ...]:
         return (self.base, *(joint.child for joint in self.joints))
 
     @property
-    def T_base_root(self) -> Float[ndarray, "4 4"] | None:
+    def T_base_root(self) -> Pose | None:
         """Pose of the URDF's root in the base frame; None if a movable joint lies between them."""
         return np.eye(4) if self.root in ("", self.base) else self.above.get(self.root)
 
     @cached_property
-    def links_fixed_to_base(self) -> dict[str, Float[ndarray, "4 4"]]:
+    def links_fixed_to_base(self) -> dict[str, Pose]:
         """T_base_link of the base and of the links that only fixed joints connect to it."""
         fixed_links = {self.base: np.eye(4)}
         for joint in self.joints:
@@ -124,16 +142,17 @@ class KinematicTree(Value):
         return (self.tip, *self.other_tips)
 
     @cached_property
+    def _above(self) -> dict[str, Joint]:
+        return {joint.child: joint for joint in self.joints}
+
+    def joints_above(self, link: str) -> list[Joint]:
+        """The joints from the base to a link."""
+        return chain(self._above, link)
+
+    @cached_property
     def planned_joints(self) -> tuple[Joint, ...]:
         """Movable, unlocked joints between the base and the tips, in depth-first order."""
-        by_child = {joint.child: joint for joint in self.joints}
-        chains: list[list[Joint]] = []
-        for link in self.tips:
-            chain: list[Joint] = []
-            while link != self.base:
-                chain.append(by_child[link])
-                link = by_child[link].parent
-            chains.append(chain[::-1])
+        chains = [self.joints_above(link) for link in self.tips]
         first: dict[str, int] = {}
         for i, chain in enumerate(chains):
             for joint in chain:
@@ -150,33 +169,13 @@ class KinematicTree(Value):
     def dof(self) -> int:
         return len(self.planned_joints)
 
-    def _limit(self, what: str) -> Float[ndarray, "dof"]:
-        return read_only(np.array([getattr(joint, what) for joint in self.planned_joints]))
-
-    @cached_property
-    def lower(self) -> Float[ndarray, "dof"]:
-        return self._limit("lower")
-
-    @cached_property
-    def upper(self) -> Float[ndarray, "dof"]:
-        return self._limit("upper")
-
-    @cached_property
-    def velocity(self) -> Float[ndarray, "dof"]:
-        return self._limit("velocity")
-
-    @cached_property
-    def acceleration(self) -> Float[ndarray, "dof"]:
-        return self._limit("acceleration")
-
-    @cached_property
-    def jerk(self) -> Float[ndarray, "dof"]:
-        return self._limit("jerk")
-
-    @cached_property
-    def effort(self) -> Float[ndarray, "dof"]:
-        """Largest torques [N m] or forces [N]; 0 where the URDF gives none."""
-        return self._limit("effort")
+    lower = _limit("lower")
+    upper = _limit("upper")
+    velocity = _limit("velocity")
+    acceleration = _limit("acceleration")
+    jerk = _limit("jerk")
+    effort = _limit("effort")
+    """Largest torques [N m] or forces [N]; 0 where the URDF gives none."""
 
     @cached_property
     def prismatic(self) -> tuple[bool, ...]:
@@ -189,20 +188,14 @@ class KinematicTree(Value):
 
     def whole_turns(self, q: Float[ndarray, "*n dof"]) -> Float[ndarray, "*n dof"]:
         """The multiples of 2 pi to subtract so that continuous joints are within [-pi, pi]; 0 for others."""
-        if not self._any_continuous:
-            return np.zeros_like(q)
         return np.where(self.continuous, TURN * np.round(q / TURN), 0.0)
 
-    def wraps(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
+    def wraps(self, q: Configurations) -> Configurations:
         """The whole turns in steps from row to row that are nearly whole turns, as where values of a
         continuous joint are wrapped to [-pi, pi]; 0 in all others."""
         steps = np.diff(q, axis=0)
         turns = self.whole_turns(steps)
         return np.where(np.abs(steps - turns) < MAX_WRAPPED_STEP, turns, 0.0)
-
-    @cached_property
-    def _any_continuous(self) -> bool:
-        return bool(self.continuous.any())
 
     def unwound(self, q: Float[ndarray, "*n dof"]) -> Float[ndarray, "*n dof"]:
         """Equivalent configurations in which joints with a range above one turn are within half a turn of the
@@ -210,9 +203,7 @@ class KinematicTree(Value):
         middle = 0.5 * (self.lower + self.upper)
         return np.where(self._turns_twice, q - TURN * np.round((q - middle) / TURN), q)
 
-    def equivalent_configurations(
-        self, q: Float[ndarray, "dof"], start: Float[ndarray, "dof"]
-    ) -> Float[ndarray, "k dof"]:
+    def equivalent_configurations(self, q: Configuration, start: Configuration) -> Configurations:
         """Configurations within the limits that differ from `q` by whole turns of joints that have limits and
         a range above one turn.
 
@@ -229,9 +220,7 @@ class KinematicTree(Value):
                 rows.append(image)
         return np.stack(rows)
 
-    def nearest_turns(
-        self, q: Float[ndarray, "n dof"], start: Float[ndarray, "dof"]
-    ) -> Float[ndarray, "n dof"]:
+    def nearest_turns(self, q: Configurations, start: Configuration) -> Configurations:
         """The configurations with continuous joints and joints with a range above one turn turned by whole
         turns, to be as close to `start` as the limits allow."""
         return self._turned(q, start, self._turns_twice | self.continuous)
@@ -307,15 +296,13 @@ class KinematicTree(Value):
 
         Empty if neither carries the other, or if a movable joint between them is not planned.
         """
-        by_child = {joint.child: joint for joint in self.joints}
-
-        def above(link: str) -> tuple[str, ...]:
-            if link not in by_child:
-                return ()
-            joint = by_child[link]
-            return (*above(joint.parent), *((joint.name,) if joint.kind in MOVING_KINDS else ()))
-
-        near, far = sorted((above(a), above(b)), key=len)
+        near, far = sorted(
+            (
+                [joint.name for joint in self.joints_above(link) if joint.kind in MOVING_KINDS]
+                for link in (a, b)
+            ),
+            key=len,
+        )
         between = far[len(near) :] if far[: len(near)] == near else ()
         return tuple(map(self.joint_names.index, between)) if {*between} <= {*self.joint_names} else ()
 
@@ -323,7 +310,7 @@ class KinematicTree(Value):
         """Index of the frame that the link is fixed to: 0 for the base, j + 1 after planned joint j."""
         return self._link(link)[0]
 
-    def T_frame_link(self, link: str) -> Float[ndarray, "4 4"]:
+    def T_frame_link(self, link: str) -> Pose:
         """Constant pose of the link in its frame (see `link_frame`); InputError for an unknown link."""
         return self._link(link)[1]
 
@@ -351,7 +338,7 @@ def once_per_robot(build: Callable[[R], T]) -> Callable[[R], T]:
 class JointNormalizer:
     """Maps lower limits to -1 and upper limits to 1, joint by joint; computed in float64."""
 
-    def __init__(self, lower: Float[ndarray, "dof"], upper: Float[ndarray, "dof"]) -> None:
+    def __init__(self, lower: Configuration, upper: Configuration) -> None:
         """`lower` and `upper` are joint limits [rad], [m] for prismatic joints. Raises InputError for an
         empty or infinite range."""
         for i, (low, high) in enumerate(zip(lower, upper, strict=True)):

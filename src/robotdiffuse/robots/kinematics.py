@@ -4,6 +4,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from robotdiffuse.core.transforms import placed
+from robotdiffuse.core.types import Configuration, Configurations, Points, Pose, Poses, Spheres
 from robotdiffuse.robots.kinematic_tree import KinematicTree, once_per_robot
 
 REACH_SAMPLES = 4096
@@ -12,12 +14,12 @@ REACH_QUANTILE = 0.99
 """Quantile of the distances of the tip, since the largest ones are rare and random."""
 
 
-def link_pose(robot: KinematicTree, q: Float[ndarray, "dof"], link: str) -> Float[ndarray, "4 4"]:
+def link_pose(robot: KinematicTree, q: Configuration, link: str) -> Pose:
     """T_base_link at one configuration; raises InputError for an unknown link."""
     return link_poses(robot, np.asarray(q)[None], link)[0]
 
 
-def _motions(robot: KinematicTree, j: int, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n 4 4"]:
+def _motions(robot: KinematicTree, j: int, q: Configurations) -> Poses:
     """The motion of planned joint j about or along its z axis, at each configuration."""
     motion = np.broadcast_to(np.eye(4), (len(q), 4, 4)).copy()
     if robot.prismatic[j]:
@@ -29,24 +31,28 @@ def _motions(robot: KinematicTree, j: int, q: Float[ndarray, "n dof"]) -> Float[
     return motion
 
 
-def link_poses(robot: KinematicTree, q: Float[ndarray, "n dof"], link: str) -> Float[ndarray, "n 4 4"]:
-    """T_base_link at a batch of configurations; raises InputError for an unknown link."""
-    T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
+def _frames(robot: KinematicTree, q: Configurations, link: str) -> list[Poses]:
+    """Poses of the frames from the base to a link."""
+    frames = [np.broadcast_to(np.eye(4), (len(q), 4, 4))]
     for j in robot.chain(link):
-        T = T @ robot.frame_offsets[j] @ _motions(robot, j, q)
-    return T @ robot.T_frame_link(link)
+        frames.append(frames[-1] @ robot.frame_offsets[j] @ _motions(robot, j, q))
+    return frames
 
 
-def link_jacobians(robot: KinematicTree, q: Float[ndarray, "n dof"], link: str) -> Float[ndarray, "n 6 dof"]:
+def link_poses(robot: KinematicTree, q: Configurations, link: str) -> Poses:
+    """T_base_link at a batch of configurations; raises InputError for an unknown link."""
+    return _frames(robot, q, link)[-1] @ robot.T_frame_link(link)
+
+
+def link_jacobians(robot: KinematicTree, q: Configurations, link: str) -> Float[ndarray, "n 6 dof"]:
     """Geometric Jacobians of a link at a batch of configurations; raises InputError for an unknown link.
 
     Rows are linear, then angular, in the axes of the base frame; the linear ones are of the link's origin.
     """
+    _, *frames = _frames(robot, q, link)
     origins = link_origins(robot, q, link)
     J = np.zeros((len(q), 6, robot.dof))
-    T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
-    for j in robot.chain(link):
-        T = T @ robot.frame_offsets[j] @ _motions(robot, j, q)
+    for j, T in zip(robot.chain(link), frames, strict=True):
         axis = T[:, :3, 2]
         if robot.prismatic[j]:
             J[:, :3, j] = axis
@@ -56,30 +62,20 @@ def link_jacobians(robot: KinematicTree, q: Float[ndarray, "n dof"], link: str) 
     return J
 
 
-def link_origins(robot: KinematicTree, q: Float[ndarray, "n dof"], link: str) -> Float[ndarray, "n 3"]:
+def link_origins(robot: KinematicTree, q: Configurations, link: str) -> Points:
     """Positions of a link's origin in the base frame [m]; raises InputError for an unknown link."""
     return link_poses(robot, q, link)[:, :3, 3]
 
 
-@once_per_robot
-def _spheres_by_frame(robot: KinematicTree) -> list[Float[ndarray, "n 4"]]:
-    """Collision spheres [x y z radius, m] by frame, in the coordinates of that frame."""
-    parts: list[list[ndarray]] = [[np.zeros((0, 4))] for _ in range(robot.dof + 1)]
-    for link, spheres in robot.spheres.items():
-        T = robot.T_frame_link(link)
-        placed = np.column_stack([spheres[:, :3] @ T[:3, :3].T + T[:3, 3], spheres[:, 3]])
-        parts[robot.link_frame(link)].append(placed)
-    return [np.concatenate(part) for part in parts]
-
-
-def placed_spheres(robot: KinematicTree, q: Float[ndarray, "dof"]) -> Float[ndarray, "n 4"]:
+def placed_spheres(robot: KinematicTree, q: Configuration) -> Spheres:
     """All collision spheres at one configuration, x y z radius in the base frame [m]."""
-    parts = []
     frames = [np.eye(4)]
     for j, parent in enumerate(robot.parents):
         frames.append(frames[parent] @ robot.frame_offsets[j] @ _motions(robot, j, q[None])[0])
-    for T, spheres in zip(frames, _spheres_by_frame(robot), strict=True):
-        parts.append(np.column_stack([spheres[:, :3] @ T[:3, :3].T + T[:3, 3], spheres[:, 3]]))
+    parts = [np.zeros((0, 4))]
+    for link, spheres in robot.spheres.items():
+        T = frames[robot.link_frame(link)] @ robot.T_frame_link(link)
+        parts.append(np.column_stack([placed(T, spheres[:, :3]), spheres[:, 3]]))
     return np.concatenate(parts)
 
 

@@ -1,8 +1,4 @@
-"""Bounds on the motion of links: how far a link can be from the axis of a joint.
-
-Kernels propagate support functions on a grid of directions over a joint and its offset. Their sums have a
-fixed order and no fused operations, so the results equal those of NumPy.
-"""
+"""Bounds on the motion of links: how far a link can be from the axis of a joint."""
 
 from functools import lru_cache
 
@@ -10,49 +6,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.core.kernels import kernel
+from robotdiffuse.core.transforms import placed
 from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot
-
-
-@kernel()
-def sliding_maximum(support, first, width):
-    """Largest value [n, rows, columns] among `width` longitudes, beginning `first` after each longitude."""
-    n, rows, columns = support.shape
-    out = np.empty_like(support)
-    maxima = np.empty(columns)
-    next_wide = np.empty(columns)
-    for i in range(n):
-        for row in range(rows):
-            for k in range(columns):
-                maxima[k] = support[i, row, (k + first) % columns]
-            covered = 1
-            while covered < width:  # maxima over 2 n neighbors from maxima over n
-                shift = min(covered, width - covered)
-                for k in range(columns - shift):
-                    next_wide[k] = max(maxima[k], maxima[k + shift])
-                for k in range(columns - shift, columns):
-                    next_wide[k] = max(maxima[k], maxima[k + shift - columns])
-                maxima, next_wide = next_wide, maxima
-                covered += shift
-            for k in range(columns):  # assigning the array would compile Numba's messages on shapes
-                out[i, row, k] = maxima[k]
-    return out
-
-
-@kernel()
-def interpolated(values, corners, weights, residual, reach):
-    """Bounds [n, directions] in rotated directions: values interpolated from four grid corners each, with
-    weights [4, directions], plus the residual times the distance `reach` [n] of the farthest point."""
-    out = np.empty_like(values)
-    for i in range(len(values)):
-        for k in range(values.shape[1]):
-            total = values[i, corners[0, k]] * weights[0, k]
-            for c in range(1, 4):
-                total += values[i, corners[c, k]] * weights[c, k]
-            out[i, k] = total + residual[k] * reach[i]
-    return out
-
 
 COLUMNS = 180
 """Grid directions around the axis; bounds exceed the true maxima by about 0.1 % per joint in between."""
@@ -95,7 +51,7 @@ def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
         for i in np.flatnonzero(frames == j + 1):
             spheres = robot.spheres[links[i]]
             T = robot.T_frame_link(links[i])
-            centers = spheres[:, :3] @ T[:3, :3].T + T[:3, 3]
+            centers = placed(T, spheres[:, :3])
             support[i] = (centers @ by_row + spheres[:, 3, None]).max(axis=1)
             farthest[i] = (np.linalg.norm(centers, axis=1) + spheres[:, 3]).max()
         moved = np.flatnonzero(robot.moved_by[frames, j])
@@ -117,7 +73,12 @@ def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
         offset = robot.frame_offsets[j]
         rotation = offset[:3, :3].tobytes()
         interpolation = _cached_interpolation(rotation) if robot.attached else interpolation_of(rotation)
-        h = interpolated(h.reshape(len(moved), -1), *interpolation, r)
+        corners, weights, residual = interpolation
+        values = h.reshape(len(moved), -1)
+        h = values[:, corners[0]] * weights[0]
+        for corner, weight in zip(corners[1:], weights[1:], strict=True):
+            h += values[:, corner] * weight
+        h += residual * r[:, None]
         support[moved] = h.reshape(-1, ROWS, COLUMNS) + directions @ offset[:3, 3]
         farthest[moved] = r + np.linalg.norm(offset[:3, 3])
     radii = np.concatenate([bare_radii, radii])
@@ -161,7 +122,13 @@ def _rotated(
     width = -int(np.floor(lower / STEP)) - first + 1
     if width >= COLUMNS:
         return np.broadcast_to(support.max(-1, keepdims=True), support.shape)
-    return sliding_maximum(support, first, width)
+    wide = np.roll(support, -first, axis=-1)
+    done = 1
+    while done < width:  # maxima over 2 n neighbours from maxima over n
+        shift = min(done, width - done)
+        wide = np.maximum(wide, np.roll(wide, -shift, axis=-1))
+        done += shift
+    return wide
 
 
 def _interpolation(directions: Float[ndarray, "rows columns 3"]) -> _Interpolation:

@@ -2,19 +2,21 @@
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache, reduce
+from itertools import combinations
 from numbers import Real
 from typing import Any, cast
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import MAX_COORDINATE, Value, numbers, within
 from robotdiffuse.core.errors import InputError, shown, unknown_name
+from robotdiffuse.core.types import Mask, Pose, Spheres, Values
 from robotdiffuse.robots.bodies import (
     TOOL,
     AttachedBody,
@@ -53,7 +55,7 @@ class LinkPairTable(Value):
     apart: Bool[ndarray, "*cells"]
     """Whether the links are apart throughout a cell."""
 
-    def at(self, *values: Float[ndarray, "n"]) -> Bool[ndarray, "n"]:
+    def at(self, *values: Values) -> Mask:
         """Whether the links are known to be apart at joint values, one array per joint."""
         inside = np.ones(len(values[0]), dtype=bool)
         index = []
@@ -65,9 +67,7 @@ class LinkPairTable(Value):
             index.append(cell % count)
         return inside & self.apart[tuple(index)]
 
-    def throughout(
-        self, *intervals: tuple[Float[ndarray, "n"], Float[ndarray, "n"]]
-    ) -> Bool[ndarray, "*intervals"]:
+    def throughout(self, *intervals: tuple[Values, Values]) -> Bool[ndarray, "*intervals"]:
         """Whether the links are known to be apart throughout intervals [low, high] of the joints between
         them.
 
@@ -87,9 +87,7 @@ class LinkPairTable(Value):
     def _whole(self, axis: int) -> bool:
         return abs(self.upper[axis] - self.lower[axis] - TURN) < ROUNDING
 
-    def _reached(
-        self, axis: int, low: Float[ndarray, "n"], high: Float[ndarray, "n"]
-    ) -> Bool[ndarray, "n cells"]:
+    def _reached(self, axis: int, low: Values, high: Values) -> Bool[ndarray, "n cells"]:
         """Which cells along a joint each interval overlaps."""
         count = self.apart.shape[axis]
         first = np.floor((low - ROUNDING - self.lower[axis]) / self._edge(axis)).astype(int)
@@ -125,7 +123,7 @@ class Robot(KinematicTree):
     """Default link for goals and pictures; the first of `tips`."""
     joints: tuple[Joint, ...]
     """All joints below the base, parents before children."""
-    spheres: dict[str, Float[ndarray, "n 4"]] = field(default_factory=dict)
+    spheres: dict[str, Spheres] = field(default_factory=dict)
     """Collision spheres by link, x y z radius in the link frame [m]. They cover `meshes`."""
     meshes: dict[str, tuple[ConvexMesh, ...]] = field(default_factory=dict)
     """Convex collision meshes by link: the geometry that the validator checks."""
@@ -137,7 +135,7 @@ class Robot(KinematicTree):
     """What was changed or ignored when the URDF was read."""
     root: str = ""
     """Root link of the URDF; if empty, the base is the root."""
-    above: dict[str, Float[ndarray, "4 4"]] = field(default_factory=dict)
+    above: dict[str, Pose] = field(default_factory=dict)
     """T_base_link of the links above the base that only fixed joints connect to it. The root is among them
     unless a movable joint lies between."""
     poses: dict[str, dict[str, float]] = field(default_factory=dict)
@@ -178,9 +176,7 @@ class Robot(KinematicTree):
             >>> rd.load_robot("panda").fk([0, -0.785, 0, -2.356, 0, 1.571, 0.785])[:3, 3].round(2).tolist()
             [0.31, 0.0, 0.59]
         """
-        rows = configurations(self, q)
-        T = link_poses(self, np.atleast_2d(rows), self.tip if link is None else link)
-        return T[0] if rows.ndim == 1 else T
+        return self._of_link(link_poses, q, link)
 
     def jacobian(self, q: ArrayLike, link: str | None = None) -> ndarray:
         """Geometric Jacobian of a link.
@@ -198,9 +194,12 @@ class Robot(KinematicTree):
         Raises:
             InputError: For an unknown link, or q of the wrong shape.
         """
+        return self._of_link(link_jacobians, q, link)
+
+    def _of_link(self, function: Callable[..., ndarray], q: ArrayLike, link: str | None) -> ndarray:
         rows = configurations(self, q)
-        J = link_jacobians(self, np.atleast_2d(rows), self.tip if link is None else link)
-        return J[0] if rows.ndim == 1 else J
+        found = function(self, np.atleast_2d(rows), link or self.tip)
+        return found[0] if rows.ndim == 1 else found
 
     def ik(
         self,
@@ -236,19 +235,16 @@ class Robot(KinematicTree):
         from robotdiffuse.robots.inverse_kinematics import inverse_kinematics  # compiled code
 
         rng = np.random.default_rng(seed)
-        frame = self.tip if link is None else link
         seeded = None if near is None else configurations(self, near)
-        return inverse_kinematics(self, frame, cast(ndarray, pose), count, rng=rng, near=seeded)
+        return inverse_kinematics(self, link or self.tip, cast(ndarray, pose), count, rng=rng, near=seeded)
 
     def checked_pairs(self) -> tuple[tuple[str, str], ...]:
         """Pairs of links that are checked against each other: with geometry, on different frames, not
         allowed."""
-        links = [link for link in self.link_names if link in self.spheres]
         return tuple(
-            (a, b)
-            for i, a in enumerate(links)
-            for b in links[i + 1 :]
-            if frozenset((a, b)) not in self.allowed_collisions and self.link_frame(a) != self.link_frame(b)
+            pair
+            for pair in moving_pairs(self, self.spheres)
+            if frozenset(pair) not in self.allowed_collisions
         )
 
     def with_locked(self, locked: dict[str, float]) -> "Robot":
@@ -326,7 +322,7 @@ class Robot(KinematicTree):
     def with_tool(
         self,
         link: str,
-        T_link_tool: Float[ndarray, "4 4"],
+        T_link_tool: Pose,
         shapes: Sequence[RigidShape] = (),
         touch_links: Sequence[str] = (),
         name: str = TOOL,
@@ -402,7 +398,7 @@ class Robot(KinematicTree):
         ]
         return reduce(Robot.with_body, remaining, self.arm)
 
-    def placed_in_world(self, T_world_base: Float[ndarray, "4 4"]) -> "Robot":
+    def placed_in_world(self, T_world_base: Pose) -> "Robot":
         """The robot with a new base link, the world, that carries the old one: for pictures and simulators.
 
         Args:
@@ -411,8 +407,7 @@ class Robot(KinematicTree):
         name = "world"
         while name in self.link_names:
             name += "_"
-        axis = np.array([0.0, 0.0, 1.0])
-        ground = Joint(f"{name}_to_{self.base}", "fixed", name, self.base, T_world_base, axis)
+        ground = Joint(f"{name}_to_{self.base}", "fixed", name, self.base, T_world_base)
         bare = None if self.bare is None else self.bare.placed_in_world(T_world_base)
         return replace(self, base=name, joints=(ground, *self.joints), root="", above={}, bare=bare)
 
@@ -467,17 +462,19 @@ def _with_body(robot: Robot, content: BodyContent) -> Robot:
     )
 
     body = content.body
-    axis = np.array([0.0, 0.0, 1.0])
-    joint = Joint(f"{body.link}_to_{body.name}", "fixed", body.link, body.name, body.T_link_body, axis)
-    geometry = {body.name: body_geometry(body)} if body.shapes else {}
+    joint = Joint(f"{body.link}_to_{body.name}", "fixed", body.link, body.name, body.T_link_body)
+    meshes = dict(robot.meshes)
+    spheres = dict(robot.spheres)
+    if body.shapes:
+        meshes[body.name], spheres[body.name] = body_geometry(body)
     # goals and pictures refer to the tip; a tool on another branch than the tip's does not replace it
     frame = robot.link_frame(body.link) if body.tool and robot.at_end(body.link) else -1
     tip, *remaining_tips = [body.name if robot.link_frame(tip) == frame else tip for tip in robot.tips]
     return replace(
         robot,
         joints=(*robot.joints, joint),
-        spheres=robot.spheres | {name: spheres for name, (_, spheres) in geometry.items()},
-        meshes=robot.meshes | {name: meshes for name, (meshes, _) in geometry.items()},
+        spheres=spheres,
+        meshes=meshes,
         allowed_collisions=robot.allowed_collisions
         | {frozenset((body.name, link)) for link in body.touch_links},
         tip=tip,
@@ -511,10 +508,16 @@ def scaled(robot: Robot, scale: float) -> Robot:
     )
 
 
-def _moved(T: Float[ndarray, "4 4"], scale: float) -> Float[ndarray, "4 4"]:
+def _moved(T: Pose, scale: float) -> Pose:
     found = T.copy()
     found[:3, 3] *= scale
     return found
+
+
+def moving_pairs(robot: Robot, of: Container[str]) -> list[tuple[str, str]]:
+    """Pairs of links on different frames that are both in `of`."""
+    links = [link for link in robot.link_names if link in of]
+    return [(a, b) for a, b in combinations(links, 2) if robot.link_frame(a) != robot.link_frame(b)]
 
 
 def configurations(robot: Robot, q: ArrayLike) -> ndarray:

@@ -10,9 +10,11 @@ import hashlib
 import io
 import json
 import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -38,67 +40,8 @@ def user_robots() -> Path:
     return Path(data) / "robotdiffuse" / "robots"
 
 
+M = TypeVar("M", bound=Surface)
 SURFACE_FILE = "surfaces.npz"
-Surfaces = dict[str, Surface]
-Grazing = frozenset[frozenset[str]]
-Meshes = dict[str, tuple[ConvexMesh, ...]]
-
-
-def pack_surfaces(surfaces: Surfaces, grazing: Grazing, meshes: Meshes) -> bytes:
-    """The content of surfaces.npz. Coordinates are rounded to float32, by 6e-8 of their size at most."""
-    content = io.BytesIO()
-    arrays = {
-        "links": np.array(list(surfaces), np.str_),
-        "sizes": np.array([(len(s.vertices), len(s.faces)) for s in surfaces.values()], np.int64),
-        "vertices": np.concatenate([s.vertices for s in surfaces.values()]).astype(np.float32),
-        "faces": np.concatenate([s.faces for s in surfaces.values()]).astype(np.int32),
-        "grazing": np.array(sorted(sorted(pair) for pair in grazing), np.str_),
-        "of": np.array(_digest(meshes)),
-    }
-    np.savez_compressed(content, allow_pickle=False, **arrays)
-    return content.getvalue()
-
-
-def read_surfaces(file: Path, meshes: Meshes) -> tuple[Surfaces, Grazing]:
-    """The surfaces and grazing pairs of a file; InputError if it is damaged or made for other `meshes`."""
-    arrays = read_arrays(file)
-    try:
-        links, sizes, vertices, faces, grazing, of = (
-            arrays[key] for key in ("links", "sizes", "vertices", "faces", "grazing", "of")
-        )
-        ends = np.cumsum(sizes, axis=0)
-        if (ends[-1] != (len(vertices), len(faces))).any() or vertices.shape[1:] != (3,):
-            raise ValueError("sizes do not add up")
-        if str(of) != _digest(meshes):
-            raise ValueError("it belongs to other convex meshes; create the robot again")
-        surfaces = {
-            str(link): _surface(vertices[end[0] - size[0] : end[0]], faces[end[1] - size[1] : end[1]])
-            for link, size, end in zip(links, sizes, ends, strict=True)
-        }
-        pairs = frozenset(frozenset(map(str, pair)) for pair in grazing)
-        if {link for pair in pairs for link in pair} != {*surfaces} or not {*surfaces} <= {*meshes}:
-            raise ValueError("grazing pairs and surfaces must name the same links of the robot")
-    except (KeyError, IndexError, ValueError, TypeError) as error:
-        raise InputError(f"{file} is damaged: {type(error).__name__}: {shortened(str(error))}") from None
-    return surfaces, pairs
-
-
-def _surface(vertices: ndarray, faces: ndarray) -> Surface:
-    vertices = vertices.astype(np.float64)
-    faces = faces.astype(np.int64)
-    if faces.shape[1:] != (3,) or not ((faces >= 0) & (faces < len(vertices))).all() or not within(vertices):
-        raise ValueError("triangles of finite vertices expected")
-    return Surface(vertices, faces)
-
-
-def _digest(meshes: Meshes) -> str:
-    digest = hashlib.sha256()
-    for link in sorted(meshes):
-        for mesh in meshes[link]:
-            digest.update(link.encode() + np.ascontiguousarray(mesh.vertices, np.float64).tobytes())
-    return digest.hexdigest()
-
-
 FORMAT = 2
 """Version of the format."""
 AXIS_LENGTH_TOLERANCE = 1e-3
@@ -116,42 +59,76 @@ def write_robot_folder(robot: Robot, folder: str | Path, source: dict[str, Any])
     Raises InputError if the folder cannot be written.
     """
     folder = Path(folder)
-    meshes = io.BytesIO()
-    np.savez_compressed(meshes, allow_pickle=False, **_pack(robot))
-    text = _dump(_to_json(robot, source)) + "\n"
+    arrays = _packed([(link, mesh) for link, meshes in robot.meshes.items() for mesh in meshes])
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / SURFACE_FILE).unlink(missing_ok=True)  # it may belong to other meshes
-        write_atomically(folder / MESH_FILE, meshes.getvalue())
-        write_atomically(folder / ROBOT_FILE, text)
+        write_atomically(folder / MESH_FILE, _npz(arrays))
+        write_atomically(folder / ROBOT_FILE, _dump(_to_json(robot, source)) + "\n")
         if robot.grazing:
-            write_atomically(
-                folder / SURFACE_FILE, pack_surfaces(robot.surfaces, robot.grazing, robot.meshes)
-            )
+            arrays = _packed([*robot.surfaces.items()])
+            arrays |= {
+                "vertices": arrays["vertices"].astype(np.float32),  # rounded by 6e-8 of their size at most
+                "faces": arrays["faces"].astype(np.int32),
+                "grazing": np.array(sorted(sorted(pair) for pair in robot.grazing), np.str_),
+                "of": np.array(_digest(robot)),
+            }
+            write_atomically(folder / SURFACE_FILE, _npz(arrays))
     except OSError as error:
         raise write_error(folder, error) from None
 
 
+def _npz(arrays: dict[str, ndarray]) -> bytes:
+    content = io.BytesIO()
+    np.savez_compressed(content, allow_pickle=False, **arrays)
+    return content.getvalue()
+
+
 def read_robot_folder(folder: str | Path) -> Robot:
     """Read the robot in a folder; raises InputError that names the file if one is missing or damaged."""
-    data = _read_json(Path(folder) / ROBOT_FILE)
-    meshes = _unpack(Path(folder) / MESH_FILE)
-    try:
+    folder = Path(folder)
+    data = _read_json(folder / ROBOT_FILE)
+    meshes: dict[str, tuple[ConvexMesh, ...]] = {}
+    arrays = read_arrays(folder / MESH_FILE)
+    with _damage(folder / MESH_FILE):
+        for link, mesh in _unpacked(arrays, ConvexMesh):
+            meshes[link] = (*meshes.get(link, ()), mesh)
+    with _damage(folder / ROBOT_FILE):
         robot = _from_json(data, meshes)
         _check_tree(robot)
         robot.frame_offsets  # noqa: B018  (walks the tree: fails if a joint has no parent)
-        of_links = {*robot.spheres, *robot.inertias}
-        if robot.dof == 0 or not of_links <= set(robot.link_names):
+        if robot.dof == 0 or not {*robot.spheres, *robot.inertias} <= {*robot.link_names}:
             raise ValueError("no planned joints, or spheres or inertias of an unknown link")
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise InputError(
-            f"{Path(folder) / ROBOT_FILE} is damaged: {type(error).__name__}: {shortened(str(error))}"
-        ) from None
-    file = Path(folder) / SURFACE_FILE
+    file = folder / SURFACE_FILE
     if not is_file(file):
         return robot
-    surfaces, grazing = read_surfaces(file, meshes)
-    return replace(robot, surfaces=surfaces, grazing=grazing)
+    arrays = read_arrays(file)
+    with _damage(file):
+        if str(arrays["of"]) != _digest(robot):
+            raise ValueError("it belongs to other convex meshes; create the robot again")
+        surfaces = dict(_unpacked(arrays, Surface))
+        grazing = frozenset(frozenset(map(str, pair)) for pair in arrays["grazing"])
+        if {link for pair in grazing for link in pair} != {*surfaces} or not {*surfaces} <= {*meshes}:
+            raise ValueError("grazing pairs and surfaces must name the same links of the robot")
+        robot = replace(robot, surfaces=surfaces, grazing=grazing)
+    return robot
+
+
+@contextmanager
+def _damage(file: Path) -> Iterator[None]:
+    """Errors of any kind that damaged data raises become InputError."""
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise InputError(f"{file} is damaged: {type(error).__name__}: {shortened(str(error))}") from None
+
+
+def _digest(robot: Robot) -> str:
+    digest = hashlib.sha256()
+    for link in sorted(robot.meshes):
+        for mesh in robot.meshes[link]:
+            digest.update(link.encode() + np.ascontiguousarray(mesh.vertices, np.float64).tobytes())
+    return digest.hexdigest()
 
 
 def _check_tree(robot: Robot) -> None:
@@ -249,27 +226,23 @@ def _joint_to_json(joint: Joint) -> dict:
 
 def _dump(data: dict) -> str:
     """JSON text with one joint, sphere or pair per line."""
-
-    def compact(value: object) -> str:
-        return json.dumps(value, allow_nan=False)
-
     lines = []
     for key, value in data.items():
-        if key == "spheres":
-            links = [
-                f"    {compact(link)}: [\n" + ",\n".join(f"      {compact(row)}" for row in rows) + "\n    ]"
-                for link, rows in value.items()
-            ]
-            text = "{\n" + ",\n".join(links) + "\n  }"
-        elif key == "inertias" and value:
-            rows = [f"    {compact(link)}: {compact(row)}" for link, row in value.items()]
-            text = "{\n" + ",\n".join(rows) + "\n  }"
-        elif isinstance(value, list) and value:
-            text = "[\n" + ",\n".join(f"    {compact(item)}" for item in value) + "\n  ]"
-        else:
-            text = compact(value)
-        lines.append(f"  {compact(key)}: {text}")
+        levels = 2 if key == "spheres" else int(isinstance(value, list) or key == "inertias")
+        lines.append(f"  {json.dumps(key)}: {_dump_value(value, levels, '  ')}")
     return "{\n" + ",\n".join(lines) + "\n}"
+
+
+def _dump_value(value: Any, levels: int, pad: str) -> str:
+    """JSON text of a value, of which this many levels have an entry per line."""
+    if not levels or not value:
+        return json.dumps(value, allow_nan=False)
+    named = isinstance(value, dict)
+    items = (
+        [(f"{json.dumps(key)}: ", value[key]) for key in value] if named else [("", item) for item in value]
+    )
+    rows = ",\n".join(f"{pad}  {name}{_dump_value(item, levels - 1, pad + '  ')}" for name, item in items)
+    return f"{'{' if named else '['}\n{rows}\n{pad}{'}' if named else ']'}"
 
 
 def _read_json(file: Path) -> dict:
@@ -308,13 +281,14 @@ def _joint_from_json(data: dict) -> Joint:
     name = str(data["name"])
     kind = str(data["kind"])
     T = _pose_from_json(data, f"joint {name}")
+    ends = (name, kind, str(data["parent"]), str(data["child"]), T)
     if kind == "fixed":
-        return Joint(name, kind, str(data["parent"]), str(data["child"]), T, np.array([0.0, 0.0, 1.0]))
+        return Joint(*ends)
     if kind not in MOVING_KINDS:
         raise ValueError(f"joint {name} is of kind {shown(kind)}")
     axis = _array([data["axis"]], 3, f"joint {name}: axis")[0]
-    lower, upper, velocity, acceleration, jerk = (float(data[limit]) for limit in LIMITS)
-    rates = (velocity, acceleration, jerk)
+    limits = {limit: float(data[limit]) for limit in LIMITS}
+    lower, upper, *rates = limits.values()
     if (
         not -MAX_COORDINATE <= lower <= upper <= MAX_COORDINATE
         or not min(rates) >= MIN_RATE
@@ -324,8 +298,7 @@ def _joint_from_json(data: dict) -> Joint:
     if not abs(np.linalg.norm(axis) - 1) < AXIS_LENGTH_TOLERANCE:
         raise ValueError(f"joint {name}: an axis of length 1 expected")
     if kind == "continuous":
-        lower = -CONTINUOUS_LIMIT
-        upper = CONTINUOUS_LIMIT
+        limits |= {"lower": -CONTINUOUS_LIMIT, "upper": CONTINUOUS_LIMIT}
     mimic = None
     if "mimic" in data:
         master, multiplier, offset = data["mimic"]
@@ -333,9 +306,7 @@ def _joint_from_json(data: dict) -> Joint:
     effort = float(data.get("effort", 0.0))
     if not 0 <= effort <= MAX_COORDINATE:
         raise ValueError(f"joint {name}: effort")
-    ends = (str(data["parent"]), str(data["child"]))
-    limits = (lower, upper, velocity, acceleration, jerk)
-    return Joint(name, kind, *ends, T, axis, *limits, mimic, effort)
+    return Joint(*ends, axis, **limits, mimic=mimic, effort=effort)
 
 
 def _pose_from_json(data: dict, what: str) -> Float[ndarray, "4 4"]:
@@ -351,32 +322,27 @@ def _array(rows: object, width: int, what: str) -> Float[ndarray, "n w"]:
     return array
 
 
-def _pack(robot: Robot) -> dict[str, ndarray]:
-    """All meshes in four arrays, since reading many small ones would take longer."""
-    parts = [(link, mesh) for link, meshes in robot.meshes.items() for mesh in meshes]
+def _packed(meshes: Sequence[tuple[str, Surface]]) -> dict[str, ndarray]:
+    """Meshes of links in four arrays, since reading many small ones would take longer."""
     return {
-        "links": np.array([link for link, _ in parts], dtype=np.str_),
-        "sizes": np.array([(len(m.vertices), len(m.faces)) for _, m in parts], np.int64).reshape(-1, 2),
-        "vertices": np.concatenate([np.zeros((0, 3)), *(mesh.vertices for _, mesh in parts)]),
-        "faces": np.concatenate([np.zeros((0, 3), np.int64), *(mesh.faces for _, mesh in parts)]),
+        "links": np.array([link for link, _ in meshes], dtype=np.str_),
+        "sizes": np.array([(len(mesh.vertices), len(mesh.faces)) for _, mesh in meshes], np.int64).reshape(
+            -1, 2
+        ),
+        "vertices": np.concatenate([np.zeros((0, 3)), *(mesh.vertices for _, mesh in meshes)]),
+        "faces": np.concatenate([np.zeros((0, 3), np.int64), *(mesh.faces for _, mesh in meshes)]),
     }
 
 
-def _unpack(file: Path) -> dict[str, tuple[ConvexMesh, ...]]:
-    """Meshes by link from the arrays that `_pack` made."""
-    arrays = read_arrays(file)
-    try:
-        links, sizes, vertices, faces = (arrays[key] for key in ("links", "sizes", "vertices", "faces"))
-        ends = np.cumsum(sizes, axis=0)
-        if len(links) and (ends[-1] != (len(vertices), len(faces))).any():
-            raise ValueError("sizes do not add up")
-        meshes: dict[str, tuple[ConvexMesh, ...]] = {}
-        for link, (v, f), (v_end, f_end) in zip(links, sizes, ends, strict=True):
-            corners = _array(vertices[v_end - v : v_end], 3, f"vertices of {link}")
-            mesh = ConvexMesh(corners, np.asarray(faces[f_end - f : f_end], np.int64))
-            if not ((mesh.faces >= 0) & (mesh.faces < len(corners))).all():
-                raise ValueError(f"faces of {link}: indices of its {len(corners)} vertices expected")
-            meshes[str(link)] = (*meshes.get(str(link), ()), mesh)
-    except (KeyError, ValueError, TypeError) as error:
-        raise InputError(f"{file} is damaged: {type(error).__name__}: {shortened(str(error))}") from None
-    return meshes
+def _unpacked(arrays: dict[str, ndarray], kind: type[M]) -> Iterator[tuple[str, M]]:
+    """Links and meshes from the arrays that `_packed` made."""
+    links, sizes, vertices, faces = (arrays[key] for key in ("links", "sizes", "vertices", "faces"))
+    ends = np.cumsum(sizes, axis=0)
+    if len(links) and (ends[-1] != (len(vertices), len(faces))).any():
+        raise ValueError("sizes do not add up")
+    for link, (v, f), (v_end, f_end) in zip(links, sizes, ends, strict=True):
+        corners = _array(vertices[v_end - v : v_end], 3, f"vertices of {link}")
+        indices = np.asarray(faces[f_end - f : f_end], np.int64)
+        if indices.shape[1:] != (3,) or not ((indices >= 0) & (indices < len(corners))).all():
+            raise ValueError(f"faces of {link}: indices of its {len(corners)} vertices expected")
+        yield str(link), kind(corners, indices)

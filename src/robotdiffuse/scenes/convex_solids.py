@@ -1,6 +1,8 @@
 """Convex meshes that enclose shapes, for robots that hold them."""
 
+from collections.abc import Callable
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -13,19 +15,6 @@ PRISM_SIDES = 32
 """Sides of the prism around a cylinder, which is 0.5 % wider than the cylinder."""
 SPHERE_RINGS = 7
 """Rings of vertices around a sphere, and around the caps of a capsule."""
-
-
-def box_mesh(size: Float[ndarray, "3"]) -> ConvexMesh:
-    """A box with these full edge lengths [m]."""
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    return convex_hull(corners * size / 2)
-
-
-def prism(radius: float, height: float) -> ConvexMesh:
-    """A prism around a cylinder about the z axis [m]."""
-    ring = _polygon_around_circle(radius)
-    ends = [np.column_stack([ring, np.full(PRISM_SIDES, z)]) for z in (-height / 2, height / 2)]
-    return convex_hull(np.concatenate(ends))
 
 
 def capsule_polyhedron(radius: float, height: float) -> ConvexMesh:
@@ -47,6 +36,11 @@ def capsule_polyhedron(radius: float, height: float) -> ConvexMesh:
     return convex_hull(np.concatenate([corners - half, corners + half]))
 
 
+def _polygon_around_circle(radius: float) -> Float[ndarray, "k 2"]:
+    angles = 2 * np.pi * np.arange(PRISM_SIDES) / PRISM_SIDES
+    return radius / np.cos(np.pi / PRISM_SIDES) * np.column_stack([np.cos(angles), np.sin(angles)])
+
+
 @lru_cache(maxsize=64)
 def mesh_parts(vertices: bytes, faces: bytes) -> tuple[ConvexMesh, ...]:
     """Convex parts of a triangle mesh, whose float64 vertices and int64 faces are given as bytes.
@@ -57,6 +51,23 @@ def mesh_parts(vertices: bytes, faces: bytes) -> tuple[ConvexMesh, ...]:
     return convex_parts((Surface(points, np.frombuffer(faces, np.int64).reshape(-1, 3)),))
 
 
-def _polygon_around_circle(radius: float) -> Float[ndarray, "k 2"]:
-    angles = 2 * np.pi * np.arange(PRISM_SIDES) / PRISM_SIDES
-    return radius / np.cos(np.pi / PRISM_SIDES) * np.column_stack([np.cos(angles), np.sin(angles)])
+def _box(shape: Any) -> ConvexMesh:
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    return convex_hull(corners * shape.size / 2)
+
+
+def _prism(shape: Any) -> ConvexMesh:
+    """A prism around a cylinder."""
+    ring = _polygon_around_circle(shape.radius)
+    ends = [np.column_stack([ring, np.full(PRISM_SIDES, z * shape.height)]) for z in (-0.5, 0.5)]
+    return convex_hull(np.concatenate(ends))
+
+
+SOLIDS: dict[str, Callable[[Any], tuple[ConvexMesh, ...]]] = {
+    "sphere": lambda shape: (capsule_polyhedron(shape.radius, 0.0),),
+    "box": lambda shape: (_box(shape),),
+    "cylinder": lambda shape: (_prism(shape),),
+    "capsule": lambda shape: (capsule_polyhedron(shape.radius, shape.height),),
+    "mesh": lambda shape: mesh_parts(shape.vertices.tobytes(), shape.faces.tobytes()),
+}
+"""By the kind of shape: convex meshes in the frame of a shape that enclose it."""

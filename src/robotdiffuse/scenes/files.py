@@ -47,7 +47,11 @@ def check_fields(
             f"{where} is {shown(data)}; it must be a mapping with the fields {', '.join(field_names)}"
         )
     if "rpy" in data and "wxyz" in field_names:
-        data = _without_rpy(where, data)
+        if "wxyz" in data:
+            raise InputError(f"{where} has wxyz and rpy; it must have one of them")
+        rpy = vector(where, "rpy", data["rpy"], 3)
+        data = {name: value for name, value in data.items() if name != "rpy"}
+        data["wxyz"] = quaternion_from_rotation(rotation_from_rpy(*rpy)).tolist()
     for name in data:
         if name not in field_names:
             raise unknown_name(f"field of {where}:", name, field_names)
@@ -55,15 +59,6 @@ def check_fields(
     if missing:
         raise InputError(f"{where} has no {' and no '.join(missing)}; known fields: {', '.join(field_names)}")
     return data
-
-
-def _without_rpy(where: str, data: dict[str, Any]) -> dict[str, Any]:
-    """The data with its roll, pitch, yaw [rad], in the order of URDFs, as a quaternion."""
-    if "wxyz" in data:
-        raise InputError(f"{where} has wxyz and rpy; it must have one of them")
-    rotation = rotation_from_rpy(*vector(where, "rpy", data["rpy"], 3))
-    rest = {name: value for name, value in data.items() if name != "rpy"}
-    return rest | {"wxyz": quaternion_from_rotation(rotation).tolist()}
 
 
 def read_scene(
@@ -138,27 +133,26 @@ def _content(kind: type[Shape], file: str, notes: list[str]) -> tuple[ndarray, .
 def scene_entries(scene: Scene, folder: Path | None) -> list[dict[str, dict[str, object]]]:
     """The scene as `read_scene` reads it, exactly. Shapes that were read from files are written as file
     names."""
-    return [{shape.kind: _values(shape, folder)} for shape in scene.shapes]
+    entries = []
+    for shape in scene.shapes:
+        file = getattr(shape, "file", None)
+        left_out = {"file"} if file is None else {*FILE_CONTENT[shape.kind], "file"}
+        values: dict[str, object] = {} if file is None else {"file": name_from(folder, Path(file))}
+        for field in fields(shape):  # type: ignore[arg-type]
+            value = getattr(shape, field.name)
+            if field.name not in left_out:
+                values[field.name] = value.tolist() if isinstance(value, ndarray) else value
+        if values["name"] == shape.kind:
+            del values["name"]
+        if values.get("wxyz") == list(IDENTITY):
+            del values["wxyz"]
+        entries.append({shape.kind: values})
+    return entries
 
 
 def contacts_entry(scene: Scene) -> dict[str, object]:
     """The allowed contacts as problem files hold them."""
     return {name: links if isinstance(links, str) else list(links) for name, links in scene.allowed_contacts}
-
-
-def _values(shape: Shape, folder: Path | None) -> dict[str, object]:
-    file = getattr(shape, "file", None)
-    left_out = {"file"} if file is None else {*FILE_CONTENT[shape.kind], "file"}
-    values: dict[str, object] = {} if file is None else {"file": name_from(folder, Path(file))}
-    for f in fields(shape):  # type: ignore[arg-type]
-        value = getattr(shape, f.name)
-        if f.name not in left_out:
-            values[f.name] = value.tolist() if isinstance(value, ndarray) else value
-    if values["name"] == shape.kind:
-        del values["name"]
-    if values.get("wxyz") == list(IDENTITY):
-        del values["wxyz"]
-    return values
 
 
 def name_from(folder: Path | None, file: Path) -> str:

@@ -3,17 +3,15 @@
 As with shapes, the constructor checks its arguments itself: see `no_type_check` in scenes/shapes.py.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, no_type_check
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import Value, form, numbers, read_only, vector, within
+from robotdiffuse.core.bounds import Value, form, numbers, read_only, rigid_transform, vector, within
 from robotdiffuse.core.errors import InputError, distinct, shown
 from robotdiffuse.core.transforms import (
     inverse,
@@ -22,12 +20,15 @@ from robotdiffuse.core.transforms import (
     rotation_from_quaternion,
     transform,
 )
+from robotdiffuse.core.types import ArrayOrNone, Pose, Poses, Values, VectorOrNone
 from robotdiffuse.scenes.shapes import Shape
 
 MAX_POINT_SPEED = 100.0
 """Speed limit of every point of an obstacle [m/s]; anything faster between two poses is a jump."""
 MAX_DURATION = 1e5
 """How long a constant velocity lasts [s], about a day: the longest motion that is validated."""
+RIGID_SLACK = 1e-6
+"""Largest deviation of a pose from a rigid transform."""
 POSE_TOLERANCE = 1e-6
 """Tolerance between the first pose and the pose of the shape [m], [rad]."""
 
@@ -48,11 +49,11 @@ class MovingObstacle(Value):
     """
 
     shape: Shape
-    velocity: Float[ndarray, "3"] | None = None
+    velocity: VectorOrNone = None  # pyright: ignore[reportAssignmentType]
     """Constant velocity [m/s]."""
-    times: Float[ndarray, "k"] | None = None
+    times: ArrayOrNone = None  # pyright: ignore[reportAssignmentType]
     """Times of the poses [s], increasing."""
-    poses: Float[ndarray, "k 4 4"] | None = None
+    poses: ArrayOrNone = None  # pyright: ignore[reportAssignmentType]
     """T_base_shape at each time."""
     max_speed: float | None = None
     """Speed limit of all points of an obstacle whose motion is unknown [m/s]."""
@@ -73,33 +74,45 @@ class MovingObstacle(Value):
                 "exactly one of velocity, times and poses, max_speed"
             )
         if self.velocity is not None:
-            self._set(velocity=vector(self.name, "velocity", self.velocity, 3, MAX_POINT_SPEED))
+            object.__setattr__(
+                self, "velocity", vector(self.name, "velocity", self.velocity, 3, MAX_POINT_SPEED)
+            )
         elif self.max_speed is not None:
-            self._set(max_speed=_speed(self.name, self.max_speed))
+            speed = numbers(self.max_speed)
+            if speed is None or speed.ndim != 0 or not 0 <= speed <= MAX_POINT_SPEED:
+                raise InputError(
+                    f"{self.name}.max_speed is {shown(self.max_speed)}; it must be a speed from 0 to "
+                    f"{MAX_POINT_SPEED:g} m/s"
+                )
+            object.__setattr__(self, "max_speed", float(speed))
         else:
-            times = _times(self.name, self.times)
-            poses = _poses(self.name, self.poses, len(times))
-            self._set(times=times, poses=poses)
-            self._check_track(times, poses)
+            self._check_track()
         super().__post_init__()
 
-    if TYPE_CHECKING:
-
-        def __init__(
-            self,
-            shape: Shape,
-            velocity: ArrayLike | None = None,
-            times: ArrayLike | None = None,
-            poses: ArrayLike | Sequence[ArrayLike] | None = None,
-            max_speed: float | None = None,
-        ) -> None: ...
-
-    def _set(self, **values: object) -> None:
-        for key, value in values.items():
-            object.__setattr__(self, key, value)
-
-    def _check_track(self, times: ndarray, poses: ndarray) -> None:
-        """Raises InputError unless the poses begin at the pose of the shape and do not jump."""
+    def _check_track(self) -> None:
+        """Sets times and poses. Raises InputError unless times increase, and poses are rigid transforms,
+        begin at the pose of the shape and do not jump."""
+        times = numbers(self.times)
+        poses = numbers(self.poses)
+        if times is None or times.ndim != 1 or len(times) < 2 or not within(times, MAX_DURATION):
+            raise InputError(
+                f"{self.name}.times is {shown(self.times)}; it must be two or more times within "
+                f"±{MAX_DURATION:g} s, one for each of the poses"
+            )
+        backwards = np.flatnonzero(np.diff(times) <= 0)
+        if len(backwards):
+            i = int(backwards[0])
+            time, before = distinct(times[i + 1], times[i])
+            raise InputError(f"{self.name}.times[{i + 1}] is {time} after {before}; times must increase")
+        if poses is None or poses.shape != (len(times), 4, 4):
+            raise InputError(
+                f"{self.name}.poses is {form(poses)}; it must be {len(times)} transforms of 4 x 4, one for "
+                f"each time"
+            )
+        for i, T in enumerate(poses):
+            rigid_transform(f"{self.name}.poses[{i}]", T, RIGID_SLACK)
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "poses", poses)
         off = inverse(self.shape.T_base_shape) @ poses[0]
         if np.linalg.norm(off[:3, 3]) > POSE_TOLERANCE or rotation_angle(off[:3, :3]) > POSE_TOLERANCE:
             raise InputError(
@@ -134,7 +147,7 @@ class MovingObstacle(Value):
         return float(np.linalg.norm(np.maximum(np.abs(low - center), np.abs(high - center))))
 
     @cached_property
-    def track(self) -> tuple[Float[ndarray, "k"], Float[ndarray, "k 4 4"]]:
+    def track(self) -> tuple[Values, Poses]:
         """Times, and poses between which it moves at constant rates; it stands still before and after.
 
         If its motion is unknown, only its pose at time 0.
@@ -154,7 +167,7 @@ class MovingObstacle(Value):
             return self.max_speed
         return float(track_speeds(*self.track, self.radius).max(initial=0.0))
 
-    def pose(self, time: float) -> Float[ndarray, "4 4"]:
+    def pose(self, time: float) -> Pose:
         """T_base_shape at a time.
 
         Args:
@@ -182,7 +195,7 @@ class MovingObstacle(Value):
         """
         return self.shape.moved(self.pose(time) @ inverse(self.shape.T_base_shape))
 
-    def moved(self, T: Float[ndarray, "4 4"]) -> "MovingObstacle":
+    def moved(self, T: Pose) -> "MovingObstacle":
         """The obstacle and its motion after a rigid motion.
 
         Args:
@@ -193,9 +206,7 @@ class MovingObstacle(Value):
         return replace(self, shape=self.shape.moved(T), velocity=velocity, poses=poses)
 
 
-def track_speeds(
-    times: Float[ndarray, "k"], poses: Float[ndarray, "k 4 4"], radius: float
-) -> Float[ndarray, "intervals"]:
+def track_speeds(times: Values, poses: Poses, radius: float) -> Float[ndarray, "intervals"]:
     """Bounds of the speed between the times [m/s], for points up to `radius` [m] from the origin."""
     distances_between = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     turns = [rotation_angle(a.T @ b) for a, b in zip(poses[:-1, :3, :3], poses[1:, :3, :3], strict=True)]
@@ -209,41 +220,3 @@ def _slerp(a: Float[ndarray, "4"], b: Float[ndarray, "4"], fraction: float) -> F
     if angle < 1e-9:
         return b
     return (np.sin((1 - fraction) * angle) * a + np.sin(fraction * angle) * b) / np.sin(angle)
-
-
-def _speed(name: str, value: object) -> float:
-    speed = numbers(value)
-    if speed is None or speed.ndim != 0 or not 0 <= speed <= MAX_POINT_SPEED:
-        raise InputError(
-            f"{name}.max_speed is {shown(value)}; it must be a speed from 0 to {MAX_POINT_SPEED:g} m/s"
-        )
-    return float(speed)
-
-
-def _times(name: str, value: object) -> Float[ndarray, "k"]:
-    times = numbers(value)
-    if times is None or times.ndim != 1 or len(times) < 2 or not within(times, MAX_DURATION):
-        raise InputError(
-            f"{name}.times is {shown(value)}; it must be two or more times within ±{MAX_DURATION:g} s, one "
-            "for each of the poses"
-        )
-    backwards = np.flatnonzero(np.diff(times) <= 0)
-    if len(backwards):
-        i = int(backwards[0])
-        time, before = distinct(times[i + 1], times[i])
-        raise InputError(f"{name}.times[{i + 1}] is {time} after {before}; times must increase")
-    return times
-
-
-def _poses(name: str, value: object, count: int) -> Float[ndarray, "k 4 4"]:
-    poses = numbers(value)
-    if poses is None or poses.shape != (count, 4, 4):
-        raise InputError(
-            f"{name}.poses is {form(poses)}; it must be {count} transforms of 4 x 4, one for each time"
-        )
-    for i, T in enumerate(poses):
-        R = T[:3, :3]
-        proper = within(T) and np.abs(R.T @ R - np.eye(3)).max() < 1e-6 and np.linalg.det(R) > 0
-        if not proper or np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-9:
-            raise InputError(f"{name}.poses[{i}] is not a rigid transform of finite numbers")
-    return poses

@@ -10,11 +10,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
 from robotdiffuse.core.input_files import input_file, read_arrays, read_bytes
+from robotdiffuse.core.types import Points, Vector
 
 FIRST_LINE = b"# Octomap OcTree binary file"
 TREE_DEPTH = 16
@@ -25,7 +25,7 @@ INNER = 3
 MAX_VOXELS = 5_000_000
 
 
-def read_octomap(file: str | Path) -> tuple[Float[ndarray, "n 3"], float]:
+def read_octomap(file: str | Path) -> tuple[Points, float]:
     """The centres of a .bt file's occupied voxels [m], and their edge [m].
 
     Of occupied leaves above the lowest level, the voxels at their surface. Raises InputError for a file that
@@ -54,7 +54,7 @@ def cover_radius(edge: float) -> float:
     return edge * np.sqrt(3) / 2
 
 
-def occupied_voxels(data: bytes, edge: float) -> Float[ndarray, "n 3"]:
+def occupied_voxels(data: bytes, edge: float) -> Points:
     """The centres of the occupied voxels of a tree in OctoMap's binary format [m].
 
     Raises InputError for data that end too soon, a tree that is too deep or has too many voxels, and an edge
@@ -91,7 +91,7 @@ def occupied_voxels(data: bytes, edge: float) -> Float[ndarray, "n 3"]:
     return np.concatenate(centers) if centers else np.zeros((0, 3))
 
 
-def _shell(level: int) -> Float[ndarray, "n 3"]:
+def _shell(level: int) -> Points:
     """Centres of the voxels at the surface of a cube of 2^level voxels, about its middle, in voxels."""
     n = 2**level
     if 6 * n**2 > MAX_VOXELS:
@@ -109,7 +109,7 @@ MIXERS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], 
 """Odd numbers with many bits, by which coordinates are mixed into a hash."""
 
 
-def voxel_thin(points: Float[ndarray, "n 3"], voxel: float) -> Float[ndarray, "m 3"]:
+def voxel_thin(points: Points, voxel: float) -> Points:
     """The first point of every occupied cell of a grid with cells `voxel` wide [m], in the original order.
 
     Every removed point is less than sqrt(3) * voxel away from a remaining one.
@@ -131,7 +131,7 @@ def voxel_thin(points: Float[ndarray, "n 3"], voxel: float) -> Float[ndarray, "m
     return points[np.sort(first_indices)]
 
 
-def distinct(points: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:
+def distinct(points: Points) -> Points:
     """The points without repetitions, in the old order; the same array if there are none."""
     if len(points) == 0:
         return points
@@ -145,12 +145,12 @@ def distinct(points: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:
     return points[np.sort(first_indices)]
 
 
-def crop(points: Float[ndarray, "n 3"], center: Float[ndarray, "3"], reach: float) -> Float[ndarray, "m 3"]:
+def crop(points: Points, center: Vector, reach: float) -> Points:
     """The points within `reach` of `center` [m]."""
     return points[((points - center) ** 2).sum(axis=1) <= reach**2]
 
 
-def read_points(file: str | Path) -> tuple[Float[ndarray, "n 3"], tuple[str, ...]]:
+def read_points(file: str | Path) -> tuple[Points, tuple[str, ...]]:
     """The points of a .ply, .pcd, .xyz, .csv, .npy, .npz or .bt file [m], and notes on removed points.
 
     Points that are not finite (missing returns of a depth camera) are removed, with a note. Columns after the
@@ -195,19 +195,15 @@ def _read_text(file: Path) -> ndarray:
         first = stream.readline()
     delimiter = "," if "," in first else None
     names = [name.strip().strip('"').lower() for name in first.split(delimiter)]
-    header = not _is_number(names[0])
+    header = False
+    try:
+        float(names[0])
+    except ValueError:
+        header = not names[0].startswith("#")
     columns = [names.index(axis) for axis in "xyz"] if header and {"x", "y", "z"} <= {*names} else None
     if header and not file.read_text(encoding="utf-8").partition("\n")[2].strip():
         return np.zeros((0, 3))
     return np.loadtxt(file, delimiter=delimiter, skiprows=int(header), usecols=columns, ndmin=2, comments="#")
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return text.startswith("#")
-    return True
 
 
 def _read_npz(file: Path) -> ndarray:

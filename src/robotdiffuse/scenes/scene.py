@@ -7,15 +7,14 @@ from functools import cached_property
 from typing import Any, no_type_check
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from robotdiffuse.core.bounds import Value
 from robotdiffuse.core.errors import InputError, joined, shown, unknown_name
-from robotdiffuse.core.transforms import inverse
+from robotdiffuse.core.transforms import inverse, quaternion_from_rotation, transform
+from robotdiffuse.core.types import Configuration, Pose
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.shapes import Shape
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
 
 SHOWN_NAMES = 5
 """Names of shapes in the text of a scene."""
@@ -23,6 +22,11 @@ ALL_LINKS = "all"
 """Stands for all links of a robot in `Scene.allowed_contacts`."""
 MAX_CONTACT_LINKS = 1000
 """Most links that `Scene.allowed_contacts` may name for one obstacle."""
+
+PLANE_SIZE = 10.0
+"""Edge of the box that stands for an infinite plane [m]."""
+PLANE_DEPTH = 0.1
+"""Thickness of the boxes that stand for planes [m]."""
 
 
 @no_type_check
@@ -91,11 +95,9 @@ class Scene(Value):
         Raises:
             InputError: For an unknown body, and for height fields and signed distance fields.
         """
-        from robotdiffuse.scenes.mujoco_scene import shapes_in
+        return cls(_mujoco_shapes(model, data, base))
 
-        return cls(shapes_in(model, data, base))
-
-    def moved(self, T: Float[ndarray, "4 4"]) -> "Scene":
+    def moved(self, T: Pose) -> "Scene":
         """The scene after a rigid motion.
 
         Args:
@@ -134,7 +136,7 @@ class Scene(Value):
         self,
         name: str,
         robot: Robot,
-        q: Float[ndarray, "dof"],
+        q: Configuration,
         link: str | None = None,
         touch_links: Sequence[str] = (),
     ) -> tuple["Scene", Robot]:
@@ -164,7 +166,7 @@ class Scene(Value):
         remaining_scene = self.with_shapes([shape for shape in self.shapes if shape.name != name])
         return remaining_scene, robot.attach(taken_shape, link, touch_links)
 
-    def detach(self, name: str, robot: Robot, q: Float[ndarray, "dof"]) -> tuple["Scene", Robot]:
+    def detach(self, name: str, robot: Robot, q: Configuration) -> tuple["Scene", Robot]:
         """The robot puts a held object down.
 
         Args:
@@ -228,3 +230,57 @@ def _contacts(
         for name, touching in by_name.items()
         if touching
     )
+
+
+def _mujoco_shapes(model: Any, data: Any, base: str) -> list[Shape]:
+    """The obstacles of a model; see `Scene.from_mujoco`."""
+    from robotdiffuse.robots.parsing import mjcf
+
+    mujoco = mjcf.imported_mujoco()
+    placed = mujoco.MjData(model)
+    if data is not None:
+        placed.qpos[:] = data.qpos
+        placed.mocap_pos[:] = data.mocap_pos
+        placed.mocap_quat[:] = data.mocap_quat
+    mujoco.mj_kinematics(model, placed)
+    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, base)
+    if body < 0:
+        raise unknown_name("body", base, [model.body(k).name for k in range(model.nbody)])
+    T_base_world = inverse(transform(placed.xpos[body], placed.xmat[body].reshape(3, 3)))
+    robot = set(mjcf.robot_bodies(model))
+    colliding = model.geom_contype | model.geom_conaffinity
+    shapes: list[Shape] = []
+    for geom in range(model.ngeom):
+        body = int(model.geom_bodyid[geom])
+        if body in robot or not colliding[geom]:
+            continue
+        name = model.geom(geom).name or model.body(body).name
+        T = T_base_world @ transform(placed.geom_xpos[geom], placed.geom_xmat[geom].reshape(3, 3))
+        center = T[:3, 3]
+        wxyz = quaternion_from_rotation(T[:3, :3])
+        size = model.geom_size[geom]
+        surface = None
+        match mjcf.kind_of("Geom", model.geom_type[geom]):
+            case "plane":
+                halves = np.where(size[:2] > 0, size[:2], PLANE_SIZE / 2)
+                below = center - T[:3, 2] * PLANE_DEPTH / 2
+                shapes.append(Box(below, [*2 * halves, PLANE_DEPTH], wxyz, name))
+            case "sphere":
+                shapes.append(Sphere(center, float(size[0]), name))
+            case "box":
+                shapes.append(Box(center, 2 * size, wxyz, name))
+            case "capsule" | "cylinder" as kind:
+                shape = Capsule if kind == "capsule" else Cylinder
+                shapes.append(shape(center, float(size[0]), float(2 * size[1]), wxyz, name))
+            case "ellipsoid":
+                surface = mjcf.ellipsoid(size)
+            case "mesh":  # MuJoCo collides with the hull
+                surface = mjcf.mesh_of(model, int(model.geom_dataid[geom])).convex_hull
+            case kind:
+                raise InputError(
+                    f"geom {name} is of type {kind}; obstacles may be planes, spheres, capsules, ellipsoids, "
+                    f"cylinders, boxes and meshes"
+                )
+        if surface is not None:
+            shapes.append(Mesh(surface.vertices, surface.faces, center, wxyz, name=name))
+    return shapes

@@ -50,7 +50,20 @@ class PackedScenes:
         kinds = np.full((len(scenes), slots), NONE, np.int8)
         params = np.zeros((len(scenes), slots, PARAMETERS), np.float32)
         for scene, kind, row in zip(scenes, kinds, params, strict=True):
-            _pack(scene.shapes[floor:], kind, row)
+            shapes = scene.shapes[floor:]
+            if len(shapes) > slots:
+                raise InputError(f"the scene has {len(shapes)} shapes; there are {slots} slots")
+            for i, shape in enumerate(shapes):
+                row[i, :3] = getattr(shape, "center", 0)
+                if isinstance(shape, Sphere):
+                    kind[i] = SPHERE
+                    row[i, 3] = shape.radius
+                elif isinstance(shape, Box):
+                    kind[i] = BOX
+                    row[i, 3:6] = shape.size
+                    row[i, 6:] = shape.wxyz
+                else:
+                    raise InputError(f"{shape.name} is a {shape.kind}; only spheres and boxes can be packed")
         floors = np.array([floor_row(s.shapes[0]) for s in scenes]).reshape(-1, 6) if floor else None
         return PackedScenes(kinds, params, floors)
 
@@ -116,19 +129,3 @@ def floor_row(floor: Shape | None) -> Float[ndarray, "6"]:
     if not isinstance(floor, Box) or floor.wxyz[0] != 1:
         raise InputError(f"the floor {floor.name} is a {floor.kind}; it must be a box without rotation")
     return np.concatenate([floor.center, floor.size])
-
-
-def _pack(shapes: Sequence[Shape], kinds: Int8[ndarray, "k"], params: Float32[ndarray, "k 10"]) -> None:
-    if len(shapes) > len(kinds):
-        raise InputError(f"the scene has {len(shapes)} shapes; there are {len(kinds)} slots")
-    for i, shape in enumerate(shapes):
-        params[i, :3] = getattr(shape, "center", 0)
-        if isinstance(shape, Sphere):
-            kinds[i] = SPHERE
-            params[i, 3] = shape.radius
-        elif isinstance(shape, Box):
-            kinds[i] = BOX
-            params[i, 3:6] = shape.size
-            params[i, 6:] = shape.wxyz
-        else:
-            raise InputError(f"{shape.name} is a {shape.kind}; only spheres and boxes can be packed")

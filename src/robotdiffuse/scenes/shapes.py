@@ -6,13 +6,14 @@ run-time type checks of the tests off these classes.
 
 import warnings
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, no_type_check
+from typing import Any, ClassVar, no_type_check
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
@@ -30,11 +31,14 @@ from robotdiffuse.core.bounds import (
 )
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.mesh_files import read_triangles
-from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
+from robotdiffuse.core.transforms import placed, quaternion_from_rotation, rotation_from_quaternion, transform
+from robotdiffuse.core.types import GivenArray, GivenVector, Points, Pose, Rotation, Values
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.scenes.point_cloud import POINT_RADIUS, default_radius, distinct, read_points, voxel_thin
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
+Corners = Float[ndarray, "2 3"]
+"""Lower and upper corner of a box along the axes [m]."""
 
 
 class Shape(Value, ABC):
@@ -53,44 +57,80 @@ class Shape(Value, ABC):
 
     @property
     @abstractmethod
-    def bounds(self) -> Float[ndarray, "2 3"]:
+    def bounds(self) -> Corners:
         """Lower and upper corner of an axis-aligned box around the shape [m]."""
 
     @property
-    def T_base_shape(self) -> Float[ndarray, "4 4"]:
+    def T_base_shape(self) -> Pose:
         """Pose of the shape's own frame. Raises InputError for shapes without one, such as point clouds."""
         raise self._not_solid()
 
-    def moved(self, T: Float[ndarray, "4 4"]) -> "Shape":
+    def moved(self, T: Pose) -> "Shape":
         """The shape after the rigid motion T. A point cloud forgets the file that it was read from.
 
         Raises InputError for shapes that do not implement it.
         """
         raise InputError(f"a {self.kind} cannot be moved; write it as a mesh")
 
-    def solid(self) -> tuple[Float[ndarray, "4 4"], tuple[ConvexMesh, ...]]:
+    def solid(self) -> tuple[Pose, tuple[ConvexMesh, ...]]:
         """T_base_shape, and convex meshes in the shape's own frame that enclose it, for a robot to hold.
 
         The mesh of a box is exact; round shapes get a polyhedron around them. Raises InputError for point
         clouds and height maps.
         """
-        return self.T_base_shape, self._convex_meshes()
+        from robotdiffuse.scenes.convex_solids import SOLIDS  # SciPy, which few problems need
 
-    def _convex_meshes(self) -> tuple[ConvexMesh, ...]:
-        raise self._not_solid()
+        if self.kind not in SOLIDS:
+            raise self._not_solid()
+        return self.T_base_shape, SOLIDS[self.kind](self)
 
     def _not_solid(self) -> InputError:
         return InputError(
             f"{self.name!r} is a {self.kind}; it must be one of sphere, box, cylinder, capsule and mesh"
         )
 
+    def __post_init__(self) -> None:
+        """Checks the fields that `CHECKS` names. Raises InputError for the first that is wrong."""
+        for name in (field.name for field in fields(self)):  # type: ignore[arg-type]
+            if name in CHECKS:
+                object.__setattr__(self, name, CHECKS[name](self.kind, name, getattr(self, name)))
+        super().__post_init__()
 
-def set_fields(shape: Shape, **values: object) -> None:
-    """Set checked values in the constructor of a shape, read-only. Raises InputError for a bad name."""
-    if not isinstance(shape.name, str) or not shape.name:
-        raise InputError(f"{shape.kind}.name is {shown(shape.name)}; it must be a non-empty string")
-    for key, value in values.items():
-        object.__setattr__(shape, key, read_only(value))
+
+def _vector(kind: str, name: str, value: object) -> ndarray:
+    return vector(kind, name, value, 3)
+
+
+def _name(kind: str, name: str, value: object) -> object:
+    if not isinstance(value, str) or not value:
+        raise InputError(f"{kind}.name is {shown(value)}; it must be a non-empty string")
+    return value
+
+
+def _size(kind: str, name: str, value: object) -> ndarray:
+    size = vector(kind, name, value, 3)
+    if (size < MIN_SIZE).any():
+        raise InputError(
+            f"{kind}.size is {shown(value)}; edge lengths must be positive, at least {MIN_SIZE:g} m"
+        )
+    return size
+
+
+CHECKS: dict[str, Callable[[str, str, Any], Any]] = {
+    "size": _size,
+    "center": _vector,
+    "xyz": _vector,
+    "wxyz": lambda kind, name, value: unit_quaternion(kind, value),
+    "radius": positive,
+    "height": positive,
+    "cell": positive,
+    "points": points,
+    "vertices": points,
+    "point_radius": positive,
+    "name": _name,
+}
+"""Checks of fields of shapes by name: functions of a shape's kind, the field's name and value that return the
+value to keep, or raise InputError."""
 
 
 @no_type_check
@@ -103,35 +143,24 @@ class Sphere(Shape):
     name: by which results and commands refer to it; a scene appends a number to names that are not unique.
     """
 
-    center: Float[ndarray, "3"]
+    center: GivenVector
     radius: float
     name: str = "sphere"
     kind: ClassVar[str] = "sphere"
-
-    def __post_init__(self) -> None:
-        set_fields(
-            self,
-            center=vector("sphere", "center", self.center, 3),
-            radius=positive("sphere", "radius", self.radius),
-        )
-
-    if TYPE_CHECKING:
-
-        def __init__(self, center: ArrayLike, radius: float, name: str = "sphere") -> None: ...
 
     @property
     def area(self) -> float:
         return 4 * np.pi * self.radius**2
 
     @property
-    def bounds(self) -> Float[ndarray, "2 3"]:
+    def bounds(self) -> Corners:
         return np.stack([self.center - self.radius, self.center + self.radius])
 
     @property
-    def T_base_shape(self) -> Float[ndarray, "4 4"]:
+    def T_base_shape(self) -> Pose:
         return transform(self.center)
 
-    def moved(self, T: Float[ndarray, "4 4"]) -> "Shape":
+    def moved(self, T: Pose) -> "Shape":
         """The sphere after a rigid motion.
 
         Args:
@@ -139,34 +168,31 @@ class Sphere(Shape):
         """
         return replace(self, center=T[:3, :3] @ self.center + T[:3, 3])
 
-    def _convex_meshes(self) -> tuple[ConvexMesh, ...]:
-        from robotdiffuse.scenes.convex_solids import capsule_polyhedron  # SciPy, which few problems need
 
-        return (capsule_polyhedron(self.radius, 0.0),)
+class _Posed(Shape):
+    """A shape with a frame of its own."""
 
-
-class _Oriented(Shape):
-    """A shape with a centre and an orientation."""
-
-    center: Float[ndarray, "3"]
-    wxyz: Float[ndarray, "4"]
+    origin: ClassVar[str] = "center"
+    """The field that holds the frame's position."""
+    wxyz: GivenArray
 
     @cached_property
-    def rotation(self) -> Float[ndarray, "3 3"]:
+    def rotation(self) -> Rotation:
         return read_only(rotation_from_quaternion(self.wxyz))
 
     @property
-    def T_base_shape(self) -> Float[ndarray, "4 4"]:
-        return transform(self.center, self.rotation)
+    def T_base_shape(self) -> Pose:
+        return transform(getattr(self, self.origin), self.rotation)
 
-    def moved(self, T: Float[ndarray, "4 4"]) -> "Shape":
+    def moved(self, T: Pose) -> "Shape":
         T = T @ self.T_base_shape
-        return replace(self, center=T[:3, 3], wxyz=quaternion_from_rotation(T[:3, :3]))  # type: ignore[type-var]
+        moved: dict[str, Any] = {self.origin: T[:3, 3], "wxyz": quaternion_from_rotation(T[:3, :3])}
+        return replace(self, **moved)  # type: ignore[type-var]
 
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class Box(_Oriented):
+class Box(_Posed):
     """A box of any orientation.
 
     center: its middle, x y z in the frame of the robot's base [m].
@@ -175,27 +201,12 @@ class Box(_Oriented):
     name: by which results and commands refer to it; a scene appends a number to names that are not unique.
     """
 
-    center: Float[ndarray, "3"]
-    size: Float[ndarray, "3"]
+    center: GivenVector
+    size: GivenVector
     """Full edge lengths [m]."""
-    wxyz: Float[ndarray, "4"] = field(default=IDENTITY)  # type: ignore[assignment]
+    wxyz: GivenArray = IDENTITY  # type: ignore[assignment]
     name: str = "box"
     kind: ClassVar[str] = "box"
-
-    def __post_init__(self) -> None:
-        size = vector("box", "size", self.size, 3)
-        if (size < MIN_SIZE).any():
-            raise InputError(
-                f"box.size is {shown(self.size)}; edge lengths must be positive, at least {MIN_SIZE:g} m"
-            )
-        center = vector("box", "center", self.center, 3)
-        set_fields(self, center=center, size=size, wxyz=unit_quaternion("box", self.wxyz))
-
-    if TYPE_CHECKING:
-
-        def __init__(
-            self, center: ArrayLike, size: ArrayLike, wxyz: ArrayLike = IDENTITY, name: str = "box"
-        ) -> None: ...
 
     @property
     def area(self) -> float:
@@ -203,34 +214,20 @@ class Box(_Oriented):
         return 2 * float(x * y + y * z + z * x)
 
     @property
-    def bounds(self) -> Float[ndarray, "2 3"]:
+    def bounds(self) -> Corners:
         half = np.abs(self.rotation) @ self.size / 2
         return np.stack([self.center - half, self.center + half])
-
-    def _convex_meshes(self) -> tuple[ConvexMesh, ...]:
-        from robotdiffuse.scenes.convex_solids import box_mesh
-
-        return (box_mesh(self.size),)
 
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class _Axial(_Oriented):
+class _Axial(_Posed):
     """A shape about its own z axis."""
 
-    center: Float[ndarray, "3"]
+    center: GivenVector
     radius: float
     height: float
-    wxyz: Float[ndarray, "4"] = field(default=IDENTITY)  # type: ignore[assignment]
-
-    def __post_init__(self) -> None:
-        set_fields(
-            self,
-            center=vector(self.kind, "center", self.center, 3),
-            radius=positive(self.kind, "radius", self.radius),
-            height=positive(self.kind, "height", self.height),
-            wxyz=unit_quaternion(self.kind, self.wxyz),
-        )
+    wxyz: GivenArray = IDENTITY  # type: ignore[assignment]
 
 
 @no_type_check
@@ -247,31 +244,15 @@ class Cylinder(_Axial):
     name: str = "cylinder"
     kind: ClassVar[str] = "cylinder"
 
-    if TYPE_CHECKING:
-
-        def __init__(
-            self,
-            center: ArrayLike,
-            radius: float,
-            height: float,
-            wxyz: ArrayLike = IDENTITY,
-            name: str = "cylinder",
-        ) -> None: ...
-
     @property
     def area(self) -> float:
         return 2 * np.pi * self.radius * (self.radius + self.height)
 
     @property
-    def bounds(self) -> Float[ndarray, "2 3"]:
+    def bounds(self) -> Corners:
         axis = self.rotation[:, 2]
         half = np.abs(axis) * self.height / 2 + self.radius * np.sqrt(np.clip(1 - axis**2, 0, None))
         return np.stack([self.center - half, self.center + half])
-
-    def _convex_meshes(self) -> tuple[ConvexMesh, ...]:
-        from robotdiffuse.scenes.convex_solids import prism
-
-        return (prism(self.radius, self.height),)
 
 
 @no_type_check
@@ -289,30 +270,14 @@ class Capsule(_Axial):
     name: str = "capsule"
     kind: ClassVar[str] = "capsule"
 
-    if TYPE_CHECKING:
-
-        def __init__(
-            self,
-            center: ArrayLike,
-            radius: float,
-            height: float,
-            wxyz: ArrayLike = IDENTITY,
-            name: str = "capsule",
-        ) -> None: ...
-
     @property
     def area(self) -> float:
         return 2 * np.pi * self.radius * (2 * self.radius + self.height)
 
     @property
-    def bounds(self) -> Float[ndarray, "2 3"]:
+    def bounds(self) -> Corners:
         half = np.abs(self.rotation[:, 2]) * self.height / 2 + self.radius
         return np.stack([self.center - half, self.center + half])
-
-    def _convex_meshes(self) -> tuple[ConvexMesh, ...]:
-        from robotdiffuse.scenes.convex_solids import capsule_polyhedron
-
-        return (capsule_polyhedron(self.radius, self.height),)
 
 
 @no_type_check
@@ -325,29 +290,12 @@ class PointCloud(Shape):
     name: as of Box.
     """
 
-    points: Float[ndarray, "n 3"]
+    points: GivenArray
     point_radius: float = POINT_RADIUS
     """Radius of the sphere around each point [m]."""
     file: str | None = None
     name: str = "point_cloud"
     kind: ClassVar[str] = "point_cloud"
-
-    def __post_init__(self) -> None:
-        set_fields(
-            self,
-            points=points("point_cloud", "points", self.points),
-            point_radius=positive("point_cloud", "point_radius", self.point_radius),
-        )
-
-    if TYPE_CHECKING:
-
-        def __init__(
-            self,
-            points: ArrayLike,
-            point_radius: float = POINT_RADIUS,
-            file: str | None = None,
-            name: str = "point_cloud",
-        ) -> None: ...
 
     @classmethod
     def from_file(
@@ -383,7 +331,7 @@ class PointCloud(Shape):
         return cls(scale * points, point_radius, name=name)  # files of problems have no scale
 
     @cached_property
-    def distinct_points(self) -> Float[ndarray, "m 3"]:
+    def distinct_points(self) -> Points:
         """Without repetitions, each of which takes as long as a point of its own in Coal's tree."""
         return distinct(self.points)
 
@@ -394,20 +342,20 @@ class PointCloud(Shape):
         return len(voxel_thin(self.points, width)) * width**2
 
     @cached_property
-    def bounds(self) -> Float[ndarray, "2 3"]:
+    def bounds(self) -> Corners:
         if len(self.points) == 0:
             return read_only(np.zeros((2, 3)))
         low = self.points.min(axis=0)
         high = self.points.max(axis=0)
         return read_only(np.stack([low - self.point_radius, high + self.point_radius]))
 
-    def moved(self, T: Float[ndarray, "4 4"]) -> "Shape":
+    def moved(self, T: Pose) -> "Shape":
         """The cloud after a rigid motion.
 
         Args:
             T: The rigid motion, a homogeneous transform [4, 4].
         """
-        return replace(self, points=self.points @ T[:3, :3].T + T[:3, 3], file=None)
+        return replace(self, points=placed(T, self.points), file=None)
 
 
 class Triangulated(Shape):
@@ -423,28 +371,13 @@ class Triangulated(Shape):
         return self.mesh.area
 
     @property
-    def bounds(self) -> Float[ndarray, "2 3"]:
+    def bounds(self) -> Corners:
         return self.mesh.bounds
-
-
-class PosedTriangles(Triangulated):
-    """Triangles in a frame of their own, which `xyz` and `wxyz` place in the base frame."""
-
-    xyz: Float[ndarray, "3"]
-    wxyz: Float[ndarray, "4"]
-
-    @property
-    def T_base_shape(self) -> Float[ndarray, "4 4"]:
-        return transform(self.xyz, rotation_from_quaternion(self.wxyz))
-
-    def moved(self, T: Float[ndarray, "4 4"]) -> "Shape":
-        T = T @ self.T_base_shape
-        return replace(self, xyz=T[:3, 3], wxyz=quaternion_from_rotation(T[:3, :3]))  # type: ignore[type-var]
 
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class Mesh(PosedTriangles):
+class Mesh(_Posed, Triangulated):
     """A triangle mesh. Only its surface counts for collision. `Mesh.from_file` reads one.
 
     vertices: n x 3, in the mesh's own frame [m].
@@ -453,45 +386,28 @@ class Mesh(PosedTriangles):
     name: as of Box.
     """
 
-    vertices: Float[ndarray, "v 3"]
+    vertices: GivenArray
     """In the mesh's own frame [m]."""
-    faces: Int[ndarray, "f 3"]
-    xyz: Float[ndarray, "3"] = field(default=(0.0, 0.0, 0.0))  # type: ignore[assignment]
-    wxyz: Float[ndarray, "4"] = field(default=IDENTITY)  # type: ignore[assignment]
+    faces: GivenArray
+    xyz: GivenVector = (0.0, 0.0, 0.0)  # type: ignore[assignment]
+    wxyz: GivenArray = IDENTITY  # type: ignore[assignment]
     file: str | None = None
     """The file that it was read from, for writing it back."""
     name: str = "mesh"
     kind: ClassVar[str] = "mesh"
+    origin: ClassVar[str] = "xyz"
 
     def __post_init__(self) -> None:
-        vertices = points("mesh", "vertices", self.vertices)
+        super().__post_init__()
         faces = numbers(self.faces)
         if faces is None or faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
             raise InputError(f"mesh.faces is {form(faces)}; it must be n x 3 indices, at least one row")
-        if not (faces == np.floor(faces)).all() or faces.min() < 0 or faces.max() >= len(vertices):
+        if not (faces == np.floor(faces)).all() or faces.min() < 0 or faces.max() >= len(self.vertices):
             raise InputError(
                 f"mesh.faces holds values from {faces.min():g} to {faces.max():g}; "
-                f"they must be indices of the {len(vertices)} vertices"
+                f"they must be indices of the {len(self.vertices)} vertices"
             )
-        set_fields(
-            self,
-            vertices=vertices,
-            faces=faces.astype(np.int64),
-            xyz=vector("mesh", "xyz", self.xyz, 3),
-            wxyz=unit_quaternion("mesh", self.wxyz),
-        )
-
-    if TYPE_CHECKING:
-
-        def __init__(
-            self,
-            vertices: ArrayLike,
-            faces: ArrayLike,
-            xyz: ArrayLike = (0.0, 0.0, 0.0),
-            wxyz: ArrayLike = IDENTITY,
-            file: str | None = None,
-            name: str = "mesh",
-        ) -> None: ...
+        object.__setattr__(self, "faces", read_only(faces.astype(np.int64)))
 
     @classmethod
     def from_file(
@@ -525,11 +441,11 @@ class Mesh(PosedTriangles):
         return self
 
     @cached_property
-    def world_vertices(self) -> Float[ndarray, "v 3"]:
-        return read_only(self.vertices @ rotation_from_quaternion(self.wxyz).T + self.xyz)
+    def world_vertices(self) -> Points:
+        return read_only(self.vertices @ self.rotation.T + self.xyz)
 
     @cached_property
-    def face_areas(self) -> Float[ndarray, "f"]:
+    def face_areas(self) -> Values:
         a, b, c = np.moveaxis(self.vertices[self.faces], 1, 0)
         return read_only(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
 
@@ -538,18 +454,13 @@ class Mesh(PosedTriangles):
         return float(self.face_areas.sum())
 
     @property
-    def bounds(self) -> Float[ndarray, "2 3"]:
+    def bounds(self) -> Corners:
         return np.stack([self.world_vertices.min(axis=0), self.world_vertices.max(axis=0)])
-
-    def _convex_meshes(self) -> tuple[ConvexMesh, ...]:
-        from robotdiffuse.scenes.convex_solids import mesh_parts
-
-        return mesh_parts(self.vertices.tobytes(), self.faces.tobytes())
 
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class HeightMap(PosedTriangles):
+class HeightMap(_Posed, Triangulated):
     """Terrain: heights at the points of a grid, joined by triangles. Only this surface counts for collision.
 
     heights: rows along y, columns along x, above `xyz` along z [m]; cells with a height that is not a number
@@ -559,14 +470,15 @@ class HeightMap(PosedTriangles):
     name: as of Box.
     """
 
-    heights: Float[ndarray, "rows columns"]
+    heights: GivenArray
     cell: float
-    xyz: Float[ndarray, "3"] = field(default=(0.0, 0.0, 0.0))  # type: ignore[assignment]
-    wxyz: Float[ndarray, "4"] = field(default=IDENTITY)  # type: ignore[assignment]
+    xyz: GivenVector = (0.0, 0.0, 0.0)  # type: ignore[assignment]
+    wxyz: GivenArray = IDENTITY  # type: ignore[assignment]
     file: str | None = None
     """The file that it was read from, for writing it back."""
     name: str = "height_map"
     kind: ClassVar[str] = "height_map"
+    origin: ClassVar[str] = "xyz"
 
     def __post_init__(self) -> None:
         heights = numbers(self.heights)
@@ -577,27 +489,10 @@ class HeightMap(PosedTriangles):
         finite = np.abs(heights[~np.isnan(heights)])
         if not (finite <= MAX_COORDINATE).all():
             raise InputError(f"height_map.heights has numbers that are not within ±{MAX_COORDINATE:g} m")
-        set_fields(
-            self,
-            heights=heights,
-            cell=positive("height_map", "cell", self.cell),
-            xyz=vector("height_map", "xyz", self.xyz, 3),
-            wxyz=unit_quaternion("height_map", self.wxyz),
-        )
+        object.__setattr__(self, "heights", heights)
+        super().__post_init__()
         if not len(self._faces):
             raise InputError("height_map.heights has no cell of four heights")
-
-    if TYPE_CHECKING:
-
-        def __init__(
-            self,
-            heights: ArrayLike,
-            cell: float,
-            xyz: ArrayLike = (0.0, 0.0, 0.0),
-            wxyz: ArrayLike = IDENTITY,
-            file: str | None = None,
-            name: str = "height_map",
-        ) -> None: ...
 
     @property
     def _faces(self) -> ndarray:

@@ -3,8 +3,9 @@
 See `surface_clouds` for many scenes at once.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import singledispatch
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -14,7 +15,7 @@ from numpy.random import Generator
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Positive, Settings
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere, Triangulated
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere
 
 MAX_SAMPLING_ROUNDS = 6
 """Rounds of sampling in `sample_surface` before it repeats points."""
@@ -49,43 +50,10 @@ class VisibleRegion(Settings, name="region"):
 PANDA_REGION = VisibleRegion()
 
 
-def _sphere(shape: Sphere, n: int, rng: Generator) -> ndarray:
-    directions = rng.standard_normal((n, 3))
-    directions *= (shape.radius / np.sqrt((directions * directions).sum(axis=1)))[:, None]
-    return directions + shape.center
-
-
-def _box(shape: Box, n: int, rng: Generator) -> ndarray:
-    points = rng.random((n, 3)) - 0.5
-    x, y, z = shape.size
-    faces = np.array([y * z, z * x, x * y])
-    axis = np.searchsorted(np.cumsum(faces / faces.sum())[:2], rng.random(n), side="right")
-    rows = np.arange(n)
-    points[rows, axis] = np.where(points[rows, axis] < 0, -0.5, 0.5)
-    return (points * shape.size) @ shape.rotation.T + shape.center
-
-
-def _cylinder(shape: Cylinder, n: int, rng: Generator) -> ndarray:
-    angle = rng.random(n) * (2 * np.pi)
-    height = rng.random(n) - 0.5
-    on_side = rng.random(n) * (shape.height + shape.radius) < shape.height
-    radius = np.where(on_side, 1.0, np.sqrt(rng.random(n))) * shape.radius
-    z = np.where(on_side, height, np.where(height < 0, -0.5, 0.5)) * shape.height
-    local = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
-    return local @ shape.rotation.T + shape.center
-
-
-def _capsule(shape: Capsule, n: int, rng: Generator) -> ndarray:
-    local = rng.standard_normal((n, 3))
-    on_side = rng.random(n) * (shape.height + 2 * shape.radius) < shape.height
-    local[on_side, 2] = 0
-    local *= (shape.radius / np.sqrt((local * local).sum(axis=1)))[:, None]
-    along = np.where(on_side, rng.random(n) - 0.5, np.copysign(0.5, local[:, 2]))
-    local[:, 2] += along * shape.height
-    return local @ shape.rotation.T + shape.center
-
-
-def _triangles(shape: Triangulated, n: int, rng: Generator) -> ndarray:
+@singledispatch
+def draw(shape: Any, n: int, rng: Generator) -> ndarray:
+    """n points on a shape, uniform by area, in the base frame: those of its triangles, if no function for its
+    class is registered."""
     mesh = shape.mesh
     edges = np.cumsum(mesh.face_areas)
     face = np.searchsorted(edges[:-1], rng.random(n) * edges[-1], side="right")
@@ -97,24 +65,49 @@ def _triangles(shape: Triangulated, n: int, rng: Generator) -> ndarray:
     return a + u * (b - a) + v * (c - a)
 
 
+@draw.register
+def _sphere(shape: Sphere, n: int, rng: Generator) -> ndarray:
+    directions = rng.standard_normal((n, 3))
+    directions *= (shape.radius / np.sqrt((directions * directions).sum(axis=1)))[:, None]
+    return directions + shape.center
+
+
+@draw.register
+def _box(shape: Box, n: int, rng: Generator) -> ndarray:
+    points = rng.random((n, 3)) - 0.5
+    x, y, z = shape.size
+    faces = np.array([y * z, z * x, x * y])
+    axis = np.searchsorted(np.cumsum(faces / faces.sum())[:2], rng.random(n), side="right")
+    rows = np.arange(n)
+    points[rows, axis] = np.where(points[rows, axis] < 0, -0.5, 0.5)
+    return (points * shape.size) @ shape.rotation.T + shape.center
+
+
+@draw.register
+def _cylinder(shape: Cylinder, n: int, rng: Generator) -> ndarray:
+    angle = rng.random(n) * (2 * np.pi)
+    height = rng.random(n) - 0.5
+    on_side = rng.random(n) * (shape.height + shape.radius) < shape.height
+    radius = np.where(on_side, 1.0, np.sqrt(rng.random(n))) * shape.radius
+    z = np.where(on_side, height, np.where(height < 0, -0.5, 0.5)) * shape.height
+    local = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+    return local @ shape.rotation.T + shape.center
+
+
+@draw.register
+def _capsule(shape: Capsule, n: int, rng: Generator) -> ndarray:
+    local = rng.standard_normal((n, 3))
+    on_side = rng.random(n) * (shape.height + 2 * shape.radius) < shape.height
+    local[on_side, 2] = 0
+    local *= (shape.radius / np.sqrt((local * local).sum(axis=1)))[:, None]
+    along = np.where(on_side, rng.random(n) - 0.5, np.copysign(0.5, local[:, 2]))
+    local[:, 2] += along * shape.height
+    return local @ shape.rotation.T + shape.center
+
+
+@draw.register
 def _point_cloud(shape: PointCloud, n: int, rng: Generator) -> ndarray:
     return shape.points[rng.integers(len(shape.points), size=n)]
-
-
-DRAWS: dict[type[Shape], Callable[..., ndarray]] = {
-    Sphere: _sphere,
-    Box: _box,
-    Cylinder: _cylinder,
-    Capsule: _capsule,
-    Mesh: _triangles,
-    PointCloud: _point_cloud,
-}
-"""For each shape class, a function that samples n points uniformly by area, in the base frame. For classes
-that are not listed, the triangles are sampled."""
-
-
-def _draw_of(shape: Shape) -> Callable[..., ndarray]:
-    return next((DRAWS[kind] for kind in type(shape).__mro__ if kind in DRAWS), _triangles)
 
 
 def sample_surface(
@@ -132,11 +125,10 @@ def sample_surface(
     shares = areas / areas.sum()
     found: list[ndarray] = []
     missing = count
-    draw = 2 * count
+    wanted = 2 * count
     for _ in range(MAX_SAMPLING_ROUNDS):
-        parts = rng.multinomial(draw, shares)
-        draws = [_draw_of(shape) for shape in shapes]
-        drawn = [f(s, int(n), rng) for f, s, n in zip(draws, shapes, parts, strict=True) if n > 0]
+        parts = rng.multinomial(wanted, shares)
+        drawn = [draw(shape, int(n), rng) for shape, n in zip(shapes, parts, strict=True) if n > 0]
         points = np.concatenate(drawn)
         points = points[region.holds(points)]
         # The points are ordered by shape: without the permutation, the first ones would all be on the first
@@ -146,7 +138,7 @@ def sample_surface(
         missing -= len(points)
         if missing == 0:
             break
-        draw = min(4 * draw, 65536)
+        wanted = min(4 * wanted, 65536)
     points = np.concatenate(found)
     if 0 < missing < count:
         points = np.concatenate([points, points[rng.integers(len(points), size=missing)]])

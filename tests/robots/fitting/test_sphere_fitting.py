@@ -21,7 +21,7 @@ from robotdiffuse.robots.fitting.sphere_fitting import (
 from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.robots.robot import ConvexMesh, Robot
 
-QUICK = SphereSettings(candidates=200, rounds=6, tries=1, starts=1)
+QUICK = SphereSettings(candidates=200, rounds=6, tries=1)
 TOLERANCE = 0.015
 
 

@@ -1,6 +1,5 @@
 """Collision elements of URDFs as triangle meshes."""
 
-import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +8,13 @@ import trimesh
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.fitting.convex_parts import Surface
-from robotdiffuse.robots.parsing.packages import Packages
-from robotdiffuse.robots.parsing.urdf import link_surfaces
+from robotdiffuse.robots.parsing.urdf import UrdfTree
 
 
 def surfaces(file: Path, shape: str, origin: str = "") -> tuple[Surface, ...]:
     link = f'<link name="arm"><collision>{origin}<geometry>{shape}</geometry></collision></link>'
-    return link_surfaces(file, ET.fromstring(link), "collision", Packages(file, {}), [])
+    file.write_text(f'<robot name="arm">{link}</robot>')
+    return UrdfTree(file, {}).surfaces("arm")
 
 
 @pytest.mark.parametrize(
@@ -27,8 +26,10 @@ def surfaces(file: Path, shape: str, origin: str = "") -> tuple[Surface, ...]:
         ('<capsule radius="0.1" length="0.5"/>', np.pi * (5e-3 + 4 / 3 * 1e-3), [0.2, 0.2, 0.7]),
     ],
 )
-def test_polyhedra_lie_closely_around_primitives(shape: str, volume: float, extents: list[float]) -> None:
-    [surface] = surfaces(Path("arm.urdf"), shape)
+def test_polyhedra_lie_closely_around_primitives(
+    tmp_path: Path, shape: str, volume: float, extents: list[float]
+) -> None:
+    [surface] = surfaces(tmp_path / "arm.urdf", shape)
     solid = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
     assert solid.is_watertight and -1e-9 < solid.volume / volume - 1 < 0.06
     assert (solid.extents > np.array(extents) - 1e-9).all()

@@ -16,15 +16,17 @@ from numpy import ndarray
 from scipy import ndimage
 from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
 
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.kernels import kernel
+from robotdiffuse.core.settings import Count, Positive, Settings
+from robotdiffuse.core.types import Points, Values, Vector
 from robotdiffuse.robots.bodies import ConvexMesh, Surface
 
+Triangles = Float[ndarray, "_ 3 3"]
 MIN_THICKNESS = 1e-3
 """Smallest thickness of a hull [m]: spheres and distances need a sheet to have a volume."""
 
 
-def convex_hull(points: Float[ndarray, "n 3"]) -> ConvexMesh:
+def convex_hull(points: Points) -> ConvexMesh:
     """Convex hull with outward faces; a point set thinner than `MIN_THICKNESS` in a direction is thickened to
     it."""
     points = thickened(points)
@@ -38,7 +40,7 @@ def convex_hull(points: Float[ndarray, "n 3"]) -> ConvexMesh:
     return ConvexMesh(vertices, faces)
 
 
-def thickened(points: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:
+def thickened(points: Points) -> Points:
     """The points, or copies shifted to both sides along the principal axes in which the set is too thin."""
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     for axis in axes[np.ptp(points @ axes.T, axis=0) < MIN_THICKNESS]:
@@ -46,7 +48,7 @@ def thickened(points: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:
     return points
 
 
-def face_normals(mesh: ConvexMesh) -> Float[ndarray, "f 3"]:
+def face_normals(mesh: ConvexMesh) -> Points:
     """Outward unit normals of the faces; zero for a face without area."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
     normals = np.cross(b - a, c - a)
@@ -54,7 +56,7 @@ def face_normals(mesh: ConvexMesh) -> Float[ndarray, "f 3"]:
     return np.where(size > 1e-14, normals / np.maximum(size, 1e-14), 0.0)
 
 
-def planes_of(mesh: ConvexMesh) -> tuple[Float[ndarray, "p 3"], Float[ndarray, "p"]]:
+def planes_of(mesh: ConvexMesh) -> tuple[Points, Values]:
     """Normals and offsets of the distinct planes of a convex mesh."""
     normals = face_normals(mesh)
     normals = np.unique(np.round(normals[np.linalg.norm(normals, axis=1) > 0.5], 9), axis=0)
@@ -62,7 +64,7 @@ def planes_of(mesh: ConvexMesh) -> tuple[Float[ndarray, "p 3"], Float[ndarray, "
     return normals, (mesh.vertices @ normals.T).max(0)
 
 
-def hull_volume(points: Float[ndarray, "n 3"]) -> float:
+def hull_volume(points: Points) -> float:
     try:
         return ConvexHull(points).volume
     except (QhullError, ValueError):  # flat, or fewer than four points
@@ -81,12 +83,12 @@ TIGHT_SLOPE = 0.3
 class DistanceGrid:
     """Distances of voxels from a solid, zero inside [m]."""
 
-    origin: Float[ndarray, "3"]
+    origin: Vector
     pitch: float
     distance: Float[ndarray, "nx ny nz"]
 
     @staticmethod
-    def around(soups: list[Float[ndarray, "n 3 3"]], voxels: int, finest: float) -> "DistanceGrid":
+    def around(soups: list[Triangles], voxels: int, finest: float) -> "DistanceGrid":
         """The grid around triangles, with about this many voxels of at least the `finest` size [m]."""
         corners = np.concatenate(soups).reshape(-1, 3)
         low = corners.min(0)
@@ -97,14 +99,13 @@ class DistanceGrid:
         shape = np.ceil((high - origin) / pitch).astype(int) + 3
         occupied = np.zeros(shape, dtype=bool)
         for soup in soups:
-            _mark(occupied, split(soup, pitch / 2), origin, pitch)
+            voxels_of = ((split(soup, pitch / 2).reshape(-1, 3) - origin) / pitch).astype(int)
+            occupied[tuple(voxels_of.T)] = True
         found: Any = ndimage.label(~occupied)
         free = found[0] == found[0][0, 0, 0]
         return DistanceGrid(origin, pitch, ndimage.distance_transform_edt(free) * pitch)
 
-    def near_tight(
-        self, tight: Float[ndarray, "n 3"], concavity: float
-    ) -> tuple["DistanceGrid", "DistanceGrid"]:
+    def near_tight(self, tight: Points, concavity: float) -> tuple["DistanceGrid", "DistanceGrid"]:
         """Two copies with distances enlarged near `tight` places, so that sticking out there counts more.
 
         The first is zero elsewhere; the second keeps the other distances.
@@ -123,16 +124,6 @@ class DistanceGrid:
         low = np.floor((hull.vertices.min(0) - self.origin) / self.pitch).astype(int)
         high = np.ceil((hull.vertices.max(0) - self.origin) / self.pitch).astype(int) + 1
         return _farthest_inside(self.distance, self.origin, self.pitch, low, high, *planes_of(hull))
-
-
-@kernel()
-def _mark(occupied, triangles, origin, pitch):
-    """Mark the voxels that contain corners of triangles."""
-    for t in range(len(triangles)):
-        for k in range(3):
-            i = int((triangles[t, k, 0] - origin[0]) / pitch)
-            j = int((triangles[t, k, 1] - origin[1]) / pitch)
-            occupied[i, j, int((triangles[t, k, 2] - origin[2]) / pitch)] = True
 
 
 @kernel()
@@ -157,7 +148,7 @@ def _farthest_inside(distance, origin, pitch, low, high, normals, offsets):
     return best
 
 
-def split(triangles: Float[ndarray, "n 3 3"], size: "float | Float[ndarray, 'n']") -> Float[ndarray, "m 3 3"]:
+def split(triangles: Triangles, size: "float | Float[ndarray, 'n']") -> Triangles:
     """Halve triangles at their longest edge until no edge is longer than `size` [m]."""
     sizes = np.broadcast_to(np.asarray(size, np.float64), len(triangles))
     return _split(np.ascontiguousarray(triangles, np.float64), sizes**2)
@@ -218,57 +209,42 @@ MAX_NORMALS = 1000
 """A hull with more faces has similar normals merged before it is simplified."""
 TIGHT_PART_FACTOR = 4
 """A link with tight places may have this many times as many parts."""
+MAX_PLANES = 120
+"""Largest number of planes of a simplified hull."""
 SIMPLIFIED_GROWTH = 1e-7
 """Growth of simplified hulls [m], larger than rounding errors."""
 
 
 @dataclass(frozen=True)
-class PartSettings:
+class PartSettings(Settings, name="convex parts"):
     """How closely convex parts follow a mesh."""
 
-    concavity: float = 0.007
+    concavity: Positive = 0.007
     """How far the hull of a part may stick out of the mesh [m]."""
-    most: int = 16
+    most: Count = 16
     """Largest number of parts per link."""
-    voxels: int = 400_000
+    voxels: Count = 400_000
     """Approximate number of voxels of the grid that measures concavity."""
-    finest: float = 0.0015
+    finest: Positive = 0.0015
     """Smallest voxel edge [m]."""
     faces: int = 400
     """Hulls with more triangles are simplified; they only grow."""
     rounding: float = 5e-4
     """How far a simplified hull may stick out of the hull [m], if 120 planes suffice for that."""
 
-    def __post_init__(self) -> None:
-        if not self.finest > 0 or not self.concavity > 0 or self.most < 1:
-            raise InputError(
-                f"convex parts: concavity is {self.concavity}, finest {self.finest}, most {self.most}; "
-                "all must be positive"
-            )
-
-    def scaled(self, size: float) -> "PartSettings":
-        """The settings for meshes scaled by a factor."""
-        lengths = ("concavity", "finest", "rounding")
-        return replace(self, **{name: size * getattr(self, name) for name in lengths})
-
-    def finer(self) -> "PartSettings":
-        """The settings with voxels of half the size."""
-        return replace(self, voxels=8 * self.voxels, finest=self.finest / 2)
-
 
 def convex_parts(
     surfaces: tuple[Surface, ...],
-    settings: PartSettings | None = None,
-    tight: Float[ndarray, "n 3"] | None = None,
+    settings: PartSettings = PartSettings(),
+    tight: Points | None = None,
 ) -> tuple[ConvexMesh, ...]:
     """Convex meshes whose union contains the surfaces of a link and the space that they enclose.
 
     Near `tight` places [n, 3], in the link's frame, the meshes stick out as little as possible.
     """
-    settings = settings or PartSettings()
     soups = [surface.vertices[surface.faces] for surface in surfaces]
-    grid = settings if tight is None else settings.finer()
-    space = DistanceGrid.around(soups, grid.voxels, grid.finest)
+    finer = 1 if tight is None else 2
+    space = DistanceGrid.around(soups, finer**3 * settings.voxels, settings.finest / finer)
     parts = [Part.of(soup, _spread(soup, space.pitch), space, settings) for soup in soups]
     parts = _cut(parts, space, settings, max(settings.most, 2 * len(parts)))
     if tight is not None:
@@ -290,13 +266,12 @@ def _cut(parts: list["Part"], space: DistanceGrid, settings: PartSettings, most:
     return parts
 
 
-def simplified(hull: ConvexMesh, settings: PartSettings = PartSettings(), most: int = 120) -> ConvexMesh:
+def simplified(hull: ConvexMesh, settings: PartSettings = PartSettings()) -> ConvexMesh:
     """A convex mesh with fewer faces that contains a hull; the hull itself if it has at most
     `settings.faces`.
 
-    It is bounded by up to `most` of the hull's planes. Planes are added where its corners stick out most.
+    It is bounded by up to `MAX_PLANES` of the hull's planes, added where its corners stick out most.
     """
-    settings = settings or PartSettings()
     if len(hull.faces) <= settings.faces:
         return hull
     normals = face_normals(hull)
@@ -313,9 +288,9 @@ def simplified(hull: ConvexMesh, settings: PartSettings = PartSettings(), most: 
             corners = HalfspaceIntersection(halfspaces, middle).intersections
             beyond = corners @ normals.T - offsets
             worst = beyond.max(1)
-            if worst.max() <= settings.rounding or len(chosen) >= most:
+            if worst.max() <= settings.rounding or len(chosen) >= MAX_PLANES:
                 return convex_hull(corners)
-            for corner in np.argsort(-worst)[: min(8, most - len(chosen))]:
+            for corner in np.argsort(-worst)[: min(8, MAX_PLANES - len(chosen))]:
                 plane = int(beyond[corner].argmax())
                 if worst[corner] > settings.rounding and plane not in chosen:
                     chosen.append(plane)
@@ -325,8 +300,8 @@ def simplified(hull: ConvexMesh, settings: PartSettings = PartSettings(), most: 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    triangles: Float[ndarray, "n 3 3"]
-    points: Float[ndarray, "m 3"]
+    triangles: Triangles
+    points: Points
     """Points spread over the triangles, for choosing cuts."""
     hull: ConvexMesh
     concavity: float
@@ -365,7 +340,7 @@ class Part:
         return [Part.of(side, near, space, settings) for side, near in zip(halves, points, strict=True)]
 
 
-def _wall_cuts(heights: Float[ndarray, "n"], pitch: float) -> list[float]:
+def _wall_cuts(heights: Values, pitch: float) -> list[float]:
     """Cuts just before and after surfaces perpendicular to an axis, where parts often meet."""
     counts, edges = np.histogram(heights, max(int(np.ptp(heights) / pitch), 1))
     fullest = np.argsort(-counts)[:MAX_WALLS]
@@ -377,12 +352,12 @@ def _wall_cuts(heights: Float[ndarray, "n"], pitch: float) -> list[float]:
     return [middle + step for middle in middles for step in (-WALL_OFFSET, WALL_OFFSET)]
 
 
-def _spread(triangles: Float[ndarray, "n 3 3"], pitch: float) -> Float[ndarray, "m 3"]:
+def _spread(triangles: Triangles, pitch: float) -> Points:
     """Points spread over a surface, one per cube of edge `pitch` [m]."""
     return _one_per_cube(split(triangles, 2 * pitch).reshape(-1, 3), pitch)
 
 
-def _thinned(points: Float[ndarray, "n 3"], size: float) -> tuple[Float[ndarray, "m 3"], float]:
+def _thinned(points: Points, size: float) -> tuple[Points, float]:
     """At most `MAX_CUT_POINTS` points, one per cube, and the edge of the cubes [m]."""
     while len(points) > MAX_CUT_POINTS:
         size *= 1.3
@@ -390,14 +365,14 @@ def _thinned(points: Float[ndarray, "n 3"], size: float) -> tuple[Float[ndarray,
     return points, size
 
 
-def _one_per_cube(points: Float[ndarray, "n 3"], size: float) -> Float[ndarray, "m 3"]:
+def _one_per_cube(points: Points, size: float) -> Points:
     cubes = np.floor((points - points.min(0)) / size).astype(np.int64)
     _, first = np.unique(np.ravel_multi_index(tuple(cubes.T), cubes.max(0) + 1), return_index=True)
     return points[first]
 
 
 def _sides(
-    triangles: Float[ndarray, "n 3 3"], axis: int, at: float
+    triangles: Triangles, axis: int, at: float
 ) -> tuple[Float[ndarray, "a 3 3"], Float[ndarray, "b 3 3"]]:
     """Triangles cut by an axis-aligned plane: those below and those above it."""
     height = triangles[:, :, axis] - at

@@ -14,12 +14,15 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial import ConvexHull, QhullError
 
-from robotdiffuse.core.transforms import inverse
+from robotdiffuse.core.transforms import inverse, placed
+from robotdiffuse.core.types import Points, Rotation, Spheres, Values, Vector
 from robotdiffuse.robots.bodies import AttachedBody, ConvexMesh
 from robotdiffuse.robots.fitting.sphere_fitting import MARGIN, SphereSettings
 
 LINK_TOLERANCES = SphereSettings()
 """Tolerances of the spheres of links."""
+HAND = (1, 0)
+"""Frame and number of joints of a robot that stand for a link at its end."""
 MAX_SPHERES = 100
 """Largest number of spheres per solid; if they do not suffice, they exceed the tolerance."""
 MAX_PIECES_PER_AXIS = 40
@@ -29,14 +32,16 @@ BOUNDING_STEPS = 15
 EQUIDISTANT = 0.999
 
 
-def cover(mesh: ConvexMesh) -> Float[ndarray, "n 4"]:
+def cover(mesh: ConvexMesh) -> Spheres:
     """Spheres [x y z radius, m] that cover surface and interior of a convex mesh."""
     axes = _axes(mesh.vertices)
     vertices = mesh.vertices @ axes.T
     low = vertices.min(axis=0)
     high = vertices.max(axis=0)
     bounding = _around(vertices)
-    if bounding[3] - (high - low).min() / 2 <= _tolerance(high - low):
+    if bounding[3] - (high - low).min() / 2 <= LINK_TOLERANCES.tolerance(
+        *HAND, float((high - low).min()) / 2
+    ):
         spheres = bounding[None]
     else:
         slabs = [vertices]
@@ -47,15 +52,7 @@ def cover(mesh: ConvexMesh) -> Float[ndarray, "n 4"]:
     return np.column_stack([spheres[:, :3] @ axes, spheres[:, 3] + MARGIN])
 
 
-def _tolerance(size: Float[ndarray, "3"]) -> float:
-    """How far the spheres of a box-sized solid may stick out [m]: the tolerance for the hand's links."""
-    return max(
-        min(LINK_TOLERANCES.second_half, LINK_TOLERANCES.relative * float(size.min()) / 2),
-        LINK_TOLERANCES.finest,
-    )
-
-
-def _axes(vertices: Float[ndarray, "v 3"]) -> Float[ndarray, "3 3"]:
+def _axes(vertices: Points) -> Rotation:
     """Axes as rows: those of the mesh's frame, or the principal axes if a box along these is smaller."""
     principal = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
     frame_volume = np.ptp(vertices, axis=0).prod()
@@ -63,7 +60,7 @@ def _axes(vertices: Float[ndarray, "v 3"]) -> Float[ndarray, "3 3"]:
     return principal if principal_volume < 0.9 * frame_volume else np.eye(3)
 
 
-def _lattice(size: Float[ndarray, "3"]) -> tuple[int, ...]:
+def _lattice(size: Vector) -> tuple[int, ...]:
     """Number of pieces along each axis: the fewest within the tolerance, or else the closest of at most
     MAX_SPHERES."""
     counts = np.stack(
@@ -72,12 +69,12 @@ def _lattice(size: Float[ndarray, "3"]) -> tuple[int, ...]:
     counts = counts[counts.prod(axis=1) <= MAX_SPHERES]
     half = size / counts / 2
     out = np.linalg.norm(half, axis=1) - half.min(axis=1)
-    close = np.flatnonzero(out <= _tolerance(size))
+    close = np.flatnonzero(out <= LINK_TOLERANCES.tolerance(*HAND, float(size.min()) / 2))
     best = close[counts[close].prod(axis=1).argmin()] if len(close) else out.argmin()
     return tuple(counts[best].tolist())
 
 
-def _slices(corners: Float[ndarray, "v 3"], axis: int, cuts: Float[ndarray, "c"]) -> list[ndarray]:
+def _slices(corners: Points, axis: int, cuts: Values) -> list[ndarray]:
     """The hull of `corners`, cut at coordinates along an axis: the corners of each slice."""
     slices = []
     for cut in cuts:
@@ -94,7 +91,7 @@ def _slices(corners: Float[ndarray, "v 3"], axis: int, cuts: Float[ndarray, "c"]
     return [*slices, corners]
 
 
-def _outermost(points: Float[ndarray, "n 3"], axis: int) -> Float[ndarray, "m 3"]:
+def _outermost(points: Points, axis: int) -> Points:
     """Corners of the hull of points in a plane perpendicular to an axis."""
     try:
         return points[ConvexHull(np.delete(points, axis, axis=1)).vertices]
@@ -102,7 +99,7 @@ def _outermost(points: Float[ndarray, "n 3"], axis: int) -> Float[ndarray, "m 3"
         return np.unique(points, axis=0)
 
 
-def _around(points: Float[ndarray, "n 3"]) -> Float[ndarray, "4"]:
+def _around(points: Points) -> Float[ndarray, "4"]:
     """A small sphere around points: the best of the centre of their box and of some steps of Badoiu and
     Clarkson's algorithm."""
     center = (points.min(axis=0) + points.max(axis=0)) / 2
@@ -117,7 +114,7 @@ def _around(points: Float[ndarray, "n 3"]) -> Float[ndarray, "4"]:
     return best
 
 
-def body_geometry(body: AttachedBody) -> tuple[tuple[ConvexMesh, ...], Float[ndarray, "n 4"]]:
+def body_geometry(body: AttachedBody) -> tuple[tuple[ConvexMesh, ...], Spheres]:
     """Convex meshes of a body and spheres [x y z radius, m] that cover them, in the body's frame."""
     T_body_link = inverse(body.T_link_body)
     meshes: list[ConvexMesh] = []
@@ -126,7 +123,7 @@ def body_geometry(body: AttachedBody) -> tuple[tuple[ConvexMesh, ...], Float[nda
         T_link_shape, parts = shape.solid()
         T = T_body_link @ T_link_shape
         for part in parts:
-            meshes.append(ConvexMesh(part.vertices @ T[:3, :3].T + T[:3, 3], part.faces))
+            meshes.append(ConvexMesh(placed(T, part.vertices), part.faces))
             around = cover(part)
-            spheres.append(np.column_stack([around[:, :3] @ T[:3, :3].T + T[:3, 3], around[:, 3]]))
+            spheres.append(np.column_stack([placed(T, around[:, :3]), around[:, 3]]))
     return tuple(meshes), np.concatenate(spheres)

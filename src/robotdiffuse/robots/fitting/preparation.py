@@ -15,13 +15,15 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.settings import Bound, Natural, Settings
 from robotdiffuse.core.transforms import inverse
+from robotdiffuse.core.types import Mask, Points, Poses, Spheres
 from robotdiffuse.robots.bodies import Surface
 from robotdiffuse.robots.fitting.convex_parts import PartSettings, convex_parts
 from robotdiffuse.robots.fitting.sampled_links import Links, joint_table
@@ -35,7 +37,6 @@ from robotdiffuse.robots.fitting.self_collisions import (
     PairFalseCollisions,
     PairReport,
     SamplingSettings,
-    allowed_pairs,
     find_allowed_collisions,
     measure_false_collisions,
 )
@@ -47,10 +48,10 @@ from robotdiffuse.robots.fitting.sphere_fitting import (
     SphereSettings,
     covered,
     fit_spheres,
+    is_inside,
     stacked_planes,
     stick_out,
 )
-from robotdiffuse.robots.fitting.sphere_fitting_kernel import within
 from robotdiffuse.robots.kinematic_tree import MOVING_KINDS
 from robotdiffuse.robots.kinematics import reach
 from robotdiffuse.robots.parsing.srdf import read_srdf, srdf_beside
@@ -66,12 +67,11 @@ BOX_PADDING = 10 * GAP
 """Points further than this from a neighbour's bounding box are skipped, even near sharp edges [m]."""
 
 
-@dataclass(frozen=True, eq=False)
-class Neighbour:
+class Neighbour(NamedTuple):
     """A link that a joint connects to another one."""
 
     link: str
-    T_link_neighbour: Float[ndarray, "n 4 4"]
+    T_link_neighbour: Poses
     """At joint values over the range of the joint between them; one pose if it is fixed."""
 
 
@@ -83,7 +83,7 @@ def neighbours(robot: Robot, link: str) -> tuple[Neighbour, ...]:
         above = joint.parent
         T_above_parent = np.eye(4)
         while above not in robot.meshes and above != robot.base:
-            through = next(j for j in robot.joints if j.child == above)
+            through = robot.joints_above(above)[-1]
             if through.kind in MOVING_KINDS:
                 break
             above = through.parent
@@ -99,7 +99,7 @@ def neighbours(robot: Robot, link: str) -> tuple[Neighbour, ...]:
     return tuple(adjacent)
 
 
-def hidden_by_neighbours(robot: Robot, link: str) -> Callable[[Float[ndarray, "n 3"]], Bool[ndarray, "n"]]:
+def hidden_by_neighbours(robot: Robot, link: str) -> Callable[[Points], Mask]:
     """A function that tells which points, in the link's frame [m], are inside one neighbour at all joint
     values."""
     neighbour_planes: list[tuple[Neighbour, tuple[ndarray, ndarray], Planes]] = []
@@ -108,7 +108,7 @@ def hidden_by_neighbours(robot: Robot, link: str) -> Callable[[Float[ndarray, "n
         box = corners.min(0) - BOX_PADDING, corners.max(0) + BOX_PADDING
         neighbour_planes.append((near_link, box, stacked_planes(robot.meshes[near_link.link])))
 
-    def hidden(points: Float[ndarray, "n 3"]) -> Bool[ndarray, "n"]:
+    def hidden(points: Points) -> Mask:
         found = np.zeros(len(points), dtype=bool)
         for near_link, (low, high), planes in neighbour_planes:
             left = np.flatnonzero(~found)
@@ -117,7 +117,7 @@ def hidden_by_neighbours(robot: Robot, link: str) -> Callable[[Float[ndarray, "n
                 near = ((local >= low) & (local <= high)).all(axis=1)
                 left = left[near]
                 local = local[near]
-                left = left[within(local, *planes, -GAP)]
+                left = left[is_inside(local, planes, -GAP)]
             found[left] = True
         return found
 
@@ -164,35 +164,31 @@ gap."""
 
 
 @dataclass(frozen=True)
-class PreparationSettings:
+class PreparationSettings(Settings, name="preparation"):
     """Settings of `prepare`."""
 
-    parts: PartSettings = field(default_factory=PartSettings)
-    spheres: SphereSettings = field(default_factory=SphereSettings)
-    sampling: SamplingSettings = field(default_factory=SamplingSettings)
-    max_false_collisions: float = 0.075
+    parts: PartSettings = PartSettings()  # noqa: RUF009  (frozen)
+    spheres: SphereSettings = SphereSettings()  # noqa: RUF009
+    sampling: SamplingSettings = SamplingSettings()  # noqa: RUF009
+    max_false_collisions: Annotated[float, Bound(above=0.0, below=1.0)] = 0.075
     """Fraction of the free configurations with false collisions of spheres above which links are refined."""
-    samples: int = 4000
+    samples: Annotated[int, Bound(least=100.0)] = 4000
     """Random configurations for measuring false collisions."""
-    rounds: int = 2
+    rounds: Natural = 2
     """Largest number of refinements."""
     finest: float = 0.002
     """Smallest tolerance of spheres [m]."""
 
-    def __post_init__(self) -> None:
-        if not 0 < self.max_false_collisions < 1 or self.samples < 100 or self.rounds < 0:
-            raise InputError(
-                f"preparation: max_false_collisions is {self.max_false_collisions} (must be between 0 "
-                f"and 1), samples {self.samples} "
-                f"(at least 100), rounds {self.rounds} (at least 0)"
-            )
-
     def for_reach(self, reach: float) -> "PreparationSettings":
         """The settings with their lengths scaled for an arm with a reach [m]."""
         size = max(reach / LARGE_REACH, 1.0)
-        return replace(
-            self, parts=self.parts.scaled(size), spheres=self.spheres.scaled(size), finest=size * self.finest
-        )
+
+        def scaled(settings: Any, *lengths: str) -> Any:
+            return replace(settings, **{name: size * getattr(settings, name) for name in lengths})
+
+        parts = scaled(self.parts, "concavity", "finest", "rounding")
+        spheres = scaled(self.spheres, "first_half", "second_half", "fixed", "finest")
+        return replace(scaled(self, "finest"), parts=parts, spheres=spheres)
 
 
 @dataclass(frozen=True)
@@ -227,14 +223,14 @@ class _Link:
     name: str
     surfaces: tuple[Surface, ...]
     parts: PartSettings
-    tight: Float[ndarray, "n 3"] | None = None
+    tight: Points = field(default_factory=lambda: np.zeros((0, 3)))
     """Places where parts should stick out as little as possible."""
     bounds: Bounds = field(default_factory=lambda: Bounds(0.0))
     solid: Solid | None = None
 
     def decompose(self, robot: Robot) -> Robot:
         """The robot with this link's convex parts."""
-        meshes = convex_parts(self.surfaces, self.parts, self.tight)
+        meshes = convex_parts(self.surfaces, self.parts, self.tight if len(self.tight) else None)
         self.solid = None
         return replace(robot, meshes=robot.meshes | {self.name: meshes})
 
@@ -270,7 +266,10 @@ def prepare(
         progress: Called at each step.
         allowed: Pairs of links, with reasons, that are not checked even if sampling finds collisions.
     """
-    settings = settings.for_reach(_turning_reach(robot))
+    # without prismatic joints, since an arm on a long rail is not larger
+    slides = {j.name: (j.lower + j.upper) / 2 for j in robot.planned_joints if j.kind == "prismatic"}
+    size = 0.0 if len(slides) == robot.dof else reach(robot.with_locked(slides))
+    settings = settings.for_reach(size)
     links = {name: _Link(name, meshes, settings.parts) for name, meshes in surfaces.items()}
     steps = 2 * len(links) + 1 + settings.rounds
     for step, link in enumerate(links.values()):
@@ -288,7 +287,8 @@ def prepare(
         else pair
         for pair in sampled
     )
-    robot = replace(robot, allowed_collisions=allowed_pairs(pairs))
+    allowed_pairs = frozenset(frozenset(pair.links) for pair in pairs if pair.reason != CHECKED)
+    robot = replace(robot, allowed_collisions=allowed_pairs)
     tried = []
     for k in range(settings.rounds + 1):
         progress("false collisions", 2 * len(links) + 1 + k, steps)
@@ -313,20 +313,13 @@ def prepare(
     )
     robot = with_grazing_links(robot, surfaces, measured)
     progress("done", steps, steps)
-    return Prepared(robot, tuple(_report(robot, name) for name in links), pairs, sampled, false_collisions)
-
-
-def _turning_reach(robot: Robot) -> float:
-    """Reach of the arm with its prismatic joints fixed [m], since an arm on a long rail is not larger."""
-    slides = {j.name: (j.lower + j.upper) / 2 for j in robot.planned_joints if j.kind == "prismatic"}
-    return 0.0 if len(slides) == robot.dof else reach(robot.with_locked(slides))
-
-
-def _report(robot: Robot, link: str) -> LinkReport:
-    meshes = robot.meshes[link]
-    spheres = robot.spheres[link]
-    out = float(stick_out(Solid.of(meshes, 0.0), spheres).max())
-    return LinkReport(link, len(meshes), len(spheres), out, covered(meshes, spheres))
+    reports = []
+    for name in links:
+        meshes = robot.meshes[name]
+        spheres = robot.spheres[name]
+        out = float(stick_out(Solid.of(meshes, 0.0), spheres).max())
+        reports.append(LinkReport(name, len(meshes), len(spheres), out, covered(meshes, spheres)))
+    return Prepared(robot, tuple(reports), pairs, sampled, false_collisions)
 
 
 def _refined(
@@ -352,7 +345,7 @@ def _refined(
         places = [pair.coarse[name] for pair in worst_pairs if pair.links in close and name in pair.links]
         tight = np.concatenate([*places, np.zeros((0, 3))])
         if len(tight):
-            link.tight = tight if link.tight is None else np.concatenate([link.tight, tight])
+            link.tight = np.concatenate([link.tight, tight])
         else:
             link.parts = replace(
                 link.parts, concavity=link.parts.concavity * CONCAVITY_SHRINKAGE, most=2 * link.parts.most
@@ -368,11 +361,9 @@ def _refined(
             places = np.concatenate(tight)
             gaps = GAP_FRACTION * GAP_SHRINKAGE**k * places[:, 3]
             places[:, 3] = np.clip(gaps, settings.finest, link.bounds.tolerance)
-            known = [] if link.bounds.tight is None else [link.bounds.tight]
-            link.bounds = replace(link.bounds, tight=np.concatenate([*known, places]))
+            link.bounds = replace(link.bounds, tight=np.concatenate([link.bounds.tight, places]))
         robot = link.fit(robot, settings.spheres, seed)
-    stale_tables = {table.links for table in robot.tables if coarse_links & {*table.links}}
-    return _with_tables(robot, close | stale_tables, settings)
+    return _with_tables(robot, close, coarse_links, settings)
 
 
 def with_finer_parts(
@@ -393,20 +384,20 @@ def with_finer_parts(
                 places.setdefault(name, []).append(pair.coarse[name])
     if not places:
         return None
-    coarse_links = set(places)
-    for name in sorted(coarse_links):
+    for name in sorted(places):
         link = links[name]
-        known = [] if link.tight is None else [link.tight]
-        link.tight = np.concatenate([*known, *places[name]])
+        link.tight = np.concatenate([link.tight, *places[name]])
         robot = link.fit(link.decompose(robot), settings.spheres, seed)
-    return _with_tables(
-        robot, {table.links for table in robot.tables if coarse_links & {*table.links}}, settings
-    )
+    return _with_tables(robot, set(), set(places), settings)
 
 
-def _with_tables(robot: Robot, pairs: set[tuple[str, str]], settings: PreparationSettings) -> Robot:
-    """The robot with new tables over the joints between the given pairs of links."""
+def _with_tables(
+    robot: Robot, pairs: set[tuple[str, str]], changed: set[str], settings: PreparationSettings
+) -> Robot:
+    """The robot with new tables over the joints between the given pairs of links, and of links whose
+    parts have changed."""
     of_parts = Links(robot)
+    pairs = pairs | {table.links for table in robot.tables if changed & {*table.links}}
     tables = {table.links: table for table in robot.tables}
     for pair in sorted(pairs):
         tables[pair] = joint_table(robot, of_parts, pair, settings.finest / 4)
@@ -421,7 +412,7 @@ def _beyond_spheres(robot: Robot, pair: PairFalseCollisions, settings: Preparati
     return bool(hopeless) and len(robot.joints_between(*pair.links)) in (1, 2)
 
 
-def _shared(pair: PairFalseCollisions, link: str) -> Float[ndarray, "n 4"]:
+def _shared(pair: PairFalseCollisions, link: str) -> Spheres:
     """Places on one of two links, and the part of the gap that its spheres may fill [m].
 
     About A / t spheres that stick out by t cover an area A. The two links need the fewest spheres together if
@@ -541,30 +532,6 @@ class AddReport:
         return (*warnings, *(f"spheres do not cover {link.link}" for link in self.links if not link.covered))
 
 
-def never_free(false_collisions: FalseCollisions) -> bool:
-    """Whether all sampled configurations are in self-collision, so that nothing can be planned."""
-    return false_collisions.free == 0 or false_collisions.by_parts == 1
-
-
-def never_free_error(urdf: str | Path, false_collisions: FalseCollisions) -> InputError:
-    """The error for a robot that always collides with itself.
-
-    It proposes to allow the pairs of links that always collide, or else those that collide most often.
-    """
-
-    def colliding(pair: PairFalseCollisions) -> float:
-        return max(pair.colliding, pair.by_parts)
-
-    often = sorted(false_collisions.pairs, key=lambda pair: -colliding(pair))
-    worst = [pair for pair in often if colliding(pair) == 1] or often[:MAX_PROPOSED]
-    names = "; ".join(f"{' and '.join(pair.links)} collide in {colliding(pair):.1%}" for pair in worst)
-    options = " ".join(f"--allow {' '.join(pair.links)}" for pair in worst)
-    return InputError(
-        f"{urdf}: every configuration collides with itself: {names}; if these links may touch, add "
-        f"{options}, or give an SRDF that allows such pairs with --srdf FILE"
-    )
-
-
 def add_robot(
     urdf: str | Path,
     name: str | None = None,
@@ -630,8 +597,18 @@ def add_robot(
     if semantics is not None and semantics is tree.semantics:
         settings = replace(settings, sampling=replace(settings.sampling, assumptions=False))
     made = prepare(robot, surfaces, settings, seed, progress, allowed)
-    if never_free(made.false_collisions):
-        raise never_free_error(urdf, made.false_collisions)
+    measured = made.false_collisions
+    if measured.free == 0 or measured.by_parts == 1:  # nothing can be planned
+        shares = {pair.links: max(pair.colliding, pair.by_parts) for pair in measured.pairs}
+        often = sorted(shares, key=lambda pair: -shares[pair])
+        worst = [pair for pair in often if shares[pair] == 1] or often[:MAX_PROPOSED]
+        options = " ".join(f"--allow {' '.join(pair)}" for pair in worst)
+        names = "; ".join(f"{' and '.join(pair)} collide in {shares[pair]:.1%}" for pair in worst)
+        raise InputError(
+            f"{urdf}: every configuration collides with itself: {names}; if these links may touch, add "
+            f"{options}, or give an SRDF that allows such "
+            f"pairs with --srdf FILE"
+        )
     differences = tuple(
         PairDifference(
             pair.links, pair.reason, pair.colliding, srdf_allowed.get(frozenset(pair.links), CHECKED)
@@ -641,7 +618,6 @@ def add_robot(
     )
     folder = user_robots() / name if out is None else Path(out)
     source = {"urdf": Path(urdf).name, "sha256": tree.digest, "licence": license}
-    measured = made.false_collisions
     shares = {"free": round(measured.free, 4), "refused": round(measured.by_spheres, 4)}
     note = (
         f"{measured.free:.1%} of the configurations are free of self-collision; convex parts "

@@ -10,20 +10,23 @@ the cell. Other cells are split, down to a fraction of a millimetre of motion.
 # Coal's Python module has no type information.
 # pyright: reportAttributeAccessIssue=false
 
+from collections.abc import Callable
 from functools import cached_property, lru_cache
+from typing import Any
 
 import coal
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.optimize import linprog
 
 from robotdiffuse.core.bounds import for_kernels
+from robotdiffuse.core.types import Mask, Points, Poses, Spheres, Values
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose
 from robotdiffuse.robots.fitting.convex_parts import planes_of
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import ball_distances, deepest_touches
-from robotdiffuse.robots.kinematic_tree import MOVING_KINDS, TURN, Joint
+from robotdiffuse.robots.kinematic_tree import MOVING_KINDS, TURN, Joint, with_mimics
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import LinkPairTable, Robot
 
@@ -54,32 +57,34 @@ class Links:
         self._leading: dict[frozenset[str], tuple[str, list[Joint]]] = {}
         self.request, self.result = coal.CollisionRequest(), coal.CollisionResult()
 
+    def _of_parts(self, function: Callable[[ConvexMesh], Any]) -> dict[str, list[Any]]:
+        return {link: [function(mesh) for mesh in parts] for link, parts in self.robot.meshes.items()}
+
     @cached_property
     def hulls(self) -> dict[str, list["coal.Convex"]]:
-        meshes = self.robot.meshes.items()
-        return {link: [coal_convex(mesh.vertices, mesh.faces) for mesh in parts] for link, parts in meshes}
+        return self._of_parts(lambda mesh: coal_convex(mesh.vertices, mesh.faces))
 
     @cached_property
-    def balls(self) -> dict[str, Float[ndarray, "parts 4"]]:
+    def balls(self) -> dict[str, Spheres]:
         """Balls [x y z radius] around each part, by link [m]."""
-        return {link: np.stack([_ball(mesh) for mesh in parts]) for link, parts in self.robot.meshes.items()}
+        return {link: np.stack(balls) for link, balls in self._of_parts(_ball).items()}
 
     @cached_property
-    def inner(self) -> dict[str, Float[ndarray, "parts 4"]]:
+    def inner(self) -> dict[str, Spheres]:
         """Balls [x y z radius] inside each part, by link [m]."""
-        return {link: np.stack([_inner(mesh) for mesh in parts]) for link, parts in self.robot.meshes.items()}
+        return {link: np.stack(balls) for link, balls in self._of_parts(_inner).items()}
 
     def random(self, count: int, rng: np.random.Generator) -> Float[ndarray, "n d"]:
         """Uniform values of all joints within their limits."""
         return rng.uniform(self.lower, self.upper, (count, len(self.joints)))
 
-    def named(self, pose: dict[str, float]) -> Float[ndarray, "d"]:
+    def named(self, pose: dict[str, float]) -> Values:
         """Values of all joints in a named pose; joints that it omits keep their locked value, or else
         zero."""
         rest = self.robot.locked | pose
         return np.array([rest.get(j.name, min(max(0.0, j.lower), j.upper)) for j in self.joints])
 
-    def stop_explains(self, joint: Joint, q: Float[ndarray, "n d"], colliding: Bool[ndarray, "n"]) -> bool:
+    def stop_explains(self, joint: Joint, q: Float[ndarray, "n d"], colliding: Mask) -> bool:
         """Whether a joint alone determines in which configurations two links collide, up to one of its
         stops."""
         if joint not in self.joints or joint.upper - joint.lower > MAX_STOPPED_RANGE:
@@ -92,87 +97,45 @@ class Links:
         variance = colliding.mean() * (1 - colliding.mean())
         return bool(max(often[0], often[-1]) > 0.99 and unexplained < MAX_UNEXPLAINED * variance)
 
-    def poses(
-        self, q: Float[ndarray, "n d"], wanted: frozenset[str] | None = None
-    ) -> dict[str, Float[ndarray, "n 4 4"]]:
+    def poses(self, q: Float[ndarray, "n d"], wanted: frozenset[str] | None = None) -> dict[str, Poses]:
         """T_base_link by link. With `wanted` links, only their relative poses, in the frame of some common
         link."""
         start, joints = (self.robot.base, self.robot.joints) if wanted is None else self._between(wanted)
         poses = {start: np.broadcast_to(np.eye(4), (len(q), 4, 4))}
+        values = with_mimics(self.robot.joints, {joint.name: q[:, i] for i, joint in enumerate(self.joints)})
         for joint in joints:
-            poses[joint.child] = poses[joint.parent] @ self._motion(joint, q)
+            T_parent_child = joint.T_parent_joint
+            if joint.kind in MOVING_KINDS:
+                T_parent_child = T_parent_child @ joint.motion(values[joint.name])
+            poses[joint.child] = poses[joint.parent] @ T_parent_child
         return poses
-
-    def _motion(self, joint: Joint, q: Float[ndarray, "n d"]) -> Float[ndarray, "*n 4 4"]:
-        """T_parent_child for a batch of values of all joints."""
-        if joint.kind not in MOVING_KINDS:
-            return joint.T_parent_joint
-        column, multiplier, offset, still, of_cosine, of_sine = self._moves[joint.name]
-        value = multiplier * q[:, column, None, None] + offset
-        if joint.kind == "prismatic":
-            return still + value * of_sine
-        return still + np.cos(value) * of_cosine + np.sin(value) * of_sine
-
-    @cached_property
-    def _moves(self) -> dict[str, tuple[int, float, float, ndarray, ndarray, ndarray]]:
-        """By movable joint: the column of its (or its leader's) value, the factor and offset of that value,
-        and the matrices C, A, B of T_parent_child = C + cos(value) A + sin(value) B, or C + value B if
-        prismatic."""
-        by_name = {joint.name: joint for joint in self.robot.joints}
-        columns = {joint.name: i for i, joint in enumerate(self.joints)}
-        moves = {}
-        for joint in self.robot.joints:
-            if joint.kind not in MOVING_KINDS:
-                continue
-            leader = joint
-            multiplier = 1.0
-            offset = 0.0
-            while leader.mimic is not None:
-                offset += multiplier * leader.mimic.offset
-                multiplier *= leader.mimic.multiplier
-                leader = by_name[leader.mimic.joint]
-            still = np.eye(4)
-            of_cosine = np.zeros((4, 4))
-            of_sine = np.zeros((4, 4))
-            if joint.kind == "prismatic":
-                of_sine[:3, 3] = joint.axis
-            else:
-                still[:3, :3] = np.outer(joint.axis, joint.axis)
-                of_cosine[:3, :3] = np.eye(3) - still[:3, :3]
-                of_sine[:3, :3] = np.cross(np.eye(3), joint.axis)
-            matrices = (joint.T_parent_joint @ matrix for matrix in (still, of_cosine, of_sine))
-            moves[joint.name] = (columns[leader.name], multiplier, offset, *matrices)
-        return moves
 
     def _between(self, links: frozenset[str]) -> tuple[str, list[Joint]]:
         """The last common ancestor of links, and the joints from there to them."""
         if links not in self._leading:
-            by_child = {joint.child: joint for joint in self.robot.joints}
-            chains = []
-            for link in links:
-                chain = [link]
-                while chain[-1] in by_child:
-                    chain.append(by_child[chain[-1]].parent)
-                chains.append(chain[::-1])
-            common = [link for link, *others in zip(*chains, strict=False) if {*others} <= {link}]
-            needed = {link for chain in chains for link in chain[len(common) :]}
+            chains = [self.robot.joints_above(link) for link in links]
+            common = [one for one, *others in zip(*chains, strict=False) if {*others} <= {one}]
+            needed = {joint.child for chain in chains for joint in chain[len(common) :]}
             joints = [joint for joint in self.robot.joints if joint.child in needed]
-            self._leading[links] = common[-1], joints
+            self._leading[links] = common[-1].child if common else self.robot.base, joints
         return self._leading[links]
 
-    def sphere_distance(self, poses: dict[str, ndarray], a: str, b: str) -> Float[ndarray, "n"]:
+    def sphere_distance(self, poses: dict[str, ndarray], a: str, b: str) -> Values:
         """Signed distances between the covering spheres of two links [m], a lower bound for their meshes."""
         first, second = (for_kernels(self.robot.spheres[link]) for link in (a, b))
         return -deepest_touches(poses[a], poses[b], first, second, NEAR_DISTANCE, -np.inf)[0]
+
+    def _placed(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> tuple[Any, Any, ndarray]:
+        """Poses of two links in configuration i, and distances between the balls around their parts."""
+        apart = ball_distances(poses[a][i], poses[b][i], self.balls[a], self.balls[b])
+        return coal_pose(poses[a][i]), coal_pose(poses[b][i]), apart
 
     def collide(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> bool:
         """Whether the meshes of two links collide in configuration i."""
         inside = ball_distances(poses[a][i], poses[b][i], self.inner[a], self.inner[b])
         if (inside < 0).any():
             return True
-        T_a = coal_pose(poses[a][i])
-        T_b = coal_pose(poses[b][i])
-        apart = ball_distances(poses[a][i], poses[b][i], self.balls[a], self.balls[b])
+        T_a, T_b, apart = self._placed(poses, a, b, i)
         near = list(zip(*np.nonzero(apart <= 0), strict=True))
         hit = self._hit.get((a, b))
         for m, n in [hit, *near] if hit in near else near:
@@ -182,12 +145,10 @@ class Links:
                 return True
         return False
 
-    def contacts(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> Float[ndarray, "n 3"]:
+    def contacts(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> Points:
         """Points where convex parts of two links overlap in configuration i, one for each pair of parts
         [m]."""
-        T_a = coal_pose(poses[a][i])
-        T_b = coal_pose(poses[b][i])
-        apart = ball_distances(poses[a][i], poses[b][i], self.balls[a], self.balls[b])
+        T_a, T_b, apart = self._placed(poses, a, b, i)
         found = []
         for m, n in zip(*np.nonzero(apart <= 0), strict=True):
             result = coal.CollisionResult()
@@ -198,10 +159,8 @@ class Links:
 
     def mesh_distance(self, poses: dict[str, ndarray], a: str, b: str, i: int = 0) -> float:
         """Distance between the meshes of two links in configuration i [m]; zero or less if they collide."""
-        T_a = coal_pose(poses[a][i])
-        T_b = coal_pose(poses[b][i])
+        T_a, T_b, apart = self._placed(poses, a, b, i)
         least = np.inf
-        apart = ball_distances(poses[a][i], poses[b][i], self.balls[a], self.balls[b])
         for k in apart.argsort(axis=None):
             m, n = divmod(int(k), apart.shape[1])
             if apart[m, n] >= least:
@@ -221,7 +180,7 @@ class Links:
         rows: Int[ndarray, "n"],
         parts: Int[ndarray, "2 n"],
         limit: float,
-    ) -> Float[ndarray, "n"]:
+    ) -> Values:
         """Distances between parts of two links [m]: parts[:, k] in configuration rows[k]. Distances above
         `limit` are replaced by lower bounds that are above it too."""
         balls = [self.balls[link][parts[k]] for k, link in enumerate((a, b))]

@@ -7,6 +7,7 @@ free configurations in which covering spheres or convex parts of two links colli
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import coal
 import numpy as np
@@ -14,13 +15,14 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import for_kernels
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.settings import Bound, Natural, Settings
+from robotdiffuse.core.types import Points, Spheres, Values
 from robotdiffuse.robots.coal_geometry import coal_pose, coal_surface
 from robotdiffuse.robots.fitting.convex_parts import Surface
 from robotdiffuse.robots.fitting.sampled_links import NEAR_DISTANCE, Links
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import deepest_touches
 from robotdiffuse.robots.kinematic_tree import MOVING_KINDS, Joint
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot import Robot, moving_pairs
 
 ADJACENT = "adjacent"
 ALWAYS = "always"
@@ -43,26 +45,22 @@ MAX_POSE_OVERLAP = 0.03
 """If links overlap in a named pose by less than this, their meshes count as coarse there [m]."""
 
 
+ALWAYS_FRACTION = 0.95
+"""A pair that collides in at least this fraction of the samples counts as always colliding, as in MoveIt's
+Setup Assistant."""
+
+
 @dataclass(frozen=True)
-class SamplingSettings:
+class SamplingSettings(Settings, name="sampling"):
     """Settings of `find_allowed_collisions`."""
 
-    samples: int = 20_000
+    samples: Annotated[int, Bound(least=100.0)] = 20_000
     """Number of configurations, uniform within the limits of all joints, including gripper joints."""
-    always: float = 0.95
-    """A pair that collides in at least this fraction of the samples counts as always colliding (0.95 in
-    MoveIt's Setup Assistant)."""
-    descents: int = 20
+    descents: Natural = 20
     """For a pair without collisions: number of closest samples from which a descent searches for one."""
     assumptions: bool = True
     """Whether links that are adjacent, or that collide at rest, in a named pose or up to a stop of a joint,
     are assumed safe; False for MuJoCo models, which say themselves what may touch."""
-
-    def __post_init__(self) -> None:
-        if self.samples < 100:
-            raise InputError(f"samples is {self.samples}; it must be at least 100")
-        if not 0.5 < self.always <= 1:
-            raise InputError(f"always is {self.always}; it must be above 0.5 and at most 1")
 
 
 @dataclass(frozen=True)
@@ -105,30 +103,28 @@ def find_allowed_collisions(
     poses = links.poses(q)
     default_poses = links.poses(default)
     held_poses = links.poses(links.named({})[None])
-    named = [links.poses(links.named(pose)[None]) for pose in robot.poses.values()]
-    adjacent = _adjacent(robot) if settings.assumptions else frozenset[frozenset[str]]()
+    named: list[dict[str, ndarray]] = []
+    adjacent = set[frozenset[str]]()
+    if settings.assumptions:
+        named = [links.poses(links.named(pose)[None]) for pose in robot.poses.values()]
+        adjacent = _adjacent(robot)
 
     def reason(a: str, b: str, near: ndarray, colliding: ndarray) -> str:
         if frozenset((a, b)) in adjacent:
             return ADJACENT
-        if colliding.mean() >= settings.always:
+        if colliding.mean() >= ALWAYS_FRACTION:
             return ALWAYS
-        if not settings.assumptions:
-            return by_search(a, b, near, colliding)
-        by_default = _own_between(robot, a, b, MAX_HELD_JOINTS)
+        by_default = _own_between(robot, a, b, MAX_HELD_JOINTS) if settings.assumptions else None
         zero = by_default is not None and all(joint.lower <= 0 <= joint.upper for joint in by_default)
         if zero and links.collide(default_poses, a, b, 0) and links.collide(held_poses, a, b, 0):
             return DEFAULT
         if any(-MAX_POSE_OVERLAP < links.mesh_distance(pose, a, b) <= 0 for pose in named):
             return POSE
-        between = _own_between(robot, a, b) or ()
+        between = _own_between(robot, a, b) if settings.assumptions else None
         if colliding.mean() >= MIN_LIMITS_COLLIDING and any(
-            links.stop_explains(joint, q, colliding) for joint in between
+            links.stop_explains(joint, q, colliding) for joint in between or ()
         ):
             return LIMITS
-        return by_search(a, b, near, colliding)
-
-    def by_search(a: str, b: str, near: ndarray, colliding: ndarray) -> str:
         descents = settings.descents if near.min() < NEAR_DISTANCE else settings.descents // 5
         if not colliding.any() and not _descend(links, a, b, q[np.argsort(near)[:descents]], rng):
             return NEVER
@@ -136,18 +132,13 @@ def find_allowed_collisions(
 
     reports = []
     few = {link: T[: max(len(q) // ADJACENT_STRIDE, 1)] for link, T in poses.items()}
-    for a, b in _moving_pairs(robot):
+    for a, b in moving_pairs(robot, robot.meshes):
         near = links.sphere_distance(few if frozenset((a, b)) in adjacent else poses, a, b)
         colliding = np.zeros(len(near), dtype=bool)
         for i in np.flatnonzero(near <= 0):
             colliding[i] = links.collide(poses, a, b, int(i))
         reports.append(PairReport((a, b), reason(a, b, near, colliding), float(colliding.mean())))
     return tuple(reports)
-
-
-def allowed_pairs(reports: tuple[PairReport, ...]) -> frozenset[frozenset[str]]:
-    """The pairs of links that are not checked."""
-    return frozenset(frozenset(report.links) for report in reports if report.reason != CHECKED)
 
 
 def _descend(links: "Links", a: str, b: str, starts: Float[ndarray, "n d"], rng: np.random.Generator) -> bool:
@@ -179,10 +170,6 @@ def _own_between(robot: Robot, a: str, b: str, max_held: int = 0) -> list[Joint]
     A link belongs to the arm if at most `max_held` held joints connect it to a moving link, and if it is not
     a tool.
     """
-    by_child = {joint.child: joint for joint in robot.joints}
-
-    def joints_above(link: str) -> list[Joint]:
-        return [by_child[link], *joints_above(by_child[link].parent)] if link in by_child else []
 
     def own(link: str) -> bool:
         """Whether a link belongs to the arm; true for what its links carry, except for the last one."""
@@ -192,22 +179,11 @@ def _own_between(robot: Robot, a: str, b: str, max_held: int = 0) -> list[Joint]
         tool = robot.at_end(link) and above[link][:1] != planned
         return not tool and len(moving) <= max_held
 
-    above = {link: joints_above(link) for link in (a, b)}
+    above = {link: robot.joints_above(link)[::-1] for link in (a, b)}
     if not own(a) or not own(b):
         return None
     chain_joints = {joint.name: joint for joint in (*above[a], *above[b])}.values()
     return [j for j in chain_joints if (j in above[a]) != (j in above[b]) and j.kind in MOVING_KINDS]
-
-
-def _moving_pairs(robot: Robot) -> list[tuple[str, str]]:
-    """Pairs of links with meshes that move relative to each other."""
-    links = [link for link in robot.link_names if link in robot.meshes]
-    return [
-        (a, b)
-        for i, a in enumerate(links)
-        for b in links[i + 1 :]
-        if robot.link_frame(a) != robot.link_frame(b)
-    ]
 
 
 def _adjacent(robot: Robot) -> set[frozenset[str]]:
@@ -242,12 +218,12 @@ class PairFalseCollisions:
     """Fraction of the free configurations in which convex parts of the two collide."""
     by_spheres: float
     """The same for spheres; includes configurations in which the parts collide too."""
-    gaps: Float[ndarray, "configurations"]
+    gaps: Values
     """Distances between the parts in some of the configurations in which only the spheres collide [m]."""
-    places: dict[str, Float[ndarray, "n 4"]]
+    places: dict[str, Spheres]
     """By link and in its frame: rows x y z where spheres touch although the parts are apart, and the smallest
     distance of the parts there [m]."""
-    coarse: dict[str, Float[ndarray, "m 3"]]
+    coarse: dict[str, Points]
     """By link and in its frame: places where parts overlap although the true meshes are apart [m]. Each place
     is listed for the link whose parts stick out further there."""
 
@@ -284,26 +260,37 @@ def measure_false_collisions(
         link: tuple(coal_surface(part.vertices, part.faces) for part in parts)
         for link, parts in surfaces.items()
     }
-    tables = {frozenset(table.links): (table,) for table in robot.tables}
     column = {joint.name: i for i, joint in enumerate(links.joints)}
+    request = coal.CollisionRequest()
+    result = coal.CollisionResult()
     found = []
     for a, b in robot.checked_pairs():
         first, second = (for_kernels(robot.spheres[link]) for link in (a, b))
         depth, middle = deepest_touches(poses[a], poses[b], first, second, 0.0, 0.0)
         spheres = depth > 0
-        for table in tables.get(frozenset((a, b)), ()):
+        for table in (table for table in robot.tables if {*table.links} == {a, b}):
             spheres &= ~table.at(*(q[:, column[name]] for name in table.joints))
         parts = np.zeros(samples, dtype=bool)
         meshes = np.zeros(samples, dtype=bool)
         for i in np.flatnonzero(spheres):
             parts[i] = links.collide(poses, a, b, int(i))
             if parts[i]:
-                meshes[i] = _collide(trees[a], trees[b], poses[a][i], poses[b][i])
+                places = coal_pose(poses[a][i]), coal_pose(poses[b][i])
+                result.clear()
+                meshes[i] = any(  # one inside the other is not detected
+                    coal.collide(one, places[0], other, places[1], request, result)
+                    for one in trees[a]
+                    for other in trees[b]
+                )
         found.append((spheres, parts, meshes, middle))
     if not found:
         return FalseCollisions(1.0, 0.0, 0.0, ())
     free = ~np.any([meshes for _, _, meshes, _ in found], axis=0)
     count = max(int(free.sum()), 1)
+
+    def share(colliding: ndarray) -> float:
+        return float((colliding & free).sum() / count)
+
     pairs = []
     for (a, b), (spheres, parts, meshes, middle) in zip(robot.checked_pairs(), found, strict=True):
         false_spheres = np.flatnonzero(spheres & ~parts & free)[:MAX_SPHERE_CASES]
@@ -322,16 +309,11 @@ def measure_false_collisions(
         places = {a: _one_per_cube(middle[false_spheres], gaps), b: _one_per_cube(on_b, gaps)}
         false_parts = np.flatnonzero(parts & ~meshes & free)[:MAX_PART_CASES]
         coarse = _sticking_out(links, trees, poses, (a, b), false_parts)
-        shares = (float((parts & free).sum() / count), float((spheres & free).sum() / count))
+        shares = share(parts), share(spheres)
         pairs.append(PairFalseCollisions((a, b), float(meshes.mean()), *shares, every, places, coarse))
-    by_parts = np.any([parts for _, parts, _, _ in found], axis=0)
-    by_spheres = np.any([spheres for spheres, _, _, _ in found], axis=0)
-    return FalseCollisions(
-        float(free.mean()),
-        float((by_parts & free).sum() / count),
-        float((by_spheres & free).sum() / count),
-        tuple(sorted(pairs, key=lambda pair: -pair.by_spheres)),
-    )
+    spheres, parts, _ = (np.any(rows, axis=0) for rows in list(zip(*found, strict=True))[:3])
+    worst_first = sorted(pairs, key=lambda pair: -pair.by_spheres)
+    return FalseCollisions(float(free.mean()), share(parts), share(spheres), tuple(worst_first))
 
 
 def _sticking_out(
@@ -340,7 +322,7 @@ def _sticking_out(
     poses: dict[str, ndarray],
     pair: tuple[str, str],
     rows: Int[ndarray, "n"],
-) -> dict[str, Float[ndarray, "places 3"]]:
+) -> dict[str, Points]:
     """Places where parts of two links overlap in configurations `rows`, each listed for the link whose true
     meshes are further from it, in that link's frame."""
     places_by_link: dict[str, list[ndarray]] = {link: [] for link in pair}
@@ -363,24 +345,8 @@ def _sticking_out(
     return {link: np.reshape(places, (-1, 3)) for link, places in places_by_link.items()}
 
 
-def _one_per_cube(points: Float[ndarray, "n 3"], gaps: Float[ndarray, "n"]) -> Float[ndarray, "m 4"]:
+def _one_per_cube(points: Points, gaps: Values) -> Spheres:
     """The place with the narrowest gap of each cube."""
     order = np.argsort(gaps)
     rows = np.column_stack([points, gaps])[order]
     return rows[np.unique(np.floor(rows[:, :3] / PLACE_SPACING), axis=0, return_index=True)[1]]
-
-
-def _collide(
-    first: tuple["coal.BVHModelOBBRSS", ...],
-    second: tuple["coal.BVHModelOBBRSS", ...],
-    T_a: ndarray,
-    T_b: ndarray,
-) -> bool:
-    """Whether surfaces of two links intersect; one inside the other is not detected."""
-    request = coal.CollisionRequest()
-    result = coal.CollisionResult()
-    place_a = coal_pose(T_a)
-    place_b = coal_pose(T_b)
-    return any(
-        coal.collide(one, place_a, other, place_b, request, result) for one in first for other in second
-    )

@@ -16,7 +16,7 @@ not contain points below the plane that the robot stands on.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +27,8 @@ from scipy.spatial import KDTree
 
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.settings import Positive, Settings
+from robotdiffuse.core.types import Mask, Points, Spheres, Values, Vector
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.fitting.convex_parts import planes_of, split
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import (
@@ -38,7 +40,6 @@ from robotdiffuse.robots.fitting.sphere_fitting_kernel import (
     max_radii_at,
     plane_depths,
     relax,
-    within,
 )
 
 GRID_POINTS = 200_000
@@ -59,7 +60,7 @@ FLOOR_TOLERANCE = 0.0015
 TOLERANCE_LEVEL = np.log(1.3)
 """Logarithm of the factor within which tolerances are grouped; the lowest of a group applies to all of it."""
 
-Planes = tuple[Float[ndarray, "p 3"], Float[ndarray, "p"], ndarray]
+Planes = tuple[Points, Values, ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,26 +69,24 @@ class Bounds:
 
     tolerance: float
     """[m]"""
-    hidden: Callable[[Float[ndarray, "n 3"]], Bool[ndarray, "n"]] | None = None
+    hidden: Callable[[Points], Mask] | None = None
     """Whether points are inside a neighbour, so that spheres may contain them."""
-    tight: Float[ndarray, "n 4"] | None = None
+    tight: Spheres = field(default_factory=lambda: np.zeros((0, 4)))
     """Rows x y z and how far spheres may stick out there [m]. Near these, `hidden` does not apply."""
-    floor: tuple[Float[ndarray, "3"], float] | None = None
+    floor: tuple[Vector, float] | None = None
     """Upward normal n and offset of a plane: spheres may not contain points x with n . x below the offset."""
 
     @property
     def varies(self) -> bool:
         """Whether the tolerance is smaller in some places."""
-        return self.tight is not None or self.floor is not None
+        return len(self.tight) > 0 or self.floor is not None
 
-    def tolerances(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
+    def tolerances(self, points: Points) -> Values:
         """How far spheres may stick out at points [m]."""
         allowed = np.full(len(points), self.tolerance)
         if self.floor is not None:
             normal, offset = self.floor
             np.minimum(allowed, np.maximum(points @ normal - offset, FLOOR_TOLERANCE), out=allowed)
-        if self.tight is None:
-            return allowed
         level = np.ceil(np.log(self.tight[:, 3]) / TOLERANCE_LEVEL)
         for one in np.unique(level):
             places = self.tight[level == one]
@@ -105,14 +104,14 @@ class SphereSizeGrid:
     be."""
 
     grid: Float[ndarray, "nx ny nz"]
-    origin: Float[ndarray, "3"]
+    origin: Vector
     spacing: float
 
     @property
     def arrays(self) -> tuple[ndarray, ndarray, float]:
         return self.grid, self.origin, self.spacing
 
-    def at(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
+    def at(self, points: Points) -> Values:
         """Largest radius at points [m]."""
         return max_radii_at(np.ascontiguousarray(points), *self.arrays)
 
@@ -123,7 +122,7 @@ class Solid:
 
     meshes: tuple[ConvexMesh, ...]
     distance: Float[ndarray, "nx ny nz"]
-    origin: Float[ndarray, "3"]
+    origin: Vector
     spacing: float
 
     @staticmethod
@@ -138,14 +137,14 @@ class Solid:
         high = high + padding + 2 * spacing
         shape = np.ceil((high - low) / spacing).astype(int) + 1
         planes = stacked_planes(meshes)
-        depth = plane_depths(_grid_points(shape, low, spacing), *planes).reshape(shape)
+        depth = plane_depths(_grid_points(shape, low, spacing), *planes, -np.inf).reshape(shape)
         inside = depth > 0
         # planes between overlapping meshes are not surface: measure from the outer surface instead
         deep = depth if len(meshes) == 1 else _distance_inside(inside, spacing, np.maximum(-depth, 0.0))
         return Solid(meshes, np.where(inside, -deep, -depth), low, spacing)
 
     @property
-    def points(self) -> Float[ndarray, "n 3"]:
+    def points(self) -> Points:
         """Points of the grid."""
         return _grid_points(self.distance.shape, self.origin, self.spacing)
 
@@ -155,7 +154,7 @@ class Solid:
         return max(float(-self.distance.min()), MIN_DEPTH)
 
     @property
-    def inside(self) -> Float[ndarray, "n 3"]:
+    def inside(self) -> Points:
         """Grid points inside the solid; the nearest ones if the solid is thinner than the spacing."""
         distance = self.distance.ravel()
         return self.points[distance < max(0.0, float(distance.min()) + self.spacing / 2)]
@@ -205,15 +204,18 @@ def stacked_planes(meshes: tuple[ConvexMesh, ...]) -> Planes:
     return np.concatenate([normals for normals, _ in planes]), np.concatenate([o for _, o in planes]), starts
 
 
-def depths(meshes: tuple[ConvexMesh, ...], points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
+def is_inside(points: Points, planes: Planes, depth: float) -> Mask:
+    """Which points are deeper than `depth` in a part."""
+    return plane_depths(points, *planes, depth) > depth
+
+
+def depths(meshes: tuple[ConvexMesh, ...], points: Points) -> Values:
     """Distance from points to the nearest face plane of the mesh in which they are deepest [m]; negative
     outside."""
-    return plane_depths(np.ascontiguousarray(points), *stacked_planes(meshes))
+    return plane_depths(np.ascontiguousarray(points), *stacked_planes(meshes), -np.inf)
 
 
-def _grid_points(
-    shape: tuple[int, ...] | ndarray, origin: Float[ndarray, "3"], spacing: float
-) -> Float[ndarray, "n 3"]:
+def _grid_points(shape: tuple[int, ...] | ndarray, origin: Vector, spacing: float) -> Points:
     """Coordinates of all points of a grid [m]."""
     axes = [low + spacing * np.arange(count) for low, count in zip(origin, shape, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -239,7 +241,7 @@ ADDED_SPACING = 0.02
 
 
 @dataclass(frozen=True)
-class SphereSettings:
+class SphereSettings(Settings, name="sphere tolerances"):
     """How closely covering spheres follow the meshes of a link."""
 
     first_half: float = 0.015
@@ -248,9 +250,7 @@ class SphereSettings:
     """The same for the links beyond, which work closer to obstacles [m]."""
     fixed: float = 0.03
     """The same for links that no planned joint moves, which can only collide with the arm itself [m]."""
-    relative: float = 1.0
-    """Upper bound on the tolerance, as a multiple of the radius of the largest sphere inside the link."""
-    finest: float = 0.004
+    finest: Positive = 0.004
     """Lower bound on the tolerance [m]."""
     candidates: int = 1000
     """Candidate centres of the greedy cover."""
@@ -258,22 +258,16 @@ class SphereSettings:
     """Rounds of assigning cells and moving spheres, for each number of spheres."""
     tries: int = 3
     """Failed attempts to drop a sphere after which a round of dropping ends."""
-    starts: int = 1
-    """Number of random starts; the fit with the fewest spheres is kept."""
     most: int = 200
     """Approximate largest number of spheres per link; if they do not suffice, they exceed the tolerance."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.finest <= min(self.first_half, self.second_half):
+        super().__post_init__()
+        if self.finest > min(self.first_half, self.second_half):
             raise InputError(
-                f"sphere tolerances: finest is {self.finest}; it must be positive and at most first_half "
+                f"sphere tolerances: finest is {self.finest}; it must be at most first_half "
                 f"({self.first_half}) and second_half ({self.second_half})"
             )
-
-    def scaled(self, size: float) -> "SphereSettings":
-        """The settings for links scaled by a factor."""
-        lengths = ("first_half", "second_half", "fixed", "finest")
-        return replace(self, **{name: size * getattr(self, name) for name in lengths})
 
     def tolerance(self, frame: int, dof: int, inradius: float) -> float:
         """How far the spheres of a link may stick out [m]: a link on a frame (see `Robot.link_frame`) of a
@@ -281,7 +275,7 @@ class SphereSettings:
         wanted = self.first_half if frame <= (dof + 1) // 2 else self.second_half
         if frame == 0:
             wanted = max(wanted, self.fixed)
-        return float(max(min(wanted, self.relative * inradius), self.finest))
+        return float(max(min(wanted, inradius), self.finest))
 
 
 def fit_spheres(
@@ -289,28 +283,26 @@ def fit_spheres(
     bounds: Bounds,
     rng: np.random.Generator,
     settings: SphereSettings = SphereSettings(),
-) -> Float[ndarray, "n 4"]:
+) -> Spheres:
     """Spheres [x y z radius, m] within bounds that cover surface and interior of a solid."""
     sizes = solid.sphere_sizes(bounds)
     inside = solid.inside
     # a sphere that sticks out of a flat face by e covers a disc of radius sqrt(2 r e); cells are much smaller
     coarse, fine = (Cells.of(solid, bounds, *size) for size in (COARSE_CELLS, FINE_CELLS))
-    covers = []
-    for _ in range(settings.starts):
-        places = rng.permutation(inside)[: settings.candidates] + rng.uniform(-0.5, 0.5, 3) * solid.spacing
-        centers = _thin_out(sizes, coarse, _first_cover(sizes, coarse, places, settings), settings)
-        covers.append(centers)
-    centers = _with_enough_spheres(sizes, fine, min(covers, key=len), settings)
+    places = rng.permutation(inside)[: settings.candidates] + rng.uniform(-0.5, 0.5, 3) * solid.spacing
+    chosen = greedy_cover(coarse.points, coarse.corners, places, sizes.at(places))
+    centers = _with_enough_spheres(sizes, coarse, places[chosen], settings)
+    centers = _with_enough_spheres(sizes, fine, _thin_out(sizes, coarse, centers, settings), settings)
     centers, _ = _relax(sizes, fine, centers, settings.rounds, -np.inf)  # minimise the excess
     return _without_holes(solid, inside, _with_radii(sizes, fine, centers))
 
 
-def stick_out(solid: Solid, spheres: Float[ndarray, "n 4"]) -> Float[ndarray, "n"]:
+def stick_out(solid: Solid, spheres: Spheres) -> Values:
     """How far each sphere sticks out of the solid [m]."""
     return spheres[:, 3] - solid.inscribed_sizes().at(spheres[:, :3])
 
 
-def covered(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"]) -> bool:
+def covered(meshes: tuple[ConvexMesh, ...], spheres: Spheres) -> bool:
     """Whether the spheres provably cover the surface of the union of the meshes.
 
     Triangles that no single sphere contains are cut in four, until all are contained, or a corner is found
@@ -324,7 +316,7 @@ def covered(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"]) -> b
         contained, bare = held_by_one(triangles, spheres)
         is_open = ~contained
         for planes in single:
-            hidden = within(corners, *planes, BURIED_DEPTH)
+            hidden = is_inside(corners, planes, BURIED_DEPTH)
             is_open &= ~hidden.reshape(-1, 3).all(1)
             bare &= ~hidden
         if bare.any():
@@ -345,10 +337,10 @@ def covered(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"]) -> b
 class Cells:
     """Small triangles on the surface of the union of meshes."""
 
-    points: Float[ndarray, "p 3"]
+    points: Points
     corners: Int[ndarray, "c 3"]
     """Indices into points."""
-    sharp: Bool[ndarray, "p"]
+    sharp: Mask
     """Whether a point is a vertex of a mesh; all others lie between neighbours on a face or an edge."""
 
     @staticmethod
@@ -379,7 +371,7 @@ class Cells:
                 if other != k:
                     asked = np.flatnonzero(((low >= lowest) & (high <= highest)).all(1) & ~hidden)
                     corners = triangles[asked].reshape(-1, 3)
-                    hidden[asked] = within(corners, *planes[other], BURIED_DEPTH).reshape(-1, 3).all(1)
+                    hidden[asked] = is_inside(corners, planes[other], BURIED_DEPTH).reshape(-1, 3).all(1)
             triangles = triangles[~hidden]
             if bounds.varies:
                 tolerances = bounds.tolerances(triangles.mean(1))
@@ -402,25 +394,10 @@ class Cells:
         sharp |= left_out
         return Cells(points, index.ravel()[count:].reshape(-1, 3), sharp)
 
-    def assigned(self, sizes: SphereSizeGrid, centers: Float[ndarray, "n 3"]) -> "_Assignment":
-        count = len(self.corners)
-        owner = np.empty(count, np.int64)
-        runner_up = np.empty(count, np.int64)
-        owner_excess = np.empty(count)
-        second_excess = np.empty(count)
-        assign(
-            self.points,
-            self.corners,
-            centers,
-            sizes.at(centers),
-            owner,
-            owner_excess,
-            runner_up,
-            second_excess,
-        )
-        return _Assignment(owner, owner_excess, runner_up, second_excess)
+    def assigned(self, sizes: SphereSizeGrid, centers: Points) -> "_Assignment":
+        return _Assignment(*assign(self.points, self.corners, centers, sizes.at(centers)))
 
-    def part(self, mine: Bool[ndarray, "c"]) -> "Cells":
+    def part(self, mine: Mask) -> "Cells":
         """A subset of the cells; points on its border count as vertices, since other cells need them
         covered."""
         outside = np.zeros(len(self.points), dtype=bool)
@@ -434,32 +411,24 @@ class _Assignment(NamedTuple):
 
     owner: Int[ndarray, "c"]
     """The sphere that covers the cell with the least excess."""
-    owner_excess: Float[ndarray, "c"]
+    owner_excess: Values
     """Its excess radius for the cell [m]."""
     runner_up: Int[ndarray, "c"]
     """The second best sphere; -1 if there is none."""
-    second_excess: Float[ndarray, "c"]
+    second_excess: Values
     """Its excess radius [m]."""
 
 
 def _relax(
-    sizes: SphereSizeGrid, cells: Cells, centers: Float[ndarray, "n 3"], rounds: int, enough: float
-) -> tuple[Float[ndarray, "n 3"], float]:
+    sizes: SphereSizeGrid, cells: Cells, centers: Points, rounds: int, enough: float
+) -> tuple[Points, float]:
     """Improved centres and the largest excess radius [m]; ends early at `enough`."""
     return relax(cells.points, cells.corners, cells.sharp, centers, rounds, enough, *sizes.arrays, DIRECTIONS)
 
 
-def _first_cover(
-    sizes: SphereSizeGrid, cells: Cells, places: Float[ndarray, "n 3"], settings: SphereSettings
-) -> Float[ndarray, "k 3"]:
-    """Centres from a greedy set cover of the cells."""
-    chosen = greedy_cover(cells.points, cells.corners, places, sizes.at(places))
-    return _with_enough_spheres(sizes, cells, places[chosen], settings)
-
-
 def _with_enough_spheres(
-    sizes: SphereSizeGrid, cells: Cells, centers: Float[ndarray, "n 3"], settings: SphereSettings
-) -> Float[ndarray, "m 3"]:
+    sizes: SphereSizeGrid, cells: Cells, centers: Points, settings: SphereSettings
+) -> Points:
     """Improved centres, with spheres added until none exceeds its largest radius, or there are
     `settings.most`."""
     max_excess = sizes.spacing * EXCESS_TOLERANCE
@@ -473,9 +442,7 @@ def _with_enough_spheres(
     return centers
 
 
-def _farthest_apart(
-    points: Float[ndarray, "c 3"], excess: Float[ndarray, "c"], count: int
-) -> Float[ndarray, "k 3"]:
+def _farthest_apart(points: Points, excess: Values, count: int) -> Points:
     """Up to `count` points with the largest excess, apart from each other."""
     order = np.argsort(-excess)[: max(1, int((excess > 0).sum()))]
     points = points[order]
@@ -486,9 +453,7 @@ def _farthest_apart(
     return np.array(chosen)
 
 
-def _thin_out(
-    sizes: SphereSizeGrid, cells: Cells, centers: Float[ndarray, "n 3"], settings: SphereSettings
-) -> Float[ndarray, "m 3"]:
+def _thin_out(sizes: SphereSizeGrid, cells: Cells, centers: Points, settings: SphereSettings) -> Points:
     """Centres without the spheres whose cells the others can cover; the least needed ones are dropped first.
 
     Only the spheres that take over cells are moved.
@@ -530,7 +495,7 @@ def _thin_out(
     return centers
 
 
-def _with_radii(sizes: SphereSizeGrid, cells: Cells, centers: Float[ndarray, "n 3"]) -> Float[ndarray, "m 4"]:
+def _with_radii(sizes: SphereSizeGrid, cells: Cells, centers: Points) -> Spheres:
     """Spheres with the smallest radii that cover the cells assigned to them; spheres without cells are
     dropped."""
     owner = cells.assigned(sizes, centers).owner
@@ -540,9 +505,7 @@ def _with_radii(sizes: SphereSizeGrid, cells: Cells, centers: Float[ndarray, "n 
     return np.concatenate([centers, radii[:, None]], axis=1)[radii > 0]
 
 
-def _without_holes(
-    solid: Solid, inside: Float[ndarray, "g 3"], spheres: Float[ndarray, "n 4"]
-) -> Float[ndarray, "m 4"]:
+def _without_holes(solid: Solid, inside: Points, spheres: Spheres) -> Spheres:
     """Spheres with more of them added in uncovered holes inside the solid, where a small obstacle could
     hide."""
     depth = solid.inscribed_sizes().at(inside)

@@ -29,16 +29,16 @@ DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 
 
 @kernel()
-def plane_depths(points, normals, offsets, starts):
+def plane_depths(points, normals, offsets, starts, lowest):
     """Distance [n] from each point to the nearest face plane of the part in which it is deepest; negative
-    outside.
+    outside. At least `lowest`.
 
     Planes are as in `sphere_fitting.stacked_planes`.
     """
     depths = np.empty(len(points))
     for i in range(len(points)):
         x, y, z = points[i]
-        best = -1e9
+        best = lowest
         for part in range(len(starts) - 1):
             face_distance = 1e9
             for f in range(starts[part], starts[part + 1]):
@@ -50,23 +50,6 @@ def plane_depths(points, normals, offsets, starts):
             best = max(best, face_distance)
         depths[i] = best
     return depths
-
-
-@kernel()
-def within(points, normals, offsets, starts, depth):
-    """Whether each point is deeper than `depth` in a part."""
-    found = np.zeros(len(points), np.bool_)
-    for i in range(len(points)):
-        x, y, z = points[i]
-        for part in range(len(starts) - 1):
-            found[i] = True
-            for f in range(starts[part], starts[part + 1]):
-                if offsets[f] - normals[f, 0] * x - normals[f, 1] * y - normals[f, 2] * z <= depth:
-                    found[i] = False
-                    break
-            if found[i]:
-                break
-    return found
 
 
 @kernel(fastmath=True)
@@ -112,11 +95,16 @@ def squared_distance(a, i, b, j):
 
 
 @kernel(fastmath=True)
-def assign(points, corners, centers, depths, owner, least, heir, second):
-    """Write for each cell the sphere that covers it with the least excess, that excess, and the second best.
+def assign(points, corners, centers, depths):
+    """For each cell: the sphere that covers it with the least excess, that excess, and both of the second
+    one; -1 if there is none.
 
     `depths` are the largest radii of spheres at `centers`.
     """
+    owner = np.empty(len(corners), np.int64)
+    least = np.empty(len(corners))
+    heir = np.empty(len(corners), np.int64)
+    second = np.empty(len(corners))
     for c in range(len(corners)):
         best = 1e9
         runner = 1e9
@@ -143,6 +131,7 @@ def assign(points, corners, centers, depths, owner, least, heir, second):
         least[c] = best
         heir[c] = next_best
         second[c] = runner
+    return owner, least, heir, second
 
 
 @kernel(fastmath=True)
@@ -358,10 +347,6 @@ def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing
     """
     cells = len(corners)
     count = len(centers)
-    owner = np.empty(cells, np.int64)
-    least = np.empty(cells)
-    heir = np.empty(cells, np.int64)
-    second = np.empty(cells)
     first = np.empty(len(points), np.int64)
     stamp = np.empty(len(points), np.int64)
     rim = np.empty(len(points), np.bool_)
@@ -373,9 +358,7 @@ def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing
     best_value = 1e9
     step = INITIAL_STEP
     for r in range(rounds + 1):
-        assign(
-            points, corners, centers, max_radii_at(centers, grid, origin, spacing), owner, least, heir, second
-        )
+        owner, least, _, _ = assign(points, corners, centers, max_radii_at(centers, grid, origin, spacing))
         value = least.max()
         if value < best_value:
             best = centers.copy()

@@ -24,6 +24,7 @@ from robotdiffuse.core.transforms import (
     rotation_from_quaternion,
     transform,
 )
+from robotdiffuse.core.types import Pose, Values, Vector
 from robotdiffuse.robots.parsing.srdf import Srdf
 
 MOVABLE = ("hinge", "slide")
@@ -117,8 +118,7 @@ def converted(path: Path) -> ConvertedModel:
 
     Raises InputError for a model without a joint, for ball joints, and for geoms that cannot be planned with.
     """
-    conversion = _Conversion(path, compiled_model(path))
-    return conversion.result()
+    return _Conversion(path, compiled_model(path)).result()
 
 
 class _Conversion:
@@ -131,6 +131,8 @@ class _Conversion:
         self.folder = TemporaryDirectory(prefix="robotdiffuse-mjcf-")
         self.root = ET.Element("robot", name=_model_name(model) or path.stem)
         self.bodies = robot_bodies(model)
+        self.masks = model.geom_contype | model.geom_conaffinity
+        """Not 0 for geoms that collide with anything."""
         self.notes: list[str] = []
         self.links: set[str] = set()
         self.meshes: dict[int, str] = {}
@@ -147,16 +149,23 @@ class _Conversion:
         semantics = Srdf(self.path, allowed=self._excluded(), poses=self._poses())
         return ConvertedModel(ET.tostring(self.root), self.folder, semantics, tuple(self.notes))
 
-    def name(self, kind: Any, index: int) -> str:
+    def name(self, kind: str, index: int) -> str:
         """The name of an element, or its kind and number."""
-        given = self.mujoco.mj_id2name(self.model, kind, index)
-        return given or f"{kind.name.removeprefix('mjOBJ_').lower()}{index}"
-
-    def body_name(self, body: int) -> str:
-        return self.name(self.mujoco.mjtObj.mjOBJ_BODY, body)
+        return getattr(self.model, kind)(index).name or f"{kind}{index}"
 
     def joint_name(self, joint: int) -> str:
-        return self.name(self.mujoco.mjtObj.mjOBJ_JOINT, joint)
+        return self.name("joint", joint)
+
+    def joint_kind(self, joint: int) -> str:
+        return kind_of("Joint", self.model.jnt_type[joint])
+
+    def _element(self, name: str, kind: str, parent: str, child: str, T: Pose) -> ET.Element:
+        """A new joint of the URDF."""
+        joint = ET.SubElement(self.root, "joint", name=name, type=kind)
+        ET.SubElement(joint, "parent", link=parent)
+        ET.SubElement(joint, "child", link=child)
+        _origin(joint, T)
+        return joint
 
     def _link(self, name: str) -> ET.Element:
         self.links.add(name)
@@ -165,21 +174,20 @@ class _Conversion:
     def _body(self, body: int, mimics: dict[int, dict[str, str]]) -> None:
         """The link of a body, and its joints: each at its anchor, which the frame of the body may leave."""
         model = self.model
-        name = self.body_name(body)
+        name = self.name("body", body)
         parent = int(model.body_parentid[body])
-        above = "world" if parent == WORLD else self.body_name(parent)
-        T = transform(model.body_pos[body], rotation_from_quaternion(model.body_quat[body]))
+        above = "world" if parent == WORLD else self.name("body", parent)
+        T = _pose(model.body_pos[body], model.body_quat[body])
         joints = _joints_of(model, [body])
         for joint in joints:
             label = self.joint_name(joint)
-            kind = kind_of("Joint", model.jnt_type[joint])
+            kind = self.joint_kind(joint)
             if kind == "free":
                 self.notes.append(f"the free joint of {name} is held where the model places it")
                 continue
             if kind == "ball":
                 raise InputError(f"{self.path}: joint {label} is a ball joint; use three hinges in its place")
-            anchor = np.eye(4)
-            anchor[:3, 3] = model.jnt_pos[joint]
+            anchor = transform(model.jnt_pos[joint])
             reference = self._moved(joint, -float(model.qpos0[model.jnt_qposadr[joint]]))
             last = joint == joints[-1] and np.linalg.norm(model.jnt_pos[joint]) < MIN_SHIFT
             child = name if last else f"{label}_anchor"
@@ -188,29 +196,25 @@ class _Conversion:
             above = child
             T = inverse(anchor)
         if above != name:
-            fixed = ET.SubElement(self.root, "joint", name=f"{name}_fixed", type="fixed")
-            _ends(fixed, above, name)
-            _origin(fixed, T)
+            self._element(f"{name}_fixed", "fixed", above, name, T)
         self._geometry(self._link(name), body)
 
-    def _moved(self, joint: int, value: float) -> Float[ndarray, "4 4"]:
+    def _moved(self, joint: int, value: float) -> Pose:
         """The motion of a joint by a value."""
         axis = self.model.jnt_axis[joint]
-        if kind_of("Joint", self.model.jnt_type[joint]) == "slide":
-            return transform(value * axis, np.eye(3))
+        if self.joint_kind(joint) == "slide":
+            return transform(value * axis)
         return transform(np.zeros(3), rotation_about(axis, value))
 
     def _joint(self, joint: int, parent: str, child: str, T: ndarray, mimic: dict[str, str] | None) -> None:
         model = self.model
         label = self.joint_name(joint)
-        slides = kind_of("Joint", model.jnt_type[joint]) == "slide"
+        slides = self.joint_kind(joint) == "slide"
         limited = bool(model.jnt_limited[joint])
         if slides and not limited:
             raise InputError(f"{self.path}: slide joint {label} has no range; give it one")
         kind = "prismatic" if slides else "revolute" if limited else "continuous"
-        element = ET.SubElement(self.root, "joint", name=label, type=kind)
-        _ends(element, parent, child)
-        _origin(element, T)
+        element = self._element(label, kind, parent, child, T)
         ET.SubElement(element, "axis", xyz=_text(model.jnt_axis[joint]))
         limits: dict[str, str] = {}
         if limited:
@@ -270,15 +274,14 @@ class _Conversion:
         model = self.model
         if model.body_mass[body] > 0:
             inertial = ET.SubElement(link, "inertial")
-            T = transform(model.body_ipos[body], rotation_from_quaternion(model.body_iquat[body]))
+            T = _pose(model.body_ipos[body], model.body_iquat[body])
             _origin(inertial, T)
             ET.SubElement(inertial, "mass", value=repr(float(model.body_mass[body])))
             xx, yy, zz = map(repr, model.body_inertia[body].tolist())
             ET.SubElement(inertial, "inertia", ixx=xx, iyy=yy, izz=zz, ixy="0", ixz="0", iyz="0")
         for geom in _geoms_of(model, body):
-            collides = bool(model.geom_contype[geom] | model.geom_conaffinity[geom])
-            element = ET.SubElement(link, "collision" if collides else "visual")
-            T = transform(model.geom_pos[geom], rotation_from_quaternion(model.geom_quat[geom]))
+            element = ET.SubElement(link, "collision" if self.masks[geom] else "visual")
+            T = _pose(model.geom_pos[geom], model.geom_quat[geom])
             _origin(element, T)
             self._shape(ET.SubElement(element, "geometry"), geom)
 
@@ -299,11 +302,11 @@ class _Conversion:
                 self.meshes[mesh] = self._written(mesh_of(self.model, mesh), f"mesh{mesh}")
             ET.SubElement(parent, "mesh", filename=self.meshes[mesh])
         else:
-            name = self.name(self.mujoco.mjtObj.mjOBJ_GEOM, geom)
-
+            name = self.name("geom", geom)
+            body = self.name("body", int(self.model.geom_bodyid[geom]))
             raise InputError(
-                f"{self.path}: {name} of body {self.body_name(int(self.model.geom_bodyid[geom]))} is of type "
-                f"{kind}; a robot may have spheres, capsules, ellipsoids, cylinders, boxes and meshes"
+                f"{self.path}: {name} of body {body} is of type {kind}; a robot may have spheres, capsules, "
+                f"ellipsoids, cylinders, boxes and meshes"
             )
 
     def _written(self, mesh: trimesh.Trimesh, name: str) -> str:
@@ -314,14 +317,12 @@ class _Conversion:
         bodies = set(self.bodies)
         for site in range(self.model.nsite):
             body = int(self.model.site_bodyid[site])
-            name = self.name(self.mujoco.mjtObj.mjOBJ_SITE, site)
+            name = self.name("site", site)
             if body not in bodies:
                 continue
             link = name if name not in self.links else f"{name}_site"
-            fixed = ET.SubElement(self.root, "joint", name=f"{link}_fixed", type="fixed")
-            _ends(fixed, self.body_name(body), link)
-            rotation = rotation_from_quaternion(self.model.site_quat[site])
-            _origin(fixed, transform(self.model.site_pos[site], rotation))
+            T = _pose(self.model.site_pos[site], self.model.site_quat[site])
+            self._element(f"{link}_fixed", "fixed", self.name("body", body), link, T)
             self._link(link)
 
     def _excluded(self) -> dict[frozenset[str], str]:
@@ -330,29 +331,33 @@ class _Conversion:
         model = self.model
         excluded = {frozenset(divmod(int(signature), 2**16)) for signature in model.exclude_signature}
         unfiltered = bool(model.opt.disableflags & int(self.mujoco.mjtDisableBit.mjDSBL_FILTERPARENT))
-        solid = [body for body in self.bodies if _colliding(model, body)]
+        geoms = {body: [geom for geom in _geoms_of(model, body) if self.masks[geom]] for body in self.bodies}
+        solid = [body for body in self.bodies if geoms[body]]
+
+        def meet(first: int, second: int) -> bool:
+            """Whether the masks let any geom of one body collide with one of the other."""
+            a, b = geoms[first], geoms[second]
+            kinds, partners = model.geom_contype, model.geom_conaffinity
+            return bool((kinds[a, None] & partners[b] | kinds[b] & partners[a, None]).any())
+
         pairs = [
-            (first, second)
-            for first, second in combinations(solid, 2)
-            if frozenset((first, second)) in excluded
-            or _related(model, first, second, unfiltered)
-            or not _masks_meet(model, first, second)
+            pair
+            for pair in combinations(solid, 2)
+            if frozenset(pair) in excluded or _related(model, *pair, unfiltered) or not meet(*pair)
         ]
         if len(solid) > 1 and len(pairs) == len(solid) * (len(solid) - 1) // 2:
             self.notes.append("by the masks and exclusions of the model, no two of its links may collide")
-        return {frozenset(map(self.body_name, pair)): EXCLUDED for pair in pairs}
+        return {frozenset(self.name("body", body) for body in pair): EXCLUDED for pair in pairs}
 
     def _poses(self) -> dict[str, dict[str, float]]:
         model = self.model
         places = {
             self.joint_name(joint): model.jnt_qposadr[joint]
             for joint in _joints_of(model, self.bodies)
-            if kind_of("Joint", model.jnt_type[joint]) in MOVABLE
+            if self.joint_kind(joint) in MOVABLE
         }
         return {
-            self.name(self.mujoco.mjtObj.mjOBJ_KEY, key): {
-                name: float(model.key_qpos[key, place]) for name, place in places.items()
-            }
+            self.name("key", key): {name: float(model.key_qpos[key, place]) for name, place in places.items()}
             for key in range(model.nkey)
         }
 
@@ -364,7 +369,7 @@ def mesh_of(model: Any, mesh: int) -> trimesh.Trimesh:
     return trimesh.Trimesh(model.mesh_vert[vertices], model.mesh_face[faces], process=False)
 
 
-def ellipsoid(radii: Float[ndarray, "3"]) -> trimesh.Trimesh:
+def ellipsoid(radii: Vector) -> trimesh.Trimesh:
     """A polyhedron around an ellipsoid."""
     ball = trimesh.creation.icosphere(subdivisions=2)
     inradius = np.einsum("fd,fd->f", ball.face_normals, ball.triangles[:, 0]).min()
@@ -380,12 +385,6 @@ def _geoms_of(model: Any, body: int) -> range:
     return range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
 
 
-def _colliding(model: Any, body: int) -> list[int]:
-    """The geoms of a body that collide with anything."""
-    masks = model.geom_contype | model.geom_conaffinity
-    return [geom for geom in _geoms_of(model, body) if masks[geom]]
-
-
 def _related(model: Any, first: int, second: int, unfiltered: bool) -> bool:
     """Whether two bodies are joined rigidly, or by the joints of one of them, and not to the world."""
     welded = [int(model.body_weldid[body]) for body in (first, second)]
@@ -394,24 +393,14 @@ def _related(model: Any, first: int, second: int, unfiltered: bool) -> bool:
     return welded[0] == welded[1] or (carried and WORLD not in welded and not unfiltered)
 
 
-def _masks_meet(model: Any, first: int, second: int) -> bool:
-    """Whether any geom of one body may collide with one of the other."""
-    return any(
-        model.geom_contype[a] & model.geom_conaffinity[b] or model.geom_contype[b] & model.geom_conaffinity[a]
-        for a in _colliding(model, first)
-        for b in _colliding(model, second)
-    )
+def _pose(xyz: Vector, wxyz: Float[ndarray, "4"]) -> Pose:
+    return transform(xyz, rotation_from_quaternion(wxyz))
 
 
-def _ends(joint: ET.Element, parent: str, child: str) -> None:
-    ET.SubElement(joint, "parent", link=parent)
-    ET.SubElement(joint, "child", link=child)
-
-
-def _origin(element: ET.Element, T: Float[ndarray, "4 4"]) -> None:
+def _origin(element: ET.Element, T: Pose) -> None:
     w, x, y, z = quaternion_from_rotation(T[:3, :3])
     ET.SubElement(element, "origin", xyz=_text(T[:3, 3]), quat_xyzw=_text(np.array([x, y, z, w])))
 
 
-def _text(numbers: Float[ndarray, "n"]) -> str:
+def _text(numbers: Values) -> str:
     return " ".join(map(repr, numbers.tolist()))

@@ -5,7 +5,8 @@ import re
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from threading import Lock
+from typing import Any
 from urllib.parse import unquote
 
 from robotdiffuse.core.errors import InputError, shown
@@ -15,6 +16,8 @@ MAX_PACKAGES = 32
 """Largest number of packages that a xacro file may refer to."""
 NAMESPACE_PREFIX = re.compile(rb"""</?([A-Za-z_][\w.-]*):[\w.-]+|\s([A-Za-z_][\w.-]*):[\w.-]+\s*=\s*["']""")
 """Matches the namespace prefix of an element or attribute."""
+XACRO = Lock()
+"""Held while xacro compiles a file: it keeps its state in its modules."""
 PACKAGE_NOT_FOUND = re.compile(r"Package not found: (\S+)")
 """Matches xacrodoc's error for an unknown package."""
 
@@ -54,31 +57,24 @@ class Packages:
         Raises InputError if there is no such file.
         """
         start = self.urdf.resolve().parent
-        if not filename.startswith("package://"):
-            name = filename.removeprefix("file://")
-            for resolved in (start / name, start / unquote(name)):
-                if is_file(resolved):
-                    return resolved
-            raise InputError(
-                f"{self.urdf}: mesh file {shown(filename)} does not exist; add it, or remove its element"
+        if filename.startswith("package://"):
+            package, _, rest = filename.removeprefix("package://").partition("/")
+            folder = self.folder(package)
+            places = [] if folder is None else [folder]
+            places += (up / below for up in (start, *start.parents) for below in (package, ""))
+            advice = (
+                f" (searched from {start} upwards); give the package's folder: --package {package}=FOLDER, "
+                f"or ROS_PACKAGE_PATH"
             )
-        package, _, rest = filename.removeprefix("package://").partition("/")
-        folder = self.folder(package)
-        upwards = [
-            up / tail
-            for up in (start, *start.parents)
-            for name in (rest, unquote(rest))
-            for tail in (f"{package}/{name}", name)
-        ]
-        inside = [] if folder is None else [folder / rest, folder / unquote(rest)]
-        candidates = [*inside, *upwards]
-        for candidate in candidates:
-            if is_file(candidate):
-                return candidate
-        raise InputError(
-            f"{self.urdf}: mesh file {shown(filename)} does not exist (searched from {start} upwards); give "
-            f"the package's folder: --package {package}=FOLDER, or ROS_PACKAGE_PATH"
-        )
+        else:
+            rest = filename.removeprefix("file://")
+            places = [start]
+            advice = "; add it, or remove its element"
+        for place in places:
+            for name in (rest, unquote(rest)):
+                if is_file(place / name):
+                    return place / name
+        raise InputError(f"{self.urdf}: mesh file {shown(filename)} does not exist{advice}")
 
 
 def _folders(variable: str) -> list[Path]:
@@ -116,18 +112,14 @@ def compiled_xacro(path: Path, packages: Packages) -> bytes:
             f"{path} is a xacro file; install its compiler with pip install 'robotdiffuse[xacro]', or "
             f"compile it elsewhere: xacro {path.name} > {path.name.split('.')[0]}.urdf"
         ) from None
-    for module in (xacro, known):
-        module.open = _open_file  # type: ignore[attr-defined]
-    try:
-        return _by_xacro(xacro, known, path, packages)
-    finally:
-        for module in (xacro, known):
-            del module.open  # type: ignore[attr-defined]
-
-
-def _open_file(file: str | Path, mode: str = "r") -> IO[Any]:
-    """`open` for xacro: it would wait for ever for a pipe that is included."""
-    return input_file(file).open(mode)
+    with XACRO:
+        for module in (xacro, known):  # it would wait for ever for a pipe that is included
+            module.open = lambda file, mode="r": input_file(file).open(mode)  # type: ignore[attr-defined]
+        try:
+            return _by_xacro(xacro, known, path, packages)
+        finally:
+            for module in (xacro, known):
+                del module.open  # type: ignore[attr-defined]
 
 
 def _by_xacro(xacro: Any, known: Any, path: Path, packages: Packages) -> bytes:

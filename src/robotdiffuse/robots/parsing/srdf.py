@@ -9,11 +9,12 @@ import xml.etree.ElementTree as ET
 from dataclasses import dataclass, field
 from itertools import takewhile
 from pathlib import Path
+from typing import NamedTuple
 
 from robotdiffuse.core.bounds import MAX_COORDINATE
 from robotdiffuse.core.errors import InputError, repeated, shown, unknown_name
 from robotdiffuse.core.input_files import is_file, parse_xml, read_bytes
-from robotdiffuse.robots.kinematic_tree import MOVING_KINDS, Joint
+from robotdiffuse.robots.kinematic_tree import MOVING_KINDS, Joint, chain
 from robotdiffuse.robots.robot import Robot
 
 SRDF_FOLDERS = (".", "../srdf", "../config", "srdf", "config")
@@ -82,10 +83,8 @@ class Srdf:
     def resting(self) -> dict[str, float]:
         """Values of joints in the poses named in `REST_POSES` [rad] or [m], the first pose that has the
         joint."""
-        values: dict[str, float] = {}
-        for name in REST_POSES:
-            values = self.poses.get(name, {}) | values
-        return values
+        poses = (self.poses.get(name, {}) for name in reversed(REST_POSES))
+        return {joint: value for pose in poses for joint, value in pose.items()}
 
 
 @dataclass(frozen=True)
@@ -122,6 +121,9 @@ def read_srdf(file: str | Path) -> Srdf:
             raise InputError(f"{path}: a <{element.tag}> has no {what}")
         return value
 
+    def names(element: ET.Element, tag: str) -> tuple[str, ...]:
+        return tuple(text(one, "name") for one in element.findall(tag))
+
     def number(element: ET.Element) -> float:
         try:
             value = float(text(element, "value").split()[0])
@@ -146,17 +148,17 @@ def read_srdf(file: str | Path) -> Srdf:
         },
         groups={
             text(group, "name"): Group(
-                joints=tuple(text(joint, "name") for joint in group.findall("joint")),
-                links=tuple(text(link, "name") for link in group.findall("link")),
+                joints=names(group, "joint"),
+                links=names(group, "link"),
                 chains=tuple(
                     (text(chain, "base_link"), text(chain, "tip_link")) for chain in group.findall("chain")
                 ),
-                groups=tuple(text(sub, "name") for sub in group.findall("group")),
+                groups=names(group, "group"),
             )
             for group in root.findall("group")
         },
         poses=poses,
-        passive=frozenset(text(joint, "name") for joint in root.findall("passive_joint")),
+        passive=frozenset(names(root, "passive_joint")),
     )
 
 
@@ -176,8 +178,7 @@ MIN_ARM_JOINTS = 4
 more branches form a hand, however long its fingers are."""
 
 
-@dataclass(frozen=True)
-class Arm:
+class Arm(NamedTuple):
     """A chain of movable joints and the link at its end."""
 
     joints: tuple[str, ...]
@@ -265,7 +266,7 @@ class JointTree:
 
 
 def planned_joints(
-    file: Path, base: str, joints: list[Joint], tip: str | None, group: str | None, srdf: Srdf | None
+    file: Path, base: str, joints: list[Joint], tip: str | None, group: str | None, srdf: Srdf
 ) -> tuple[set[str], list[str]]:
     """Names of the joints that are planned unless they are locked, and the tips.
 
@@ -277,17 +278,14 @@ def planned_joints(
     if tip is not None and tip not in (base, *above):
         raise unknown_name(f"tip link below {base} in {file.name}", tip, [base, *above])
     chosen: list[str] | None = None
-    if group is not None and srdf is not None and group in srdf.groups:
+    if group is not None and group in srdf.groups:
         chosen = [joint.name for joint in srdf.joints(group, tuple(joints))]
         if not chosen:
             raise InputError(f"{srdf.path}: group {group} has no movable joint below {base}")
         tips = _ends(chosen, above, srdf.tips(group)) if tip is None else [tip]
     elif group is not None or tip is None:
         arms = JointTree(base, joints).arms()
-        groups = [] if srdf is None else list(srdf.groups)
-        selected_arms = (
-            _one_arm(file, arms, groups) if group is None else _named_arms(file, arms, group, groups)
-        )
+        selected_arms = _chosen_arms(file, arms, group, [*srdf.groups])
         tips = [tip] if tip else [arm.tip for arm in selected_arms] or [base]
     else:
         tips = [tip]
@@ -298,8 +296,7 @@ def planned_joints(
             f"{file}: {', '.join(off)} of group {group} do not lead to {tip}; leave out --tip, or choose a "
             f"group of one arm"
         )
-    passive = frozenset() if srdf is None else srdf.passive
-    names = {joint.name for joint in leading if joint.mimic is None and joint.name not in passive}
+    names = {joint.name for joint in leading if joint.mimic is None and joint.name not in srdf.passive}
     return names if chosen is None else names & {*chosen}, tips
 
 
@@ -316,76 +313,44 @@ def _ends(chosen: list[str], above: dict[str, Joint], written: list[str]) -> lis
     return list(last.values())
 
 
-def passive_notes(srdf: Srdf | None, joints: list[Joint]) -> list[str]:
-    """Notes on the passive joints, which are held."""
-    passive = frozenset() if srdf is None else srdf.passive
-    return [f"joint {joint.name} is passive; it is held" for joint in joints if joint.name in passive]
-
-
-def chain(above: dict[str, Joint], tip: str) -> list[Joint]:
-    """The joints from the base to a link; `above` maps links to their parent joints."""
-    joints: list[Joint] = []
-    while tip in above:
-        joints.append(above[tip])
-        tip = above[tip].parent
-    return joints[::-1]
-
-
 def refuse_linkages(file: Path, robot: Robot) -> None:
     """Raise InputError if joints that mimic a planned joint move geometry, since planning would hold them."""
     by_name = {joint.name: joint for joint in robot.joints}
-    above = {joint.child: joint for joint in robot.joints}
     for joint in robot.joints:
         leader = joint
         while leader.mimic is not None:
             leader = by_name[leader.mimic.joint]
         if joint.mimic is None or leader.name in robot.locked:
             continue
-        if any(joint in chain(above, link) for link in (*robot.meshes, *robot.tips)):
+        if any(joint in robot.joints_above(link) for link in (*robot.meshes, *robot.tips)):
             raise InputError(
                 f"{file}: joint {joint.name} mimics {leader.name}, which is planned; that is not supported: "
                 f"hold it with --lock {leader.name}=VALUE, or end the arm above it with --tip"
             )
 
 
-def _one_arm(file: Path, arms: list[Arm], groups: list[str]) -> list[Arm]:
-    """The only arm of a robot, or none; raises InputError that lists the arms if there are several.
+def _chosen_arms(file: Path, arms: list[Arm], group: str | None, groups: list[str]) -> list[Arm]:
+    """The arm with the name or tip `group`, or all arms for `ALL`; without it, the only arm, or none.
 
-    `groups` are the names of groups in the SRDF, for the message.
+    `groups` are the names of groups in the SRDF, for messages. Raises InputError for another name, and for
+    several arms of which none is named.
     """
-    if len(arms) < 2:
-        return arms
-    raise InputError(
-        f"{file} has {len(arms)} arms: {_listed(arms)}; choose one, or {_together(arms)} as one robot: "
-        f"robotdiffuse robot add {file.name} --group {_names_of(arms)[0]}"
-        + (f" (groups of its SRDF: {', '.join(groups)})" if groups else "")
-    )
-
-
-def _named_arms(file: Path, arms: list[Arm], name: str, groups: list[str]) -> list[Arm]:
-    """The arm with a name of `_names_of` or with a tip, or all arms; raises InputError for other names."""
-    names = _names_of(arms)
-    chosen = [arm for arm, its in zip(arms, names, strict=True) if name in (its, arm.tip)]
-    if chosen:
-        return chosen[:1]
-    together = {ALL, _together(arms)} if len(arms) > 1 else set[str]()
-    if name in together:
-        return arms
-    raise unknown_name(f"group of {file}", name, [*names, *sorted(together), *groups])
-
-
-def _together(arms: list[Arm]) -> str:
-    return BOTH if len(arms) == 2 else ALL
-
-
-def _names_of(arms: list[Arm]) -> list[str]:
-    """The names of arms, or their tips if two have the same name."""
     twice = repeated(arm.name for arm in arms)
-    return [arm.tip if arm.name in twice else arm.name for arm in arms]
-
-
-def _listed(arms: list[Arm]) -> str:
-    return ", ".join(
-        f"{name} ({len(arm.joints)} joints to {arm.tip})"
-        for name, arm in zip(_names_of(arms), arms, strict=True)
-    )
+    names = [arm.tip if arm.name in twice else arm.name for arm in arms]
+    together = BOTH if len(arms) == 2 else ALL
+    if group is None and len(arms) > 1:
+        listed = (
+            f"{name} ({len(arm.joints)} joints to {arm.tip})" for name, arm in zip(names, arms, strict=True)
+        )
+        raise InputError(
+            f"{file} has {len(arms)} arms: {', '.join(listed)}; choose one, or {together} as one robot: "
+            f"robotdiffuse robot add {file.name} --group {names[0]}"
+            + (f" (groups of its SRDF: {', '.join(groups)})" if groups else "")
+        )
+    if group is None:
+        return arms
+    chosen = [arm for arm, name in zip(arms, names, strict=True) if group in (name, arm.tip)]
+    words = sorted({ALL, together}) if len(arms) > 1 else []
+    if not chosen and group not in words:
+        raise unknown_name(f"group of {file}", group, [*names, *words, *groups])
+    return chosen[:1] or arms

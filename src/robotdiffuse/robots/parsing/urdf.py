@@ -4,12 +4,12 @@ import hashlib
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import (
@@ -24,47 +24,21 @@ from robotdiffuse.core.bounds import (
 from robotdiffuse.core.errors import InputError, joined, shown, unknown_name
 from robotdiffuse.core.input_files import parse_xml, read_bytes, read_yaml
 from robotdiffuse.core.mesh_files import read_triangles
-from robotdiffuse.core.transforms import inverse, rotation_from_quaternion, rotation_from_rpy, transform
+from robotdiffuse.core.transforms import (
+    inverse,
+    placed,
+    rotation_from_quaternion,
+    rotation_from_rpy,
+    transform,
+)
+from robotdiffuse.core.types import Points, Pose, Values
 from robotdiffuse.robots.bodies import ConvexMesh, Inertia, inertia_of
 from robotdiffuse.robots.fitting.convex_parts import MIN_THICKNESS, Surface, convex_hull, thickened
 from robotdiffuse.robots.kinematic_tree import CONTINUOUS_LIMIT, MOVING_KINDS, Joint, Mimic, with_mimics
 from robotdiffuse.robots.kinematics import reach
 from robotdiffuse.robots.parsing.packages import Packages, compiled_xacro, is_xacro, with_prefixes
-from robotdiffuse.robots.parsing.srdf import Srdf, passive_notes, planned_joints, refuse_linkages
+from robotdiffuse.robots.parsing.srdf import Srdf, planned_joints, refuse_linkages
 from robotdiffuse.robots.robot import Robot
-
-
-def numbers_of(
-    path: Path, text: str, count: int, what: str, most: float = MAX_COORDINATE
-) -> Float[ndarray, "n"]:
-    """The numbers of an attribute, whose absolute values are at most `most`."""
-    try:
-        values = np.array([float(word) for word in text.split()])
-    except ValueError:
-        values = np.zeros(0)
-    if len(values) != count or not np.isfinite(values).all():
-        raise InputError(f"{path}: {what} is {shown(text)}; it must be {count} finite number(s)")
-    if not within(values, most):
-        raise InputError(f"{path}: {what} is {shown(text)}; it must be within ±{most:g}")
-    return values
-
-
-def origin_of(path: Path, element: ET.Element, what: str) -> Float[ndarray, "4 4"]:
-    """The transform of the element's <origin>."""
-    origin = element.find("origin")
-    if origin is None:
-        return np.eye(4)
-    xyz = numbers_of(path, origin.get("xyz", "0 0 0"), 3, f"{what}: origin xyz")
-    turned = origin.get("quat_xyzw")
-    if turned is None:
-        rpy = numbers_of(path, origin.get("rpy", "0 0 0"), 3, f"{what}: origin rpy")
-        return transform(xyz, rotation_from_rpy(*map(float, rpy)))
-    if "rpy" in origin.attrib:
-        raise InputError(f"{path}: {what}: origin has rpy and quat_xyzw; it must have one of them")
-    where = f"{what}: origin quat_xyzw"
-    x, y, z, w = unit_quaternion(f"{path}: {what}", numbers_of(path, turned, 4, where), "origin quat_xyzw")
-    return transform(xyz, rotation_from_quaternion(np.array([w, x, y, z])))
-
 
 ROTATING_KINDS = ("revolute", "continuous")
 RIGHT_ANGLE_TOLERANCE = 1e-3
@@ -89,81 +63,7 @@ def moves_in_a_plane(joints: Sequence[Joint]) -> bool:
 PRIMITIVES = ("box", "capsule", "cylinder", "sphere")
 
 
-def link_surfaces(
-    path: Path, link: ET.Element, kind: str, packages: Packages, notes: list[str]
-) -> tuple[Surface, ...]:
-    """The elements `kind` (collision or visual) of a link as triangle meshes, in the link's frame.
-
-    `notes` receives a note on each mesh file that is turned or scaled. Raises InputError for elements without
-    geometry, unknown shapes and damaged meshes.
-    """
-    parts = []
-    name = link.get("name", "")
-    for element in link.findall(kind):
-        geometry = element.find("geometry")
-        shape = next(iter(geometry), None) if geometry is not None else None
-        if shape is None:
-            raise InputError(f"{path}: link {name}: a <{kind}> has no geometry")
-        if shape.tag == "mesh":
-            surface = _mesh(path, shape, name, packages, notes)
-        elif shape.tag in PRIMITIVES:
-            hull = convex_hull(_primitive(path, shape, name))
-            surface = Surface(hull.vertices, hull.faces)
-        else:
-            raise InputError(
-                f"{path}: link {name}: {kind} shape <{shape.tag}> is not supported; "
-                f"known: {', '.join(sorted((*PRIMITIVES, 'mesh')))}"
-            )
-        T = origin_of(path, element, f"link {name}: {kind}")
-        parts.append(Surface(surface.vertices @ T[:3, :3].T + T[:3, 3], surface.faces))
-    return tuple(parts)
-
-
-def _primitive(path: Path, shape: ET.Element, link: str) -> Float[ndarray, "n 3"]:
-    """Corners of a polyhedron around a primitive."""
-
-    def positive(name: str, count: int) -> Float[ndarray, "n"]:
-        what = f"link {link}: {shape.tag} {name}"
-        values = numbers_of(path, shape.get(name, ""), count, what)
-        if (values < MIN_SIZE).any():
-            raise InputError(f"{path}: {what} is {shown(shape.get(name))}; it must be positive")
-        return values
-
-    if shape.tag == "box":
-        return np.array(trimesh.creation.box(positive("size", 3)).vertices)
-    radius = positive("radius", 1)
-    if shape.tag == "sphere":
-        return _ball() * radius
-    if shape.tag == "capsule":
-        end = _ball() * radius
-    else:
-        angle = np.arange(32) * np.pi / 16
-        ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(32)], axis=1)
-        end = ring * radius / np.cos(np.pi / 32)
-    half = float(positive("length", 1)[0]) / 2
-    return np.concatenate([end + np.array([0, 0, z]) for z in (-half, half)])
-
-
-def _mesh(path: Path, shape: ET.Element, link: str, packages: Packages, notes: list[str]) -> Surface:
-    file = packages.file(shape.get("filename", ""))
-    where = f"link {link}: mesh"
-    scale = numbers_of(path, shape.get("scale", "1 1 1"), 3, f"{where} scale")
-    if (np.abs(scale) < MIN_SIZE).any():
-        raise InputError(f"{path}: {where} scale is {shown(shape.get('scale'))}; its numbers must not be 0")
-    try:
-        vertices, faces = read_triangles(file, merge=True, notes=notes)
-        vertices = points(where, "vertices", vertices * scale)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    if len(vertices) < 4:
-        raise InputError(
-            f"{path}: link {link}: {file} has no triangle mesh with at least four vertices; "
-            f"repair it or remove its element"
-        )
-    return Surface(vertices, faces)
-
-
-def _ball() -> Float[ndarray, "n 3"]:
+def _ball() -> Points:
     """Vertices of a polyhedron around the unit ball."""
     ball = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
     inradius = np.einsum("fd,fd->f", ball.face_normals, ball.triangles[:, 0]).min()
@@ -242,9 +142,12 @@ class UrdfTree:
         self.parents: dict[str, str] = {}
         """Parent joint of each link except the root."""
         self.children: dict[str, list[str]] = {}
+        self.ends: dict[str, tuple[str, str]] = {}
+        """Parent and child link of each joint."""
         for name, element in self.elements.items():
             parent = self._end(name, element, "parent")
             child = self._end(name, element, "child")
+            self.ends[name] = parent, child
             if child in self.parents:
                 raise InputError(
                     f"{self.path}: link {child} has two parent joints ({self.parents[child]}, {name}); a "
@@ -296,6 +199,7 @@ class UrdfTree:
             InputError: If the file or the arguments are incomplete or contradictory; it names the file.
         """
         base = base or self.root
+        srdf = srdf or Srdf(self.path)
         if base not in self.links:
             raise unknown_name(f"base link in {self.path.name}", base, self.links)
         joints = self.below(base)
@@ -303,6 +207,9 @@ class UrdfTree:
         planned, ends = planned_joints(self.path, base, joints, tip, group, srdf)
         meshes = self.geometry(names)
         inertias = self.inertias(names)
+        passive = [
+            f"joint {joint.name} is passive; it is held" for joint in joints if joint.name in srdf.passive
+        ]
         robot = Robot(
             name=self.name,
             base=base,
@@ -310,13 +217,13 @@ class UrdfTree:
             other_tips=tuple(ends[1:]),
             joints=tuple(joints),
             meshes={link: parts for link, parts in meshes.items() if parts},
-            notes=tuple(dict.fromkeys((*self.notes, *passive_notes(srdf, joints)))),
+            notes=tuple(dict.fromkeys((*self.notes, *passive))),
             root=self.carried(base),
             above=self.above(base),
-            poses={} if srdf is None else dict(srdf.poses),
+            poses=dict(srdf.poses),
             inertias=inertias,
         )
-        resting = {} if srdf is None else srdf.resting()
+        resting = srdf.resting()
         rest = {
             joint.name: float(np.clip(resting.get(joint.name, 0.0), joint.lower, joint.upper))
             for joint in joints
@@ -396,7 +303,7 @@ class UrdfTree:
             joints += self.below(joints[-1].child)
         return joints
 
-    def above(self, link: str) -> dict[str, Float[ndarray, "4 4"]]:
+    def above(self, link: str) -> dict[str, Pose]:
         """T_link_ancestor by ancestor of a link, up to the first movable joint."""
         found: dict[str, ndarray] = {}
         T_link_ancestor = np.eye(4)
@@ -405,8 +312,8 @@ class UrdfTree:
             element = self.elements[name]
             if element.get("type") != "fixed":
                 break
-            link = self._end(name, element, "parent")
-            T_link_ancestor = T_link_ancestor @ inverse(origin_of(self.path, element, f"joint {name}"))
+            link = self.ends[name][0]
+            T_link_ancestor = T_link_ancestor @ inverse(self._origin(element, f"joint {name}"))
             found[link] = T_link_ancestor
         return found
 
@@ -419,12 +326,12 @@ class UrdfTree:
         end = link
         while end in self.parents:
             way.insert(0, self.parents[end])
-            end = self._end(way[0], self.elements[way[0]], "parent")
+            end = self.ends[way[0]][0]
         bare = [self.links[self.root].find(kind) is None for kind in ("collision", "visual")]
         for k, name in enumerate(way, 1):
             if not all(bare):
                 break
-            child = self._end(name, self.elements[name], "child")
+            child = self.ends[name][1]
             if self.elements[name].get("type") in ("planar", "floating"):
                 return child
             if moves_in_a_plane([self._joint(above) for above in way[:k]]):
@@ -437,30 +344,21 @@ class UrdfTree:
         what = f"joint {name}"
         kind = element.get("type", "")
         if kind not in KINDS:
-            child = self._end(name, element, "child")
             raise InputError(
                 f"{self.path}: {what} has type {shown(kind)}; supported: {', '.join(KINDS)}; remove it with "
-                f"what it carries, or use --base {child} to plan for what it carries alone"
+                f"what it carries, or use --base {self.ends[name][1]} to plan for what it carries alone"
             )
         axis_element = element.find("axis")
         axis = np.array([1.0, 0.0, 0.0])
         if axis_element is not None and kind != "fixed":
-            axis = numbers_of(self.path, axis_element.get("xyz", "1 0 0"), 3, f"{what}: axis")
+            axis = self._numbers(axis_element.get("xyz", "1 0 0"), 3, f"{what}: axis")
             if np.linalg.norm(axis) < 1e-6:
                 raise InputError(f"{self.path}: {what}: its axis is zero; give it a direction")
             axis = axis / np.linalg.norm(axis)
-        joint = Joint(
-            name=name,
-            kind=kind,
-            parent=self._end(name, element, "parent"),
-            child=self._end(name, element, "child"),
-            T_parent_joint=origin_of(self.path, element, what),
-            axis=axis,
-            mimic=None if kind == "fixed" else self._mimic(name, element),
-        )
+        joint = Joint(name, kind, *self.ends[name], self._origin(element, what), axis)
         if kind == "fixed":
             return joint
-        joint = self._with_limits(joint, element.find("limit"))
+        joint = self._with_limits(replace(joint, mimic=self._mimic(name, element)), element.find("limit"))
         safety = element.find("safety_controller")
         soft = {} if safety is None else safety.attrib
         soft_limits = [
@@ -493,22 +391,20 @@ class UrdfTree:
             self.notes.append(f"joint {name} mimics the fixed joint {leaders[-1]}; treated as independent")
             return None
         what = f"joint {name}: mimic"
-        multiplier = numbers_of(self.path, followed.get("multiplier", "1"), 1, f"{what} multiplier")
-        offset = numbers_of(self.path, followed.get("offset", "0"), 1, f"{what} offset")
+        multiplier = self._numbers(followed.get("multiplier", "1"), 1, f"{what} multiplier")
+        offset = self._numbers(followed.get("offset", "0"), 1, f"{what} offset")
         return Mimic(leaders[1], float(multiplier[0]), float(offset[0]))
 
     def _with_limits(self, joint: Joint, limit: ET.Element | None) -> Joint:
+        of = {} if limit is None else limit.attrib
         given: dict[str, float] = {}
         for what in ("lower", "upper", "velocity"):
-            if limit is not None and limit.get(what) is not None:
-                text = limit.get(what, "")
+            if what in of:
                 most = MAX_RATE if what == "velocity" else MAX_COORDINATE
-                given[what] = float(
-                    numbers_of(self.path, text, 1, f"joint {joint.name}: {what} limit", most)[0]
-                )
+                numbers = self._numbers(of[what], 1, f"joint {joint.name}: {what} limit", most)
+                given[what] = float(numbers[0])
         if joint.kind == "continuous":
-            given["lower"] = -CONTINUOUS_LIMIT
-            given["upper"] = CONTINUOUS_LIMIT
+            given |= {"lower": -CONTINUOUS_LIMIT, "upper": CONTINUOUS_LIMIT}
         if "lower" not in given and "upper" not in given:
             raise InputError(
                 f"{self.path}: joint {joint.name} is {joint.kind} and has no <limit lower= upper=>"
@@ -528,6 +424,9 @@ class UrdfTree:
         if velocity <= 0:
             velocity = DEFAULT_VELOCITY
             self.notes.append(f"joint {joint.name} has no velocity limit; {velocity:g} assumed")
+        effort = 0.0
+        with suppress(InputError):  # most planning needs none
+            effort = max(float(self._numbers(of.get("effort", ""), 1, "effort")[0]), 0.0)
         acceleration = ACCELERATION_PER_VELOCITY * velocity
         jerk = JERK_PER_ACCELERATION * acceleration
         return replace(
@@ -537,18 +436,8 @@ class UrdfTree:
             velocity=velocity,
             acceleration=acceleration,
             jerk=jerk,
-            effort=self._effort(joint.name, limit),
+            effort=effort,
         )
-
-    def _effort(self, name: str, limit: ET.Element | None) -> float:
-        """The effort limit; 0 if it is missing or invalid, since most planning needs none."""
-        if limit is None or limit.get("effort") is None:
-            return 0.0
-        try:
-            effort = numbers_of(self.path, limit.get("effort", ""), 1, f"joint {name}: effort limit")[0]
-        except InputError:
-            return 0.0
-        return max(float(effort), 0.0)
 
     def inertias(self, links: list[str]) -> dict[str, Inertia]:
         """Inertias of the links that have a mass. Physically impossible ones are left out, with a note."""
@@ -558,23 +447,18 @@ class UrdfTree:
             mass = None if element is None else element.find("mass")
             if element is None or mass is None or mass.get("value", "").strip() in ("0", "0.0"):
                 continue
+            inertia = element.find("inertia")
+            of = {} if inertia is None else inertia.attrib
             try:
-                found[link] = self._inertia(element, f"link {link}: inertial")
+                T = self._origin(element, link)
+                texts = (mass.get("value", ""), *(of.get(name, "") for name in MOMENTS))
+                value, xx, xy, xz, yy, yz, zz = (self._numbers(text, 1, link)[0] for text in texts)
+                R = T[:3, :3]
+                moments = R @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ R.T
+                found[link] = inertia_of([value, *T[:3, 3], *moments[np.triu_indices(3)]])
             except (InputError, ValueError):
                 self.notes.append(f"link {link} has a physically impossible inertia; left out")
         return found
-
-    def _inertia(self, element: ET.Element, what: str) -> Inertia:
-        mass = element.find("mass")
-        inertia = element.find("inertia")
-        value = "" if mass is None else mass.get("value", "")
-        mass = numbers_of(self.path, value, 1, what)[0]
-        of = {} if inertia is None else inertia.attrib
-        xx, xy, xz, yy, yz, zz = (numbers_of(self.path, of.get(name, ""), 1, what)[0] for name in MOMENTS)
-        T = origin_of(self.path, element, what)
-        R = T[:3, :3]
-        moments = R @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ R.T
-        return inertia_of([mass, *T[:3, 3], *moments[np.triu_indices(3)]])
 
     def geometry(self, links: list[str]) -> dict[str, tuple[ConvexMesh, ...]]:
         """Convex hulls of the links' collision elements, by link and in its frame.
@@ -602,11 +486,102 @@ class UrdfTree:
         return parts
 
     def surfaces(self, link: str) -> tuple[Surface, ...]:
-        """The link's collision elements as triangle meshes, in the link's frame."""
-        if link not in self._surfaces:
-            element = self.links[link]
-            self._surfaces[link] = link_surfaces(self.path, element, self.kind, self.packages, self.notes)
+        """The link's collision elements as triangle meshes, in the link's frame.
+
+        Raises InputError for elements without geometry, unknown shapes and damaged meshes.
+        """
+        if link in self._surfaces:
+            return self._surfaces[link]
+        parts = []
+        for element in self.links[link].findall(self.kind):
+            shape = next(iter(element.findall("geometry/*")), None)
+            if shape is None:
+                raise InputError(f"{self.path}: link {link}: a <{self.kind}> has no geometry")
+            if shape.tag == "mesh":
+                surface = self._mesh(shape, link)
+            elif shape.tag in PRIMITIVES:
+                surface = convex_hull(self._primitive(shape, link))
+            else:
+                raise InputError(
+                    f"{self.path}: link {link}: {self.kind} shape <{shape.tag}> is not supported; "
+                    f"known: {', '.join(sorted((*PRIMITIVES, 'mesh')))}"
+                )
+            T = self._origin(element, f"link {link}: {self.kind}")
+            parts.append(Surface(placed(T, surface.vertices), surface.faces))
+        self._surfaces[link] = tuple(parts)
         return self._surfaces[link]
+
+    def _primitive(self, shape: ET.Element, link: str) -> Points:
+        """Corners of a polyhedron around a primitive."""
+
+        def positive(name: str, count: int) -> Values:
+            what = f"link {link}: {shape.tag} {name}"
+            values = self._numbers(shape.get(name, ""), count, what)
+            if (values < MIN_SIZE).any():
+                raise InputError(f"{self.path}: {what} is {shown(shape.get(name))}; it must be positive")
+            return values
+
+        if shape.tag == "box":
+            return np.array(trimesh.creation.box(positive("size", 3)).vertices)
+        radius = positive("radius", 1)
+        if shape.tag == "sphere":
+            return _ball() * radius
+        if shape.tag == "capsule":
+            end = _ball() * radius
+        else:
+            angle = np.arange(32) * np.pi / 16
+            ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(32)], axis=1)
+            end = ring * radius / np.cos(np.pi / 32)
+        half = float(positive("length", 1)[0]) / 2
+        return np.concatenate([end + np.array([0, 0, z]) for z in (-half, half)])
+
+    def _mesh(self, shape: ET.Element, link: str) -> Surface:
+        file = self.packages.file(shape.get("filename", ""))
+        where = f"link {link}: mesh"
+        scale = self._numbers(shape.get("scale", "1 1 1"), 3, f"{where} scale")
+        if (np.abs(scale) < MIN_SIZE).any():
+            raise InputError(
+                f"{self.path}: {where} scale is {shown(shape.get('scale'))}; its numbers must not be 0"
+            )
+        try:
+            vertices, faces = read_triangles(file, merge=True, notes=self.notes)
+            vertices = points(where, "vertices", vertices * scale)
+        except InputError as error:
+            raise InputError(f"{self.path}: {error}") from None
+        if len(vertices) < 4:
+            raise InputError(
+                f"{self.path}: link {link}: {file} has no triangle mesh with at least four vertices; "
+                f"repair it or remove its element"
+            )
+        return Surface(vertices, faces)
+
+    def _numbers(self, text: str, count: int, what: str, most: float = MAX_COORDINATE) -> Values:
+        """The numbers of an attribute, whose absolute values are at most `most`."""
+        try:
+            values = np.array([float(word) for word in text.split()])
+        except ValueError:
+            values = np.zeros(0)
+        if len(values) != count or not np.isfinite(values).all():
+            raise InputError(f"{self.path}: {what} is {shown(text)}; it must be {count} finite number(s)")
+        if not within(values, most):
+            raise InputError(f"{self.path}: {what} is {shown(text)}; it must be within ±{most:g}")
+        return values
+
+    def _origin(self, element: ET.Element, what: str) -> Pose:
+        """The transform of the element's <origin>."""
+        origin = element.find("origin")
+        if origin is None:
+            return np.eye(4)
+        xyz = self._numbers(origin.get("xyz", "0 0 0"), 3, f"{what}: origin xyz")
+        turned = origin.get("quat_xyzw")
+        if turned is None:
+            rpy = self._numbers(origin.get("rpy", "0 0 0"), 3, f"{what}: origin rpy")
+            return transform(xyz, rotation_from_rpy(*map(float, rpy)))
+        if "rpy" in origin.attrib:
+            raise InputError(f"{self.path}: {what}: origin has rpy and quat_xyzw; it must have one of them")
+        numbers = self._numbers(turned, 4, f"{what}: origin quat_xyzw")
+        x, y, z, w = unit_quaternion(f"{self.path}: {what}", numbers, "origin quat_xyzw")
+        return transform(xyz, rotation_from_quaternion(np.array([w, x, y, z])))
 
 
 FIELDS = {
