@@ -5,11 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from helpers.box_arm import box_arm, box_mesh
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import inverse, transform
 from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.bodies import Surface
+from robotdiffuse.robots.fitting.convex_parts import convex_hull
+from robotdiffuse.robots.fitting.covering_spheres import cover
 from robotdiffuse.robots.fitting.preparation import AddReport
 from robotdiffuse.robots.fitting.sampled_links import Links
 from robotdiffuse.robots.fitting.self_collisions import (
@@ -17,6 +21,7 @@ from robotdiffuse.robots.fitting.self_collisions import (
     PairReport,
     SamplingSettings,
     find_allowed_collisions,
+    measure_false_collisions,
 )
 from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.robots.robot import ConvexMesh, Robot
@@ -202,3 +207,24 @@ def test_bundled_panda_has_the_expected_pairs() -> None:
 def test_settings_out_of_range(bad: dict) -> None:
     with pytest.raises(InputError):
         SamplingSettings(**bad)
+
+
+def test_false_collisions_of_parts_after_true_ones_are_counted() -> None:
+    """A box slides through two plates, whose convex part fills the space between them."""
+    plates = [trimesh.creation.box((0.02, 0.2, 0.2)).apply_translation((x, 0, 0)) for x in (0.0, 0.3)]
+    box = trimesh.creation.box((0.04, 0.04, 0.04))
+    surfaces = {
+        link: tuple(Surface(np.array(mesh.vertices), np.array(mesh.faces)) for mesh in meshes)
+        for link, meshes in {"plates": plates, "box": [box]}.items()
+    }
+    parts = {
+        link: (convex_hull(np.concatenate([one.vertices for one in pieces])),)
+        for link, pieces in surfaces.items()
+    }
+    slide = Joint("slide", "prismatic", "plates", "box", np.eye(4), np.array([1.0, 0, 0]), -0.1, 0.4)
+    spheres = {link: cover(part) for link, (part,) in parts.items()}
+    robot = Robot("slider", "plates", "box", (slide,), spheres, parts)
+    measured = measure_false_collisions(robot, surfaces, 2000, np.random.default_rng(0))
+    # of 0.5 m, the box is in a plate for 0.12 m and between them, without touching one, for 0.24 m
+    assert measured.free == pytest.approx(0.76, abs=0.05)
+    assert measured.by_parts == pytest.approx(0.24 / 0.38, abs=0.05)
