@@ -5,7 +5,6 @@ Links are the bodies of the model, at MuJoCo's frames; sites are links too. Valu
 """
 
 import xml.etree.ElementTree as ET
-from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -34,18 +33,6 @@ EXCLUDED = "excluded by the model"
 """Why a pair of links is not checked."""
 MIN_SHIFT = 1e-9
 """Joints closer to the origin of their body are at it [m]."""
-
-
-@dataclass(frozen=True)
-class ConvertedModel:
-    """A MuJoCo model as a URDF."""
-
-    urdf: bytes
-    folder: TemporaryDirectory
-    """Holds the mesh files that the URDF names."""
-    semantics: Srdf
-    """Keyframes as named poses, and pairs of links that the model does not let collide."""
-    notes: tuple[str, ...]
 
 
 def imported_mujoco() -> Any:
@@ -113,23 +100,18 @@ def _joints_of(model: Any, bodies: list[int]) -> list[int]:
     ]
 
 
-def converted(path: Path) -> ConvertedModel:
-    """The robot of an MJCF file as a URDF whose root link is the world.
+class ConvertedModel:
+    """The robot of an MJCF file as a URDF whose root link is the world."""
 
-    Raises InputError for a model without a joint, for ball joints, and for geoms that cannot be planned with.
-    """
-    return _Conversion(path, compiled_model(path)).result()
-
-
-class _Conversion:
-    """The conversion of one model."""
-
-    def __init__(self, path: Path, model: Any) -> None:
+    def __init__(self, path: Path) -> None:
+        """Raises InputError for a model without a joint, for ball joints, and for geoms that cannot be
+        planned with."""
         self.path = path
-        self.model = model
+        self.model = model = compiled_model(path)
         self.mujoco = imported_mujoco()
         self.folder = TemporaryDirectory(prefix="robotdiffuse-mjcf-")
-        self.root = ET.Element("robot", name=_model_name(model) or path.stem)
+        """Holds the mesh files that the URDF names."""
+        self.root = ET.Element("robot", name=bytes(model.names).partition(b"\0")[0].decode() or path.stem)
         self.bodies = robot_bodies(model)
         self.masks = model.geom_contype | model.geom_conaffinity
         """Not 0 for geoms that collide with anything."""
@@ -137,7 +119,6 @@ class _Conversion:
         self.links: set[str] = set()
         self.meshes: dict[int, str] = {}
 
-    def result(self) -> ConvertedModel:
         if not self.bodies:
             raise InputError(f"{self.path} has no robot: no body is moved by a hinge or a slide joint")
         self._link("world")
@@ -146,8 +127,9 @@ class _Conversion:
             self._body(body, mimics)
         self._sites()
         ET.indent(self.root)
-        semantics = Srdf(self.path, allowed=self._excluded(), poses=self._poses())
-        return ConvertedModel(ET.tostring(self.root), self.folder, semantics, tuple(self.notes))
+        self.semantics = Srdf(self.path, allowed=self._excluded(), poses=self._poses())
+        """Keyframes as named poses, and pairs of links that the model does not let collide."""
+        self.urdf = ET.tostring(self.root)
 
     def name(self, kind: str, index: int) -> str:
         """The name of an element, or its kind and number."""
@@ -375,10 +357,6 @@ def ellipsoid(radii: Vector) -> trimesh.Trimesh:
     inradius = np.einsum("fd,fd->f", ball.face_normals, ball.triangles[:, 0]).min()
     ball.apply_scale(radii / inradius)
     return ball
-
-
-def _model_name(model: Any) -> str:
-    return bytes(model.names).partition(b"\0")[0].decode()
 
 
 def _geoms_of(model: Any, body: int) -> range:

@@ -117,9 +117,9 @@ class UrdfTree:
             )
             root = parse_xml(self.text, str(self.path))
         if root.tag == "mujoco":
-            from robotdiffuse.robots.parsing.mjcf import converted
+            from robotdiffuse.robots.parsing.mjcf import ConvertedModel
 
-            model = converted(self.path)
+            model = ConvertedModel(self.path)
             self.text = model.urdf
             self.semantics = model.semantics
             self.notes += model.notes
