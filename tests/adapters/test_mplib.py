@@ -117,3 +117,14 @@ def test_failures_say_why() -> None:
 def test_bad_input(call: object, message: str) -> None:
     with pytest.raises(InputError, match=message):
         call(planner())  # type: ignore[operator]
+
+
+def test_a_moved_base_keeps_obstacles_held_objects_and_allowed_contacts() -> None:
+    made = planner()
+    made.workspace.add(rd.Box([0.5, 0.0, 0.1], [0.2, 0.2, 0.2], name="block"))
+    made.workspace.allow("block", [HAND])
+    made.update_attached_sphere(0.02, [0.0, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0])
+    made.set_base_pose([0.1, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0])
+    assert made.workspace.scene.allowed_contacts == (("block", (HAND,)),)
+    assert np.allclose(made.workspace.scene.shapes[0].center, [0.4, 0.0, -0.2])
+    assert len(made.workspace.robot.attached) == 1

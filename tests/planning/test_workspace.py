@@ -70,7 +70,7 @@ def test_a_grasped_obstacle_moves_with_the_arm_until_it_is_put_down() -> None:
     q = down.path.positions[-1]
     space.attach("can", q, touch_links=fingers)
     assert space.obstacles == ("table",)
-    assert not space.is_free(q)  # it stands on the table
+    assert "if it stands there, allowed_contacts of table may name it" in space.is_free(q).reason
     space.allow("table", ["can"])
     up = space.plan_line(above, q, time_limit=10.0)
     assert up.solved, up.reason
@@ -101,3 +101,18 @@ def test_bad_input(call: object, message: str) -> None:
     space.add(rd.Sphere([0.5, 0.0, 0.6], 0.2, name="ball"))
     with pytest.raises(rd.InputError, match=message):
         call(space)  # type: ignore[operator]
+
+
+def test_values_by_joint_are_a_configuration() -> None:
+    space = panda()
+    by_joint = dict(zip(space.robot.joint_names, RIGHT.tolist(), strict=True))
+    problem = rd.Problem(space.robot, space.scene, by_joint | {"panda_finger_joint1": 0.01}, "ready")
+    assert np.array_equal(problem.start, RIGHT)
+    several = rd.Problem(space.robot, space.scene, "ready", [by_joint, "extended"])
+    assert np.array_equal(several.goal.positions[0], RIGHT)  # type: ignore[union-attr]
+    assert np.array_equal(space.pose(by_joint), space.pose(RIGHT))
+    assert space.is_free(by_joint)
+    with pytest.raises(rd.InputError, match="start has no panda_joint7"):
+        rd.Problem(space.robot, space.scene, {k: v for k, v in by_joint.items() if k[-1] != "7"}, RIGHT)
+    with pytest.raises(rd.InputError, match=r"unknown joint in goal: 'joint_1'"):
+        rd.Problem(space.robot, space.scene, RIGHT, by_joint | {"joint_1": 0.0})

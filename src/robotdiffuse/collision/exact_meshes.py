@@ -43,6 +43,8 @@ CHUNK_SIZE = 8192
 """Configurations that `collides` processes at once; bounds its memory."""
 CLEAR_DISTANCE = 1e-6
 """`collides` does not compute distances beyond this [m]."""
+RESTING_DEPTH = 0.01
+"""Depth of contacts of held objects up to which messages say how to allow them [m]."""
 MAX_CONTACTS = 200
 """Triangles or points of one obstacle at which the depth of a link is computed; 1,000 take 5 ms."""
 
@@ -408,4 +410,8 @@ def explain_collision(robot: Robot, scene: Scene, q: Float[ndarray, "dof"]) -> s
 def contact_message(robot: Robot, contact: Distance) -> str:
     """A contact in words."""
     link, partner, distance = contact
-    return describe_contact(link, str(partner), -distance, partner in robot.link_names)
+    itself = partner in robot.link_names
+    message = describe_contact(link, str(partner), -distance, itself)
+    if not itself and -distance < RESTING_DEPTH and link in [body.name for body in robot.attached]:
+        message += f"; if it stands there, allowed_contacts of {partner} may name it"
+    return message

@@ -20,6 +20,8 @@ from robotdiffuse.core.output_files import check_output, write_atomically
 
 Configuration = Float[ndarray, "dof"]
 """Joint positions [rad], [m] for prismatic joints."""
+AnyConfiguration = ArrayLike | Mapping[str, float]
+"""A configuration as numbers, as values by joint, or as the name of a pose."""
 Configurations = Float[ndarray, "_ dof"]
 """Configurations in rows, such as waypoints, samples and goals."""
 JointValues = Float[ndarray, "dof"]

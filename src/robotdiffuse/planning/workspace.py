@@ -11,6 +11,7 @@ from robotdiffuse.core.bounds import rigid_transform
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.transforms import inverse
+from robotdiffuse.core.types import AnyConfiguration
 from robotdiffuse.planning import plan
 from robotdiffuse.problems.constraints import CartesianLine
 from robotdiffuse.problems.goals import Goal, PoseGoal
@@ -122,7 +123,7 @@ class Workspace:
         )
 
     def attach(
-        self, name: str, q: ArrayLike | str, link: str | None = None, touch_links: Iterable[str] = ()
+        self, name: str, q: AnyConfiguration, link: str | None = None, touch_links: Iterable[str] = ()
     ) -> None:
         """The robot takes an obstacle; from then on it is a link of the robot.
 
@@ -141,7 +142,7 @@ class Workspace:
             name, self.robot, at, self.tip if link is None else link, tuple(touch_links)
         )
 
-    def detach(self, name: str, q: ArrayLike | str) -> None:
+    def detach(self, name: str, q: AnyConfiguration) -> None:
         """The robot puts a held object down, which is an obstacle from then on.
 
         Args:
@@ -153,11 +154,11 @@ class Workspace:
         """
         self.scene, self.robot = self.scene.detach(name, self.robot, self._configuration(q))
 
-    def pose(self, q: ArrayLike | str, link: str | None = None) -> ndarray:
+    def pose(self, q: AnyConfiguration, link: str | None = None) -> ndarray:
         """The pose of a link.
 
         Args:
-            q: A configuration [dof], or the name of a pose.
+            q: A configuration [dof], values by joint, or the name of a pose.
             link: Name of the link; None: the tip of the workspace.
 
         Returns:
@@ -179,11 +180,11 @@ class Workspace:
         T = self._T_base_world @ rigid_transform("pose", pose)
         return self.robot.ik(T, self.tip, near=near, count=count)
 
-    def is_free(self, q: ArrayLike | str) -> StateValidity:
+    def is_free(self, q: AnyConfiguration) -> StateValidity:
         """Whether the arm is within its limits and free of collision; see `Problem.is_free`.
 
         Args:
-            q: A configuration [dof], or the name of a pose.
+            q: A configuration [dof], values by joint, or the name of a pose.
         """
         return self._problem(self.scene).is_free(q)
 
@@ -198,13 +199,13 @@ class Workspace:
         """
         return self._problem(self.scene).clearance_at(q)
 
-    def plan(self, goal: Any, start: ArrayLike | str, **request: Any) -> PlanResult:
+    def plan(self, goal: Any, start: AnyConfiguration, **request: Any) -> PlanResult:
         """Plan a motion among the obstacles as they are now.
 
         Args:
             goal: A pose of the tip [4, 4] in the frame of the world, or a goal as of `rd.Problem` in that of
                 the base.
-            start: Start configuration [dof], or the name of a pose.
+            start: Start configuration [dof], values by joint, or the name of a pose.
             request: Arguments of `rd.plan`: time_limit, seed, until, ...
 
         Returns:
@@ -215,7 +216,7 @@ class Workspace:
     def plan_line(
         self,
         pose: ArrayLike,
-        start: ArrayLike | str,
+        start: AnyConfiguration,
         tolerance: float = 0.001,
         angle: float = 0.05,
         speed: float | None = None,
@@ -225,7 +226,7 @@ class Workspace:
 
         Args:
             pose: T_world_tip at the end [4, 4].
-            start: Start configuration [dof], or the name of a pose.
+            start: Start configuration [dof], values by joint, or the name of a pose.
             tolerance: Largest distance of the tip from the line [m].
             angle: Largest deviation of its orientation [rad].
             speed: Largest speed of the tip [m/s]; None: what the joints allow.
@@ -243,10 +244,10 @@ class Workspace:
             return goal
         return PoseGoal(self.tip, self._T_base_world @ rigid_transform("goal", goal))
 
-    def _configuration(self, q: ArrayLike | str) -> ndarray:
+    def _configuration(self, q: AnyConfiguration) -> ndarray:
         return self._problem(Scene(), q).start
 
-    def _problem(self, scene: Scene, start: ArrayLike | str | None = None) -> Problem:
+    def _problem(self, scene: Scene, start: AnyConfiguration | None = None) -> Problem:
         """A problem of which only scene and start matter."""
         middle = 0.5 * (self.robot.lower + self.robot.upper)
         return Problem(self.robot, scene, middle if start is None else start, middle)

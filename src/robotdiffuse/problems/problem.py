@@ -4,7 +4,7 @@ fields, each of which returns the value as the problem keeps it, or raises Input
 As with shapes, the constructors check their arguments themselves: see `no_type_check` in scenes/shapes.py.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any, ClassVar, TypedDict, Unpack, no_type_check
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from robotdiffuse.core.bounds import MAX_COORDINATE, MIN_RATE, Value, numbers, rigid_transform, short
 from robotdiffuse.core.errors import InputError, check_type, distinct, shown, unknown_name
 from robotdiffuse.core.transforms import inverse
-from robotdiffuse.core.types import Configuration, JointValues, Pose, Values
+from robotdiffuse.core.types import AnyConfiguration, Configuration, JointValues, Pose, Values
 from robotdiffuse.perception.depth_view import DepthView, SeenPoints
 from robotdiffuse.problems.constraints import CONSTRAINTS, CartesianLine, Constraint
 from robotdiffuse.problems.goals import AnyGoal as AnyGoal
@@ -156,10 +156,7 @@ def velocity_at_start(robot: Robot, value: object, notes: list[str]) -> JointVal
 def checked_goal(robot: Robot, field: str, goal: object, notes: list[str]) -> Goal:
     """The goal as an object of its class, with its configurations within limits."""
     if isinstance(goal, list | tuple):
-        goal = [
-            named_pose(robot, f"{field}[{i}]", one) if isinstance(one, str) else one
-            for i, one in enumerate(goal)
-        ]
+        goal = [_values(robot, f"{field}[{i}]", one) for i, one in enumerate(goal)]
         if any(isinstance(one, OneGoal) for one in goal):
             goal = AnyGoal(tuple(one if isinstance(one, OneGoal) else JointGoal(one) for one in goal))
     if isinstance(goal, AnyGoal):
@@ -169,8 +166,7 @@ def checked_goal(robot: Robot, field: str, goal: object, notes: list[str]) -> Go
     if isinstance(goal, PoseGoal):
         _check_planned_joint_moves(robot, f"{field}.frame", goal.frame)
         return goal
-    if isinstance(goal, str):
-        goal = named_pose(robot, field, goal)
+    goal = _values(robot, field, goal)
     if isinstance(goal, PosesGoal):
         _check_independent_links(robot, field, goal)
         return goal
@@ -193,9 +189,25 @@ def _check_independent_links(robot: Robot, field: str, goal: PosesGoal) -> None:
             )
 
 
+def _values(robot: Robot, field: str, value: Any) -> Any:
+    """The planned joints' values in the named pose, or of a dict by joint; anything else as it is."""
+    if isinstance(value, str):
+        return named_pose(robot, field, value)
+    if not isinstance(value, Mapping):
+        return value
+    joint_names = [joint.name for joint in robot.joints]
+    for name in value:
+        if name not in joint_names:
+            raise unknown_name(f"joint in {field}:", str(name), joint_names)
+    missing = [name for name in robot.joint_names if name not in value]
+    if missing:
+        raise InputError(f"{field} has no {', '.join(missing)}")
+    return [value[name] for name in robot.joint_names]
+
+
 def configuration(robot: Robot, field: str, value: object) -> Configuration:
-    """The value of each planned joint, of a list of numbers or the name of a pose."""
-    q = numbers(named_pose(robot, field, value) if isinstance(value, str) else value)
+    """The value of each planned joint, of a list of numbers, a dict by joint or the name of a pose."""
+    q = numbers(_values(robot, field, value))
     names = ", ".join(robot.joint_names)
     if q is None or q.ndim != 1:
         raise InputError(f"{field} is {shown(value)}; it must be a list of {robot.dof} numbers: {names}")
@@ -288,7 +300,8 @@ class StateValidity:
 class Problem(Value):
     """A planning problem. Lengths in [m], angles in [rad], poses in the frame of the robot's base.
 
-    `start` accepts a configuration, or the name of a pose of the robot (`robot.poses`), such as "ready".
+    `start` accepts a configuration, a dict of values by joint (those of joints that are not planned are
+    ignored), or the name of a pose of the robot (`robot.poses`), such as "ready".
     `goal` accepts these, a list of configurations, a JointGoal, a PoseGoal, a PosesGoal, or a list
     of goals, any of which may be reached. Each waypoint accepts the same.
 
@@ -407,7 +420,7 @@ class Problem(Value):
             scene: Obstacles in the frame of the world, which are moved into that of the base. So are the
                 poses of
                 goals and waypoints, views, constraints and moving obstacles.
-            start: Start configuration [dof], or the name of a pose.
+            start: Start configuration [dof], values by joint, or the name of a pose.
             goal: As of `rd.Problem`.
             options: Further fields of `rd.Problem`.
 
@@ -460,13 +473,13 @@ class Problem(Value):
         clearances = each.min(axis=1, initial=1.0).astype(np.float64)
         return float(clearances[0]) if rows.ndim == 1 else clearances
 
-    def is_free(self, q: ArrayLike | str) -> "StateValidity":
+    def is_free(self, q: AnyConfiguration) -> "StateValidity":
         """Whether the arm is within its limits and free of collision.
 
         The exact meshes decide, as for starts and goals. Moving obstacles and path constraints are ignored.
 
         Args:
-            q: A configuration [dof], or the name of a pose.
+            q: A configuration [dof], values by joint, or the name of a pose.
 
         Returns:
             A value that is true if the arm is free; else it has a `reason`.
