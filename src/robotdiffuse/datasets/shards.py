@@ -301,12 +301,12 @@ def write_shard(
 
 def _fingerprint(arrays: dict[str, ndarray]) -> str:
     """The fingerprint of the arrays' fingerprints, in the order of their names."""
-    found = []
+    fingerprints = []
     for name, array in sorted(arrays.items()):
         digest = hashlib.sha256(f"{array.dtype.str} {array.shape}".encode())
         digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
-        found.append((name, digest.hexdigest()[:16]))
-    return hashlib.sha256(json.dumps(found).encode()).hexdigest()[:16]
+        fingerprints.append((name, digest.hexdigest()[:16]))
+    return hashlib.sha256(json.dumps(fingerprints).encode()).hexdigest()[:16]
 
 
 def read_shard(folder: str | FilePath, index: int, names: tuple[str, ...] | None = None) -> Shard:

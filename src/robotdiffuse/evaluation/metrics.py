@@ -105,8 +105,8 @@ def _over_straight_line(trajectory: Trajectory, robot: Robot) -> float | None:
     if min(robot.velocity.min(), robot.acceleration.min()) <= 0:
         return None
     q = trajectory.positions
-    least = float(straight_line_time(q[0], q[-1], robot.velocity, robot.acceleration))
-    return trajectory.duration / least if least > 0 else None
+    straight_time = float(straight_line_time(q[0], q[-1], robot.velocity, robot.acceleration))
+    return trajectory.duration / straight_time if straight_time > 0 else None
 
 
 def _joint_jerk(of: Callable[[ndarray, ndarray], float]) -> Callable[[Motion], float | None]:
