@@ -19,18 +19,19 @@ from robotdiffuse.core import registry
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.registry import Entry
 from robotdiffuse.core.types import Path as Motion
-from robotdiffuse.evaluation import bench, planner_processes
+from robotdiffuse.evaluation import bench
 from robotdiffuse.evaluation.bench import (
     PRESETS,
     BenchSettings,
+    PlannerProcess,
+    PlannerSpec,
     Preset,
     open_runs,
     preset_settings,
     run_bench,
 )
-from robotdiffuse.evaluation.comparison import LATE_SECONDS
+from robotdiffuse.evaluation.bench_report import LATE_SECONDS
 from robotdiffuse.evaluation.metrics import METRICS
-from robotdiffuse.evaluation.planner_processes import PlannerProcess, PlannerSpec
 from robotdiffuse.evaluation.problem_sets import gather_cases, problem_set_name, validator
 from robotdiffuse.evaluation.runs import Record, RecordFile, Run, read_records
 from robotdiffuse.learning.weight_files import BUNDLED
@@ -93,7 +94,7 @@ def test_records_hold_what_was_measured_and_are_not_made_twice(tmp_path: Path) -
 
 @pytest.fixture
 def faulty(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(planner_processes, "GRACE", 6.0)
+    monkeypatch.setattr(bench, "GRACE", 6.0)
     monkeypatch.setitem(PLANNERS, "faulty", faulty_planner.ENTRY)
 
 

@@ -12,8 +12,8 @@ from robotdiffuse.cli import main
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.tables import Table
 from robotdiffuse.core.types import Path as Motion
-from robotdiffuse.evaluation import bench_report, comparison, plots
-from robotdiffuse.evaluation.comparison import (
+from robotdiffuse.evaluation import bench_report, plots
+from robotdiffuse.evaluation.bench_report import (
     GAVE_UP,
     LATER,
     RAN_OUT,
@@ -121,7 +121,7 @@ def small(tmp_path: Path) -> Path:
     return write(tmp_path / "small_run", records)
 
 
-def rows(section: comparison.Section, limit: float) -> dict[str, comparison.Row]:
+def rows(section: bench_report.Section, limit: float) -> dict[str, bench_report.Row]:
     (found,) = (c for c in section.comparisons if c.limit == limit)
     return {row.planner: row for row in found.rows}
 
@@ -161,7 +161,7 @@ def test_figures_of_a_small_run(small: Path) -> None:
     bench = read_bench(small)
     assert next(iter(bench.records)) == bench.reference == "robotdiffuse"
     assert set(bench.records) == {"robotdiffuse", "mpnet", "ompl_rrt_star"}
-    whole, apart = comparison.sections(bench)
+    whole, apart = bench_report.sections(bench)
     assert (whole.name, apart.name) == ("rop", "rop, non-trivial")
     assert [c.limit for c in whole.comparisons] == [0.1, 1.0, 10.0]
     assert [c.problems for c in whole.comparisons] == [4, 4, 4]
@@ -185,7 +185,7 @@ def test_figures_of_a_small_run(small: Path) -> None:
 
 
 def test_comscore_of_a_small_run(small: Path) -> None:
-    whole, _ = comparison.sections(read_bench(small), [1.0])
+    whole, _ = bench_report.sections(read_bench(small), [1.0])
     of = rows(whole, 1.0)
     lengths = {"robotdiffuse": 6.0, "mpnet": 6.6, "ompl_rrt_star": 9.0}
     times = {"robotdiffuse": 0.05, "mpnet": 0.51, "ompl_rrt_star": 1.0}
@@ -205,7 +205,7 @@ def test_compared_are_problems_that_all_planners_were_given_this_time_for(tmp_pa
     records += [failed("edmp", name, 1.0, 1.0) for name in names]
     folder = write(tmp_path / "run", records, {10.0: 2})
     keep_problems(folder, names)
-    (section,) = comparison.sections(read_bench(folder))
+    (section,) = bench_report.sections(read_bench(folder))
     whole = {c.limit: c for c in section.comparisons}
     assert whole[1.0].problems == 6
     assert whole[1.0].missing == ()
@@ -223,7 +223,7 @@ def test_seeds_of_a_problem_are_one_row_of_the_comparison(tmp_path: Path) -> Non
         records.append(solved("robotdiffuse", "b", 1.0, [(0.1, 2.0)], seed=seed))
         one = solved("mpd", "b", 1.0, [(0.1, 2.0)], seed=seed)
         records.append(one if seed == 0 else failed("mpd", "b", 1.0, 1.0, seed=seed))
-    (section,) = comparison.sections(read_bench(write(tmp_path / "run", records)), [1.0])
+    (section,) = bench_report.sections(read_bench(write(tmp_path / "run", records)), [1.0])
     row = rows(section, 1.0)["mpd"]
     assert section.main.seeds == 3
     assert row.success == pytest.approx(4 / 6)
@@ -233,7 +233,7 @@ def test_seeds_of_a_problem_are_one_row_of_the_comparison(tmp_path: Path) -> Non
 
 
 def test_curves_end_where_they_are_no_longer_known_of_all_problems(small: Path) -> None:
-    whole, _ = comparison.sections(read_bench(small))
+    whole, _ = bench_report.sections(read_bench(small))
     curves = {curve.planner: curve for curve in whole.curves}
     assert curves["mpnet"].end == 10.0
     assert curves["ompl_rrt_star"].found.tolist() == [0.05, 0.5, 5.0]
@@ -263,7 +263,7 @@ def test_lengths_are_compared_at_equal_time(tmp_path: Path) -> None:
         ]
     bench = read_bench(write(tmp_path / "run", records))
     assert list(bench.records)[:2] == ["robotdiffuse", "robotdiffuse+restarts"]
-    section = comparison.sections(bench)[-1]
+    section = bench_report.sections(bench)[-1]
     table = bench_report.main_table(section, section.main, bench.reference)
     assert cells(table, "joint length / robotdiffuse: hybrid, restarted") == {
         "robotdiffuse: hybrid": "–",
@@ -282,7 +282,7 @@ def test_lengths_are_compared_at_equal_time(tmp_path: Path) -> None:
     alone = Bench(
         plain.folder, plain.sessions, {n: r for n, r in plain.records.items() if RESTARTED not in n}
     )
-    section = comparison.sections(alone)[-1]
+    section = bench_report.sections(alone)[-1]
     table = bench_report.main_table(section, section.main, alone.reference)
     assert cells(table, "joint length / robotdiffuse: hybrid") == {
         "robotdiffuse: hybrid": "1",
@@ -315,7 +315,7 @@ def test_rows_that_were_timed_under_other_loads_are_told_in_the_table(tmp_path: 
     ]
     (folder / "runs.jsonl").write_text("".join(json.dumps(run) + "\n" for run in runs))
     bench = read_bench(folder)
-    (section,) = comparison.sections(bench, [1.0])
+    (section,) = bench_report.sections(bench, [1.0])
     table = bench_report.main_table(section, section.main, bench.reference)
     assert cells(table, "timed") == {
         "robotdiffuse: hybrid": "run a, 2 at once",
@@ -324,7 +324,7 @@ def test_rows_that_were_timed_under_other_loads_are_told_in_the_table(tmp_path: 
     }
     assert "Not all rows were timed alike" in table.notes[0]
     bench = read_bench(folder, ["robotdiffuse", "rrt_connect"])
-    (section,) = comparison.sections(bench, [1.0])
+    (section,) = bench_report.sections(bench, [1.0])
     table = bench_report.main_table(section, section.main, bench.reference)
     assert table.columns[-1].heading == "ComScore"
     assert table.notes[0] == "All rows were timed alike: run a, 2 at once; load average 1.5 to 2.2."
@@ -344,7 +344,7 @@ def test_a_metric_is_declared_in_one_place(
     assert record.row()["waypoint_count"] == 3
     assert record_of_row(json.loads(json.dumps(record.row()))) == record
     bench = read_bench(write(tmp_path / "run", [record]))
-    parts = comparison.sections(bench, [1.0])
+    parts = bench_report.sections(bench, [1.0])
     report = bench_report.bench_report(bench, parts)
     assert re.search(r"waypoint count kilo .*\n.*\n.* 0.0030 ", report.markdown)
     page = report.page
@@ -389,7 +389,7 @@ def test_no_legend_or_name_is_clipped() -> None:
 def test_what_is_shown_is_hard_or_failed(small: Path) -> None:
     keep_problems(small, [f"rop/{i}" for i in range(4)])
     bench = read_bench(small)
-    shown = bench_report.motions_to_replay(bench, comparison.sections(bench, [1.0]))
+    shown = bench_report.motions_to_replay(bench, bench_report.sections(bench, [1.0]))
     titles = [motion.title for motion in shown]
     assert titles[0] == "robotdiffuse · rop/0"  # solved by all; made up as one and the same
     assert "ompl_rrt_star · rop/0" in titles
@@ -409,7 +409,7 @@ def test_bad_input_is_one_clear_line(small: Path, capsys: pytest.CaptureFixture[
     with pytest.raises(InputError, match=r"no records of foo; it has .*mpnet, "):
         read_bench(small, ["foo"])
     with pytest.raises(InputError, match="no planner was run that long"):
-        comparison.sections(read_bench(small, ["ompl_rrt_star"]), [60.0])
+        bench_report.sections(read_bench(small, ["ompl_rrt_star"]), [60.0])
     assert main(["bench", "report", str(small), "--limits", "1,x"]) == 2
     assert "limits are '1,x'" in capsys.readouterr().err
     (small / "runs.jsonl").write_text('{"date": 1}\n')

@@ -12,7 +12,7 @@ import pytest
 
 from helpers.factory_runs import contents, in_this_process
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.evaluation import planner_processes
+from robotdiffuse.evaluation import bench
 from robotdiffuse.evaluation.bench import BenchSettings, run_bench
 from robotdiffuse.evaluation.runs import read_records
 from robotdiffuse.generation import GenerationSettings, factory, generate
@@ -129,7 +129,7 @@ def test_bench_on_a_cluster_is_as_on_this_machine(cluster: Any, tmp_path: Path) 
 def test_a_node_killed_during_a_bench_loses_no_call_and_doubles_none(
     cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(planner_processes, "RUNS_PER_TASK", 1)
+    monkeypatch.setattr(bench, "RUNS_PER_TASK", 1)
     node = cluster.add_node(num_cpus=1, object_store_memory=STORE)
     cluster.wait_for_nodes()
     killed: list[int] = []

@@ -27,7 +27,7 @@ from robotdiffuse.processes.ray_cluster import CLUSTERS
 if TYPE_CHECKING:
     from robotdiffuse.evaluation import report
     from robotdiffuse.evaluation.bench import BenchSettings, Done, Report
-    from robotdiffuse.evaluation.comparison import Bench, Section
+    from robotdiffuse.evaluation.bench_report import Bench, Section
     from robotdiffuse.evaluation.paper import Table1Settings
 
 
@@ -164,8 +164,13 @@ def _bench_settings(arguments: Namespace) -> "list[BenchSettings]":
 def run_report(arguments: Namespace) -> None:
     from robotdiffuse.core.output_files import write_atomically
     from robotdiffuse.core.tables import show
-    from robotdiffuse.evaluation.bench_report import bench_report, main_table, missing_line
-    from robotdiffuse.evaluation.comparison import read_bench, sections
+    from robotdiffuse.evaluation.bench_report import (
+        bench_report,
+        main_table,
+        missing_line,
+        read_bench,
+        sections,
+    )
 
     planners = None if arguments.planners is None else arguments.planners.split(",")
     limits = None if arguments.limits is None else _limits(arguments.limits)

@@ -1,36 +1,324 @@
 """The bench: calls planners on problems and keeps a record of each call; kept calls are not repeated.
 
-Presets are comparisons of planners by name, the tables of docs/results.md.
+Planners under test each have a process of their own, so that a crash, an endless loop or a leak affects no
+other planner; on this machine, or on a Ray cluster. Warming up (compiled code, imports) is not timed. Presets
+are comparisons of planners by name, the tables of docs/results.md.
 """
 
 import os
 import platform
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+import resource
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path as FilePath
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.input_files import is_file
 from robotdiffuse.core.output_files import JsonLines, lock_folder
 from robotdiffuse.core.settings import Count, Filled, OneOf, Positive, Settings
-from robotdiffuse.evaluation.planner_processes import PlannerSpec, on_cluster, on_this_machine
+from robotdiffuse.evaluation.methods import measure_of, planner_calls
 from robotdiffuse.evaluation.problem_sets import gather_cases, problem_set_name
 from robotdiffuse.evaluation.report import processor, versions
 from robotdiffuse.evaluation.runs import (
+    CRASHED,
+    OVERRAN,
     RESTARTED,
+    Fields,
     Record,
     RecordFile,
+    Results,
     Run,
     keep_records,
     load_average,
     record_path,
     runs_of,
 )
-from robotdiffuse.planning import PLANNERS
+from robotdiffuse.learning.weight_files import NETWORKS, folder_of, read_description
+from robotdiffuse.planning import PLANNERS, load_planner, planner_settings
+from robotdiffuse.planning.context import PlanRequest
+from robotdiffuse.planning.planner import Planner
+from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.problems.held_out import Case
 from robotdiffuse.processes.ray_cluster import CLUSTERS
+from robotdiffuse.processes.workers import EndedError, NotStartedError, OverrunError, Worker
+from robotdiffuse.robots.robot import Robot
+
+CALL_ARGUMENTS = [field.name for field in fields(PlanRequest) if field.name not in ("time_limit", "seed")]
+"""Arguments of a planner's calls that a planner under test may set; the bench sets the others."""
+
+
+@dataclass(frozen=True)
+class PlannerSpec:
+    """A planner as the bench loads and calls it."""
+
+    name: str
+    """In `planning.PLANNERS`."""
+    weights: str | None = None
+    """A folder; None: those that come with the package."""
+    settings: tuple[str, ...] = ()
+    """NAME=VALUE of the planner's settings and of its calls' arguments (`PlanRequest`)."""
+
+    @classmethod
+    def parse(cls, text: str) -> "PlannerSpec":
+        """Parse NAME, NAME@WEIGHTS, NAME:SETTING=VALUE:SETTING=VALUE or NAME@WEIGHTS:SETTING=VALUE.
+
+        Raises InputError for an unknown planner or setting, listing the known ones, and for a value out of
+        bounds.
+        """
+        planner_text, *settings = text.split(":")
+        name, at, folder = planner_text.partition("@")
+        PLANNERS.entry(name)
+        spec = cls(name, str(folder_of(folder).resolve()) if at else None, tuple(settings))
+        spec.request()
+        if settings:
+            spec._settings()
+        return spec
+
+    @property
+    def label(self) -> str:
+        """Its name in results."""
+        name = self.name if self.weights is None else f"{self.name}@{FilePath(self.weights).name}"
+        return ":".join([name, *self.settings])
+
+    @property
+    def weights_hashes(self) -> dict[str, Any]:
+        """SHA-256 of the weights in its folder, by network; empty without a folder."""
+        if self.weights is None:
+            return {}
+        folder = FilePath(self.weights)
+        names = [name for name in NETWORKS if is_file(folder / f"{name}.json")]
+        return {name: read_description(folder, name).get("weights_sha256") for name in names}
+
+    def request(self) -> dict[str, Any]:
+        """Arguments of its calls: until, clearance, ..."""
+        request = PlanRequest().changed(text for text in self.settings if _of_call(text))
+        return {name: getattr(request, name) for name in CALL_ARGUMENTS}
+
+    def load(self) -> Planner:
+        """Load the planner. Raises InputError as `load_planner` does, and for a planner that another process
+        cannot import."""
+        if PLANNERS.entry(self.name).location.startswith("__main__:"):
+            raise InputError(
+                f"planner {self.name} is in the program that was started, which the processes of a bench do "
+                "not import; put it into a module of its own"
+            )
+        if not self.settings:
+            return load_planner(self.name, weights=self.weights)
+        return load_planner(self.name, self._settings())
+
+    def _settings(self) -> Settings:
+        weights = () if self.weights is None else (f"weights={self.weights}",)
+        setting_texts = (text for text in self.settings if not _of_call(text))
+        return planner_settings(self.name, (*weights, *setting_texts))
+
+
+def _of_call(text: str) -> bool:
+    return text.partition("=")[0] in CALL_ARGUMENTS
+
+
+PlannerSpecs = Mapping[str, PlannerSpec]
+"""By their labels, which are the methods of runs."""
+START_TIMEOUT = 300.0
+"""For starting and for warming up [s]; the first time ever, kernels are compiled."""
+GRACE = 20.0
+"""A process that has not answered this long after the time limit is killed [s]; validating and timing the
+motion take part of it."""
+RESTARTS_TIMEOUT_FACTOR = 20.0
+"""Timeout of planners that restart, in time limits: the time for timing each path does not count."""
+RUNS_PER_TASK = 20
+"""Runs of one planner that a node of a cluster makes with one start of the process."""
+
+
+class PlannerProcess:
+    """A planner in another process, which starts with the first run and again after it died."""
+
+    def __init__(self, spec: PlannerSpec, log: FilePath) -> None:
+        """`log`: the process's output is appended to this file."""
+        self._log = log
+        self._worker = Worker(_prepare, (spec, str(log)))
+
+    def warm(self, run: Run) -> None:
+        """Warm up for a run's robot. If the process dies of that, `plan` will report it. Raises InputError if
+        the program cannot start processes."""
+        try:
+            self._worker.start()
+        except NotStartedError as error:
+            raise InputError(str(error)) from None
+        except EndedError:
+            return
+        self._ask(START_TIMEOUT, _warm_up, problem_record(run.problem))
+
+    def plan(self, run: Run, restarts: bool = False) -> list[Fields]:
+        """The fields of a run's records. A crash or an overrun is a record too."""
+        problem = problem_record(run.problem)
+        # a robot that is new to the process is warmed up first
+        answer = self._ask(START_TIMEOUT, _warm_up, problem)
+        if answer is not None:
+            return [answer]
+        answer = self._ask(run.limit + GRACE, _first_answer, problem, run.seed, run.limit, restarts)
+        answers: list[Fields] = []
+        while answer is not None:
+            answers.append(answer)
+            if answer["status"] in (CRASHED, OVERRAN):
+                break
+            answer = self._ask(RESTARTS_TIMEOUT_FACTOR * run.limit + GRACE, _next_answer)
+        return answers
+
+    def close(self) -> None:
+        """Kill the process, even if another thread waits for it."""
+        self._worker.close(0.0)
+
+    def _ask(self, timeout: float, call: Callable[..., Fields | None], *arguments: Any) -> Fields | None:
+        """The answer of a call in the process, or the record of a process that gave none."""
+        try:
+            return self._worker.call(call, *arguments, timeout=timeout)
+        except OverrunError:
+            reason = f"no answer {timeout:g} s after the call; the process was killed"
+            return {"status": OVERRAN, "reason": reason, "time": timeout}
+        except EndedError as error:
+            lines = self._log.read_text(errors="replace").strip().splitlines() if self._log.exists() else []
+            reason = ": ".join([f"the planner's process ended {error}", *lines[-1:]])
+            return {"status": CRASHED, "reason": reason[:300], "time": 0.0}
+
+
+# In the process
+
+_planner: Planner
+_request: Fields
+"""Further arguments of the planner's calls."""
+_answers: Iterator[Fields]
+"""Those that are left of the current run."""
+_warm: set[Robot] = set()
+"""Robots that the planner is warmed up for."""
+
+
+def _prepare(spec: PlannerSpec, log: str) -> None:
+    """Load the planner; all output goes to the log."""
+    global _planner, _request
+    FilePath(log).parent.mkdir(parents=True, exist_ok=True)
+    with open(log, "a") as stream:
+        os.dup2(stream.fileno(), 1)
+        os.dup2(stream.fileno(), 2)
+    _planner = spec.load()
+    _request = spec.request()
+
+
+def _warm_up(record: Fields) -> None:
+    """Compile, load and fill caches, those of the metrics too."""
+    problem = problem_from_record(record)
+    if problem.robot in _warm:
+        return
+    _warm.add(problem.robot)
+    try:
+        for result in _planner.warm_up(problem):
+            if result.path is not None and result.trajectory is not None:
+                measure_of(problem.robot)(result.path, result.trajectory, result)
+    except (Exception, SystemExit):  # the timed call will report it
+        traceback.print_exc()
+
+
+def _first_answer(record: Fields, seed: int, limit: float, restarts: bool) -> Fields | None:
+    """Begin a run and return the fields of its first record."""
+    global _answers
+    _answers = iter(planner_calls(_planner, problem_from_record(record), seed, limit, restarts, _request))
+    return _next_answer()
+
+
+def _next_answer() -> Fields | None:
+    """The fields of the run's next record, with memory of the process and load of the machine; None after the
+    last."""
+    answer = next(_answers, None)
+    if answer is None:
+        return None
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return answer | {"memory": round(memory, 1), "load": load_average()}
+
+
+# Runs of many planners
+
+
+def on_this_machine(
+    specs: PlannerSpecs, runs: Sequence[Run], workers: int, restarts: bool, session: str, logs: FilePath
+) -> Results:
+    """Make runs in a process for each planner, of which `workers` run at a time; `logs` gets what they print.
+
+    All processes are warmed up before the first call is timed. They take turns, so that other work on the
+    machine affects all planners alike.
+    """
+    first = {run.method: run for run in reversed(runs)}
+    planners = {label: PlannerProcess(specs[label], _log_file(logs, label)) for label in first}
+    pool = ThreadPoolExecutor(workers)
+    todo = list(runs)
+    running: dict[Future[list[Fields]], Run] = {}
+    try:
+        for job in [pool.submit(planners[label].warm, run) for label, run in first.items()]:
+            job.result()
+        while todo or running:
+            busy = {run.method for run in running.values()}
+            place = next((i for i, run in enumerate(todo) if run.method not in busy), None)
+            if place is not None and len(running) < workers:
+                run = todo.pop(place)
+                running[pool.submit(planners[run.method].plan, run, restarts)] = run
+                continue
+            for job in wait(running, return_when=FIRST_COMPLETED).done:
+                run = running.pop(job)
+                yield run, records_of(run, job.result(), {"run": session, "workers": workers})
+    finally:
+        for process in planners.values():
+            process.close()
+        pool.shutdown(cancel_futures=True)
+
+
+def on_cluster(
+    specs: PlannerSpecs, runs: Sequence[Run], cluster: str, restarts: bool, session: str, logs: FilePath
+) -> Results:
+    """Make runs on a cluster, a name in `ray_cluster.CLUSTERS`; each task starts a process for some runs.
+
+    The nodes need this package, and weights and files at the same paths.
+    """
+    tasks: list[tuple[PlannerSpec, list[Run], bool]] = []
+    for label, spec in specs.items():
+        of_planner = [run for run in runs if run.method == label]
+        parts = (of_planner[i : i + RUNS_PER_TASK] for i in range(0, len(of_planner), RUNS_PER_TASK))
+        tasks += [(spec, part, restarts) for part in parts]
+    for number, (answers, output) in CLUSTERS[cluster](_run_task, tasks):
+        _, part, _ = tasks[number]
+        if output:
+            logs.mkdir(parents=True, exist_ok=True)
+            with _log_file(logs, part[0].method).open("a") as log:
+                log.write(output)
+        for run, answer in zip(part, answers, strict=True):
+            yield run, records_of(run, answer, {"run": session, "workers": cluster})
+
+
+def records_of(run: Run, answers: Sequence[Fields], about: Fields) -> list[Record]:
+    """The records of a run; the second is that of restarts."""
+    labels = (run.method, run.method + RESTARTED)
+    pairs = zip(labels, answers, strict=False)
+    return [run.record({"planner": label, **about, **answer}) for label, answer in pairs]
+
+
+def _log_file(logs: FilePath, label: str) -> FilePath:
+    return logs / f"{label.replace('/', '_')}.log"
+
+
+def _run_task(spec: PlannerSpec, runs: list[Run], restarts: bool) -> tuple[list[list[Fields]], str]:
+    """The answers to the runs, and the planner's output."""
+    with TemporaryDirectory() as folder:
+        log = FilePath(folder) / "log"
+        process = PlannerProcess(spec, log)
+        try:
+            answers = [process.plan(run, restarts) for run in runs]
+        finally:
+            process.close()
+        return answers, log.read_text(errors="replace") if log.exists() else ""
+
 
 PACKAGES = ("numpy", "numba", "onnxruntime", "ompl")
 """Packages whose versions are kept with the results."""

@@ -1,38 +1,504 @@
-"""The report of a bench: tables and plots of every problem set and time limit, and the motions to replay."""
+"""The report of a bench: planners beside each other for every problem set and time limit, as tables, plots
+and the motions to replay.
+
+A time limit needs no calls of its own: records of a longer limit say what was found by then, and a call that
+ended by itself says what a longer limit would have given.
+"""
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path as FilePath
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.output_files import JsonLines
 from robotdiffuse.core.tables import Cell, Column, Figure, Table, plain
+from robotdiffuse.core.types import Status, Values
 from robotdiffuse.evaluation import plots
-from robotdiffuse.evaluation.comparison import (
-    FAILURES,
-    Bench,
-    Comparison,
-    Curve,
-    Row,
-    Section,
-    base_name,
-    calls_on,
-    deciding_record,
-    outcome,
-    plain_name,
-)
 from robotdiffuse.evaluation.metrics import METRICS, Metric
 from robotdiffuse.evaluation.problem_sets import read_cases
 from robotdiffuse.evaluation.report import Report, interval, share_cell
-from robotdiffuse.evaluation.runs import CRASHED, OVERRAN, RAISED, RESTARTED, Record
-from robotdiffuse.evaluation.statistics import Paired
+from robotdiffuse.evaluation.runs import (
+    CRASHED,
+    ENDED_EARLY,
+    OVERRAN,
+    RAISED,
+    RESTARTED,
+    SHORTEST_FACTOR,
+    Record,
+    read_records,
+    recorded,
+)
+from robotdiffuse.evaluation.statistics import Indicators, Paired, compare, comscores, wilson_interval
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, SEARCH
+from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.held_out import Case
 from robotdiffuse.problems.problem import JointGoal
+
+LIMITS = (0.1, 1.0, 10.0, 60.0)
+"""Time limits of a report beside those of its records, up to the longest of these [s]."""
+NONTRIVIAL_LABEL = ", non-trivial"
+LATE_SHARE = 0.1
+LATE_SECONDS = 0.05
+"""A returned motion counts if it is at most this share of the limit, or this time [s], late: planners stop in
+time, and validation follows."""
+RAN_OUT = "time ran out"
+GAVE_UP = "gave up before"
+LATER = "found one later"
+REFUSED = {"scene_collision": "scene collision", "self_collision": "self-collision"}
+FAILURES = (
+    *(RAN_OUT, GAVE_UP, LATER),
+    *REFUSED.values(),
+    *("other refusal", "ends refused", CRASHED, OVERRAN, RAISED),
+)
+"""Reasons of failures: no path by the end of the limit, ended without one long before, or found one after
+it; the last path hit an obstacle, the arm itself, or broke limits, missed the goal or twitched; start or goal
+were refused; the process died, or did not answer and was killed; an exception."""
+
+Key = tuple[str, int]
+"""A problem of a set by name, and a seed."""
+Calls = dict[Key, list[Record]]
+"""The records of one planner on one problem set, shorter limits first."""
+
+
+# The folder
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """The content of a folder of `bench run`."""
+
+    folder: FilePath
+    sessions: tuple[dict[str, Any], ...]
+    """A note on each call of `bench run`: machine, versions, settings."""
+    records: dict[str, list[Record]]
+    """By planner, in the order of PLANNERS; rows with restarts follow those without."""
+
+    @property
+    def reference(self) -> str:
+        """The planner that the others are compared with; its restarts if it has any."""
+        plain = DEFAULT_PLANNER if DEFAULT_PLANNER in self.records else next(iter(self.records))
+        return plain + RESTARTED if plain + RESTARTED in self.records else plain
+
+    @property
+    def problem_sets(self) -> list[str]:
+        return list(dict.fromkeys(r.problem_set for records in self.records.values() for r in records))
+
+
+def plain_name(planner: str) -> str:
+    """The name without the suffix of restarts."""
+    return planner.removesuffix(RESTARTED)
+
+
+def base_name(planner: str) -> str:
+    """The name in PLANNERS: without weights, settings and restarts."""
+    return re.split("[@:+]", planner, maxsplit=1)[0]
+
+
+def read_bench(folder: FilePath, planners: Sequence[str] | None = None) -> Bench:
+    """Read the records of all planners, or of some, with their restarts.
+
+    Raises InputError for a folder without a bench, damaged files and planners without records.
+    """
+    if planners is not None:
+        restarts = [name + RESTARTED for name in planners]
+        planners = [*planners, *(name for name in restarts if name in recorded(folder))]
+    records = read_records(folder, planners)
+    order = {name: i for i, name in enumerate(PLANNERS)}
+    names = sorted(
+        records, key=lambda n: (order.get(base_name(n), len(order)), plain_name(n), n.endswith(RESTARTED))
+    )
+    for name in names:
+        if name.endswith(RESTARTED):
+            # calls that used up the limit were not repeated: those of the plain planner count
+            repeated = {record.key for record in records[name]}
+            plain = [record for record in records.get(plain_name(name), ()) if record.key not in repeated]
+            records[name] = records[name] + [replace(record, planner=name) for record in plain]
+    if not any(records.values()):
+        raise InputError(f"{folder} holds no records yet; continue with `robotdiffuse bench run`")
+    file = folder / "runs.jsonl"
+    sessions = JsonLines(file).rows
+    for name in ("date", "versions", "planners", "problems", "time_limit", "seeds", "count"):
+        if not all(name in run for run in sessions):
+            raise InputError(f"{file} is damaged: a run has no {name}; results cannot be read without it")
+    return Bench(folder, tuple(sessions), {name: records[name] for name in names})
+
+
+# What a call had found by a time limit
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a call had found by a time limit."""
+
+    record: Record
+    found: float
+    """Time of the first path [s]; infinite if there was none by the limit."""
+    returned: float
+    """Time at which the planner returns [s]; the limit for anytime planners and without a path."""
+    joint_length: float
+    """Length of the best path by then [rad]; NaN without one."""
+    link_length: float
+    """The paper's path length [m], scaled by the joint lengths if the path by then is not the returned one;
+    NaN without a path."""
+
+    @property
+    def solved(self) -> bool:
+        return self.found < np.inf
+
+    def full(self, limit: float, shortest: float) -> bool:
+        """Whether the planner used up the limit, or no shorter path exists."""
+        nothing_shorter = self.record.trivial and self.joint_length <= SHORTEST_FACTOR * shortest
+        return self.record.restarts is not None or self.returned >= ENDED_EARLY * limit or nothing_shorter
+
+    @property
+    def failure(self) -> str:
+        """One of FAILURES."""
+        record = self.record
+        if record.solved:
+            return LATER
+        if record.status in FAILURES:
+            return record.status
+        if record.status not in (Status.TIMEOUT.value, Status.NO_PATH.value):
+            return "ends refused"
+        if record.refused:
+            return REFUSED.get(record.refused, "other refusal")
+        return GAVE_UP if record.ended_by_itself and record.time < self.returned else RAN_OUT
+
+
+def deciding_record(records: Sequence[Record], limit: float) -> Record | None:
+    """The record that says what a planner finds within a limit [s]: that of the shortest limit as long, else
+    the last that ended by itself. `records` are those of one problem and seed, shorter limits first."""
+    for record in records:
+        if record.time_limit >= limit:
+            return record
+    return next((record for record in reversed(records) if record.ended_by_itself), None)
+
+
+def outcome(record: Record, limit: float) -> Outcome:
+    """Returns what a recorded call had found by a time limit [s]."""
+    late = max(LATE_SHARE * limit, LATE_SECONDS) if record.time_limit == limit else 0.0
+    paths = [(at, length) for at, length in record.progress if record.solved and at <= limit + late]
+    if not paths:
+        return Outcome(record, np.inf, limit, np.nan, np.nan)
+    length = paths[-1][1]
+    factor = length / record.joint_length if record.joint_length else 1.0
+    link = factor * record.measures.get("link_length", np.nan)
+    return Outcome(record, min(paths[0][0], limit), min(record.time, limit), length, link)
+
+
+def calls_on(records: Iterable[Record], problem_set: str) -> Calls:
+    """Those of a planner's records that are on a problem set, by problem and seed."""
+    calls: Calls = {}
+    for record in sorted(records, key=lambda record: record.time_limit):
+        if record.problem_set == problem_set:
+            calls.setdefault((record.name, record.seed), []).append(record)
+    return calls
+
+
+# Figures
+
+
+class Mean(NamedTuple):
+    """The mean over the motions that have a metric; NaN without any."""
+
+    value: float
+    half: float
+    """Half the width of its 95 % interval, by the standard error."""
+
+    @classmethod
+    def of(cls, values: Iterable[float | None]) -> "Mean":
+        """The mean of the values that are neither None nor NaN."""
+        finite = np.array([value for value in values if value is not None and value == value])
+        if not len(finite):
+            return cls(np.nan, np.nan)
+        half = 1.96 * float(finite.std(ddof=1)) / len(finite) ** 0.5 if len(finite) > 1 else np.nan
+        return cls(float(finite.mean()), half)
+
+    def cell(self, metric: Metric) -> Figure | None:
+        """The mean of a metric with its interval."""
+        value, half = (f"{metric.scale * x:{metric.format}}" for x in self)
+        text = value if np.isnan(self.half) else f"{value} ± {half}"
+        return None if np.isnan(self.value) else Figure(text.replace("-", "−"), self.value)
+
+
+@dataclass(frozen=True)
+class Row:
+    """Figures of a planner at a time limit. Means are over the problems that it solved; NaN without any."""
+
+    planner: str
+    success: float
+    success_interval: tuple[float, float]
+    """95 %, by E. B. Wilson's method over problems."""
+    collision: float
+    """Share of the problems whose last path was in collision."""
+    link_length: float
+    """The paper's path length [m]."""
+    first: float
+    """Median time to the first path [s]."""
+    returned: float
+    """Mean time until the planner returns [s], over all problems; the limit for an unsolved one."""
+    time: float
+    """Mean of the calls' own times [s]."""
+    comscore: float
+    """Among the rows of this table."""
+    paired: Paired | None
+    """Comparison with the reference by joint-space lengths; None for the reference and without it."""
+    full: bool
+    """Whether all solved calls used up the limit, with restarts or without."""
+    timed: str
+    """The sessions that made the calls, and the calls at a time in these."""
+    measures: dict[str, Mean]
+    """Measures of the returned motions, by the names of METRICS."""
+    memory: float
+    """Peak memory of the process [MB]."""
+    failures: Counter[str]
+    families: dict[str, tuple[float, tuple[float, float]]]
+    """Share of solved calls with its 95 % interval, by family."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Planners at a time limit, on the problems for which all of them have results with that limit."""
+
+    limit: float
+    problems: int
+    of: int
+    """Problems in the section."""
+    seeds: int
+    rows: tuple[Row, ...]
+    missing: tuple[str, ...]
+    """Planners without results for this limit."""
+    keys: tuple[Key, ...]
+    loads: tuple[float, ...]
+    """Load averages after the calls, where they were noted."""
+
+    @property
+    def alike(self) -> bool:
+        """Whether all rows were timed in the same sessions, with as many calls at a time."""
+        return len({row.timed for row in self.rows}) < 2
+
+    @property
+    def metrics(self) -> list[Metric]:
+        """The metrics that some row has."""
+        return [m for m in METRICS.values() if any(row.measures[m.name].value < np.inf for row in self.rows)]
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Success and path lengths of a planner over time, from its calls with the longest limit."""
+
+    planner: str
+    calls: int
+    end: float
+    """Results later than this [s] are known for some problems only."""
+    found: Values
+    """Times of first paths [s], sorted."""
+    times: Values
+    """Times from which half of these problems are solved [s]."""
+    ratios: Values
+    """Median at these times of joint-space length over the best known one, on the non-trivial problems that
+    the planner solves in the end; problems not solved yet count as infinite."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """Results on a problem set, or on its non-trivial part."""
+
+    name: str
+    problem_set: str
+    comparisons: tuple[Comparison, ...]
+    """Shorter limits first."""
+    curves: tuple[Curve, ...]
+
+    @property
+    def main(self) -> Comparison:
+        """The comparison of most planners and problems, and of those with the longest limit."""
+        return max(self.comparisons, key=lambda c: (len(c.rows) * c.problems, c.limit))
+
+
+def sections(bench: Bench, limits: Sequence[float] | None = None) -> list[Section]:
+    """The results on all problem sets; sets of random problems also without their trivial ones.
+
+    limits: time limits to report [s]; None: those of the records, and LIMITS below them.
+
+    Raises InputError if no planner has results for any of these.
+    """
+    results = []
+    for problem_set in bench.problem_sets:
+        calls = {name: calls_on(records, problem_set) for name, records in bench.records.items()}
+        records = [r for of in calls.values() for key in of for r in of[key]]
+        names = list(dict.fromkeys(r.name for r in records))
+        cases = [case.name for case in read_cases(bench.folder, problem_set)]
+        places = {name: i for i, name in enumerate(dict.fromkeys([*cases, *names]))}
+        if limits is None:
+            recorded = {record.time_limit for record in records}
+            chosen = recorded | {limit for limit in LIMITS if limit < max(recorded)}
+        else:
+            chosen = set(limits)
+        parts = {problem_set: set(names)}
+        if any(r.trivial for r in records) and {r.family for r in records} <= set(FAMILIES):
+            parts[problem_set + NONTRIVIAL_LABEL] = {r.name for r in records if r.solved and not r.trivial}
+        for name, problems in parts.items():
+            part = {
+                planner: {key: of[key] for key in of if key[0] in problems} for planner, of in calls.items()
+            }
+            comparisons = (
+                _comparison(bench, problem_set, part, len(problems), places, limit)
+                for limit in sorted(chosen)
+            )
+            with_rows = tuple(comparison for comparison in comparisons if comparison.rows)
+            if with_rows:
+                results.append(Section(name, problem_set, with_rows, curves(part)))
+    if not results:
+        raise InputError(
+            f"limits are {', '.join(f'{x:g}' for x in limits or ())} s; no planner was run that long"
+        )
+    return results
+
+
+def _counted(
+    bench: Bench, planner: str, problem_set: str, calls: Calls, places: dict[str, int], limit: float
+) -> dict[Key, Record]:
+    """The records that count for a limit.
+
+    If a planner had this limit on the first problems only, the others do not count: of these only calls that
+    ended by themselves are known, which are the easy ones.
+    """
+    counted = {key: record for key, of in calls.items() if (record := deciding_record(of, limit)) is not None}
+    if len(counted) == len(calls):
+        return counted
+    counts = [
+        (run["seeds"], run["count"] or len(places))
+        for run in bench.sessions
+        if plain_name(planner) in run["planners"]
+        and problem_set in run["problems"]
+        and run["time_limit"] >= limit
+    ]
+    return {
+        key: record
+        for key, record in counted.items()
+        if any(key[1] < seeds and places[key[0]] < count for seeds, count in counts)
+    }
+
+
+def _comparison(
+    bench: Bench,
+    problem_set: str,
+    calls: dict[str, Calls],
+    problems: int,
+    places: dict[str, int],
+    limit: float,
+) -> Comparison:
+    counted = {name: _counted(bench, name, problem_set, of, places, limit) for name, of in calls.items()}
+    counted = {name: of for name, of in counted.items() if of}
+    shared = set.intersection(*map(set, counted.values())) if counted else set()
+    keys = sorted(shared, key=lambda key: (places[key[0]], key[1]))
+    outcomes = {name: [outcome(of[key], limit) for key in keys] for name, of in counted.items() if keys}
+    indicators = {name: _indicators(of) for name, of in outcomes.items() if not name.endswith(RESTARTED)}
+    scores = dict(zip(indicators, comscores(list(indicators.values())).tolist(), strict=True))
+    lengths = {name: _problem_lengths(keys, of) for name, of in outcomes.items()}
+    shortest = [
+        min((o.joint_length for o in of if o.solved), default=np.inf)
+        for of in zip(*outcomes.values(), strict=True)
+    ]
+    reference = lengths.get(bench.reference)
+    names = {name for name, _ in keys}
+    rows = []
+    for planner, of in outcomes.items():
+        records = [o.record for o in of]
+        solved = [o for o in of if o.solved]
+        figures = _indicators(of)
+        by_family: dict[str, list[bool]] = {}
+        for o in of:
+            by_family.setdefault(o.record.family, []).append(o.solved)
+        timed = sorted({f"run {record.run or '?'}, {record.workers or '?'} at once" for record in records})
+        row = Row(
+            planner=planner,
+            success=figures.success / 100,
+            # the seeds of one problem are not independent, so trials are problems
+            success_interval=wilson_interval(round(figures.success / 100 * len(names)), len(names)),
+            collision=figures.collision / 100,
+            link_length=figures.length,
+            first=float(np.median([o.found for o in solved])) if solved else np.nan,
+            returned=figures.time,
+            time=Mean.of(record.time for record in records).value,
+            comscore=scores.get(planner, np.nan),
+            paired=None
+            if planner == bench.reference or reference is None
+            else compare(lengths[planner], reference),
+            full=all(o.full(limit, length) for o, length in zip(of, shortest, strict=True) if o.solved),
+            timed=" or ".join(timed),
+            measures={name: Mean.of(o.record.measures.get(name) for o in solved) for name in METRICS},
+            memory=max((record.memory for record in records if record.memory is not None), default=np.nan),
+            failures=Counter(o.failure for o in of if not o.solved),
+            families={
+                family: (sum(calls) / len(calls), wilson_interval(sum(calls), len(calls)))
+                for family, calls in by_family.items()
+            },
+        )
+        rows.append(row)
+    loads = tuple(o.record.load for of in outcomes.values() for o in of if o.record.load is not None)
+    missing = tuple(name for name in calls if name not in outcomes)
+    seeds = len({seed for _, seed in keys})
+    return Comparison(limit, len(names), problems, seeds, tuple(rows), missing, tuple(keys), loads)
+
+
+def _indicators(outcomes: Sequence[Outcome]) -> Indicators:
+    """The paper's four indicators of all calls; the length is that of the solved ones."""
+    return Indicators(
+        success=100 * float(np.mean([o.solved for o in outcomes])),
+        collision=100 * float(np.mean([o.record.in_collision for o in outcomes])),
+        length=Mean.of(o.link_length for o in outcomes).value,
+        time=float(np.mean([o.returned for o in outcomes])),
+    )
+
+
+def _problem_lengths(keys: Sequence[Key], outcomes: Sequence[Outcome]) -> Values:
+    """The joint-space length of each problem [rad]: the median of its seeds, NaN if half or more of them
+    failed."""
+    lengths: dict[str, list[float]] = {}
+    for (name, _), o in zip(keys, outcomes, strict=True):
+        lengths.setdefault(name, []).append(o.joint_length)
+    values = map(np.array, lengths.values())
+    return np.array([np.nanmedian(v) if 2 * np.isnan(v).sum() < len(v) else np.nan for v in values])
+
+
+def curves(calls: dict[str, Calls]) -> tuple[Curve, ...]:
+    """The curves on the problems that every planner was called on."""
+    with_calls = {name: of for name, of in calls.items() if of}
+    keys = sorted(set.intersection(*map(set, with_calls.values()))) if with_calls else []
+    if not keys:
+        return ()
+    lengths = {key: [r.joint_length for of in with_calls.values() for r in of[key]] for key in keys}
+    best = {key: min(filter(None, of), default=1.0) for key, of in lengths.items()}
+    records = {name: {key: of[key][-1] for key in keys} for name, of in with_calls.items()}
+    longest = max(r.time_limit for of in records.values() for r in of.values())
+    return tuple(_curve(name, of, best, longest) for name, of in records.items())
+
+
+def _curve(planner: str, records: dict[Key, Record], best: dict[Key, float], longest: float) -> Curve:
+    """The curve of a planner. `longest`: the longest limit of any planner [s], where the plot ends."""
+    end = min([longest, *(r.time_limit for r in records.values() if not r.ended_by_itself)])
+    solved = {key: r for key, r in records.items() if outcome(r, r.time_limit).found <= end}
+    first_times = np.sort([min(r.progress[0][0], end) for r in solved.values()])
+    hard = {key: r for key, r in solved.items() if not r.trivial}
+    times = np.geomspace(1e-4, end, 240)
+    ratios = np.full((max(len(hard), 1), len(times)), np.inf)
+    for row, (key, record) in zip(ratios, hard.items(), strict=False):
+        for at, length in record.progress:
+            row[times >= min(at, end)] = length / best[key]
+    with np.errstate(invalid="ignore"):
+        medians = np.median(ratios, axis=0)
+    finite = np.isfinite(medians)
+    return Curve(planner, len(records), end, first_times, times[finite], medians[finite])
+
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as PlotFigure
