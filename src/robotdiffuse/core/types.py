@@ -40,7 +40,7 @@ Pose = Float[ndarray, "4 4"]
 """A rigid transform."""
 Poses = Float[ndarray, "_ 4 4"]
 Spheres = Float[ndarray, "_ 4"]
-"""Centres and radii in rows [m]."""
+"""Centers and radii in rows [m]."""
 Mask = Bool[ndarray, "_"]
 if TYPE_CHECKING:  # fields of values, whose constructors take all that NumPy reads as arrays
 

@@ -110,7 +110,7 @@ class MPiNetsNetworkSettings(Settings, name="mpinets"):
                 raise InputError(f"mpinets.{name} is {getattr(self, name)}; it must be two numbers")
         if self.centres[0] > self.scene_points or self.centres[1] > self.centres[0]:
             raise InputError(
-                f"mpinets.centers is {self.centres}; it must fall, from at most scene_points, "
+                f"mpinets.centres is {self.centres}; it must fall, from at most scene_points, "
                 f"{self.scene_points}"
             )
         if len(self.cloud_widths) != 2 or self.cloud_widths[0] % GROUPS:

@@ -90,9 +90,9 @@ class Inertia(NamedTuple):
     mass: float
     """[kg]"""
     com: Vector
-    """Centre of mass [m]."""
+    """Center of mass [m]."""
     moments: Rotation
-    """Inertia matrix about the centre of mass, along the frame's axes [kg m²]."""
+    """Inertia matrix about the center of mass, along the frame's axes [kg m²]."""
 
     @property
     def values(self) -> list[float]:
@@ -126,11 +126,11 @@ class Payload(Value):
     mass: float
     """[kg]"""
     com: GivenVector = (0.0, 0.0, 0.0)  # pyright: ignore[reportAssignmentType]
-    """Centre of mass, in the frame of the link [m]."""
+    """Center of mass, in the frame of the link [m]."""
     link: str | None = None
     """Link that carries the mass; None: the robot's tip."""
     moments: GivenVector = (0.0, 0.0, 0.0)  # pyright: ignore[reportAssignmentType]
-    """Moments of inertia about the centre of mass, along the frame's axes [kg m²]; 0 for a point mass."""
+    """Moments of inertia about the center of mass, along the frame's axes [kg m²]; 0 for a point mass."""
 
     def __post_init__(self) -> None:
         mass = numbers(self.mass)

@@ -50,9 +50,9 @@ class Body(NamedTuple):
     mass: float
     """[kg]"""
     lever: float
-    """Distance of the centre of mass from the frame's origin [m]."""
+    """Distance of the center of mass from the frame's origin [m]."""
     moment: float
-    """Largest principal moment about the centre of mass [kg m²]."""
+    """Largest principal moment about the center of mass [kg m²]."""
 
 
 def product(a: Jet, b: Jet) -> Jet:

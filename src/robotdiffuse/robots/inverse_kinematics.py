@@ -112,8 +112,8 @@ def inverse_kinematics(
         seeds = np.ascontiguousarray(seeds[:, arm])
         before = len(accepted)
         while len(seeds) and len(accepted) < count:
-            known = np.ascontiguousarray(accepted[:, arm])
-            new, used = solve_seeds(seeds, known, count - len(accepted), chain, target, parameters)
+            accepted_arm = np.ascontiguousarray(accepted[:, arm])
+            new, used = solve_seeds(seeds, accepted_arm, count - len(accepted), chain, target, parameters)
             seeds = seeds[used:]
             if len(arm) < robot.dof:
                 new_arm = new
@@ -165,5 +165,5 @@ def beside(robot: KinematicTree, link: str) -> Bool[ndarray, "dof"]:
     """Which planned joints are neither before nor after a link: those of another arm."""
     frame = robot.link_frame(link)
     before = robot.moved_by[frame]
-    behind = robot.moved_by[1:, frame - 1] if frame else np.ones(robot.dof, bool)
-    return ~(before | behind)
+    downstream = robot.moved_by[1:, frame - 1] if frame else np.ones(robot.dof, bool)
+    return ~(before | downstream)

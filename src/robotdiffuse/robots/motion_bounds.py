@@ -122,13 +122,13 @@ def _rotated(
     width = -int(np.floor(lower / STEP)) - first + 1
     if width >= COLUMNS:
         return np.broadcast_to(support.max(-1, keepdims=True), support.shape)
-    wide = np.roll(support, -first, axis=-1)
-    done = 1
-    while done < width:  # maxima over 2 n neighbours from maxima over n
-        shift = min(done, width - done)
-        wide = np.maximum(wide, np.roll(wide, -shift, axis=-1))
-        done += shift
-    return wide
+    maxima = np.roll(support, -first, axis=-1)
+    covered = 1
+    while covered < width:  # maxima over 2 n neighbors from maxima over n
+        shift = min(covered, width - covered)
+        maxima = np.maximum(maxima, np.roll(maxima, -shift, axis=-1))
+        covered += shift
+    return maxima
 
 
 def _interpolation(directions: Float[ndarray, "rows columns 3"]) -> _Interpolation:

@@ -198,8 +198,8 @@ class Robot(KinematicTree):
 
     def _of_link(self, function: Callable[..., ndarray], q: ArrayLike, link: str | None) -> ndarray:
         rows = configurations(self, q)
-        found = function(self, np.atleast_2d(rows), link or self.tip)
-        return found[0] if rows.ndim == 1 else found
+        values = function(self, np.atleast_2d(rows), link or self.tip)
+        return values[0] if rows.ndim == 1 else values
 
     def ik(
         self,
@@ -509,9 +509,9 @@ def scaled(robot: Robot, scale: float) -> Robot:
 
 
 def _moved(T: Pose, scale: float) -> Pose:
-    found = T.copy()
-    found[:3, 3] *= scale
-    return found
+    moved = T.copy()
+    moved[:3, 3] *= scale
+    return moved
 
 
 def moving_pairs(robot: Robot, of: Container[str]) -> list[tuple[str, str]]:

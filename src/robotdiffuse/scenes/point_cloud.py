@@ -26,7 +26,7 @@ MAX_VOXELS = 5_000_000
 
 
 def read_octomap(file: str | Path) -> tuple[Points, float]:
-    """The centres of a .bt file's occupied voxels [m], and their edge [m].
+    """The centers of a .bt file's occupied voxels [m], and their edge [m].
 
     Of occupied leaves above the lowest level, the voxels at their surface. Raises InputError for a file that
     is not of this format, or damaged.
@@ -55,7 +55,7 @@ def cover_radius(edge: float) -> float:
 
 
 def occupied_voxels(data: bytes, edge: float) -> Points:
-    """The centres of the occupied voxels of a tree in OctoMap's binary format [m].
+    """The centers of the occupied voxels of a tree in OctoMap's binary format [m].
 
     Raises InputError for data that end too soon, a tree that is too deep or has too many voxels, and an edge
     that is not positive.
@@ -65,7 +65,7 @@ def occupied_voxels(data: bytes, edge: float) -> Points:
     centers: list[ndarray] = []
     count = 0
     at = 0
-    waiting = [(np.zeros(3), TREE_DEPTH)]  # inner nodes to read: centre and level, the next one last
+    waiting = [(np.zeros(3), TREE_DEPTH)]  # inner nodes to read: center and level, the next one last
     while waiting and data:
         center, level = waiting.pop()
         if at + 2 > len(data) or level == 0:
@@ -92,7 +92,7 @@ def occupied_voxels(data: bytes, edge: float) -> Points:
 
 
 def _shell(level: int) -> Points:
-    """Centres of the voxels at the surface of a cube of 2^level voxels, about its middle, in voxels."""
+    """Centers of the voxels at the surface of a cube of 2^level voxels, about its middle, in voxels."""
     n = 2**level
     if 6 * n**2 > MAX_VOXELS:
         raise InputError(f"the tree has more than {MAX_VOXELS:,} occupied voxels")

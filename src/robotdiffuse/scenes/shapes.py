@@ -465,7 +465,7 @@ class HeightMap(_Posed, Triangulated):
 
     heights: rows along y, columns along x, above `xyz` along z [m]; cells with a height that is not a number
         are holes.
-    cell: distance between neighbouring points [m].
+    cell: distance between neighboring points [m].
     xyz, wxyz: pose of the first height's point at height 0 in the frame of the robot's base.
     name: as of Box.
     """

@@ -30,9 +30,9 @@ class VisibleRegion(Settings, name="region"):
     """Points must be higher than this [m]: every scene contains the mounting plane, which carries no
     information."""
     center: tuple[float, float, float] = (0.0, 0.0, 0.3)
-    """Centre of the region in the base frame [m]: on the base axis, near a Panda's shoulder."""
+    """Center of the region in the base frame [m]: on the base axis, near a Panda's shoulder."""
     reach: Positive = 1.2
-    """Points must be within this distance of the centre [m]; a Panda's flange reaches 0.86."""
+    """Points must be within this distance of the center [m]; a Panda's flange reaches 0.86."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -123,23 +123,23 @@ def sample_surface(
         return np.zeros((0, 3))
     areas = np.array([shape.area for shape in shapes])
     shares = areas / areas.sum()
-    found: list[ndarray] = []
+    batches: list[ndarray] = []
     missing = count
-    wanted = 2 * count
+    sample_count = 2 * count
     for _ in range(MAX_SAMPLING_ROUNDS):
-        parts = rng.multinomial(wanted, shares)
-        drawn = [draw(shape, int(n), rng) for shape, n in zip(shapes, parts, strict=True) if n > 0]
-        points = np.concatenate(drawn)
+        parts = rng.multinomial(sample_count, shares)
+        samples = [draw(shape, int(n), rng) for shape, n in zip(shapes, parts, strict=True) if n > 0]
+        points = np.concatenate(samples)
         points = points[region.holds(points)]
         # The points are ordered by shape: without the permutation, the first ones would all be on the first
         # shape.
         points = points[rng.permutation(len(points))[:missing]]
-        found.append(points)
+        batches.append(points)
         missing -= len(points)
         if missing == 0:
             break
-        wanted = min(4 * wanted, 65536)
-    points = np.concatenate(found)
+        sample_count = min(4 * sample_count, 65536)
+    points = np.concatenate(batches)
     if 0 < missing < count:
         points = np.concatenate([points, points[rng.integers(len(points), size=missing)]])
     return points

@@ -101,8 +101,8 @@ class DistanceGrid:
         for soup in soups:
             voxels_of = ((split(soup, pitch / 2).reshape(-1, 3) - origin) / pitch).astype(int)
             occupied[tuple(voxels_of.T)] = True
-        found: Any = ndimage.label(~occupied)
-        free = found[0] == found[0][0, 0, 0]
+        components: Any = ndimage.label(~occupied)
+        free = components[0] == components[0][0, 0, 0]
         return DistanceGrid(origin, pitch, ndimage.distance_transform_edt(free) * pitch)
 
     def near_tight(self, tight: Points, concavity: float) -> tuple["DistanceGrid", "DistanceGrid"]:
@@ -128,7 +128,7 @@ class DistanceGrid:
 
 @kernel()
 def _farthest_inside(distance, origin, pitch, low, high, normals, offsets):
-    """Largest value of `distance` among voxels whose centres are within the planes."""
+    """Largest value of `distance` among voxels whose centers are within the planes."""
     best = 0.0
     for i in range(max(low[0], 0), min(high[0], distance.shape[0])):
         x = origin[0] + (i + 0.5) * pitch
@@ -287,12 +287,12 @@ def simplified(hull: ConvexMesh, settings: PartSettings = PartSettings()) -> Con
             halfspaces = np.column_stack([normals[chosen], -offsets[chosen]])
             corners = HalfspaceIntersection(halfspaces, middle).intersections
             beyond = corners @ normals.T - offsets
-            worst = beyond.max(1)
-            if worst.max() <= settings.rounding or len(chosen) >= MAX_PLANES:
+            max_excess = beyond.max(1)
+            if max_excess.max() <= settings.rounding or len(chosen) >= MAX_PLANES:
                 return convex_hull(corners)
-            for corner in np.argsort(-worst)[: min(8, MAX_PLANES - len(chosen))]:
+            for corner in np.argsort(-max_excess)[: min(8, MAX_PLANES - len(chosen))]:
                 plane = int(beyond[corner].argmax())
-                if worst[corner] > settings.rounding and plane not in chosen:
+                if max_excess[corner] > settings.rounding and plane not in chosen:
                     chosen.append(plane)
     except QhullError:  # almost flat
         return hull

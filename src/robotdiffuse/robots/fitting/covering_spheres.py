@@ -27,7 +27,7 @@ MAX_SPHERES = 100
 """Largest number of spheres per solid; if they do not suffice, they exceed the tolerance."""
 MAX_PIECES_PER_AXIS = 40
 # Steps of the search for a small sphere around points. It ends early if all points are at least at this
-# fraction of the radius from the centre.
+# fraction of the radius from the center.
 BOUNDING_STEPS = 15
 EQUIDISTANT = 0.999
 
@@ -100,7 +100,7 @@ def _outermost(points: Points, axis: int) -> Points:
 
 
 def _around(points: Points) -> Float[ndarray, "4"]:
-    """A small sphere around points: the best of the centre of their box and of some steps of Badoiu and
+    """A small sphere around points: the best of the center of their box and of some steps of Badoiu and
     Clarkson's algorithm."""
     center = (points.min(axis=0) + points.max(axis=0)) / 2
     best = np.array([*center, np.inf])

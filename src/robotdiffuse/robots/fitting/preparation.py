@@ -62,9 +62,9 @@ from robotdiffuse.robots.robot_folder import read_robot_folder, user_robots, wri
 JOINT_SAMPLES = 9
 """Values of the joint between two links at which points are tested."""
 GAP = 0.004
-"""Points this close to a neighbour count as inside [m]: gaps between links are about this thin."""
+"""Points this close to a neighbor count as inside [m]: gaps between links are about this thin."""
 BOX_PADDING = 10 * GAP
-"""Points further than this from a neighbour's bounding box are skipped, even near sharp edges [m]."""
+"""Points further than this from a neighbor's bounding box are skipped, even near sharp edges [m]."""
 
 
 class Neighbour(NamedTuple):
@@ -100,7 +100,7 @@ def neighbours(robot: Robot, link: str) -> tuple[Neighbour, ...]:
 
 
 def hidden_by_neighbours(robot: Robot, link: str) -> Callable[[Points], Mask]:
-    """A function that tells which points, in the link's frame [m], are inside one neighbour at all joint
+    """A function that tells which points, in the link's frame [m], are inside one neighbor at all joint
     values."""
     neighbour_planes: list[tuple[Neighbour, tuple[ndarray, ndarray], Planes]] = []
     for near_link in neighbours(robot, link):
@@ -109,17 +109,17 @@ def hidden_by_neighbours(robot: Robot, link: str) -> Callable[[Points], Mask]:
         neighbour_planes.append((near_link, box, stacked_planes(robot.meshes[near_link.link])))
 
     def hidden(points: Points) -> Mask:
-        found = np.zeros(len(points), dtype=bool)
+        hidden_points = np.zeros(len(points), dtype=bool)
         for near_link, (low, high), planes in neighbour_planes:
-            left = np.flatnonzero(~found)
+            candidates = np.flatnonzero(~hidden_points)
             for T in near_link.T_link_neighbour:
-                local = (points[left] - T[:3, 3]) @ T[:3, :3]
+                local = (points[candidates] - T[:3, 3]) @ T[:3, :3]
                 near = ((local >= low) & (local <= high)).all(axis=1)
-                left = left[near]
+                candidates = candidates[near]
                 local = local[near]
-                left = left[is_inside(local, planes, -GAP)]
-            found[left] = True
-        return found
+                candidates = candidates[is_inside(local, planes, -GAP)]
+            hidden_points[candidates] = True
+        return hidden_points
 
     return hidden
 
@@ -199,7 +199,7 @@ class LinkReport:
     parts: int
     spheres: int
     stick_out: float
-    """Largest distance that a sphere sticks out of the parts [m]; includes space inside neighbours."""
+    """Largest distance that a sphere sticks out of the parts [m]; includes space inside neighbors."""
     covered: bool
     """Whether the spheres provably cover the surface of the parts."""
 
@@ -289,17 +289,19 @@ def prepare(
     )
     allowed_pairs = frozenset(frozenset(pair.links) for pair in pairs if pair.reason != CHECKED)
     robot = replace(robot, allowed_collisions=allowed_pairs)
-    tried = []
+    attempts = []
     for k in range(settings.rounds + 1):
         progress("false collisions", 2 * len(links) + 1 + k, steps)
         false_collisions = measure_false_collisions(
             robot, surfaces, settings.samples, np.random.default_rng(seed)
         )
-        tried.append((false_collisions.by_spheres, k, robot, false_collisions))
+        attempts.append((false_collisions.by_spheres, k, robot, false_collisions))
         if false_collisions.by_spheres <= settings.max_false_collisions or k == settings.rounds:
             break
         robot = _refined(robot, links, false_collisions, k, settings, seed)
-    _, _, robot, false_collisions = min(tried, key=lambda one: one[:2])  # refinement can add false collisions
+    _, _, robot, false_collisions = min(
+        attempts, key=lambda one: one[:2]
+    )  # refinement can add false collisions
     closer = with_finer_parts(robot, links, false_collisions, settings, seed)
     if closer is not None:
         remeasured = measure_false_collisions(closer, surfaces, settings.samples, np.random.default_rng(seed))
@@ -596,14 +598,14 @@ def add_robot(
     settings = settings or PreparationSettings()
     if semantics is not None and semantics is tree.semantics:
         settings = replace(settings, sampling=replace(settings.sampling, assumptions=False))
-    made = prepare(robot, surfaces, settings, seed, progress, allowed)
-    measured = made.false_collisions
+    prepared = prepare(robot, surfaces, settings, seed, progress, allowed)
+    measured = prepared.false_collisions
     if measured.free == 0 or measured.by_parts == 1:  # nothing can be planned
         shares = {pair.links: max(pair.colliding, pair.by_parts) for pair in measured.pairs}
         often = sorted(shares, key=lambda pair: -shares[pair])
-        worst = [pair for pair in often if shares[pair] == 1] or often[:MAX_PROPOSED]
-        options = " ".join(f"--allow {' '.join(pair)}" for pair in worst)
-        names = "; ".join(f"{' and '.join(pair)} collide in {shares[pair]:.1%}" for pair in worst)
+        colliding_pairs = [pair for pair in often if shares[pair] == 1] or often[:MAX_PROPOSED]
+        options = " ".join(f"--allow {' '.join(pair)}" for pair in colliding_pairs)
+        names = "; ".join(f"{' and '.join(pair)} collide in {shares[pair]:.1%}" for pair in colliding_pairs)
         raise InputError(
             f"{urdf}: every configuration collides with itself: {names}; if these links may touch, add "
             f"{options}, or give an SRDF that allows such "
@@ -613,7 +615,7 @@ def add_robot(
         PairDifference(
             pair.links, pair.reason, pair.colliding, srdf_allowed.get(frozenset(pair.links), CHECKED)
         )
-        for pair in made.sampled
+        for pair in prepared.sampled
         if semantics is not None and (pair.reason == CHECKED) == (frozenset(pair.links) in srdf_allowed)
     )
     folder = user_robots() / name if out is None else Path(out)
@@ -624,8 +626,16 @@ def add_robot(
         f"collide falsely in {measured.by_parts:.1%} of these, spheres in "
         f"{measured.by_spheres:.1%}"
     )
-    write_robot_folder(replace(made.robot, notes=(*robot.notes, note)), folder, source | shares)
+    write_robot_folder(replace(prepared.robot, notes=(*robot.notes, note)), folder, source | shares)
     seconds = time.process_time() - begin
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * BYTES_PER_UNIT
-    summary = (made.links, made.pairs, made.false_collisions, seconds, memory, srdf_file, differences)
+    summary = (
+        prepared.links,
+        prepared.pairs,
+        prepared.false_collisions,
+        seconds,
+        memory,
+        srdf_file,
+        differences,
+    )
     return AddReport(read_robot_folder(folder), folder, *summary)

@@ -3,8 +3,8 @@ that pass closer to each other than covering spheres can resolve, as a flange in
 
 The relative pose of two links depends only on the joints between them. If these are one or two joints, a
 table over their values tells where the convex parts of the links are apart. A cell counts as free if the
-distance of the links at its centre exceeds the motion of any point of one link, seen from the other, within
-the cell. Other cells are split, down to a fraction of a millimetre of motion.
+distance of the links at its center exceeds the motion of any point of one link, seen from the other, within
+the cell. Other cells are split, down to a fraction of a millimeter of motion.
 """
 
 # Coal's Python module has no type information.
@@ -114,7 +114,7 @@ class Links:
         """The last common ancestor of links, and the joints from there to them."""
         if links not in self._leading:
             chains = [self.robot.joints_above(link) for link in links]
-            common = [one for one, *others in zip(*chains, strict=False) if {*others} <= {one}]
+            common = [one for one, *rest_of_chain in zip(*chains, strict=False) if {*rest_of_chain} <= {one}]
             needed = {joint.child for chain in chains for joint in chain[len(common) :]}
             joints = [joint for joint in self.robot.joints if joint.child in needed]
             self._leading[links] = common[-1].child if common else self.robot.base, joints
@@ -127,16 +127,16 @@ class Links:
 
     def _placed(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> tuple[Any, Any, ndarray]:
         """Poses of two links in configuration i, and distances between the balls around their parts."""
-        apart = ball_distances(poses[a][i], poses[b][i], self.balls[a], self.balls[b])
-        return coal_pose(poses[a][i]), coal_pose(poses[b][i]), apart
+        ball_gaps = ball_distances(poses[a][i], poses[b][i], self.balls[a], self.balls[b])
+        return coal_pose(poses[a][i]), coal_pose(poses[b][i]), ball_gaps
 
     def collide(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> bool:
         """Whether the meshes of two links collide in configuration i."""
         inside = ball_distances(poses[a][i], poses[b][i], self.inner[a], self.inner[b])
         if (inside < 0).any():
             return True
-        T_a, T_b, apart = self._placed(poses, a, b, i)
-        near = list(zip(*np.nonzero(apart <= 0), strict=True))
+        T_a, T_b, ball_gaps = self._placed(poses, a, b, i)
+        near = list(zip(*np.nonzero(ball_gaps <= 0), strict=True))
         hit = self._hit.get((a, b))
         for m, n in [hit, *near] if hit in near else near:
             self.result.clear()
@@ -148,29 +148,29 @@ class Links:
     def contacts(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> Points:
         """Points where convex parts of two links overlap in configuration i, one for each pair of parts
         [m]."""
-        T_a, T_b, apart = self._placed(poses, a, b, i)
-        found = []
-        for m, n in zip(*np.nonzero(apart <= 0), strict=True):
+        T_a, T_b, ball_gaps = self._placed(poses, a, b, i)
+        contact_points = []
+        for m, n in zip(*np.nonzero(ball_gaps <= 0), strict=True):
             result = coal.CollisionResult()
             request = coal.CollisionRequest(coal.CONTACT, 1)
             if coal.collide(self.hulls[a][m], T_a, self.hulls[b][n], T_b, request, result):
-                found.append(result.getContact(0).pos)
-        return np.reshape(found, (-1, 3))
+                contact_points.append(result.getContact(0).pos)
+        return np.reshape(contact_points, (-1, 3))
 
     def mesh_distance(self, poses: dict[str, ndarray], a: str, b: str, i: int = 0) -> float:
         """Distance between the meshes of two links in configuration i [m]; zero or less if they collide."""
-        T_a, T_b, apart = self._placed(poses, a, b, i)
-        least = np.inf
-        for k in apart.argsort(axis=None):
-            m, n = divmod(int(k), apart.shape[1])
-            if apart[m, n] >= least:
+        T_a, T_b, ball_gaps = self._placed(poses, a, b, i)
+        min_distance = np.inf
+        for k in ball_gaps.argsort(axis=None):
+            m, n = divmod(int(k), ball_gaps.shape[1])
+            if ball_gaps[m, n] >= min_distance:
                 break
             self.distance_result.clear()
             distance = coal.distance(
                 self.hulls[a][m], T_a, self.hulls[b][n], T_b, self.distance_request, self.distance_result
             )
-            least = min(least, distance)
-        return float(least)
+            min_distance = min(min_distance, distance)
+        return float(min_distance)
 
     def part_distances(
         self,
@@ -206,14 +206,14 @@ class Links:
 
 
 def _ball(mesh: ConvexMesh) -> Float[ndarray, "4"]:
-    """Centre and radius of a ball that contains a mesh [m]."""
+    """Center and radius of a ball that contains a mesh [m]."""
     center = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
     return np.append(center, np.linalg.norm(mesh.vertices - center, axis=1).max() + BALL_MARGIN)
 
 
 @lru_cache(maxsize=1024)
 def _inner(mesh: ConvexMesh) -> Float[ndarray, "4"]:
-    """Centre and radius of a largest ball inside a convex mesh [m]."""
+    """Center and radius of a largest ball inside a convex mesh [m]."""
     normals, offsets = planes_of(mesh)
     planes = np.column_stack([normals, np.ones(len(normals))])
     solution = linprog([0, 0, 0, -1], planes, offsets, bounds=[(None, None)] * 3 + [(0, None)])

@@ -131,9 +131,9 @@ def find_allowed_collisions(
         return CHECKED
 
     reports = []
-    few = {link: T[: max(len(q) // ADJACENT_STRIDE, 1)] for link, T in poses.items()}
+    strided = {link: T[: max(len(q) // ADJACENT_STRIDE, 1)] for link, T in poses.items()}
     for a, b in moving_pairs(robot, robot.meshes):
-        near = links.sphere_distance(few if frozenset((a, b)) in adjacent else poses, a, b)
+        near = links.sphere_distance(strided if frozenset((a, b)) in adjacent else poses, a, b)
         colliding = np.zeros(len(near), dtype=bool)
         for i in np.flatnonzero(near <= 0):
             colliding[i] = links.collide(poses, a, b, int(i))
@@ -263,7 +263,7 @@ def measure_false_collisions(
     column = {joint.name: i for i, joint in enumerate(links.joints)}
     request = coal.CollisionRequest()
     result = coal.CollisionResult()
-    found = []
+    collisions = []
     for a, b in robot.checked_pairs():
         first, second = (for_kernels(robot.spheres[link]) for link in (a, b))
         depth, middle = deepest_touches(poses[a], poses[b], first, second, 0.0, 0.0)
@@ -278,21 +278,21 @@ def measure_false_collisions(
                 places = coal_pose(poses[a][i]), coal_pose(poses[b][i])
                 result.clear()
                 meshes[i] = any(  # one inside the other is not detected
-                    coal.collide(one, places[0], other, places[1], request, result)
+                    coal.collide(one, places[0], second_mesh, places[1], request, result)
                     for one in trees[a]
-                    for other in trees[b]
+                    for second_mesh in trees[b]
                 )
-        found.append((spheres, parts, meshes, middle))
-    if not found:
+        collisions.append((spheres, parts, meshes, middle))
+    if not collisions:
         return FalseCollisions(1.0, 0.0, 0.0, ())
-    free = ~np.any([meshes for _, _, meshes, _ in found], axis=0)
+    free = ~np.any([meshes for _, _, meshes, _ in collisions], axis=0)
     count = max(int(free.sum()), 1)
 
     def share(colliding: ndarray) -> float:
         return float((colliding & free).sum() / count)
 
     pairs = []
-    for (a, b), (spheres, parts, meshes, middle) in zip(robot.checked_pairs(), found, strict=True):
+    for (a, b), (spheres, parts, meshes, middle) in zip(robot.checked_pairs(), collisions, strict=True):
         false_spheres = np.flatnonzero(spheres & ~parts & free)[:MAX_SPHERE_CASES]
         gaps = np.array([links.mesh_distance(poses, a, b, int(i)) for i in false_spheres])
         every = gaps
@@ -308,10 +308,10 @@ def measure_false_collisions(
         on_b = np.einsum("nji,nj->ni", T_base_b[:, :3, :3], at - T_base_b[:, :3, 3])
         places = {a: _one_per_cube(middle[false_spheres], gaps), b: _one_per_cube(on_b, gaps)}
         false_parts = np.flatnonzero(parts & ~meshes & free)[:MAX_PART_CASES]
-        coarse = _sticking_out(links, trees, poses, (a, b), false_parts)
+        sticking_out = _sticking_out(links, trees, poses, (a, b), false_parts)
         shares = share(parts), share(spheres)
-        pairs.append(PairFalseCollisions((a, b), float(meshes.mean()), *shares, every, places, coarse))
-    spheres, parts, _ = (np.any(rows, axis=0) for rows in list(zip(*found, strict=True))[:3])
+        pairs.append(PairFalseCollisions((a, b), float(meshes.mean()), *shares, every, places, sticking_out))
+    spheres, parts, _ = (np.any(rows, axis=0) for rows in list(zip(*collisions, strict=True))[:3])
     worst_first = sorted(pairs, key=lambda pair: -pair.by_spheres)
     return FalseCollisions(float(free.mean()), share(parts), share(spheres), tuple(worst_first))
 

@@ -4,14 +4,14 @@ The surface is cut into small triangles, the cells. A sphere is convex, so it co
 if it contains the three corners. If every cell lies within one sphere, the spheres provably cover the
 surface, not just samples of it.
 
-A grid holds the largest allowed radius of a sphere by its centre (`SphereSizeGrid`). For the cells assigned
-to a sphere, the best centre p minimises the excess radius max |corner - p| - max_radius(p). Like Lloyd's
+A grid holds the largest allowed radius of a sphere by its center (`SphereSizeGrid`). For the cells assigned
+to a sphere, the best center p minimizes the excess radius max |corner - p| - max_radius(p). Like Lloyd's
 algorithm, the fit alternates between assigning each cell to the sphere that covers it with the least excess
-and moving each sphere to its best centre. It starts from a greedy set cover and drops spheres as long as
+and moving each sphere to its best center. It starts from a greedy set cover and drops spheres as long as
 none gets too large.
 
 A sphere may contain points whose distance from the link is at most the tolerance, which may be smaller near
-some places, and points that are inside a neighbouring link at any angle of the joint between them. It may
+some places, and points that are inside a neighboring link at any angle of the joint between them. It may
 not contain points below the plane that the robot stands on.
 """
 
@@ -47,9 +47,9 @@ GRID_POINTS = 200_000
 MIN_SPACING = 0.0015
 """Smallest spacing of a grid [m]."""
 MIN_PADDING = 0.03
-"""Smallest padding of the grid around the link [m]: spheres may reach this far into a neighbour."""
+"""Smallest padding of the grid around the link [m]: spheres may reach this far into a neighbor."""
 # A smaller tolerance applies within this distance of its place [m]; beyond, it grows by this much per
-# metre.
+# meter.
 TIGHT_RADIUS = 0.015
 TIGHT_SLOPE = 0.3
 
@@ -70,7 +70,7 @@ class Bounds:
     tolerance: float
     """[m]"""
     hidden: Callable[[Points], Mask] | None = None
-    """Whether points are inside a neighbour, so that spheres may contain them."""
+    """Whether points are inside a neighbor, so that spheres may contain them."""
     tight: Spheres = field(default_factory=lambda: np.zeros((0, 4)))
     """Rows x y z and how far spheres may stick out there [m]. Near these, `hidden` does not apply."""
     floor: tuple[Vector, float] | None = None
@@ -100,7 +100,7 @@ class Bounds:
 
 @dataclass(frozen=True, eq=False)
 class SphereSizeGrid:
-    """Largest radius of a sphere by its centre [m], interpolated on a grid; negative where no sphere may
+    """Largest radius of a sphere by its center [m], interpolated on a grid; negative where no sphere may
     be."""
 
     grid: Float[ndarray, "nx ny nz"]
@@ -253,7 +253,7 @@ class SphereSettings(Settings, name="sphere tolerances"):
     finest: Positive = 0.004
     """Lower bound on the tolerance [m]."""
     candidates: int = 1000
-    """Candidate centres of the greedy cover."""
+    """Candidate centers of the greedy cover."""
     rounds: int = 5
     """Rounds of assigning cells and moving spheres, for each number of spheres."""
     tries: int = 3
@@ -272,10 +272,10 @@ class SphereSettings(Settings, name="sphere tolerances"):
     def tolerance(self, frame: int, dof: int, inradius: float) -> float:
         """How far the spheres of a link may stick out [m]: a link on a frame (see `Robot.link_frame`) of a
         robot with `dof` planned joints, whose largest inscribed sphere has the radius `inradius` [m]."""
-        wanted = self.first_half if frame <= (dof + 1) // 2 else self.second_half
+        target = self.first_half if frame <= (dof + 1) // 2 else self.second_half
         if frame == 0:
-            wanted = max(wanted, self.fixed)
-        return float(max(min(wanted, inradius), self.finest))
+            target = max(target, self.fixed)
+        return float(max(min(target, inradius), self.finest))
 
 
 def fit_spheres(
@@ -288,13 +288,15 @@ def fit_spheres(
     sizes = solid.sphere_sizes(bounds)
     inside = solid.inside
     # a sphere that sticks out of a flat face by e covers a disc of radius sqrt(2 r e); cells are much smaller
-    coarse, fine = (Cells.of(solid, bounds, *size) for size in (COARSE_CELLS, FINE_CELLS))
+    coarse_cells, fine_cells = (Cells.of(solid, bounds, *size) for size in (COARSE_CELLS, FINE_CELLS))
     places = rng.permutation(inside)[: settings.candidates] + rng.uniform(-0.5, 0.5, 3) * solid.spacing
-    chosen = greedy_cover(coarse.points, coarse.corners, places, sizes.at(places))
-    centers = _with_enough_spheres(sizes, coarse, places[chosen], settings)
-    centers = _with_enough_spheres(sizes, fine, _thin_out(sizes, coarse, centers, settings), settings)
-    centers, _ = _relax(sizes, fine, centers, settings.rounds, -np.inf)  # minimise the excess
-    return _without_holes(solid, inside, _with_radii(sizes, fine, centers))
+    chosen = greedy_cover(coarse_cells.points, coarse_cells.corners, places, sizes.at(places))
+    centers = _with_enough_spheres(sizes, coarse_cells, places[chosen], settings)
+    centers = _with_enough_spheres(
+        sizes, fine_cells, _thin_out(sizes, coarse_cells, centers, settings), settings
+    )
+    centers, _ = _relax(sizes, fine_cells, centers, settings.rounds, -np.inf)  # minimize the excess
+    return _without_holes(solid, inside, _with_radii(sizes, fine_cells, centers))
 
 
 def stick_out(solid: Solid, spheres: Spheres) -> Values:
@@ -341,7 +343,7 @@ class Cells:
     corners: Int[ndarray, "c 3"]
     """Indices into points."""
     sharp: Mask
-    """Whether a point is a vertex of a mesh; all others lie between neighbours on a face or an edge."""
+    """Whether a point is a vertex of a mesh; all others lie between neighbors on a face or an edge."""
 
     @staticmethod
     def of(solid: Solid, bounds: Bounds, cut: float, most: int) -> "Cells":
@@ -367,11 +369,13 @@ class Cells:
             hidden = np.zeros(len(triangles), dtype=bool)
             low = triangles.min(1)
             high = triangles.max(1)
-            for other, (lowest, highest) in enumerate(boxes):
-                if other != k:
-                    asked = np.flatnonzero(((low >= lowest) & (high <= highest)).all(1) & ~hidden)
-                    corners = triangles[asked].reshape(-1, 3)
-                    hidden[asked] = is_inside(corners, planes[other], BURIED_DEPTH).reshape(-1, 3).all(1)
+            for mesh_index, (lowest, highest) in enumerate(boxes):
+                if mesh_index != k:
+                    queried = np.flatnonzero(((low >= lowest) & (high <= highest)).all(1) & ~hidden)
+                    corners = triangles[queried].reshape(-1, 3)
+                    hidden[queried] = (
+                        is_inside(corners, planes[mesh_index], BURIED_DEPTH).reshape(-1, 3).all(1)
+                    )
             triangles = triangles[~hidden]
             if bounds.varies:
                 tolerances = bounds.tolerances(triangles.mean(1))
@@ -422,14 +426,14 @@ class _Assignment(NamedTuple):
 def _relax(
     sizes: SphereSizeGrid, cells: Cells, centers: Points, rounds: int, enough: float
 ) -> tuple[Points, float]:
-    """Improved centres and the largest excess radius [m]; ends early at `enough`."""
+    """Improved centers and the largest excess radius [m]; ends early at `enough`."""
     return relax(cells.points, cells.corners, cells.sharp, centers, rounds, enough, *sizes.arrays, DIRECTIONS)
 
 
 def _with_enough_spheres(
     sizes: SphereSizeGrid, cells: Cells, centers: Points, settings: SphereSettings
 ) -> Points:
-    """Improved centres, with spheres added until none exceeds its largest radius, or there are
+    """Improved centers, with spheres added until none exceeds its largest radius, or there are
     `settings.most`."""
     max_excess = sizes.spacing * EXCESS_TOLERANCE
     centers, largest_excess = _relax(sizes, cells, centers, settings.rounds, max_excess)
@@ -454,7 +458,7 @@ def _farthest_apart(points: Points, excess: Values, count: int) -> Points:
 
 
 def _thin_out(sizes: SphereSizeGrid, cells: Cells, centers: Points, settings: SphereSettings) -> Points:
-    """Centres without the spheres whose cells the others can cover; the least needed ones are dropped first.
+    """Centers without the spheres whose cells the others can cover; the least needed ones are dropped first.
 
     Only the spheres that take over cells are moved.
     """

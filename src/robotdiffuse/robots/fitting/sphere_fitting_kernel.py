@@ -1,7 +1,7 @@
 """Compiled inner loops of the sphere fit, and of tests between sets of spheres.
 
 A surface consists of cells, which are triangles of points. A grid holds the largest radius of a sphere by its
-centre. Without jaxtyping annotations, since Numba compiles these functions. Lengths are in metres.
+center. Without jaxtyping annotations, since Numba compiles these functions. Lengths are in meters.
 """
 
 import math
@@ -10,13 +10,13 @@ import numpy as np
 
 from robotdiffuse.core.kernels import kernel
 
-# Initial step of the search for a centre [m]: in the first round, its lower bound, and its factor per
+# Initial step of the search for a center [m]: in the first round, its lower bound, and its factor per
 # round.
 INITIAL_STEP = 0.004
 MIN_INITIAL_STEP = 0.0005
 STEP_SHRINKAGE = 0.8
 MIN_STEP = 2e-4
-"""The search for a centre ends at this step [m]."""
+"""The search for a center ends at this step [m]."""
 OUTSIDE_GRID = -1.0
 """Largest radius just outside the grid [m]: negative, so that no sphere is placed there."""
 MIN_GAIN = 1e-7
@@ -78,7 +78,7 @@ def max_radius_at(x, y, z, grid, origin, spacing):
 
 @kernel(fastmath=True)
 def max_radii_at(centers, grid, origin, spacing):
-    """Grid values [n] interpolated at centres [n, 3]."""
+    """Grid values [n] interpolated at centers [n, 3]."""
     radii = np.empty(len(centers))
     for i in range(len(centers)):
         radii[i] = max_radius_at(centers[i, 0], centers[i, 1], centers[i, 2], grid, origin, spacing)
@@ -102,7 +102,7 @@ def assign(points, corners, centers, depths):
     `depths` are the largest radii of spheres at `centers`.
     """
     owner = np.empty(len(corners), np.int64)
-    least = np.empty(len(corners))
+    min_excess = np.empty(len(corners))
     heir = np.empty(len(corners), np.int64)
     second = np.empty(len(corners))
     for c in range(len(corners)):
@@ -128,10 +128,10 @@ def assign(points, corners, centers, depths):
                 runner = needed
                 next_best = i
         owner[c] = mine
-        least[c] = best
+        min_excess[c] = best
         heir[c] = next_best
         second[c] = runner
-    return owner, least, heir, second
+    return owner, min_excess, heir, second
 
 
 @kernel(fastmath=True)
@@ -172,7 +172,7 @@ def greedy_cover(points, corners, places, depths):
 
 @kernel()
 def enclosing(spheres):
-    """Centre and radius of a ball that contains spheres."""
+    """Center and radius of a ball that contains spheres."""
     center = np.array([0.5 * (spheres[:, k].min() + spheres[:, k].max()) for k in range(3)])
     radius = 0.0
     for i in range(len(spheres)):
@@ -257,7 +257,7 @@ def deepest_touches(T_base_a, T_base_b, first, second, apart, least):
                     continue
                 far = math.sqrt(dx * dx + dy * dy + dz * dz)
                 depth[n] = first[i, 3] + second[j, 3] - far
-                # from b's centre towards a's, to the middle of the two surfaces
+                # from b's center towards a's, to the middle of the two surfaces
                 along = (far + second[j, 3] - first[i, 3]) / 2 / max(far, 1e-9)
                 middle[n, 0] = x + along * dx
                 middle[n, 1] = y + along * dy
@@ -307,7 +307,7 @@ def held_by_one(triangles, spheres):
 
 @kernel(fastmath=True)
 def excess_radius(x, y, z, own, count, grid, origin, spacing):
-    """Excess radius of a sphere at a centre that contains the first `count` points of `own`."""
+    """Excess radius of a sphere at a center that contains the first `count` points of `own`."""
     far = 0.0
     for k in range(count):
         dx = own[k, 0] - x
@@ -319,7 +319,7 @@ def excess_radius(x, y, z, own, count, grid, origin, spacing):
 
 @kernel(fastmath=True)
 def move_center(center, own, count, step, grid, origin, spacing, directions):
-    """Pattern search for the centre of least excess radius, in place."""
+    """Pattern search for the center of least excess radius, in place."""
     min_radius = excess_radius(center[0], center[1], center[2], own, count, grid, origin, spacing)
     while step > MIN_STEP:
         best = min_radius - MIN_GAIN
@@ -343,7 +343,7 @@ def move_center(center, own, count, step, grid, origin, spacing, directions):
 def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing, directions):
     """Alternate between assigning cells to spheres and moving the spheres.
 
-    Returns the best centres found and their largest excess radius; ends early at `enough`.
+    Returns the best centers found and their largest excess radius; ends early at `enough`.
     """
     cells = len(corners)
     count = len(centers)
@@ -358,8 +358,10 @@ def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing
     best_value = 1e9
     step = INITIAL_STEP
     for r in range(rounds + 1):
-        owner, least, _, _ = assign(points, corners, centers, max_radii_at(centers, grid, origin, spacing))
-        value = least.max()
+        owner, min_excess, _, _ = assign(
+            points, corners, centers, max_radii_at(centers, grid, origin, spacing)
+        )
+        value = min_excess.max()
         if value < best_value:
             best = centers.copy()
             best_value = value

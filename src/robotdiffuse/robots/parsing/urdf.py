@@ -253,8 +253,8 @@ class UrdfTree:
             if size <= MAX_LINK_SIZE:
                 continue
             note = (
-                f"check the units: link {link} is {size:.4g} m long; lengths are in metres, and a mesh in "
-                f'millimetres needs scale="0.001 0.001 0.001"'
+                f"check the units: link {link} is {size:.4g} m long; lengths are in meters, and a mesh in "
+                f'millimeters needs scale="0.001 0.001 0.001"'
             )
             if robot.link_frame(link) > 0 and size > MAX_SIZE_PER_REACH * reach(robot):
                 raise InputError(f"{self.path}: {note}")
@@ -305,7 +305,7 @@ class UrdfTree:
 
     def above(self, link: str) -> dict[str, Pose]:
         """T_link_ancestor by ancestor of a link, up to the first movable joint."""
-        found: dict[str, ndarray] = {}
+        transforms: dict[str, ndarray] = {}
         T_link_ancestor = np.eye(4)
         while link in self.parents:
             name = self.parents[link]
@@ -314,8 +314,8 @@ class UrdfTree:
                 break
             link = self.ends[name][0]
             T_link_ancestor = T_link_ancestor @ inverse(self._origin(element, f"joint {name}"))
-            found[link] = T_link_ancestor
-        return found
+            transforms[link] = T_link_ancestor
+        return transforms
 
     def carried(self, link: str) -> str:
         """The link that a robot pose in a scene refers to, on the way to `link`.
@@ -341,21 +341,21 @@ class UrdfTree:
 
     def _joint(self, name: str) -> Joint:
         element = self.elements[name]
-        what = f"joint {name}"
+        location = f"joint {name}"
         kind = element.get("type", "")
         if kind not in KINDS:
             raise InputError(
-                f"{self.path}: {what} has type {shown(kind)}; supported: {', '.join(KINDS)}; remove it with "
-                f"what it carries, or use --base {self.ends[name][1]} to plan for what it carries alone"
+                f"{self.path}: {location} has type {shown(kind)}; supported: {', '.join(KINDS)}; remove it "
+                f"with what it carries, or use --base {self.ends[name][1]} to plan for what it carries alone"
             )
         axis_element = element.find("axis")
         axis = np.array([1.0, 0.0, 0.0])
         if axis_element is not None and kind != "fixed":
-            axis = self._numbers(axis_element.get("xyz", "1 0 0"), 3, f"{what}: axis")
+            axis = self._numbers(axis_element.get("xyz", "1 0 0"), 3, f"{location}: axis")
             if np.linalg.norm(axis) < 1e-6:
-                raise InputError(f"{self.path}: {what}: its axis is zero; give it a direction")
+                raise InputError(f"{self.path}: {location}: its axis is zero; give it a direction")
             axis = axis / np.linalg.norm(axis)
-        joint = Joint(name, kind, *self.ends[name], self._origin(element, what), axis)
+        joint = Joint(name, kind, *self.ends[name], self._origin(element, location), axis)
         if kind == "fixed":
             return joint
         joint = self._with_limits(replace(joint, mimic=self._mimic(name, element)), element.find("limit"))
@@ -366,8 +366,8 @@ class UrdfTree:
         ]
         if soft_limits:
             self.notes.append(
-                f"{what}: the soft limits of its safety_controller ({', '.join(soft_limits)}) are ignored; "
-                f"set limits with --limits"
+                f"{location}: the soft limits of its safety_controller ({', '.join(soft_limits)}) are "
+                f"ignored; set limits with --limits"
             )
         return joint
 
@@ -390,32 +390,34 @@ class UrdfTree:
         if self.elements[leaders[-1]].get("type") == "fixed" or last is None:
             self.notes.append(f"joint {name} mimics the fixed joint {leaders[-1]}; treated as independent")
             return None
-        what = f"joint {name}: mimic"
-        multiplier = self._numbers(followed.get("multiplier", "1"), 1, f"{what} multiplier")
-        offset = self._numbers(followed.get("offset", "0"), 1, f"{what} offset")
+        location = f"joint {name}: mimic"
+        multiplier = self._numbers(followed.get("multiplier", "1"), 1, f"{location} multiplier")
+        offset = self._numbers(followed.get("offset", "0"), 1, f"{location} offset")
         return Mimic(leaders[1], float(multiplier[0]), float(offset[0]))
 
     def _with_limits(self, joint: Joint, limit: ET.Element | None) -> Joint:
         of = {} if limit is None else limit.attrib
-        given: dict[str, float] = {}
-        for what in ("lower", "upper", "velocity"):
-            if what in of:
-                most = MAX_RATE if what == "velocity" else MAX_COORDINATE
-                numbers = self._numbers(of[what], 1, f"joint {joint.name}: {what} limit", most)
-                given[what] = float(numbers[0])
+        limits: dict[str, float] = {}
+        for limit_name in ("lower", "upper", "velocity"):
+            if limit_name in of:
+                max_value = MAX_RATE if limit_name == "velocity" else MAX_COORDINATE
+                numbers = self._numbers(
+                    of[limit_name], 1, f"joint {joint.name}: {limit_name} limit", max_value
+                )
+                limits[limit_name] = float(numbers[0])
         if joint.kind == "continuous":
-            given |= {"lower": -CONTINUOUS_LIMIT, "upper": CONTINUOUS_LIMIT}
-        if "lower" not in given and "upper" not in given:
+            limits |= {"lower": -CONTINUOUS_LIMIT, "upper": CONTINUOUS_LIMIT}
+        if "lower" not in limits and "upper" not in limits:
             raise InputError(
                 f"{self.path}: joint {joint.name} is {joint.kind} and has no <limit lower= upper=>"
             )
-        lower = given.get("lower", 0.0)
-        upper = given.get("upper", 0.0)
+        lower = limits.get("lower", 0.0)
+        upper = limits.get("upper", 0.0)
         if lower > upper:
             raise InputError(
                 f"{self.path}: joint {joint.name}: lower limit {lower} is above upper {upper}; exchange them"
             )
-        velocity = given.get("velocity", 0.0)
+        velocity = limits.get("velocity", 0.0)
         if 0 < velocity < MIN_RATE:
             raise InputError(
                 f"{self.path}: joint {joint.name}: velocity limit is {velocity:g}; it must be at least "
@@ -441,7 +443,7 @@ class UrdfTree:
 
     def inertias(self, links: list[str]) -> dict[str, Inertia]:
         """Inertias of the links that have a mass. Physically impossible ones are left out, with a note."""
-        found = {}
+        inertias = {}
         for link in links:
             element = self.links[link].find("inertial")
             mass = None if element is None else element.find("mass")
@@ -455,10 +457,10 @@ class UrdfTree:
                 value, xx, xy, xz, yy, yz, zz = (self._numbers(text, 1, link)[0] for text in texts)
                 R = T[:3, :3]
                 moments = R @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ R.T
-                found[link] = inertia_of([value, *T[:3, 3], *moments[np.triu_indices(3)]])
+                inertias[link] = inertia_of([value, *T[:3, 3], *moments[np.triu_indices(3)]])
             except (InputError, ValueError):
                 self.notes.append(f"link {link} has a physically impossible inertia; left out")
-        return found
+        return inertias
 
     def geometry(self, links: list[str]) -> dict[str, tuple[ConvexMesh, ...]]:
         """Convex hulls of the links' collision elements, by link and in its frame.
@@ -515,10 +517,10 @@ class UrdfTree:
         """Corners of a polyhedron around a primitive."""
 
         def positive(name: str, count: int) -> Values:
-            what = f"link {link}: {shape.tag} {name}"
-            values = self._numbers(shape.get(name, ""), count, what)
+            location = f"link {link}: {shape.tag} {name}"
+            values = self._numbers(shape.get(name, ""), count, location)
             if (values < MIN_SIZE).any():
-                raise InputError(f"{self.path}: {what} is {shown(shape.get(name))}; it must be positive")
+                raise InputError(f"{self.path}: {location} is {shown(shape.get(name))}; it must be positive")
             return values
 
         if shape.tag == "box":
@@ -537,15 +539,15 @@ class UrdfTree:
 
     def _mesh(self, shape: ET.Element, link: str) -> Surface:
         file = self.packages.file(shape.get("filename", ""))
-        where = f"link {link}: mesh"
-        scale = self._numbers(shape.get("scale", "1 1 1"), 3, f"{where} scale")
+        location = f"link {link}: mesh"
+        scale = self._numbers(shape.get("scale", "1 1 1"), 3, f"{location} scale")
         if (np.abs(scale) < MIN_SIZE).any():
             raise InputError(
-                f"{self.path}: {where} scale is {shown(shape.get('scale'))}; its numbers must not be 0"
+                f"{self.path}: {location} scale is {shown(shape.get('scale'))}; its numbers must not be 0"
             )
         try:
             vertices, faces = read_triangles(file, merge=True, notes=self.notes)
-            vertices = points(where, "vertices", vertices * scale)
+            vertices = points(location, "vertices", vertices * scale)
         except InputError as error:
             raise InputError(f"{self.path}: {error}") from None
         if len(vertices) < 4:
