@@ -89,6 +89,9 @@ MAX_WRAPPED_STEP = 0.5
 
 T = TypeVar("T")
 R = TypeVar("R", bound="KinematicTree")
+JointArray = Float[ndarray, "*batch dof"]
+"""Values of the joints of a configuration, or of several."""
+JointMask = Bool[ndarray, "dof"]
 TURN = 2 * np.pi
 
 
@@ -182,11 +185,11 @@ class KinematicTree(Value):
         return tuple(joint.kind == "prismatic" for joint in self.planned_joints)
 
     @cached_property
-    def continuous(self) -> Bool[ndarray, "dof"]:
+    def continuous(self) -> JointMask:
         """Which planned joints rotate without limits, so that values one turn apart are equivalent."""
         return read_only(np.array([joint.kind == "continuous" for joint in self.planned_joints], dtype=bool))
 
-    def whole_turns(self, q: Float[ndarray, "*n dof"]) -> Float[ndarray, "*n dof"]:
+    def whole_turns(self, q: JointArray) -> JointArray:
         """The multiples of 2 pi to subtract so that continuous joints are within [-pi, pi]; 0 for others."""
         return np.where(self.continuous, TURN * np.round(q / TURN), 0.0)
 
@@ -197,7 +200,7 @@ class KinematicTree(Value):
         turns = self.whole_turns(steps)
         return np.where(np.abs(steps - turns) < MAX_WRAPPED_STEP, turns, 0.0)
 
-    def unwound(self, q: Float[ndarray, "*n dof"]) -> Float[ndarray, "*n dof"]:
+    def unwound(self, q: JointArray) -> JointArray:
         """Equivalent configurations in which joints with a range above one turn are within half a turn of the
         middle of their limits."""
         middle = 0.5 * (self.lower + self.upper)
@@ -225,7 +228,7 @@ class KinematicTree(Value):
         turns, to be as close to `start` as the limits allow."""
         return self._turned(q, start, self._turns_twice | self.continuous)
 
-    def _turned(self, q: ndarray, start: ndarray, joints: Bool[ndarray, "dof"]) -> ndarray:
+    def _turned(self, q: ndarray, start: ndarray, joints: JointMask) -> ndarray:
         """The configurations with whole turns added to these joints, to be as close to `start` as the limits
         allow."""
         limited = joints & ~self.continuous
@@ -234,7 +237,7 @@ class KinematicTree(Value):
         return np.where(limited & (nearest < self.lower), nearest + TURN, nearest)
 
     @cached_property
-    def _turns_twice(self) -> Bool[ndarray, "dof"]:
+    def _turns_twice(self) -> JointMask:
         return read_only((self.upper - self.lower > TURN) & ~np.array(self.prismatic, dtype=bool))
 
     @cached_property
@@ -349,10 +352,10 @@ class JointNormalizer:
         self.middle = (upper + lower) / 2
         self.half_range = (upper - lower) / 2
 
-    def to_unit(self, q: Float[ndarray, "*batch dof"]) -> Float[ndarray, "*batch dof"]:
+    def to_unit(self, q: JointArray) -> JointArray:
         """Joint values [rad] or [m] mapped to [-1, 1], of the same dtype."""
         return ((q - self.middle) / self.half_range).astype(q.dtype)
 
-    def from_unit(self, x: Float[ndarray, "*batch dof"]) -> Float[ndarray, "*batch dof"]:
+    def from_unit(self, x: JointArray) -> JointArray:
         """Joint values [rad] or [m] from values in [-1, 1], of the same dtype."""
         return (x * self.half_range + self.middle).astype(x.dtype)

@@ -21,7 +21,7 @@ from numpy import ndarray
 from scipy.optimize import linprog
 
 from robotdiffuse.core.bounds import for_kernels
-from robotdiffuse.core.types import Mask, Points, Poses, Spheres, Values
+from robotdiffuse.core.types import Configurations, Mask, Points, Poses, Spheres, Values
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose
 from robotdiffuse.robots.fitting.convex_parts import planes_of
@@ -74,7 +74,7 @@ class Links:
         """Balls [x y z radius] inside each part, by link [m]."""
         return {link: np.stack(balls) for link, balls in self._of_parts(_inner).items()}
 
-    def random(self, count: int, rng: np.random.Generator) -> Float[ndarray, "n d"]:
+    def random(self, count: int, rng: np.random.Generator) -> Configurations:
         """Uniform values of all joints within their limits."""
         return rng.uniform(self.lower, self.upper, (count, len(self.joints)))
 
@@ -84,7 +84,7 @@ class Links:
         rest = self.robot.locked | pose
         return np.array([rest.get(j.name, min(max(0.0, j.lower), j.upper)) for j in self.joints])
 
-    def stop_explains(self, joint: Joint, q: Float[ndarray, "n d"], colliding: Mask) -> bool:
+    def stop_explains(self, joint: Joint, q: Configurations, colliding: Mask) -> bool:
         """Whether a joint alone determines in which configurations two links collide, up to one of its
         stops."""
         if joint not in self.joints or joint.upper - joint.lower > MAX_STOPPED_RANGE:
@@ -97,7 +97,7 @@ class Links:
         variance = colliding.mean() * (1 - colliding.mean())
         return bool(max(often[0], often[-1]) > 0.99 and unexplained < MAX_UNEXPLAINED * variance)
 
-    def poses(self, q: Float[ndarray, "n d"], wanted: frozenset[str] | None = None) -> dict[str, Poses]:
+    def poses(self, q: Configurations, wanted: frozenset[str] | None = None) -> dict[str, Poses]:
         """T_base_link by link. With `wanted` links, only their relative poses, in the frame of some common
         link."""
         start, joints = (self.robot.base, self.robot.joints) if wanted is None else self._between(wanted)
