@@ -21,6 +21,7 @@ import argparse
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from math import ceil
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,6 +29,7 @@ import numpy as np
 from numpy import ndarray
 
 from common import WIDTH, draw_hard_cases, header, parse, parts_of, print_table
+from robotdiffuse.baselines.controls import ControlSettings
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core import tables
 from robotdiffuse.core.tables import Cell, Column, Table, show
@@ -36,10 +38,10 @@ from robotdiffuse.evaluation.methods import (
     NETWORK_ALONE,
     Draw,
     fields_of,
+    from_control,
     from_network,
     measure_of,
     sampled,
-    without_network,
 )
 from robotdiffuse.evaluation.runs import Clock, Fields, Method, Record, Run, run_all
 from robotdiffuse.evaluation.statistics import bootstrap_interval, wilson_interval
@@ -153,20 +155,26 @@ def network_methods(planner: RobotDiffuse, cases: list[Case]) -> dict[str, Draw]
 
 def controls(planner: RobotDiffuse, cases: list[Case]) -> dict[str, Draw]:
     """The network with guidance, and smooth noise with as many gradient steps and with as much CPU time."""
-    model = planner.model(PANDA)
-    assert model is not None
-    found = {"guided": from_network(planner)}
-    waypoints = model.settings.waypoints
-    found["control: smooth noise, as many gradient steps"] = without_network(planner.settings, waypoints)
-    steps = equal_time_steps(planner, waypoints, cases[:TIMED])
-    name = f"control: smooth noise, equal CPU time ({steps} gradient steps)"
-    return found | {name: without_network(planner.settings, waypoints, steps)}
+    settings = planner.settings
+    assert settings.sampling_steps is not None
+    as_many = settings.guidance_steps * ceil(settings.guided_share * settings.sampling_steps)
+    steps = equal_time_steps(planner, cases[:TIMED])
+    return {
+        "guided": from_network(planner),
+        "control: smooth noise, as many gradient steps": noise(planner, as_many),
+        f"control: smooth noise, equal CPU time ({steps} gradient steps)": noise(planner, steps),
+    }
 
 
-def equal_time_steps(planner: RobotDiffuse, waypoints: int, cases: list[Case]) -> int:
+def noise(planner: RobotDiffuse, steps: int) -> Draw:
+    """Smooth noise, as many candidates as the planner's, after gradient steps."""
+    return from_control(ControlSettings(samples=planner.settings.samples, guidance_steps=steps))
+
+
+def equal_time_steps(planner: RobotDiffuse, cases: list[Case]) -> int:
     """Gradient steps on smooth noise that take as much CPU time as a batch of the network under guidance."""
     few, many = TIMED_STEPS
-    draws = [from_network(planner), *(without_network(planner.settings, waypoints, n) for n in (few, many))]
+    draws = [from_network(planner), noise(planner, few), noise(planner, many)]
     seconds = np.zeros((TIMED_ROUNDS, len(cases), len(draws)))
     for turn in seconds:  # the first is left out: it loads and compiles
         for i, case in enumerate(cases):

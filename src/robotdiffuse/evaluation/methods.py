@@ -11,7 +11,6 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, replace
 from functools import lru_cache
-from math import ceil
 from pathlib import Path as FilePath
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -36,9 +35,8 @@ from robotdiffuse.evaluation.runs import (
     Method,
     Run,
 )
-from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.planning.diffusion import ModelSampler, encode
-from robotdiffuse.planning.hybrid import RobotDiffuseSettings, smooth_noise
+from robotdiffuse.planning.hybrid import RobotDiffuseSettings
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.held_out import goal_of
 from robotdiffuse.problems.problem import JointGoal, Problem
@@ -247,25 +245,5 @@ def from_control(settings: ControlSettings) -> Draw:
 
     def draw(run: Run, checker: CollisionChecker) -> ndarray:
         return control.candidates(run.problem.start, goal_of(run.problem)[None], checker, run.rng())
-
-    return draw
-
-
-def without_network(settings: RobotDiffuseSettings, waypoints: int, steps: int | None = None) -> Draw:
-    """The control without a network: smooth noise about the straight line, the noise that the model starts
-    from, after gradient steps of guidance.
-
-    steps: None: as many as guidance takes on a network's samples.
-    """
-    sampling_steps = settings.sampling_steps
-    assert sampling_steps is not None  # networks are sampled in a given number of steps
-    if steps is None:
-        steps = settings.guidance_steps * ceil(settings.guided_share * sampling_steps)
-
-    def draw(run: Run, checker: CollisionChecker) -> ndarray:
-        start = run.problem.start
-        goals = goal_of(run.problem)[None]
-        q = smooth_noise(start, goals, settings.samples, waypoints, run.problem.robot, run.rng())
-        return CollisionGuidance(checker, settings.guidance)(q, steps)[0] if steps else q
 
     return draw
