@@ -13,9 +13,16 @@ from hypothesis import strategies as st
 from helpers.box_arm import box_arm
 from helpers.example_robots import example_robot
 from robotdiffuse.certificates import bounds
-from robotdiffuse.certificates.bounds import SCENE, Prover, Stretches
+from robotdiffuse.certificates.bounds import (
+    CLEARANCE_CAP,
+    SCENE,
+    Obstacles,
+    Prover,
+    Rounded,
+    Stretches,
+    Surface,
+)
 from robotdiffuse.certificates.kinematics import Linkage
-from robotdiffuse.certificates.obstacles import CLEARANCE_CAP, Obstacles, Rounded, Surface
 from robotdiffuse.certificates.requirements import configurations, deviations
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Trajectory

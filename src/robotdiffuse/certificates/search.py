@@ -26,14 +26,15 @@ from robotdiffuse.certificates.bounds import (
     Part,
     Plane,
     Prover,
+    Rounded,
     Stretches,
+    Surface,
     gaps,
     placed,
 )
 from robotdiffuse.certificates.certificate import Certificate
 from robotdiffuse.certificates.checker import hash_of
 from robotdiffuse.certificates.kinematics import cubics_of, places_of
-from robotdiffuse.certificates.obstacles import Rounded, Surface
 from robotdiffuse.certificates.proof import (
     DECIMALS,
     StretchProof,

@@ -21,9 +21,9 @@ from robotdiffuse.planning.exploration.simulated import RecordedAct, RecordedExp
 from robotdiffuse.planning.exploration.steps import DONE, LOOK
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.visualization.arm import DrawnArm
-from robotdiffuse.visualization.camera import Camera, view_of_motion
 from robotdiffuse.visualization.picture import (
     MARGINS,
+    Camera,
     ClearSurface,
     PictureSettings,
     caption,
@@ -32,6 +32,7 @@ from robotdiffuse.visualization.picture import (
     render,
     save_png,
     tube,
+    view_of_motion,
 )
 from robotdiffuse.visualization.replay_page import page_data, page_shapes, page_text
 

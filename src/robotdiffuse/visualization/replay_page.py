@@ -44,14 +44,15 @@ from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud, Sphere, Triangulated
 from robotdiffuse.visualization.arm import DrawnArm, facts, interpolated, timed
-from robotdiffuse.visualization.camera import VERTICAL_FIELD, view_of_motion
 from robotdiffuse.visualization.picture import (
     MARGINS,
+    VERTICAL_FIELD,
     ClearSurface,
     PictureSettings,
     linear,
     render,
     tube,
+    view_of_motion,
     write_captioned,
 )
 

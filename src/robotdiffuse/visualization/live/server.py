@@ -21,7 +21,7 @@ from robotdiffuse.core.types import Configurations
 from robotdiffuse.drawables import drawables
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.visualization.arm import DrawnArm
-from robotdiffuse.visualization.camera import VERTICAL_FIELD, view_of_motion
+from robotdiffuse.visualization.picture import VERTICAL_FIELD, view_of_motion
 
 FLOOR_SIZE = 4.7
 """Edge length of the floor, as a multiple of the arm's reach."""
