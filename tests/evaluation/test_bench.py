@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -55,7 +54,7 @@ def settings(
     out: Path, planners: str = "rrt_connect", problems: str = "rop", count: int = 3
 ) -> BenchSettings:
     return BenchSettings(
-        tuple(planners.split(",")), tuple(problems.split(",")), out, time_limit=2.0, count=count
+        tuple(planners.split(",")), tuple(problems.split(",")), out, time_limit=20.0, count=count
     )
 
 
@@ -73,7 +72,7 @@ def test_records_hold_what_was_measured_and_are_not_made_twice(tmp_path: Path) -
     rows = read_records(tmp_path)
     assert list(rows) == [plain, with_settings], "a planner with settings is a row of its own"
     for records in rows.values():
-        assert keys(records) == {("rop", f"rop/{i}", seed, 2.0): 1 for i in range(2) for seed in range(2)}
+        assert keys(records) == {("rop", f"rop/{i}", seed, 20.0): 1 for i in range(2) for seed in range(2)}
     records = rows[plain]
     solved = [record for record in records if record.solved]
     runs = [json.loads(line) for line in (tmp_path / "runs.jsonl").read_text().splitlines()]
@@ -94,7 +93,6 @@ def test_records_hold_what_was_measured_and_are_not_made_twice(tmp_path: Path) -
 
 @pytest.fixture
 def faulty(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench, "GRACE", 6.0)
     monkeypatch.setitem(PLANNERS, "faulty", faulty_planner.ENTRY)
 
 
@@ -142,21 +140,23 @@ def test_a_metric_of_an_imported_module_is_measured(tmp_path: Path, monkeypatch:
 @pytest.mark.slow
 def test_killed_run_completes_without_repeating_or_losing_a_result(tmp_path: Path) -> None:
     arguments = ["bench", "run", "--planners", "rrt_connect,shared_tree_rrt_star", "--problems", "rop"]
-    arguments += ["--count", "3", "--time-limit", "2", "--workers", "2", "--out", str(tmp_path)]
+    arguments += ["--count", "3", "--time-limit", "20", "--workers", "2", "--out", str(tmp_path)]
     command = [sys.executable, "-m", "robotdiffuse", *arguments]
     run = subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL)
     first = tmp_path / "records" / "rrt_connect.jsonl"
-    until = time.monotonic() + 400
-    while not (first.is_file() and first.read_text().count("\n") >= 2):
-        assert run.poll() is None and time.monotonic() < until
-        time.sleep(0.02)
+
+    def half_done() -> bool:
+        assert run.poll() is None
+        return first.is_file() and first.read_text().count("\n") >= 2
+
+    waiting.until(half_done, 400.0)
     os.kill(run.pid, signal.SIGKILL)
     run.wait()
     before = {file: file.read_text() for file in (tmp_path / "records").iterdir()}
     assert main(arguments) == 0
     for file in (tmp_path / "records").iterdir():
         assert file.read_text().startswith(before.get(file, "").rpartition("\n")[0])
-        assert keys(RecordFile(file).records) == {("rop", f"rop/{i}", 0, 2.0): 1 for i in range(3)}
+        assert keys(RecordFile(file).records) == {("rop", f"rop/{i}", 0, 20.0): 1 for i in range(3)}
 
 
 def test_what_ended_by_itself_is_not_asked_again_with_more_time(tmp_path: Path) -> None:
@@ -195,7 +195,7 @@ def test_restarts_are_asked_for_where_time_is_left(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_planner_is_restarted_until_its_time_is_used_up(tmp_path: Path) -> None:
-    asked = replace(settings(tmp_path, "rrt_connect", "rop_nontrivial", count=2), time_limit=0.3)
+    asked = replace(settings(tmp_path, "rrt_connect", "rop_nontrivial", count=2), time_limit=2.0)
     assert run_bench(asked, quiet, quiet) == 2
     before = read_records(tmp_path)["rrt_connect"]
     assert run_bench(replace(asked, equal_time=True), quiet, quiet) == 2
@@ -207,7 +207,7 @@ def test_a_planner_is_restarted_until_its_time_is_used_up(tmp_path: Path) -> Non
         assert once.joint_length is not None and again.joint_length is not None
         assert again.joint_length <= once.joint_length
         assert again.progress[-1][1] == pytest.approx(again.joint_length, rel=1e-5)
-        assert list(again.progress) == sorted(again.progress) and again.progress[-1][0] <= 0.3 + LATE_SECONDS
+        assert list(again.progress) == sorted(again.progress) and again.progress[-1][0] <= 2.0 + LATE_SECONDS
         problem = held_out_problem("rop", int(again.name.partition("/")[2]))
         assert verify(problem, Motion(problem.robot.joint_names, again.waypoints)).valid
         assert not again.ended_by_itself

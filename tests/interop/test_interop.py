@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers import waiting
 from helpers.box_arm import box_arm
 from helpers.full_disk import full_disk
 from robotdiffuse.core.errors import InputError, OutputError
@@ -526,8 +527,6 @@ def test_motions_are_published_to_a_rosbridge(
     planned: tuple[Problem, Trajectory], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Subscribers had no time to match the publisher, which sent and ended at once."""
-    import time
-
     from robotdiffuse.interop import recorded_motion as module
 
     _, trajectory = planned
@@ -535,9 +534,7 @@ def test_motions_are_published_to_a_rosbridge(
     with rosbridge() as (port, heard):
 
         def wait(_: float) -> None:
-            end = time.monotonic() + 300
-            while len(heard) <= len(waited) and time.monotonic() < end:
-                time.sleep(0.01)
+            waiting.until(lambda: len(heard) > len(waited), 300.0)
             waited.append(heard[-1]["op"])
 
         monkeypatch.setattr(module, "sleep", wait)

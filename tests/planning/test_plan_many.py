@@ -27,10 +27,10 @@ def problems() -> list[rd.Problem]:
 
 def test_results_are_in_order_and_as_alone() -> None:
     counts: list[tuple[int, int]] = []
-    request = {"time_limit": 20.0, "seed": 3, "progress": lambda done, total: counts.append((done, total))}
+    request = {"time_limit": 300.0, "seed": 3, "progress": lambda done, total: counts.append((done, total))}
     results = list(rd.plan_many(problems(), "rrt_connect", workers=2, **request))
     assert counts == [(done, 6) for done in range(1, 7)]
-    alone = [RRTConnect().plan(problem, 20.0, seed=3) for problem in problems()]
+    alone = [RRTConnect().plan(problem, 300.0, seed=3) for problem in problems()]
     assert [result.status for result in results] == [rd.Status.SOLVED] * 5 + [rd.Status.INVALID_START]
     for together, one in zip(results[:5], alone, strict=False):
         assert together.path is not None and one.path is not None
@@ -39,8 +39,8 @@ def test_results_are_in_order_and_as_alone() -> None:
 
 def test_settings_may_be_a_table() -> None:
     problem = problems()[0]
-    [result] = rd.plan_many([problem], "aorrtc", {"range": 0.3}, workers=1, until="first", time_limit=5.0)
-    alone = rd.plan(problem, planner="aorrtc", settings={"range": 0.3}, until="first", time_limit=5.0)
+    [result] = rd.plan_many([problem], "aorrtc", {"range": 0.3}, workers=1, until="first", time_limit=300.0)
+    alone = rd.plan(problem, planner="aorrtc", settings={"range": 0.3}, until="first", time_limit=300.0)
     assert np.array_equal(result.path.positions, alone.path.positions)
 
 
@@ -51,7 +51,7 @@ def test_a_process_that_dies_costs_one_problem(monkeypatch: pytest.MonkeyPatch) 
     asked.insert(3, replace(asked[0], robot=replace(PANDA, name="unknown")))
     entry = Entry("helpers.deadly_planner:Deadly", "dies of it", "RRTConnectSettings", SEARCH)
     monkeypatch.setitem(PLANNERS, "deadly", entry)
-    results = list(rd.plan_many(asked, "deadly", workers=1, time_limit=20.0))
+    results = list(rd.plan_many(asked, "deadly", workers=1, time_limit=300.0))
     ends = [result.status for result in results]
     assert ends == [rd.Status.SOLVED, rd.Status.ERROR, rd.Status.SOLVED, rd.Status.ERROR, rd.Status.SOLVED]
     assert "died" in results[1].reason and "no such robot" in results[3].reason
@@ -78,7 +78,7 @@ def test_arguments_are_checked_at_once(arguments: dict, message: str) -> None:
 def test_robots_that_hold_something_go_to_processes_too() -> None:
     cup = rd.Cylinder([0, 0, 0.16], 0.03, 0.12, name="cup")
     held = [replace(problem, robot=PANDA.attach(cup, "panda_hand")) for problem in problems()[:2]]
-    results = list(rd.plan_many(held, "rrt_connect", workers=1, time_limit=20.0))
+    results = list(rd.plan_many(held, "rrt_connect", workers=1, time_limit=300.0))
     for problem, result in zip(held, results, strict=True):
         assert result.path is not None and rd.verify(problem, result.path).valid
 

@@ -203,5 +203,5 @@ def test_calls_while_the_first_process_starts_wait_for_it() -> None:
         starting = threading.Thread(target=workers.start)
         starting.start()
         time.sleep(0.1)
-        assert [workers.submit(abs, -i) for i in range(3)][2].result(60) == 2
+        assert [workers.submit(abs, -i) for i in range(3)][2].result(300) == 2
         starting.join()

@@ -64,5 +64,5 @@ def test_outside_a_notebook(result: rd.PlanResult, monkeypatch: pytest.MonkeyPat
 
 
 def test_results_of_many_know_their_problems(problem: rd.Problem) -> None:
-    [many] = rd.plan_many([problem], "aorrtc", workers=1, time_limit=5.0)
+    [many] = rd.plan_many([problem], "aorrtc", workers=1, until="first", time_limit=300.0)
     assert many.problem is problem

@@ -32,7 +32,7 @@ from robotdiffuse.visualization.live.session import NO_MOTION, VALID
 
 PATIENCE = 300.0
 """[s]; a new machine compiles first."""
-SETTINGS = ExplorerSettings(time_limit=0.5)
+SETTINGS = ExplorerSettings(time_limit=2.0)
 until = partial(waiting.state_when, patience=PATIENCE)
 
 

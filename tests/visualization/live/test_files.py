@@ -32,7 +32,7 @@ def test_problems_go_out_and_come_back(demo: Problem) -> None:
 
 
 def test_a_replay_holds_the_motion(demo: Problem) -> None:
-    result = load_planner("aorrtc").plan(demo, 5.0)
+    result = load_planner("aorrtc").plan(demo, 20.0)
     page = replay_page(demo, result).decode()
     assert page.startswith("<!doctype html>") and "bottle" in page and "src=" not in page
 

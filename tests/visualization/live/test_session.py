@@ -2,15 +2,14 @@
 
 import re
 import threading
-import time
 from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
 import pytest
 
+from helpers import waiting
 from helpers.slow_planner import SlowPlanner
-from helpers.waiting import state_when
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.registry import Entry
 from robotdiffuse.core.transforms import rotation_about, transform
@@ -43,7 +42,7 @@ START = np.array([0.0, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8])
 END = np.array([1.2, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8])
 PATIENCE = 300.0
 """Timeout [s]; a new machine compiles first."""
-until = partial(state_when, patience=PATIENCE)
+until = partial(waiting.state_when, patience=PATIENCE)
 
 
 def settled(state: State) -> bool:
@@ -59,7 +58,7 @@ def a_problem(shapes: tuple = ()) -> Problem:
 
 @pytest.fixture
 def session() -> Iterator[Session]:
-    session = Session(a_problem((Sphere([0.0, 0.0, 1.5], 0.05, "lamp"),)), PageOptions("aorrtc", 2.0))
+    session = Session(a_problem((Sphere([0.0, 0.0, 1.5], 0.05, "lamp"),)), PageOptions("aorrtc", 20.0))
     session.start()
     until(session, settled)
     yield session
@@ -202,12 +201,9 @@ def slow(monkeypatch: pytest.MonkeyPatch) -> type[SlowPlanner]:
 
 
 def test_the_latest_request_wins(slow: type[SlowPlanner]) -> None:
-    session = Session(a_problem((Sphere([0.0, 0.0, 1.5], 0.05, "lamp"),)), PageOptions("slow"))
+    session = Session(a_problem((Sphere([0.0, 0.0, 1.5], 0.05, "lamp"),)), PageOptions("slow", 20.0))
     session.start()
-    deadline = time.monotonic() + PATIENCE
-    while not slow.calls:
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
+    waiting.until(lambda: slow.calls, PATIENCE)
     for height in (1.6, 1.7, 1.8):
         session.move_obstacle("lamp", transform(np.array([0.0, 0.0, height])))
     for _ in range(2):
@@ -222,32 +218,27 @@ def test_the_latest_request_wins(slow: type[SlowPlanner]) -> None:
 
 
 def test_an_overtaken_plan_is_dropped_if_it_is_no_longer_free(slow: type[SlowPlanner]) -> None:
-    session = Session(a_problem((Sphere([0.0, 0.0, 1.5], 0.05, "lamp"),)), PageOptions("slow"))
+    session = Session(a_problem((Sphere([0.0, 0.0, 1.5], 0.05, "lamp"),)), PageOptions("slow", 20.0))
     session.start()
-    deadline = time.monotonic() + PATIENCE
-    while not slow.calls:
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
+    waiting.until(lambda: slow.calls, PATIENCE)
     middle = link_pose(session.state.problem.robot, 0.5 * (START + END), "panda_hand")
     session.move_obstacle("lamp", transform(middle[:3, 3]))
     slow.go.release()
-    deadline = time.monotonic() + PATIENCE
-    while len(slow.calls) < 2:
-        assert time.monotonic() < deadline
+
+    def called_again() -> bool:
         assert session.state.motion is None
-        time.sleep(0.005)
+        return len(slow.calls) == 2
+
+    waiting.until(called_again, PATIENCE)
     slow.go.release()
     assert validity(until(session, settled)).kind == VALID
     session.close()
 
 
 def test_a_plan_for_a_robot_that_has_gone_is_dropped(slow: type[SlowPlanner]) -> None:
-    session = Session(a_problem(), PageOptions("slow"))
+    session = Session(a_problem(), PageOptions("slow", 20.0))
     session.start()
-    deadline = time.monotonic() + PATIENCE
-    while not slow.calls:
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
+    waiting.until(lambda: slow.calls, PATIENCE)
     start = np.array([0.0, -1.2, 1.2, 0.0, 0.5, 0.0])
     session.open(Problem(load_robot("ur5"), Scene(), start, JointGoal(start + 0.2)))
     for _ in range(2):
@@ -258,7 +249,7 @@ def test_a_plan_for_a_robot_that_has_gone_is_dropped(slow: type[SlowPlanner]) ->
 
 
 def test_a_planner_that_breaks_costs_one_plan(slow: type[SlowPlanner]) -> None:
-    session = Session(a_problem((Sphere([0.0, 0.0, 1.5], 0.05, "broken"),)), PageOptions("slow"))
+    session = Session(a_problem((Sphere([0.0, 0.0, 1.5], 0.05, "broken"),)), PageOptions("slow", 20.0))
     session.start()
     shown = validity(until(session, settled))
     assert shown.kind == NO_MOTION and shown.lines == ("slow failed: RuntimeError: no such luck",)
@@ -270,7 +261,7 @@ def test_a_planner_that_breaks_costs_one_plan(slow: type[SlowPlanner]) -> None:
 def test_candidates_of_an_arm_without_weights_are_smooth_noise() -> None:
     start = np.array([0.0, -1.2, 1.2, 0.0, 0.5, 0.0])
     problem = Problem(load_robot("ur5"), Scene(), start, JointGoal(start + 0.4))
-    session = Session(problem, PageOptions("aorrtc", candidates=True))
+    session = Session(problem, PageOptions("aorrtc", 20.0, candidates=True))
     session.start()
     drawn = until(session, lambda state: state.candidates).candidates
     assert drawn is not None and drawn.source == "smooth_noise"
@@ -291,10 +282,7 @@ def test_latest_goes_on_after_an_error(caplog: pytest.LogCaptureFixture) -> None
 
     latest = LatestTask(do, "test")
     latest.submit(0)
-    deadline = time.monotonic() + PATIENCE
-    while "ZeroDivisionError" not in caplog.text:
-        assert time.monotonic() < deadline
-        time.sleep(0.002)
+    waiting.until(lambda: "ZeroDivisionError" in caplog.text, PATIENCE)
     latest.submit(1)
     assert done.wait(PATIENCE)
     latest.close()
@@ -316,10 +304,7 @@ def test_latest_drops_what_was_not_begun() -> None:
     for work in (2, 3, 4):
         latest.submit(work)
     go.set()
-    deadline = time.monotonic() + PATIENCE
-    while done != [1, 4]:
-        assert time.monotonic() < deadline
-        time.sleep(0.002)
+    waiting.until(lambda: done == [1, 4], PATIENCE)
     latest.close()
 
 

@@ -233,7 +233,7 @@ class AnytimeSearch:
                 self._lower_clearance(fallback)
         return self.best is not None
 
-    def improve(self, work: float) -> None:
+    def improve(self, work: int) -> None:
         """Search for shorter paths, for at most `work` more iterations, or until the path is optimal."""
         work_limit = self.work + work
         if self._untightened and self.best is not None:
