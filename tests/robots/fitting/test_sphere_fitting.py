@@ -8,7 +8,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.fitting.convex_parts import convex_hull
-from robotdiffuse.robots.fitting.preparation import hidden_by_neighbours, neighbours
+from robotdiffuse.robots.fitting.preparation import hidden_by_neighbors, neighbors
 from robotdiffuse.robots.fitting.sphere_fitting import (
     Bounds,
     Cells,
@@ -101,7 +101,7 @@ def test_what_is_finer_than_the_grid_is_covered_too(size: tuple[float, float, fl
     assert covered(meshes, spheres) and len(spheres) <= 210
 
 
-def test_what_neighbours_hide_wholly_is_covered_too() -> None:
+def test_what_neighbors_hide_wholly_is_covered_too() -> None:
     """Baxter's sonar ring is inside its torso; unlimited sphere sizes gave NaN."""
     solid = Solid.of((box((0.01, 0.01, 0.01)),), TOLERANCE)
     hidden = Bounds(TOLERANCE, lambda points: np.ones(len(points), dtype=bool))
@@ -163,11 +163,11 @@ def two_cylinders() -> Robot:
     return Robot("cans", "low", "high", (turn,), meshes={"low": (can,), "high": (can,)})
 
 
-def test_spheres_may_reach_into_a_neighbour() -> None:
+def test_spheres_may_reach_into_a_neighbor() -> None:
     robot = two_cylinders()
-    (beside,) = neighbours(robot, "low")
-    assert beside.link == "high" and len(beside.T_link_neighbour) > 1
-    hidden = hidden_by_neighbours(robot, "low")
+    (beside,) = neighbors(robot, "low")
+    assert beside.link == "high" and len(beside.T_link_neighbor) > 1
+    hidden = hidden_by_neighbors(robot, "low")
     assert hidden(np.array([[0, 0, 0.21], [0.03, 0, 0.25]])).all()
     assert not hidden(np.array([[0, 0, -0.02], [0.07, 0, 0.25]])).any()
     solid = Solid.of(robot.meshes["low"], TOLERANCE)
@@ -178,13 +178,13 @@ def test_spheres_may_reach_into_a_neighbour() -> None:
     assert stick_out(solid, spheres).max() > TOLERANCE
 
 
-def test_nothing_is_hidden_by_a_neighbour_that_turns_away() -> None:
+def test_nothing_is_hidden_by_a_neighbor_that_turns_away() -> None:
     robot = two_cylinders()
     swing = Joint(
         "turn", "revolute", "low", "high", transform(np.array([0, 0, 0.2])), np.array([0, 1.0, 0]), -1.0, 1.0
     )
     robot = Robot("cans", "low", "high", (swing,), meshes=robot.meshes)
-    assert not hidden_by_neighbours(robot, "low")(np.array([[0.04, 0, 0.23]])).any()
+    assert not hidden_by_neighbors(robot, "low")(np.array([[0.04, 0, 0.23]])).any()
 
 
 def test_bundled_panda_is_covered() -> None:

@@ -157,7 +157,7 @@ class ArmDistance:
         )
         self._kinematics = kinematics
         self._frame = torch.as_tensor(groups[groups > 0], device=kinematics.device).long()
-        self._centres = spheres[:, :3]
+        self._centers = spheres[:, :3]
         self._radii = spheres[:, 3]
 
     def __call__(
@@ -165,8 +165,8 @@ class ArmDistance:
     ) -> Float[Tensor, "n waypoints spheres"]:
         """D of the paper [m], negative inside; q in [rad]. A floor counts as the plane of its top."""
         T = self._kinematics(q)[..., self._frame, :3, :]
-        centres = (T[..., :3] * self._centres[:, None]).sum(-1) + T[..., 3]
-        at = centres.movedim(-1, 0).flatten(2).contiguous()
+        centers = (T[..., :3] * self._centers[:, None]).sum(-1) + T[..., 3]
+        at = centers.movedim(-1, 0).flatten(2).contiguous()
         obstacles = _obstacles(scenes).to(at)
         with torch.no_grad():  # only the distance to the nearest obstacle has a gradient
             slot, nearest_distance = _nearest(at, obstacles, scenes.kinds > 0)
@@ -178,16 +178,16 @@ class ArmDistance:
             top = torch.from_numpy(scenes.floors[:, 2] + scenes.floors[:, 5] / 2).to(at)[:, None]
             has_floor = torch.from_numpy(scenes.floors.any(1)).to(at.device)[:, None]
             distance = torch.where(has_floor, torch.minimum(distance, at[2] - top), distance)
-        return distance.view(centres.shape[:-1]) - self._radii
+        return distance.view(centers.shape[:-1]) - self._radii
 
 
 def _obstacles(scenes: PackedScenes) -> Float[Tensor, "16 n slots"]:
     """Center, half edges, radius and rotation of the obstacles; a sphere is a box of size 0 with a radius."""
     box = (scenes.kinds == BOX)[..., None]
     sphere = (scenes.kinds == SPHERE)[..., None]
-    centre, size, wxyz = np.split(scenes.params, (3, 6), -1)
+    center, size, wxyz = np.split(scenes.params, (3, 6), -1)
     rotation = rotation_from_quaternion(np.where(box, wxyz, [1, 0, 0, 0])).reshape(*scenes.kinds.shape, 9)
-    parts = centre, np.where(box, size / 2, 0), np.where(sphere, size[..., :1], 0), rotation
+    parts = center, np.where(box, size / 2, 0), np.where(sphere, size[..., :1], 0), rotation
     return torch.from_numpy(np.moveaxis(np.concatenate(parts, -1), -1, 0))
 
 
@@ -210,8 +210,8 @@ def _distance(
     at: Float[Tensor, "3 n points"], obstacles: Float[Tensor, "16 n #points"]
 ) -> Float[Tensor, "n points"]:
     """Signed distance of each point to one obstacle [m]."""
-    centre, half, radius, rotation = obstacles.split((3, 3, 1, 9))
-    local = ((at - centre)[:, None] * rotation.unflatten(0, (3, 3))).sum(0)
+    center, half, radius, rotation = obstacles.split((3, 3, 1, 9))
+    local = ((at - center)[:, None] * rotation.unflatten(0, (3, 3))).sum(0)
     outside = local.abs() - half
     away = (outside.clamp(min=0).square().sum(0) + EPSILON).sqrt()
     return away + outside.amax(0).clamp(max=0) - radius[0]

@@ -67,15 +67,15 @@ BOX_PADDING = 10 * GAP
 """Points further than this from a neighbor's bounding box are skipped, even near sharp edges [m]."""
 
 
-class Neighbour(NamedTuple):
+class Neighbor(NamedTuple):
     """A link that a joint connects to another one."""
 
     link: str
-    T_link_neighbour: Poses
+    T_link_neighbor: Poses
     """At joint values over the range of the joint between them; one pose if it is fixed."""
 
 
-def neighbours(robot: Robot, link: str) -> tuple[Neighbour, ...]:
+def neighbors(robot: Robot, link: str) -> tuple[Neighbor, ...]:
     """Links with geometry that a joint connects to this one; skips fixed links without geometry in
     between."""
     adjacent = []
@@ -95,24 +95,24 @@ def neighbours(robot: Robot, link: str) -> tuple[Neighbour, ...]:
         values = np.linspace(*ends, JOINT_SAMPLES) if joint.kind in MOVING_KINDS else [0.0]
         T = np.stack([T_above_parent @ joint.T_parent_joint @ joint.motion(float(q)) for q in values])
         next_link = joint.child if link == above else above
-        adjacent.append(Neighbour(next_link, T if link == above else np.stack([inverse(t) for t in T])))
+        adjacent.append(Neighbor(next_link, T if link == above else np.stack([inverse(t) for t in T])))
     return tuple(adjacent)
 
 
-def hidden_by_neighbours(robot: Robot, link: str) -> Callable[[Points], Mask]:
+def hidden_by_neighbors(robot: Robot, link: str) -> Callable[[Points], Mask]:
     """A function that tells which points, in the link's frame [m], are inside one neighbor at all joint
     values."""
-    neighbour_planes: list[tuple[Neighbour, tuple[ndarray, ndarray], Planes]] = []
-    for near_link in neighbours(robot, link):
+    neighbor_planes: list[tuple[Neighbor, tuple[ndarray, ndarray], Planes]] = []
+    for near_link in neighbors(robot, link):
         corners = np.concatenate([mesh.vertices for mesh in robot.meshes[near_link.link]])
         box = corners.min(0) - BOX_PADDING, corners.max(0) + BOX_PADDING
-        neighbour_planes.append((near_link, box, stacked_planes(robot.meshes[near_link.link])))
+        neighbor_planes.append((near_link, box, stacked_planes(robot.meshes[near_link.link])))
 
     def hidden(points: Points) -> Mask:
         hidden_points = np.zeros(len(points), dtype=bool)
-        for near_link, (low, high), planes in neighbour_planes:
+        for near_link, (low, high), planes in neighbor_planes:
             candidates = np.flatnonzero(~hidden_points)
-            for T in near_link.T_link_neighbour:
+            for T in near_link.T_link_neighbor:
                 local = (points[candidates] - T[:3, 3]) @ T[:3, :3]
                 near = ((local >= low) & (local <= high)).all(axis=1)
                 candidates = candidates[near]
@@ -241,7 +241,7 @@ class _Link:
             frame = robot.link_frame(self.name)
             self.solid = Solid.of(meshes, settings.tolerance(frame, robot.dof, np.inf))
             tolerance = settings.tolerance(frame, robot.dof, self.solid.depth)
-            hidden = hidden_by_neighbours(robot, self.name)
+            hidden = hidden_by_neighbors(robot, self.name)
             self.bounds = Bounds(tolerance, hidden, self.bounds.tight, _floor(robot, self.name))
         fit = fit_spheres(self.solid, self.bounds, np.random.default_rng(seed), settings)
         fit = np.round(fit, 6)  # as stored in the file, so that these values are checked

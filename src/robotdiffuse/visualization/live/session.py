@@ -521,11 +521,11 @@ def _why_not(state: State) -> str:
     return f"{state.answer.status.value}: {state.answer.reason}"
 
 
-def _distance(metres: float | None) -> str:
-    metres = metres or 0.0
-    if metres > CLEARANCE_CAP - 1e-4:
+def _distance(meters: float | None) -> str:
+    meters = meters or 0.0
+    if meters > CLEARANCE_CAP - 1e-4:
         return f"more than {CLEARANCE_CAP:g} m"
-    return f"{100 * metres:.1f} cm" if metres >= 0.01 else f"{1000 * metres:.1f} mm"
+    return f"{100 * meters:.1f} cm" if meters >= 0.01 else f"{1000 * meters:.1f} mm"
 
 
 def first_problem(file: str | None, robot: str | None) -> Problem:
