@@ -534,8 +534,7 @@ def plot_success_over_time(bench: Bench) -> str:
     return success_over_time(next(part for part in parts if part.name == POSE), list(plain_rows))
 
 
-@dataclass(frozen=True, eq=False)
-class Compared:
+class Compared(NamedTuple):
     """Motions of one problem."""
 
     case: Case

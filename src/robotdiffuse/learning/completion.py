@@ -7,7 +7,7 @@ Nothing here loads PyTorch. The network itself is in `completion_network`.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
 from typing import NamedTuple
 
@@ -147,6 +147,8 @@ OUT_OF_RANGE_SHARE = 0.5
 """Share of the noisy samples in which surfaces out of range return no depth, as with most real cameras."""
 MISSING_SHARE = 0.02
 """Share of the pixels without a return, anywhere, with noise of the usual strength."""
+NOISE_FIELDS = ("spread", "missing", "stray", "flying", "edge_missing", "grazing")
+"""Fields of the noise that its strength multiplies."""
 NO_FLOOR_SHARE = 0.1
 """Share of the samples without a floor: the arm stands on a pedestal."""
 
@@ -227,15 +229,8 @@ def draw_sample(families: Sequence[str], robot: Robot, rng: Generator) -> Sample
     if rng.random() < NOISE_SHARE:
         strength = 2 * rng.random()
         hide_far = rng.random() < OUT_OF_RANGE_SHARE
-        usual = DepthNoise()
-        noise = DepthNoise(
-            strength * usual.spread,
-            strength * MISSING_SHARE,
-            strength * usual.stray,
-            strength * usual.flying,
-            strength * usual.edge_missing,
-            grazing=strength * usual.grazing,
-        )
+        usual = replace(DepthNoise(), missing=MISSING_SHARE)
+        noise = replace(usual, **{name: strength * getattr(usual, name) for name in NOISE_FIELDS})
         views = [noise.applied(_without_infinity(view) if hide_far else view, rng) for view in views]
     seen, depth_behind = pack(observe(views, robot, q))
     return Sample(seen, depth_behind, pack_fine(true_voxels(scene)))

@@ -236,22 +236,15 @@ class Batch:
     scenes: PackedScenes
 
 
+@dataclass(frozen=True, eq=False)
 class Batches:
     """Draws training batches: rows of the data at random levels, half of them reversed, which are as good."""
 
-    def __init__(
-        self,
-        data: TrajectoryData,
-        model: MotionNetwork,
-        clearances: PackedClearanceFn,
-        trivial_share: float,
-        weight_limit: float | None,
-    ) -> None:
-        self.data = data
-        self.model = model
-        self.clearances = clearances
-        self.trivial_share = trivial_share
-        self.weight_limit = weight_limit
+    data: TrajectoryData
+    model: MotionNetwork
+    clearances: PackedClearanceFn
+    trivial_share: float
+    weight_limit: float | None
 
     def draw(self, count: int, rng: np.random.Generator) -> Batch:
         """A random batch."""

@@ -117,10 +117,8 @@ class Processes:
 
     def share(self, value: Value | None) -> Value:
         """The first process's value; the values of the others are ignored."""
-        from accelerate.utils import broadcast_object_list
-
-        values: list[Any] = [value]
-        return broadcast_object_list(values)[0]
+        found: Any = self.gather(value)[0]
+        return found
 
     def first_goes_first(self) -> AbstractContextManager[None]:
         """A context that the first process of each machine passes before the others, which read what it

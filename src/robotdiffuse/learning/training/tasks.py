@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import fields
+from functools import partial
 from pathlib import Path as FilePath
 from typing import Any, ClassVar
 
@@ -185,38 +186,27 @@ def planning_success(
 
     nan if the data hold no such problem.
     """
-    rows = np.flatnonzero(~data.trivial)[:problems].tolist()
-    free = [_sampled_free(model, robot, data, row, candidates, rng).mean() for row in rows]
+    settings = SamplingSettings(samples=candidates, sampling_steps=min(SAMPLING_STEPS, model.schedule.steps))
+    free = []
+    for row in np.flatnonzero(~data.trivial)[:problems].tolist():
+        start, *_, goal = data.q[row].astype(np.float64)
+        checker = CollisionChecker(robot, data.scenes.scene(row))
+        code = np.zeros(0)
+        guide = None
+        if data.codes is not None:
+            code = data.codes[row]
+        elif model.encoder is not None:
+            code = encode_scenes(model.encoder, data.scenes[row : row + 1], rng)[0]
+        if model.encoder is None:
+            guide = partial(_guided, CollisionGuidance(checker))
+        clearances = link_clearances(checker, model.settings)
+        q = model.sample(start, goal, code.astype(np.float32), clearances, rng, settings, guide)
+        free.append(free_in_scene(checker, q).mean())
     return float(np.mean(free)) if free else float("nan")
 
 
-def _sampled_free(
-    model: MotionNetwork,
-    robot: Robot,
-    data: TrajectoryData,
-    row: int,
-    candidates: int,
-    rng: np.random.Generator,
-) -> Bool[ndarray, "candidates"]:
-    q = data.q[row]
-    checker = CollisionChecker(robot, data.scenes.scene(row))
-    code = np.zeros(0)
-    if data.codes is not None:
-        code = data.codes[row]
-    elif model.encoder is not None:
-        code = encode_scenes(model.encoder, data.scenes[row : row + 1], rng)[0]
-    guidance = CollisionGuidance(checker)
-
-    def guide(q: ndarray, _level: float) -> ndarray:
-        return guidance(q, PRIOR_GUIDANCE_STEPS)[0]
-
-    start = q[0].astype(np.float64)
-    goal = q[-1].astype(np.float64)
-    clearances = link_clearances(checker, model.settings)
-    settings = SamplingSettings(samples=candidates, sampling_steps=min(SAMPLING_STEPS, model.schedule.steps))
-    guided = guide if model.encoder is None else None
-    q = model.sample(start, goal, code.astype(np.float32), clearances, rng, settings, guided)
-    return free_in_scene(checker, q)
+def _guided(guidance: CollisionGuidance, q: ndarray, _level: float) -> ndarray:
+    return guidance(q, PRIOR_GUIDANCE_STEPS)[0]
 
 
 def free_in_scene(checker: CollisionChecker, q: Float[ndarray, "n waypoints dof"]) -> Bool[ndarray, "n"]:
