@@ -25,6 +25,7 @@ import numpy as np
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import FIRST, Configurations, Status
+from robotdiffuse.perception.camera_calibration import camera_note
 from robotdiffuse.perception.depth_filter import measured_share
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
 from robotdiffuse.perception.observed_volume import ObservedVolume, observe
@@ -96,6 +97,7 @@ def plan_with_unknown_space(
         exported_completion()  # loaded before the clock starts
     else:
         predict = None
+    cameras = [camera_note(view, problem.robot, problem.start) for view in problem.views]
     context = PlanningContext(solver.name, problem, request)
     volume = None
     if unknown is None:
@@ -107,6 +109,9 @@ def plan_with_unknown_space(
     if shares and max(shares) < MIN_MEASURED_SHARE:
         why = "the views measured nothing: hardly a pixel has a return; is the camera covered or broken?"
         return _with_notes(context, context.fail(Status.NO_PATH, why))
+    for i, wrong in enumerate(cameras):
+        if wrong:
+            context.note(f"check the camera of views[{i}]: {wrong}")
     for i, share in enumerate(shares):
         if share < NOTED_SHARE:
             context.note(

@@ -1,0 +1,86 @@
+"""A camera checked against the arm in its image, which is drawn by balls on the surfaces of its meshes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
+
+import robotdiffuse as rd
+from robotdiffuse.perception.camera_calibration import OPTICAL, agreement, camera_note, offset
+from robotdiffuse.perception.depth_view import DepthNoise
+from robotdiffuse.perception.ray_caster import looking_at, ray_cast, render_depth
+from robotdiffuse.perception.visibility import surface_balls
+
+PANDA = rd.load_robot("panda")
+HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
+SCENE = rd.Scene([rd.Box((0, 0, -0.05), (4, 4, 0.1)), rd.Box((0.6, 0.4, 0.2), (0.3, 0.3, 0.4))])
+K = (230.0, 230.0, 159.5, 119.5)
+T = looking_at(np.array([1.2, -0.8, 0.9]), np.array([0.2, 0.0, 0.4]))
+
+
+def seen(q: ndarray, seed: int = 0) -> rd.DepthView:
+    """The image that a sensor with correlated noise has of the arm and the scene."""
+    view = ray_cast(SCENE, T, K, (320, 240))
+    balls = surface_balls(PANDA, q)
+    rows = np.zeros((len(balls), 16), np.float32)
+    rows[:, :3] = balls
+    rows[:, 3:12] = np.eye(3).ravel()
+    rows[:, [12, 15]] = 0.0035
+    depth = np.where(np.isfinite(view.depth), view.depth, 9.0).astype(np.float32)
+    intrinsics = np.array(K, np.float32)
+    render_depth(np.zeros(len(balls), np.int64), rows, intrinsics, T.astype(np.float32), depth)
+    clean = replace(view, depth=np.where(depth < 4.0, depth, np.inf), configuration=q)
+    return DepthNoise(0.003, correlation=1.5, zeros=True).applied(clean, np.random.default_rng(seed))
+
+
+VIEW = seen(HOME)
+
+
+def test_nothing_is_said_of_a_camera_as_stated() -> None:
+    share, cells = agreement(VIEW, PANDA, HOME)
+    assert share > 0.7 and cells > 100 and camera_note(VIEW, PANDA, HOME) == ""
+    away = replace(VIEW, T_base_camera=looking_at(np.array([1.2, 0.0, 0.5]), np.array([3.0, 0.0, 0.5])))
+    empty = replace(away, depth=np.full_like(VIEW.depth, 3.0))
+    assert camera_note(empty, PANDA, HOME) == "", "the arm is not in the image"
+
+
+@pytest.mark.parametrize(
+    ("pose", "name"),
+    [
+        (np.linalg.inv(T), "is the inverse, T_camera_base"),
+        (T @ np.linalg.inv(OPTICAL), "of the camera's body"),
+        (T @ OPTICAL, "turned into the optical frame twice"),
+        (T @ np.diag([1.0, -1, -1, 1]), "as OpenGL"),
+    ],
+)
+def test_mistakes_in_poses_are_named(pose: ndarray, name: str) -> None:
+    """Planned on without a note, with points of walls and arm anywhere."""
+    wrong = replace(VIEW, T_base_camera=pose)
+    assert name in camera_note(wrong, PANDA, HOME)
+    result = rd.load_planner("aorrtc").plan(rd.Problem(PANDA, rd.Scene([]), HOME, HOME + 0.1, views=[wrong]))
+    assert any(name in note for note in result.notes)
+
+
+def test_intrinsics_of_another_image_are_named() -> None:
+    fx, fy, cx, cy = K
+    wrong = replace(VIEW, intrinsics=(1.5 * fx, 1.5 * fy, 1.5 * cx, 1.5 * cy))
+    assert "intrinsics are those of an image 1.5 times as wide" in camera_note(wrong, PANDA, HOME)
+
+
+def test_the_pose_is_estimated_from_views_of_the_arm() -> None:
+    configurations = [
+        HOME + turn for turn in ([0.0] * 7, [0.5, 0.2, 0, 0.4, 0, 0, 0], [-0.6, 0.4, 0, 0.5, 0, 0, 0])
+    ]
+    off = T.copy()
+    off[:3, 3] += [0.02, -0.015, 0.01]
+    off[:3, :3] = Rotation.from_rotvec([0.02, -0.03, 0.02]).as_matrix() @ T[:3, :3]
+    views = [replace(seen(np.array(q), i), T_base_camera=off) for i, q in enumerate(configurations)]
+    found = rd.calibrate_camera(views, PANDA)
+    position, angle = offset(T, found.T_base_camera)
+    assert position < 0.012 and angle < 0.01, "from 27 mm and 2.4 degrees off"
+    stated = found.pose_deviation
+    assert position < 2 * stated[0] and angle < 2 * stated[1] and stated[0] < 0.04
+    with pytest.raises(rd.InputError, match="configuration"):
+        rd.calibrate_camera([replace(VIEW, configuration=None)], PANDA)
