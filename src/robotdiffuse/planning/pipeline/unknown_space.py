@@ -25,7 +25,7 @@ import numpy as np
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import FIRST, Configurations, Status
-from robotdiffuse.perception.camera_calibration import camera_note
+from robotdiffuse.perception.camera_check import camera_note
 from robotdiffuse.perception.depth_filter import measured_share
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
 from robotdiffuse.perception.observed_volume import ObservedVolume, observe
