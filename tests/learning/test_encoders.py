@@ -222,7 +222,7 @@ def test_compression_autoencoder_has_the_papers_layers():
     for network, wanted in ((encoder.encoder, sizes), (encoder.decoder, sizes[::-1])):
         linear = [layer for layer in network if isinstance(layer, torch.nn.Linear)]
         assert [linear[0].in_features, *(layer.out_features for layer in linear)] == wanted
-    assert [tuple(w.shape) for w in encoder.penalised()] == [(786, 4200), (512, 786), (256, 512), (60, 256)]
+    assert [tuple(w.shape) for w in encoder.penalized()] == [(786, 4200), (512, 786), (256, 512), (60, 256)]
 
 
 def test_arranged_clouds():

@@ -103,7 +103,7 @@ class Autoencoder(Encoder):
         """Loss of the reconstruction, and its errors by name [m]."""
 
     @abstractmethod
-    def penalised(self) -> Iterable[Tensor]:
+    def penalized(self) -> Iterable[Tensor]:
         """The weights theta of the paper's regularizer, lambda * sum theta^2."""
 
 
@@ -174,7 +174,7 @@ class CompressionAutoencoder(Autoencoder):
             error = (self.decode(self.encoder(points.flatten(1))) - points).square().sum(-1).mean()
         return error, {"reconstruction": error.item() ** 0.5}
 
-    def penalised(self) -> Iterable[Tensor]:
+    def penalized(self) -> Iterable[Tensor]:
         """The encoder's weights.
 
         The equation has (theta^2_ij)^2, which literally is a sum of fourth powers. MPNet's equation has the
@@ -298,7 +298,7 @@ class PointAutoencoder(Autoencoder):
             1,
         )
 
-    def penalised(self) -> Iterable[Tensor]:
+    def penalized(self) -> Iterable[Tensor]:
         """All parameters."""
         return self.parameters()
 

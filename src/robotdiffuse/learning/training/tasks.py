@@ -100,7 +100,7 @@ class _EncoderTask(TrainingTask):
             else max_points
         )
         error, _ = self._reconstruction(settings.batch, points, rng)
-        theta = torch.stack([p.square().sum() for p in module.penalised()]).sum()
+        theta = torch.stack([p.square().sum() for p in module.penalized()]).sum()
         return error + REGULARIZATION * theta
 
     def validate(self, fraction: float) -> Validation:
