@@ -198,6 +198,7 @@ def test_it_comes_back_after_the_server_restarts(browser: Any, live: "tuple[Page
     from robotdiffuse.visualization.live.server import PageServer, free_port
 
     view = browser.new_page(viewport={"width": 500, "height": 400})
+    view.set_default_timeout(PATIENCE)
     number = 0
     for planner in ("aorrtc", "rrt_connect"):
         server = PageServer("127.0.0.1", free_port("127.0.0.1", number))
