@@ -160,6 +160,20 @@ def of_another_size(messages: dict[str, Any]) -> None:
     messages["/camera/camera_info"][0]["width"] = 3
 
 
+def test_an_image_without_a_joint_state_leaves_the_rest(tmp_path: Path) -> None:
+    """It ended the reading for good."""
+
+    def early_too(messages: dict[str, Any]) -> None:
+        [image] = messages["/camera/image_rect"]
+        early = image | {"header": image["header"] | {"stamp": {"sec": 0, "nanosec": 0}}}
+        early["header"]["stamp"]["nanosec"] = 5 * 10**8
+        messages["/camera/image_rect"] = [early, image | {"encoding": "mono16"}]
+
+    [(stamp, view)] = read_depth_views(recording(tmp_path / "r.mcap", early_too), PANDA)
+    assert stamp == pytest.approx(1.05)
+    np.testing.assert_allclose(view.depth, [[0.5, 0.0], [1.5, 2.0]], rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -65,7 +65,8 @@ def test_depth_files(tmp_path: Path) -> None:
     Image.fromarray(image).save(tmp_path / "a.png")
     np.save(tmp_path / "a.npy", image / 1000)
     np.savez(tmp_path / "a.npz", depth=image, other=image)
-    for name in ("a.png", "a.npy", "a.npz"):
+    np.save(tmp_path / "one.npy", image[:, :, None] / 1000)
+    for name in ("a.png", "a.npy", "a.npz", "one.npy"):
         assert np.allclose(read_depth(tmp_path / name), image / 1000)
     assert np.allclose(read_depth(tmp_path / "a.png", 0.0001), image / 10000)
     Image.fromarray(image.astype(np.uint8)).save(tmp_path / "gray.png")

@@ -32,7 +32,7 @@ from robotdiffuse.robots.robot import Robot
 IMAGE = "sensor_msgs/msg/Image"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
-ENCODINGS = {"32FC1": ("f4", 1.0), "16UC1": ("u2", 0.001)}
+ENCODINGS = {"32FC1": ("f4", 1.0), "16UC1": ("u2", 0.001), "mono16": ("u2", 0.001)}
 """Types of the pixels of depth images, and meters per unit (REP 118)."""
 Stamped = TypeVar("Stamped", bound=tuple[float, Any])
 MAX_SIZE = 64 * 10**9
@@ -124,19 +124,19 @@ def read_depth_views(
 ) -> Iterator[StampedView]:
     """Read the depth images of a recording, as `Explorer.observe` takes them.
 
-    They come in the order of their log times. Images must be rectified. The camera's pose and the arm's
+    They come in the order of their log times. Images without joint states or transforms within 0.1 s are left
+    out. Images must be rectified. The camera's pose and the arm's
     configuration are interpolated to the stamp of each.
 
     Args:
         file: An .mcap file.
         robot: The robot whose joint states it holds.
-        topics: Topics of the images; None: all with depth images (32FC1 in m, 16UC1 in mm).
+        topics: Topics of the images; None: all with depth images (32FC1 in m, 16UC1 or mono16 in mm).
         base: The frame of the arm's base in the file; None: `robot.base`.
 
     Raises:
-        InputError: For a file that is damaged or holds no depth images, images without joint states or
-            transforms
-            within 0.1 s, and distorted or compressed images.
+        InputError: For a file that is damaged or holds no depth images, if no image has joint states and
+            transforms within 0.1 s, and for distorted or compressed images.
     """
     path = input_file(file, largest=MAX_SIZE)
     with reading(file):
@@ -165,16 +165,25 @@ def _read(path: Path, robot: Robot, topics: Sequence[str] | None, base: str) -> 
                 for one in message.transforms:
                     transforms.add(to_plain(one), static=topic.endswith("static"))
         has_images = False
+        has_views = False
+        reason: InputError | None = None
         for topic, at, message in messages_in(reader, kinds, images):
             if message.encoding not in ENCODINGS and topics is None:
                 continue
             has_images = True
             stamp = _seconds(message, at)
             location = f"the image of {topic} at {stamp:.3f} s"
-            T = transforms.at(base, message.header.frame_id, stamp, MAX_GAP, location)
+            try:
+                T = transforms.at(base, message.header.frame_id, stamp, MAX_GAP, location)
+                q = states.at(stamp, location)
+            except InputError as error:
+                reason = reason or error
+                continue
+            has_views = True
             intrinsics = _intrinsics(topic, infos.get(_folder(topic)), message)
-            view = DepthView(_depth(location, message), intrinsics, T, states.at(stamp, location))
-            yield StampedView(stamp, view)
+            yield StampedView(stamp, DepthView(_depth(location, message), intrinsics, T, q))
+    if reason is not None and not has_views:
+        raise reason
     if not has_images:
         listed = ", ".join(f"{topic} ({schema.name})" for topic, schema in kinds.items()) or "none"
         raise InputError(f"{path} holds no depth images (32FC1 or 16UC1); topics: {listed}")

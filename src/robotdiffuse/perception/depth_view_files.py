@@ -48,6 +48,8 @@ def read_depth(file: str | Path, scale: float | None = None) -> Float[ndarray, "
     except Exception as error:  # the libraries raise many kinds of errors for damaged files
         raise InputError(f"depth image {file} cannot be read: {shortened(str(error))}") from None
     _check_size(file, image.size)
+    if image.ndim == 3 and image.shape[2] == 1:
+        image = image[:, :, 0]
     if image.ndim != 2 or image.dtype.kind not in "uif":
         form = " x ".join(map(str, image.shape))
         raise InputError(
