@@ -247,7 +247,7 @@ def shade(image, lattice, spacing, near, seen, camera, ground, background, sky, 
 def blend_ghost(image, solid, near, seen, camera, toward, tint, alpha):
     """Blend one see-through arm over the image: its nearest surface, more opaque where it is seen edge-on."""
     h, w = near.shape
-    ident, _, faces, _, colors = seen
+    ident, _, faces, normals, colors = seen
     for row in range(h):
         for column in range(w):
             # It must be slightly nearer than the solid arm: links that only turn about their axis coincide.
@@ -255,9 +255,12 @@ def blend_ghost(image, solid, near, seen, camera, toward, tint, alpha):
                 continue
             _, ray, n, weights, _ = _surface(row, column, near, seen, camera, -np.inf)
             facing = _dot(n, ray) / np.sqrt(_dot(ray, ray))
-            bright = 0.62 + 0.38 * max(0.0, _dot(n, toward))
+            corners = _row(faces, ident[row, column])
+            outward = _mixed(normals, corners, weights)  # n points to the eye
+            length = np.sqrt(_dot(outward, outward)) + 1e-9
+            bright = 0.62 + 0.38 * max(0.0, _dot(outward, toward) / length)
             cover = min(1.0, alpha * (0.7 + 1.1 * (1 - abs(facing)) ** 2))
-            base_color = _mixed(colors, _row(faces, ident[row, column]), weights)
+            base_color = _mixed(colors, corners, weights)
             for c in range(3):
                 value = bright * tint[c] * (0.45 + 0.55 * base_color[c])
                 image[row, column, c] += cover * (value - image[row, column, c])
