@@ -51,7 +51,7 @@ def live() -> Iterator["tuple[Page, str]"]:
     from robotdiffuse.visualization.live.server import PageServer, free_port
 
     server = PageServer("127.0.0.1", free_port("127.0.0.1", 0))
-    page = Page(Session(first_problem(None, None), PageOptions("aorrtc", 20.0)), server)
+    page = Page(Session(first_problem(None, None), PageOptions("aorrtc", 10.0)), server)
     # in whichever test a worker begins, it compiles here: later waits are for the page alone
     until(lambda: page.session.state.motion is not None, patience=COMPILING / 1000)
     yield page, server.url
@@ -202,7 +202,7 @@ def test_it_comes_back_after_the_server_restarts(browser: Any, live: "tuple[Page
     number = 0
     for planner in ("aorrtc", "rrt_connect"):
         server = PageServer("127.0.0.1", free_port("127.0.0.1", number))
-        page = Page(Session(live[0].session.state.problem, PageOptions(planner, 20.0)), server)
+        page = Page(Session(live[0].session.state.problem, PageOptions(planner, 10.0)), server)
         if not number:
             number = server.get_port()
             view.goto(server.url)
