@@ -14,6 +14,7 @@ from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.loading import loading
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Configuration, Configurations, Status
+from robotdiffuse.perception.depth_view import SeenPoints
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, OneGoal, PoseGoal, PosesGoal, poses_of
 from robotdiffuse.problems.units import arm_in_cloud_note
@@ -433,4 +434,7 @@ def _explained(robot: Robot, scene: Scene, q: Configuration) -> str | None:
     with loading():
         from robotdiffuse.collision.exact_meshes import explain_collision
 
-    return explain_collision(robot, scene, q)
+    message = explain_collision(robot, scene, q)
+    if message and any(isinstance(shape, SeenPoints) and shape.name in message for shape in scene.shapes):
+        return f"{message}; these points may be the arm's own: state the view's noise and pose_deviation"
+    return message

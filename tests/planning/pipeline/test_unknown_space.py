@@ -13,6 +13,7 @@ from numpy import ndarray
 import robotdiffuse as rd
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.types import FIRST
+from robotdiffuse.perception.depth_view import SeenPoints
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
 from robotdiffuse.perception.unknown_space import (
@@ -227,3 +228,9 @@ def test_confidence_falls_with_what_rays_do_not_tell(planner: Planner) -> None:
     blind = plan_with_unknown_space(planner, partial("optimistic", away), REQUEST)
     assert blind.confidence is not None and blind.confidence <= 0.5
     assert any("see nothing of the motion's way" in note for note in blind.notes)
+
+
+def test_points_that_may_be_the_arms_own_are_said_to_be(planner: Planner) -> None:
+    inside = SeenPoints(placed_spheres(PANDA, GOAL)[-30:, :3], 0.001, name="seen_at_ends")
+    result = planner.plan(rd.Problem(PANDA, rd.Scene([inside]), START, GOAL), time_limit=4.0)
+    assert result.status is rd.Status.INVALID_GOAL and "may be the arm's own" in result.reason
