@@ -440,7 +440,7 @@ class TrainingRun:
 
     def _restore(self, check: bool) -> None:
         try:
-            state = torch.load(self._file, self.processes.device, weights_only=True)
+            state = torch.load(self._file, "cpu", weights_only=True)
             notes = json.loads(state["notes"])
             if check:
                 self._check_same(notes)
