@@ -128,3 +128,20 @@ def test_a_moved_base_keeps_obstacles_held_objects_and_allowed_contacts() -> Non
     assert made.workspace.scene.allowed_contacts == (("block", (HAND,)),)
     assert np.allclose(made.workspace.scene.shapes[0].center, [0.4, 0.0, -0.2])
     assert len(made.workspace.robot.attached) == 1
+
+
+def test_a_line_to_the_edge_of_reach_ends_tilted_with_a_note() -> None:
+    made = planner()
+    q = np.array([-0.23, 0.58, 0.0, -1.27, 0.0, 1.84, 0.56])
+    far = made.workspace.pose(q)
+    far[:3] = rd.pose([0.777, -0.226, 0.122], rpy=[np.pi, 0.0, 0.0])[:3]
+    assert not len(made.workspace.ik(far))
+    result = made.plan_screw(far, q, planning_time=10.0)
+    assert result["status"] == "Success" and "out of reach; the motion ends tilted by" in result["note"]
+    end = tip(made, result["position"][-1])
+    assert np.allclose(end[:3, 3], far[:3, 3], atol=1e-3)
+    assert 0.01 < np.arccos(end[2, 2] * far[2, 2]) < np.radians(15)
+    far[0, 3] = 1.2
+    assert (
+        "out of reach" in made.plan_screw(far, q)["status"] or "brings" in made.plan_screw(far, q)["status"]
+    )

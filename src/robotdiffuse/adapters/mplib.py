@@ -15,11 +15,13 @@ from typing import Any
 import numpy as np
 from numpy import ndarray
 from numpy.typing import ArrayLike
+from scipy.optimize import least_squares
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.transforms import inverse, pose
+from robotdiffuse.core.transforms import inverse, pose, rotation_about, transform
 from robotdiffuse.planning.workspace import Workspace
+from robotdiffuse.problems.compiled_constraints import rotation_vector
 from robotdiffuse.problems.goals import JointGoal
 from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.bodies import RigidShape
@@ -27,11 +29,14 @@ from robotdiffuse.robots.fitting.preparation import add_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.robot_folder import ROBOT_FILE, user_robots
 from robotdiffuse.scenes.shapes import Box, Mesh, PointCloud, Sphere
+from robotdiffuse.validation.tolerances import DEFAULT
 
 SUCCESS = "Success"
 CLOUD = "point_cloud"
 HELD = "attached"
 DEFAULT_ACCELERATION = 3.5  # with more, controllers of simulators lag behind [rad/s²]
+TILT_WEIGHT = 0.01  # of rotation beside position, where poses are out of reach [m/rad]
+TILT_MARGIN = 1.25  # of the least tilt with which a position is in reach: there the arm is stretched
 HELD_JOINT_STEP = 0.002  # grippers are held at multiples of this [rad] or [m]
 
 
@@ -189,7 +194,8 @@ class Planner:
                 are ignored.
 
         Returns:
-            `status`, "Success" or the reason; and `time`, `position`, `velocity`, `acceleration`, `duration`.
+            `status`, "Success" or the reason; and `time`, `position`, `velocity`, `acceleration`,
+            `duration`, `note`.
         """
         goal = self._in_world(goal_pose, options)
         return self._planned("planning failed", partial(self.workspace.plan, goal), current_qpos, options)
@@ -202,10 +208,25 @@ class Planner:
         return self._planned("planning failed", plan, current_qpos, options)
 
     def plan_screw(self, target_pose: Any, qpos: ArrayLike, *_: Any, **options: Any) -> dict[str, Any]:
-        """Move along a straight line, turning evenly; see `plan_pose`."""
+        """Move along a straight line, turning evenly; see `plan_pose`.
+
+        Where the arm reaches the position only with a tilt of less than 15 degrees, it moves there so, and
+        `note` says how far it is tilted.
+        """
+        T = self._in_world(target_pose, options)
 
         def plan(start: ndarray, **request: Any) -> PlanResult:
-            return self.workspace.plan_line(self._in_world(target_pose, options), start, **request)
+            result = self.workspace.plan_line(T, start, **request)
+            if result.solved or len(self.workspace.ik(T, near=start, count=1)):
+                return result
+            tilt = self._tilt(T, start)
+            angle = np.linalg.norm(tilt)
+            if angle > DEFAULT.goal_angle:
+                return result
+            turned = transform(T[:3, 3], rotation_about(tilt / angle, angle) @ T[:3, :3])
+            tilted = self.workspace.plan_line(turned, start, **request)
+            note = f"the pose is out of reach; the motion ends tilted by {np.degrees(angle):.1f} degrees"
+            return replace(tilted, notes=(*tilted.notes, note)) if tilted.solved else result
 
         return self._planned("screw plan failed", plan, qpos, options)
 
@@ -246,7 +267,23 @@ class Planner:
             "velocity": state.velocities,
             "acceleration": state.accelerations,
             "duration": trajectory.duration,
+            "note": "\n".join(result.notes),
         }
+
+    def _tilt(self, T_world_tip: ndarray, start: ndarray) -> ndarray:
+        """Rotation vector, a little longer than necessary, with which the position is in reach."""
+
+        def off(q: ndarray) -> ndarray:
+            T = self.workspace.pose(q)
+            turn = rotation_vector(T[:3, :3] @ T_world_tip[:3, :3].T)
+            return np.append(T[:3, 3] - T_world_tip[:3, 3], TILT_WEIGHT * turn)
+
+        robot = self.robot
+        found = least_squares(
+            off, np.clip(start, robot.lower, robot.upper), bounds=(robot.lower, robot.upper)
+        )
+        near = np.linalg.norm(found.fun[:3]) < 1e-3
+        return TILT_MARGIN * found.fun[3:] / TILT_WEIGHT if near else np.full(3, np.inf)
 
     def _in_world(self, pose: Any, options: dict[str, Any]) -> ndarray:
         T = matrix(pose)
