@@ -126,7 +126,8 @@ def test_a_moved_base_keeps_obstacles_held_objects_and_allowed_contacts() -> Non
     made.update_attached_sphere(0.02, [0.0, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0])
     made.set_base_pose([0.1, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0])
     assert made.workspace.scene.allowed_contacts == (("block", (HAND,)),)
-    assert np.allclose(made.workspace.scene.shapes[0].center, [0.4, 0.0, -0.2])
+    block = made.workspace.scene.shapes[0]
+    assert isinstance(block, rd.Box) and np.allclose(block.center, [0.4, 0.0, -0.2])
     assert len(made.workspace.robot.attached) == 1
 
 

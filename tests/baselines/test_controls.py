@@ -44,7 +44,8 @@ def test_the_nearest_motions_are_bent_to_start_and_goal(monkeypatch: pytest.Monk
     motions = np.stack([ends[:, 0], ends.mean(1) + np.array([0.0, 0.5]), ends[:, 1]], axis=1)
     start, goal = np.array([0.0, 0.1]), np.array([3.0, 0.0])
     first, second = controls.bent(motions, start, goal, 2)
-    np.testing.assert_allclose(first, [start, [1.5, 0.55], goal])  # backwards, by half of each difference
+    # backwards, by half of each difference
+    np.testing.assert_allclose(first, np.stack([start, [1.5, 0.55], goal]))
     np.testing.assert_allclose(second[[0, -1]], [start, goal])
     monkeypatch.setattr(controls, "library", lambda data, robot: np.stack([[START, GOAL]] * 2))
     control = Control(ControlSettings(source=NEAREST, data="data", samples=1, guidance_steps=0))

@@ -70,7 +70,9 @@ def test_zeros_are_told_from_nothing_in_range() -> None:
     assert found[nothing].mean() > 0.95 and found[~nothing].mean() < 0.01
     hole = view.depth.copy()
     hole[150:190, 100:160] = 0.0
-    assert not (empty_regions(hole, 2.0) & (clean.depth < 1.9))[150:190, 100:160].any(), "surrounded: a hole"
+    empty = empty_regions(hole, 2.0)
+    assert empty is not None
+    assert not (empty & (clean.depth < 1.9))[150:190, 100:160].any(), "surrounded: a hole"
     assert empty_regions(np.where(np.arange(320) < 160, view.depth, 0.0), 2.0) is None, (
         "half an image is lost"
     )

@@ -395,8 +395,8 @@ class Problem(Value):
             self,
             robot: Robot,
             scene: Scene,
-            start: ArrayLike,
-            goal: ArrayLike | Goal | Sequence[OneGoal | ArrayLike],
+            start: AnyConfiguration,
+            goal: AnyConfiguration | Goal | Sequence[OneGoal | AnyConfiguration],
             *,
             T_world_base: ArrayLike | None = None,
             **options: Unpack[ProblemOptions],
@@ -408,8 +408,8 @@ class Problem(Value):
         T_world_base: ArrayLike,
         robot: Robot,
         scene: Scene,
-        start: ArrayLike,
-        goal: "ArrayLike | Goal | Sequence[OneGoal | ArrayLike]",
+        start: AnyConfiguration,
+        goal: "AnyConfiguration | Goal | Sequence[OneGoal | AnyConfiguration]",
         **options: Unpack[ProblemOptions],
     ) -> "Problem":
         """The problem of a robot on a base that stands elsewhere, given in the frame of the world.
