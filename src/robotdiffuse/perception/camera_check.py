@@ -22,6 +22,8 @@ MIN_CELLS = 40
 """Fewer cells with the arm in them say nothing."""
 MIN_AGREEMENT = 0.6
 """Part of the arm's cells that have the arm's depth, at least, where the camera is as stated, within cm."""
+MIN_NAMED = 0.4
+"""Part of them that must agree once a mistake is undone: things before the arm may hide it."""
 BETTER = 1.5
 """A mistake is named if without it the agreement is this many times as high."""
 MIN_THROUGH = 0.35
@@ -79,7 +81,7 @@ def camera_note(view: DepthView, robot: Robot, start: Configuration) -> str:
     if count >= MIN_CELLS and found >= MIN_AGREEMENT:
         return ""
     best = ""
-    highest = max(MIN_AGREEMENT, BETTER * found if count >= MIN_CELLS else 0.0)
+    highest = max(MIN_NAMED, BETTER * found if count >= MIN_CELLS else 0.0)
     for name, other in mistakes(view):
         agrees, _, cells = agreement(other, robot, q)
         if cells >= MIN_CELLS and agrees > highest:
