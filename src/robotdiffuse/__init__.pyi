@@ -13,6 +13,7 @@ from .core.types import Trajectory as Trajectory
 from .datasets.external import write_dataset as write_dataset
 from .datasets.loader import RopDataset as RopDataset
 from .interop.depth_recording import read_depth_views as read_depth_views
+from .perception.camera_calibration import calibrate_camera as calibrate_camera
 from .perception.depth_filter import measure_noise as measure_noise
 from .perception.depth_view import DepthView as DepthView
 from .planning import load_planner as load_planner

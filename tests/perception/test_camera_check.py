@@ -8,6 +8,7 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 import robotdiffuse as rd
+from robotdiffuse.perception.camera_calibration import offset
 from robotdiffuse.perception.camera_check import OPTICAL, agreement, camera_note
 from robotdiffuse.perception.depth_view import DepthNoise
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, render_depth
@@ -73,3 +74,26 @@ def test_a_calibration_that_is_off_is_named() -> None:
     off = T.copy()
     off[:3, :3] = T[:3, :3] @ Rotation.from_rotvec([0.0, 0.1, 0.0]).as_matrix()
     assert "sees through" in camera_note(replace(VIEW, T_base_camera=off), PANDA, HOME)
+
+
+def test_the_pose_is_estimated_from_views_of_the_arm() -> None:
+    configurations = [
+        HOME + turn for turn in ([0.0] * 7, [0.5, 0.2, 0, 0.4, 0, 0, 0], [-0.6, 0.4, 0, 0.5, 0, 0, 0])
+    ]
+    off = T.copy()
+    off[:3, 3] += [0.02, -0.015, 0.01]
+    off[:3, :3] = Rotation.from_rotvec([0.02, -0.03, 0.02]).as_matrix() @ T[:3, :3]
+    views = [replace(seen(np.array(q), i), T_base_camera=off) for i, q in enumerate(configurations)]
+    found = rd.calibrate_camera(views, PANDA)
+    position, angle = offset(T, found.T_base_camera)
+    assert position < 0.012 and angle < 0.01, "from 27 mm and 2.4 degrees off"
+    stated = found.pose_deviation
+    assert position < 2 * stated[0] and angle < 2 * stated[1] and stated[0] < 0.04
+    with pytest.raises(rd.InputError, match="configuration"):
+        rd.calibrate_camera([replace(VIEW, configuration=None)], PANDA)
+    moved = replace(views[0], T_base_camera=T)
+    with pytest.raises(rd.InputError, match="views differ in T_base_camera"):
+        rd.calibrate_camera([*views, moved], PANDA)
+    elsewhere = replace(VIEW, depth=np.full_like(VIEW.depth, 3.0))
+    with pytest.raises(rd.InputError, match=r"hardly seen|agrees with the images"):
+        rd.calibrate_camera([elsewhere], PANDA)

@@ -1,0 +1,159 @@
+"""The pose of a camera, estimated from views of the arm: image points are fitted to its surface.
+
+Points are matched with the nearest point of the surface, along its normal (Y. Chen and G. Medioni, "Object
+modelling by registration of multiple range images", 1992), weighted by Geman and McClure's function, whose
+width falls from round to round.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.transforms import transform
+from robotdiffuse.core.types import Configuration, Points, Pose
+from robotdiffuse.perception.camera_check import (
+    BETTER,
+    MIN_CELLS,
+    MIN_NAMED,
+    STEP_ANGLE,
+    agreement,
+    mistakes,
+)
+from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.visibility import surface_balls
+from robotdiffuse.robots.robot import Robot
+
+GATES = np.geomspace(0.15, 0.012, 25)
+"""Points farther from the arm than this do not count, in rounds of the estimate [m]."""
+MAX_POINTS = 1500
+"""Points of a view that an estimate uses."""
+MODEL_CELL = 0.01
+"""One point of the arm's surface is used for each cell of this edge [m]."""
+NEIGHBORS = 10
+"""Points of the surface that its normal is estimated from."""
+POINTS_PER_ERROR = 25
+"""So many neighboring points have about one error in common."""
+
+
+def offset(first: Pose, second: Pose) -> tuple[float, float]:
+    """Distance [m] and angle [rad] between two poses."""
+    turn = Rotation.from_matrix(first[:3, :3].T @ second[:3, :3])
+    return float(np.linalg.norm(first[:3, 3] - second[:3, 3])), float(turn.magnitude())
+
+
+@dataclass(frozen=True, eq=False)
+class CameraCalibration:
+    """The pose of a camera, as views of the arm show it."""
+
+    T_base_camera: Pose
+    covariance: Float[ndarray, "6 6"]
+    """Of the position [m] and the rotation vector [rad] of the camera, in the base frame."""
+    agreement: float
+    """Part of the image cells with the arm in them that have its depth."""
+
+    @property
+    def pose_deviation(self) -> tuple[float, float]:
+        """Two standard deviations, for `DepthView.pose_deviation`: position [m] and angle [rad]."""
+        position, angle = (
+            2 * float(np.sqrt(np.trace(self.covariance[i : i + 3, i : i + 3]))) for i in (0, 3)
+        )
+        return position, angle
+
+
+def calibrate_camera(views: Sequence[DepthView], robot: Robot) -> CameraCalibration:
+    """Estimate the pose of a camera that stands, from views of the arm in several configurations.
+
+    Args:
+        views: Depth images of one camera, each with the arm's configuration. Their `T_base_camera` is where
+            the search begins: within about 10 cm and 5 degrees, or one of the usual mistakes away.
+        robot: The robot in the images.
+
+    Returns:
+        The pose, its covariance, and how well the images agree with it.
+
+    Raises:
+        InputError: Without views, for views of several poses or without a configuration, where the arm is
+            not seen, and where no pose nearby agrees with the images.
+
+    Example:
+        ```python
+        calibration = rd.calibrate_camera(views, robot)
+        view = rd.DepthView(image, K, calibration.T_base_camera, pose_deviation=calibration.pose_deviation)
+        ```
+    """
+    each = [(view, view.configuration) for view in views if view.configuration is not None]
+    if not each or len(each) < len(views):
+        raise InputError(
+            f"{len(each)} of {len(views)} views have a configuration; calibrate_camera needs it of each"
+        )
+    first, q = each[0]
+    if any(not np.allclose(view.T_base_camera, first.T_base_camera) for view in views):
+        raise InputError(
+            "views differ in T_base_camera; calibrate_camera takes those of one camera that stands"
+        )
+    begins = [first, *(other for _, other in mistakes(first) if other.intrinsics == first.intrinsics)]
+    scores = [share * (count >= MIN_CELLS) for share, _, count in (agreement(v, robot, q) for v in begins)]
+    best = int(np.argmax(scores))
+    T = begins[best if scores[best] > BETTER * scores[0] else 0].T_base_camera
+    models = [_surface(robot, q) for _, q in each]
+    points = [_near_arm(view, T, tree) for (view, _), (tree, _, _) in zip(each, models, strict=True)]
+    hessian = np.eye(6)
+    spread = 0.0
+    for gate in GATES:
+        rows = list[ndarray]()
+        errors = list[ndarray]()
+        for (tree, surface, normals), in_camera in zip(models, points, strict=True):
+            at = in_camera @ T[:3, :3].T + T[:3, 3]
+            distance, near = map(np.asarray, tree.query(at, distance_upper_bound=gate))
+            close = np.flatnonzero(np.isfinite(distance))
+            normal = normals[near[close]]
+            rows.append(np.hstack([normal, np.cross(at[close] - T[:3, 3], normal)]))
+            errors.append((normal * (at[close] - surface[near[close]])).sum(axis=1))
+        A = np.concatenate(rows)
+        e = np.concatenate(errors)
+        if len(e) < MIN_CELLS:
+            raise InputError(f"the arm is hardly seen: {len(e)} points of the views are near it")
+        weights = 1 / (1 + (e / (0.3 * gate)) ** 2) ** 2
+        hessian = (A * weights[:, None]).T @ A + 1e-9 * np.eye(6)
+        spread = float(np.sqrt((weights * e**2).sum() / weights.sum()))
+        change = -np.linalg.solve(hessian, A.T @ (weights * e))
+        turn = Rotation.from_rotvec(change[3:]).as_matrix()
+        T = transform(T[:3, 3] + change[:3], turn @ T[:3, :3])
+    shares = [agreement(replace(view, T_base_camera=T), robot, q) for view, q in each]
+    total = sum(count for _, _, count in shares)
+    agrees = sum(share * count for share, _, count in shares) / max(total, 1)
+    if agrees < MIN_NAMED:
+        raise InputError(
+            f"no pose near T_base_camera agrees with the images: the best explains {100 * agrees:.0f} % of "
+            "the arm's depths; begin nearer, or check the intrinsics and the joint positions"
+        )
+    return CameraCalibration(T, POINTS_PER_ERROR * spread**2 * np.linalg.inv(hessian), agrees)
+
+
+def _surface(robot: Robot, q: Configuration) -> tuple[KDTree, Points, Points]:
+    """Points on the arm's surface at a configuration, as a tree and an array [m], and the normals there."""
+    balls = surface_balls(robot, q).astype(np.float64)
+    points = balls[np.unique(np.floor(balls / MODEL_CELL), axis=0, return_index=True)[1]]
+    tree = KDTree(points)
+    around = points[tree.query(points, k=NEIGHBORS)[1]]
+    off = around - around.mean(axis=1, keepdims=True)
+    return tree, points, np.linalg.eigh(np.einsum("nki,nkj->nij", off, off))[1][:, :, 0]
+
+
+def _near_arm(view: DepthView, T: Pose, tree: KDTree) -> Points:
+    """Points of an image in the camera's frame that are near the arm if the camera is about at T."""
+    fx, fy, cx, cy = view.intrinsics
+    stride = max(1, round(STEP_ANGLE * fx / 2))
+    depth = view.depth[::stride, ::stride].astype(np.float64)
+    v, u = np.nonzero(np.isfinite(depth) & (depth > 0))
+    z = depth[v, u]
+    points = np.stack([(stride * u - cx) / fx * z, (stride * v - cy) / fy * z, z], axis=1)
+    distance, _ = tree.query(points @ T[:3, :3].T + T[:3, 3], distance_upper_bound=2 * GATES[0])
+    points = points[np.isfinite(distance)]
+    return points[:: max(1, len(points) // MAX_POINTS)]
