@@ -80,6 +80,39 @@ def test_a_grasped_obstacle_moves_with_the_arm_until_it_is_put_down() -> None:
     assert np.allclose(lifted, [0.0, 0.0, 0.12], atol=2e-3)
 
 
+def test_the_nearest_goal_that_a_line_leads_to() -> None:
+    space = panda(T_world_base=T_WORLD_BASE)
+    T = space.robot.fk(READY, space.tip)
+    offsets = [[0.0, 0.0, 0.12], [0.0, 0.0, 0.06], [0.05, 0.0, 0.0], [0.0, 0.0, -2.0]]
+    goal = rd.AnyGoal([rd.PoseGoal(space.tip, T @ rd.pose(xyz)) for xyz in offsets])
+    line = rd.CartesianLine(space.tip, 0.001, 0.05)
+
+    def check(index: int) -> None:
+        result = space.plan_line(goal, READY, time_limit=40.0)
+        assert result.solved and result.goal_index == index and result.fraction == 1.0, result.reason
+        problem = rd.Problem(space.robot, space.scene, READY, goal.goals[index], constraints=[line])
+        assert rd.verify(problem, result.trajectory).valid
+
+    check(2)
+    goal = rd.AnyGoal((goal.goals[0], goal.goals[1]))
+    check(1)
+    goal = rd.AnyGoal((rd.PoseGoal(space.tip, T @ rd.pose([0.0, 0.0, -2.0])),))
+    result = space.plan_line(goal, READY, time_limit=4.0)
+    assert not result.solved and result.reason.startswith("goal 0: ")
+
+
+@pytest.mark.parametrize("angle", [0.05, None])
+@pytest.mark.parametrize(("way", "turn"), [(0.0, 0.0), (0.0, 0.5), (0.0005, 0.0)])
+def test_short_lines_and_turns_about_the_tool_point(way: float, turn: float, angle: float | None) -> None:
+    space = panda()
+    end = space.pose(READY) @ rd.pose([0.0, 0.0, way], rpy=[0.0, 0.0, turn])
+    result = space.plan_line(end, READY, angle=angle, time_limit=20.0)
+    assert result.solved and result.fraction == 1.0, result.reason
+    line = rd.CartesianLine(space.tip, 0.001, angle)
+    problem = rd.Problem(space.robot, space.scene, READY, rd.PoseGoal(space.tip, end), constraints=[line])
+    assert rd.verify(problem, result.trajectory).valid
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [

@@ -65,7 +65,8 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
     line = next(one for one in problem.constraints if isinstance(one, CartesianLine))
     T_end = line_end(problem, line)
     T_start = link_pose(robot, problem.start, line.frame)
-    if np.abs(T_end - T_start).max() < HERE:
+    off = np.abs(T_end - T_start)[:, 3 if line.angle is None else slice(None)]
+    if off.max() < HERE:
         return None
     targets = _poses(T_start, T_end)
     fraction = 0.0

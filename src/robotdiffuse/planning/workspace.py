@@ -1,6 +1,8 @@
 """What a program keeps between calls: a robot, its named obstacles and what it holds."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,7 @@ from robotdiffuse.core.transforms import inverse
 from robotdiffuse.core.types import AnyConfiguration
 from robotdiffuse.planning import plan
 from robotdiffuse.problems.constraints import CartesianLine
-from robotdiffuse.problems.goals import Goal, PoseGoal
+from robotdiffuse.problems.goals import AnyGoal, Goal, PoseGoal
 from robotdiffuse.problems.problem import Problem, StateValidity
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -215,29 +217,54 @@ class Workspace:
 
     def plan_line(
         self,
-        pose: ArrayLike,
+        pose: Any,
         start: AnyConfiguration,
         tolerance: float = 0.001,
-        angle: float = 0.05,
+        angle: float | None = 0.05,
         speed: float | None = None,
+        time_limit: float = 1.0,
         **request: Any,
     ) -> PlanResult:
         """Move the tip along a straight line, turning evenly.
 
         Args:
-            pose: T_world_tip at the end [4, 4].
+            pose: T_world_tip at the end [4, 4]; or a `rd.AnyGoal` in the frame of the base, of which the
+                nearest to the tip that a line leads to is taken.
             start: Start configuration [dof], values by joint, or the name of a pose.
             tolerance: Largest distance of the tip from the line [m].
-            angle: Largest deviation of its orientation [rad].
+            angle: Largest deviation of its orientation [rad]; None: any on the way.
             speed: Largest speed of the tip [m/s]; None: what the joints allow.
-            request: Arguments of `rd.plan`: time_limit, seed, ...
+            time_limit: Wall time of the call [s]; of several goals, each has an equal share of what is left.
+            request: Further arguments of `rd.plan`: seed, until, ...
 
         Returns:
-            A result; `fraction` says how much of the line can be followed, and `reason` why no more.
+            A result; `fraction` says how much of the line can be followed, and `reason` why no more. Of
+            several goals, `goal_index` is the one that is reached, or the result is that of the goal that a
+            line gets nearest to.
         """
+        from robotdiffuse.problems.compiled_constraints import line_end  # compiled code
+
         line = CartesianLine(self.tip, tolerance, angle, speed)
-        goal = self._goal(rigid_transform("pose", pose))
-        return plan(Problem(self.robot, self.scene, start, goal, constraints=[line]), **request)
+        several = isinstance(pose, AnyGoal)
+        goals = pose.goals if several else [self._goal(rigid_transform("pose", pose))]
+        problems = [Problem(self.robot, self.scene, start, goal, constraints=[line]) for goal in goals]
+        T_start = self._T_base_world @ self.pose(start)
+        off = [np.linalg.norm((line_end(problem, line) - T_start)[:3, 3]) for problem in problems]
+        began = perf_counter()
+        best = None
+        for tried, i in enumerate(np.argsort(off, kind="stable")):
+            left = time_limit - (perf_counter() - began)
+            if best is not None and left <= 0.0:
+                break
+            result = plan(problems[i], left / (len(goals) - tried), **request)
+            if result.solved:
+                return replace(result, goal_index=int(i)) if several else result
+            if several:
+                result = replace(result, reason=f"goal {i}: {result.reason}")
+            if best is None or (result.fraction or 0.0) > (best.fraction or 0.0):
+                best = result
+        assert best is not None
+        return best
 
     def _goal(self, goal: Any) -> Any:
         if isinstance(goal, str | Goal) or np.shape(goal) != (4, 4):

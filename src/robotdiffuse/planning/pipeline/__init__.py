@@ -30,9 +30,10 @@ def attempt(solver: Solver, problem: Problem, request: PlanRequest) -> PlanResul
     unknown space, which the pipeline handles."""
     context = PlanningContext(solver.name, problem, request)
     followed = None
+    lines = any(isinstance(one, CartesianLine) for one in problem.constraints)
     with context.deadline():
         try:
-            if solver.follows_lines and any(isinstance(one, CartesianLine) for one in problem.constraints):
+            if solver.follows_lines and lines:
                 with loading():
                     from robotdiffuse.planning.line_following import follow_line  # compiled code
 
@@ -42,10 +43,10 @@ def attempt(solver: Solver, problem: Problem, request: PlanRequest) -> PlanResul
             result = _searched(solver, context)
         except OutOfTimeError as error:
             result = context.out_of_time(error)
+    if lines and result.solved:
+        return replace(result, fraction=1.0)
     if followed is None:
         return result
-    if result.solved:
-        return replace(result, fraction=1.0)
     return replace(result, fraction=followed.fraction, reason=f"{result.reason}; {followed.reason}")
 
 
