@@ -117,6 +117,10 @@ def test_short_lines_and_turns_about_the_tool_point(way: float, turn: float, ang
     ("call", "message"),
     [
         (
+            lambda space: space.plan_line([np.eye(4), np.eye(4)], "ready"),
+            "pose is 2 poses; a line has one end: plan to each from path.positions.-1. of the line before",
+        ),
+        (
             lambda space: space.move("bal", np.eye(4)),
             "unknown obstacle 'bal'; known: ball",
         ),

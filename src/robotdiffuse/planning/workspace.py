@@ -246,6 +246,15 @@ class Workspace:
 
         line = CartesianLine(self.tip, tolerance, angle, speed)
         several = isinstance(pose, AnyGoal)
+        if (
+            isinstance(pose, list | tuple | ndarray)
+            and len(pose)
+            and getattr(pose[0], "shape", None) == (4, 4)
+        ):
+            raise InputError(
+                f"pose is {len(pose)} poses; a line has one end: plan to each from path.positions[-1] of the "
+                "line before, or give a rd.AnyGoal to reach any of them"
+            )
         goals = pose.goals if several else [self._goal(rigid_transform("pose", pose))]
         problems = [Problem(self.robot, self.scene, start, goal, constraints=[line]) for goal in goals]
         T_start = self._T_base_world @ self.pose(start)
