@@ -246,11 +246,8 @@ class Workspace:
 
         line = CartesianLine(self.tip, tolerance, angle, speed)
         several = isinstance(pose, AnyGoal)
-        if (
-            isinstance(pose, list | tuple | ndarray)
-            and len(pose)
-            and getattr(pose[0], "shape", None) == (4, 4)
-        ):
+        listed = isinstance(pose, list | tuple) and len(pose) > 0 and getattr(pose[0], "ndim", 0) == 2
+        if listed or (isinstance(pose, ndarray) and pose.ndim == 3):
             raise InputError(
                 f"pose is {len(pose)} poses; a line has one end: plan to each from path.positions[-1] of the "
                 "line before, or give a rd.AnyGoal to reach any of them"
