@@ -85,7 +85,7 @@ def test_it_continues_where_it_was_interrupted(
             made("ur5e", tmp_path / "stopped")
     shards = sorted(file.name for file in (tmp_path / "stopped" / "data").glob("shard_*"))
     assert len(shards) == (1 if phase == "data" else 3)
-    assert (tmp_path / "stopped" / "training.pt").is_file() == (phase == "training")
+    assert (tmp_path / "stopped" / "training.safetensors").is_file() == (phase == "training")
     again = made("ur5e", tmp_path / "stopped")
     weights = "model.safetensors"
     assert contents(again)[weights] == expected[weights]

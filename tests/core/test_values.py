@@ -90,7 +90,7 @@ def kinds(base: type[Value] = Value) -> Iterator[type[Value]]:
     for kind in base.__subclasses__():
         if kind.__module__.startswith("robotdiffuse."):
             yield from kinds(kind)
-            if "__dataclass_fields__" in kind.__dict__ and not kind.__name__.startswith("_"):
+            if is_dataclass(kind) and not kind.__name__.startswith("_"):
                 yield kind
 
 

@@ -385,7 +385,7 @@ def test_joint_training_changes_the_encoder(name, data, tmp_path):
     model = load_model(tmp_path / "out", box_arm())
     assert model.encoder is not None and type(model.encoder) is ENCODERS.load(name)
     trained = dict(model.encoder.named_parameters())
-    moved = {key for key, p in fresh.named_parameters() if (trained[key] - p).abs().max() > 1e-3}
+    moved = {key for key, p in fresh.named_parameters() if (trained[key] - p).abs().max() > 3e-4}
     own = ("decoder", "query") if name in ALONE else ()  # what only reconstructs takes no part
     assert {key for key in trained if not key.startswith(own) and "empty" not in key} <= moved
     assert not (data / "codes").exists()

@@ -29,7 +29,8 @@ BALLS = RNG.uniform((0.2, -0.5, 0.2), (1.2, 0.5, 0.9), (2000, 3)).astype(np.floa
 def seen_in(depth: np.ndarray, noise: float = 0.0, border: int = 0, radius: float = 0.02) -> np.ndarray:
     seen = np.zeros(len(BALLS), np.bool_)
     arguments = np.array(INTRINSICS, np.float32), T.astype(np.float32), BALLS, np.float32(radius)
-    see_through(depth.astype(np.float32), *arguments, np.float32(noise), np.float32(border), seen)
+    errors = np.array([0.0, 0.0, noise], np.float32)
+    see_through(depth.astype(np.float32), *arguments, errors, np.float32(border), seen)
     return seen
 
 

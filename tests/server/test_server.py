@@ -395,7 +395,7 @@ def test_a_full_queue_says_when_to_try_again(server: httpx.Client) -> None:
 
 @pytest.mark.slow
 def test_a_worker_that_holds_too_much_memory_is_replaced_between_requests() -> None:
-    with serving("--workers", "1", "--max-worker-memory", "1000") as (client, _):
+    with serving("--workers", "1", "--max-worker-memory", "1000", "--max-time-limit", "60") as (client, _):
         assert client.post("/plan", json=asked(KEEPS, "faulty")).json()["status"] == "solved"
         assert client.post("/plan", json=asked(3)).json()["status"] == "solved"
         assert gauge(client, "workers_renewed_total") == 1 and gauge(client, "workers_lost_total") == 0
@@ -403,7 +403,10 @@ def test_a_worker_that_holds_too_much_memory_is_replaced_between_requests() -> N
 
 @pytest.mark.slow
 def test_it_stops_gracefully_and_leaves_no_worker() -> None:
-    with serving("--workers", "1") as (client, process), ThreadPoolExecutor(2) as threads:
+    with (
+        serving("--workers", "1", "--max-time-limit", "60") as (client, process),
+        ThreadPoolExecutor(2) as threads,
+    ):
         workers = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True).stdout
         slow = asked(planner="aorrtc", time_limit=2.0, until="time_limit")
         first = threads.submit(client.post, "/plan", json=slow)

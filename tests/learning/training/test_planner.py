@@ -101,7 +101,7 @@ def test_killed_training_ends_the_same(tmp_path, data):
     train_planner(settings, str(tmp_path / "whole"))
     out = tmp_path / "killed"
     run = start("slow", replace(settings, checkpoint_seconds=0.2), out)
-    while not (out / "training.pt").exists():
+    while not (out / "training.safetensors").exists():
         assert run.poll() is None, run.communicate()[0]
         time.sleep(0.01)
     time.sleep(random.random())
@@ -329,9 +329,9 @@ def test_other_settings_need_another_folder(tmp_path, data):
 @pytest.mark.usefixtures("no_export")
 def test_damaged_checkpoint_is_named(tmp_path, data):
     train_planner(planner_settings(data, samples=16), str(tmp_path / "out"))
-    file = tmp_path / "out" / "training.pt"
+    file = tmp_path / "out" / "training.safetensors"
     file.write_bytes(file.read_bytes()[:1000])
-    with pytest.raises(InputError, match=r"training\.pt is no checkpoint"):
+    with pytest.raises(InputError, match=r"training\.safetensors is (damaged|no checkpoint)"):
         train_planner(planner_settings(data), str(tmp_path / "out"))
 
 

@@ -16,7 +16,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path as FilePath
-from pickle import UnpicklingError
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -31,7 +30,7 @@ from torch.optim.swa_utils import AveragedModel
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import lock_folder, write_atomically
 from robotdiffuse.learning import need_packages
-from robotdiffuse.learning.checkpoint import versions
+from robotdiffuse.learning.checkpoint import read_tensors, versions, write_tensors
 from robotdiffuse.learning.encoders.networks import Encoder
 from robotdiffuse.learning.network import EXPORT_PACKAGES
 from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16, load_data
@@ -205,10 +204,6 @@ class Position:
     rollbacks: int = 0
 
 
-STATES = ("module", "average", "optimizer")
-"""Attributes of a run whose states a checkpoint holds."""
-
-
 class TrainingRun:
     """Trains a module's parameters; continues an earlier run in the same folder.
 
@@ -247,7 +242,7 @@ class TrainingRun:
         self.rows: list[dict[str, float | int | str]] = []
         self._losses: list[float] = []
         self._bad = 0
-        self._file = self.out / "training.pt"
+        self._file = self.out / "training.safetensors"
         if self._file.is_file():
             self._restore(check=True)
 
@@ -396,7 +391,7 @@ class TrainingRun:
         )
 
     def save(self) -> None:
-        """Write training.pt and log.csv, each whole or not at all.
+        """Write training.safetensors and log.csv, each whole or not at all.
 
         All processes return only after the checkpoint is written.
         """
@@ -414,8 +409,11 @@ class TrainingRun:
             "losses": self._losses,
             "rows": self.rows,
         }
-        state = {name: getattr(self, name).state_dict() for name in STATES} | {"notes": json.dumps(notes)}
-        write_atomically(self._file, lambda stream: torch.save(state, stream), make_folder=True)
+        tensors = {f"module.{name}": tensor for name, tensor in self.module.state_dict().items()}
+        tensors |= {f"average.{name}": tensor for name, tensor in self.average.state_dict().items()}
+        for place, moments in self.optimizer.state_dict()["state"].items():
+            tensors |= {f"optimizer.{place}.{name}": tensor for name, tensor in moments.items()}
+        write_tensors(self._file, tensors, notes)
         text = io.StringIO()
         writer: csv.DictWriter[str] = csv.DictWriter(text, LOG_COLUMNS)
         writer.writeheader()
@@ -439,18 +437,26 @@ class TrainingRun:
                         writer.add_scalar(name, float(row[name]), int(row["samples"]))
 
     def _restore(self, check: bool) -> None:
+        tensors, notes = read_tensors(self._file)
+
+        def state(part: str) -> dict[str, Tensor]:
+            return {name.removeprefix(part): t for name, t in tensors.items() if name.startswith(part)}
+
         try:
-            state = torch.load(self._file, "cpu", weights_only=True)
-            notes = json.loads(state["notes"])
             if check:
                 self._check_same(notes)
-            for name in STATES:
-                getattr(self, name).load_state_dict(state[name])
+            self.module.load_state_dict(state("module."))
+            self.average.load_state_dict(state("average."))
+            moments: dict[int, dict[str, Tensor]] = {}
+            for key, tensor in state("optimizer.").items():
+                place, _, name = key.partition(".")
+                moments.setdefault(int(place), {})[name] = tensor
+            self.optimizer.load_state_dict(self.optimizer.state_dict() | {"state": moments})
             self.at = Position(**notes["at"])
             self.rng.bit_generator.state = notes["random"][self.processes.index]
             self._losses = notes["losses"]
             self.rows = notes["rows"]
-        except (LookupError, TypeError, RuntimeError, EOFError, UnpicklingError) as error:
+        except (LookupError, TypeError, ValueError, RuntimeError) as error:
             reason = " ".join(str(error).split())[:200]
             raise InputError(f"{self._file} is no checkpoint of this run: {reason}") from None
 
