@@ -207,6 +207,6 @@ def test_it_comes_back_after_the_server_restarts(browser: Any, live: "tuple[Page
             number = server.get_port()
             view.goto(server.url)
         until(lambda: beside(view, "Planner").input_value() == planner)  # noqa: B023
-        view.locator(VALID).wait_for()
+        until(lambda: view.locator(VALID).is_visible())
         page.close()
     view.close()
