@@ -1,12 +1,13 @@
 """Runs the whole package under jaxtyping and beartype: a wrong shape annotation fails the suite."""
 
-import importlib
+import ast
 import os
 import re
+import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -31,6 +32,22 @@ def checked_modules() -> list[str]:
     ]
 
 
+def parse_in_one_thread_at_a_time() -> None:
+    """CPython 3.11 counts the depth of the syntax trees of all threads together (gh-106905): parsing in two
+    ends in "SystemError: AST constructor recursion depth mismatch", and a live page has no plan. The hook
+    parses each module when it is imported, and NumPy and beartype parse later too: it is not enough to lock
+    the hook, or to import all modules first."""
+    parse = ast.parse
+    parsing = threading.RLock()
+
+    def alone(*args: Any, **kwargs: Any) -> Any:
+        with parsing:
+            return parse(*args, **kwargs)
+
+    ast.parse = alone
+
+
+parse_in_one_thread_at_a_time()
 install_import_hook(checked_modules(), "beartype.beartype")
 
 # the same examples at every run: a suite that fails by chance guards nothing
@@ -52,18 +69,6 @@ def cpu_clock(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -
     time."""
     if request.path.parent.name != "live":
         monkeypatch.setattr(time, "perf_counter", time.process_time)
-
-
-def pytest_collection_finish(session: pytest.Session) -> None:
-    """Imports all that pages may import in their threads: the hook parses each module, and CPython 3.11
-    counts the depth of the syntax trees of all threads together (gh-106905): two parsers at once end in a
-    SystemError."""
-    from robotdiffuse.core.errors import InputError
-
-    if any(item.path.parent.name == "live" for item in session.items):
-        for name in checked_modules():
-            with suppress(ImportError, InputError):  # of extras that are not installed
-                importlib.import_module(name)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
