@@ -84,7 +84,7 @@ def test_the_nearest_goal_that_a_line_leads_to() -> None:
     space = panda(T_world_base=T_WORLD_BASE)
     T = space.robot.fk(READY, space.tip)
     offsets = [[0.0, 0.0, 0.12], [0.0, 0.0, 0.06], [0.05, 0.0, 0.0], [0.0, 0.0, -2.0]]
-    goal = rd.AnyGoal([rd.PoseGoal(space.tip, T @ rd.pose(xyz)) for xyz in offsets])
+    goal = rd.AnyGoal(tuple(rd.PoseGoal(space.tip, T @ rd.pose(xyz)) for xyz in offsets))
     line = rd.CartesianLine(space.tip, 0.001, 0.05)
 
     def check(index: int) -> None:
