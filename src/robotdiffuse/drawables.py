@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.transforms import inverse, transform
+from robotdiffuse.core.transforms import inverse, placed, transform
 from robotdiffuse.core.types import Points, Pose
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
 from robotdiffuse.robots.robot import Robot
@@ -50,8 +50,7 @@ class Surface:
 
     def moved(self, T: Pose) -> "Surface":
         """The surface after a rigid transform."""
-        vertices = self.vertices @ T[:3, :3].T + T[:3, 3]
-        return Surface(vertices, self.normals @ T[:3, :3].T, self.colors, self.faces)
+        return Surface(placed(T, self.vertices), self.normals @ T[:3, :3].T, self.colors, self.faces)
 
     @property
     def by_color(self) -> list[tuple[Color, "Surface"]]:

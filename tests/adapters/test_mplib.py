@@ -1,4 +1,4 @@
-"""MPlib's methods, with its arguments and results: motions reach what was asked, and failures say why."""
+"""MPlib's methods, arguments and results: motions reach what was asked, and failures have a reason."""
 
 from types import SimpleNamespace
 

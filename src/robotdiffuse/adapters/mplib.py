@@ -16,10 +16,11 @@ import numpy as np
 from numpy import ndarray
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.transforms import inverse, pose, rotation_about, transform
+from robotdiffuse.core.transforms import inverse, pose, transform
 from robotdiffuse.planning.workspace import Workspace
 from robotdiffuse.problems.compiled_constraints import rotation_vector
 from robotdiffuse.problems.goals import JointGoal
@@ -223,7 +224,7 @@ class Planner:
             angle = np.linalg.norm(tilt)
             if angle > DEFAULT.goal_angle:
                 return result
-            turned = transform(T[:3, 3], rotation_about(tilt / angle, angle) @ T[:3, :3])
+            turned = transform(T[:3, 3], Rotation.from_rotvec(tilt).as_matrix() @ T[:3, :3])
             tilted = self.workspace.plan_line(turned, start, **request)
             note = f"the pose is out of reach; the motion ends tilted by {np.degrees(angle):.1f} degrees"
             return replace(tilted, notes=(*tilted.notes, note)) if tilted.solved else result

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from robotdiffuse.baselines.straight_line import first_accepted
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
@@ -93,12 +94,11 @@ class Control(Planner[ControlSettings]):
         lines = np.stack([np.broadcast_to(start, goals.shape), goals], axis=1)
         for batch in (lines, self.candidates(start, goals, start_goal.checker, context.rng)):
             paths = [Path(names, start_goal.complete(q)) for q in batch]
-            for path in sorted(paths, key=lambda path: path.length):
-                result = context.finish(path.positions, self.settings.source, "solved by a control")
-                if result is not None:
-                    return result
-                if context.ended:
-                    break
+            paths.sort(key=lambda path: path.length)
+            positions = (path.positions for path in paths)
+            result = first_accepted(context, positions, self.settings.source, "solved by a control")
+            if result is not None:
+                return result
         return context.unsolved(f"the straight line and {self.settings.samples} candidates are refused")
 
 

@@ -70,10 +70,10 @@ ours, as theirs have other units. Batches are repeated with new noise while ther
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise, product
 from math import ceil
-from typing import Annotated, TypeVar
+from typing import Annotated, ClassVar, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -123,8 +123,20 @@ class GuidedPrior(ExportedPlanner[GuidedPriorSettings]):
     """
 
     network_name = "trajectory_prior"
+    noise_scale: ClassVar[float] = 1.0
+    """Factor on the standard deviation of the noise of a denoising step."""
+    quiet_steps: ClassVar[int] = 0
+    """Number of final steps without noise."""
+
+    @staticmethod
+    @abstractmethod
+    def levels(schedule: NoiseSchedule, steps: int) -> Int[ndarray, "steps"]:
+        """The noise levels of the denoising steps, falling."""
 
     @abstractmethod
+    def guided(self, checker: CollisionChecker, q: Trajectories, left: int) -> Trajectories:
+        """The means of a denoising step after the gradient steps of its guides; see `Guide`."""
+
     def draw(
         self,
         prior: MotionModel,
@@ -135,6 +147,17 @@ class GuidedPrior(ExportedPlanner[GuidedPriorSettings]):
         stop: Callable[[], bool] = lambda: False,
     ) -> Trajectories | None:
         """A batch of guided samples, float32; None if `stop` returns True before they are complete."""
+        return sample(
+            prior,
+            starts,
+            goals,
+            self.levels(prior.schedule, self.settings.sampling_steps),
+            rng,
+            partial(self.guided, checker),
+            self.noise_scale,
+            self.quiet_steps,
+            stop,
+        )
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
@@ -279,12 +302,8 @@ def limited(moves: Trajectories, most: float) -> Trajectories:
     return moves * np.minimum(1.0, most / np.maximum(lengths, 1e-9)).astype(moves.dtype)
 
 
-QUIET_STEPS = 5
-"""Number of final steps without noise."""
 GUIDE_STEPS = 5
 """Gradient steps at each guided denoising step."""
-NOISE_SCALE = 0.5
-"""Factor on the standard deviation of the noise of a denoising step."""
 LIMIT_MARGIN = 0.02
 """Joints nearer to their limits than this are moved away from them [rad]."""
 COLLISION_WEIGHT = 0.1
@@ -315,28 +334,19 @@ class MPD(GuidedPrior[MPDSettings]):
     name = "mpd"
     settings_class = MPDSettings
 
-    def draw(
-        self,
-        prior: MotionModel,
-        checker: CollisionChecker,
-        starts: Configurations,
-        goals: Configurations,
-        rng: np.random.Generator,
-        stop: Callable[[], bool] = lambda: False,
-    ) -> Trajectories | None:
-        """See `GuidedPrior.draw`."""
-        settings = self.settings
-        guided = ceil(settings.guided_share * settings.sampling_steps)
+    noise_scale = 0.5
+    quiet_steps = 5
 
-        def guide(q: ndarray, left: int) -> ndarray:
-            return self.guided(checker, q) if left < guided else q
+    @staticmethod
+    def levels(schedule: NoiseSchedule, steps: int) -> Int[ndarray, "steps"]:
+        """See `exponential_levels`."""
+        return exponential_levels(schedule, steps)
 
-        levels = exponential_levels(prior.schedule, settings.sampling_steps)
-        return sample(prior, starts, goals, levels, rng, guide, NOISE_SCALE, QUIET_STEPS, stop)
-
-    def guided(self, checker: CollisionChecker, q: Trajectories) -> Trajectories:
+    def guided(self, checker: CollisionChecker, q: Trajectories, left: int = 0) -> Trajectories:
         """Trajectories after the gradient steps of one denoising step; their ends stay fixed."""
         settings = self.settings
+        if left >= ceil(settings.guided_share * settings.sampling_steps):
+            return q
         robot = checker.robot
         for _ in range(GUIDE_STEPS):
             _, gradient = collision_gradient(
@@ -477,22 +487,10 @@ class EDMP(GuidedPrior[EDMPSettings]):
     name = "edmp"
     settings_class = EDMPSettings
 
-    def draw(
-        self,
-        prior: MotionModel,
-        checker: CollisionChecker,
-        starts: Configurations,
-        goals: Configurations,
-        rng: np.random.Generator,
-        stop: Callable[[], bool] = lambda: False,
-    ) -> Trajectories | None:
-        """See `GuidedPrior.draw`."""
-        levels = quadratic_levels(prior.schedule, self.settings.sampling_steps)
-
-        def guide(q: ndarray, left: int) -> ndarray:
-            return self.guided(checker, q, left)
-
-        return sample(prior, starts, goals, levels, rng, guide, stop=stop)
+    @staticmethod
+    def levels(schedule: NoiseSchedule, steps: int) -> Int[ndarray, "steps"]:
+        """See `quadratic_levels`."""
+        return quadratic_levels(schedule, steps)
 
     def guided(self, checker: CollisionChecker, q: Trajectories, left: int) -> Trajectories:
         """The batch after a gradient step of every guide on its rows; the ends of trajectories stay fixed."""

@@ -1,5 +1,6 @@
 """No planner: the straight line in joint space, as a control for every planner."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -7,6 +8,7 @@ import numpy as np
 
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import OneOf, Settings
+from robotdiffuse.core.types import Configurations
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.planning.start_goal import StartGoal
@@ -21,6 +23,17 @@ class StraightLineSettings(Settings, name="straight_line"):
     """Goal configurations that are tried: the nearest one, or all, the nearest first."""
 
 
+def first_accepted(
+    context: PlanningContext, paths: Iterable[Configurations], stage: str, reason: str
+) -> PlanResult | None:
+    """The result of the first path that the validator accepts; None if it accepts none in time."""
+    for path in paths:
+        result = context.finish(path, stage, reason)
+        if result is not None or context.ended:
+            return result
+    return None
+
+
 class StraightLine(Planner[StraightLineSettings]):
     """The shortest straight line from the start to a goal configuration that passes the validator."""
 
@@ -32,12 +45,9 @@ class StraightLine(Planner[StraightLineSettings]):
         start, goals = start_goal.rows()
         order = np.argsort(np.linalg.norm(goals - start, axis=1))
         selected = order[:1] if self.settings.goals == NEAREST else order
-        for goal in goals[selected]:
-            path = start_goal.complete(np.stack([start, goal]))
-            result = context.finish(path, "straight_line", "solved by the straight line")
-            if result is not None:
-                return result
-            if context.ended:
-                break
+        paths = (start_goal.complete(np.stack([start, goal])) for goal in goals[selected])
+        result = first_accepted(context, paths, "straight_line", "solved by the straight line")
+        if result is not None:
+            return result
         plural = "line is" if len(selected) == 1 else f"lines to {len(selected)} goal configurations are"
         return context.unsolved(f"the straight {plural} refused")

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.collision.kernels.convex_bounds import Hulls, Solids
-from robotdiffuse.core.transforms import transform
+from robotdiffuse.core.transforms import placed, transform
 from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -67,7 +67,7 @@ def parts_of(robot: Robot) -> dict[str, tuple[Part, ...]]:
         T = robot.T_frame_link(link)
         convex_parts: list[Part] = []
         for mesh in robot.meshes.get(link, ()):
-            vertices = mesh.vertices @ T[:3, :3].T + T[:3, 3]
+            vertices = placed(T, mesh.vertices)
             center = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
             radius = float(np.linalg.norm(vertices - center, axis=1).max())
             convex_parts.append(Part(frame, vertices, mesh.faces, 0.0, center, radius))

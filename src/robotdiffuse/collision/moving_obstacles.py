@@ -24,7 +24,7 @@ from robotdiffuse.collision.kernels.moving_obstacles import CLEARANCE_CAP, Links
 from robotdiffuse.collision.motions import with_covering_spheres
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.loading import loading
-from robotdiffuse.core.transforms import inverse, quaternion_from_rotation
+from robotdiffuse.core.transforms import inverse, placed, quaternion_from_rotation
 from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot
@@ -199,7 +199,7 @@ def compile_links(robot: Robot) -> tuple[tuple[str, ...], Links]:
     for link in names:
         T = covered.T_frame_link(link)
         local = np.asarray(covered.spheres[link], np.float64)
-        spheres.append(np.column_stack([local[:, :3] @ T[:3, :3].T + T[:3, 3], local[:, 3]]))
+        spheres.append(np.column_stack([placed(T, local[:, :3]), local[:, 3]]))
     bounds = np.zeros((len(names), 4))
     for i, of_link in enumerate(spheres):
         low = (of_link[:, :3] - of_link[:, 3:]).min(axis=0)

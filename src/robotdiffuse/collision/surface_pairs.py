@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from robotdiffuse.collision.convex_geometry import Check, checks_of, surfaces_decide
+from robotdiffuse.core.transforms import placed
 from robotdiffuse.robots.coal_geometry import coal_pose, coal_surface
 from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot
@@ -77,7 +78,7 @@ class SurfacePair:
         if coal.collide(*places, coal.CollisionRequest(), coal.CollisionResult()):
             return None
         for body, T_body, other_body, T_other in ((a, T_a, b, T_b), (b, T_b, a, T_a)):
-            in_base = other_body.points @ T_other[:3, :3].T + T_other[:3, 3]
+            in_base = placed(T_other, other_body.points)
             if body.inside((in_base - T_body[:3, 3]) @ T_body[:3, :3]).any():
                 return None
         result = coal.DistanceResult()
@@ -107,7 +108,7 @@ def _body(robot: Robot, link: str) -> _Body:
 
     T = robot.T_frame_link(link)
     surface = robot.surfaces[link]
-    vertices = surface.vertices @ T[:3, :3].T + T[:3, 3]
+    vertices = placed(T, surface.vertices)
     faces = surface.faces
     ends = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
     edges = coo_array((np.ones(len(ends[0]), bool), ends), (len(vertices),) * 2)

@@ -98,7 +98,7 @@ def descend(robot, scene, q, lower, upper, steps, rounds):
 def _push_away(cost, gradient, push, pushed):
     """The Gauss-Newton step -g 2c / (g.g) of the collision costs, at most `push` [rad], into pushed[dof].
 
-    For a single contact this step just clears it, whatever the scale of the cost. Returns 1 if there is a
+    For a single contact this step just clears it, at any scale of the cost. Returns 1 if there is a
     contact, else 0.
     """
     pushed[:] = _ZERO

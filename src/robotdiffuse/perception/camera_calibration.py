@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.transforms import transform
+from robotdiffuse.core.transforms import placed, transform
 from robotdiffuse.core.types import Configuration, Points, Pose
 from robotdiffuse.perception.camera_check import (
     BETTER,
@@ -109,7 +109,7 @@ def calibrate_camera(views: Sequence[DepthView], robot: Robot) -> CameraCalibrat
         rows = list[ndarray]()
         errors = list[ndarray]()
         for (tree, surface, normals), in_camera in zip(models, points, strict=True):
-            at = in_camera @ T[:3, :3].T + T[:3, 3]
+            at = placed(T, in_camera)
             distance, near = map(np.asarray, tree.query(at, distance_upper_bound=gate))
             close = np.flatnonzero(np.isfinite(distance))
             normal = normals[near[close]]
@@ -148,12 +148,9 @@ def _surface(robot: Robot, q: Configuration) -> tuple[KDTree, Points, Points]:
 
 def _near_arm(view: DepthView, T: Pose, tree: KDTree) -> Points:
     """Points of an image in the camera's frame that are near the arm if the camera is about at T."""
-    fx, fy, cx, cy = view.intrinsics
-    stride = max(1, round(STEP_ANGLE * fx / 2))
-    depth = view.depth[::stride, ::stride].astype(np.float64)
-    v, u = np.nonzero(np.isfinite(depth) & (depth > 0))
-    z = depth[v, u]
-    points = np.stack([(stride * u - cx) / fx * z, (stride * v - cy) / fy * z, z], axis=1)
-    distance, _ = tree.query(points @ T[:3, :3].T + T[:3, 3], distance_upper_bound=2 * GATES[0])
+    stride = max(1, round(STEP_ANGLE * view.intrinsics[0] / 2))
+    fx, fy, cx, cy = (value / stride for value in view.intrinsics)
+    points = DepthView(view.depth[::stride, ::stride], (fx, fy, cx, cy), np.eye(4)).points()
+    distance, _ = tree.query(placed(T, points), distance_upper_bound=2 * GATES[0])
     points = points[np.isfinite(distance)]
     return points[:: max(1, len(points) // MAX_POINTS)]

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -75,8 +76,14 @@ def mistakes(view: DepthView) -> Iterator[tuple[str, DepthView]]:
 
 def camera_note(view: DepthView, robot: Robot, start: Configuration) -> str:
     """What is wrong with a view's camera, as the arm in the image shows; "" if nothing is, or it shows too
-    little."""
+    little. The last results are cached: calls with the same views ask for them again."""
     q = start if view.configuration is None else view.configuration
+    return _camera_note(view, robot, tuple(q.tolist()))
+
+
+@lru_cache(maxsize=32)
+def _camera_note(view: DepthView, robot: Robot, joint_values: tuple[float, ...]) -> str:
+    q = np.array(joint_values)
     found, through, count = agreement(view, robot, q)
     if count >= MIN_CELLS and found >= MIN_AGREEMENT:
         return ""

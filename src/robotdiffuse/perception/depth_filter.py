@@ -232,9 +232,9 @@ def measure_noise(images: Sequence[ArrayLike]) -> DepthNoise:
     products = (clipped[:, :, 1:] * clipped[:, :, :-1])[:, both].sum()
     correlated = products / max((clipped**2)[:, always].mean() * len(stack) * both.sum(), 1e-30)
     still = [patch_noise(image) for image in arrays]
-    spread, neighbours = max((over_time, float(correlated)), *still)
-    neighbours = min(neighbours, 0.98)
-    length = 1 / np.sqrt(-2 * np.log(neighbours)) if neighbours > np.exp(-2) else 0.0
+    spread, neighbor_correlation = max((over_time, float(correlated)), *still)
+    neighbor_correlation = min(neighbor_correlation, 0.98)
+    length = 1 / np.sqrt(-2 * np.log(neighbor_correlation)) if neighbor_correlation > np.exp(-2) else 0.0
     missing = 1 - seen.sum() / max(len(stack) * int((seen.sum(axis=0) > 0).sum()), 1)
     return DepthNoise(spread=spread, missing=float(missing), correlation=float(length))
 

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from robotdiffuse.core.bounds import MAX_RATE, Value, numbers, rigid_transform, vector
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.settings import Bound, NotNegative, Positive, Settings
+from robotdiffuse.core.transforms import placed
 from robotdiffuse.core.types import Configuration, Points, Pose
 from robotdiffuse.scenes.shapes import PointCloud
 
@@ -119,7 +120,7 @@ class DepthView(Value):
         z = self.depth[rows, columns].astype(np.float64)
         fx, fy, cx, cy = self.intrinsics
         in_camera = np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], axis=1)
-        return in_camera @ self.T_base_camera[:3, :3].T + self.T_base_camera[:3, 3]
+        return placed(self.T_base_camera, in_camera)
 
     def moved(self, T: Pose) -> "DepthView":
         """The view after a rigid motion of its camera and its points.
@@ -127,7 +128,7 @@ class DepthView(Value):
         Args:
             T: The rigid motion, a homogeneous transform [4, 4].
         """
-        cloud = None if self.cloud is None else self.cloud @ T[:3, :3].T + T[:3, 3]
+        cloud = None if self.cloud is None else placed(T, self.cloud)
         return replace(self, T_base_camera=T @ self.T_base_camera, cloud=cloud)
 
     @classmethod

@@ -328,7 +328,8 @@ def confidence(assumption: str, crossed: CrossedSpace) -> float:
 
     It is the share of sampled worlds in which the motion is free; see `sampled_worlds`. Without a prediction,
     it is the assumption's rate. Either falls with the part of the motion of which rays should tell and do
-    not, whatever the network predicts there; where views saw nothing of it, it is at most UNSEEN_CONFIDENCE.
+    not, also where the network predicts free space; where views saw nothing of it, it is at most
+    UNSEEN_CONFIDENCE.
     """
     share = crossed.free_share
     stated = RATES[assumption] if share is None else min(share, MAX_CONFIDENCE)

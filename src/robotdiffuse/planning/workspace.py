@@ -9,7 +9,7 @@ import numpy as np
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import rigid_transform
+from robotdiffuse.core.bounds import numbers, rigid_transform
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.transforms import inverse
@@ -246,8 +246,8 @@ class Workspace:
 
         line = CartesianLine(self.tip, tolerance, angle, speed)
         several = isinstance(pose, AnyGoal)
-        listed = isinstance(pose, list | tuple) and len(pose) > 0 and getattr(pose[0], "ndim", 0) == 2
-        if listed or (isinstance(pose, ndarray) and pose.ndim == 3):
+        matrices = numbers(pose)
+        if matrices is not None and matrices.ndim == 3:
             raise InputError(
                 f"pose is {len(pose)} poses; a line has one end: plan to each from path.positions[-1] of the "
                 "line before, or give a rd.AnyGoal to reach any of them"

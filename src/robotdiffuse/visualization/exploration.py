@@ -13,6 +13,7 @@ from PIL import Image
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.output_files import check_output, write_atomically
+from robotdiffuse.core.transforms import placed
 from robotdiffuse.core.types import Path, Points, Trajectory
 from robotdiffuse.drawables import ASSUMED, OBSERVED, Color, Surface, drawables, painted
 from robotdiffuse.perception.seen_points import near_scene
@@ -152,7 +153,7 @@ def frustum(explorer: RecordedExplorer, act: RecordedAct) -> list[Points]:
     corners = np.array([(0, 0), (width, 0), (width, height), (0, height)], float)
     in_camera = np.column_stack([(corners - (cx, cy)) / (fx, fy), np.ones(4)]) * FRUSTUM_DEPTH
     T = act.T_base_camera
-    rim = in_camera @ T[:3, :3].T + T[:3, 3]
+    rim = placed(T, in_camera)
     return [np.stack([T[:3, 3], corner]) for corner in rim] + [np.concatenate([rim, rim[:1]])]
 
 

@@ -1,6 +1,7 @@
 """The trainings: of an auto-encoder of point clouds, of the diffusion model, and of baselines' networks."""
 
 import copy
+from abc import ABC, abstractmethod
 from dataclasses import fields
 from functools import partial
 from pathlib import Path as FilePath
@@ -380,7 +381,7 @@ class PlannerLoss:
         return error
 
 
-class BaselineNetwork(Network):
+class BaselineNetwork(Network, ABC):
     """A network that `train_baseline` trains; `settings` are of the class that NETWORKS names."""
 
     training_defaults: ClassVar[dict[str, Any]] = {}
@@ -395,11 +396,11 @@ class BaselineNetwork(Network):
     def fit_statistics(self, data: TrajectoryData) -> None:
         """Fill buffers with statistics of the training trajectories; called before a run."""
 
+    @abstractmethod
     def loss(
         self, data: TrajectoryData, count: int, fraction: float, rng: np.random.Generator
     ) -> Float[Tensor, ""]:
         """The loss of `count` samples drawn from the data; `fraction` of the training is done, 0 to 1."""
-        raise NotImplementedError
 
 
 def baseline_training(name: str, given: dict[str, Any]) -> BaselineTraining:

@@ -97,13 +97,13 @@ def plan_with_unknown_space(
         exported_completion()  # loaded before the clock starts
     else:
         predict = None
-    cameras = [camera_note(view, problem.robot, problem.start) for view in problem.views]
     context = PlanningContext(solver.name, problem, request)
     volume = None
     if unknown is None:
         volume = observe(problem.views, problem.robot, problem.start)
         predicted = predict(volume) if predict is not None else predicted
         unknown = unknown_space_of(problem, volume, predicted)
+    cameras = [camera_note(view, problem.robot, problem.start) for view in problem.views]
     prepared = context.elapsed
     shares = [measured_share(view) for view in problem.views]
     if shares and max(shares) < MIN_MEASURED_SHARE:

@@ -12,6 +12,7 @@ from numpy.random import Generator
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Positive, Settings
+from robotdiffuse.core.transforms import placed
 from robotdiffuse.core.types import Configuration, Configurations, JointRows, Pose
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
@@ -176,7 +177,7 @@ def base_spheres(robot: Robot) -> Spheres:
     for link, spheres in robot.spheres.items():
         if robot.link_frame(link) == 0:
             T = robot.T_frame_link(link)
-            parts.append(np.column_stack([spheres[:, :3] @ T[:3, :3].T + T[:3, 3], spheres[:, 3]]))
+            parts.append(np.column_stack([placed(T, spheres[:, :3]), spheres[:, 3]]))
     return np.concatenate(parts)
 
 

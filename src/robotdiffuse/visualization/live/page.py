@@ -3,6 +3,7 @@
 import contextlib
 import html
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -63,7 +64,7 @@ NOTIFICATION_TIME = 8.0
 """Time that notifications stay [s]."""
 
 
-class LivePage:
+class LivePage(ABC):
     """Shows the state of a session to all browsers that the server lets in, until it is closed."""
 
     def __init__(self, session: Any, server: PageServer, robot: Robot) -> None:
@@ -95,9 +96,9 @@ class LivePage:
             if not self._closed:
                 self._draw()
 
+    @abstractmethod
     def _draw(self) -> None:
         """Draw what has changed; only this task draws."""
-        raise NotImplementedError
 
 
 class Page(LivePage):
