@@ -71,10 +71,6 @@ def slower(certificate: Certificate) -> Certificate:
     return replace(certificate, motion=late, motion_hash=hash_of(late))
 
 
-def without_moving(certificate: Certificate) -> Certificate:
-    return replace(certificate, moving=None)
-
-
 def nearer(certificate: Certificate) -> Certificate:
     assert certificate.moving is not None
     proof = certificate.moving
@@ -90,24 +86,13 @@ def shorter(certificate: Certificate) -> Certificate:
     return replace(certificate, moving=replace(proof, stretches=stretches))
 
 
-def tighter(certificate: Certificate) -> Certificate:
-    return replace(certificate, constraints=tuple((name, most / 2) for name, most in certificate.constraints))
-
-
-def unconstrained(certificate: Certificate) -> Certificate:
-    return replace(certificate, constraints=())
-
-
 def coarser(certificate: Certificate) -> Certificate:
     return replace(certificate, between=certificate.between[:0])
 
 
 TAMPERED: dict[str, tuple[str, Callable[[Certificate], Certificate], str]] = {
-    "no proof": ("moving", without_moving, "proof: there is none among moving obstacles"),
     "displacement": ("moving", nearer, "proof: displacement of .* against post from row .* is "),
     "a gap": ("moving", shorter, "proof: (clearance of |displacement of )?.*post (is missing )?from row"),
-    "bounds": ("cone", tighter, "constraints: the bound of axis_cone of panda_hand is "),
-    "no bounds": ("line", unconstrained, "constraints: they are not those of the problem"),
     "chords": ("cone", coarser, "motion: its cubics leave the straight lines that were certified"),
     "beginning": ("start velocity", slower, "motion: it does not begin at the problem's start_velocity"),
 }

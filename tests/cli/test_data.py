@@ -2,7 +2,6 @@
 
 import json
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -114,15 +113,6 @@ def test_bad_input_is_status_2_in_one_line(case, folder, capsys, monkeypatch):
     assert run("data", *argv) == 2
     error = capsys.readouterr().err
     assert named in error and error.count("\n") == 1
-
-
-def test_missing_pybullet_is_status_2(folder, capsys, monkeypatch):
-    for name in [name for name in sys.modules if name.startswith("robotdiffuse.simulation")]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "pybullet", None)
-    assert run("data", "check", folder, "--workers", 1) == 2
-    error = capsys.readouterr().err
-    assert "--no-pybullet" in error and "pip install" in error and error.count("\n") == 1
 
 
 def test_info_on_motions_that_are_all_straight_warns_of_nothing(

@@ -57,16 +57,6 @@ def test_bad_input_is_one_line(
     assert message in error and error.count("\n") == 1
 
 
-def test_the_live_page_needs_viser(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for module in [name for name in sys.modules if name.startswith("robotdiffuse.visualization.live")]:
-        monkeypatch.delitem(sys.modules, module)
-    monkeypatch.setitem(sys.modules, "viser", None)
-    assert run("explore", write_problem(tmp_path), "--live", "--port", "0") == 2
-    assert "explore --live needs viser: pip install 'robotdiffuse[live]'" in capsys.readouterr().err
-
-
 def test_the_live_page_is_served_until_it_is_stopped(tmp_path: Path) -> None:
     pytest.importorskip("viser", reason="explore --live needs viser: pip install 'robotdiffuse[live]'")
     command = [sys.executable, "-m", "robotdiffuse", "explore", str(write_problem(tmp_path)), "--live"]

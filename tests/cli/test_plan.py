@@ -2,7 +2,6 @@
 
 import json
 import os
-import runpy
 from dataclasses import replace
 from pathlib import Path
 
@@ -145,22 +144,6 @@ def test_a_result_saved_from_python_holds_its_problem(
     assert "holds no problem (without its problem: robot 'mine' is neither" in capsys.readouterr().err
 
 
-BAD_PROBLEM = {
-    "unknown robot": ({"robot": "pandaa"}, "pandaa"),
-    "out of limits": ({"start": [4.0, *START[1:]]}, "panda_joint1 is 4 rad"),
-}
-
-
-@pytest.mark.parametrize("case", BAD_PROBLEM)
-def test_bad_problem_is_status_2_in_one_line(
-    case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    changes, named = BAD_PROBLEM[case]
-    assert run("plan", write_problem(tmp_path, **changes), "--planner", "rrt_connect") == 2
-    error = capsys.readouterr().err
-    assert error.startswith("robotdiffuse: error: ") and named in error and error.count("\n") == 1
-
-
 def test_problem_of_a_jsonl_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "problems.jsonl"
     blocked = PROBLEM | {"scene": NO_PLAN["start in collision"][0]["scene"]}
@@ -219,12 +202,6 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize("file", EXAMPLES, ids=lambda file: file.name)
 def test_examples_are_solved(file: Path) -> None:
     assert run("plan", file, "--planner", "rrt_connect", "--time-limit", 5) == 0
-
-
-def test_example_in_python(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    runpy.run_path(str(ROOT / "examples" / "plan.py"))
-    assert capsys.readouterr().out.startswith("solved")
-    assert (tmp_path / "motion.csv").exists()
 
 
 def test_the_clearance_is_printed_beside_the_requested_one(

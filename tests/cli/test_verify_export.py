@@ -88,16 +88,6 @@ def test_motions_from_other_programs(planned: Path, capsys: pytest.CaptureFixtur
     assert "--scene and --robot belong together" in capsys.readouterr().err
 
 
-def test_scene_of_another_robot(planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    state = "robot_state: {joint_state: {name: [gripper], position: [0.1]}}"
-    Path("stranger.yaml").write_text(state)
-    asked = ("verify", planned / "m.yaml", "--scene", "stranger.yaml", "--robot", "panda")
-    assert run(*asked) == 2
-    assert "has values of gripper, movable joints that panda lacks" in capsys.readouterr().err
-    assert run(*asked, "--ignore-joints") == 0
-    assert "note: robot_state.joint_state: ignored gripper" in capsys.readouterr().out
-
-
 def test_all_violations_are_listed(planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
     asked = ("verify", planned / "m.yaml", "--problem", planned / "other.json")
     assert run(*asked, "--certificate", "c.json") == 1

@@ -19,7 +19,7 @@ from trimesh.exchange.gltf import export_gltf
 from trimesh.exchange.obj import export_obj
 from trimesh.exchange.ply import export_ply
 
-from robotdiffuse import InputError, load_problem
+from robotdiffuse import InputError
 from robotdiffuse.core.errors import joined, shown, unknown_name
 from robotdiffuse.core.input_files import (
     MAX_SHOWN_NAME,
@@ -32,7 +32,6 @@ from robotdiffuse.core.input_files import (
     read_text,
 )
 from robotdiffuse.core.mesh_files import read_triangles
-from robotdiffuse.core.output_files import check_output
 
 SOURCE = Path(__file__).parents[2] / "src" / "robotdiffuse"
 DEEP = 100_000
@@ -290,8 +289,3 @@ def test_nothing_unpickles_files() -> None:
             if call in ("np.load", "numpy.load"):
                 allowed = [key.value for key in node.keywords if key.arg == "allow_pickle"]  # type: ignore[attr-defined]
                 assert all(isinstance(one, ast.Constant) and one.value is False for one in allowed), file
-
-
-def test_an_overlong_file_name_is_one_line(tmp_path: Path) -> None:
-    assert "too long" in one_line(lambda: load_problem(tmp_path / ("x" * 300 + ".yaml")))
-    assert "too long" in one_line(lambda: check_output("y" * 5000 + ".json", (".json",)))

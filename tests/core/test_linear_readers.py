@@ -5,7 +5,6 @@ from typing import ClassVar
 import pytest
 
 from robotdiffuse import Box, InputError, Scene
-from robotdiffuse.core.errors import repeated
 from robotdiffuse.core.input_files import parse_json
 from robotdiffuse.core.types import check_motion_arrays
 from robotdiffuse.scenes.scene import MAX_CONTACT_LINKS
@@ -29,11 +28,6 @@ class Name(str):
 def names(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(Name, "compared", 0)
     return [Name(f"j{i}") for i in range(COUNT)]
-
-
-def test_repeated_names_in_order() -> None:
-    assert repeated(["b", "a", "b", "c", "a"]) == ["b", "a"]
-    assert repeated("abc") == []
 
 
 def test_joint_names_are_compared_a_few_times_each(names: list[str]) -> None:

@@ -1,6 +1,5 @@
 """Result and trajectory files: round trips, and one-line errors for damaged files."""
 
-import csv
 import json
 from dataclasses import fields, replace
 from pathlib import Path as FilePath
@@ -104,30 +103,6 @@ def test_failed_result_round_trip(failed: PlanResult, tmp_path: FilePath) -> Non
     assert json.loads(file.read_text())["verified"] is False
     with pytest.raises(InputError, match=r"no trajectory to write \(timeout\)"):
         failed.save(str(tmp_path / "result.csv"))
-
-
-def test_csv_holds_every_number_exactly(trajectory: Trajectory, tmp_path: FilePath) -> None:
-    file = tmp_path / "motion.csv"
-    trajectory.save(str(file))
-    with file.open(newline="") as stream:
-        header, *rows = csv.reader(stream)
-    assert header[:3] == ["time", "shoulder_position", "elbow_position"]
-    assert header[3:5] == ["shoulder_velocity", "elbow_velocity"] and len(header) == 7
-    values = np.array(rows, dtype=float)
-    assert np.array_equal(values[:, 0], trajectory.times)
-    assert np.array_equal(values[:, 1:3], trajectory.positions)
-    assert np.array_equal(values[:, 5:], trajectory.accelerations)
-
-
-def test_trajectory_json(trajectory: Trajectory, tmp_path: FilePath) -> None:
-    trajectory.save(str(tmp_path / "motion.json"))
-    record = json.loads((tmp_path / "motion.json").read_text())
-    assert record["joint_names"] == list(NAMES) and record["positions"] == trajectory.positions.tolist()
-
-
-def test_unknown_ending_lists_the_known_ones(trajectory: Trajectory, tmp_path: FilePath) -> None:
-    with pytest.raises(InputError, match=r"unknown ending '.txt'; known: .json, .csv"):
-        trajectory.save(tmp_path / "motion.txt")
 
 
 def test_unwritable(solved: PlanResult, tmp_path: FilePath) -> None:

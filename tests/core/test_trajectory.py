@@ -1,5 +1,4 @@
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -7,7 +6,6 @@ import pytest
 from helpers.box_arm import box_arm
 from robotdiffuse import InputError, Problem, Scene, Trajectory, load_planner, verify
 from robotdiffuse.core.types import ROWS
-from robotdiffuse.interop import read_motion
 from robotdiffuse.validation.rates import rate_violations
 from robotdiffuse.validation.validator import VerifySettings
 
@@ -43,16 +41,6 @@ def pulse(step: float = 0.004, count: int = 6) -> Trajectory:
     moved = step * (v[1:] + v[:-1]) / 2 - step**2 * (a[1:] - a[:-1]) / 12
     q = np.concatenate([np.zeros((1, 3)), np.cumsum(moved, axis=0)])
     return Trajectory(("a", "b", "c"), step * np.arange(len(a)), q, v, a)
-
-
-def test_no_cell_of_csv_begins_a_formula(tmp_path: Path) -> None:
-    names = ("=HYPERLINK(1)", "+1", "-j", "@j")
-    rows = np.zeros((2, 4))
-    motion = Trajectory(names, np.array([0.0, 1.0]), rows, rows, rows)
-    motion.save(tmp_path / "m.csv")
-    header = (tmp_path / "m.csv").read_text().partition("\n")[0]
-    assert not any(cell.startswith(("=", "+", "-", "@")) for cell in header.split(","))
-    assert tuple(read_motion(tmp_path / "m.csv").joint_names) == names
 
 
 def test_a_cubic_is_exact_at_any_time():

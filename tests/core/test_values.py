@@ -176,12 +176,6 @@ def test_views_of_what_can_be_written_to_are_copied() -> None:
     assert not np.shares_memory(buffer, read_only(buffer))
 
 
-def test_a_value_of_read_only_arrays_keeps_them() -> None:
-    path = VALUES[rd.Path]()
-    assert isinstance(path, rd.Path)
-    assert rd.Path(path.joint_names, path.positions).positions is path.positions
-
-
 def test_compiled_code_gets_arrays_of_one_type() -> None:
     mine = np.zeros(3)
     kept = read_only(np.zeros(3))

@@ -5,12 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helpers.example_robots import planar_arm
 from robotdiffuse.cli import main
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.evaluation import ablation
-from robotdiffuse.evaluation.metrics import link_length
-from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.networks import TrajectoryTransformer
 from robotdiffuse.learning.encoders import make_encoder
@@ -58,24 +55,6 @@ def test_what_is_given_beside_a_config_wins() -> None:
 def test_every_row_has_its_config() -> None:
     assert len(ablation.ROWS) == 10
     assert {row.config for row in ablation.ROWS.values()} == {c for c in CONFIGS if c.startswith("table2_")}
-
-
-def test_link_path_length_by_hand() -> None:
-    """A two-link arm that turns as a whole about its base: the arc of the origin of l2."""
-    arm = planar_arm(0.5, 0.4)
-    turn = np.linspace(0.0, 1.0, 2001)
-    q = np.stack([turn, 0 * turn], axis=1)
-    # l1 turns in place; l2's origin is 0.5 m from the axis; the tip is fixed to l2
-    np.testing.assert_allclose(link_length(arm, np.stack([q, q[::-1]])), 0.5, rtol=1e-6)
-
-
-def test_bootstrap_covers_the_mean() -> None:
-    rng = np.random.default_rng(0)
-    covered = 0
-    for i in range(60):
-        low, high = bootstrap_interval(rng.normal(1.0, 2.0, 80), seed=i)
-        covered += low < 1.0 < high
-    assert 50 <= covered <= 60
 
 
 def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -377,13 +377,6 @@ def test_bad_settings_are_told_before_anything_is_made(tmp_path: Path, change: d
     assert not (tmp_path / "out" / "records").exists()
 
 
-def test_command_with_bad_input(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    asked = ["bench", "run", "--problems", "rop", "--out", str(tmp_path)]
-    assert main([*asked, "--planners", "nonsense"]) == 2
-    assert "unknown planner 'nonsense'" in capfd.readouterr().err
-    assert main([*asked, "--planners", "rrt_connect", "--workers", "2", "--cluster", "ray"]) == 2
-
-
 @pytest.mark.parametrize("name", PRESETS)
 def test_planners_and_problems_of_presets_are_known(name: str, tmp_path: Path) -> None:
     pytest.importorskip("ompl")

@@ -63,46 +63,39 @@ def test_collision_is_found_by_both_validators(tmp_path, pybullet):
     assert found(tmp_path, pybullet=False) == {"collision": 1}
 
 
-@pytest.mark.sim
-def test_collision_between_frames_is_found(tmp_path, pybullet):
-    thin = Scene([Box([0.0, 1.1, 0.0], [0.01, 0.01, 0.01])])
-    q = line(AWAY, BACK, waypoints=4)
-    row = record(ARM, thin, q)
-    assert row["clearance"] > 0.05
-    write_motions(tmp_path, ARM, [row], waypoints=4)
-    assert found(tmp_path) == {"collision": 1, "pybullet": 1}
+UNSOUND = {
+    "a collision between frames": (
+        Scene([Box([0.0, 1.1, 0.0], [0.01, 0.01, 0.01])]),
+        line(AWAY, BACK, waypoints=4),
+        {"collision": 1, "pybullet": 1},
+    ),
+    "self-collision": (Scene(), line(0 * AWAY, np.array([0.0, 2.7, 2.7])), {"collision": 1, "pybullet": 1}),
+    "a start out of limits": (Scene(), line(np.array([2.9, 0, 0]), -2 * AWAY), {"limits": 1, "motion": 1}),
+    "twitching": (Scene(), line(AWAY, BACK)[[*(i * (i % 2 == 0) for i in range(19)), 19]], {"motion": 1}),
+}
 
 
 @pytest.mark.sim
-def test_self_collision_is_found(tmp_path, pybullet):
-    write_motions(tmp_path, ARM, [record(ARM, Scene([]), line(np.zeros(3), np.array([0.0, 2.7, 2.7])))])
-    assert found(tmp_path) == {"collision": 1, "pybullet": 1}
+@pytest.mark.parametrize("case", UNSOUND)
+def test_unsound_motions_are_found(case, tmp_path, pybullet):
+    scene, q, kinds = UNSOUND[case]
+    write_motions(tmp_path, ARM, [record(ARM, scene, q)], waypoints=len(q))
+    assert found(tmp_path) == kinds
 
 
 @pytest.mark.sim
-def test_limit_violation_is_found(tmp_path, pybullet):
+def test_limits_on_the_way_are_found_but_not_of_continuous_joints(tmp_path, pybullet):
     q = line(np.array([2.7, 0.0, 0.0]), np.array([2.7, 1.0, 0.0]))
     q[7, 0] = 2.801
-    write_motions(tmp_path, ARM, [*right(1), record(ARM, Scene([]), q)])
-    check = check_data(tmp_path, ARM)
+    write_motions(tmp_path / "arm", ARM, [*right(1), record(ARM, Scene([]), q)])
+    check = check_data(tmp_path / "arm", ARM)
     assert {kind: n for kind, n in check.counts.items() if n} == {"limits": 1}
     (example,) = check.findings
     assert example.where == "shard 0, row 1" and "j0 is 2.801 at waypoint 7" in example.message
-
-
-@pytest.mark.sim
-def test_continuous_joints_have_no_limits(tmp_path, pybullet):
     robot = load_robot("gen3")
     q = line(np.where(robot.continuous, 9.6, 0.0), np.where(robot.continuous, 9.5, 0.1))
-    write_motions(tmp_path, robot, [record(robot, Scene([]), q)])
-    assert any(robot.continuous) and check_data(tmp_path, robot).counts["limits"] == 0
-
-
-@pytest.mark.sim
-def test_start_out_of_limits_is_found(tmp_path, pybullet):
-    q = line(np.array([2.9, 0.0, 0.0]), np.array([2.0, 0.0, 0.0]))
-    write_motions(tmp_path, ARM, [record(ARM, Scene([]), q)])
-    assert found(tmp_path) == {"limits": 1, "motion": 1}
+    write_motions(tmp_path / "gen3", robot, [record(robot, Scene([]), q)])
+    assert any(robot.continuous) and check_data(tmp_path / "gen3", robot).counts["limits"] == 0
 
 
 WRONG = {
@@ -121,13 +114,6 @@ def test_what_is_recorded_wrongly_is_found(case, tmp_path):
     near = record(ARM, Scene([Sphere([0.0, 1.5, 0.0], 0.1)]), line(AWAY, np.array([1.0, 0.0, 0.0])))
     write_motions(tmp_path, ARM, [*right(2), spoil(near)])
     assert found(tmp_path, pybullet=False) == {kind: 1}
-
-
-def test_twitching_is_found(tmp_path):
-    q = line(AWAY, BACK)
-    q[1:-1:2] = q[0]
-    write_motions(tmp_path, ARM, [record(ARM, Scene([]), q)])
-    assert found(tmp_path, pybullet=False) == {"motion": 1}
 
 
 def test_damaged_shard_is_named_and_the_others_are_validated(tmp_path):

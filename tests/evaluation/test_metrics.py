@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from helpers.example_robots import planar_arm
-from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.core.types import Path, Trajectory
@@ -267,37 +266,6 @@ def test_exceeded_limits_fail(joint: int, upper: bool) -> None:
     assert panda_verdict(np.stack([base, at, base])) == ""
     assert panda_verdict(np.stack([base, beyond, base])) == "limits"
     assert panda_verdict(np.stack([base, beyond, base]), limit_slack=2e-3) == ""
-
-
-def test_self_collision_between_valid_ends_fails() -> None:
-    """The fingers pass through the upper arm; without the middle waypoint the motion is free."""
-    folded = np.array([0, -1.5, 0, -3.0, 0, 0.2, 0.785])
-    assert panda_verdict(np.stack([START, END])) == ""
-    assert panda_verdict(np.stack([START, folded, END])) == "self_collision"
-
-
-@pytest.mark.parametrize(("gap", "kind"), [(1e-3, None), (-1e-3, "scene_collision")])
-def test_scene_collision_fails_from_contact_on(gap: float, kind: str | None) -> None:
-    """A ball beside the hand's way, a millimeter clear of the nearest link or in it."""
-    middle = link_pose(PANDA, (START + END) / 2, "panda_hand")[:3, 3] + np.array([0.3, -0.1, 0.1])
-    small = ExactCollision(PANDA, Scene([Sphere(middle, 0.01)]))
-    way = np.linspace(START, END, 120)
-    least = min(d.distance for q in way for d in small.link_distances(q))
-    assert least > 0.05
-    problem = Problem(PANDA, Scene([Sphere(middle, 0.01 + least - gap)]), START, JointGoal(END[None]))
-    violation = verify(problem, Path(PANDA.joint_names, np.stack([START, END]))).violation
-    assert (violation.kind if violation else None) == kind
-
-
-@pytest.mark.parametrize(("reversals", "kind"), [(3, ""), (4, "twitch")])
-def test_twitching_fails_by_the_number_of_reversals(reversals: int, kind: str) -> None:
-    there = START
-    back = START + 0.1
-    rows = np.stack([back if i % 2 else there for i in range(reversals + 2)])
-    assert panda_verdict(rows) == kind
-    assert panda_verdict(rows, reversals=reversals) == ""
-    assert panda_verdict(rows, reversals=reversals - 1) == "twitch"
-    assert panda_verdict(rows, reversal_step=0.5) == ""
 
 
 # Statistics

@@ -86,11 +86,6 @@ def test_the_row_of_weights_says_what_they_are(
     assert unguided == Row(f"{name}, no guidance", unguided_planner)
 
 
-def test_weights_of_the_package_are_named_without_their_folder(tmp_path: Path) -> None:
-    row = Table1Settings(tmp_path, paper_weights="panda_points").rows[5]
-    assert row.name.startswith(f"{paper.WITHOUT_CLEARANCES}: points, cross_attention")
-
-
 def test_a_limit_that_no_sample_keeps_is_refused_before_the_first_call(tmp_path: Path) -> None:
     settings = Table1Settings(tmp_path, time_limit=1e-4, paper_weights="panda_points")
     with pytest.raises(InputError, match=r"single sample takes about .* denoising steps"):

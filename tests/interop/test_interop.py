@@ -428,6 +428,7 @@ def test_truncated_files_are_one_line(planned: tuple[Problem, Trajectory], tmp_p
         ("time,a\n", "it has a header and no rows"),
         ("time,a\n0,1,2\n", "line 2 has 3 cells; the header has 2"),
         ("time,a\n0,x\n", "line 2: a is 'x'; it must be a number"),
+        ("\ntime,a\n\n0,1\n\n1,x\n", "line 6: a is 'x'"),
         ("time,a,a_position\n0,1,1\n", "the header has 'a_position' more than once"),
         ("time,a,b_velocity\n0,1,1\n", "velocities of other joints"),
         ("time,a\n0,nan\n", "must be finite"),
@@ -641,9 +642,3 @@ def test_rerun_shows_moving_obstacles_and_where_the_base_stands(tmp_path: Path) 
             found.setdefault(str(chunk.entity_path), []).extend(row[0] for row in rows)
     assert found["/scene/cart"] == [[2.0, 0.0, 0.0], [3.0, 0.0, 0.0]]
     assert found["/scene"] == found["/robot"] == [[0.0, 0.0, 1.0]]
-
-
-def test_lines_of_a_csv_file_are_counted_with_blank_ones(tmp_path: Path) -> None:
-    (tmp_path / "m.csv").write_text("\ntime,a\n\n0,1\n\n1,x\n")
-    with pytest.raises(InputError, match="line 6: a is 'x'"):
-        read_motion(tmp_path / "m.csv")

@@ -20,7 +20,6 @@ from robotdiffuse.learning.checkpoint import (
 from robotdiffuse.learning.encoders.networks import (
     PointAutoencoder,
 )
-from robotdiffuse.learning.training.config import EncoderTraining
 
 
 def cloud(n: int, seed: int = 0) -> torch.Tensor:
@@ -126,16 +125,3 @@ def test_encoder_files(tmp_path):
     torch.testing.assert_close(loaded(cloud(9)), encoder(cloud(9)), atol=5e-3, rtol=0)
     with pytest.raises(InputError, match=r"no trained model: encoder\.json"):
         load_encoder(tmp_path / "nothing")
-
-
-def test_settings_as_json():
-    settings = EncoderTraining(seed=3, encoder=SMALL_ENCODER)
-    text = json.dumps(settings.to_json())
-    assert EncoderTraining.from_json(json.loads(text), "x") == settings
-    for bad, message in [
-        ({"seeed": 1}, "x.seeed"),
-        ({"seed": 1.5}, "x.seed"),
-        ({"encoder": {"code": "a"}}, "code"),
-    ]:
-        with pytest.raises(InputError, match=message):
-            EncoderTraining.from_json(bad, "x")

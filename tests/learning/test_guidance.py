@@ -249,16 +249,6 @@ def test_formula_by_hand() -> None:
     assert costs["length"][0] == pytest.approx(0.5 * PANDA.dof * (0.8**2 + 0.4**2))
 
 
-def test_collision_costs_add_up_to_the_checker_s() -> None:
-    q = random_motions(3)
-    costs = formulas(CollisionGuidance(CROWDED, GuidanceSettings(margin=0.05, self_margin=0.03)), q)
-    both, _ = CROWDED.cost_gradients(q.reshape(-1, PANDA.dof), 0.05, 0.03)
-    assert (costs["collision"] > 0).any() and (costs["self_collision"] > 0).any()
-    np.testing.assert_allclose(
-        costs["collision"] + costs["self_collision"], both.reshape(4, -1).sum(1), rtol=1e-4
-    )
-
-
 def test_together_they_reach_a_free_and_short_path_that_none_reaches_alone() -> None:
     """A zigzag through a ball: pushes alone leave the zigzag, length alone the ball."""
     checker = CollisionChecker(box_arm(), Scene([Sphere([1.02, 0.55, 0.0], 0.08)]))

@@ -9,7 +9,7 @@ import torch
 from helpers.box_arm import box_arm
 from helpers.small_model import SMALL_ENCODER, small_model
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.learning.diffusion import SAMPLERS, NoiseSchedule, ScheduleSettings, noise_factor
+from robotdiffuse.learning.diffusion import SAMPLERS, noise_factor
 from robotdiffuse.learning.encoders.networks import (
     PointAutoencoder,
     chamfer,
@@ -55,19 +55,6 @@ def test_normalizer():
     np.testing.assert_allclose(normalizer.from_unit(normalizer.to_unit(q)), q, atol=1e-7)
     with pytest.raises(InputError, match="joint 1"):
         JointNormalizer(np.array([0.0, 1.0]), np.array([1.0, 1.0]))
-
-
-def test_schedule():
-    schedule = NoiseSchedule(ScheduleSettings())
-    np.testing.assert_allclose(schedule.signal**2 + schedule.noise**2, 1.0)
-    assert (np.diff(schedule.signal) <= 0).all()
-    assert schedule.noise[0] == 0
-    assert schedule.signal[-1] ** 2 <= 1.1e-4
-    weight = schedule.weight(np.arange(201), 5.0)
-    assert weight.max() == 5.0
-    assert weight.min() >= 1.0
-    with pytest.raises(InputError, match="sampling steps"):
-        schedule.sampling_levels(0)
 
 
 @pytest.mark.parametrize("smooth", [False, True])

@@ -14,7 +14,6 @@ import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from robotdiffuse.collision import exact_meshes as exact_collision
 from robotdiffuse.collision.exact_meshes import ExactCollision
-from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.shapes import Shape
 from robotdiffuse.trajectories.cubics import Cubics
@@ -24,7 +23,6 @@ from robotdiffuse.validation.rates import rate_violations
 from robotdiffuse.validation.report import Report, Violation
 from robotdiffuse.validation.validator import VerifySettings, verifier, verify_trajectory, violations
 
-Z = np.array([0.0, 0.0, 1.0])
 RATES = VerifySettings()
 
 
@@ -221,15 +219,10 @@ def test_meshes_decide_where_spheres_are_too_coarse() -> None:
         assert bool(meshes_asked(shape)) == by_coal
         assert report.min_clearance is not None
         assert 0.001 <= report.min_clearance <= 0.002
+    assert meshes_asked(rd.Sphere(vector(-1, 0, 0), 0.2)) == 0
     touching = rd.Box(vector(0.6, 0, -0.03005 - 0.05), vector(1.5, 1.5, 0.1))
     assert refused(validator(SWING, touching), "scene_collision").time == 0
     assert validator(SWING[:1], touching, contact=1e-5).valid
-
-
-def test_a_clear_motion_needs_no_meshes() -> None:
-    far = rd.Sphere(vector(-1, 0, 0), 0.2)
-    assert validator(SWING, far).valid
-    assert meshes_asked(far) == 0
 
 
 def problem_and_path(rows: np.ndarray) -> tuple[rd.Problem, rd.Path]:
@@ -258,22 +251,6 @@ def test_the_earliest_of_different_violations_is_reported() -> None:
     assert rd.verify(problem, rd.Path(box_arm().joint_names, rows)).violation.kind == "scene_collision"  # type: ignore[union-attr]
     problem = rd.Problem(box_arm(), rd.Scene(), rows[0], rd.JointGoal(rows[:1]))
     assert rd.verify(problem, rd.Path(box_arm().joint_names, rows)).violation.kind == "limits"  # type: ignore[union-attr]
-
-
-@pytest.mark.parametrize(
-    ("shift", "angle", "valid"),
-    [(0.0, 0.0, True), (0.009, 14.0, True), (0.011, 0.0, False), (0.0, 16.0, False)],
-)
-def test_pose_goals_within_the_papers_tolerances(shift: float, angle: float, valid: bool) -> None:
-    robot = box_arm()
-    T = link_pose(robot, SWING[1], "l3") @ transform(
-        vector(0, 0, shift), rotation_about(Z, np.radians(angle))
-    )
-    problem = rd.Problem(robot, rd.Scene(), SWING[0], rd.PoseGoal("l3", T))
-    report = rd.verify(problem, rd.Path(robot.joint_names, SWING))
-    assert report.valid == valid
-    if not valid:
-        assert refused(report, "goal").subject == "l3"
 
 
 def test_any_of_a_goal_set_will_do() -> None:
@@ -307,7 +284,7 @@ def test_twitching(spacing: float) -> None:
     along = np.concatenate([there, 0.3 - there, there, 0.3 - there, there, [0.3]])
     rows = np.column_stack([along, np.zeros((len(along), 2))])
     assert "4 sharp reversals" in refused(validator(rows), "twitch").message
-    assert validator(rows, reversals=4).valid
+    assert validator(rows, reversals=4).valid and validator(rows, reversal_step=0.5).valid
     assert validator(rows * 0.1).valid
 
 

@@ -170,15 +170,6 @@ def test_doors_hang_on_the_edges_of_cells_and_drawers_have_room_inside() -> None
     assert drawers and 0.0 in np.round(angles, 9) and max(angles) > 2.0
 
 
-@every_family
-def test_same_seed_same_scene(name: str) -> None:
-    (a,), (b,) = drawn(name, 1, seed=3), drawn(name, 1, seed=3)
-    packed = PackedScenes.pack([a.scene, b.scene], 48)
-    assert (packed.params[0] == packed.params[1]).all()
-    targets = [sample_target(f.regions[0], np.random.default_rng(4)) for f in (a, b)]
-    assert (targets[0] == targets[1]).all()
-
-
 def test_targets_have_the_fingers_in_the_region() -> None:
     approach = np.array([0.6, 0.0, -0.8])
     region = Region(np.array([0.5, 0.1, 0.3]), np.array([0.4, 0.2, 2 * REGION_MARGIN]), 0.7, approach)

@@ -7,7 +7,6 @@ import pytest
 
 from robotdiffuse import Box, InputError, Scene, Sphere
 from robotdiffuse.problems.families.rop import ROP, ROP_DENSE, Rop
-from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.surface_points import VisibleRegion, sample_surface
 
 FLOOR = 1
@@ -49,11 +48,6 @@ def test_every_setting_counts() -> None:
     for shape in shapes:
         assert isinstance(shape, Box) and 2 <= shape.center[0] <= 3 and 0.3 <= shape.size[0] <= 0.4
         assert 0 < abs(shape.wxyz[3]) <= np.sin(np.pi / 8) and shape.wxyz[1] == shape.wxyz[2] == 0
-
-
-def test_same_seed_same_scene() -> None:
-    packed = PackedScenes.pack([ROP_DENSE.scene(np.random.default_rng(3)) for _ in range(2)], 13)
-    assert (packed.kinds[0] == packed.kinds[1]).all() and (packed.params[0] == packed.params[1]).all()
 
 
 def test_obstacles_stay_clear_of_the_base() -> None:

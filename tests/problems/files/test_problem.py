@@ -364,14 +364,6 @@ def test_saved_problems_are_read_back_exactly(ending: str, goal: Any, tmp_path: 
     assert [file.name for file in tmp_path.iterdir()] == [file.name], "no part of a file is left behind"
 
 
-def test_saved_poses_are_read_back(tmp_path: Path) -> None:
-    pose = rd.PoseGoal("panda_hand", transform(np.array([0.3, 0.2, 1 / 3]), rotation_about(Z, 2.0)))
-    save_problem(full_problem(pose), tmp_path / "pose.yaml")
-    back = rd.load_problem(tmp_path / "pose.yaml").goal
-    assert isinstance(back, rd.PoseGoal) and back.frame == "panda_hand"
-    np.testing.assert_allclose(back.T_base_frame, pose.T_base_frame, atol=1e-15)
-
-
 def test_lines_are_appended(tmp_path: Path) -> None:
     for i in range(3):
         save_problem(full_problem([0.1 * i, *READY[1:]]), tmp_path / "many.jsonl")
