@@ -30,14 +30,15 @@ pytestmark = pytest.mark.cluster
 SETTINGS = GenerationSettings(trajectories=24, shard=2, waypoints=16)
 STORE = 80 * 2**20
 """Smallest object store of a node, about [bytes]."""
-HEALTH_CHECKS = {"health_check_period_ms": 500, "health_check_timeout_ms": 3000}
-"""A node that is gone is missed at once, not after some times 3 seconds."""
+SYSTEM = {"health_check_period_ms": 500, "health_check_timeout_ms": 3000, "worker_niceness": 0}
+"""A node that is gone is missed at once, not after some times 3 seconds; Ray's workers, at niceness 15 by
+default, get their share of a machine that others use, too."""
 
 
 @pytest.fixture(scope="module")
 def head() -> Iterator[Any]:
     """A cluster of one node with one core."""
-    of_head = {"num_cpus": 1, "include_dashboard": False, "_system_config": HEALTH_CHECKS}
+    of_head = {"num_cpus": 1, "include_dashboard": False, "_system_config": SYSTEM}
     made = cluster_utils.Cluster(
         initialize_head=True, head_node_args=of_head | {"object_store_memory": STORE}
     )
