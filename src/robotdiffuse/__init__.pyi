@@ -23,9 +23,15 @@ from .planning.exploration.looks import NextView as NextView
 from .planning.exploration.looks import next_view as next_view
 from .planning.exploration.steps import ArmCamera as ArmCamera
 from .planning.exploration.steps import ExplorerSettings as ExplorerSettings
+from .planning.pipeline.waypoints import join as join
 from .planning.plan_many import plan_many as plan_many
 from .planning.reactive.replanner import Replanner as Replanner
 from .planning.reactive.replanner import ReplannerSettings as ReplannerSettings
+from .planning.steps import Attach as Attach
+from .planning.steps import Detach as Detach
+from .planning.steps import MoveRelative as MoveRelative
+from .planning.steps import MoveTo as MoveTo
+from .planning.steps import StepsResult as StepsResult
 from .planning.workspace import Workspace as Workspace
 from .problems.constraints import AxisCone as AxisCone
 from .problems.constraints import CartesianLine as CartesianLine

@@ -70,6 +70,11 @@ class PlanRequest(Settings):
     objective: Annotated[str, OneOf(OBJECTIVES)] = TIME
 
 
+def clock() -> float:
+    """The time of a clock that stands still while this thread loads code [s]."""
+    return time.perf_counter() - loading_seconds()
+
+
 def requested_clearance(problem: Problem, clearance: float | None) -> float:
     """The clearance of a call; if it gives none, the problem's, or the default one [m]."""
     choices = (clearance, problem.clearance, DEFAULT_CLEARANCE)
@@ -106,7 +111,7 @@ class PlanningContext:
 
         Raises InputError if `problem` is not a Problem.
         """
-        self.started = time.perf_counter() - loading_seconds()
+        self.started = clock()
         check_problem(problem)
         self.planner_name = planner_name
         self.problem = problem
@@ -164,7 +169,7 @@ class PlanningContext:
     def elapsed(self) -> float:
         """Wall time since the call began, without that for loading; see `core/loading.py` [s]."""
         check_cancelled()
-        return time.perf_counter() - loading_seconds() - self.started
+        return clock() - self.started
 
     @property
     def search_until(self) -> float:

@@ -56,8 +56,8 @@ ROUND = InverseKinematicsSettings(max_rounds=1)
 
 def follow_line(context: PlanningContext) -> PlanResult | None:
     """The fastest of several motions that follow the line from the start and pass the validator; else a
-    result whose `fraction` and `reason` say how far that goes. None where the goal is several, or where the
-    link is."""
+    result whose `fraction` and `reason` say how far that goes. None where the goal is several, or another
+    configuration for where the link is."""
     problem = context.problem
     robot = context.problem.robot
     if not isinstance(problem.goal, PoseGoal | JointGoal):
@@ -67,7 +67,8 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
     T_start = link_pose(robot, problem.start, line.frame)
     off = np.abs(T_end - T_start)[:, 3 if line.angle is None else slice(None)]
     if off.max() < HERE:
-        return None
+        rest = np.stack([problem.start, problem.start])
+        return context.finish(rest, STAGE, "the start is the end of the line")
     targets = _poses(T_start, T_end)
     fraction = 0.0
     why = ""

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,10 @@ from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.transforms import inverse
 from robotdiffuse.core.types import AnyConfiguration
 from robotdiffuse.planning import plan
-from robotdiffuse.problems.constraints import CartesianLine
-from robotdiffuse.problems.goals import AnyGoal, Goal, PoseGoal
+from robotdiffuse.planning.context import clock
+from robotdiffuse.planning.steps import Step, StepsResult, plan_steps
+from robotdiffuse.problems.constraints import CartesianLine, Constraint
+from robotdiffuse.problems.goals import AnyGoal, PoseGoal
 from robotdiffuse.problems.problem import Problem, StateValidity
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -201,19 +202,52 @@ class Workspace:
         """
         return self._problem(self.scene).clearance_at(q)
 
-    def plan(self, goal: Any, start: AnyConfiguration, **request: Any) -> PlanResult:
+    def plan(
+        self, goal: Any, start: AnyConfiguration, constraints: Sequence[Constraint] = (), **request: Any
+    ) -> PlanResult:
         """Plan a motion among the obstacles as they are now.
 
         Args:
-            goal: A pose of the tip [4, 4] in the frame of the world, or a goal as of `rd.Problem` in that of
-                the base.
+            goal: A pose of the tip [4, 4] in the frame of the world, or several [n, 4, 4], any of which may
+                be reached; or a goal as of `rd.Problem` in the frame of the base.
             start: Start configuration [dof], values by joint, or the name of a pose.
+            constraints: Path constraints, in the frame of the base.
             request: Arguments of `rd.plan`: time_limit, seed, until, ...
 
         Returns:
             A result with a verified motion, or with a status and a reason why there is none.
         """
-        return plan(Problem(self.robot, self.scene, start, self._goal(goal)), **request)
+        problem = Problem(self.robot, self.scene, start, self._goal(goal), constraints=constraints)
+        return plan(problem, **request)
+
+    def plan_steps(
+        self, steps: Sequence[Step], start: AnyConfiguration, time_limit: float = 10.0, **request: Any
+    ) -> StepsResult:
+        """Plan steps such as approach, grasp, lift, carry and place; the workspace stays as it is.
+
+        Where a step fails, the last step before it that can end at another goal, or in another configuration,
+        is planned again.
+
+        Args:
+            steps: `rd.MoveTo`, `rd.MoveRelative`, `rd.Attach` and `rd.Detach`, in their order.
+            start: Start configuration [dof], values by joint, or the name of a pose.
+            time_limit: Wall time of the call [s].
+            request: Further arguments of `rd.plan`: seed, until, ...
+
+        Returns:
+            A result with a verified motion for each step, or with the step that failed, and why.
+
+        Raises:
+            InputError: Where a step alone would; the message names the step.
+
+        Examples:
+            >>> space = rd.Workspace(rd.load_robot("panda"))
+            >>> space.add(rd.Box([0.5, 0.0, -0.06], [0.8, 1.2, 0.1], name="table"))
+            >>> steps = [rd.MoveTo("extended", name="stretch"), rd.MoveRelative([0, 0, -0.1], "world")]
+            >>> space.plan_steps(steps, "ready").solved
+            True
+        """
+        return plan_steps(self, steps, start, time_limit, **request)
 
     def plan_line(
         self,
@@ -256,10 +290,10 @@ class Workspace:
         problems = [Problem(self.robot, self.scene, start, goal, constraints=[line]) for goal in goals]
         T_start = self._T_base_world @ self.pose(start)
         off = [np.linalg.norm((line_end(problem, line) - T_start)[:3, 3]) for problem in problems]
-        began = perf_counter()
+        began = clock()
         best = None
         for tried, i in enumerate(np.argsort(off, kind="stable")):
-            left = time_limit - (perf_counter() - began)
+            left = time_limit - (clock() - began)
             if best is not None and left <= 0.0:
                 break
             result = plan(problems[i], left / (len(goals) - tried), **request)
@@ -273,7 +307,10 @@ class Workspace:
         return best
 
     def _goal(self, goal: Any) -> Any:
-        if isinstance(goal, str | Goal) or np.shape(goal) != (4, 4):
+        matrices = numbers(goal)
+        if matrices is not None and matrices.ndim == 3:
+            return AnyGoal(tuple(self._goal(T) for T in matrices))
+        if matrices is None or matrices.shape != (4, 4):
             return goal
         return PoseGoal(self.tip, self._T_base_world @ rigid_transform("goal", goal))
 

@@ -16,16 +16,19 @@ on, and its corner at the stopping place is rounded where that is free, so that 
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path, Status, Trajectory
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.pipeline import Solver, attempt
+from robotdiffuse.problems.constraints import CartesianLine
 from robotdiffuse.problems.goals import Goal, JointGoal
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.trajectories.corner_rounding import corner_middle
@@ -169,7 +172,7 @@ def _joined(
 ) -> PlanResult:
     """The result for the segments as one motion, validated as one."""
     path = _path(segments)
-    trajectory = _one_after_another(motions)
+    trajectory = one_after_another(motions)
     reports = context.validator.path(path), context.validator.trajectory(trajectory)
     for report in reports:
         if report.violation is not None:
@@ -199,7 +202,7 @@ def _joined(
     )
 
 
-def _one_after_another(motions: Sequence[Trajectory]) -> Trajectory:
+def one_after_another(motions: Sequence[Trajectory]) -> Trajectory:
     """Motions from rest to rest as one; a row that ends one and begins the next is kept once."""
     times = [motions[0].times]
     parts = [motions[0]]
@@ -212,6 +215,71 @@ def _one_after_another(motions: Sequence[Trajectory]) -> Trajectory:
         for name in ("positions", "velocities", "accelerations")
     ]
     return Trajectory(motions[0].joint_names, np.concatenate(times), *rows)
+
+
+def join(
+    results: Sequence[PlanResult], blend: float = 0.0, time_limit: float = 10.0, **request: Any
+) -> PlanResult:
+    """One motion of several, each of which begins where the one before ends, verified as one.
+
+    Args:
+        results: Results of `rd.plan` for one robot and one scene, without waypoints.
+        blend: How far from each end between them the motion may pass without a stop: [m] for a pose, [rad]
+            for a configuration; 0: it stops there. Constraints that only some of the motions keep need 0.
+        time_limit: Wall time of the call [s].
+        request: Further arguments of `rd.plan`, for corners: clearance, velocity_scaling, ...
+
+    Returns:
+        A result whose problem has the goals between as waypoints; or a reason why the motions are none
+        together.
+
+    Raises:
+        InputError: For results without a motion, of other robots or scenes, and motions that do not meet.
+
+    Examples:
+        >>> space = rd.Workspace(rd.load_robot("panda"))
+        >>> there = space.plan("extended", "ready")
+        >>> rd.join([there, space.plan("ready", there.path.positions[-1])]).stops
+        1
+    """
+    check_type("results", results, (list, tuple), "a list of results")
+    for i, result in enumerate(results):
+        check_type(f"results[{i}]", result, PlanResult, "a PlanResult")
+        if result.problem is None or not result.solved:
+            raise InputError(f"results[{i}] has no motion, or no problem: {result.reason}")
+        if result.problem.waypoints:
+            raise InputError(f"results[{i}] has waypoints; join motions without them")
+    if len(results) < 2:
+        raise InputError(f"results has {len(results)} results; it takes two to join")
+    problems = [result.problem for result in results]
+    first = problems[0]
+    shared = [one for one in first.constraints if all(one in problem.constraints for problem in problems)]
+    shared = [one for one in shared if not isinstance(one, CartesianLine)]
+    for i, (before, after) in enumerate(pairwise(results), 1):
+        of = after.problem
+        if of.robot is not first.robot or (of.scene.shapes, of.scene.allowed_contacts) != (
+            first.scene.shapes,
+            first.scene.allowed_contacts,
+        ):
+            raise InputError(
+                f"results[{i}] is for another robot or scene than results[0]: execute one after the other"
+            )
+        gap = np.abs(after.path.positions[0] - before.path.positions[-1])
+        if gap.max() > DEFAULT.start_tolerance:
+            name = first.robot.joint_names[int(gap.argmax())]
+            raise InputError(
+                f"results[{i}] begins {gap.max():.3g} rad from the end of results[{i - 1}] in {name}: plan "
+                "it from path.positions[-1] of that"
+            )
+    if blend and any(len(problem.constraints) > len(shared) for problem in problems):
+        raise InputError(
+            f"blend is {blend:g}, and some motions have constraints of their own, which a corner would "
+            "leave; join them with blend 0"
+        )
+    goals = [problem.goal for problem in problems]
+    problem = replace(first, waypoints=goals[:-1], blend=blend, goal=goals[-1], constraints=shared, notes=())
+    context = PlanningContext(results[-1].planner, problem, PlanRequest(time_limit, **request))
+    return replace(_joined(context, results, _motions(context, results)), problem=problem)
 
 
 def plan_from_start_velocity(solver: Solver, problem: Problem, request: PlanRequest) -> PlanResult:
