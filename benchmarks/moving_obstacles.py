@@ -19,7 +19,7 @@ import numpy as np
 
 import robotdiffuse as rd
 from common import FIRST, header, parse, print_table, progress
-from robotdiffuse.baselines.lattice import DStarLiteSearch, DStarLiteSettings
+from robotdiffuse.baselines.lattice import DStarLiteSettings, LatticeSearch
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.robots.robot import Robot
@@ -168,7 +168,7 @@ def repairs(robot: Robot, runs: int) -> Iterator[float]:
         [ball] = scene(robot, 1, seed)
         way = np.arange(0.0, ball.track[0][1], PERIOD)
         checkers = [CollisionChecker(robot, rd.Scene([FLOOR, ball.at(t)])) for t in way]
-        search = DStarLiteSearch(checkers[0], np.array(START), np.array([GOAL]), DStarLiteSettings())
+        search = LatticeSearch(checkers[0], np.array(START), np.array([GOAL]), DStarLiteSettings())
         for checker in checkers[:: max(len(way) // 20, 1)]:
             began = time.process_time()
             search.update(checker)

@@ -12,11 +12,10 @@ from helpers.box_arm import box_arm
 from robotdiffuse import Box, InputError, JointGoal, Problem, Scene, Sphere, Status, load_robot, verify
 from robotdiffuse.baselines.lattice import (
     AStar,
-    AStarSearch,
     AStarSettings,
     DStarLite,
-    DStarLiteSearch,
     DStarLiteSettings,
+    LatticeSearch,
     LatticeSettings,
     Outcome,
     lattice_moves,
@@ -96,7 +95,7 @@ def least_cost(
     return float(dijkstra(matrix, directed=False, indices=number[0, 0, 0])[-1])
 
 
-def cost_of(search: AStarSearch | DStarLiteSearch) -> float:
+def cost_of(search: LatticeSearch) -> float:
     """The cost that the search found, after checking its path."""
     outcome = search.run()
     assert outcome in (Outcome.FOUND, Outcome.EXHAUSTED)
@@ -118,8 +117,8 @@ def test_both_find_the_least_cost(seed, joints):
     checker, start, goals, _ = arm_problem(seed)
     settings = {"spacing": SPACING, "joints_per_move": joints, "resolution": 0.01}
     expected = least_cost(checker, start, goals, LatticeSettings(**settings))
-    a_star = AStarSearch(checker, start, goals, AStarSettings(inflation=1.0, **settings))
-    d_star = DStarLiteSearch(checker, start, goals, DStarLiteSettings(**settings))
+    a_star = LatticeSearch(checker, start, goals, AStarSettings(inflation=1.0, **settings))
+    d_star = LatticeSearch(checker, start, goals, DStarLiteSettings(**settings))
     assert cost_of(a_star) == pytest.approx(expected, rel=1e-5)
     assert cost_of(d_star) == a_star.cost
 
@@ -128,8 +127,8 @@ def test_both_find_the_least_cost(seed, joints):
 def test_inflation_bounds_the_cost(seed):
     checker, start, goals, _ = arm_problem(seed)
     settings = AStarSettings(spacing=0.2, resolution=0.01, inflation=1.0)
-    best = AStarSearch(checker, start, goals, settings)
-    fast = AStarSearch(checker, start, goals, replace(settings, inflation=2.0))
+    best = LatticeSearch(checker, start, goals, settings)
+    fast = LatticeSearch(checker, start, goals, replace(settings, inflation=2.0))
     assert cost_of(best) - 1e-6 <= cost_of(fast) <= 2 * best.cost + 1e-6
     assert fast.expansions <= best.expansions
 
@@ -140,7 +139,7 @@ def test_repairs_cost_what_a_new_search_costs(seed, joints):
     """Obstacles move, appear and disappear, while the arm moves along its path."""
     checker, start, goals, rng = arm_problem(seed)
     settings = DStarLiteSettings(spacing=0.3, joints_per_move=joints, resolution=0.02)
-    search = DStarLiteSearch(checker, start, goals, settings)
+    search = LatticeSearch(checker, start, goals, settings)
     at = None
     cost_of(search)
     for step in range(6):
@@ -157,13 +156,13 @@ def test_repairs_cost_what_a_new_search_costs(seed, joints):
         if step % 2 and path is not None and len(path) > 2:
             at = path[1]
         search.update(checker, at)
-        fresh = DStarLiteSearch(checker, start, goals, settings)
+        fresh = LatticeSearch(checker, start, goals, settings)
         # exactly the same lattice, searched from the node where the arm stands
         fresh.update(checker, at)
         assert cost_of(search) == cost_of(fresh)
         if checker.free(np.array([start if at is None else at]))[0]:
             a_star = AStarSettings(spacing=0.3, joints_per_move=joints, resolution=0.02, inflation=1.0)
-            other = AStarSearch(checker, (start if at is None else at).astype(np.float32), goals, a_star)
+            other = LatticeSearch(checker, (start if at is None else at).astype(np.float32), goals, a_star)
             assert search.cost == pytest.approx(cost_of(other), rel=1e-4)
 
 
@@ -173,7 +172,7 @@ def test_repairs_of_small_changes_expand_less():
     for seed in range(10):
         checker, start, goals, rng = arm_problem(seed)
         settings = DStarLiteSettings(spacing=0.15, resolution=0.02)
-        search = DStarLiteSearch(checker, start, goals[:1], settings)
+        search = LatticeSearch(checker, start, goals[:1], settings)
         cost_of(search)
         before = search.expansions
         shapes = list(checker.scene.shapes)
@@ -182,7 +181,7 @@ def test_repairs_of_small_changes_expand_less():
         shapes[0] = Sphere(ball.center + rng.normal(0, 0.02, 3) * [1, 1, 0], ball.radius)
         checker = CollisionChecker(ARM, Scene(shapes))
         search.update(checker)
-        new = DStarLiteSearch(checker, start, goals[:1], settings)
+        new = LatticeSearch(checker, start, goals[:1], settings)
         assert cost_of(search) == cost_of(new)
         repaired += search.expansions - before
         fresh += new.expansions
@@ -191,7 +190,7 @@ def test_repairs_of_small_changes_expand_less():
 
 def test_start_buried_and_freed_again():
     checker, start, goals, _ = arm_problem(0)
-    search = DStarLiteSearch(checker, start, goals, DStarLiteSettings(spacing=0.3))
+    search = LatticeSearch(checker, start, goals, DStarLiteSettings(spacing=0.3))
     cost = cost_of(search)
     assert cost < np.inf
     around = Box([0.0, 0.0, 0.0], [4.0, 4.0, 1.0])
@@ -258,7 +257,7 @@ def test_spacing_with_too_many_nodes():
 
 def test_updates_refuse_another_robot_and_places_off_the_lattice():
     checker, start, goals, _ = arm_problem(0)
-    search = DStarLiteSearch(checker, start, goals, DStarLiteSettings())
+    search = LatticeSearch(checker, start, goals, DStarLiteSettings())
     with pytest.raises(InputError, match="robot"):
         search.update(CollisionChecker(PANDA, WALL))
     with pytest.raises(InputError, match="start is"):
@@ -275,8 +274,7 @@ def test_two_arms_do_not_outrun_the_time_limit(settings: AStarSettings | DStarLi
     checker = CollisionChecker(baxter, Scene())
     q = rng.uniform(baxter.lower, baxter.upper, (2000, 14)).astype(np.float32)
     start, goal = q[checker.free(q)][:2]
-    search = AStarSearch if isinstance(settings, AStarSettings) else DStarLiteSearch
-    running = search(checker, start, goal[None], replace(settings, max_nodes=60_000))  # type: ignore[arg-type]
+    running = LatticeSearch(checker, start, goal[None], replace(settings, max_nodes=60_000))
     looks = [0]
 
     def stop() -> bool:
@@ -300,4 +298,4 @@ def test_too_many_edges_per_node_are_refused() -> None:
     baxter = load_robot("baxter")
     ends = np.zeros((2, 14), np.float32)
     with pytest.raises(InputError, match=r"joints_per_move is 14; on baxter .* 4782968 edges.* at most 5"):
-        AStarSearch(CollisionChecker(baxter, Scene()), ends[0], ends[1:], AStarSettings(joints_per_move=14))
+        LatticeSearch(CollisionChecker(baxter, Scene()), ends[0], ends[1:], AStarSettings(joints_per_move=14))
