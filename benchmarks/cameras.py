@@ -42,6 +42,7 @@ import numpy as np
 from common import FIRST, TIME_LIMIT, header, parse, print_table, progress, use_processor_time
 from robotdiffuse.core.output_files import JsonLines
 from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.types import Values
 from robotdiffuse.evaluation.statistics import compare, wilson_interval
 from robotdiffuse.learning.completion import (
     CameraPlaces,
@@ -127,7 +128,7 @@ def _hard(problem: Problem) -> bool:
 
 
 def views(
-    problem: Problem, family: str, number: int, count: int, noisy: bool, cameras: str = RING
+    problem: Problem, family: str, number: int, count: int, noise: DepthNoise | None, cameras: str = RING
 ) -> list[DepthView]:
     """Depth views of the problem's scene from random cameras, with the arm at its start."""
     place = list(FAMILIES).index(family) if family in FAMILIES else zlib.crc32(Path(family).name.encode())
@@ -138,7 +139,7 @@ def views(
         focal = SIZE[1] / 2 / np.tan(angle / 2)
         intrinsics = (focal, focal, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
         view = ray_cast(problem.scene, T, intrinsics, SIZE, problem.robot, problem.start)
-        taken.append(DepthNoise().applied(view, rng) if noisy else view)
+        taken.append(view if noise is None else noise.applied(view, rng))
     return taken
 
 
@@ -190,7 +191,8 @@ def run(arguments: argparse.Namespace) -> None:
             missing = [method for method in methods if (family, number, method) not in done]
             if not missing:
                 continue
-            taken = views(problem, family, number, *place.values())
+            noise = DepthNoise() if arguments.noise else None
+            taken = views(problem, family, number, arguments.views, noise, arguments.cameras)
             began = time.process_time()
             known = known_scene(problem)
             partial = Problem(problem.robot, known, problem.start, problem.goal, views=taken)
@@ -264,23 +266,28 @@ def calibration(rows: list[Row], of: str) -> None:
             continue
         stated = np.array([row["confidence"] for row in mine])
         free = np.array([row["free"] for row in mine], float)
-        lines = []
-        error = 0.0
-        for low in np.arange(0, 1, 0.2):
-            part = (stated >= low) & (stated < low + 0.2 + 1e-9 * (low > 0.7))
-            if part.any():
-                lines.append(
-                    (
-                        f"{low:.1f} to {low + 0.2:.1f}",
-                        int(part.sum()),
-                        f"{stated[part].mean():.2f}",
-                        f"{free[part].mean():.2f}",
-                    )
-                )
-                error += part.mean() * abs(stated[part].mean() - free[part].mean())
+        lines = [
+            (f"{i / 5:.1f} to {(i + 1) / 5:.1f}", n, f"{said:.2f}", f"{was:.2f}")
+            for i, n, said, was in fifths(stated, free)
+        ]
         print_table(f"Confidence of {method}, {of}", ["stated", "motions", "mean", "free"], lines)
         whole = f"{len(mine)} motions, {stated.mean():.2f} stated, {free.mean():.2f} free"
-        print(f"{whole}, expected error {error:.3f}\n")
+        print(f"{whole}, expected error {expected_error(stated, free):.3f}\n")
+
+
+def fifths(stated: Values, free: Values) -> list[tuple[int, int, float, float]]:
+    """Of each fifth of the stated confidences that has motions: its place, their number, their mean
+    confidence and the share that is free."""
+    at = np.minimum(5 * stated, 4).astype(int)
+    return [
+        (i, int((at == i).sum()), float(stated[at == i].mean()), float(free[at == i].mean()))
+        for i in np.unique(at).tolist()
+    ]
+
+
+def expected_error(stated: Values, free: Values) -> float:
+    """The expected calibration error over fifths."""
+    return sum(n * abs(said - was) for _, n, said, was in fifths(stated, free)) / len(stated)
 
 
 def report(rows: list[Row]) -> None:
@@ -303,7 +310,7 @@ def times(families: list[str]) -> None:
     volumes = []
     for family in families:
         problem = held_out_problem(family, 0)
-        seen = observe(views(problem, family, 0, 1, False), problem.robot, problem.start)
+        seen = observe(views(problem, family, 0, 1, None), problem.robot, problem.start)
         volumes.append(pack(seen))
     network = exported_completion()
     spent = list[float]()
@@ -340,7 +347,7 @@ def run_next_view(records: str, families: list[str], count: int) -> None:
 
 def plan_with_second_views(problem: Problem, family: str, number: int) -> Row:
     """A record of the motion from one view, and of those from each second view."""
-    [view] = views(problem, family, number, 1, False)
+    [view] = views(problem, family, number, 1, None)
     one = _plan_on(problem, view)
     row: Row = {"one": is_free(problem, one[1]), "confidence": one[1].confidence}
     if one[1].path is None:

@@ -137,7 +137,7 @@ def play(problem: Problem, family: str, number: int, method: str, noisy: bool) -
     camera = wrist_camera(problem.robot)
     known = known_scene(problem)
     legs = [replace(problem, start=HOME, goal=JointGoal(problem.start[None])), problem]
-    [beside] = views(legs[0], family, number, 1, False)
+    [beside] = views(legs[0], family, number, 1, None)
     seen = [measured(beside, np.inf, noise, rng)]
     reason = ""
     reached = collided = False
