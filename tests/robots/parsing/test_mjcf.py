@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 
 import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
@@ -179,3 +180,57 @@ def test_bad_models_are_one_line(text: str, wanted: str, tmp_path: Path) -> None
     with pytest.raises(InputError, match=wanted) as error:
         UrdfTree(tmp_path / "m.xml", {}).robot()
     assert "\n" not in str(error.value)
+
+
+PLACED = """
+<mujoco>
+  <compiler angle="radian"/>
+  <worldbody>
+    <body name="base" pos="0.1 0 0.2">
+      <joint name="x" type="slide" axis="1 0 0" pos="0 0 1" ref="0.3"/>
+      <geom size="0.1"/>
+      <body name="arm" pos="0 0 0.3">
+        <joint name="j" axis="0 1 0" range="-1 1"/>
+        <geom type="capsule" size="0.03 0.1" pos="0 0 0.2"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><position joint="j"/></actuator>
+  <keyframe><key name="home" qpos="0.3 0.5"/></keyframe>
+</mujoco>
+"""
+
+
+def test_a_base_on_slides_without_range_and_actuator_is_held(tmp_path: Path) -> None:
+    """As Fetch stands in Gymnasium-Robotics: the slides only place it."""
+    (tmp_path / "m.xml").write_text(PLACED)
+    tree = UrdfTree(tmp_path / "m.xml", {})
+    robot = tree.robot(srdf=tree.semantics)
+    assert robot.joint_names == ("j",)
+    assert robot.poses["home"] == {"j": 0.5}
+    assert any("slide joint x" in note and "is held" in note for note in robot.notes)
+    np.testing.assert_allclose(link_pose(robot, np.array([0.0]), "base")[:3, 3], [0.1, 0, 0.2], atol=1e-12)
+
+
+HOLLOW = """
+<mujoco>
+  <asset><mesh name="u" vertex="{}" face="{}"/></asset>
+  <worldbody>
+    <body name="base"><joint name="j" range="-1 1"/><geom type="mesh" mesh="u"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_meshes_that_collide_are_hulls_as_for_mujoco(tmp_path: Path) -> None:
+    """A link with a hollow: MuJoCo collides with its hull, so a motion through the hollow is none."""
+    legs = [trimesh.creation.box([0.1, 0.1, 0.3]).apply_translation([x, 0, 0]) for x in (-0.2, 0.2)]
+    vertices = np.concatenate([leg.vertices for leg in legs])
+    faces = np.concatenate([legs[0].faces, legs[1].faces + len(legs[0].vertices)])
+    numbers = (" ".join(map(str, values.ravel().tolist())) for values in (vertices, faces))
+    (tmp_path / "m.xml").write_text(HOLLOW.format(*numbers))
+    tree = UrdfTree(tmp_path / "m.xml", {})
+    [surface] = tree.surfaces("base")
+    bounds = surface.vertices.max(axis=0) - surface.vertices.min(axis=0)
+    volume = trimesh.Trimesh(surface.vertices, surface.faces).volume
+    np.testing.assert_allclose(volume, np.prod(bounds), rtol=1e-6)

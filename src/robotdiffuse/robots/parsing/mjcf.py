@@ -24,6 +24,7 @@ from robotdiffuse.core.transforms import (
     transform,
 )
 from robotdiffuse.core.types import Pose, Values, Vector
+from robotdiffuse.robots.fitting.convex_parts import convex_hull
 from robotdiffuse.robots.parsing.srdf import Srdf
 
 MOVABLE = ("hinge", "slide")
@@ -72,11 +73,7 @@ def robot_bodies(model: Any) -> list[int]:
         root: {kind_of("Joint", model.jnt_type[joint]) for joint in tree_joints}
         for root, tree_joints in joints.items()
     }
-    driven = {
-        int(model.actuator_trnid[k, 0])
-        for k in range(model.nu)
-        if kind_of("Trn", model.actuator_trntype[k]) in ("joint", "jointinparent")
-    }
+    driven = driven_joints(model)
     chosen = [root for root, tree_joints in joints.items() if driven & set(tree_joints)]
     if not chosen:
         chosen = [
@@ -85,6 +82,15 @@ def robot_bodies(model: Any) -> list[int]:
             if tree_joints.intersection(MOVABLE) and "free" not in tree_joints
         ]
     return [body for root in chosen for body in trees[root]]
+
+
+def driven_joints(model: Any) -> set[int]:
+    """The joints that an actuator moves."""
+    return {
+        int(model.actuator_trnid[k, 0])
+        for k in range(model.nu)
+        if kind_of("Trn", model.actuator_trntype[k]) in ("joint", "jointinparent")
+    }
 
 
 def kind_of(enumeration: str, value: Any) -> str:
@@ -117,7 +123,7 @@ class ConvertedModel:
         """Not 0 for geoms that collide with anything."""
         self.notes: list[str] = []
         self.links: set[str] = set()
-        self.meshes: dict[int, str] = {}
+        self.meshes: dict[str, str] = {}
 
         if not self.bodies:
             raise InputError(f"{self.path} has no robot: no body is moved by a hinge or a slide joint")
@@ -164,8 +170,11 @@ class ConvertedModel:
         for joint in joints:
             label = self.joint_name(joint)
             kind = self.joint_kind(joint)
-            if kind == "free":
-                self.notes.append(f"the free joint of {name} is held where the model places it")
+            if kind == "free" or self._held(joint):
+                what = f"the free joint of {name}"
+                if kind == "slide":
+                    what = f"slide joint {label}, which has no range and no actuator,"
+                self.notes.append(f"{what} is held where the model places it")
                 continue
             if kind == "ball":
                 raise InputError(f"{self.path}: joint {label} is a ball joint; use three hinges in its place")
@@ -180,6 +189,12 @@ class ConvertedModel:
         if above != name:
             self._element(f"{name}_fixed", "fixed", above, name, T)
         self._geometry(self._link(name), body)
+
+    def _held(self, joint: int) -> bool:
+        """Whether a joint slides without a range and actuators move others, as where a base is placed."""
+        driven = driven_joints(self.model)
+        slides = self.joint_kind(joint) == "slide" and not self.model.jnt_limited[joint]
+        return slides and bool(driven) and joint not in driven
 
     def _moved(self, joint: int, value: float) -> Pose:
         """The motion of a joint by a value."""
@@ -235,7 +250,7 @@ class ConvertedModel:
             follower = int(model.eq_obj1id[k])
             leader = int(model.eq_obj2id[k])
             offset, slope, *higher = model.eq_data[k, :5].tolist()
-            if leader < 0:
+            if leader < 0 or self._held(leader):
                 continue
             if any(higher):
                 self.notes.append(
@@ -268,6 +283,7 @@ class ConvertedModel:
             self._shape(ET.SubElement(element, "geometry"), geom)
 
     def _shape(self, parent: ET.Element, geom: int) -> None:
+        """The shape of a geom; of a mesh that collides the hull, with which MuJoCo collides."""
         kind = kind_of("Geom", self.model.geom_type[geom])
         size = self.model.geom_size[geom]
         if kind == "sphere":
@@ -279,10 +295,16 @@ class ConvertedModel:
         elif kind == "ellipsoid":
             ET.SubElement(parent, "mesh", filename=self._written(ellipsoid(size), f"geom{geom}"))
         elif kind == "mesh":
-            mesh = int(self.model.geom_dataid[geom])
-            if mesh not in self.meshes:
-                self.meshes[mesh] = self._written(mesh_of(self.model, mesh), f"mesh{mesh}")
-            ET.SubElement(parent, "mesh", filename=self.meshes[mesh])
+            index = int(self.model.geom_dataid[geom])
+            solid = bool(self.masks[geom])
+            name = f"{'hull' if solid else 'mesh'}{index}"
+            if name not in self.meshes:
+                mesh = mesh_of(self.model, index)
+                if solid:
+                    hull = convex_hull(mesh.vertices)
+                    mesh = trimesh.Trimesh(hull.vertices, hull.faces, process=False)
+                self.meshes[name] = self._written(mesh, name)
+            ET.SubElement(parent, "mesh", filename=self.meshes[name])
         else:
             name = self.name("geom", geom)
             body = self.name("body", int(self.model.geom_bodyid[geom]))
@@ -336,7 +358,7 @@ class ConvertedModel:
         places = {
             self.joint_name(joint): model.jnt_qposadr[joint]
             for joint in _joints_of(model, self.bodies)
-            if self.joint_kind(joint) in MOVABLE
+            if self.joint_kind(joint) in MOVABLE and not self._held(joint)
         }
         return {
             self.name("key", key): {name: float(model.key_qpos[key, place]) for name, place in places.items()}
