@@ -11,10 +11,9 @@
 Prints benchmarks/results/unseen.txt. Problems are held-out ones of the families, or those of folders of
 MotionBenchMaker, that the straight line does not solve and a search in the true scene does. Cameras stand
 where a person would place them, 1.4 to 1.8 m away (--cameras: near, 0.8 to 1.2 m; far, 2.4 to 3 m; overhead),
-in front more often than behind; the floor is known, all else must be seen. Every method plans with AORRTC,
-but for `hybrid`, and has the same CPU time. A motion
-is free if the validator accepts path and timed motion in the true scene. Records are kept in FILE and not
-made again; --report prints their tables.
+in front more often than behind; the floor is known, all else must be seen. Every method plans with AORRTC and
+has the same CPU time. A motion is free if the validator accepts path and timed motion in the true scene.
+Records are kept in FILE and not made again; --report prints their tables.
 
 --weights adds the method 'predicted' with other weights of the occupancy completion network, folders of
 `train completion`; methods are named by the folder. Those of a training that left families out are tried on
@@ -78,14 +77,11 @@ CAMERAS = {
     "overhead": CameraPlaces(distance=(0.1, 0.6), height=(1.6, 2.0), target_spread=0.1, roll=0.3),
 }
 SIZE = (640, 480)
-HYBRID = "hybrid"
-"""As `predicted`, with `robotdiffuse` in place of AORRTC."""
 METHODS = {
     "as seen": "optimistic",
     "occupied": "occupied",
     "padded": "padded",
     "predicted": PREDICTED,
-    HYBRID: PREDICTED,
 }
 TRUE = "true voxels"
 """As `predicted`, with the voxels of 2 cm that obstacles fill in the true scene."""
@@ -97,7 +93,7 @@ WARM_UP_CALLS = 7
 SECOND_VIEWS = ("next_view", "random", "opposite")
 UNSURE = 0.9
 """Another view is most wanted if the motion of one view has a stated confidence below this."""
-PLANNER, HYBRID_PLANNER = load_planner("aorrtc"), load_planner("robotdiffuse")
+PLANNER = load_planner("aorrtc")
 Row = dict[str, Any]
 
 
@@ -154,8 +150,7 @@ def plan(problem: Problem, partial: Problem, method: str, network: Completion | 
         voxels = predict(observe(partial.views, partial.robot, partial.start), network)
     asked = replace(partial, unknown=METHODS.get(method, PREDICTED))
     left = LIMIT if network is None else LIMIT - (time.process_time() - began)
-    planner = HYBRID_PLANNER if method == HYBRID else PLANNER
-    result = plan_with_unknown_space(planner, asked, PlanRequest(left), voxels)
+    result = plan_with_unknown_space(PLANNER, asked, PlanRequest(left), voxels)
     spent = time.process_time() - began
     return {
         "method": method,
@@ -198,7 +193,7 @@ def run(arguments: argparse.Namespace) -> None:
             partial = Problem(problem.robot, known, problem.start, problem.goal, views=taken)
             spent = time.process_time() - began
             if warm:
-                HYBRID_PLANNER.warm_up(problem, TIME_LIMIT)
+                PLANNER.warm_up(problem, TIME_LIMIT)
                 plan(problem, partial, PREDICTED if PREDICTED in missing else "padded")
                 warm = False
             for method in missing:
@@ -238,7 +233,6 @@ def table(rows: list[Row], title: str) -> None:
     print_table(title, columns, lines)
     base = {name: _free(rows, name) for name in [*METHODS, *others, TRUE]}
     pairs = [("padded", "as seen"), ("predicted", "as seen"), ("predicted", "padded"), (TRUE, "predicted")]
-    pairs += [(HYBRID, "predicted")]
     pairs += [(other, of) for other in others for of in ("as seen", "padded", "predicted")]
     for a, b in pairs:
         both = base[a].keys() & base[b].keys()

@@ -44,7 +44,6 @@ BEST = Path(__file__).parent / "results" / "best_durations.json"
 ROWS = (
     ("aorrtc", TIME, CONVERGED),
     ("aorrtc", LENGTH, CONVERGED),
-    ("robotdiffuse", TIME, CONVERGED),
     ("aorrtc", TIME, TIME_LIMIT),
     ("diffusion", TIME, CONVERGED),
     ("ompl_rrt_connect", LENGTH, CONVERGED),

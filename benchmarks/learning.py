@@ -1,6 +1,6 @@
-"""The diffusion model alone, with and without its inputs, and beside smooth noise; the whole planner.
+"""The diffusion model alone, with and without its inputs, and beside smooth noise.
 
-    python benchmarks/learning.py [--parts alone,planner] [--families rop,shelf] [--problems 500]
+    python benchmarks/learning.py [--parts alone] [--families rop,shelf] [--problems 500]
         [--cases FOLDER] [--weights FOLDER]
 
 Prints benchmarks/results/network.txt and network_inputs.txt. FOLDER of cases keeps what is known of the
@@ -14,12 +14,10 @@ counts as solved passed the validator.
   which is what the model starts from: with as many gradient steps, and with as many as fit in the network's
   CPU time.
 - controls: of `alone`, the guided network and the controls; prints benchmarks/results/network_equal_time.txt.
-- planner: the whole planner; PyBullet checks its motions on meshes.
 """
 
 import argparse
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from math import ceil
 from pathlib import Path
@@ -33,30 +31,24 @@ from robotdiffuse.baselines.controls import ControlSettings
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core import tables
 from robotdiffuse.core.tables import Cell, Column, Table, show
-from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.evaluation.methods import (
     NETWORK_ALONE,
     Draw,
-    fields_of,
     from_control,
     from_network,
-    measure_of,
     sampled,
 )
-from robotdiffuse.evaluation.runs import Clock, Fields, Method, Record, Run, run_all
+from robotdiffuse.evaluation.runs import Clock, Record, Run, run_all
 from robotdiffuse.evaluation.statistics import bootstrap_interval, wilson_interval
 from robotdiffuse.learning.motion_model import MAX_CLEARANCE, ClearanceFn, MotionModel
-from robotdiffuse.planning.hybrid import RobotDiffuse, RobotDiffuseSettings
+from robotdiffuse.planning.diffusion import Diffusion
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.held_out import Case
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
-from robotdiffuse.simulation.validator import PyBulletOracle
 
 PANDA = load_robot("panda")
-PARTS = ("alone", "controls", "planner")
-PLANNER_LIMIT = 5.0
-"""Time limit of the whole planner [s]."""
+PARTS = ("alone", "controls")
 # Problems and rounds that the equal number of gradient steps is measured on.
 TIMED = 10
 TIMED_ROUNDS = 4
@@ -128,15 +120,14 @@ def clearances_without_obstacles(model: MotionModel) -> ClearanceFn:
     return clearances
 
 
-def network_methods(planner: RobotDiffuse, cases: list[Case]) -> dict[str, Draw]:
+def network_methods(planner: Diffusion, cases: list[Case]) -> dict[str, Draw]:
     """The network with guidance and without, and with fewer of its inputs."""
 
     def other(run: Run) -> Problem:
         return cases[(run.index + 1) % len(cases)].problem
 
-    unguided = RobotDiffuse(replace(planner.settings, guidance_steps=0))
-    model = planner.model(PANDA)
-    assert model is not None
+    unguided = Diffusion(replace(planner.settings, guidance_steps=0))
+    model = planner.network(PANDA)
     blind = clearances_without_obstacles(model)
     found: dict[str, Draw] = {}
     for name, of in (("guided", planner), ("without guidance", unguided)):
@@ -148,12 +139,12 @@ def network_methods(planner: RobotDiffuse, cases: list[Case]) -> dict[str, Draw]
         }
         if model.settings.null_condition:
             found[f"{name}, condition hidden"] = from_network(
-                RobotDiffuse(replace(of.settings, guidance_scale=0.0))
+                Diffusion(replace(of.settings, guidance_scale=0.0))
             )
     return found
 
 
-def controls(planner: RobotDiffuse, cases: list[Case]) -> dict[str, Draw]:
+def controls(planner: Diffusion, cases: list[Case]) -> dict[str, Draw]:
     """The network with guidance, and smooth noise with as many gradient steps and with as much CPU time."""
     settings = planner.settings
     assert settings.sampling_steps is not None
@@ -166,12 +157,12 @@ def controls(planner: RobotDiffuse, cases: list[Case]) -> dict[str, Draw]:
     }
 
 
-def noise(planner: RobotDiffuse, steps: int) -> Draw:
+def noise(planner: Diffusion, steps: int) -> Draw:
     """Smooth noise, as many candidates as the planner's, after gradient steps."""
     return from_control(ControlSettings(samples=planner.settings.samples, guidance_steps=steps))
 
 
-def equal_time_steps(planner: RobotDiffuse, cases: list[Case]) -> int:
+def equal_time_steps(planner: Diffusion, cases: list[Case]) -> int:
     """Gradient steps on smooth noise that take as much CPU time as a batch of the network under guidance."""
     few, many = TIMED_STEPS
     draws = [from_network(planner), noise(planner, few), noise(planner, many)]
@@ -184,22 +175,6 @@ def equal_time_steps(planner: RobotDiffuse, cases: list[Case]) -> int:
                 turn[i, j] = clock.cpu
     network, short, long = np.median(seconds[1:], axis=0).mean(axis=0)
     return max(round(few + (network - short) * (many - few) / (long - short)), 1)
-
-
-def confirmed(planner: RobotDiffuse) -> Method:
-    """The whole planner; `refuted` is 1 if its path or motion collides by PyBullet."""
-
-    def call(run: Run) -> Iterator[Fields]:
-        with Clock() as clock:
-            result = planner.plan(run.problem, run.limit, seed=run.index)
-        hit = False
-        if result.path is not None and result.trajectory is not None:
-            moved = JointPath(result.trajectory.joint_names, result.trajectory.positions)
-            with PyBulletOracle(PANDA, run.problem.scene) as oracle:
-                hit = any(oracle.check_path(path) is not None for path in (result.path, moved))
-        yield fields_of(result, measure_of(PANDA)) | {"cpu": clock.cpu, "refuted": float(hit)}
-
-    return call
 
 
 def print_worth_of_inputs(found: dict[str, list[Record]]) -> None:
@@ -218,7 +193,7 @@ def report_alone(
     family: str, cases: list[Case], weights: str | None, inputs: bool
 ) -> dict[str, list[Record]]:
     """Print how the network does alone, and with `inputs` also without each of them; its records."""
-    planner = RobotDiffuse(replace(NETWORK_ALONE, weights=weights))
+    planner = Diffusion(replace(NETWORK_ALONE, weights=weights))
     draws = (network_methods(planner, cases) if inputs else {}) | controls(planner, cases)
     methods = {name: sampled(draw) for name, draw in draws.items()}
     found = run_all(cases, methods, seeds=(1,), title=family)
@@ -226,25 +201,9 @@ def report_alone(
     return found
 
 
-def report_planner(family: str, cases: list[Case], weights: str | None) -> None:
-    """Print how the whole planner does."""
-    whole = confirmed(RobotDiffuse(RobotDiffuseSettings(weights=weights)))
-    found = run_all(cases, {"robotdiffuse": whole}, limit=PLANNER_LIMIT, title=family)
-    show(summary("Whole planner", found, (SOLVED, LENGTH, CPU)), width=WIDTH)
-    print_stages(found["robotdiffuse"])
-
-
-def print_stages(records: list[Record]) -> None:
-    """Print which stages of the planner the answers come from, and what PyBullet says."""
-    stages = Counter(record.stage or "nothing" for record in records)
-    print("solved by " + ", ".join(f"{name} {n / len(records):.1%}" for name, n in sorted(stages.items())))
-    refuted = sum(record.measures["refuted"] for record in records)
-    print(f"motions that PyBullet finds in collision: {refuted:.0f} of {sum(r.solved for r in records)}")
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description="The network alone, and the whole planner.")
-    parser.add_argument("--parts", default="alone,planner", help=f"of {','.join(PARTS)} (alone,planner)")
+    parser = argparse.ArgumentParser(description="The network alone.")
+    parser.add_argument("--parts", default="alone", help=f"of {','.join(PARTS)} (alone)")
     parser.add_argument("--families", default=",".join(FAMILIES), help="of problems (all)")
     parser.add_argument("--problems", type=int, default=500, help="non-trivial ones of each family (500)")
     parser.add_argument("--cases", type=Path, help="folder that keeps what is known of the problems")
@@ -258,12 +217,9 @@ def main() -> None:
     for family in families:
         cases = draw_hard_cases(family, arguments.problems, arguments.cases)
         print(f"\n== {family}, {len(cases)} problems\n", flush=True)
-        if {"alone", "controls"} & set(parts):
-            inputs = "alone" in parts
-            for name, records in report_alone(family, cases, arguments.weights, inputs).items():
-                alone.setdefault(name, []).extend(records)
-        if "planner" in parts:
-            report_planner(family, cases, arguments.weights)
+        inputs = "alone" in parts
+        for name, records in report_alone(family, cases, arguments.weights, inputs).items():
+            alone.setdefault(name, []).extend(records)
     if any("condition hidden" in name for name in alone):
         print_worth_of_inputs(alone)
     print(

@@ -1,19 +1,16 @@
-"""What the network adds to search, and how its motions differ from those of search.
+"""How motions of the network differ from those of search.
 
-    python benchmarks/network_controls.py [--parts hybrid,diversity] [--families rop,shelf]
-        [--problems 60] [--cases FOLDER]
+    python benchmarks/network_controls.py [--families rop,shelf] [--problems 60] [--cases FOLDER]
 
-It prints benchmarks/results/network_controls.txt. Problems are held out; the straight line does not solve
-them, and ten seconds of search do.
+It prints the last table of benchmarks/results/network_controls.txt: the free ones of 16 samples of
+`diffusion`, beside 16 first paths of `aorrtc` with different seeds, brought to as many waypoints even in
+arc length. Problems are held out; the straight line does not solve them, and ten seconds of search
+do.
 
-- hybrid: the hybrid planner beside itself with batches of smooth noise, refined by gradient steps, in place
-  of the network's, with the same seeds and time; lengths where it minimizes length, durations where it
-  minimizes time. Limits are CPU time.
-- diversity: the free ones of 16 samples of `diffusion`, beside 16 first paths of `aorrtc` with different
-  seeds, brought to as many waypoints even in arc length. apart: mean over the pairs of the root mean
-  square of their distances in joint space at the same part of their lengths. classes: number of different
-  sides on which the tip passes the obstacles, of which there are four for each (left, right, above, below, as
-  seen along the line between the ends of the tip's way); then smoothness of the motions that both return.
+apart: mean over the pairs of the root mean square of their distances in joint space at the same part of their
+lengths. classes: number of different sides on which the tip passes the obstacles, of which there are four for
+each (left, right, above, below, as seen along the line between the ends of the tip's way); then smoothness of
+the motions that both return.
 """
 
 import argparse
@@ -27,7 +24,6 @@ from numpy import ndarray
 
 from common import (
     FIRST,
-    TIME_LIMIT,
     draw_hard_cases,
     header,
     parse,
@@ -37,31 +33,20 @@ from common import (
 )
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.tables import Figure
-from robotdiffuse.core.types import LENGTH, TIME
-from robotdiffuse.evaluation.methods import fields_of, from_network, measure_of, planned, validated
+from robotdiffuse.evaluation.methods import fields_of, from_network, measure_of, validated
 from robotdiffuse.evaluation.runs import Fields, Method, Record, Run, run_all
-from robotdiffuse.evaluation.statistics import bootstrap_interval
-from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.planning.diffusion import Diffusion, DiffusionSettings
-from robotdiffuse.planning.hybrid import RobotDiffuse
 from robotdiffuse.planning.search.rrt import AORRTC
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.held_out import Case
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_origins
-from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.shapes import Box, Cylinder, Sphere
 
 PANDA = load_robot("panda")
-PARTS = ("hybrid", "diversity")
-EQUAL_TIME = 1.0
-"""CPU time of a call of the hybrids [s]."""
 PLANNER_LIMIT = 20.0
 """Of planners that end by themselves, for diversity [s]."""
-SEEDS = (1, 2)
-BATCH_STAGES = ("network", "refinement", "smooth_noise")
-"""Stages of answers that come from batches."""
 MOTIONS = 16
 WAYPOINTS = 48
 SMOOTHNESS = ("turning", "jerk", "duration")
@@ -70,56 +55,6 @@ SMOOTHNESS = ("turning", "jerk", "duration")
 
 COLUMNS = ("paths", "apart", "classes", *SMOOTHNESS)
 """Of the table of diversity."""
-
-
-class WithNoise(RobotDiffuse):
-    """The hybrid without weights: its batches are smooth noise."""
-
-    def model(self, robot: Robot) -> MotionModel | None:
-        return None
-
-
-def interval(values: Float[ndarray, "n"], digits: int) -> Figure:
-    """The mean with its 95 % interval over problems."""
-    low, high = bootstrap_interval(values)
-    mean = float(values.mean())
-    return Figure(f"{mean:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})", mean)
-
-
-def report_hybrid(every: dict[str, list[Case]]) -> None:
-    """Print lengths and durations of the hybrid over those with smooth noise in place of the network."""
-    planners = {"network": RobotDiffuse(), "smooth noise": WithNoise()}
-    for planner in planners.values():
-        planner.warm_up(next(iter(every.values()))[0].problem, TIME_LIMIT)
-    for objective, metric in ((LENGTH, "joint_length"), (TIME, "duration")):
-        methods = {
-            name: planned(planner, until=TIME_LIMIT, clearance=0.0, objective=objective)
-            for name, planner in planners.items()
-        }
-        rows = []
-        ratios = dict[str, ndarray]()
-        answers = {name: list[bool]() for name in planners}
-        for family, cases in every.items():
-            found = run_all(cases, methods, seeds=SEEDS, limit=EQUAL_TIME, title=f"{family}, {metric}")
-            network, noise = (
-                np.array([r.measures[metric] if r.solved else np.nan for r in found[name]]).reshape(
-                    len(SEEDS), len(cases)
-                )
-                for name in planners
-            )
-            for name, records in found.items():
-                answers[name] += [r.stage in BATCH_STAGES for r in records if r.solved]
-            ratio = np.exp(np.log(network / noise).mean(axis=0))
-            ratios[family] = ratio[~np.isnan(ratio)]
-        for family, of in [*ratios.items(), ("all", np.concatenate(list(ratios.values())))]:
-            rows.append((family, len(of), interval(of, 4), f"{np.median(of):.4f}"))
-        print_table(
-            f"Hybrid with the network over the hybrid with smooth noise, {metric}, "
-            f"{EQUAL_TIME:g} s of CPU time a call, {len(SEEDS)} seeds",
-            ["family", "problems", "mean of ratios (95 %)", "median"],
-            rows,
-            [f"answers of batches: {', '.join(f'{k} {np.mean(v):.0%}' for k, v in answers.items())}"],
-        )
 
 
 def even(path: Float[ndarray, "n dof"]) -> Float[ndarray, "waypoints dof"]:
@@ -214,21 +149,16 @@ def _mean(records: Sequence[Record], key: str) -> Figure | None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="What the network adds to search.")
-    parser.add_argument("--parts", default=",".join(PARTS), help=f"of {','.join(PARTS)} (all)")
+    parser = argparse.ArgumentParser(description="How motions of the network differ from those of search.")
     parser.add_argument("--families", default="rop,rop_dense,shelf,crate,table", help="of problems")
     parser.add_argument("--problems", type=int, default=60, help="of each family (60)")
     parser.add_argument("--cases", type=Path, help="folder that keeps what is known of the problems")
     arguments = parse(parser, families="rop", problems=2)
-    parts = parts_of(arguments.parts, PARTS)
     families = parts_of(arguments.families, FAMILIES)
     use_processor_time()
     print(header("numpy", "numba", "onnxruntime"))
     every = {name: draw_hard_cases(name, arguments.problems, arguments.cases) for name in families}
-    if "hybrid" in parts:
-        report_hybrid(every)
-    if "diversity" in parts:
-        report_diversity(every)
+    report_diversity(every)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Search and the hybrid: time to the first motion, path lengths at equal time, overrun, timing, collisions.
+"""Search: time to the first motion, path lengths at equal time, overrun, timing, collisions.
 
     python benchmarks/planners.py [--parts first,lengths,limits,timing,collisions] [--each 25]
         [--problems FOLDER --lengths FILE] [--limits 0.01,0.05,0.1,1] [--seeds 1] [--motions 400] [--cpu]
@@ -54,7 +54,7 @@ from robotdiffuse.trajectories.timing import TimingSettings, time_parameterize
 
 PANDA = load_robot("panda")
 SEED = 20261122
-PLANNERS = ("aorrtc", "robotdiffuse", "rrt_connect")
+PLANNERS = ("aorrtc", "rrt_connect")
 JERK = 100.0
 """[rad/s³]"""
 FIRST_CALLS = 5
@@ -143,10 +143,8 @@ def lengths(cases: Sequence[Case], known: dict, limits: Sequence[float], seeds: 
                 ratios = [r.measures["joint_length"] / best[r.name] for r in records if r.solved]
                 missing = len(records) - len(ratios)
                 row.append(f"{np.mean(ratios):.4f}" + (f" ({missing} unsolved)" if missing else ""))
-            stages = [r.stage for r in found[name, limits[-1]] if r.name in inside and r.solved]
-            share = sum(stage in ("network", "refinement") for stage in stages) / max(len(stages), 1)
-            rows.append([*row, f"{100 * share:.0f} %"])
-    columns = ["family", "planner", *(f"{limit:g} s" for limit in limits), "network's in the last"]
+            rows.append(row)
+    columns = ["family", "planner", *(f"{limit:g} s" for limit in limits)]
     notes = ("mean of lengths over the best known one of the solved; rrt_connect: restarts",)
     print_table("Length over best known at equal time", columns, rows, notes)
 
@@ -154,21 +152,18 @@ def lengths(cases: Sequence[Case], known: dict, limits: Sequence[float], seeds: 
 def limits(cases: Sequence[Case]) -> None:
     """Print how much longer calls take than their time limits."""
     rows = []
-    for name in ("aorrtc", "robotdiffuse"):
-        planner = warm(name, cases)
-        for limit in OVERRUN_LIMITS:
-            over = []
-            for case in progress(cases, f"{name} {limit:g} s"):
-                with Clock() as clock:
-                    result = planner.plan(
-                        case.problem, limit, until=TIME_LIMIT, clearance=0.0, objective=LENGTH
-                    )
-                over.append((1e3 * (clock.wall - limit), result.solved))
-            late = np.array([o for o, _ in over])
-            solved = sum(s for _, s in over)
-            p50, p99 = np.percentile(late, (50, 99))
-            rows.append((name, f"{1e3 * limit:g}", f"{solved} of {len(cases)}", f"{p50:.1f}", f"{p99:.1f}"))
-    columns = ["planner", "limit ms", "solved", "overrun ms, median", "p99"]
+    planner = warm("aorrtc", cases)
+    for limit in OVERRUN_LIMITS:
+        over = []
+        for case in progress(cases, f"{limit:g} s"):
+            with Clock() as clock:
+                result = planner.plan(case.problem, limit, until=TIME_LIMIT, clearance=0.0, objective=LENGTH)
+            over.append((1e3 * (clock.wall - limit), result.solved))
+        late = np.array([o for o, _ in over])
+        solved = sum(s for _, s in over)
+        p50, p99 = np.percentile(late, (50, 99))
+        rows.append((f"{1e3 * limit:g}", f"{solved} of {len(cases)}", f"{p50:.1f}", f"{p99:.1f}"))
+    columns = ["limit ms", "solved", "overrun ms, median", "p99"]
     print_table("Wall time beyond the limit, validation and timing of the answer included", columns, rows)
 
 
@@ -229,33 +224,30 @@ def collisions(motions: int, seed: int) -> None:
     """Print how many returned motions collide on meshes, half of them in scenes with thin obstacles, how many
     stop on the way, and the largest shares of the limits of velocity, acceleration and jerk."""
     rng = np.random.default_rng(seed)
-    rows = []
     families = [load_family(name) for name in FAMILIES]
-    numbers = np.array_split(np.arange(motions), 2)  # every motion has a problem of its own
+    planner = load_planner("aorrtc")
+    hits = [0, 0, 0]
+    checked = 0
+    configurations = 0
+    shares = np.zeros(3)
     with PyBulletOracle(PANDA, Scene()) as oracle:
-        for name, of in zip(("aorrtc", "robotdiffuse"), numbers, strict=True):
-            planner = load_planner(name)
-            hits = [0, 0, 0]
-            checked = 0
-            configurations = 0
-            shares = np.zeros(3)
-            for i in progress(of.tolist(), name):
-                family = families[i % len(families)]
-                problem = family.draw(PANDA, np.random.default_rng([seed, i])).problem(PANDA)
-                problem = with_thin_obstacles(problem, rng) if i % 2 else problem
-                result = planner.plan(problem, 0.05, seed=i, clearance=0.0)
-                if result.trajectory is None:
-                    continue
-                q = dense(result.trajectory.positions, MESH_STEP)
-                checked = checked + 1
-                configurations = configurations + len(q)
-                contacts = contacts_on_meshes(problem, q, tolerance=0.0, oracle=oracle)
-                hits[0] += contacts.coal > 0
-                hits[1] += contacts.pybullet
-                hits[2] += bool(result.stops)
-                shares = np.maximum(shares, limit_shares(PANDA, result.trajectory))
-            rows.append((name, checked, configurations, *hits, *(f"{share:.5f}" for share in shares)))
-    columns = ["planner", "motions", "configurations", "in collision by Coal", "by PyBullet", "with stops"]
+        for i in progress(range(motions), "motions"):
+            family = families[i % len(families)]
+            problem = family.draw(PANDA, np.random.default_rng([seed, i])).problem(PANDA)
+            problem = with_thin_obstacles(problem, rng) if i % 2 else problem
+            result = planner.plan(problem, 0.05, seed=i, clearance=0.0)
+            if result.trajectory is None:
+                continue
+            q = dense(result.trajectory.positions, MESH_STEP)
+            checked = checked + 1
+            configurations = configurations + len(q)
+            contacts = contacts_on_meshes(problem, q, tolerance=0.0, oracle=oracle)
+            hits[0] += contacts.coal > 0
+            hits[1] += contacts.pybullet
+            hits[2] += bool(result.stops)
+            shares = np.maximum(shares, limit_shares(PANDA, result.trajectory))
+    rows = [(checked, configurations, *hits, *(f"{share:.5f}" for share in shares))]
+    columns = ["motions", "configurations", "in collision by Coal", "by PyBullet", "with stops"]
     columns += ["velocity", "acceleration", "jerk"]
     print_table("Returned motions on meshes", columns, rows)
 
@@ -264,7 +256,7 @@ PARTS = ("first", "lengths", "limits", "timing", "collisions")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Search and the hybrid: times, lengths, limits, collisions.")
+    parser = argparse.ArgumentParser(description="Search: times, lengths, limits, collisions.")
     parser.add_argument("--problems", type=Path, help="folder with MotionBenchMaker families")
     parser.add_argument("--lengths", type=Path, help="reference lengths (JSON)")
     parser.add_argument("--families", nargs="+", default=list(FAMILIES), help="(all)")

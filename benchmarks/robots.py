@@ -21,12 +21,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from common import FIRST, TIME_LIMIT, dense, header, parse, print_table, progress, use_processor_time
+from common import FIRST, dense, header, parse, print_table, progress, use_processor_time
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.transforms import rotation_angle, transform
-from robotdiffuse.core.types import LENGTH
 from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.problems.problem import Problem
@@ -60,8 +59,6 @@ class Tally:
     long: int = 0
     """... and within LONG."""
     times: list[float] = field(default_factory=list)
-    ratios: list[float] = field(default_factory=list)
-    noise: int = 0
     hard: list[str] = field(default_factory=list)
     """Problems not solved within SHORT, and when they were."""
     configurations: int = 0
@@ -96,34 +93,24 @@ def measure(name: str, problems: int) -> Tally:
     """Plan the problems of one robot."""
     robot = load_robot(name)
     tally = Tally()
-    hybrid = load_planner("robotdiffuse")
-    search = load_planner("aorrtc")
+    planner = load_planner("robotdiffuse")
     drawn = [problem for family in FAMILIES for problem in draw(family, robot, problems // len(FAMILIES))]
     if not drawn:
         return tally
-    for planner in (hybrid, search):
-        planner.warm_up(drawn[0][1], TIME_LIMIT)
+    planner.warm_up(drawn[0][1], FIRST)
     with PyBulletOracle(robot, drawn[0][1].scene) as oracle:
         for i, (what, problem) in enumerate(progress(drawn, name)):
             tally.problems += 1
-            result = hybrid.plan(problem, SHORT, seed=i, until=FIRST)
+            result = planner.plan(problem, SHORT, seed=i, until=FIRST)
             tally.short += result.solved
             if result.solved:
                 tally.times.append(1e3 * result.planning_time)
             else:
-                result = hybrid.plan(problem, LONG, seed=i, until=FIRST)
+                result = planner.plan(problem, LONG, seed=i, until=FIRST)
                 tally.hard.append(f"{what} {f'{result.planning_time:.1f} s' if result.solved else 'never'}")
             tally.long += result.solved
             if result.solved:
                 check(problem, result, oracle, tally)
-            if i % COMPARED_EVERY == 0 and result.solved and result.stage != "straight_line":
-                ours, theirs = (
-                    p.plan(problem, SHORT, seed=i, until=TIME_LIMIT, clearance=0.0, objective=LENGTH)
-                    for p in (hybrid, search)
-                )
-                if ours.path is not None and theirs.path is not None:
-                    tally.ratios.append(ours.path.length / theirs.path.length)
-                    tally.noise += ours.stage in ("smooth_noise", "network", "refinement")
     return tally
 
 
@@ -133,13 +120,10 @@ def report(head: str, tallies: dict[str, Tally]) -> None:
     notes = []
     for name, of in tallies.items():
         if of.problems == 0:
-            rows.append([name, "0", *["-"] * 9])
+            rows.append([name, "0", *["-"] * 7])
             continue
         p50, p95 = np.percentile(of.times, (50, 95))
-        lengths = (
-            [f"{np.mean(of.ratios):.4f}", f"{of.noise} of {len(of.ratios)}"] if of.ratios else ["-", "-"]
-        )
-        found = [f"{of.problems}", f"{of.short}", f"{of.long}", f"{p50:.1f}", f"{p95:.1f}", *lengths]
+        found = [f"{of.problems}", f"{of.short}", f"{of.long}", f"{p50:.1f}", f"{p95:.1f}"]
         rows.append([name, *found, f"{of.configurations}", f"{of.by_coal}", f"{of.by_pybullet}"])
         if of.hard:
             notes.append(f"{name}, not within a second: {', '.join(of.hard)}")
@@ -150,12 +134,6 @@ def report(head: str, tallies: dict[str, Tally]) -> None:
         "in 10 s",
         "first ms, median",
         "p95",
-        "length",
-        "batches'",
-    )
-    notes.append(
-        "length: of the hybrid over that of search alone at the same second, mean; batches': how many of "
-        "those answers come from batches (smooth noise; of the Panda, the network)",
     )
     print(head)
     print_table("Furniture and clutter", (*columns, "checked", "Coal", "PyBullet"), rows, notes)

@@ -33,6 +33,7 @@ from numpy import ndarray
 from torch import Tensor, nn
 
 from common import FIRST, header, parse, parts_of, print_table, progress, use_processor_time
+from robotdiffuse.baselines.controls import smooth_noise
 from robotdiffuse.core.output_files import JsonLines
 from robotdiffuse.datasets.rows import read_rows
 from robotdiffuse.datasets.shards import SPLITS, read_shard, shard_indices
@@ -57,7 +58,6 @@ from robotdiffuse.learning.training.config import JOINT_POINT_COLLISION, Encoder
 from robotdiffuse.learning.training.loop import Processes, Validation, train
 from robotdiffuse.learning.training.tasks import PlannerTask, model_settings, train_encoder
 from robotdiffuse.learning.weight_files import RobotIdentity
-from robotdiffuse.planning.hybrid import smooth_noise
 from robotdiffuse.planning.search.rrt import AORRTC
 from robotdiffuse.problems.held_out import Case, goal_of
 from robotdiffuse.problems.problem import Problem

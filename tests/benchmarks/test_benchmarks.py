@@ -12,7 +12,6 @@ SCRIPTS = sorted(file.stem for file in FOLDER.glob("*.py") if file.stem != "comm
 NEEDS = {
     "certificates": ("ompl",),
     "constraints": ("pybullet",),
-    "learning": ("pybullet",),
     "moving_obstacles": ("pybullet",),
     "planning_requests": ("pybullet", "pinocchio"),
     "robots": ("pybullet",),

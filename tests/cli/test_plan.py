@@ -170,9 +170,9 @@ def test_plan_takes_settings_of_the_planner(tmp_path: Path, monkeypatch: pytest.
         return PlanResult(Status.NO_PATH, "none", planner, "panda", 0.1, 0)
 
     monkeypatch.setattr("robotdiffuse.cli.plan.load_and_plan", solve)
-    sets = ("--set", "search.range=0.5", "--set", "samples=4")
+    sets = ("--set", "range=0.5", "--set", "smoothings=4")
     assert run("plan", write_problem(tmp_path), *sets) == 1
-    settings = planner_settings("robotdiffuse", ["samples=4", "search.range=0.5"])
+    settings = planner_settings("robotdiffuse", ["smoothings=4", "range=0.5"])
     assert settings in given and settings != planner_settings("robotdiffuse", [])
 
 

@@ -36,7 +36,6 @@ from robotdiffuse.evaluation.runs import Record, RecordFile, Run, read_records
 from robotdiffuse.learning.weight_files import BUNDLED
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.planning.diffusion import Diffusion
-from robotdiffuse.planning.hybrid import RobotDiffuse
 from robotdiffuse.planning.search.rrt import AORRTCSettings, RRTConnect
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.held_out import held_out_problem, line_length
@@ -254,9 +253,9 @@ def test_a_planner_with_settings() -> None:
     assert calls.load().settings == AORRTCSettings(gain=0.01)
     with pytest.raises(InputError, match="until 'soon'; known: converged"):
         PlannerSpec.parse("aorrtc:until=soon")
-    nested = PlannerSpec.parse("robotdiffuse:search.range=0.5:samples=4").load()
-    assert isinstance(nested, RobotDiffuse)
-    assert (nested.settings.search.range, nested.settings.samples) == (0.5, 4)
+    nested = PlannerSpec.parse("diffusion:guidance.margin=0.02:samples=4").load()
+    assert isinstance(nested, Diffusion)
+    assert (nested.settings.guidance.margin, nested.settings.samples) == (0.02, 4)
 
 
 def test_weights_of_the_package_are_found_by_their_name() -> None:

@@ -101,7 +101,8 @@ def test_a_small_page_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert main(command) == 0 and main(command) == 0
     assert [len(records) for records in read_records(tmp_path).values()] == [6, 6]
     page = (tmp_path / "table1.md").read_text()
-    assert "Goal: a pose with ten configurations; all problems: 3" in page
+    assert "Goal: a pose with ten configurations; 3 problems that are not trivial" in page
+    assert "Of the problems drawn, trivial are" in page
     assert "| nearest" in page and "14.218" in page
 
 
@@ -127,5 +128,9 @@ def test_problems_are_written_once(tmp_path: Path) -> None:
     write_problems(tmp_path, 2, said.append)
     assert len(said) == 1 and problem_file(tmp_path, POSE).read_bytes() == before
     cases = CaseFile(problem_file(tmp_path, POSE)).cases()
-    assert [case.name for case in cases] == ["rop_pose/0", "rop_pose/1"]
-    assert all(case.trivial == (case.reference is not None) for case in cases)
+    assert len(cases) == 2 and not any(case.trivial for case in cases)
+    for case in cases:
+        assert not any(free_lines(case.problem, goal_configurations(case.problem)))
+    numbers = [int(case.name.removeprefix("rop_pose/")) for case in cases]
+    assert numbers == sorted(numbers)
+    assert paper.trivial_share(tmp_path, POSE) == 1 - 2 / (numbers[1] + 1)

@@ -20,7 +20,6 @@ from robotdiffuse.datasets.rows import read_rows
 from robotdiffuse.datasets.shards import SPLITS
 from robotdiffuse.learning.guidance import CollisionGuidance, Trajectories
 from robotdiffuse.planning.context import PlanningContext
-from robotdiffuse.planning.hybrid import WAYPOINTS, smooth_noise
 from robotdiffuse.planning.learned import nearest_goals
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.planning.start_goal import StartGoal
@@ -31,6 +30,17 @@ NEAREST = "nearest_motions"
 NOISE = "smooth_noise"
 LIBRARY_SHARDS = 10
 """Shards of a data set that the nearest motions are taken from, some thousand motions."""
+WAYPOINTS = 48
+"""Waypoints of candidates: as many as the networks have."""
+SPREAD = 0.127
+"""Standard deviation of smooth noise over the waypoints, as a fraction of half a joint's range: the mean over
+the Panda's joints."""
+MAX_HALF_RANGE = np.pi
+"""Half a joint's range counts as no more than this [rad]: continuous joints have no limits."""
+WAVES = 8
+"""Number of sines; more would add less than a hundredth."""
+VARIANCE_EXPONENT = 3.5
+"""The variance of the sine of k half waves falls as k to this power."""
 EQUAL_TIME_STEPS = 110
 """Gradient steps of 16 candidates that take about as long as six guided denoising steps of 16 samples."""
 
@@ -100,6 +110,35 @@ class Control(Planner[ControlSettings]):
             if result is not None:
                 return result
         return context.unsolved(f"the straight line and {self.settings.samples} candidates are refused")
+
+
+def smooth_noise(
+    start: Configuration,
+    goals: Configurations,
+    count: int,
+    waypoints: int,
+    robot: Robot,
+    rng: np.random.Generator,
+) -> Trajectories:
+    """Straight lines from the start to the goals in turn, plus smooth noise; float32.
+
+    The noise of the model that comes with the Panda has the covariance of its training trajectories about the
+    straight lines between their ends. Its eigenvectors are nearly sines of k half waves, its eigenvalues fall
+    as k^-3.5, and its standard deviation is an eighth of half the range of a joint. So the noise has a closed
+    form for any arm. All waypoints but the ends are clipped to the joint limits.
+    """
+    t = np.linspace(0.0, 1.0, waypoints)
+    waves = np.arange(1, WAVES + 1)
+    deviations = waves ** (-VARIANCE_EXPONENT / 2)
+    deviations *= SPREAD * np.sqrt(2) / np.linalg.norm(deviations)  # a sine's mean square is a half
+    basis = np.sin(np.pi * t[:, None] * waves) * deviations
+    half = np.minimum(0.5 * (robot.upper - robot.lower), MAX_HALF_RANGE)
+    lines = start + t[:, None] * (goals[np.arange(count) % len(goals), None] - start)
+    q = lines + half * (basis @ rng.normal(size=(count, WAVES, len(start))))
+    q = np.clip(q, robot.lower, robot.upper).astype(np.float32)
+    q[:, 0] = lines[:, 0]
+    q[:, -1] = lines[:, -1]
+    return q
 
 
 @lru_cache

@@ -67,6 +67,7 @@ def add_bench(commands: Commands) -> None:
             "also call planners that end early again until the time limit, as extra rows, to compare lengths",
         ),
         ("--data FOLDER", "data set, for a row of its nearest motions"),
+        ("--cpu-time", "limits and times are CPU time, for a machine that does other work"),
         ("--workers N", "planners that run at once (default: half of the cores)", count),
         ("--cluster", "use the Ray cluster at RAY_ADDRESS", {"choices": CLUSTERS}),
     )
@@ -291,7 +292,7 @@ def _add_planning(parser: ArgumentParser) -> None:
     options(
         parser,
         ("--out FOLDER !", "folder for problems, results, page"),
-        ("--problems N", "problems of each kind of goal (default: 300)", count, 300),
+        ("--problems N", "problems of each kind of goal that are not trivial (default: 60)", count, 60),
         ("--time-limit S", "of a call [s] (default: 10)", positive, 10.0),
         (
             "--paper-weights FOLDER",
@@ -299,6 +300,7 @@ def _add_planning(parser: ArgumentParser) -> None:
             "clearances, with and without guidance (default: a note says how to train them)",
         ),
         ("--data FOLDER", "data set, for a row of its nearest motions"),
+        ("--cpu-time", "limits and times are CPU time, for a machine that does other work"),
         ("--workers N", "planners that run at once (default: half of the cores)", count),
     )
     option(parser, "--cluster", "use the Ray cluster at RAY_ADDRESS", choices=CLUSTERS)
@@ -325,6 +327,7 @@ def _table1(arguments: Namespace) -> "tuple[Table1Settings, Bench]":
         out=Path(arguments.out),
         problems=arguments.problems,
         time_limit=arguments.time_limit,
+        cpu_time=arguments.cpu_time,
         paper_weights=arguments.paper_weights,
         data=arguments.data,
         workers=arguments.workers or max(1, (os.cpu_count() or 1) // 2),

@@ -27,7 +27,7 @@ class Entry:
     settings: str = ""
     """Name of its settings class in the same module, or module:name; empty for none."""
     kind: str = ""
-    """Category within its registry, e.g. search, learned or hybrid for planners."""
+    """Category within its registry, e.g. search or learned for planners."""
     supports: frozenset[str] = frozenset()
     """Features that not every entry of the registry supports, e.g. path constraints for planners."""
 

@@ -48,7 +48,7 @@ class PlanResult:
     """Wall time of plan() [s], including verification, without time parameterization."""
     seed: int
     stage: str = ""
-    """The part of the planner that produced the path, e.g. 'aorrtc', 'network', 'smooth_noise'."""
+    """The part of the planner that produced the path, e.g. 'aorrtc', 'straight_line', 'network'."""
     path: Path | Any = None
     trajectory: Trajectory | Any = None
     min_clearance: float | Any = None

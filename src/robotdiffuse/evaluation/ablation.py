@@ -44,7 +44,7 @@ from robotdiffuse.evaluation.statistics import bootstrap_interval, wilson_interv
 from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.training.config import CONFIGS, EncoderTraining, planner_training
 from robotdiffuse.learning.training.tasks import train_encoder, train_planner
-from robotdiffuse.planning.hybrid import RobotDiffuse
+from robotdiffuse.planning.diffusion import Diffusion
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.families.rop import ROP, Rop
 from robotdiffuse.problems.held_out import Case
@@ -280,7 +280,7 @@ def _evaluate(
             weights=str(folder),
             points=encoder.settings.cloud,
         )
-        draw = from_network(RobotDiffuse(planner))
+        draw = from_network(Diffusion(planner))
     digest = sampling_digest(planner, None if isinstance(which, str) else folder)
     method = {f"{'guided' if guided else 'unguided'} {digest}": sampled(draw, partial(link_length, robot))}
     (records,) = run_all(cases, method, seeds=(1,), folder=folder, bar=False).values()

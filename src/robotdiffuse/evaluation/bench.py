@@ -8,6 +8,7 @@ are comparisons of planners by name, the tables of docs/results.md.
 import os
 import platform
 import resource
+import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
@@ -138,10 +139,10 @@ RUNS_PER_TASK = 20
 class PlannerProcess:
     """A planner in another process, which starts with the first run and again after it died."""
 
-    def __init__(self, spec: PlannerSpec, log: FilePath) -> None:
-        """`log`: the process's output is appended to this file."""
+    def __init__(self, spec: PlannerSpec, log: FilePath, cpu_time: bool = False) -> None:
+        """`log`: the process's output is appended to this file. cpu_time: see `BenchSettings`."""
         self._log = log
-        self._worker = Worker(_prepare, (spec, str(log)))
+        self._worker = Worker(_prepare, (spec, str(log), cpu_time))
 
     def warm(self, run: Run) -> None:
         """Warm up for a run's robot. If the process dies of that, `plan` will report it. Raises InputError if
@@ -198,9 +199,11 @@ _warm: set[Robot] = set()
 """Robots that the planner is warmed up for."""
 
 
-def _prepare(spec: PlannerSpec, log: str) -> None:
+def _prepare(spec: PlannerSpec, log: str, cpu_time: bool) -> None:
     """Load the planner; all output goes to the log."""
     global _planner, _request
+    if cpu_time:
+        time.perf_counter = time.process_time
     FilePath(log).parent.mkdir(parents=True, exist_ok=True)
     with open(log, "a") as stream:
         os.dup2(stream.fileno(), 1)
@@ -243,16 +246,19 @@ def _next_answer() -> Fields | None:
 # Runs of many planners
 
 
-def on_this_machine(
-    specs: PlannerSpecs, runs: Sequence[Run], workers: int, restarts: bool, session: str, logs: FilePath
-) -> Results:
-    """Make runs in a process for each planner, of which `workers` run at a time; `logs` gets what they print.
+def on_this_machine(settings: "BenchSettings", runs: Sequence[Run], session: str) -> Results:
+    """Make runs in a process for each planner, of which some run at a time.
 
     All processes are warmed up before the first call is timed. They take turns, so that other work on the
     machine affects all planners alike.
     """
     first = {run.method: run for run in reversed(runs)}
-    planners = {label: PlannerProcess(specs[label], _log_file(logs, label)) for label in first}
+    specs = settings.specs
+    workers = settings.workers
+    planners = {
+        label: PlannerProcess(specs[label], _log_file(settings.logs, label), settings.cpu_time)
+        for label in first
+    }
     pool = ThreadPoolExecutor(workers)
     todo = list(runs)
     running: dict[Future[list[Fields]], Run] = {}
@@ -264,7 +270,7 @@ def on_this_machine(
             place = next((i for i, run in enumerate(todo) if run.method not in busy), None)
             if place is not None and len(running) < workers:
                 run = todo.pop(place)
-                running[pool.submit(planners[run.method].plan, run, restarts)] = run
+                running[pool.submit(planners[run.method].plan, run, settings.equal_time)] = run
                 continue
             for job in wait(running, return_when=FIRST_COMPLETED).done:
                 run = running.pop(job)
@@ -275,26 +281,25 @@ def on_this_machine(
         pool.shutdown(cancel_futures=True)
 
 
-def on_cluster(
-    specs: PlannerSpecs, runs: Sequence[Run], cluster: str, restarts: bool, session: str, logs: FilePath
-) -> Results:
-    """Make runs on a cluster, a name in `ray_cluster.CLUSTERS`; each task starts a process for some runs.
+def on_cluster(settings: "BenchSettings", runs: Sequence[Run], session: str) -> Results:
+    """Make runs on a cluster; each task starts a process for some runs.
 
     The nodes need this package, and weights and files at the same paths.
     """
     tasks: list[tuple[PlannerSpec, list[Run], bool]] = []
-    for label, spec in specs.items():
+    assert settings.cluster is not None
+    for label, spec in settings.specs.items():
         of_planner = [run for run in runs if run.method == label]
         parts = (of_planner[i : i + RUNS_PER_TASK] for i in range(0, len(of_planner), RUNS_PER_TASK))
-        tasks += [(spec, part, restarts) for part in parts]
-    for number, (answers, output) in CLUSTERS[cluster](_run_task, tasks):
+        tasks += [(spec, part, settings.equal_time) for part in parts]
+    for number, (answers, output) in CLUSTERS[settings.cluster](_run_task, tasks):
         _, part, _ = tasks[number]
         if output:
-            logs.mkdir(parents=True, exist_ok=True)
-            with _log_file(logs, part[0].method).open("a") as log:
+            settings.logs.mkdir(parents=True, exist_ok=True)
+            with _log_file(settings.logs, part[0].method).open("a") as log:
                 log.write(output)
         for run, answer in zip(part, answers, strict=True):
-            yield run, records_of(run, answer, {"run": session, "workers": cluster})
+            yield run, records_of(run, answer, {"run": session, "workers": settings.cluster})
 
 
 def records_of(run: Run, answers: Sequence[Fields], about: Fields) -> list[Record]:
@@ -347,6 +352,8 @@ class BenchSettings(Settings):
     equal_time: bool = False
     """Whether planners that end early are called again with other seeds until the limit, in rows of their
     own, so that lengths can be compared at equal time."""
+    cpu_time: bool = False
+    """Whether limits and times are CPU time of the planner's process; not on a cluster."""
 
     def __post_init__(self) -> None:
         if self.planners == ("all",):
@@ -355,6 +362,15 @@ class BenchSettings(Settings):
         _ = self.specs
         if len(set(self.problems)) < len(self.problems):
             raise InputError(f"problems are {', '.join(self.problems)!r}; they must name none twice")
+        if self.cpu_time and self.cluster is not None:
+            raise InputError(
+                f"cpu_time is True and cluster is {self.cluster}; CPU time is measured here alone"
+            )
+
+    @property
+    def logs(self) -> FilePath:
+        """What the planners print."""
+        return self.out / "logs"
 
     @property
     def specs(self) -> dict[str, PlannerSpec]:
@@ -392,11 +408,8 @@ def run_bench(settings: BenchSettings, report: Report, done: Done) -> int:
         total = len(cases) * settings.seeds
         for label in specs:
             done(label, total - sum(run.method == label for run in todo), total)
-        about = (settings.equal_time, session, settings.out / "logs")
-        if settings.cluster is None:
-            results = on_this_machine(specs, todo, settings.workers, *about)
-        else:
-            results = on_cluster(specs, todo, settings.cluster, *about)
+        make = on_this_machine if settings.cluster is None else on_cluster
+        results = make(settings, todo, session)
         return keep_records(todo, results, files, lambda label, left: done(label, total - left, total))
 
 
@@ -485,9 +498,9 @@ def by_length(*planners: str) -> tuple[str, ...]:
 
 PRESETS: dict[str, Preset] = {
     "equal_time": Preset(
-        "path lengths at one second: search, the hybrid, diffusion, learned baselines",
+        "path lengths at one second: search, diffusion, learned baselines",
         (
-            *by_length("robotdiffuse", "aorrtc", "rrt_connect"),
+            *by_length("aorrtc", "rrt_connect"),
             *("shared_tree_rrt_star", "diffusion", "mpd", "edmp", "mpnet", "mpinets"),
         ),
         (*ROP, "shelf_nontrivial"),
@@ -495,8 +508,8 @@ PRESETS: dict[str, Preset] = {
         30,
     ),
     "learning": Preset(
-        "what the network adds: diffusion and the hybrid beside search, with 0.1 and 0.3 s",
-        (*by_length("robotdiffuse"), "diffusion", *by_length("aorrtc"), "shared_tree_rrt_star"),
+        "the network alone beside search, with 0.1 and 0.3 s",
+        ("diffusion", *by_length("aorrtc"), "shared_tree_rrt_star"),
         (*ROP, "shelf_nontrivial"),
         (0.1, 0.3),
         150,
@@ -504,8 +517,8 @@ PRESETS: dict[str, Preset] = {
     "durations": Preset(
         "durations of motions with 0.1 and 1 s: by time, by length, and the timed paths of OMPL",
         (
-            *("aorrtc", "robotdiffuse", "diffusion"),
-            *by_length("aorrtc", "robotdiffuse"),
+            *("aorrtc", "diffusion"),
+            *by_length("aorrtc"),
             *("ompl_rrt_connect", "ompl_aorrtc"),
         ),
         ("shelf_nontrivial", "crate_nontrivial", "table_nontrivial", "kitchen_nontrivial", "rop_nontrivial"),
@@ -521,8 +534,8 @@ PRESETS: dict[str, Preset] = {
         100,
     ),
     "restarts": Preset(
-        "the hybrid beside restarts of RRT-Connect until the same limit",
-        by_length("robotdiffuse", "rrt_connect"),
+        "AORRTC beside restarts of RRT-Connect until the same limit",
+        by_length("aorrtc", "rrt_connect"),
         (*ROP, "shelf_nontrivial"),
         (1.0,),
         100,

@@ -544,12 +544,9 @@ NOTES = (
 
 
 def named(planner: str) -> str:
-    """The name of a planner in tables: with its settings, and whether it is the hybrid and was restarted."""
-    name, *settings = plain_name(planner).split(":")
-    if base_name(planner) == DEFAULT_PLANNER:
-        name += ": hybrid"
+    """The name of a planner in tables: with its settings, and whether it was restarted."""
     restarted = ["restarted"] if planner.endswith(RESTARTED) else []
-    return ", ".join([name, *settings, *restarted])
+    return ", ".join([*plain_name(planner).split(":"), *restarted])
 
 
 # Tables

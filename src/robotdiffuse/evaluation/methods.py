@@ -35,8 +35,7 @@ from robotdiffuse.evaluation.runs import (
     Method,
     Run,
 )
-from robotdiffuse.planning.diffusion import ModelSampler, encode
-from robotdiffuse.planning.hybrid import RobotDiffuseSettings
+from robotdiffuse.planning.diffusion import Diffusion, DiffusionSettings, encode
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.held_out import goal_of
 from robotdiffuse.problems.problem import JointGoal, Problem
@@ -46,9 +45,8 @@ from robotdiffuse.validation.validator import VerifySettings, verifier
 if TYPE_CHECKING:
     from robotdiffuse.learning.motion_model import ClearanceFn
 
-NETWORK_ALONE = RobotDiffuseSettings(sampling_steps=6, guidance_steps=4, guidance_scale=1.0)
-"""Settings of networks that are measured alone; the planner's own number of steps is too small without
-guidance."""
+NETWORK_ALONE = DiffusionSettings(sampling_steps=6, guidance_steps=4)
+"""Settings of networks whose samples are measured."""
 UNSOLVED = Status.NO_PATH.value
 
 measure_of = lru_cache(maxsize=8)(Measure)
@@ -208,7 +206,7 @@ def sampled(draw: Draw, lengths: Callable[[ndarray], ndarray] = path_lengths) ->
     return call
 
 
-def sampling_digest(settings: RobotDiffuseSettings | ControlSettings, folder: FilePath | None) -> str:
+def sampling_digest(settings: DiffusionSettings | ControlSettings, folder: FilePath | None) -> str:
     """Identifies in the names of methods what samples depend on: the settings, and the network's weights in a
     folder, if there is a network."""
     weights = None if folder is None else json.loads((folder / "model.json").read_text())["weights_sha256"]
@@ -217,7 +215,7 @@ def sampling_digest(settings: RobotDiffuseSettings | ControlSettings, folder: Fi
 
 
 def from_network(
-    sampler: ModelSampler,
+    sampler: Diffusion,
     encoded: Callable[[Run], Problem] | None = None,
     clearances: "ClearanceFn | None" = None,
 ) -> Draw:
@@ -230,8 +228,7 @@ def from_network(
     def draw(run: Run, checker: CollisionChecker) -> ndarray:
         problem = run.problem
         rng = run.rng()
-        model = sampler.model(problem.robot)
-        assert model is not None
+        model = sampler.network(problem.robot)
         scene_checker = checker if encoded is None else CollisionChecker(problem.robot, encoded(run).scene)
         code = encode(model, scene_checker, sampler.settings.points, rng)
         return sampler.draw(model, checker, code, problem.start, goal_of(problem)[None], rng, clearances)

@@ -6,6 +6,7 @@ configuration and a first goal configuration, whose pose is the goal. Planners f
 and success is within 1 cm and 15 degrees.
 """
 
+import itertools
 import timeit
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, replace
@@ -40,8 +41,7 @@ from robotdiffuse.evaluation.statistics import Indicators, bootstrap_interval, c
 from robotdiffuse.learning.diffusion import SAMPLERS
 from robotdiffuse.learning.motion_model import MotionModelSettings, link_clearances
 from robotdiffuse.learning.weight_files import POINTS, folder_of, read_description, weights_for
-from robotdiffuse.planning.diffusion import encode
-from robotdiffuse.planning.hybrid import RobotDiffuse, RobotDiffuseSettings
+from robotdiffuse.planning.diffusion import Diffusion, DiffusionSettings, encode
 from robotdiffuse.planning.pose_goals import GOAL_COUNT, pose_configurations
 from robotdiffuse.problems.families.family import POSITION
 from robotdiffuse.problems.families.rop import ROP, Rop
@@ -117,18 +117,26 @@ def case_name(problem_set: str, number: int) -> str:
 
 
 def write_problems(out: FilePath, count: int, report: Say) -> None:
-    """Draw the first `count` problems of both sets into the folder of a bench, unless it has them."""
+    """Draw the first `count` problems of both sets that are not trivial into the folder of a bench, unless it
+    has them."""
     files = {name: CaseFile(problem_file(out, name)) for name in GOALS}
     if min(map(len, files.values())) < count:
         cases: dict[str, list[Case]] = {name: [] for name in GOALS}
-        for number in range(count):
+        for number in itertools.count():
             for name, problem in draw_problem(number).items():
-                free = [x for x in free_lines(problem, goal_configurations(problem)) if x is not None]
-                line = min(free, default=None)
-                cases[name].append(Case(case_name(name, number), "rop", problem, bool(free), line, name))
+                if len(cases[name]) < count and not any(free_lines(problem, goal_configurations(problem))):
+                    cases[name].append(Case(case_name(name, number), "rop", problem, False, None, name))
+            if all(len(found) == count for found in cases.values()):
+                break
         for name, file in files.items():
             file.fill(cases[name])
         report(f"problems: {count} of {', '.join(GOALS)}")
+
+
+def trivial_share(out: FilePath, problem_set: str) -> float:
+    """The share of trivial problems among those that were drawn up to the last one of a set."""
+    cases = CaseFile(problem_file(out, problem_set)).cases()
+    return 1 - len(cases) / (1 + int(cases[-1].name.partition("/")[2]))
 
 
 def straight_line_shares(count: int, family: Rop = ROP) -> dict[str, int]:
@@ -231,8 +239,7 @@ ROWS = (
     Row("diffusion, a single sample", "diffusion:samples=1:repeat=false"),
     Row("diffusion, a single sample, no guidance", ":".join(["diffusion", *ONE_SAMPLE])),
     Row("the same, no clearances: 32 points of the scene", ":".join([f"diffusion@{POINTS}", *ONE_SAMPLE])),
-    Row("robotdiffuse (hybrid)", "robotdiffuse"),
-    Row("aorrtc", "aorrtc"),
+    Row("robotdiffuse, the default: aorrtc", "robotdiffuse"),
     Row("no planner: line to the nearest goal", "straight_line:goals=nearest"),
     Row("no planner: line to any goal", "straight_line"),
     Row("no planner: line, else one via", "control:source=vias:samples=1:guidance_steps=0"),
@@ -247,10 +254,12 @@ MEASURES = ("link_length", "joint_length", "duration", "jerk", "turning")
 class Table1Settings:
     out: FilePath
     """Folder of the bench."""
-    problems: int = 300
-    """Problems of each kind of goal."""
+    problems: int = 60
+    """Problems of each kind of goal, none of them trivial."""
     time_limit: float = 10.0
     """Time limit of a call [s]; RRT* uses all of it."""
+    cpu_time: bool = False
+    """See `BenchSettings`."""
     paper_weights: str | None = None
     """Folder with weights of config `paper`, `points` or another one without clearances as inputs, for two
     rows of single samples: under guidance, as the paper's own row, and without it."""
@@ -285,6 +294,7 @@ class Table1Settings:
             out=self.out,
             time_limit=self.time_limit,
             count=self.problems,
+            cpu_time=self.cpu_time,
             workers=self.workers,
             cluster=self.cluster,
         )
@@ -336,17 +346,21 @@ def _check_paper_weights(folder: str, time_limit: float) -> None:
 
 
 def table1(settings: Table1Settings, bench: Bench) -> Report:
-    """Table 1: for each kind of goal, on all problems and on those that are not trivial."""
+    """Table 1: for each kind of goal, on problems that are not trivial."""
     weights = "" if settings.paper_weights is None else " --paper-weights FOLDER"
     weights += "" if settings.data is None else " --data DATA"
     command = (
         f"robotdiffuse reproduce table1 --out FOLDER --problems {settings.problems} "
-        f"--time-limit {settings.time_limit:g}{weights}"
+        f"--time-limit {settings.time_limit:g}{' --cpu-time' * settings.cpu_time}{weights}"
     )
     report = paper_report("Table 1", command)
     rows = dict(zip(settings.bench.specs, settings.rows, strict=True))
     # the folder may have more
-    names = {case_name(problem_set, i) for problem_set in GOALS for i in range(settings.problems)}
+    names = {
+        case.name
+        for problem_set in GOALS
+        for case in read_cases(settings.out, problem_set)[: settings.problems]
+    }
     records = {
         label: [r for r in bench.records[label] if r.name in names and r.time_limit == settings.time_limit]
         for label in rows
@@ -355,7 +369,12 @@ def table1(settings: Table1Settings, bench: Bench) -> Report:
     for section in sections(replace(bench, records=records), [settings.time_limit]):
         loads += section.main.loads
         report.table(_table(section, rows), level=2)
-    lines = [*notes(settings), *about(bench), *crashes(bench)]
+    shares = [f"{100 * trivial_share(settings.out, name):.0f} % with {kind}" for name, kind in GOALS.items()]
+    trivial = (
+        f"Of the problems drawn, trivial are {' and '.join(shares)} as the goal: the straight line to some "
+        "goal configuration is free. They are left out; the paper's figures are of all."
+    )
+    lines = [trivial, *notes(settings), *about(bench), *crashes(bench)]
     if loads:
         lines.append(f"Load average of the machine after the calls: {min(loads):.1f} to {max(loads):.1f}.")
     add_notes(report, lines)
@@ -377,18 +396,16 @@ def scores(rows: Sequence[Row], of: dict[str, Indicators]) -> dict[str, float]:
 
 
 def _table(section: Section, rows: dict[str, Row]) -> Table:
-    """The table of a problem set or of its part; `rows` by planner."""
+    """The table of a problem set; `rows` by planner."""
     comparison = section.main
-    is_whole = section.name == section.problem_set
-    part = "all problems" if is_whole else "not trivial, and solved by some row"
-    title = f"Goal: {GOALS[section.problem_set]}; {part}: {comparison.problems}"
+    title = f"Goal: {GOALS[section.problem_set]}; {comparison.problems} problems that are not trivial"
     indicators = {
         rows[of.planner].name: Indicators(100 * of.success, 100 * of.collision, of.link_length, of.time)
         for of in comparison.rows
     }
     comscore = scores(tuple(rows.values()), indicators)
     printed = {row.name: (*astuple(row.indicators), row.comscore) for row in PAPER_TABLE_1}
-    printed_beside = section.name == POSE
+    printed_beside = section.problem_set == POSE
     table = []
     for of in comparison.rows:
         row = rows[of.planner]
@@ -423,8 +440,8 @@ def _table(section: Section, rows: dict[str, Row]) -> Table:
 def notes(settings: Table1Settings) -> list[str]:
     """How to read the tables."""
     texts = [
-        f"Every call has {settings.time_limit:g} s, in the paper up to 600. RRT* searches until then, unless "
-        "it has the straight line.",
+        f"Every call has {settings.time_limit:g} s{' of CPU time' * settings.cpu_time}, in the paper up to "
+        "600. RRT* searches until then.",
         "success: the motion passes the validator and ends within 1 cm and 15° of the pose, with the 95 % "
         "interval by Wilson. collision: share of problems on which the validator refused the planner's last "
         "path because it collides. RRT*, MPNet, MPiNets, MPD and diffusion as it ships try again until time "
@@ -434,10 +451,10 @@ def notes(settings: Table1Settings) -> list[str]:
         "problems seem short. length of links 1 to 7: path lengths of the origins of the links that joints "
         "move, which the paper calls path length (its arm has no hand; it names no unit). log jerk: "
         "logarithm of the dimensionless jerk; turning: sum of the angles between segments.",
-        "trivial: the straight line to any goal configuration is free. ComScore: as in the paper, among its "
+        "ComScore: as in the paper, among its "
         "five rows; each further row takes the place of the paper's method.",
-        "robotdiffuse and aorrtc minimize the duration, their default. time: mean until the planner returns; "
-        "the machine may do other work.",
+        "robotdiffuse minimizes the duration, its default. time: mean until the planner returns"
+        f"{' (CPU time of its process)' * settings.cpu_time}; the machine may do other work.",
     ]
     return texts if settings.paper_weights is not None else [NO_WEIGHTS, *texts]
 
@@ -463,11 +480,10 @@ class Noisy(NamedTuple):
 
 def denoising(problem: Problem, seed: int = 0) -> list[Noisy]:
     """One motion of the bundled network at several noise levels, without guidance, the noisiest first."""
-    planner = RobotDiffuse()
+    planner = Diffusion()
     rng = np.random.default_rng(seed)
     robot = problem.robot
-    model = planner.model(robot)
-    assert model is not None
+    model = planner.network(robot)
     checker = CollisionChecker(robot, problem.scene)
     code = encode(model, checker, planner.settings.points, rng)
     start = problem.start
@@ -500,12 +516,12 @@ def success_by_steps(out: FilePath, count: int) -> dict[str, dict[int, list[Reco
     cases = hard_cases("rop", count, out / "problems")
     weights = weights_for("model", load_robot("panda"))
     records: dict[str, dict[int, list[Record]]] = {}
-    for name, guidance in (("no guidance", 0), ("guidance", RobotDiffuseSettings().guidance_steps)):
+    for name, guidance in (("no guidance", 0), ("guidance", DiffusionSettings().guidance_steps)):
         methods = {}
         for steps in STEPS:
             settings = replace(NETWORK_ALONE, guidance_steps=guidance, sampling_steps=steps)
             method = f"{name}, {steps} steps, {sampling_digest(settings, weights)}"
-            methods[method] = sampled(from_network(RobotDiffuse(settings)))
+            methods[method] = sampled(from_network(Diffusion(settings)))
         of = run_all(cases, methods, seeds=(1,), folder=out / "figures", title=f"figure 1, {name}")
         records[name] = dict(zip(STEPS, of.values(), strict=True))
     return records

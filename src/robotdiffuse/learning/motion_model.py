@@ -373,7 +373,7 @@ class MotionModel(ABC):
         self,
         start: Configuration,
         goal: Configuration,
-        code: Float[ndarray, "code"] | None,
+        code: Float[ndarray, "code"],
         clearances: ClearanceFn,
         rng: np.random.Generator,
         settings: SamplingSettings | None = None,
@@ -381,7 +381,7 @@ class MotionModel(ABC):
     ) -> Float[ndarray, "samples waypoints dof"]:
         """Trajectories from start to goal [rad], float64 with exact ends.
 
-        code: z of the scene, from `encode`; None: the condition is hidden, as by a guidance_scale of 0.
+        code: z of the scene, from `encode`.
         clearances: see ClearanceFn.
         settings: None: the defaults.
         guide: improves the predicted clean trajectories in the guided steps (paper, section Motion Guided
@@ -392,9 +392,6 @@ class MotionModel(ABC):
         """
         settings = settings or SamplingSettings()
         scale = settings.guidance_scale
-        if code is None:
-            code = np.zeros(self.settings.code, np.float32)
-            scale = 0.0
         if scale != 1.0 and not self.settings.null_condition:
             raise InputError(
                 f"guidance_scale is {scale}; it must be 1, for this model was trained with "

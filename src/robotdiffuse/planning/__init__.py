@@ -15,10 +15,9 @@ if TYPE_CHECKING:
     from robotdiffuse.problems.problem import Problem
 
 
-# Kinds of planners: without a network; only a network's motions, with or without guidance; both.
+# Kinds of planners: without a network; only a network's motions, with or without guidance.
 SEARCH = "search"
 LEARNED = "learned"
-HYBRID = "hybrid"
 # What not every planner supports.
 PATH_CONSTRAINTS = "path constraints"
 CLEARANCE = "a requested clearance"
@@ -36,10 +35,10 @@ PLANNERS = Registry(
     "planner",
     {
         "robotdiffuse": _entry(
-            "planning.hybrid:RobotDiffuse",
-            "RobotDiffuseSettings",
-            HYBRID,
-            "AORRTC search first, then batches of the diffusion model too (the default)",
+            "planning.search.rrt:RobotDiffuse",
+            "AORRTCSettings",
+            SEARCH,
+            "aorrtc under the package's name (the default)",
             PATH_CONSTRAINTS,
             CLEARANCE,
         ),

@@ -5,8 +5,7 @@ collision guidance; every sample goes to the validator as it is, and the shortes
 Where none is valid, the next batch is drawn from new noise, until time runs out. There is no straight line,
 no search, no refinement, and nothing is shortened: what this planner solves, the network and its guidance
 solve. With the settings samples=1, guidance_steps=0, repeat=false and weights of config `paper`, which have
-no clearances as inputs, it does only what the paper says. The hybrid planner (`planning.diffusion.hybrid`)
-surrounds it with a search.
+no clearances as inputs, it does only what the paper says.
 
 Path constraints are one more cost of guidance, and each waypoint of a sample is projected onto them before
 validation, which proves them between the waypoints too. The network was trained without constraints.
@@ -16,7 +15,7 @@ network runs without guidance.
 """
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -28,13 +27,11 @@ from robotdiffuse.core.settings import Count, Natural, NotNegative
 from robotdiffuse.core.types import Configuration, Configurations, Path
 from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings, Trajectories
 from robotdiffuse.learning.motion_model import SamplingSettings
-from robotdiffuse.learning.weight_files import weights_for
 from robotdiffuse.planning import PATH_CONSTRAINTS
 from robotdiffuse.planning.context import TOLERANCE_FRACTION, PlanningContext
 from robotdiffuse.planning.learned import ExportedPlanner, LearnedSettings, nearest_goals
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.problems.compiled_constraints import PathConstraints
-from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.surface_points import sample_surface
 
 if TYPE_CHECKING:
@@ -42,49 +39,49 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class GuidedSamplingSettings(SamplingSettings, LearnedSettings):
-    """How batches of trajectories are drawn from a trained model under guidance."""
-
+class DiffusionSettings(SamplingSettings, LearnedSettings, name="diffusion"):
     guidance_steps: Natural = 8
     """Gradient steps at each guided denoising step."""
     points: Count = 320
     """Points of the encoder's input cloud (paper: 1,400), unless it takes clouds of one size."""
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
-
-
-@dataclass(frozen=True)
-class DiffusionSettings(GuidedSamplingSettings, name="diffusion"):
     optimize_time: NotNegative = 0.0
     """Time for more batches after the first one with a valid sample [s]; the shortest of all is returned."""
     repeat: bool = True
     """Whether more batches are drawn where the validator accepts no sample of the first (the paper: no)."""
 
 
-SamplerSettings = TypeVar("SamplerSettings", bound=GuidedSamplingSettings)
+def encode(
+    model: "MotionModel", checker: CollisionChecker, points: int, rng: np.random.Generator
+) -> Float[ndarray, "code"]:
+    """The encoding z of a scene: its point cloud of `points` points through the frozen encoder, unless the
+    encoder has a fixed size."""
+    of_encoder = model.settings.encoder_settings
+    assert of_encoder is not None  # unconditional priors are not used by these planners
+    count = points if of_encoder.any_size else of_encoder.cloud
+    return model.encode(sample_surface(checker.scene, count, rng, of_encoder.region), rng)
 
 
-class ModelSampler(ExportedPlanner[SamplerSettings]):
-    """Base of the planners that use the diffusion model: loads it, and draws batches by the settings."""
+def _projected(constraints: PathConstraints, path: Configurations) -> Configurations:
+    """The path with its inner waypoints projected onto the constraints; the path itself, for the validator to
+    refuse, if the projection of one fails."""
+    between = constraints.projected(path[1:-1], TOLERANCE_FRACTION)
+    return np.concatenate([path[:1], between, path[-1:]]) if len(between) == len(path) - 2 else path
 
+
+class Diffusion(ExportedPlanner[DiffusionSettings]):
+    """The diffusion model and its guidance as a planner; see the head of this file."""
+
+    name = "diffusion"
     network_name = "model"
-
-    def model(self, robot: Robot) -> "MotionModel | None":
-        """The model for a robot; None if none comes with the package.
-
-        Raises InputError if the settings name weights of another robot, or ones that cannot be read.
-        """
-        weights = self.settings.weights or weights_for(self.network_name, robot)
-        return self.network(robot) if weights else None
-
-    def guidance_scale(self, model: "MotionModel") -> float:
-        """Scale of classifier-free guidance for a model."""
-        return self.settings.guidance_scale
+    settings_class = DiffusionSettings
+    supports = frozenset({PATH_CONSTRAINTS})
 
     def draw(
         self,
         model: "MotionModel",
         checker: CollisionChecker,
-        code: Float[ndarray, "code"] | None,
+        code: Float[ndarray, "code"],
         start: Configuration,
         goals: Configurations,
         rng: np.random.Generator,
@@ -93,7 +90,7 @@ class ModelSampler(ExportedPlanner[SamplerSettings]):
     ) -> Trajectories:
         """A batch of samples under guidance, divided among the nearest goals.
 
-        code: the scene embedding of `encode`; None: the condition is hidden, for weights that allow it.
+        code: the scene embedding of `encode`.
         clearances: the model's clearance inputs; None: the true ones of the checker's scene.
         constraints: of the path, one more cost of the guidance.
         """
@@ -115,38 +112,12 @@ class ModelSampler(ExportedPlanner[SamplerSettings]):
                 code,
                 clearances,
                 rng,
-                replace(settings, samples=count, guidance_scale=self.guidance_scale(model)),
+                replace(settings, samples=count),
                 guide if settings.guidance_steps else None,
             )
             for goal, count in zip(goals, counts, strict=True)
         ]
         return np.concatenate(parts)
-
-
-def encode(
-    model: "MotionModel", checker: CollisionChecker, points: int, rng: np.random.Generator
-) -> Float[ndarray, "code"]:
-    """The encoding z of a scene: its point cloud of `points` points through the frozen encoder, unless the
-    encoder has a fixed size."""
-    of_encoder = model.settings.encoder_settings
-    assert of_encoder is not None  # unconditional priors are not used by these planners
-    count = points if of_encoder.any_size else of_encoder.cloud
-    return model.encode(sample_surface(checker.scene, count, rng, of_encoder.region), rng)
-
-
-def _projected(constraints: PathConstraints, path: Configurations) -> Configurations:
-    """The path with its inner waypoints projected onto the constraints; the path itself, for the validator to
-    refuse, if the projection of one fails."""
-    between = constraints.projected(path[1:-1], TOLERANCE_FRACTION)
-    return np.concatenate([path[:1], between, path[-1:]]) if len(between) == len(path) - 2 else path
-
-
-class Diffusion(ModelSampler[DiffusionSettings]):
-    """The diffusion model and its guidance as a planner; see the head of this file."""
-
-    name = "diffusion"
-    settings_class = DiffusionSettings
-    supports = frozenset({PATH_CONSTRAINTS})
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""

@@ -444,7 +444,7 @@ def _settings(rng: np.random.Generator, folder: FilePath) -> Callable[[], object
         return lambda: PlannerTraining.from_json(data, "settings")
     names = [*PLANNERS]
     name = names[rng.integers(len(names))]
-    fields = ("range", "guidance.margin", "search.iterations", "samples", "weights", "", "a.b.c")
+    fields = ("range", "guidance.margin", "iterations", "samples", "weights", "", "a.b.c")
     value = str(nasty(rng))
     said = f"{fields[rng.integers(len(fields))]}={value}" if rng.random() < 0.8 else value
     return lambda: planner_settings(name, [said])

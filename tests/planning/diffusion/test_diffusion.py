@@ -5,22 +5,35 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robotdiffuse import InputError, JointGoal, Path, Problem, Scene, Sphere, Status, load_robot, verify
+from robotdiffuse import (
+    Box,
+    InputError,
+    JointGoal,
+    Path,
+    PointCloud,
+    Problem,
+    Scene,
+    Sphere,
+    Status,
+    load_robot,
+    verify,
+)
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.learning.diffusion import SAMPLERS
 from robotdiffuse.learning.encoders import DGCNNSettings
 from robotdiffuse.learning.exported_model import ExportedModel
 from robotdiffuse.learning.motion_model import MotionModelSettings
 from robotdiffuse.learning.motion_network import MotionNetwork
-from robotdiffuse.learning.weight_files import RobotIdentity
+from robotdiffuse.learning.weight_files import RobotIdentity, weights_for
 from robotdiffuse.planning.diffusion import Diffusion, DiffusionSettings, encode
+from robotdiffuse.scenes.surface_points import sample_surface
 
 PANDA = load_robot("panda")
 LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 BALL = Sphere([0.5, 0.0, 0.4], 0.15, name="ball")
 PROBLEM = Problem(PANDA, Scene([BALL]), LEFT, JointGoal(RIGHT[None]))
-MODEL = Diffusion().model(PANDA)
-assert MODEL is not None
+MODEL = Diffusion().network(PANDA)
 
 
 def samples_of(seed: int) -> list[Path]:
@@ -28,7 +41,6 @@ def samples_of(seed: int) -> list[Path]:
     planner = Diffusion()
     checker = CollisionChecker(PANDA, PROBLEM.scene)
     rng = np.random.default_rng(seed)
-    assert MODEL is not None
     code = encode(MODEL, checker, planner.settings.points, rng)
     ends = LEFT.astype(np.float32), RIGHT[None].astype(np.float32)
     drawn = planner.draw(MODEL, checker, code, *ends, rng)
@@ -62,8 +74,7 @@ def test_weights_are_used_with_their_own_sampler_and_steps(monkeypatch: pytest.M
         return own(self, features, level, *rest)
 
     monkeypatch.setattr(ExportedModel, "denoised", denoised)
-    model = Diffusion().model(PANDA)  # the one that planners will be given
-    assert model is not None
+    model = Diffusion().network(PANDA)  # the one that planners will be given
     for steps, calls in ((None, model.settings.sampling_steps), (3, 3)):
         levels.clear()
         Diffusion(DiffusionSettings(sampling_steps=steps)).plan(PROBLEM, time_limit=60.0)
@@ -142,3 +153,56 @@ def test_an_encoder_of_one_size_gets_clouds_of_that_size(monkeypatch: pytest.Mon
     monkeypatch.setattr(model, "encode", z)
     encode(model, CollisionChecker(PANDA, PROBLEM.scene), 320, np.random.default_rng(0))
     assert sizes == [50]
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_any_sampler_plans(sampler: str) -> None:
+    planner = Diffusion(DiffusionSettings(sampler=sampler, guided_share=1.0, sampling_steps=8))
+    result = planner.plan(PROBLEM, time_limit=60.0)
+    assert result.stage == "network" and result.path is not None and verify(PROBLEM, result.path).valid
+
+
+def test_a_point_cloud_in_place_of_shapes() -> None:
+    """The same ball as points, as a camera sees it."""
+    points = sample_surface(PROBLEM.scene, 4000, np.random.default_rng(0))
+    problem = Problem(PANDA, Scene([PointCloud(points, 0.01)]), LEFT, JointGoal(RIGHT[None]))
+    result = Diffusion().plan(problem, time_limit=60.0)
+    assert result.path is not None and verify(PROBLEM, result.path).valid, "the ball lies within its points"
+
+
+def test_encodings_distinguish_scenes() -> None:
+    """Encodings z of two clouds of one scene are nearer to each other than those of two scenes."""
+    rng = np.random.default_rng(0)
+    near = CollisionChecker(PANDA, Scene([BALL]))
+    far = CollisionChecker(PANDA, Scene([Box([-0.4, 0.4, 0.5], [0.2, 0.2, 0.2])]))
+    a, b, c = (encode(MODEL, checker, 320, rng) for checker in (near, near, far))
+    assert np.linalg.norm(a - b) < 0.5 * np.linalg.norm(a - c)
+
+
+def test_the_guidance_scale_reaches_the_network() -> None:
+    checker = CollisionChecker(PANDA, PROBLEM.scene)
+    code = encode(MODEL, checker, 320, np.random.default_rng(0))
+    plain, same, strong = (
+        Diffusion(DiffusionSettings(samples=2, guidance_steps=0, guidance_scale=scale)).draw(
+            MODEL, checker, code, LEFT, RIGHT[None], np.random.default_rng(1)
+        )
+        for scale in (1.0, 1.0, 3.0)
+    )
+    assert np.array_equal(plain, same) and np.abs(strong - plain).max() > 0.01
+
+
+def test_motions_depend_on_the_guidance_scale() -> None:
+    paths = [
+        Diffusion(DiffusionSettings(guidance_scale=scale)).plan(PROBLEM, time_limit=60.0).path
+        for scale in (0.0, 1.0, 3.0)
+    ]
+    assert all(path is not None and verify(PROBLEM, path).valid for path in paths)
+    assert len({path.length for path in paths if path is not None}) == 3
+
+
+def test_locked_joints_that_the_network_does_not_know_keep_the_weights() -> None:
+    """Fingers locked at another opening; with a locked arm joint the network would have fewer joints."""
+    for opening in (0.0, 0.065):
+        robot = load_robot("panda", locked={"panda_finger_joint1": opening})
+        assert weights_for("model", robot) is not None and Diffusion().network(robot) is not None
+    assert weights_for("model", load_robot("panda", locked={"panda_joint7": 0.3})) is None

@@ -258,21 +258,6 @@ def test_a_planner_that_breaks_costs_one_plan(slow: type[SlowPlanner]) -> None:
     session.close()
 
 
-def test_candidates_of_an_arm_without_weights_are_smooth_noise() -> None:
-    start = np.array([0.0, -1.2, 1.2, 0.0, 0.5, 0.0])
-    problem = Problem(load_robot("ur5"), Scene(), start, JointGoal(start + 0.4))
-    session = Session(problem, PageOptions("aorrtc", 20.0, candidates=True))
-    session.start()
-    drawn = until(session, lambda state: state.candidates).candidates
-    assert drawn is not None and drawn.source == "smooth_noise"
-    assert drawn.positions.shape[0] == len(drawn.clearances) and (drawn.clearances > 0).all()
-    np.testing.assert_allclose(drawn.positions[:, 0], np.tile(start, (len(drawn.positions), 1)), atol=1e-5)
-    assert validity(until(session, settled)).lines[0].startswith("no obstacles, between links")
-    session.set_options(candidates=False)
-    assert session.state.candidates is None
-    session.close()
-
-
 def test_latest_goes_on_after_an_error(caplog: pytest.LogCaptureFixture) -> None:
     done = threading.Event()
 

@@ -48,8 +48,6 @@ FALLING_FRACTIONS = (1.0, 0.5, 0.25)
 """Fractions of a clearance that are tried; after those of one above the default clearance, the default's."""
 ITERATIONS_PER_CLEARANCE = 400
 """Iterations at a clearance before the next lower one is tried."""
-FALLBACK_INTERVAL = 8_000
-"""Iterations without a path between two calls of the fallback."""
 BOUND_FACTOR = 1.15
 """The length bound of a round is this factor of the best length: unsimplified tree paths are longer than
 simplified ones, so with a tight bound the trees would miss shorter ways than a long detour."""
@@ -219,18 +217,17 @@ class AnytimeSearch:
             Tree(grown.nodes[i, :n].copy(), grown.parents[i, :n].copy()) for i, n in enumerate(grown.sizes)
         )
 
-    def first(self, fallback: Callable[[], None] | None = None, work: float = np.inf) -> bool:
-        """Search for a first path, for at most `work` more iterations; returns whether there is a path.
-
-        fallback: called each time that all clearances failed.
-        """
+    def first(self, work: float = np.inf) -> bool:
+        """Search for a first path, for at most `work` more iterations; returns whether there is a path."""
         if self.best is None:
             self._try_straight_lines()
         work_limit = self.work + work
         while self.best is None and self.work < work_limit and not self._stop():
             self._iterate()
-            if self.best is None and self._tried >= self._tries:
-                self._lower_clearance(fallback)
+            lowest = self._level == len(self._clearances) - 1
+            if self.best is None and self._tried >= self._tries and not lowest:
+                self._set_level(self._level + 1)  # the trees stay valid
+                self._try_straight_lines()
         return self.best is not None
 
     def improve(self, work: int) -> None:
@@ -290,17 +287,6 @@ class AnytimeSearch:
         self._level = level
         self._tried = 0
         self.space = self.start_goal.space(self.settings.resolution, self.clearance)
-
-    def _lower_clearance(self, fallback: Callable[[], None] | None) -> None:
-        """Go to the next lower clearance, at which the trees stay valid; call the fallback after the lowest
-        one."""
-        if self._level < len(self._clearances) - 1:
-            self._set_level(self._level + 1)
-            self._try_straight_lines()
-        else:
-            self._tried = self._tries - FALLBACK_INTERVAL
-            if fallback is not None and self.work >= FALLBACK_INTERVAL:
-                fallback()
 
     def _try_straight_lines(self) -> None:
         for goal in sorted(self.goals, key=lambda goal: float(np.linalg.norm(goal - self.start))):
@@ -556,13 +542,11 @@ def anytime(
     search: AnytimeSearch,
     improves: Callable[[], bool],
     improve: Callable[[], None],
-    fallback: Callable[[], None] | None = None,
 ) -> PlanResult:
     """Search for a path, and for better ones for as long as the call's `until` says.
 
     improves: whether more time is still likely to shorten the path.
     improve: spends some time on shorter paths.
-    fallback: may offer paths where the search finds none at any clearance.
     """
     request = context.request
     problem = context.problem
@@ -590,7 +574,7 @@ def anytime(
         return not (searches() or optimizes())
 
     validation = _Validation(context, search)
-    while search.first(fallback):
+    while search.first():
         finished = ended()
         if finished and motions is not None and validation.best is not None:
             break
@@ -644,13 +628,19 @@ class AORRTC(Planner[AORRTCSettings]):
         settings = self.settings
         if context.problem.constraints:
             return plan_constrained(context, start_goal, settings)
-        search = AnytimeSearch.of(context, start_goal, settings, self.name)
+        search = AnytimeSearch.of(context, start_goal, settings, AORRTC.name)
         return anytime(
             context,
             search,
             lambda: search.improves(settings.gain, settings.patience),
             lambda: search.improve(IMPROVEMENT_STEP),
         )
+
+
+class RobotDiffuse(AORRTC):
+    """The default planner: AORRTC under the package's name, which loads no network."""
+
+    name = "robotdiffuse"
 
 
 class RRTConnect(Planner[RRTConnectSettings]):

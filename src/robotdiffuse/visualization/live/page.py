@@ -18,10 +18,9 @@ from viser import uplot
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
-from robotdiffuse.core.types import Configuration, Path, Pose, Trajectory, Tree, Vector
+from robotdiffuse.core.types import Configuration, Pose, Trajectory, Tree
 from robotdiffuse.drawables import GOAL, START, Color, Drawable, Surface, drawables, own_frame, thinned
 from robotdiffuse.planning import PLANNERS
-from robotdiffuse.planning.hybrid import Candidates
 from robotdiffuse.robots.kinematics import link_pose, reach
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -36,7 +35,7 @@ from robotdiffuse.visualization.live.session import (
     NEW_OBSTACLES,
     NO_MOTION,
     PENDING,
-    TREE_SETTINGS,
+    TREE_PLANNERS,
     VALID,
     Changes,
     LatestTask,
@@ -166,8 +165,6 @@ class Page(LivePage):
                 self._new_motion(state)
             if new("validation", state.validation):
                 self._arms["contact"].show(_first_collision(state))
-            if new("candidates", state.candidates):
-                draw_candidates(self.server, self._drawn, state.candidates)
             answer = state.answer
             tree_answer = answer if state.options.trees else None
             if (answer is not None or not state.options.trees) and new("trees", tree_answer):
@@ -330,11 +327,10 @@ class Panel:
         options = self._session.state.options
         hints = {
             "follow": "Plan again after each change",
-            "candidates": "Motions proposed by the network: red in collision, green from 5 cm clearance",
             "trees": "Search trees from the start (blue) and the goal (green); planners: "
-            + ", ".join(TREE_SETTINGS),
+            + ", ".join(TREE_PLANNERS),
         }
-        labels = {"follow": "Plan automatically", "candidates": "Candidates", "trees": "Search trees"}
+        labels = {"follow": "Plan automatically", "trees": "Search trees"}
         self._options: dict[str, Any] = {
             "planner": gui.add_dropdown("Planner", tuple(PLANNERS), initial_value=options.planner)
         }
@@ -395,9 +391,7 @@ class Panel:
         state = self._session.state
         if state.motion is None:
             raise InputError("there is no motion to save yet")
-        candidates = () if state.candidates is None else state.candidates.positions
-        paths = tuple(Path(state.problem.robot.joint_names, q) for q in candidates)
-        return "replay.html", replay_page(state.problem, state.motion, paths)
+        return "replay.html", replay_page(state.problem, state.motion)
 
     # display
 
@@ -558,10 +552,7 @@ def _stages_html(seconds: tuple[tuple[str, float], ...]) -> str:
 POSE_RATE = 30.0
 """Poses of a motion that are precomputed per second."""
 RED = (0xD6, 0x3B, 0x3B)
-AMBER = (0xE0, 0x9A, 0x2F)
 GAMMA = 2.2
-SAFE_CLEARANCE = 0.05
-"""Candidates with at least this clearance are green [m]."""
 # Points of the tool's trace along an edge of a tree; most edges drawn per tree, the first ones.
 EDGE_POINTS = 6
 MAX_EDGES = 4000
@@ -571,7 +562,6 @@ GHOST_OFFSET = 0.002
 scaled by its opacity over GHOST_OPACITY."""
 # Line widths, as fractions of the arm's reach.
 TRACE_WIDTH = 0.0094
-CANDIDATE_WIDTH = 0.0035
 TREE_WIDTH = 0.0028
 GHOST_OPACITY = 0.3
 """Opacity of the start and goal arms."""
@@ -712,16 +702,6 @@ def draw_trace(server: viser.ViserServer, arm: DrawnArm, motion: Trajectory | No
     draw_lines(server, "/trace", [points], [colors], TRACE_WIDTH * reach(arm.robot))
 
 
-def draw_candidates(server: viser.ViserServer, arm: DrawnArm, candidates: Candidates | None) -> None:
-    """Draw the tool traces of all candidates: red in collision, else amber to green by clearance."""
-    traces = []
-    colors = []
-    if candidates is not None:
-        traces = [arm.trace(q) for q in candidates.positions]
-        colors = [candidate_color(clearance) for clearance in candidates.clearances]
-    draw_lines(server, "/candidates", traces, colors, CANDIDATE_WIDTH * reach(arm.robot))
-
-
 def draw_trees(server: viser.ViserServer, arm: DrawnArm, trees: tuple[Tree, ...]) -> None:
     """Draw the tool traces along the edges of both search trees, in the colors of start and goal."""
     for name, color, tree in zip(TREES, (START, GOAL), trees or (None, None), strict=True):
@@ -737,14 +717,6 @@ def _edges(arm: DrawnArm, tree: Tree) -> list[Float[ndarray, "points 3"]]:
     share = np.linspace(0, 1, EDGE_POINTS)[:, None]
     q = (begin[:, None] + share * (end - begin)[:, None]).astype(np.float64)
     return list(arm.tool_points(q.reshape(-1, arm.robot.dof)).reshape(-1, EDGE_POINTS, 3))
-
-
-def candidate_color(clearance: float) -> Vector:
-    """Color of a candidate by its clearance [m]; sRGB, 0 to 255."""
-    if clearance <= 0:
-        return np.array(RED, float)
-    share = min(clearance / SAFE_CLEARANCE, 1.0)
-    return (1 - share) * np.array(AMBER) + share * np.array(GOAL)
 
 
 def draw_lines(

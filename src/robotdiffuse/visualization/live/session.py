@@ -26,8 +26,7 @@ from robotdiffuse.core.transforms import inverse, transform
 from robotdiffuse.core.types import Configuration, Pose, Vector
 from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.drawables import own_frame
-from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, load_planner, planner_settings
-from robotdiffuse.planning.hybrid import Candidates, draw_candidates
+from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, load_planner
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.families import load_family
 from robotdiffuse.problems.files import load_problem, problem_from_record, save_problem
@@ -59,12 +58,8 @@ ORIENTED = (Box, Cylinder, Capsule, Mesh)
 # Position of new obstacles and radius of a new sphere, as fractions of the arm's reach.
 NEW_POSITION = np.array([0.5, 0.0, 0.5])
 NEW_RADIUS = 0.094
-TREE_SETTINGS = {
-    "robotdiffuse": "search.keep_trees=true",
-    "aorrtc": "keep_trees=true",
-    "rrt_connect": "keep_trees=true",
-}
-"""Planners whose search trees can be shown, with the setting that keeps the trees."""
+TREE_PLANNERS = ("robotdiffuse", "aorrtc", "rrt_connect")
+"""Planners whose search trees can be shown."""
 QUICK_IK = InverseKinematicsSettings(max_rounds=2, patience=1)
 """Inverse kinematics while dragging: few attempts, because many poses are out of reach."""
 
@@ -96,8 +91,6 @@ class PageOptions(Settings):
     """Time limit of each call [s]."""
     follow: bool = True
     """Plan again after each change."""
-    candidates: bool = False
-    """Draw a batch of candidates of the diffusion model after each plan."""
     trees: bool = False
     """Show the search trees of the last plan."""
 
@@ -133,7 +126,6 @@ class State:
     """Validation of the motion shown; of an earlier version until the new one is done."""
     seconds: tuple[tuple[str, float], ...] = ()
     """Name and time [s] of each stage of the last plan."""
-    candidates: Candidates | None = None
     goal_frame: str = ""
     """The link that represents the goal."""
     goal_pose: Pose = field(default_factory=lambda: np.eye(4))
@@ -275,9 +267,7 @@ class Session:
             state = self._state
             version = state.version + 1
             follow = state.options.follow
-            self._state = replace(
-                state, version=version, planning=follow, answer=None, failure="", candidates=None
-            )
+            self._state = replace(state, version=version, planning=follow, answer=None, failure="")
             if state.motion is not None:
                 self._validation_task.submit(version)
             if follow:
@@ -342,8 +332,6 @@ class Session:
                 if validation.version != self._state.version:
                     self._validation_task.submit(self._state.version)
         self.on_change()
-        if current and state.options.candidates:
-            self._draw_candidates(version)
 
     def _solve(self, state: State) -> tuple[PlanResult | None, str, tuple[tuple[str, float], ...]]:
         """The planner's result, or why it failed, and the times of its stages."""
@@ -352,8 +340,7 @@ class Session:
         try:
             planner = self._planners.get(options.planner)
             if planner is None:
-                setting = TREE_SETTINGS.get(options.planner)
-                settings = None if setting is None else planner_settings(options.planner, [setting])
+                settings = {"keep_trees": True} if options.planner in TREE_PLANNERS else None
                 planner = load_planner(options.planner, settings)
                 planner.warm_up(problem)
                 self._planners[options.planner] = planner
@@ -369,17 +356,6 @@ class Session:
         if result.solved:
             seconds += [("timing", max(0.0, total_time - result.planning_time))]
         return result, "", tuple(seconds)
-
-    def _draw_candidates(self, version: int) -> None:
-        try:
-            candidates = draw_candidates(self._state.problem)
-        except InputError:
-            candidates = None
-        with self._lock:
-            if self._state.version != version:
-                return
-            self._state = replace(self._state, candidates=candidates)
-        self.on_change()
 
 
 def _configuration_at(
@@ -612,13 +588,13 @@ def problem_text(problem: Problem) -> bytes:
         return file.read_bytes()
 
 
-def replay_page(problem: Problem, result: PlanResult, candidates: tuple[JointPath, ...] = ()) -> bytes:
+def replay_page(problem: Problem, result: PlanResult) -> bytes:
     """The replay of a solved result as a self-contained HTML page."""
     motion = result.trajectory or result.path
     assert motion is not None
     with TemporaryDirectory() as folder:
         file = Path(folder) / "replay.html"
-        write_replay(*problem.standing(), motion, file, result=result, candidates=candidates)
+        write_replay(*problem.standing(), motion, file, result=result)
         return file.read_bytes()
 
 

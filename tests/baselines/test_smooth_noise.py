@@ -3,8 +3,8 @@
 import numpy as np
 
 from robotdiffuse import load_robot
+from robotdiffuse.baselines.controls import MAX_HALF_RANGE, SPREAD, smooth_noise
 from robotdiffuse.learning.exported_model import exported_model
-from robotdiffuse.planning.hybrid import MAX_HALF_RANGE, SPREAD, smooth_noise
 
 PANDA = load_robot("panda")
 MIDDLE = 0.5 * (PANDA.lower + PANDA.upper)
