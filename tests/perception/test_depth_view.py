@@ -1,6 +1,7 @@
 """Depth views: points of pixels by hand, clouds as images, what is refused; files of images and clouds."""
 
 import importlib.util
+import json
 from pathlib import Path
 from typing import Any
 
@@ -118,10 +119,55 @@ def test_views_survive_their_files(tmp_path: Path) -> None:
         assert np.allclose(view.T_base_camera, T)
 
 
+MATRIX = [[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.json", {"fx": K[0], "fy": K[1], "ppx": K[2], "ppy": K[3], "width": 8, "model": "brown"}),
+        ("a.json", {"width": 8, "intrinsic_matrix": np.ravel(MATRIX, "F").tolist()}),  # Open3D
+        ("a.json", {"cam_K": np.ravel(MATRIX).tolist(), "depth_scale": 1.0}),
+        ("camera_info.yaml", {"camera_matrix": {"rows": 3, "cols": 3, "data": np.ravel(MATRIX).tolist()}}),
+        ("a.txt", "\n".join(" ".join(map(str, row)) for row in MATRIX)),
+        ("a.npy", MATRIX),
+    ],
+)
+def test_intrinsics_beside_an_image(name: str, content: Any, tmp_path: Path) -> None:
+    Image.fromarray(np.full((6, 8), 1500, np.uint16)).save(tmp_path / "a.png")
+    if name.endswith("npy"):
+        np.save(tmp_path / name, content)
+    else:
+        (tmp_path / name).write_text(content if isinstance(content, str) else json.dumps(content))
+    entry: dict[str, Any] = {"depth": "a.png", "camera": {"xyz": [0, 0, 0], "wxyz": [1, 0, 0, 0]}}
+    if name.startswith("camera"):
+        entry["intrinsics"] = name
+    [view], _ = read_views([entry], tmp_path)
+    assert view.intrinsics == K
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"fx": 1.0, "fy": 1.0, "cx": 1.0}, "a.json holds no intrinsics"),
+        ({"K": [1.0, 2.0]}, "a.json holds no intrinsics"),
+        ([1.0, 2.0], "a.json holds no intrinsics"),
+        ({"fx": "wide", "fy": 1.0, "cx": 1.0, "cy": 1.0}, "view.intrinsics is"),
+    ],
+)
+def test_files_without_intrinsics(content: Any, message: str, tmp_path: Path) -> None:
+    Image.fromarray(np.full((6, 8), 1500, np.uint16)).save(tmp_path / "a.png")
+    camera = {"xyz": [0, 0, 0], "wxyz": [1, 0, 0, 0]}
+    with pytest.raises(InputError, match=r"views\[0\] has no intrinsics"):
+        read_views([{"depth": "a.png", "camera": camera}], tmp_path)
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=message):
+        read_views([{"depth": "a.png", "camera": camera}], tmp_path)
+
+
 @pytest.mark.parametrize(
     ("entry", "message"),
     [
-        ({"depth": "a.png", "camera": {}}, r"views\[0\] has no intrinsics"),
         ({"cloud": "a.ply", "camera": {}, "scale": 1}, r"unknown field of views\[0\]"),
         ({"cloud": "a.ply", "camera": {"xyz": [0, 0, 0]}}, r"views\[0\].camera has no wxyz"),
         ({"cloud": "a.ply", "camera": {"xyz": [0, 0], "wxyz": [1, 0, 0, 0]}}, r"views\[0\]: camera.xyz"),

@@ -1,5 +1,6 @@
 """Shapes, points on their surfaces, point clouds and the files that hold them."""
 
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from robotdiffuse.core.input_files import read_yaml
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.scenes.files import SHAPES as KINDS
 from robotdiffuse.scenes.files import read_scene, scene_entries
-from robotdiffuse.scenes.point_cloud import crop, distinct, read_points, voxel_thin
+from robotdiffuse.scenes.point_cloud import crop, distinct, lzf_unpacked, read_points, voxel_thin
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, HeightMap, Mesh, PointCloud, Shape, Sphere
 from robotdiffuse.scenes.surface_points import VisibleRegion, draw, sample_surface
@@ -240,13 +241,57 @@ def ply(points: ndarray, binary: bool) -> bytes:
     return header.encode() + rows
 
 
-def pcd(points: ndarray, binary: bool) -> bytes:
-    header = PCD.format(n=len(points), data="binary" if binary else "ascii").encode()
-    if not binary:
+def pcd(points: ndarray, storage: str) -> bytes:
+    header = PCD.format(n=len(points), data=storage).encode()
+    if storage == "ascii":
         return header + "".join(f"7 {x!r} {y!r} {z!r} 0 0 0 0\n" for x, y, z in points.tolist()).encode()
     record = np.zeros(len(points), np.dtype([("rgb", "<u4"), ("xyz", "<f4", 3), ("_", "u1", 4)]))
     record["xyz"] = points
-    return header + record.tobytes()
+    if storage == "binary":
+        return header + record.tobytes()
+    columns = [record["rgb"], *record["xyz"].T, record["_"]]
+    content = b"".join(np.ascontiguousarray(column).tobytes() for column in columns)
+    packed = lzf_packed(content)
+    return header + struct.pack("<II", len(packed), len(content)) + packed
+
+
+def lzf_packed(content: bytes) -> bytes:
+    """By LibLZF's format: literal bytes, and repetitions of what came before, overlapping ones too."""
+    out = bytearray()
+    at = 0
+    while at < len(content):
+        limit = min(len(content) - at, 264)
+        start = content.rfind(content[at : at + 3], max(at - 8192, 0), at + 2) if limit >= 3 else -1
+        if start < 0:
+            out += bytes([0, content[at]])
+            at += 1
+            continue
+        length = 3
+        while length < limit and content[start + length] == content[at + length]:
+            length += 1
+        away = at - start - 1
+        long = [length - 9] if length >= 9 else []
+        out += bytes([min(length - 2, 7) << 5 | away >> 8, *long, away & 255])
+        at += length
+    return bytes(out)
+
+
+@given(st.lists(st.sampled_from([b"a", b"bc", b"abcd", b"x" * 300, bytes(range(200))]), max_size=60))
+def test_lzf(parts: list[bytes]) -> None:
+    content = b"".join(parts)
+    packed = lzf_packed(content)
+    assert lzf_unpacked(packed, len(content)) == content
+    assert lzf_unpacked(bytes([2]) + b"abc" + bytes([0x20 + 0x40, 2]), 8) == b"abcabcab"  # by hand
+    with pytest.raises(ValueError, match="do not unpack to"):
+        lzf_unpacked(packed, len(content) + 1)
+
+
+def test_packed_data_of_hostile_sizes() -> None:
+    bomb = bytes([0, 7]) + bytes([0xE0, 255, 0]) * 10**6  # 264 MB
+    with pytest.raises(ValueError, match="do not unpack to 100 bytes"):
+        lzf_unpacked(bomb, 100)
+    with pytest.raises(ValueError, match="before their beginning"):
+        lzf_unpacked(bytes([0, 7, 0x20, 200]), 100)
 
 
 def text(points: ndarray, delimiter: str, header: str = "") -> bytes:
@@ -263,8 +308,8 @@ def write_points(folder: Path, form: str, points: ndarray) -> Path:
             np.savez(file, points=points, colors=points)
         case "ply ascii" | "ply binary":
             file.write_bytes(ply(points, form.endswith("binary")))
-        case "pcd ascii" | "pcd binary":
-            file.write_bytes(pcd(points, form.endswith("binary")))
+        case "pcd ascii" | "pcd binary" | "pcd binary_compressed":
+            file.write_bytes(pcd(points, form.split()[1]))
         case "csv":
             file.write_bytes(text(points, ","))
         case "csv with names":
@@ -274,7 +319,8 @@ def write_points(folder: Path, form: str, points: ndarray) -> Path:
     return file
 
 
-FORMS = ["npy", "npz", "ply ascii", "ply binary", "pcd ascii", "pcd binary", "csv", "csv with names", "xyz"]
+PCD_FORMS = ["pcd ascii", "pcd binary", "pcd binary_compressed"]
+FORMS = ["npy", "npz", "ply ascii", "ply binary", *PCD_FORMS, "csv", "csv with names", "xyz"]
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -305,7 +351,7 @@ def test_files_of_no_points(form: str, tmp_path: Path) -> None:
         assert points.shape == (0, 3) and "holds no points" in notes[0]
 
 
-@pytest.mark.parametrize("form", ["ply ascii", "ply binary", "pcd ascii", "pcd binary", "npy", "npz"])
+@pytest.mark.parametrize("form", ["ply ascii", "ply binary", *PCD_FORMS, "npy", "npz"])
 def test_damaged_point_files(form: str, tmp_path: Path) -> None:
     file = write_points(tmp_path, form, POINTS)
     file.write_bytes(file.read_bytes()[: 100 if form.startswith("np") else 240])
@@ -322,7 +368,12 @@ def test_damaged_point_files(form: str, tmp_path: Path) -> None:
         ("cloud.ply", b"", "is empty"),
         ("cloud.csv", b"1,2\n3,4\n", "an array of 2 x 2; it must be n x 3"),
         ("cloud.xyz", b"1 2 3\n4 five 6\n", "cannot be read"),
-        ("cloud.pcd", PCD.format(n=1, data="binary_compressed").encode(), "stored as 'binary_compressed'"),
+        ("cloud.pcd", PCD.format(n=1, data="zipped").encode(), "stored as 'zipped'"),
+        (
+            "cloud.pcd",
+            PCD.format(n=10**9, data="binary_compressed").encode() + struct.pack("<II", 2, 40) + b"ab",
+            "unpacks to 40 bytes, not to 1,000,000,000 points",
+        ),
         (
             "cloud.pcd",
             PCD.replace("x y z", "i j k").format(n=1, data="ascii").encode(),

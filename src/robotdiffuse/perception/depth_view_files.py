@@ -1,6 +1,7 @@
 """Reads and writes the depth views of problem files, and reads depth images.
 
 - {depth: shelf.png, scale: 0.001, intrinsics: [fx, fy, cx, cy], camera: {xyz: [...], wxyz: [...]}}
+- {depth: shelf.png, intrinsics: camera.json, camera: {...}}; without, shelf.json, .yaml, .txt or .npy
 - {cloud: shelf.ply, camera: {...}, configuration: [...]}
 
 Further fields are range, noise and pose_deviation, as of DepthView.
@@ -16,15 +17,17 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import numbers, positive, unit_quaternion, vector
-from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
-from robotdiffuse.core.input_files import input_file, read_arrays
+from robotdiffuse.core.errors import InputError, reading, shortened, shown, unknown_name
+from robotdiffuse.core.input_files import input_file, read_arrays, read_json, read_yaml
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
 from robotdiffuse.core.types import Points
-from robotdiffuse.perception.depth_view import DepthNoise, DepthView
+from robotdiffuse.perception.depth_view import INTRINSICS, DepthNoise, DepthView
 from robotdiffuse.scenes.files import check_fields, name_from
 from robotdiffuse.scenes.point_cloud import read_points
 
 DEPTH_FORMATS = (".png", ".npy", ".npz", ".exr")
+IMAGE_FIELDS = ("intrinsics", "scale", "range", "noise")
+INTRINSICS_FORMATS = (".json", ".yaml", ".txt", ".npy")
 MAX_PIXELS = 2**24
 """Most pixels of a depth image, in all its channels: a small file can unpack to a huge image."""
 INTEGER_SCALE = 0.001
@@ -102,6 +105,34 @@ def _read_exr(file: Path) -> ndarray:
     raise InputError(f"depth image {file} has the channels {', '.join(channels)}; one must be named Z")
 
 
+def read_intrinsics(file: Path) -> Any:
+    """The intrinsics of a camera, as DepthView takes them, of a file of numbers (.npy, .txt) or of names
+    (.json, .yaml): ROS's camera_info, librealsense's, Open3D's, or fx, fy, cx and cy.
+
+    Raises InputError for a file without them.
+    """
+    input_file(file, "file of intrinsics")
+    if file.suffix.lower() == ".npy":
+        return read_arrays(file)[""]
+    if file.suffix.lower() == ".txt":
+        with reading(file):
+            return np.loadtxt(file, max_rows=4)
+    record = read_json(file) if file.suffix.lower() == ".json" else read_yaml(file)
+    if isinstance(record, dict):
+        for name in ("K", "k", "cam_K", "camera_matrix", "intrinsic_matrix"):
+            if name in record:
+                rows = record[name]["data"] if isinstance(record[name], dict) else record[name]
+                matrix = numbers(rows)
+                if matrix is None or matrix.size != 9:
+                    break
+                matrix = matrix.reshape(3, 3)
+                return matrix.T if name == "intrinsic_matrix" else matrix  # Open3D writes columns
+        values = {{"ppx": "cx", "ppy": "cy"}.get(name, name): value for name, value in record.items()}
+        if {*INTRINSICS} <= {*values}:
+            return {name: values[name] for name in INTRINSICS}
+    raise InputError(f"{file} holds no intrinsics: neither fx, fy, cx and cy nor a camera matrix of 3 x 3")
+
+
 def _area(first: ndarray, last: ndarray) -> int:
     """Pixels from the first to the last corner, both included."""
     width, height = (last.astype(np.int64) - first + 1).tolist()
@@ -138,8 +169,8 @@ def read_views(entries: object, folder: Path) -> tuple[tuple[DepthView, ...], tu
 def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthView:
     source: dict[str, str | float] | None = None
     cloud = isinstance(entry, dict) and "cloud" in entry
-    required = ("cloud", "camera") if cloud else ("depth", "intrinsics", "camera")
-    optional = ("configuration", "pose_deviation", *(() if cloud else ("scale", "range", "noise")))
+    required = ("cloud", "camera") if cloud else ("depth", "camera")
+    optional = ("configuration", "pose_deviation", *(() if cloud else IMAGE_FIELDS))
     values = check_fields(where, entry, required, optional)
     optional_fields = {
         name: values[name] for name in ("range", "pose_deviation") if values.get(name) is not None
@@ -166,14 +197,21 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
     if isinstance(image, str):
         file = str(folder / image)
         image = read_depth(file, scale)
+        beside = (Path(file).with_suffix(suffix) for suffix in INTRINSICS_FORMATS)
+        found = (str(one) for one in beside if one != Path(file) and one.is_file())
+        values.setdefault("intrinsics", next(found, None))
         source = {"depth": file} | ({} if scale is None else {"scale": scale})
     elif scale is not None:
         raise InputError(
             "view.scale cannot be combined with an image in the problem file, which is in meters"
         )
-    return DepthView(
-        image, values["intrinsics"], T_base_camera, configuration, source=source, **optional_fields
-    )
+    intrinsics = values.get("intrinsics")
+    if intrinsics is None:
+        files = ", ".join(INTRINSICS_FORMATS)
+        raise InputError(f"{where} has no intrinsics, nor a file of them with the image's name ({files})")
+    if isinstance(intrinsics, str):
+        intrinsics = read_intrinsics(folder / intrinsics)
+    return DepthView(image, intrinsics, T_base_camera, configuration, source=source, **optional_fields)
 
 
 def _rows(where: str, points: Any) -> Points:

@@ -6,6 +6,7 @@ follows. Bits 0, 1 and 2 of a child's number say whether it is the upper one in 
 OccupancyOcTreeBase::writeBinaryNode of https://github.com/OctoMap/octomap.
 """
 
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -234,13 +235,57 @@ def _read_pcd(file: Path) -> ndarray:
         columns = [sum(counts[: names.index(axis)]) for axis in "xyz"]
         rows = content[at:].decode("ascii").splitlines()
         return np.loadtxt(rows, usecols=columns, ndmin=2, max_rows=total) if total else np.zeros((0, 3))
-    if storage != "binary":
-        raise InputError(f"point cloud file {file} is stored as {shown(storage)}; it must be ascii or binary")
+    if storage not in ("binary", "binary_compressed"):
+        wanted = "it must be ascii, binary or binary_compressed"
+        raise InputError(f"point cloud file {file} is stored as {shown(storage)}; {wanted}")
     kinds = [f"<{kind.lower()}{size}" for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]
     # Fields are named by position: PCL writes several padding fields that are all called "_".
     record = np.dtype([(str(i), kind, (n,)) for i, (kind, n) in enumerate(zip(kinds, counts, strict=True))])
-    points = np.frombuffer(content, record, count=total, offset=at)
-    return np.stack([points[str(names.index(axis))][:, 0].astype(np.float64) for axis in "xyz"], axis=1)
+    places = [names.index(axis) for axis in "xyz"]
+    if storage == "binary":
+        points = np.frombuffer(content, record, count=total, offset=at)
+        columns = [points[str(i)][:, 0] for i in places]
+    else:  # one field after the other
+        packed, size = struct.unpack_from("<II", content, at)
+        if size != total * record.itemsize:
+            raise InputError(f"point cloud file {file} unpacks to {size:,} bytes, not to {total:,} points")
+        unpacked = lzf_unpacked(content[at + 8 : at + 8 + packed], size)
+        columns = []
+        for i in places:
+            offset = sum(record[k].itemsize for k in range(i))
+            values = np.frombuffer(unpacked, kinds[i], total * counts[i], total * offset)
+            columns.append(values.reshape(total, counts[i])[:, 0])
+    return np.stack([column.astype(np.float64) for column in columns], axis=1)
+
+
+def lzf_unpacked(packed: bytes, size: int) -> bytes:
+    """Data that LibLZF packed, of a size [bytes]: https://oldhome.schmorp.de/marc/liblzf.html
+
+    Raises ValueError for data of another size, of which no more is unpacked, and IndexError for data that end
+    too soon.
+    """
+    out = bytearray()
+    at = 0
+    while at < len(packed) and len(out) <= size:
+        control = packed[at]
+        at += 1
+        if control < 32:  # so many bytes and one more as they are
+            out += packed[at : at + control + 1]
+            at += control + 1
+            continue
+        length = (control >> 5) + 2
+        if length == 9:
+            length += packed[at]
+            at += 1
+        start = len(out) - 1 - ((control & 31) << 8 | packed[at])
+        at += 1
+        repeated = out[max(start, 0) : start + length]
+        if start < 0:
+            raise ValueError("the packed data refer to what is before their beginning")
+        out += (repeated * -(-length // len(repeated)))[:length]
+    if len(out) != size:
+        raise ValueError(f"the packed data do not unpack to {size:,} bytes")
+    return bytes(out)
 
 
 READERS: dict[str, Callable[[Path], ndarray]] = {
