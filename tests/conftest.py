@@ -5,18 +5,17 @@ import os
 import re
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import jaxtyping
 import pytest
 from hypothesis import settings
 from jaxtyping import install_import_hook
 
-APART = ("learning", "robots", "scenes")
-"""Packages whose tests need little of the compiled code of searches."""
 SOURCE = Path(__file__).parents[1] / "src" / "robotdiffuse"
 _KERNELS = r"robotdiffuse\.(collision\.kernels\.random|core\.kernels)"
 COMPILED = re.compile(rf"^\s*(import numba\b|from numba\b|from {_KERNELS} import)", re.MULTILINE)
@@ -47,7 +46,24 @@ def parse_in_one_thread_at_a_time() -> None:
     ast.parse = alone
 
 
+def keep_dimensions_of_shapes_alone() -> None:
+    """jaxtyping binds the arguments of every call, to compare the dimensions of its shapes. That took a large
+    part of the suite's time: functions without shapes are left to beartype."""
+    jaxtyped = jaxtyping.jaxtyped
+
+    def checked(*, typechecker: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        def decorator(of: Any) -> Any:
+            hints = getattr(of, "__annotations__", {}).values()
+            shapes = any(isinstance(hint, str) for hint in hints) or "jaxtyping." in repr(hints)
+            return (jaxtyped(typechecker=typechecker) if isinstance(of, type) or shapes else typechecker)(of)
+
+        return decorator
+
+    jaxtyping.jaxtyped = checked
+
+
 parse_in_one_thread_at_a_time()
+keep_dimensions_of_shapes_alone()
 install_import_hook(checked_modules(), "beartype.beartype")
 
 # the same examples at every run: a suite that fails by chance guards nothing
@@ -71,10 +87,11 @@ def cpu_clock(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -
         monkeypatch.setattr(time, "perf_counter", time.process_time)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Two workers begin with the first and the second half: where searches are not compiled yet, one compiles
-    them, while the other is busy with what does not need them."""
-    apart = [item for item in items if item.path.parent.name in APART]
-    others = [item for item in items if item.path.parent.name not in APART]
-    half = len(items) // 2
-    items[:] = [*others[:half], *apart, *others[half:]]
+@pytest.fixture
+def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Light and ghosts take seconds to draw; a small picture tells as much to a test."""
+    from robotdiffuse.visualization import picture, replay_page
+
+    small = picture.PictureSettings(width=480, height=300, ghosts=1)
+    for module in (picture, replay_page):
+        monkeypatch.setattr(module, "PictureSettings", lambda **_: small)

@@ -9,7 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from helpers.box_arm import box_arm
-from robotdiffuse import Box, InputError, JointGoal, Problem, Scene, Sphere, Status, load_robot, verify
+from robotdiffuse import Box, InputError, JointGoal, Problem, Scene, Sphere, Status, load_robot
 from robotdiffuse.baselines.lattice import (
     AStar,
     AStarSettings,
@@ -198,15 +198,6 @@ def test_start_buried_and_freed_again():
     assert search.run() is Outcome.EXHAUSTED and search.path() is None
     search.update(checker)
     assert cost_of(search) == cost
-
-
-@pytest.mark.parametrize("planner", [AStar, DStarLite])
-def test_around_a_wall(planner):
-    problem = Problem(PANDA, WALL, LEFT, JointGoal(RIGHT[None]))
-    result = planner().plan(problem, time_limit=120.0)
-    assert result.path is not None and verify(problem, result.path).valid
-    assert result.planner == planner.name and "expansions" in result.reason
-    assert np.array_equal(result.path.positions[0], LEFT) and np.array_equal(result.path.positions[-1], RIGHT)
 
 
 @pytest.mark.parametrize("planner", [AStar, DStarLite])

@@ -9,7 +9,7 @@ import torch
 
 from robotdiffuse import Box, InputError, PoseGoal, Problem, Scene, Sphere, Status, load_robot, verify
 from robotdiffuse.baselines.mpinets import MPiNets, MPiNetsSettings
-from robotdiffuse.learning.checkpoint import load_network, save_network
+from robotdiffuse.learning.checkpoint import save_network
 from robotdiffuse.learning.mpinets import (
     MPiNetsNetwork,
     MPiNetsNetworkSettings,
@@ -180,13 +180,6 @@ def test_trained_weights_are_read_and_the_same_seed_gives_the_same_path(
     assert paths[0] is not None and paths[1] is not None
     assert np.array_equal(paths[0].positions, paths[1].positions)
     assert len(paths[0].positions) > 2
-
-
-def test_missing_weights_name_the_command(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="train baseline mpinets"):
-        MPiNets(MPiNetsSettings(weights=str(tmp_path)))
-    with pytest.raises(InputError, match="train baseline mpinets"):
-        load_network("mpinets", str(tmp_path), PANDA)
 
 
 @pytest.mark.parametrize(

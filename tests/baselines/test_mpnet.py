@@ -269,10 +269,7 @@ def test_giving_up_says_what_was_wrong(weights: str) -> None:
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("points", 0),
-        ("dropout", 1.0),
         ("layers", ()),
-        ("step", 0.0),
         ("steady_layers", 12),
     ],
 )

@@ -3,7 +3,7 @@
 import gc
 import runpy
 import sys
-from itertools import pairwise, product
+from itertools import product
 
 import numpy as np
 import pytest
@@ -49,18 +49,6 @@ def plan(
 def compiled() -> None:
     """Compile and load the kernels before the planners are timed."""
     planners.OmplRRTConnect().plan(problem(RIGHT), time_limit=120.0)
-
-
-@every
-def test_around_a_wall(planner):
-    result = plan(planner, problem(RIGHT))
-    assert result.solved and result.path is not None, result.reason
-    assert rd.verify(problem(RIGHT), result.path).valid
-    assert result.planner == result.stage == planner.name
-    assert all(later[1] < earlier[1] for earlier, later in pairwise(result.progress))
-    assert result.progress[-1][1] == pytest.approx(result.path.length)
-    # the wall is in the way
-    assert result.path.length > 1.01 * np.linalg.norm(RIGHT - LEFT)
 
 
 def test_an_anytime_planner_improves():

@@ -225,7 +225,7 @@ def test_bounds_hold_for_cubics_that_leave_the_straight_lines() -> None:
     """Along the cubics, clearances are at least what is left of those in the middle of the straight lines."""
     rng = np.random.default_rng(0)
     robot = box_arm()
-    for _ in range(30):
+    for _ in range(12):
         rows, v = rng.uniform(-0.5, 0.5, (2, 4, 3))
         motion = Trajectory(robot.joint_names, 0.3 * np.arange(4.0), rows, v, 0 * v)
         scene = Scene([Sphere([*rng.uniform(-1, 1, 2), 0.0], 0.05)])
@@ -237,9 +237,9 @@ def test_bounds_hold_for_cubics_that_leave_the_straight_lines() -> None:
         whole = Stretches(np.arange(count), np.full(count, start), np.full(count, stop))
         found = prover.bounds(whole, np.zeros(count, bool), [])
         low, high = np.interp([start, stop], np.arange(len(times)), times)
-        dense = motion.at(np.linspace(low, high, 100)).positions
+        dense = motion.at(np.linspace(low, high, 40)).positions
         exact = Prover(robot, scene, dense)
-        for place in range(100):
+        for place in range(40):
             here = Stretches(np.arange(count), np.full(count, float(place)), np.full(count, float(place)))
             there = exact.bounds(here, np.zeros(count, bool), [])
             assert (there.clearance >= found.clearance - found.displacement - 1e-9).all()

@@ -275,7 +275,7 @@ def test_damaged_files_are_one_line(file: FilePath, tmp_path: FilePath) -> None:
     """Every field in turn is replaced by a wrong value."""
     whole = json.loads(file.read_text())
     for name in whole:
-        for value in (None, [], {}, "x", -1, [[1, 2], [3]], {"a": [None]}):
+        for value in (None, {}, "x", [[1, 2], [3]], {"a": [None]}):
             changed = tmp_path / "changed.json"
             changed.write_text(json.dumps(whole | {name: value}))
             try:

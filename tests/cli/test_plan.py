@@ -113,6 +113,7 @@ def test_no_plan_is_status_1_with_the_reason(
     assert f"its status is {status}" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("small_pictures")
 def test_what_has_no_motion_is_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """`view problem.yaml` was refused, and `plan --out bad.html` wrote nothing and said so neither."""
     problem = write_problem(tmp_path, **NO_PLAN["goal in collision"][0])
@@ -191,6 +192,7 @@ def test_wrong_settings_are_told(
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("small_pictures")
 def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("demo") == 0
     printed = capsys.readouterr().out

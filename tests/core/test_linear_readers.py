@@ -37,7 +37,7 @@ def test_joint_names_are_compared_a_few_times_each(names: list[str]) -> None:
 
 
 def test_the_last_key_of_many_is_found_to_be_the_first_again() -> None:
-    keys = ", ".join(f'"k{i}": 0' for i in range(100_000))
+    keys = ", ".join(f'"k{i}": 0' for i in range(30_000))
     with pytest.raises(InputError, match="k0 appears twice"):
         parse_json(f'{{{keys}, "k0": 1}}', "the request")
 

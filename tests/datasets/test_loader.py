@@ -8,7 +8,6 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.stores import manifest_of, random_arrays, write_store
 from robotdiffuse.core.errors import InputError
@@ -144,10 +143,6 @@ def test_pickled_without_the_trajectories(store):
     assert len(content) < 2000
     again = joined(pickle.loads(content).batches(50))
     torch.testing.assert_close(again.points, joined(data.batches(50)).points, atol=0, rtol=0)
-
-
-def test_one_line():
-    assert rd.RopDataset is RopDataset
 
 
 def test_bad_input(store, tmp_path):

@@ -7,7 +7,6 @@ import pytest
 
 from helpers.quick_preparation import QUICK, coarse_grids
 from robotdiffuse.robots.fitting.preparation import add_robot
-from robotdiffuse.visualization import picture
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
@@ -20,13 +19,6 @@ def cases() -> list[object]:
         pytest.param(file, id=file.stem, marks=[pytest.mark.slow] if file.stem in SLOW else [])
         for file in EXAMPLES
     ]
-
-
-@pytest.fixture
-def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Light and ghosts take seconds to draw; a small picture tells as much to a test."""
-    small = picture.PictureSettings(width=160, height=100, ghosts=1)
-    monkeypatch.setattr(picture, "PictureSettings", lambda **_: small)
 
 
 @pytest.mark.usefixtures("small_pictures")

@@ -21,6 +21,8 @@ from robotdiffuse.learning.encoders.networks import (
     PointAutoencoder,
 )
 
+pytestmark = pytest.mark.usefixtures("no_export")
+
 
 def cloud(n: int, seed: int = 0) -> torch.Tensor:
     points = np.random.default_rng(seed).uniform([-0.5, -0.5, 0.1], [0.5, 0.5, 0.8], (1, n, 3))

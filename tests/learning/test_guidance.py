@@ -11,7 +11,6 @@ from numpy import ndarray
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.guidance import OFF, CollisionGuidance, GuidanceSettings
 from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.problems.constraint_kernel import DISTANCE
@@ -123,15 +122,6 @@ def test_point_clouds_guide_too() -> None:
     cloud = CollisionChecker(checker.robot, Scene([PointCloud(surface, 0.005)]))
     moved, _ = CollisionGuidance(cloud)(lines, 40)
     assert checker.free(moved[0].astype(float)).all()
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("margin", -0.1), ("self_margin", -1.0), ("push", 0.0), ("width", 0.0), ("length", 1.5)],
-)
-def test_bad_settings_are_refused(name: str, value: float) -> None:
-    with pytest.raises(InputError, match=f"guidance.{name} is {value}"):
-        replace(GuidanceSettings(), **{name: value})
 
 
 NOTHING = GuidanceSettings(margin=None, self_margin=None, length=0.0, push=0.05)

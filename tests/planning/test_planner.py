@@ -32,7 +32,7 @@ def name(request: pytest.FixtureRequest) -> str:
 @pytest.mark.parametrize("number", [0, 4])
 def test_solved_means_verified(name: str, number: int) -> None:
     problem = held_out_problem("rop", number)
-    result = rd.load_planner(name).plan(problem, time_limit=1.0, seed=number)
+    result = rd.load_planner(name).plan(problem, time_limit=0.5, seed=number)
     assert result.planner == name and result.reason
     assert (result.path is not None) == (result.trajectory is not None) == result.solved
     if result.path is None or result.trajectory is None:

@@ -202,9 +202,9 @@ def followed(robot: rd.Robot, start: ndarray, shift: ndarray) -> ndarray | None:
     q = start.copy()
     T = link_pose(robot, q, robot.tip)
     target = T.copy()
-    for k in range(1, 41):
-        target[:3, 3] = T[:3, 3] + k / 40 * shift
-        for _ in range(6):
+    for k in range(1, 21):
+        target[:3, 3] = T[:3, 3] + k / 20 * shift
+        for _ in range(4):
             now = link_pose(robot, q, robot.tip)
             turn = target[:3, :3] @ now[:3, :3].T
             skew = 0.5 * (turn - turn.T)
@@ -222,7 +222,7 @@ def followed(robot: rd.Robot, start: ndarray, shift: ndarray) -> ndarray | None:
 def test_a_pose_where_the_hand_is_costs_no_motion(arm: str) -> None:
     """An iiwa14 moved by 3.2 rad."""
     robot = rd.load_robot(arm)
-    for k, start in enumerate(apart(robot, 8)):
+    for k, start in enumerate(apart(robot, 4)):
         start = start + 2 * np.pi * np.where(robot.continuous, k, 0)
         here = rd.PoseGoal(robot.tip, link_pose(robot, start, robot.tip))
         for goal in (here, rd.PoseGoal(robot.tip, here.T_base_frame, [0.01] * 3, [0.1, 0.1, np.pi])):
@@ -258,7 +258,7 @@ def test_a_pose_nearby_is_reached_by_the_nearest_configuration(arm: str) -> None
             assert result.path is not None, result.reason
             assert result.path.length <= longest
             assert result.goal_index == (1 if isinstance(problem.goal, rd.AnyGoal) else 0)
-        if tested == 3:
+        if tested == 2:
             return
     raise AssertionError("no starts")
 

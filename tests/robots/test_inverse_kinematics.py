@@ -117,15 +117,6 @@ def test_unreachable_poses_give_nothing(xyz: tuple[float, float, float]) -> None
     ).shape == (0, 7)
 
 
-def test_accept_is_honoured() -> None:
-    robot = example_robot("panda")
-    rng = np.random.default_rng(8)
-    T = link_pose(robot, (robot.lower + robot.upper) / 2, "panda_hand")
-    q = inverse_kinematics(robot, "panda_hand", T, 6, rng=rng, accept=lambda q: q[:, 0] > 0.5)
-    assert len(q) == 6 and (q[:, 0] > 0.5).all()
-    assert smallest_gap(q) > 0.1
-
-
 def test_a_narrow_range_of_acceptance_is_found() -> None:
     """Solutions close to rejected ones are tried too: here a range of 0.02 rad of the elbow is accepted."""
     robot = example_robot("panda")

@@ -126,11 +126,6 @@ def test_batch_shapes(batch: tuple[int, ...]) -> None:
     assert ForwardKinematics(robot)(torch.zeros((*batch, 3))).shape == (*batch, 4, 4, 4)
 
 
-def test_bad_input() -> None:
-    with pytest.raises(InputError, match="unknown link 'hand'"):
-        link_pose(planar_arm(1.0, 1.0), np.zeros(2), "hand")
-
-
 def test_inverse_kinematics_of_a_robot_nearest_first() -> None:
     panda = load_robot("panda")
     q = np.array([0.3, 0.2, 0.1, -1.8, 0.0, 2.1, 0.8])

@@ -10,7 +10,7 @@ import pytest
 from helpers.box_arm import box_arm
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
+from robotdiffuse.problems.files import load_problem, save_problem
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematic_tree import once_per_robot
@@ -92,10 +92,3 @@ def test_what_is_compiled_is_not_pickled() -> None:
     again = pickle.loads(pickle.dumps(robot))
     assert again.locked == robot.locked and again.link_names == robot.link_names
     np.testing.assert_array_equal(compile_robot(again).spheres, compile_robot(robot).spheres)
-
-
-def test_records_of_one_robot_share_it() -> None:
-    robot = load_robot("panda", locked={LEFT: 0.03})
-    start = (robot.lower + robot.upper) / 2
-    record = problem_record(Problem(robot, Scene([]), start, start + 0.1))
-    assert problem_from_record(record).robot is problem_from_record(record).robot is robot

@@ -9,7 +9,6 @@ import robotdiffuse as rd
 from robotdiffuse.certificates.checker import check
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.deadline import OutOfTimeError, deadline
-from robotdiffuse.planning import PLANNERS
 from robotdiffuse.planning.pipeline.moving_obstacles import GRID_STEP, WAITED, earliest
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.trajectories.speed_limits import TimingSettings
@@ -46,17 +45,6 @@ def test_motion_is_certified_in_time(obstacle: rd.MovingObstacle, jerk: float | 
         least = min(least, *(d.distance for d in exact.link_distances(q)))
     assert found.scene_clearance is not None
     assert 0 < found.scene_clearance <= least + 1e-9
-
-
-@pytest.mark.parametrize("name", ["aorrtc", "robotdiffuse", "smooth", "lattice"])
-def test_any_planner_finds_the_path(name: str) -> None:
-    known = {"smooth": "a_star", "lattice": "d_star_lite"}
-    found = rd.load_planner(known.get(name, name)).plan(problem(PASSING), 20.0, until="first")
-    assert found.status in (rd.Status.SOLVED, rd.Status.TIMEOUT, rd.Status.NO_PATH)
-    if found.trajectory is not None:
-        assert verify_trajectory(problem(PASSING), found.trajectory).valid
-    assert name in known or found.status is rd.Status.SOLVED
-    assert known.get(name, name) in PLANNERS
 
 
 def test_a_start_that_is_hit_at_once_is_invalid() -> None:

@@ -33,19 +33,6 @@ def test_motions_begin_with_the_start_velocity(velocity: np.ndarray) -> None:
     assert at_rest.kind in ("rest", "acceleration")
 
 
-@pytest.mark.parametrize("jerk", [20.0, 200.0, np.inf])
-def test_a_jerk_limit_holds_from_the_start_velocity_on(jerk: float) -> None:
-    task = rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=[0.6, 0.1, 0.2, -0.3, 0, 0, 0.5])
-    found = rd.load_planner("rrt_connect").plan(task, 60.0, jerk=jerk)
-    assert found.trajectory is not None, found.reason
-    assert task.start_velocity is not None
-    assert np.allclose(found.trajectory.velocities[0], task.start_velocity, atol=1e-9)
-    assert (np.abs(found.trajectory.at(0.0).jerks) <= jerk).all()
-    steps = np.diff(found.trajectory.times)[:, None]
-    assert (np.abs(np.diff(found.trajectory.accelerations, axis=0) / steps) <= jerk * (1 + 1e-9)).all()
-    assert not found.stops
-
-
 @pytest.mark.parametrize(
     ("velocity", "message"),
     [

@@ -117,13 +117,6 @@ def test_more_time_gives_no_longer_paths(planner: AORRTC | RRTConnect) -> None:
         assert lengths == sorted(lengths, reverse=True) and lengths[-1] == result.path_length
 
 
-def test_the_same_seed_gives_the_same_path() -> None:
-    one, two, other = (AORRTC().plan(AROUND, 20.0, seed=seed) for seed in (4, 4, 5))
-    assert one.path is not None and two.path is not None and other.path is not None
-    assert np.array_equal(one.path.positions, two.path.positions)
-    assert not np.array_equal(one.path.positions, other.path.positions)
-
-
 def test_a_free_straight_line_is_the_answer() -> None:
     result = AORRTC().plan(
         Problem(PANDA, Scene(), LEFT, JointGoal(np.stack([-LEFT * [1, 0, 0, -1, 0, -1, 1], RIGHT])))

@@ -254,7 +254,7 @@ def test_a_gap_too_narrow_for_the_distance_lowers_it() -> None:
 
 
 @pytest.mark.parametrize("family", [ROP, ROP_DENSE], ids=["rop", "rop_dense"])
-@pytest.mark.parametrize("index", range(4))
+@pytest.mark.parametrize("index", range(2))
 def test_solved_means_verified(family, index) -> None:
     problem = family.draw(PANDA, np.random.default_rng([21, index])).problem(PANDA)
     result = SharedTreeRRTStar().plan(problem, time_limit=5.0)

@@ -71,12 +71,6 @@ def test_motions_take_less_time_and_keep_their_certificate(planner: str) -> None
         assert by_length.path.length < result.path.length
 
 
-def test_the_same_seed_gives_the_same_motion() -> None:
-    first, second = (rd.load_planner("aorrtc").plan(AROUND, 60.0, seed=3) for _ in range(2))
-    assert first.path is not None and second.path is not None
-    assert np.array_equal(first.path.positions, second.path.positions)
-
-
 def test_an_unknown_objective_lists_the_known_ones() -> None:
     with pytest.raises(rd.InputError, match="length, time"):
         rd.plan(AROUND, objective="energy")

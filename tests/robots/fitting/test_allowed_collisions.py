@@ -8,7 +8,6 @@ import pytest
 import trimesh
 
 from helpers.box_arm import box_arm, box_mesh
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import inverse, transform
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.bodies import Surface
@@ -201,12 +200,6 @@ def test_bundled_panda_has_the_expected_pairs() -> None:
     for i in range(7):
         assert frozenset((f"panda_link{i}", f"panda_link{i + 1}")) not in checked
     assert frozenset(("panda_link5", "panda_link7")) not in checked
-
-
-@pytest.mark.parametrize("bad", [{"samples": 10}, {"descents": -1}])
-def test_settings_out_of_range(bad: dict) -> None:
-    with pytest.raises(InputError):
-        SamplingSettings(**bad)
 
 
 def test_false_collisions_of_parts_after_true_ones_are_counted() -> None:

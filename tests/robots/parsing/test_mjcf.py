@@ -1,5 +1,6 @@
 """MuJoCo models: frames, limits and collisions against MuJoCo itself; scenes; what cannot be planned with."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +9,11 @@ import pytest
 import trimesh
 
 import robotdiffuse as rd
+from helpers.quick_preparation import QUICK, coarse_grids
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.fitting.preparation import add_robot
+from robotdiffuse.robots.fitting.self_collisions import SamplingSettings
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.parsing.urdf import UrdfTree
 from robotdiffuse.robots.robot import Robot
@@ -71,7 +74,9 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def arm(file: Path, tmp_path_factory: pytest.TempPathFactory) -> Robot:
-    return add_robot(file, out=tmp_path_factory.mktemp("robots") / "arm").robot
+    settings = replace(QUICK, sampling=SamplingSettings(samples=1000, descents=3))
+    with coarse_grids():
+        return add_robot(file, out=tmp_path_factory.mktemp("robots") / "arm", settings=settings).robot
 
 
 def state_of(model: Any, robot: Robot, q: np.ndarray) -> Any:

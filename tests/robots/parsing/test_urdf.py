@@ -78,15 +78,6 @@ def test_joints_limits_and_geometry(tmp_path: Path) -> None:
     assert solid.is_watertight and 0 < solid.volume / (np.pi * 0.03**2 * 0.2) - 1 < 0.01
 
 
-def test_gripper_is_left_out_and_locked(tmp_path: Path) -> None:
-    robot = read_urdf(urdf(tmp_path, ARM.replace("</robot>", GRIPPER)))
-    assert robot.tip == "palm"
-    assert robot.joint_names == ("turn", "bend")
-    assert robot.locked == {"grip": 0.01, "grip2": 0.01}
-    robot = read_urdf(urdf(tmp_path, ARM.replace("</robot>", GRIPPER)), locked={"grip": 0.03, "turn": 0.5})
-    assert robot.joint_names == ("bend",) and robot.locked["grip"] == 0.03
-
-
 def test_base_and_tip_are_selectable(tmp_path: Path) -> None:
     file = urdf(tmp_path, AWKWARD)
     whole = read_urdf(file)
