@@ -165,19 +165,39 @@ def test_geoms_without_a_solid_are_refused() -> None:
         rd.Scene.from_mujoco(model)
 
 
+HILLY = """
+<mujoco>
+  <asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset>
+  <worldbody>
+    <body name="b">
+      <joint name="j" range="-1 1"/>
+      <geom name="hill" type="hfield" hfield="h" {}/>
+      <geom size="1"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_a_height_field_that_collides_with_nothing_is_left_out(tmp_path: Path) -> None:
+    (tmp_path / "m.xml").write_text(HILLY.format('contype="0" conaffinity="0" mass="0"'))
+    assert len(UrdfTree(tmp_path / "m.xml", {}).surfaces("b")) == 1
+
+
 BODY = "<mujoco><worldbody><body>{}<geom size='1'/></body></worldbody></mujoco>"
 
 
 @pytest.mark.parametrize(
     ("text", "wanted"),
     [
+        (HILLY.format(""), "hill of body b is of type hfield; use one of sphere"),
         (BODY.format(""), "has no robot: no body is moved by a hinge"),
         (BODY.format("<joint type='slide'/>"), "slide joint joint0 has no range"),
         (BODY.format("<joint/><joint name='b' type='ball'/>"), "joint b is a ball joint; use three hinges"),
         (BODY.format("<joint/><geom type='sdf' mesh='m'/>"), "is no valid MuJoCo model"),
         ("<mujoco><worldbody><body><joint", "is not well-formed XML"),
         ("<mujoco><worldbody><box/></worldbody></mujoco>", "is no valid MuJoCo model"),
-        ("<mujoco><asset><mesh name='m' file='none.stl'/></asset></mujoco>", "is no valid MuJoCo model"),
+        ("<mujoco><asset><mesh name='m' file='none.stl'/></asset></mujoco>", "none.stl.*; meshes are STL"),
     ],
 )
 def test_bad_models_are_one_line(text: str, wanted: str, tmp_path: Path) -> None:
@@ -200,7 +220,6 @@ PLACED = """
       </body>
     </body>
   </worldbody>
-  <actuator><position joint="j"/></actuator>
   <keyframe><key name="home" qpos="0.3 0.5"/></keyframe>
 </mujoco>
 """

@@ -28,6 +28,8 @@ from robotdiffuse.robots.fitting.convex_parts import convex_hull
 from robotdiffuse.robots.parsing.srdf import Srdf
 
 MOVABLE = ("hinge", "slide")
+DRAWN = ("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
+"""Geoms that a URDF can have."""
 WORLD = 0
 """Body that does not move."""
 EXCLUDED = "excluded by the model"
@@ -59,7 +61,9 @@ def compiled_model(path: Path) -> Any:
         spec.compiler.fusestatic = False  # bodies without joints are links, too
         return spec.compile()
     except Exception as error:  # MuJoCo raises several kinds of errors for a damaged model
-        raise InputError(f"{path} is no valid MuJoCo model: {shortened(str(error))}") from None
+        text = str(error)
+        remedy = "; meshes are STL, OBJ or MSH files in its meshdir" if "file" in text.lower() else ""
+        raise InputError(f"{path} is no valid MuJoCo model: {shortened(text)}{remedy}") from None
 
 
 def robot_bodies(model: Any) -> list[int]:
@@ -126,7 +130,10 @@ class ConvertedModel:
         self.meshes: dict[str, str] = {}
 
         if not self.bodies:
-            raise InputError(f"{self.path} has no robot: no body is moved by a hinge or a slide joint")
+            raise InputError(
+                f"{self.path} has no robot: no body is moved by a hinge or a slide joint; "
+                "rd.Scene.from_mujoco reads obstacles"
+            )
         self._link("world")
         mimics = self._mimics()
         for body in self.bodies:
@@ -191,10 +198,14 @@ class ConvertedModel:
         self._geometry(self._link(name), body)
 
     def _held(self, joint: int) -> bool:
-        """Whether a joint slides without a range and actuators move others, as where a base is placed."""
-        driven = driven_joints(self.model)
-        slides = self.joint_kind(joint) == "slide" and not self.model.jnt_limited[joint]
-        return slides and bool(driven) and joint not in driven
+        """Whether a joint only places the base: a slide without range and actuator, beside other joints."""
+
+        def places(joint: int) -> bool:
+            return self.joint_kind(joint) == "slide" and not self.model.jnt_limited[joint]
+
+        if not places(joint) or joint in driven_joints(self.model):
+            return False
+        return not all(places(other) for other in _joints_of(self.model, self.bodies))
 
     def _moved(self, joint: int, value: float) -> Pose:
         """The motion of a joint by a value."""
@@ -277,6 +288,8 @@ class ConvertedModel:
             xx, yy, zz = map(repr, model.body_inertia[body].tolist())
             ET.SubElement(inertial, "inertia", ixx=xx, iyy=yy, izz=zz, ixy="0", ixz="0", iyz="0")
         for geom in _geoms_of(model, body):
+            if not self.masks[geom] and kind_of("Geom", model.geom_type[geom]) not in DRAWN:
+                continue
             element = ET.SubElement(link, "collision" if self.masks[geom] else "visual")
             T = _pose(model.geom_pos[geom], model.geom_quat[geom])
             _origin(element, T)
@@ -309,8 +322,8 @@ class ConvertedModel:
             name = self.name("geom", geom)
             body = self.name("body", int(self.model.geom_bodyid[geom]))
             raise InputError(
-                f"{self.path}: {name} of body {body} is of type {kind}; a robot may have spheres, capsules, "
-                f"ellipsoids, cylinders, boxes and meshes"
+                f"{self.path}: {name} of body {body} is of type {kind}; use one of {', '.join(DRAWN)}, or "
+                "let it collide with nothing (contype and conaffinity 0)"
             )
 
     def _written(self, mesh: trimesh.Trimesh, name: str) -> str:
