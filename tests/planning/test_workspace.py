@@ -101,6 +101,37 @@ def test_the_nearest_goal_that_a_line_leads_to() -> None:
     assert not result.solved and result.reason.startswith("goal 0: ")
 
 
+def test_lines_through_waypoints_are_one_motion() -> None:
+    space = panda(T_world_base=T_WORLD_BASE)
+    T = space.pose(READY)
+    corners = [T @ rd.pose(xyz) for xyz in ([0.05, 0.0, 0.0], [0.05, 0.05, 0.0], [0.0, 0.05, 0.0])]
+    result = space.plan_line(T, READY, waypoints=corners, time_limit=20.0)
+    assert result.solved and result.fraction == 1.0 and result.stops == 3, result.reason
+    assert rd.verify(result.problem, result.trajectory).valid
+    inside = np.linalg.inv(T) @ np.array([space.pose(q) for q in result.trajectory.positions])
+    x, y, z = inside[:, :3, 3].T
+    off = np.minimum(np.minimum(abs(x), abs(x - 0.05)), np.minimum(abs(y), abs(y - 0.05)))
+    assert off.max() < 0.001 and np.abs(z).max() < 0.001
+    far = space.plan_line(T @ rd.pose([0.0, 0.0, 2.0]), READY, waypoints=corners[:1], time_limit=4.0)
+    assert not far.solved and far.reason.startswith("line 2 of 2: ") and 0.5 < far.fraction < 1.0
+
+
+def test_a_line_to_a_goal_with_tolerances_turns_no_more_than_it_must() -> None:
+    space = panda()
+    T = space.pose(READY)
+    goal = rd.PoseGoal(space.tip, T @ rd.pose([0.0, 0.05, 0.05], rpy=[0, 0, 1.0]), None, [0, 0, np.pi])
+    free = space.plan_line(goal, READY, time_limit=20.0)
+    assert free.solved, free.reason
+    end = np.linalg.inv(T) @ space.pose(free.path.positions[-1])
+    assert np.allclose(end, rd.pose([0.0, 0.05, 0.05]), atol=1e-3)
+    goal = rd.PoseGoal(space.tip, T @ rd.pose([0.0, 0.05, 0.05], rpy=[0, 0, 1.0]), [0, 0.02, 0], [0, 0, 0.2])
+    less = space.plan_line(goal, READY, time_limit=20.0)
+    end = np.linalg.inv(goal.T_base_frame) @ space.pose(less.path.positions[-1])
+    assert np.arctan2(end[1, 0], end[0, 0]) == pytest.approx(-0.2, abs=1e-3)
+    problem = rd.Problem(space.robot, space.scene, READY, goal)
+    assert rd.verify(problem, less.trajectory).valid
+
+
 @pytest.mark.parametrize("angle", [0.05, None])
 @pytest.mark.parametrize(("way", "turn"), [(0.0, 0.0), (0.0, 0.5), (0.0005, 0.0)])
 def test_short_lines_and_turns_about_the_tool_point(way: float, turn: float, angle: float | None) -> None:
@@ -118,7 +149,7 @@ def test_short_lines_and_turns_about_the_tool_point(way: float, turn: float, ang
     [
         (
             lambda space: space.plan_line([np.eye(4), np.eye(4)], "ready"),
-            "pose is 2 poses; a line has one end: plan to each from path.positions.-1. of the line before",
+            "pose is 2 poses; a line has one end: give those before the last as waypoints",
         ),
         (
             lambda space: space.move("bal", np.eye(4)),

@@ -111,7 +111,7 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
         context.improved(float(np.linalg.norm(np.diff(rows, axis=0), axis=1).sum()))
         result = context.finish(rows, STAGE, "solved along the straight line", trajectory=trajectory)
         if result is not None:
-            return replace(result, fraction=1.0)
+            return result
         if context.ended:
             break
         fraction_followed, message = context.refused_at

@@ -11,10 +11,12 @@ from numpy.typing import ArrayLike
 from robotdiffuse.core.bounds import numbers, rigid_transform
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.transforms import inverse
+from robotdiffuse.core.transforms import inverse, rpy_from_rotation
+from robotdiffuse.core.transforms import pose as pose_matrix
 from robotdiffuse.core.types import AnyConfiguration
 from robotdiffuse.planning import plan
 from robotdiffuse.planning.context import clock
+from robotdiffuse.planning.pipeline.waypoints import MIN_TIME_LIMIT, join
 from robotdiffuse.planning.steps import Step, StepsResult, plan_steps
 from robotdiffuse.problems.constraints import CartesianLine, Constraint
 from robotdiffuse.problems.goals import AnyGoal, PoseGoal
@@ -243,7 +245,7 @@ class Workspace:
         Examples:
             >>> space = rd.Workspace(rd.load_robot("panda"))
             >>> space.add(rd.Box([0.5, 0.0, -0.06], [0.8, 1.2, 0.1], name="table"))
-            >>> steps = [rd.MoveTo("extended", name="stretch"), rd.MoveRelative([0, 0, -0.1], "world")]
+            >>> steps = [rd.MoveRelative([0, 0, -0.1], "world"), rd.MoveTo("extended", name="stretch")]
             >>> space.plan_steps(steps, "ready").solved
             True
         """
@@ -257,40 +259,62 @@ class Workspace:
         angle: float | None = 0.05,
         speed: float | None = None,
         time_limit: float = 1.0,
+        waypoints: Sequence[ArrayLike] = (),
         **request: Any,
     ) -> PlanResult:
         """Move the tip along a straight line, turning evenly.
 
         Args:
-            pose: T_world_tip at the end [4, 4]; or a `rd.AnyGoal` in the frame of the base, of which the
-                nearest to the tip that a line leads to is taken.
+            pose: T_world_tip at the end [4, 4]; or in the frame of the base a `rd.PoseGoal`, of which the
+                pose within its tolerances nearest to the present one is taken, or a `rd.AnyGoal`, of which
+                the nearest to the tip that a line leads to is taken.
             start: Start configuration [dof], values by joint, or the name of a pose.
             tolerance: Largest distance of the tip from the line [m].
             angle: Largest deviation of its orientation [rad]; None: any on the way.
             speed: Largest speed of the tip [m/s]; None: what the joints allow.
             time_limit: Wall time of the call [s]; of several goals, each has an equal share of what is left.
+            waypoints: Poses of the tip [4, 4] at which the motion stops on its way: a line leads to each.
             request: Further arguments of `rd.plan`: seed, until, ...
 
         Returns:
-            A result; `fraction` says how much of the line can be followed, and `reason` why no more. Of
+            A result; with waypoints the lines are each verified, and joined as by `rd.join`. `fraction`
+            says how much of the line can be followed, and `reason` why no more. Of
             several goals, `goal_index` is the one that is reached, or the result is that of the goal that a
             line gets nearest to.
         """
         from robotdiffuse.problems.compiled_constraints import line_end  # compiled code
 
         line = CartesianLine(self.tip, tolerance, angle, speed)
+        began = clock()
+        if len(waypoints):
+            lines = list[PlanResult]()
+            q = start
+            ends = [*waypoints, pose]
+            for k, end in enumerate(ends):
+                left = max(time_limit - (clock() - began), MIN_TIME_LIMIT) / (len(ends) - k)
+                result = self.plan_line(end, q, tolerance, angle, speed, left, **request)
+                if not result.solved:
+                    reason = f"line {k + 1} of {len(ends)}: {result.reason}"
+                    return replace(result, reason=reason, fraction=(k + (result.fraction or 0.0)) / len(ends))
+                q = result.path.positions[-1]
+                lines.append(result)
+            whole = join(lines, time_limit=max(time_limit, MIN_TIME_LIMIT))
+            return replace(whole, fraction=1.0, goal_index=lines[-1].goal_index) if whole.solved else whole
         several = isinstance(pose, AnyGoal)
         matrices = numbers(pose)
         if matrices is not None and matrices.ndim == 3:
             raise InputError(
-                f"pose is {len(pose)} poses; a line has one end: plan to each from path.positions[-1] of the "
-                "line before, or give a rd.AnyGoal to reach any of them"
+                f"pose is {len(pose)} poses; a line has one end: give those before the last as waypoints, or "
+                "a rd.AnyGoal to reach any of them"
             )
-        goals = pose.goals if several else [self._goal(rigid_transform("pose", pose))]
+        goals = pose.goals if several else [pose]
+        if not isinstance(pose, AnyGoal | PoseGoal):
+            goals = [self._goal(rigid_transform("pose", pose))]
+        q = self._configuration(start)
+        goals = [self._exact(goal, q) if isinstance(goal, PoseGoal) else goal for goal in goals]
         problems = [Problem(self.robot, self.scene, start, goal, constraints=[line]) for goal in goals]
         T_start = self._T_base_world @ self.pose(start)
         off = [np.linalg.norm((line_end(problem, line) - T_start)[:3, 3]) for problem in problems]
-        began = clock()
         best = None
         for tried, i in enumerate(np.argsort(off, kind="stable")):
             left = time_limit - (clock() - began)
@@ -305,6 +329,18 @@ class Workspace:
                 best = result
         assert best is not None
         return best
+
+    def _exact(self, goal: PoseGoal, q: ndarray) -> PoseGoal:
+        """A pose within the tolerances of a goal, near to that of its link at a configuration."""
+        T = inverse(goal.T_base_frame) @ self.robot.fk(q, goal.frame)
+        xyz, rpy = (
+            np.clip(value, -tolerance, tolerance) if tolerance is not None else np.zeros(3)
+            for value, tolerance in (
+                (T[:3, 3], goal.xyz_tolerance),
+                (rpy_from_rotation(T[:3, :3]), goal.rpy_tolerance),
+            )
+        )
+        return PoseGoal(goal.frame, goal.T_base_frame @ pose_matrix(xyz, rpy=rpy))
 
     def _goal(self, goal: Any) -> Any:
         matrices = numbers(goal)

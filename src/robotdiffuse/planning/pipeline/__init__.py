@@ -38,9 +38,7 @@ def attempt(solver: Solver, problem: Problem, request: PlanRequest) -> PlanResul
                     from robotdiffuse.planning.line_following import follow_line  # compiled code
 
                 followed = follow_line(context)
-                if followed is not None and followed.solved:
-                    return followed
-            result = _searched(solver, context)
+            result = followed if followed is not None and followed.solved else _searched(solver, context)
         except OutOfTimeError as error:
             result = context.out_of_time(error)
     if lines and result.solved:
