@@ -19,7 +19,7 @@ def public_functions(name: str) -> Iterator[Callable[..., object]]:
     if inspect.isfunction(value):
         yield value
     if inspect.isclass(value):
-        for own, member in vars(value).items():
+        for own, member in list(vars(value).items()):  # copying adds to it
             function = getattr(member, "__func__", member)
             if inspect.isfunction(function) and not own.startswith("_"):
                 yield inspect.unwrap(function)
