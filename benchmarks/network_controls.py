@@ -33,7 +33,7 @@ from common import (
 )
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.tables import Figure
-from robotdiffuse.evaluation.methods import fields_of, from_network, measure_of, validated
+from robotdiffuse.evaluation.methods import fields_of, from_network, validated
 from robotdiffuse.evaluation.runs import Fields, Method, Record, Run, run_all
 from robotdiffuse.planning.diffusion import Diffusion, DiffusionSettings
 from robotdiffuse.planning.search.rrt import AORRTC
@@ -98,7 +98,7 @@ def of_network(planner: Diffusion) -> Method:
         q = draw(run, CollisionChecker(PANDA, run.problem.scene))
         free = list(q[validated(run.problem, q).passed])
         result = planner.plan(run.problem, run.limit, seed=run.index)
-        yield fields_of(result, measure_of(PANDA)) | spread(run.problem, free)
+        yield fields_of(result, PANDA) | spread(run.problem, free)
 
     return call
 
@@ -113,7 +113,7 @@ def of_search(planner: AORRTC) -> Method:
         ]
         result = planner.plan(run.problem, run.limit, seed=run.index)
         paths = [r.path.positions for r in results if r.path is not None]
-        yield fields_of(result, measure_of(PANDA)) | spread(run.problem, paths)
+        yield fields_of(result, PANDA) | spread(run.problem, paths)
 
     return call
 

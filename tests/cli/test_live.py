@@ -44,7 +44,7 @@ def test_bad_input_is_one_line(wrong, monkeypatch: pytest.MonkeyPatch) -> None:
     ]:
         monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, "viser", None)
-    assert "live needs viser: pip install 'robotdiffuse[live]'" in wrong()
+    assert 'this needs viser, not installed: pip install "robotdiffuse[live]"' in wrong()
 
 
 def hears(url: str, token: str = "", **fields: str) -> bool:

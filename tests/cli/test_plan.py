@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from helpers.commands import GOAL, PROBLEM, START, run, write_problem
-from robotdiffuse.cli.plan import shelf_problem
+from robotdiffuse.cli.demo import shelf_problem
 from robotdiffuse.core.results import PlanResult, load_result
 from robotdiffuse.core.types import Path as Path_
 from robotdiffuse.core.types import Status

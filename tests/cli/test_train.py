@@ -26,7 +26,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[PlannerTraining]:
         trained.append(settings)
         return {}
 
-    monkeypatch.setattr("robotdiffuse.learning.training.tasks.train_planner", train_planner)
+    monkeypatch.setattr("robotdiffuse.cli.train.train_planner", train_planner)
     return trained
 
 
@@ -80,7 +80,7 @@ def test_cross_attention_without_points_is_refused_before_anything_is_made(
 def test_the_encoder_of_the_config_is_that_of_an_arm_too(
     config: str, encoder: str | None, trained: list[PlannerTraining], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("robotdiffuse.generation.generate", lambda *_, **__: None)
+    monkeypatch.setattr("robotdiffuse.cli.train.generate", lambda *_, **__: None)
     assert run("train", "planner", "--robot", "panda", "--out", "o", "--config", config) == 0
     assert trained[0].encoder == encoder and not Path("o", "encoder").exists()
 

@@ -62,10 +62,9 @@ def test_every_row_of_a_split_once(store):
             torch.testing.assert_close(a, b, atol=0, rtol=0)
 
 
-@pytest.mark.parametrize("view", ["full", "partial"])
 @pytest.mark.parametrize("sort_points", [False, True])
-def test_clouds_lie_on_the_obstacles(store, view, sort_points):
-    batch = joined(RopDataset(store, points=50, view=view, sort_points=sort_points).batches(64))
+def test_clouds_lie_on_the_obstacles(store, sort_points):
+    batch = joined(RopDataset(store, points=50, sort_points=sort_points).batches(64))
     assert batch.points.shape == (len(batch), 50, 3)
     local = batch.points[:, :, None] - batch.obstacle_params[:, None, :, :3]  # boxes in stores are not turned
     sphere = (local.norm(dim=-1) - batch.obstacle_params[:, None, :, 3]).abs()
@@ -75,8 +74,6 @@ def test_clouds_lie_on_the_obstacles(store, view, sort_points):
     drawn = batch.points.any(-1)
     assert far[drawn].max() < 1e-5
     assert drawn.float().mean() > 0.95
-    if view == "partial":
-        assert batch.points[..., 2].min() >= 0
     if sort_points:
         assert (batch.points[:, 1:, 0] >= batch.points[:, :-1, 0]).all()
 
@@ -148,7 +145,6 @@ def test_pickled_without_the_trajectories(store):
 def test_bad_input(store, tmp_path):
     for arguments, message in [
         ({"split": "tests"}, "unknown split 'tests'; known: test, train, validation"),
-        ({"view": "half"}, "unknown view 'half'; known: full, partial"),
         ({"points": 0}, "points is 0; it must be at least 1"),
         ({"robot": replace(ARM, spheres={})}, "use the robot of the data"),
     ]:

@@ -1,4 +1,4 @@
-"""Clouds made in batches: on the surfaces, uniform by area, and only what a camera sees if there is one."""
+"""Clouds made in batches: on the surfaces, uniform by area."""
 
 import numpy as np
 import pytest
@@ -19,15 +19,10 @@ def seeded(seed: int = 0) -> torch.Generator:
 
 
 def some_scenes(n: int, k: int, seed: int = 0):
-    """Scenes of up to k shapes in varied places of k + 2 slots, and cameras around them."""
+    """Scenes of up to k shapes in varied places of k + 2 slots."""
     rng = np.random.default_rng(seed)
     drawn = random_scenes(n, k, rng)
-    scenes = PackedScenes(
-        np.pad(drawn.kinds, [(0, 0), (1, 1)]), np.pad(drawn.params, [(0, 0), (1, 1), (0, 0)])
-    )
-    camera = rng.standard_normal((n, 3))
-    camera *= 2.5 / np.linalg.norm(camera, axis=1, keepdims=True)
-    return scenes, torch.from_numpy(camera.astype(np.float32))
+    return PackedScenes(np.pad(drawn.kinds, [(0, 0), (1, 1)]), np.pad(drawn.params, [(0, 0), (1, 1), (0, 0)]))
 
 
 def depths(kinds: ndarray, params: ndarray, points: ndarray) -> ndarray:
@@ -43,18 +38,9 @@ def depths(kinds: ndarray, params: ndarray, points: ndarray) -> ndarray:
     return out
 
 
-def is_seen(kinds: ndarray, params: ndarray, points: ndarray, eye: ndarray, margin: float) -> ndarray:
-    """Whether nothing on the way to the eye is deeper than the margin inside a shape: by walking along it."""
-    steps = np.linspace(0, 1, 400)[1:, None, None]
-    way = (points + steps * (eye - points)).reshape(-1, 3)
-    deepest = depths(kinds, params, way).max(0).reshape(len(steps), -1)
-    return deepest.max(0) < margin
-
-
-@pytest.mark.parametrize("seen", [False, True])
-def test_points_lie_on_surfaces(seen):
-    scenes, camera = some_scenes(60, 6)
-    clouds = surface_clouds(scenes, 200, seeded(), camera=camera if seen else None)
+def test_points_lie_on_surfaces():
+    scenes = some_scenes(60, 6)
+    clouds = surface_clouds(scenes, 200, seeded())
     assert clouds.shape == (60, 200, 3)
     for scene in zip(scenes.kinds, scenes.params, clouds.double().numpy(), strict=True):
         if not scene[0].any():
@@ -89,7 +75,7 @@ def test_uniform_by_area():
 
 
 def test_agrees_with_the_clouds_of_single_scenes():
-    scenes, _ = some_scenes(20, 5, 3)
+    scenes = some_scenes(20, 5, 3)
     n = 4000
     rng = np.random.default_rng(0)
     ours = surface_clouds(scenes, n, seeded(), region=PANDA_REGION).numpy()
@@ -103,47 +89,8 @@ def test_agrees_with_the_clouds_of_single_scenes():
         assert np.abs(difference).max() < 5 * 0.7 * np.sqrt(2 / (0.3 * n))
 
 
-def test_what_a_camera_sees():
-    """Every point is seen, by walking to the camera; and what is seen of each shape has the share of points
-    that it has among points drawn everywhere and filtered."""
-    scenes, camera = some_scenes(12, 5, 5)
-    seen = surface_clouds(scenes, 400, seeded(), camera=camera).double().numpy()
-    every = surface_clouds(scenes, 4000, seeded(1)).double().numpy()
-    compared = 0
-    for i in range(len(scenes)):
-        scene = scenes.kinds[i], scenes.params[i]
-        eye = camera[i].double().numpy()
-        if not seen[i].any():
-            continue
-        assert is_seen(*scene, seen[i], eye, 2e-3).mean() > 0.995  # a thousandth of grazing rays
-        filtered = every[i][is_seen(*scene, every[i], eye, 1e-4)]
-        if len(filtered) < 300 or len(np.unique(seen[i], axis=0)) < 400:
-            continue
-        compared += 1
-        shares = [
-            np.bincount(np.abs(depths(*scene, points)).argmin(0), minlength=len(scene[0])) / len(points)
-            for points in (seen[i], filtered)
-        ]
-        np.testing.assert_allclose(shares[0], shares[1], atol=4 * np.sqrt(0.25 / 400))
-    assert compared >= 6
-
-
-def test_a_camera_sees_a_cap_and_the_front():
-    behind = Sphere([-0.8, 0, 0], 0.1)
-    two = [Scene([Sphere([0, 0, 0], 0.5)]), Scene([Box([0, 0, 0], [0.4, 0.4, 0.4]), behind])]
-    scenes = PackedScenes.pack(two, 2)
-    camera = torch.tensor([[0.0, 0.0, 1.0], [2.0, 0.0, 0.0]])
-    cap, front = surface_clouds(scenes, 4000, seeded(), camera=camera)
-    height = cap[:, 2] / 0.5  # even between the horizon, at r / distance, and the top
-    assert height.min() >= 0.5 - 1e-5
-    assert height.mean() == pytest.approx(0.75, abs=4 * 0.25 / np.sqrt(3 * 4000))
-    assert (front[:, 0] == 0.2).all()
-    inside = torch.tensor([[0.0, 0.1, 0.0], [0.0, 0.1, 0.0]])
-    assert not surface_clouds(scenes, 50, seeded(), camera=inside).any()
-
-
 def test_ordered_clouds_are_the_same_points():
-    scenes, _ = some_scenes(30, 4, 2)
+    scenes = some_scenes(30, 4, 2)
     loose = surface_clouds(scenes, 300, seeded()).numpy()
     tidy = surface_clouds(scenes, 300, seeded(), ordered=True).numpy()
     for a, b in zip(loose, tidy, strict=True):
@@ -153,10 +100,10 @@ def test_ordered_clouds_are_the_same_points():
             np.testing.assert_allclose(np.sort(b[:, axis]), np.sort(a[:, axis]), atol=2 * steps)
 
 
-@pytest.mark.parametrize("how", ["full", "region", "camera"])
+@pytest.mark.parametrize("how", ["full", "region"])
 def test_same_seed_same_cloud(how):
-    scenes, camera = some_scenes(9, 3)
-    extra = {"full": {}, "region": {"region": PANDA_REGION}, "camera": {"camera": camera}}[how]
+    scenes = some_scenes(9, 3)
+    extra = {"full": {}, "region": {"region": PANDA_REGION}}[how]
     a, b, c = (surface_clouds(scenes, 64, seeded(seed), **extra) for seed in (0, 0, 1))
     torch.testing.assert_close(a, b, atol=0, rtol=0)
     assert (a != c).any()

@@ -12,7 +12,7 @@ from robotdiffuse.cli import main
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.tables import Table
 from robotdiffuse.core.types import Path as Motion
-from robotdiffuse.evaluation import bench_report, plots
+from robotdiffuse.evaluation import bench_report
 from robotdiffuse.evaluation.bench_report import (
     GAVE_UP,
     LATER,
@@ -22,8 +22,9 @@ from robotdiffuse.evaluation.bench_report import (
     outcome,
     read_bench,
 )
-from robotdiffuse.evaluation.metrics import METRICS, Measure, Metric
+from robotdiffuse.evaluation.metrics import METRICS, Metric, measured
 from robotdiffuse.evaluation.problem_sets import case_file
+from robotdiffuse.evaluation.report import draw_plot
 from robotdiffuse.evaluation.runs import RESTARTED, Record, record_of_row, record_path
 from robotdiffuse.problems.held_out import Case, held_out_problem
 
@@ -167,21 +168,21 @@ def test_figures_of_a_small_run(small: Path) -> None:
     assert [c.problems for c in whole.comparisons] == [4, 4, 4]
     assert [c.problems for c in apart.comparisons] == [3, 3, 3]
     star = [rows(whole, t)["ompl_rrt_star"] for t in (0.1, 1.0, 10.0)]
-    assert [row.success for row in star] == [0.25, 0.5, 0.75]
-    assert star[0].link_length == 9.0  # improved by 0.075 s
-    assert star[1].first == pytest.approx((0.05 + 0.5) / 2)
-    assert star[1].returned == 1.0
+    assert [row.figures.success for row in star] == [25, 50, 75]
+    assert star[0].figures.length == 9.0  # improved by 0.075 s
+    assert [o.found for o in star[1].solved] == [0.05, 0.5]
+    assert star[1].figures.time == 1.0
     assert star[2].failures == {RAN_OUT: 1}
     net = rows(whole, 1.0)["mpnet"]
-    assert (net.success, net.collision) == (0.5, 0.25)
-    assert net.success_interval == pytest.approx((0.150, 0.850), abs=1e-3)
+    assert (net.figures.success, net.figures.collision) == (50, 25)
+    assert net.interval == pytest.approx((0.150, 0.850), abs=1e-3)
     assert net.failures == {"scene collision": 1, GAVE_UP: 1}
-    assert net.returned == pytest.approx((0.02 + 1 + 1 + 0.02) / 4)
+    assert net.figures.time == pytest.approx((0.02 + 1 + 1 + 0.02) / 4)
     assert net.paired is not None
     assert (net.paired.a_only, net.paired.b_only, net.paired.both) == (0, 2, 2)
     assert net.paired.ratio == pytest.approx(1.1)  # of 1.2 and 1
-    assert net.link_length == pytest.approx(3 * 2.2)
-    assert rows(whole, 10.0)["mpnet"].success == 0.5  # it ended by itself
+    assert net.figures.length == pytest.approx(3 * 2.2)
+    assert rows(whole, 10.0)["mpnet"].figures.success == 50  # it ended by itself
 
 
 def test_comscore_of_a_small_run(small: Path) -> None:
@@ -211,7 +212,7 @@ def test_compared_are_problems_that_all_planners_were_given_this_time_for(tmp_pa
     assert whole[1.0].missing == ()
     assert (whole[10.0].problems, whole[10.0].of) == (2, 6)
     assert whole[10.0].missing == ("edmp",)
-    assert rows(section, 10.0)["mpd"].success == 0.0
+    assert rows(section, 10.0)["mpd"].figures.success == 0
     assert section.main.limit == 1.0
 
 
@@ -226,7 +227,7 @@ def test_seeds_of_a_problem_are_one_row_of_the_comparison(tmp_path: Path) -> Non
     (section,) = bench_report.sections(read_bench(write(tmp_path / "run", records)), [1.0])
     row = rows(section, 1.0)["mpd"]
     assert section.main.seeds == 3
-    assert row.success == pytest.approx(4 / 6)
+    assert row.figures.success == pytest.approx(400 / 6)
     assert row.paired is not None
     assert (row.paired.both, row.paired.b_only) == (1, 1)
     assert row.paired.ratio == pytest.approx(1.5)
@@ -339,8 +340,8 @@ def test_a_metric_is_declared_in_one_place(
     monkeypatch.setitem(METRICS, waypoints.name, waypoints)
     problem = held_out_problem("rop", 0)
     line = np.stack([problem.start, problem.start + 0.1, problem.start])
-    measured = Measure(problem.robot)(Motion(problem.robot.joint_names, line))
-    record = solved("robotdiffuse", "rop/9", 1.0, [(0.1, 0.5)], measures=measured)
+    figures = measured(problem.robot, Motion(problem.robot.joint_names, line))
+    record = solved("robotdiffuse", "rop/9", 1.0, [(0.1, 0.5)], measures=figures)
     assert record.row()["waypoint_count"] == 3
     assert record_of_row(json.loads(json.dumps(record.row()))) == record
     bench = read_bench(write(tmp_path / "run", [record]))
@@ -381,7 +382,7 @@ def test_no_legend_or_name_is_clipped() -> None:
     pytest.importorskip("matplotlib")
     sizes = []
     for name in ("a", "robotdiffuse:iterations=5000+restarts"):
-        svg = plots.draw(lambda figure, name=name: figure.text(0.9, 0.5, name))
+        svg = draw_plot(lambda figure, name=name: figure.text(0.9, 0.5, name))
         sizes.append(float(ElementTree.fromstring(svg).attrib["viewBox"].split()[2]))
     assert sizes[1] > sizes[0] + 50
 
@@ -410,8 +411,9 @@ def test_bad_input_is_one_clear_line(small: Path, capsys: pytest.CaptureFixture[
         read_bench(small, ["foo"])
     with pytest.raises(InputError, match="no planner was run that long"):
         bench_report.sections(read_bench(small, ["ompl_rrt_star"]), [60.0])
-    assert main(["bench", "report", str(small), "--limits", "1,x"]) == 2
-    assert "limits are '1,x'" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["bench", "report", str(small), "--limits", "1,x"])
+    assert "--limits: 'x' is not a positive number" in capsys.readouterr().err
     (small / "runs.jsonl").write_text('{"date": 1}\n')
     with pytest.raises(InputError, match=r"runs\.jsonl is damaged"):
         read_bench(small)

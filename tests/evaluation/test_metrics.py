@@ -14,9 +14,9 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.evaluation.metrics import (
-    Measure,
     bending,
     log_dimensionless_jerk,
+    measured,
     spectral_arc_length,
     turning,
 )
@@ -62,7 +62,7 @@ def test_lengths_of_an_arm_that_turns_about_its_base() -> None:
     """Two waypoints: the arcs between them count, not the chord. The origin of l2 moves; the tip is
     fixed to l2 and does not count as a link."""
     motion = minimum_jerk(2.0, np.zeros(2), np.array([1.5, 0.0]))
-    found = Measure(ARM)(path_of(motion), motion)
+    found = measured(ARM, path_of(motion), motion)
     assert found["joint_length"] == pytest.approx(1.5)
     assert found["link_length"] == pytest.approx(1.5 * 0.5, rel=3e-5)
     assert found["tip_length"] == pytest.approx(1.5 * 0.9, rel=3e-5)
@@ -75,7 +75,7 @@ def test_lengths_of_an_arm_that_turns_about_its_base() -> None:
 def test_lengths_of_an_arm_that_turns_at_its_elbow_and_back() -> None:
     motion = minimum_jerk(2.0, np.zeros(2), np.array([0.0, 0.7]))
     there_and_back = Path(motion.joint_names, np.array([[0, 0], [0, 0.7], [0, 0]]))
-    found = Measure(ARM)(there_and_back, motion)
+    found = measured(ARM, there_and_back, motion)
     assert found["joint_length"] == pytest.approx(1.4)
     assert found["link_length"] == pytest.approx(0, abs=1e-12)  # l2 turns about its own origin
     assert found["tip_length"] == pytest.approx(1.4 * 0.4, rel=3e-5)
@@ -148,7 +148,7 @@ def test_spectral_arc_length_of_minimum_jerk_by_quadrature() -> None:
     assert expected == pytest.approx(-1.41, abs=0.01)
     for duration in (0.8, 1.0, 3.0, 7.3):
         motion = minimum_jerk(duration, np.zeros(2), np.array([0.6, 0.3]))
-        found = Measure(ARM)(path_of(motion), motion)
+        found = measured(ARM, path_of(motion), motion)
         # The last frequency is a multiple of 1 / (16 to 32 durations).
         assert found["sparc_joint"] == pytest.approx(expected, abs=0.01)
 
@@ -172,7 +172,7 @@ def test_interrupted_and_shaking_motions_are_less_smooth() -> None:
         np.concatenate([half.velocities, half.velocities[1:]]),
         np.concatenate([half.accelerations, half.accelerations[1:]]),
     )
-    smooth, stops = (Measure(ARM)(path_of(m), m) for m in (straight, stopping))
+    smooth, stops = (measured(ARM, path_of(m), m) for m in (straight, stopping))
     assert stops["sparc_joint"] < smooth["sparc_joint"] - 0.1
     assert stops["sparc_tip"] < smooth["sparc_tip"] - 0.1
     # Two motions of half the length in half the time: 2 * (1/2)^2 * 2^5.
@@ -183,7 +183,7 @@ def test_interrupted_and_shaking_motions_are_less_smooth() -> None:
 def test_a_motion_that_stands_still_has_figures(rows: np.ndarray) -> None:
     times = np.linspace(0, 0.01 * (len(rows) - 1), len(rows))
     motion = Trajectory(("j0", "j1"), times, rows, 0 * rows, 0 * rows)
-    found = Measure(ARM)(Path(motion.joint_names, rows), motion)
+    found = measured(ARM, Path(motion.joint_names, rows), motion)
     assert found.pop("duration") == motion.duration
     assert set(found) >= {"joint_length", "link_length", "turning", "bending", "jerk", "sparc_tip"}
     assert set(found.values()) == {0.0}
@@ -192,7 +192,7 @@ def test_a_motion_that_stands_still_has_figures(rows: np.ndarray) -> None:
 def test_a_joint_that_does_not_move_the_tip() -> None:
     """The tip of the Panda's hand lies on the axis of its last joint."""
     motion = minimum_jerk(1.0, START, START + np.array([0, 0, 0, 0, 0, 0, 0.5]))
-    found = Measure(PANDA)(path_of(motion), motion)
+    found = measured(PANDA, path_of(motion), motion)
     assert found["tip_length"] == pytest.approx(0, abs=1e-9)
     assert found["sparc_tip"] == 0
     assert found["sparc_joint"] < -1.3
@@ -206,20 +206,20 @@ def test_clearance_to_the_scene_and_to_itself_apart() -> None:
     problem = Problem(PANDA, Scene([Sphere(top + np.array([0, 0, 0.4]), 0.1)]), START, JointGoal(rows[1:]))
     path = Path(PANDA.joint_names, rows)
     verdict = verify(problem, path)
-    found = Measure(PANDA)(path, None, verdict)
+    found = measured(PANDA, path, None, verdict)
     apart = found["scene_clearance"], found["self_clearance"]
     assert apart == pytest.approx((verdict.scene_clearance, verdict.self_clearance), rel=1e-6)
     assert found["min_clearance"] == min(apart) and 0.05 < apart[0] < 0.3
-    assert "scene_clearance" not in Measure(PANDA)(path)
+    assert "scene_clearance" not in measured(PANDA, path)
 
 
 def test_figures_do_not_depend_on_the_rows_of_a_trajectory() -> None:
     coarse, fine = (minimum_jerk(1.234, START, END, rows) for rows in (200, 2000))
-    a, b = (Measure(PANDA)(path_of(m), m) for m in (coarse, fine))
+    a, b = (measured(PANDA, path_of(m), m) for m in (coarse, fine))
     assert a["jerk"] == pytest.approx(b["jerk"], abs=0.002)
     assert (a["sparc_joint"], a["sparc_tip"]) == pytest.approx((b["sparc_joint"], b["sparc_tip"]), abs=1e-3)
     fine_path = Path(fine.joint_names, fine.positions)
-    along = Measure(PANDA)(fine_path, fine)
+    along = measured(PANDA, fine_path, fine)
     assert (a["link_length"], a["tip_length"]) == pytest.approx(
         (along["link_length"], along["tip_length"]), rel=1e-4
     )

@@ -135,7 +135,7 @@ def test_a_node_killed_during_a_bench_loses_no_call_and_doubles_none(
     cluster.wait_for_nodes()
     killed: list[int] = []
 
-    def done(_: str, calls: int, __: int) -> None:
+    def done(calls: int, _: int) -> None:
         if calls and not killed:
             killed.append(calls)
             cluster.remove_node(node, allow_graceful=False)

@@ -17,7 +17,7 @@ from robotdiffuse.interop.depth_recording import (
     read_depth_views,
     write_depth_views,
 )
-from robotdiffuse.interop.mcap_file import McapWriter
+from robotdiffuse.interop.ros2 import McapWriter
 from robotdiffuse.perception.occupancy_map import OccupancyMap
 from robotdiffuse.planning.exploration.simulated import RecordedExplorer, camera_beside, explore, wrist_camera
 from robotdiffuse.planning.exploration.steps import ExplorerSettings

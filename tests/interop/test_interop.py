@@ -19,7 +19,7 @@ from helpers.full_disk import full_disk
 from robotdiffuse.core.errors import InputError, OutputError
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.core.types import Trajectory
-from robotdiffuse.interop import READERS, TRAJECTORY_ENDINGS, WRITERS, read_motion, rosbag, write_motion
+from robotdiffuse.interop import READERS, TRAJECTORY_ENDINGS, WRITERS, read_motion, ros2, write_motion
 from robotdiffuse.interop.recorded_motion import (
     checked_motion,
     joint_trajectory,
@@ -105,7 +105,7 @@ def test_mcap_knows_where_the_base_stands(planned: tuple[Problem, Trajectory], t
     from mcap.reader import make_reader
     from mcap_protobuf.decoder import DecoderFactory
 
-    from robotdiffuse.interop.mcap_file import problem_in
+    from robotdiffuse.interop.ros2 import problem_in
 
     problem, trajectory = planned
     T = np.eye(4)
@@ -178,9 +178,9 @@ def test_a_recording_that_unpacks_to_gigabytes_is_refused(
     """A file of 105 kB took 6 GB."""
     from mcap.writer import CompressionType, Writer
 
-    from robotdiffuse.interop import mcap_file
+    from robotdiffuse.interop import ros2
 
-    monkeypatch.setattr(mcap_file, "MAX_UNPACKED", 100_000)
+    monkeypatch.setattr(ros2, "MAX_UNPACKED", 100_000)
     folder = tmp_path / "bag"
     folder.mkdir()
     (folder / "metadata.yaml").write_text("rosbag2_bagfile_information: {version: 9}")
@@ -200,13 +200,12 @@ def test_a_recording_that_unpacks_to_gigabytes_is_refused(
 def test_a_motion_of_too_many_messages_is_refused(
     planned: tuple[Problem, Trajectory], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from robotdiffuse.interop import mcap_file, rosbag
+    from robotdiffuse.interop import ros2
 
     write_motion(*planned, tmp_path / "m.mcap")
     write_motion(*planned, tmp_path / "bag.rosbag2")
-    monkeypatch.setattr(mcap_file, "check_chunks", lambda *given: None)
-    monkeypatch.setattr(mcap_file, "MAX_UNPACKED", 100)
-    monkeypatch.setattr(rosbag, "MAX_UNPACKED", 100)
+    monkeypatch.setattr(ros2, "check_chunks", lambda *given: None)
+    monkeypatch.setattr(ros2, "MAX_UNPACKED", 100)
     for name in ("m.mcap", "bag.rosbag2"):
         with pytest.raises(InputError, match="the messages of /joint_trajectory take more than 100 bytes"):
             read_motion(tmp_path / name, "/joint_trajectory")
@@ -493,8 +492,8 @@ def test_a_missing_extra_says_what_to_install(module: str, package: str, extra: 
     import sys
 
     uses = {
-        "rosbags": "import robotdiffuse.interop.rosbag",
-        "mcap": "import robotdiffuse.interop.mcap_file",
+        "rosbags": "import robotdiffuse.interop.ros2",
+        "mcap": "import robotdiffuse.interop.ros2",
         "rerun": "import robotdiffuse.interop.rerun_file",
         "roslibpy": "from robotdiffuse.interop.recorded_motion import publish; publish(None, '')",
     }
@@ -600,14 +599,14 @@ def test_two_exports_to_one_bag_do_not_share_a_folder(
 ) -> None:
     """Each deleted the half-written bag of the other."""
     bag = tmp_path / "m.rosbag2"
-    to_message = rosbag.to_message
+    to_message = ros2.to_message
 
     def interrupted(kind: str, content: dict) -> object:
-        monkeypatch.setattr(rosbag, "to_message", to_message)
+        monkeypatch.setattr(ros2, "to_message", to_message)
         write_motion(PROBLEM, MOTION, bag)
         return to_message(kind, content)
 
-    monkeypatch.setattr(rosbag, "to_message", interrupted)
+    monkeypatch.setattr(ros2, "to_message", interrupted)
     write_motion(PROBLEM, MOTION, bag)
     assert read_motion(bag).joint_names == ARM.joint_names and [*tmp_path.iterdir()] == [bag]
 

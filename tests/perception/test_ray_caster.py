@@ -1,7 +1,10 @@
 """Depth images by rays: they lie on the surfaces, nothing nearer is missed, and another renderer agrees."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -90,27 +93,46 @@ def test_cameras_look_where_they_are_told_and_stand_upright() -> None:
     np.testing.assert_allclose(down[:3, :3], [[0, -1, 0], [-1, 0, 0], [0, 0, -1]], atol=1e-12)
 
 
-def test_pybullets_camera_sees_the_same() -> None:
-    pytest.importorskip("pybullet")
-    from robotdiffuse.simulation.world import DepthCamera, World, render
-
-    q = np.array([0.3, -0.5, 0.0, -2.0, 0.0, 1.5, 0.8])
-    scene = Scene(
-        [Box((0.5, 0.1, 0.2), (0.2, 0.3, 0.4), (0.9, 0.1, 0.2, 0.3)), Sphere((0.2, 0.5, 0.5), 0.15)]
+def test_pybullets_camera_sees_the_same(tmp_path: Path) -> None:
+    pybullet = pytest.importorskip("pybullet")
+    box = Box((0.5, 0.1, 0.2), (0.2, 0.3, 0.4), (0.9, 0.1, 0.2, 0.3))
+    ball = Sphere((0.2, 0.5, 0.5), 0.15)
+    (width, height), field, near, far = (160, 120), 0.96, 0.1, 4.0
+    eye, target = (1.4, 0.6, 0.9), (0.3, 0.1, 0.3)
+    client = pybullet.connect(pybullet.DIRECT)
+    try:
+        half = (box.size / 2).tolist()
+        file = str(tmp_path / "ball.obj")  # finer than Bullet's own
+        trimesh.creation.icosphere(4, ball.radius).export(file)
+        seen = (
+            (box, pybullet.createVisualShape(pybullet.GEOM_BOX, halfExtents=half)),
+            (ball, pybullet.createVisualShape(pybullet.GEOM_MESH, fileName=file)),
+        )
+        for shape, visual in seen:
+            w, *xyz = shape.wxyz.tolist() if isinstance(shape, Box) else (1.0, 0.0, 0.0, 0.0)
+            pybullet.createMultiBody(0.0, -1, visual, shape.center.tolist(), [*xyz, w])
+        *_, depth, bodies = pybullet.getCameraImage(
+            width,
+            height,
+            pybullet.computeViewMatrix(eye, target, (0, 0, 1)),
+            pybullet.computeProjectionMatrixFOV(np.degrees(field), width / height, near, far),
+            shadow=0,
+            renderer=pybullet.ER_TINY_RENDERER,
+        )
+    finally:
+        pybullet.disconnect(client)
+    found = np.reshape(bodies, (height, width)) >= 0
+    image = far * near / (far - (far - near) * np.reshape(np.float64(depth), (height, width)))
+    focal = height / 2 / np.tan(field / 2)
+    # PyBullet samples at the lower left corner of its pixels
+    intrinsics = (focal, focal, width / 2, height / 2 - 1)
+    view = ray_cast(
+        Scene([box, ball]), looking_at(np.array(eye), np.array(target)), intrinsics, (width, height)
     )
-    camera = DepthCamera((1.4, 0.6, 0.9), (0.3, 0.1, 0.3), width=160, height=120)
-    with World(PANDA, scene, visuals=True) as world:
-        world.place(q)
-        image = render(world, camera)
-    focal = camera.height / 2 / np.tan(camera.field_of_view / 2)
-    T = looking_at(np.array(camera.position), np.array(camera.target))
-    # PyBullet samples at the lower left corner of its pixels: see simulation.camera.SAMPLE_OFFSET
-    view = ray_cast(scene, T, (focal, focal, 80.0, 59.0), (160, 120))
-    both = (image.labels > 0) & np.isfinite(view.depth)
-    off = np.abs(image.depth[both] - view.depth[both])
+    both = found & np.isfinite(view.depth)
+    off = np.abs(image[both] - view.depth[both])
     assert both.sum() > 1500 and np.median(off) < 1e-3 and np.mean(off > 0.01) < 0.02, "but at edges"
-    alone = (image.labels < 0) & np.isfinite(view.depth)
-    assert alone.mean() < 0.01
+    assert (found != np.isfinite(view.depth)).mean() < 0.01
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -194,12 +194,8 @@ def test_lists_health_metrics_and_a_page_without_scripts(server: httpx.Client) -
 
 
 def test_the_interactive_page_has_an_answer_for_each_of_its_examples(server: httpx.Client) -> None:
-    """It fills requests with these; without its scripts it is the plain list."""
-    page = server.get("/docs").text
-    assert "SwaggerUIBundle(" in page and "pip install fastapi-offline" in page
-    assert "/requests/{name}" in page
-    for script in re.findall(r'"(/docs/scripts/[^"]+)"', page):
-        assert server.get(script).status_code == 200
+    """It fills requests with these."""
+    assert "SwaggerUIBundle(" in server.get("/docs").text
     schemas = server.get("/openapi.json").json()["components"]["schemas"]
     fields = schemas["PlanRequest"]["properties"]
     example = {name: field["default"] for name, field in fields.items() if name != "problem"}

@@ -191,7 +191,7 @@ def test_command_without_pybullet(
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "pybullet", None)
     assert main(["simulate", file]) == 2
-    assert "pip install 'robotdiffuse[sim]'" in capsys.readouterr().err
+    assert 'pip install "robotdiffuse[sim]"' in capsys.readouterr().err
 
 
 def test_moving_obstacles_are_contacts_where_the_validator_refuses_the_motion() -> None:

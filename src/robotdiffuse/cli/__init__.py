@@ -9,29 +9,14 @@ import re
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from importlib import import_module
 from typing import NoReturn
 
 from robotdiffuse import __version__
-from robotdiffuse.cli import bench, completion, data, explore, export, plan, robot, serve, train, verify, view
 from robotdiffuse.cli.arguments import BAD_INPUT, STOPPED, WRITE_FAILED
+from robotdiffuse.cli.commands import COMMANDS
 from robotdiffuse.core.errors import InputError, OutputError, suggestion
 from robotdiffuse.core.registry import import_modules
-
-COMMANDS = {
-    "plan": (plan.add_plan, plan.add_demo, explore.add_explore, explore.add_live, serve.add),
-    "check and show": (
-        verify.add_verify,
-        verify.add_certificate,
-        view.add_view,
-        view.add_simulate,
-        export.add_export,
-        export.add_publish,
-    ),
-    "robots and planners": (robot.add, completion.add_planner),
-    "data, training, comparisons": (data.add, train.add, bench.add_bench, bench.add_reproduce),
-    "editor and shell": (completion.add_schema, completion.add_completion),
-}
-"""Commands by topic. Each function adds one command to the parser and sets its `run` function."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -65,17 +50,13 @@ def build_parser() -> Parser:
     )
     topics = list[str]()
     for topic, group in COMMANDS.items():
-        for add in group:
-            add(commands)
-        topics.append("\n".join([f"{topic}:", *map(_summary, commands._choices_actions)]))
+        for command in group:
+            command.add(commands)
+        lines = [f"  {added.dest:<12} {added.help}" for added in commands._choices_actions]
+        topics.append("\n".join([f"{topic}:", *lines]))
         commands._choices_actions.clear()  # or argparse lists all of them without topics
     parser.epilog = "\n\n".join(topics)
     return parser
-
-
-def _summary(added: argparse.Action) -> str:
-    """The line on a command in the help of all."""
-    return f"  {added.dest:<12} {added.help}"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -84,7 +65,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         arguments = build_parser().parse_args(argv)
         import_modules(getattr(arguments, "modules", ()))
-        status = arguments.run(arguments) or 0
+        module, _, run = arguments.run.partition(":")
+        status = getattr(import_module(f"{__name__}.{module}"), run)(arguments) or 0
         sys.stdout.flush()
         return status
     except InputError as error:

@@ -1,9 +1,8 @@
 """Types of command-line values, for argparse."""
 
 import math
-from argparse import ArgumentParser, ArgumentTypeError, Namespace
+from argparse import ArgumentTypeError, Namespace
 from argparse import _ActionsContainer as ActionsContainer
-from argparse import _SubParsersAction as Commands
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -13,68 +12,33 @@ NO_PLAN = 1
 BAD_INPUT = 2
 WRITE_FAILED = 3
 STOPPED = 130
-IGNORE_JOINTS = "ignore joints of MoveIt files that the robot does not have, with a note, instead of failing"
+ENDINGS = (".html", ".png")
+"""Endings of replays and pictures."""
+ROSBRIDGE_PORT = 9090
+"""Default port of rosbridge."""
 
 
-def command(
-    commands: Commands,
-    name: str,
-    help: str,
-    description: str,
-    run: Callable[[Namespace], int | None] | None = None,
-    *rows: tuple[Any, ...],
-) -> ArgumentParser:
-    """The parser of a command with its options, each a row of the arguments of `option`.
-
-    run: what the command does; it returns the exit status, or None for 0.
-    """
-    parser = commands.add_parser(name, help=help, description=description)
-    parser.set_defaults(run=run)
-    options(parser, *rows)
-    return parser
-
-
-def group(
-    commands: Commands, name: str, help: str, description: str, title: str = "actions", kind: str = "ACTION"
-) -> Commands:
-    """Where the commands of a command are added. title, kind: what the help calls them."""
-    return command(commands, name, help, description).add_subparsers(title=title, metavar=kind, required=True)
-
-
-def option(
-    parser: ActionsContainer,
-    spec: str,
-    help: str,
-    kind: Callable[[str], Any] | None = None,
-    default: Any = None,
-    **more: Any,
-) -> None:
+def option(parser: ActionsContainer, spec: str, help: str, *more: Any) -> None:
     """Add an option, or an argument.
 
     spec: its name and what its value is called: "--seed N". Without a value it is a flag; with "*" it may be
-    repeated, and with "!" it is required. kind: reads the value; None: text. more: as of argparse.
+    repeated, and with "!" it is required. more: what reads the value (None: text), the default, and further
+    keywords of argparse in a dictionary.
     """
+    *values, keywords = more if more and isinstance(more[-1], dict) else (*more, {})
+    kind, default, *_ = *values, None, None
     name, *words = spec.split()
-    values = [word for word in words if word not in ("*", "!")]
-    if values:
-        more |= {"metavar": values[0], "type": kind, "default": default}
-    elif name.startswith("-") and "choices" not in more:
-        more["action"] = "store_true"
-    else:
-        more["default"] = default
+    called = [word for word in words if word not in ("*", "!")]
+    about: dict[str, Any] = {"default": default}
+    if called:
+        about |= {"metavar": called[0], "type": kind}
+    elif name.startswith("-") and "choices" not in keywords:
+        about = {"action": "store_true"}
     if "*" in words:
-        more |= {"action": "append", "default": []}
+        about |= {"action": "append", "default": []}
     if "!" in words:
-        more["required"] = True
-    parser.add_argument(name, help=help, **more)
-
-
-def options(parser: ActionsContainer, *rows: tuple[Any, ...]) -> None:
-    """Add options, each a row of the arguments of `option`; keywords of argparse stand in a dictionary at its
-    end."""
-    for row in rows:
-        *values, more = row if isinstance(row[-1], dict) else (*row, {})
-        option(parser, *values, **more)
+        about["required"] = True
+    parser.add_argument(name, help=help, **about | keywords)
 
 
 def chosen(arguments: Namespace, names: Iterable[str]) -> dict[str, Any]:
@@ -82,31 +46,28 @@ def chosen(arguments: Namespace, names: Iterable[str]) -> dict[str, Any]:
     return {name: value for name, value in vars(arguments).items() if name in names and value is not None}
 
 
-def add_import_option(parser: ArgumentParser) -> None:
-    """Add the option --import; `main` imports the modules before it runs the command."""
-    option(
-        parser,
-        "--import MODULE *",
-        "import MODULE first (also from the current folder), for example to register planners or families; "
-        "repeatable",
-        dest="modules",
-    )
+def number(kind: type, fits: Callable[[Any], bool], what: str) -> Callable[[str], Any]:
+    """Reads a finite number."""
+
+    def read(text: str) -> Any:
+        is_digits = text.isascii() and text.isdecimal()
+        try:
+            value = kind(text) if kind is float or is_digits else math.nan
+        except ValueError:
+            value = math.nan
+        if not (math.isfinite(value) and fits(value)):
+            raise ArgumentTypeError(f"{text!r} is not {what}")
+        return value
+
+    return read
 
 
-def _number(text: str) -> float:
-    """The text as a number; nan if it is not one."""
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
-
-
-def positive(text: str) -> float:
-    """A positive, finite number."""
-    value = _number(text)
-    if not 0 < value < math.inf:
-        raise ArgumentTypeError(f"{text!r} is not a positive number")
-    return value
+positive = number(float, lambda x: x > 0, "a positive number")
+not_negative = number(float, lambda x: x >= 0, "a number of at least 0")
+share = number(float, lambda x: 0 <= x <= 1, "between 0 and 1")
+natural = number(int, lambda _: True, "an integer of at least 0")
+count = number(int, lambda x: x > 0, "an integer of at least 1")
+port = number(int, lambda x: x < 2**16, "a port, an integer from 0 to 65535")
 
 
 def jerk_limit(text: str) -> float:
@@ -114,27 +75,20 @@ def jerk_limit(text: str) -> float:
     return math.inf if text == "none" else positive(text)
 
 
-def natural(text: str) -> int:
-    """An integer of at least 0."""
-    if not (text.isascii() and text.isdecimal()):
-        raise ArgumentTypeError(f"{text!r} is not an integer of at least 0")
-    return int(text)
-
-
-def count(text: str) -> int:
-    """An integer of at least 1."""
-    if not (text.isascii() and text.isdecimal() and int(text) > 0):
-        raise ArgumentTypeError(f"{text!r} is not an integer of at least 1")
-    return int(text)
-
-
 def assignment(text: str) -> tuple[str, float]:
     """NAME=VALUE with a finite value."""
-    name, _, number = text.partition("=")
-    value = _number(number)
-    if not name or not math.isfinite(value):
+    name, _, value = text.partition("=")
+    if not name:
         raise ArgumentTypeError(f"{text!r} is not NAME=NUMBER")
-    return name, value
+    return name, number(float, lambda _: True, "a number")(value)
+
+
+def shares(text: str) -> dict[str, float]:
+    """NAME=FRACTION,NAME=FRACTION,... with fractions of at least 0."""
+    pairs = [part.partition("=") for part in names(text)]
+    if len({name for name, _, _ in pairs}) < len(pairs):
+        raise ArgumentTypeError(f"{text!r} names a family twice")
+    return {name: not_negative(value) for name, _, value in pairs}
 
 
 def folder(text: str) -> tuple[str, str]:
@@ -145,30 +99,22 @@ def folder(text: str) -> tuple[str, str]:
     return name, path
 
 
-def not_negative(text: str) -> float:
-    """A finite number of at least 0."""
-    value = _number(text)
-    if not 0 <= value < math.inf:
-        raise ArgumentTypeError(f"{text!r} is not a number of at least 0")
-    return value
-
-
-def share(text: str) -> float:
-    """A number from 0 to 1."""
-    value = not_negative(text)
-    if value > 1:
-        raise ArgumentTypeError(f"{text!r} is not between 0 and 1")
-    return value
-
-
-def shares(text: str) -> dict[str, float]:
-    """NAME=FRACTION,NAME=FRACTION,... with fractions of at least 0."""
-    pairs = [part.strip().partition("=") for part in text.split(",")]
-    if len({name for name, _, _ in pairs}) < len(pairs):
-        raise ArgumentTypeError(f"{text!r} names a family twice")
-    return {name: not_negative(number) for name, _, number in pairs}
-
-
 def names(text: str) -> tuple[str, ...]:
     """NAME,NAME,..."""
     return tuple(part.strip() for part in text.split(","))
+
+
+def positives(text: str) -> list[float]:
+    """NUMBER,NUMBER,... of positive numbers."""
+    return list(map(positive, names(text)))
+
+
+def address(text: str) -> tuple[str, int]:
+    """HOST or HOST:PORT."""
+    host, colon, number = text.rpartition(":")
+    if not colon:
+        host = text
+        number = str(ROSBRIDGE_PORT)
+    if not host or not (number.isascii() and number.isdecimal() and 0 < int(number) < 65536):
+        raise ArgumentTypeError(f"{text!r} is not HOST or HOST:PORT")
+    return host, int(number)

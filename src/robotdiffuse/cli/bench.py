@@ -1,182 +1,75 @@
 """The commands `robotdiffuse bench` and `reproduce`, which makes the paper's tables and figures again."""
 
 import os
-from argparse import ArgumentParser, ArgumentTypeError
-from collections.abc import Iterator
-from contextlib import contextmanager
+import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from robotdiffuse.cli.arguments import (
-    Commands,
     Namespace,
-    add_import_option,
     chosen,
-    command,
-    count,
-    group,
-    option,
-    options,
-    positive,
 )
 from robotdiffuse.cli.console import progress
-from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.problems.families import FAMILIES
-from robotdiffuse.processes.ray_cluster import CLUSTERS
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.core.tables import Table, show
+from robotdiffuse.core.types import Path as Waypoints
+from robotdiffuse.evaluation import paper
+from robotdiffuse.evaluation.bench import BenchSettings, preset_settings, run_bench
+from robotdiffuse.evaluation.bench_report import (
+    Bench,
+    Section,
+    about,
+    bench_report,
+    main_table,
+    missing_line,
+    motions_to_replay,
+    read_bench,
+    sections,
+)
+from robotdiffuse.evaluation.checks import confirm
+from robotdiffuse.evaluation.problem_sets import hard_cases
+from robotdiffuse.evaluation.report import Report
+from robotdiffuse.visualization.picture import PictureSettings, write_comparison, write_picture
+from robotdiffuse.visualization.replay_page import GalleryEntry, write_gallery
 
-if TYPE_CHECKING:
-    from robotdiffuse.evaluation import report
-    from robotdiffuse.evaluation.bench import BenchSettings, Done, Report
-    from robotdiffuse.evaluation.bench_report import Bench, Section
-    from robotdiffuse.evaluation.paper import Table1Settings
-
-
-def add_bench(commands: Commands) -> None:
-    actions = group(commands, "bench", "benchmark planners", "Benchmark planners and networks.")
-    run = command(
-        actions,
-        "run",
-        "run planners on problems and record every call",
-        "Run planners on the same problems, in turns, each planner in a process of its own. "
-        "Results are lines of JSON in the folder. Ctrl-C or a crash loses at most the running calls; run "
-        "the same command again to continue; with a longer --time-limit it repeats only calls that could "
-        "improve.",
-        run_run,
-        (
-            "--planners NAME,...",
-            "names that `planner list` shows, or all. NAME:SETTING=VALUE:SETTING=VALUE changes settings, "
-            "or until=first|converged|time_limit, objective=length|time and clearance=M of the calls; "
-            "NAME@FOLDER uses other weights. Example: aorrtc:range=0.5,diffusion@runs/mine",
-        ),
-        (
-            "--problems SET,...",
-            f"{', '.join(FAMILIES)}, each also with _nontrivial; or files or folders of problems; with "
-            "--preset, sets in addition to its own",
-        ),
-        (
-            "--preset NAME",
-            "a stored comparison with its planners, limits and seeds (benchmarks/README.md): equal_time, "
-            "learning, durations, anytime or restarts",
-        ),
-        ("--out FOLDER !", "folder for problems and results"),
-        ("--time-limit S", "time limit of a call [s] (default: 1)", positive),
-        ("--seeds N", "calls per problem, with different seeds (default: 1)", count),
-        ("--count N", "problems per set (default: 100; all of a folder)", count),
-        (
-            "--equal-time",
-            "also call planners that end early again until the time limit, as extra rows, to compare lengths",
-        ),
-        ("--data FOLDER", "data set, for a row of its nearest motions"),
-        ("--cpu-time", "limits and times are CPU time, for a machine that does other work"),
-        ("--workers N", "planners that run at once (default: half of the cores)", count),
-        ("--cluster", "use the Ray cluster at RAY_ADDRESS", {"choices": CLUSTERS}),
-    )
-    add_import_option(run)
-    report = command(
-        actions,
-        "report",
-        "write tables, plots and replays of a run",
-        "Write report.md with its plots as .svg, the same as index.html, and replays.html "
-        "(motions in 3D), and print the table of each problem set.",
-        run_report,
-        ("folder FOLDER", "folder of `robotdiffuse bench run`"),
-        ("--limits S,...", "time limits [s] (default: those of the run, and 0.1, 1, 10, 60 below them)"),
-        ("--planners NAME,...", "planners to include (default: all)"),
-        ("--out OUT", "folder to write to (default: FOLDER)"),
-        ("--no-replays", "do not write replays.html"),
-    )
-    add_import_option(report)
-    command(
-        actions,
-        "confirm",
-        "check the motions of a run with PyBullet",
-        "Check every solved motion of `bench run` with PyBullet, on meshes, as a second "
-        "validator. The exit status is 1 if it finds a collision.",
-        run_confirm,
-        ("folder FOLDER", "folder of `bench run`"),
-        ("--count N", "check only the first N problems of each set (default: all)", count),
-    )
+HALF_OF_CORES = max(1, (os.cpu_count() or 1) // 2)
 
 
 def run_run(arguments: Namespace) -> None:
-    from robotdiffuse.evaluation.bench import run_bench
-
     calls_made = 0
     for settings in _bench_settings(arguments):
-        with calls_shown(settings) as (report, on_progress):
-            calls_made += run_bench(settings, report, on_progress)
+        with progress("calls") as update:
+            calls_made += run_bench(settings, _say, update)
     print(
         f"{calls_made} calls made; for tables, plots and replays: robotdiffuse bench report {arguments.out}"
     )
 
 
-@contextmanager
-def calls_shown(settings: "BenchSettings") -> "Iterator[tuple[Report, Done]]":
-    """The functions for `run_bench` that print messages and show a progress bar for each planner."""
-    import sys
-
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    console = Console(stderr=True)
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        bars = {name: bar.add_task(name, total=None, start=False) for name in settings.specs}
-
-        def done(planner: str, calls: int, all_calls: int) -> None:
-            bar.start_task(bars[planner])
-            bar.update(bars[planner], completed=calls, total=all_calls)
-
-        yield lambda text: print(text, file=sys.stderr, flush=True), done
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
 
 
 def _bench_settings(arguments: Namespace) -> "list[BenchSettings]":
     """The settings of each pass: of the preset, or one from the options."""
-    from robotdiffuse.evaluation.bench import BenchSettings, preset_settings
-
     if arguments.cluster is not None and arguments.workers is not None:
         raise InputError("--workers sets the processes on this machine; --cluster always uses all its cores")
-    out = Path(arguments.out)
-    workers = arguments.workers or max(1, (os.cpu_count() or 1) // 2)
-    problems = () if arguments.problems is None else tuple(arguments.problems.split(","))
+    given: dict[str, Any] = {"workers": HALF_OF_CORES} | chosen(arguments, BenchSettings.__dataclass_fields__)
+    given["out"] = Path(arguments.out)
     if arguments.preset is not None:
         fixed = ("planners", "time_limit", "seeds", "equal_time")
-        options = [f"--{name.replace('_', '-')}" for name in fixed if getattr(arguments, name)]
+        options = [f"--{name.replace('_', '-')}" for name in fixed if given.pop(name, None)]
         if options:
             raise InputError(f"--preset cannot be combined with {', '.join(options)}: the preset fixes these")
-        return preset_settings(arguments.preset, out, problems, arguments.count, workers, arguments.cluster)
-    if arguments.planners is None or arguments.problems is None:
+        return preset_settings(arguments.preset, **given)
+    if arguments.planners is None or not arguments.problems:
         raise InputError("name --planners and --problems, or a --preset")
-    return [
-        BenchSettings(
-            planners=tuple(arguments.planners.split(",")),
-            problems=problems,
-            out=out,
-            time_limit=arguments.time_limit or 1.0,
-            seeds=arguments.seeds or 1,
-            count=arguments.count,
-            workers=workers,
-            cluster=arguments.cluster,
-            equal_time=arguments.equal_time,
-        )
-    ]
+    return [BenchSettings(**given)]
 
 
 def run_report(arguments: Namespace) -> None:
-    from robotdiffuse.core.output_files import write_atomically
-    from robotdiffuse.core.tables import show
-    from robotdiffuse.evaluation.bench_report import (
-        bench_report,
-        main_table,
-        missing_line,
-        read_bench,
-        sections,
-    )
-
-    planners = None if arguments.planners is None else arguments.planners.split(",")
-    limits = None if arguments.limits is None else _limits(arguments.limits)
-    bench = read_bench(Path(arguments.folder), planners)
-    parts = sections(bench, limits)
+    bench = read_bench(Path(arguments.folder), arguments.planners)
+    parts = sections(bench, arguments.limits)
     out = Path(arguments.out or arguments.folder)
     replays = None if arguments.no_replays else _write_replays(bench, parts, out / "replays.html")
     report = bench_report(bench, parts, replays)
@@ -191,10 +84,6 @@ def run_report(arguments: Namespace) -> None:
 
 def _write_replays(bench: "Bench", parts: "list[Section]", file: "Path") -> str | None:
     """The name of the written file; None if there is no motion to replay."""
-    from robotdiffuse.core.types import Path as Waypoints
-    from robotdiffuse.evaluation.bench_report import motions_to_replay
-    from robotdiffuse.visualization.replay_page import GalleryEntry, write_gallery
-
     motions = motions_to_replay(bench, parts)
     if not motions:
         return None
@@ -210,19 +99,7 @@ def _write_replays(bench: "Bench", parts: "list[Section]", file: "Path") -> str 
     return file.name
 
 
-def _limits(text: str) -> list[float]:
-    try:
-        return [positive(part) for part in text.split(",")]
-    except (ArgumentTypeError, ValueError):
-        raise InputError(
-            f"limits are {shown(text)}; they must be positive times [s], such as 0.1,1,10"
-        ) from None
-
-
 def run_confirm(arguments: Namespace) -> int:
-    from robotdiffuse.core.tables import Table, show
-    from robotdiffuse.evaluation.checks import confirm
-
     with progress("checking problems") as update:
         confirmation = confirm(Path(arguments.folder), arguments.count, update)
     refuted = [record.planner for record, _ in confirmation.refuted]
@@ -242,123 +119,39 @@ FIGURE_AZIMUTH = -0.9
 """Azimuth of the camera of figure 1, the same for all noise levels [rad]."""
 
 
-def add_reproduce(commands: Commands) -> None:
-    actions = group(
-        commands,
-        "reproduce",
-        "make the paper's tables and figures again, beside the printed ones",
-        "Draw the paper's problems, plan, validate, and write one page. Ctrl-C stops; run the "
-        "same command again to continue.",
-        "parts",
-        "PART",
-    )
-    table1 = command(
-        actions,
-        "table1",
-        "planners on ROP, with poses and with configurations as goals",
-        "Write table1.md in the folder, which is one of `bench run` too.",
-        run_table1,
-    )
-    _add_planning(table1)
-    command(
-        actions,
-        "table2",
-        "train and compare the rows of the ablation",
-        "Train every row of the paper's Table 2 on the same number of samples, test it on the "
-        "same held-out problems, and write table2.md in the folder.",
-        run_table2,
-        ("--data DATA !", "data set of `data generate`"),
-        ("--out FOLDER !", "folder for networks and page"),
-        ("--samples N", "training samples per row (default: 300000)", count),
-        ("--encoder-samples N", "point clouds to train the frozen encoder on (default: 300000)", count),
-        ("--problems N", "held-out problems (default: 500)", count),
-        ("--family NAME", "family of these problems (default: rop)"),
-        ("--rows NAME,...", "rows to train (default: all ten)"),
-        ("--seeds N", "trainings of each row, with different seeds (default: 1)", count),
-        ("--workers N", "processes (default: all cores)", count, os.cpu_count() or 1),
-    )
-    figures = command(
-        actions,
-        "figures",
-        "denoising, success over time, motions of two planners",
-        "Write figures.md and its pictures in the folder of `reproduce table1`; calls that are "
-        "missing there are made first.",
-        run_figures,
-    )
-    _add_planning(figures)
-
-
-def _add_planning(parser: ArgumentParser) -> None:
-    options(
-        parser,
-        ("--out FOLDER !", "folder for problems, results, page"),
-        ("--problems N", "problems of each kind of goal that are not trivial (default: 60)", count, 60),
-        ("--time-limit S", "of a call [s] (default: 10)", positive, 10.0),
-        (
-            "--paper-weights FOLDER",
-            "weights of `train planner --config paper`, or points, for rows of single samples without "
-            "clearances, with and without guidance (default: a note says how to train them)",
-        ),
-        ("--data FOLDER", "data set, for a row of its nearest motions"),
-        ("--cpu-time", "limits and times are CPU time, for a machine that does other work"),
-        ("--workers N", "planners that run at once (default: half of the cores)", count),
-    )
-    option(parser, "--cluster", "use the Ray cluster at RAY_ADDRESS", choices=CLUSTERS)
-
-
 def run_table1(arguments: Namespace) -> int:
-    from robotdiffuse.evaluation.paper import table1
-
     settings, bench = _table1(arguments)
-    return _write(table1(settings, bench), settings.out / "table1.md")
+    return _write(paper.table1(settings, bench), settings.out / "table1.md")
 
 
-def _write(page: "report.Report", file: Path) -> int:
+def _write(page: Report, file: Path) -> int:
     page.write(file)
     print(f"wrote {file}")
     return 0
 
 
-def _table1(arguments: Namespace) -> "tuple[Table1Settings, Bench]":
+def _table1(arguments: Namespace) -> tuple[paper.Table1Settings, Bench]:
     """The settings of table 1, and its calls, of which the missing ones are made."""
-    from robotdiffuse.evaluation.paper import Table1Settings, run_table1
-
-    settings = Table1Settings(
-        out=Path(arguments.out),
-        problems=arguments.problems,
-        time_limit=arguments.time_limit,
-        cpu_time=arguments.cpu_time,
-        paper_weights=arguments.paper_weights,
-        data=arguments.data,
-        workers=arguments.workers or max(1, (os.cpu_count() or 1) // 2),
-        cluster=arguments.cluster,
-    )
-    with calls_shown(settings.bench) as (report, on_progress):
-        return settings, run_table1(settings, report, on_progress)
+    given: dict[str, Any] = {"workers": HALF_OF_CORES}
+    given |= chosen(arguments, paper.Table1Settings.__dataclass_fields__)
+    given["out"] = Path(arguments.out)
+    settings = paper.Table1Settings(**given)
+    with progress("calls") as update:
+        return settings, paper.run_table1(settings, _say, update)
 
 
 def run_table2(arguments: Namespace) -> int:
-    import sys
-
     from robotdiffuse.learning import need_packages
 
     need_packages("the ablation", "torch")
     from robotdiffuse.evaluation.ablation import ROWS, AblationSettings, run_ablation, table2
 
     settings = AblationSettings(**chosen(arguments, AblationSettings.__dataclass_fields__))
-    rows = list(ROWS) if arguments.rows is None else arguments.rows.split(",")
-    results = run_ablation(
-        settings, rows, arguments.workers, lambda text: print(text, file=sys.stderr, flush=True)
-    )
+    results = run_ablation(settings, list(arguments.rows or ROWS), arguments.workers, _say)
     return _write(table2(settings, results), Path(settings.out) / "table2.md")
 
 
 def run_figures(arguments: Namespace) -> int:
-    from robotdiffuse.evaluation import paper
-    from robotdiffuse.evaluation.bench_report import about
-    from robotdiffuse.evaluation.problem_sets import hard_cases
-    from robotdiffuse.visualization.picture import PictureSettings, write_comparison, write_picture
-
     settings, bench = _table1(arguments)
     out = settings.out
     count = min(settings.problems, FIGURE_PROBLEMS)

@@ -53,37 +53,20 @@ def steps(robot: Robot, picture: bool) -> Iterator[Callable[[], object]]:
     rows = np.stack([middle, middle + 0.01, middle])
     path = Path(robot.joint_names, rows)
     scene = Scene([BALL])
-    yield lambda: _measure(robot, scene, rows)
-    yield lambda: _certify(robot, scene, rows)
-    yield lambda: _time(robot, path)
-    if picture:
-        yield lambda: _draw(robot, scene, path)
-
-
-def _measure(robot: Robot, scene: Scene, rows: np.ndarray) -> None:
     from robotdiffuse.collision import CollisionChecker
-
-    CollisionChecker(robot, scene).link_clearances(rows)
-
-
-def _certify(robot: Robot, scene: Scene, rows: np.ndarray) -> None:
     from robotdiffuse.collision.motions import ContinuousCollision
+    from robotdiffuse.trajectories.timing import time_parameterize
     from robotdiffuse.validation.validator import VerifySettings
 
     settings = VerifySettings()
-    ContinuousCollision(robot, scene, settings.contact, settings.tightness).sweep(rows)
+    sweep = ContinuousCollision(robot, scene, settings.contact, settings.tightness).sweep
+    yield lambda: CollisionChecker(robot, scene).link_clearances(rows)
+    yield lambda: sweep(rows)
+    yield lambda: time_parameterize(robot, path, lambda _: True, lambda _: True)
+    if picture:
+        from robotdiffuse.visualization.picture import PictureSettings, render
 
-
-def _time(robot: Robot, path: Path) -> None:
-    from robotdiffuse.trajectories.timing import time_parameterize
-
-    time_parameterize(robot, path, lambda _: True, lambda _: True)
-
-
-def _draw(robot: Robot, scene: Scene, path: Path) -> None:
-    from robotdiffuse.visualization.picture import PictureSettings, render
-
-    render(robot, scene, path, PictureSettings(width=16, height=16))
+        yield lambda: render(robot, scene, path, PictureSettings(width=16, height=16))
 
 
 def main(arguments: list[str]) -> None:

@@ -4,43 +4,26 @@ import json
 from argparse import ArgumentParser
 from collections.abc import Iterator
 
-from robotdiffuse.cli.arguments import Commands, Namespace, add_import_option, command, group, option
-
-
-def add_planner(commands: Commands) -> None:
-    actions = group(commands, "planner", "list or show planners", "List the planners, or show one.")
-    listing = command(actions, "list", "list the planners", "List the planners.", run_planner_list)
-    add_import_option(listing)
-    info = command(
-        actions,
-        "info",
-        "show the settings of a planner",
-        "Show the settings of a planner, for `robotdiffuse plan --set`.",
-        run_planner_info,
-        ("planner NAME", "a planner that `planner list` shows"),
-    )
-    add_import_option(info)
+from robotdiffuse.cli import build_parser
+from robotdiffuse.cli.arguments import Namespace
+from robotdiffuse.cli.commands import Commands
+from robotdiffuse.core.tables import Column, Table, show
+from robotdiffuse.planning import PLANNERS, planner_settings
+from robotdiffuse.problems.fields import problem_schema
 
 
 def run_planner_list(arguments: Namespace) -> None:
-    from robotdiffuse.core.tables import Column, Table, show
-    from robotdiffuse.planning import PLANNERS
-
     rows = [(name, one.kind, one.description) for name, one in PLANNERS.load_installed().items()]
     show(Table.of("", ("planner", Column("kind", left=True), Column("description", left=True)), rows))
 
 
 def run_planner_info(arguments: Namespace) -> None:
-    from robotdiffuse.core.tables import Column, Table, show
-    from robotdiffuse.planning import PLANNERS, planner_settings
-
     settings = planner_settings(arguments.planner, ())
     rows = [(one.name, one.value, one.rule, one.description) for one in settings.describe()]
     columns = ("setting", *(Column(name, left=True) for name in ("default", "values", "description")))
     show(Table.of(f"{arguments.planner}: {PLANNERS[arguments.planner].description}", columns, rows))
 
 
-SHELLS = ("bash", "zsh")
 SCRIPT = """_robotdiffuse() {{
   local word="${{COMP_WORDS[COMP_CWORD]}}" command="" words="" options="" i
   for ((i = 1; i < COMP_CWORD; i++)); do
@@ -60,37 +43,12 @@ complete -o default -F _robotdiffuse robotdiffuse
 Where no word fits, the shell completes names of files."""
 
 
-def add_schema(commands: Commands) -> None:
-    command(
-        commands,
-        "schema",
-        "print the JSON schema of problem files",
-        "Print the JSON schema of problem files, by which editors complete and check them.",
-        run_schema,
-    )
-
-
-def add_completion(commands: Commands) -> None:
-    parser = commands.add_parser(
-        "completion",
-        help="print a script that completes commands and options in bash or zsh",
-        description="Print a script that completes commands and options: "
-        'eval "$(robotdiffuse completion bash)" in ~/.bashrc, or with zsh in ~/.zshrc.',
-    )
-    option(parser, "shell", "the shell", choices=SHELLS)
-    parser.set_defaults(run=run_completion, parsers=commands.choices)
-
-
 def run_schema(arguments: Namespace) -> None:
-    from robotdiffuse.problems.fields import problem_schema
-
     print(json.dumps(problem_schema(), indent=1))
 
 
 def run_completion(arguments: Namespace) -> None:
-    words_by_command = {"": (list(arguments.parsers), ["--help", "--version"])}
-    for name, parser in arguments.parsers.items():
-        words_by_command |= _words(parser, f" {name}")
+    words_by_command = dict(_words(build_parser(), ""))
     paths = "|".join(f'"{path}"' for path in words_by_command if path)
     cases = "\n".join(
         f"""    "{path}") words="{" ".join(words)}" options="{" ".join(options)}" ;;"""

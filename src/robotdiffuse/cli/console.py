@@ -7,14 +7,15 @@ from contextlib import contextmanager
 from threading import Event, Thread
 from typing import TYPE_CHECKING
 
+from robotdiffuse.collision.kernels.collision_cost import CLEARANCE_CAP
 from robotdiffuse.core.loading import compiled
+from robotdiffuse.core.tables import Table, show
 
 if TYPE_CHECKING:
     from robotdiffuse.certificates.certificate import Certificate
     from robotdiffuse.core.results import PlanResult
     from robotdiffuse.problems.problem import Problem
     from robotdiffuse.validation.report import Report
-
 
 SPINNER_DELAY = 2.0
 """Time until the spinner appears [s]."""
@@ -112,8 +113,6 @@ def clearances(motion: "PlanResult | Report | Certificate", asked: float | None 
 
 def _certified(clearance: float) -> str:
     """A certified lower bound [m]; the validator measures no distance beyond CLEARANCE_CAP."""
-    from robotdiffuse.collision.kernels.collision_cost import CLEARANCE_CAP
-
     capped = clearance > CLEARANCE_CAP - CAP_TOLERANCE
     return f"> {CLEARANCE_CAP:g} m" if capped else f"at least {1e3 * clearance + 0.0:.1f} mm"
 
@@ -123,7 +122,6 @@ def print_result(result: "PlanResult", asked: float | None = None) -> None:
 
     asked: the requested clearance, or the default one [m]; None: the planner keeps none.
     """
-    from robotdiffuse.core.tables import Table, show
 
     rows = [
         ("reason", result.reason),

@@ -4,105 +4,30 @@ import sys
 from collections import Counter
 from typing import TYPE_CHECKING
 
+from jaxtyping import Float
+from numpy import ndarray
+
 from robotdiffuse.cli.arguments import (
-    Commands,
     Namespace,
-    assignment,
-    command,
-    folder,
-    group,
-    natural,
-    options,
 )
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.interrupts import exit_on_interrupt
+from robotdiffuse.core.tables import Column, Table, show
+from robotdiffuse.core.transforms import inverse, quaternion_from_rotation
+from robotdiffuse.learning.weight_files import weights_for
+from robotdiffuse.robots import known_robots, load_robot
+from robotdiffuse.robots.kinematic_tree import Joint
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot_folder import read_source
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy import ndarray
-
     from robotdiffuse.robots.fitting.preparation import AddReport
-    from robotdiffuse.robots.kinematic_tree import Joint
-    from robotdiffuse.robots.robot import Robot
 
 MAX_PAIRS = 8
 """Most pairs of links in the report of `robot add`."""
 
 
-def add(commands: Commands) -> None:
-    actions = group(
-        commands, "robot", "list, show or prepare robots", "List or show robots, or prepare a new one."
-    )
-
-    command(
-        actions,
-        "list",
-        "list the robots that problems can name",
-        "List the bundled robots and those added by `robot add`.",
-        run_list,
-    )
-
-    command(
-        actions,
-        "info",
-        "show joints, limits and collision model",
-        "Show joints, limits and collision model of a robot.",
-        run_info,
-        ("robot ROBOT", "a bundled name, a prepared folder or a URDF file"),
-    )
-
-    make = command(
-        actions,
-        "add",
-        "prepare a robot from its URDF",
-        "Prepare a robot for planning: fit covering spheres to the collision meshes of its "
-        "URDF, find the pairs of links that need no collision check, and write a folder that problems can "
-        "name.",
-        run_add,
-        ("urdf URDF", "URDF of an arm, or xacro file, which is compiled: this runs code in it"),
-        ("--name NAME", "name that problems use (default: the URDF's)"),
-        ("--out FOLDER", "folder to write (default: one in the user's robots)"),
-        (
-            "--group NAME",
-            "group of the SRDF, or arm, to plan for; both or all: several arms as one robot (default: the "
-            "only arm)",
-        ),
-        ("--base LINK", "first link of the arm (default: the root)"),
-        ("--tip LINK", "last link of the arm (default: the link where a gripper begins)"),
-        ("--lock JOINT=VALUE *", "lock a joint at a value [rad or m]; repeatable", assignment),
-        (
-            "--srdf FILE",
-            "SRDF with groups, poses, passive joints and allowed pairs of links (default: the SRDF beside "
-            "the URDF, without its pairs)",
-        ),
-    )
-    make.add_argument(
-        "--allow",
-        nargs=2,
-        action="append",
-        default=[],
-        metavar=("LINK", "LINK"),
-        help="two links not to check against each other; repeatable",
-    )
-    options(
-        make,
-        (
-            "--package NAME=FOLDER *",
-            "folder of a ROS package (default: search ROS_PACKAGE_PATH, AMENT_PREFIX_PATH and the folders "
-            "above the URDF)",
-            folder,
-        ),
-        ("--limits FILE", "file of joint limits, as MoveIt's joint_limits.yaml"),
-        ("--license TEXT", "license of the URDF's geometry, to keep in the folder"),
-        ("--seed N", "random seed (default: 0)", natural, 0),
-    )
-
-
 def run_list(arguments: Namespace) -> None:
-    from robotdiffuse.core.tables import Column, Table, show
-    from robotdiffuse.learning.weight_files import weights_for
-    from robotdiffuse.robots import known_robots, load_robot
-    from robotdiffuse.robots.robot_folder import read_source
-
     rows = []
     for name, place in known_robots().items():
         try:
@@ -121,16 +46,12 @@ def run_list(arguments: Namespace) -> None:
 
 
 def run_info(arguments: Namespace) -> None:
-    from robotdiffuse.robots import load_robot
-
     print_robot(load_robot(arguments.robot))
 
 
 def run_add(arguments: Namespace) -> None:
     from rich.console import Console
     from rich.progress import Progress
-
-    from robotdiffuse.core.interrupts import exit_on_interrupt
 
     console = Console(stderr=True)
     bar = Progress(console=console, transient=True, disable=not console.is_terminal)
@@ -170,7 +91,6 @@ def run_add(arguments: Namespace) -> None:
 def print_preparation(report: "AddReport") -> None:
     """Print links, the pairs with most false collisions, and the time and memory of preparation; warnings go
     to standard error."""
-    from robotdiffuse.core.tables import Column, Table, show
 
     columns = ("link", "convex parts", "spheres", Column("stick-out", "mm", ".1f", scale=1e3), "covered")
     links = [
@@ -201,8 +121,6 @@ def print_preparation(report: "AddReport") -> None:
 
 def _print_pairs(report: "AddReport") -> None:
     """Print the number of allowed pairs of links by reason, and where they differ from the SRDF."""
-    from robotdiffuse.core.tables import Column, Table, show
-
     reasons = Counter(pair.reason for pair in report.pairs)
     counted = ", ".join(f"{reason} {count}" for reason, count in sorted(reasons.items()))
     show(Table.pairs("", [("pairs of links", counted)]))
@@ -216,9 +134,6 @@ def _print_pairs(report: "AddReport") -> None:
 
 def print_robot(robot: "Robot") -> None:
     """Print joints, limits, collision model and notes of a robot."""
-    from robotdiffuse.core.tables import Column, Table, show
-    from robotdiffuse.core.transforms import inverse
-
     columns = ("joint", Column("kind", left=True), "lower", "upper", "velocity", "accel.", "jerk")
     joints = [(j.name, j.kind, *_range(j), j.velocity, j.acceleration, j.jerk) for j in robot.planned_joints]
     spheres = sum(len(rows) for rows in robot.spheres.values())
@@ -243,8 +158,6 @@ def _range(joint: "Joint") -> tuple[float | None, float | None]:
 
 
 def _place(T: "Float[ndarray, '4 4']") -> str:
-    from robotdiffuse.core.transforms import quaternion_from_rotation
-
     xyz = T[:3, 3]
     wxyz = quaternion_from_rotation(T[:3, :3])
     return " ".join(["xyz", *(f"{value:g}" for value in xyz), "wxyz", *(f"{value:.4g}" for value in wxyz)])

@@ -3,35 +3,41 @@
 import os
 import shutil
 import sys
-from argparse import ArgumentParser
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from robotdiffuse.cli.arguments import (
-    Commands,
     Namespace,
     chosen,
-    command,
-    count,
-    group,
-    names,
-    natural,
-    option,
-    options,
-    positive,
-    share,
 )
-from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.cli.console import progress
+from robotdiffuse.core.errors import InputError, needs, shown
 from robotdiffuse.core.output_files import write_atomically
-from robotdiffuse.learning import need_packages
+from robotdiffuse.generation import GenerationSettings, generate
+from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
+from robotdiffuse.learning.weight_files import BUNDLED, user_weights
+from robotdiffuse.problems.families.scaled import scale_for
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 
-if TYPE_CHECKING:
-    from robotdiffuse.generation import GenerationSettings
-    from robotdiffuse.learning.training.config import PlannerTraining
+with needs("torch", "train"):
+    from robotdiffuse.learning.checkpoint import export_weights, load_model, save_network
+    from robotdiffuse.learning.denoisers import DENOISERS
+    from robotdiffuse.learning.training.completion import CompletionTraining, train_completion
+    from robotdiffuse.learning.training.config import (
+        CONFIGS,
+        EncoderTraining,
+        PlannerTraining,
+        planner_training,
+    )
+    from robotdiffuse.learning.training.tasks import (
+        baseline_training,
+        train_baseline,
+        train_encoder,
+        train_planner,
+    )
 
 TRAINING_OPTIONS = (
     *("minutes", "samples", "seed", "batch", "learning_rate", "threads"),
@@ -44,143 +50,7 @@ MODEL_OPTIONS = (
 """Options of `train planner` that replace parts of its config."""
 
 
-def add(commands: Commands) -> None:
-    kinds = group(
-        commands,
-        "train",
-        "train networks",
-        "Train a network. Ctrl-C stops after writing a checkpoint; run the same command again to "
-        "continue. To train with N processes, on a GPU each if there are enough: "
-        "torchrun --nproc-per-node N -m robotdiffuse train ...",
-        "networks",
-        "NETWORK",
-    )
-
-    encoder = command(
-        kinds,
-        "encoder",
-        "train an auto-encoder of point clouds",
-        "Train an auto-encoder of point clouds on random scenes. The planner's training keeps it frozen.",
-        run_encoder,
-        ("--encoder NAME", "encoder to train (default: point_autoencoder)", {"dest": "name"}),
-        ("--scenes NAME", "training scenes: mixed (default), or rop, those of the paper's data"),
-    )
-    _add_shared(encoder)
-    _add_device(encoder)
-
-    completion = command(
-        kinds,
-        "completion",
-        "train the occupancy completion network",
-        "Train the occupancy completion network, which predicts the obstacles that depth "
-        "cameras do not see, on random scenes.",
-        run_completion,
-        ("--families NAMES", "families of the scenes (default: all)", names),
-        ("--robot NAME", "bundled name or URDF of the arm in the images"),
-        ("--workers N", "processes that draw samples (default: 1)", natural),
-        ("--weights FOLDER", "weights to begin with; bundled: those that come with the package"),
-    )
-    _add_shared(completion)
-    _add_device(completion)
-
-    planner = command(
-        kinds,
-        "planner",
-        "train the network that predicts motions",
-        "Train the network that predicts motions, on planned trajectories. With --robot and "
-        "without --data, generate data for the arm, train on them, and install the weights where planners "
-        "find them; this takes about two hours on two cores.",
-        run_planner,
-        ("--data FOLDER", "folder with shards of trajectories (default: generate them for --robot)"),
-        (
-            "--config NAME",
-            "compact (default), paper, points (no clearances as inputs), trajectory_prior (for MPD and "
-            "EDMP), or a row of the paper's Table 2: table2_jpc, table2_unet, ...",
-            None,
-            "compact",
-        ),
-        (
-            "--encoder FOLDER",
-            "folder of a trained encoder; pointnet or dgcnn, which are trained with the planner; or points, "
-            "for the denoiser cross_attention (default: that of the config, or the bundled one)",
-        ),
-        ("--robot NAME", "bundled name or URDF of the robot (default: panda)"),
-        ("--trajectories N", "motions to generate, without --data (default: 60,000)", count),
-        ("--workers N", "processes that generate data without --data (all cores)", count),
-    )
-    _add_shared(planner, out_required=False)
-    _add_device(planner)
-    parts = planner.add_argument_group("parts of the model that replace those of the config")
-    options(
-        parts,
-        (
-            "--denoiser NAME",
-            "transformer, encoder_decoder, decoder_only, unet, or cross_attention for the encoder points",
-        ),
-        ("--sampler NAME", "sampler for planning: ddim or ddpm"),
-        ("--objective NAME", "what the denoiser predicts: clean or noise"),
-        ("--target NAME", "what motions are relative to: residual (the straight line), absolute or limits"),
-        ("--sampling-steps N", "denoising steps for planning", count),
-        ("--condition-drop P", "fraction of samples without condition, for classifier-free guidance", share),
-        ("--waypoints N", "waypoints of a motion", count),
-    )
-
-    baseline = command(
-        kinds,
-        "baseline",
-        "train the network of a learned baseline: mpnet, mpinets, trajectory_prior",
-        "Train the network of a learned baseline on planned trajectories.",
-        run_baseline,
-        ("name NAME", "mpnet, mpinets or trajectory_prior (for MPD and EDMP)"),
-        ("--data FOLDER !", "data set of `data generate`"),
-        ("--robot NAME", "bundled name or URDF of the data's robot"),
-    )
-    _add_shared(baseline)
-
-    command(
-        kinds,
-        "export",
-        "write the ONNX files of trained weights anew",
-        "Write the ONNX files that planning runs, from trained weights. Training writes them "
-        "too; weights of earlier versions lack them.",
-        run_export,
-        ("folder FOLDER", "folder with weights"),
-    )
-
-
-def _add_shared(parser: ArgumentParser, out_required: bool = True) -> None:
-    default = "" if out_required else "; without --data also for the data (default: beside the user's robots)"
-    parser.add_argument(
-        "--out",
-        required=out_required,
-        metavar="FOLDER",
-        help=f"folder for weights, settings and checkpoints{default}",
-    )
-    length = parser.add_mutually_exclusive_group()
-    options(
-        length,
-        ("--minutes MIN", "length of the training [minutes]", positive),
-        ("--samples N", "length of the training [samples]", count),
-    )
-    options(
-        parser,
-        ("--seed N", "random seed", natural),
-        ("--batch N", "batch size", count),
-        ("--learning-rate X", "peak learning rate", positive),
-        ("--threads N", "number of PyTorch threads", count),
-        ("--checkpoint-seconds S", "time between checkpoints [s] (default: 120)", positive),
-    )
-
-
-def _add_device(parser: ArgumentParser) -> None:
-    option(parser, "--device NAME", "cpu or cuda (default: cuda if there is one)")
-
-
 def run_encoder(arguments: Namespace) -> None:
-    need_packages("training", "torch")
-    from robotdiffuse.learning.training.config import EncoderTraining
-    from robotdiffuse.learning.training.tasks import train_encoder
-
     options = chosen(arguments, ("name", "scenes", "device", *TRAINING_OPTIONS))
     if "samples" in options:
         options["minutes"] = None
@@ -189,9 +59,6 @@ def run_encoder(arguments: Namespace) -> None:
 
 
 def run_completion(arguments: Namespace) -> None:
-    need_packages("training", "torch")
-    from robotdiffuse.learning.training.completion import CompletionTraining, train_completion
-
     options = chosen(arguments, ("families", "robot", "workers", "weights", "device", *TRAINING_OPTIONS))
     if "minutes" in options:
         options["samples"] = None
@@ -199,12 +66,7 @@ def run_completion(arguments: Namespace) -> None:
     _print_report(train_completion(settings, arguments.out), arguments.out)
 
 
-def run_planner(arguments: Namespace) -> int:
-    need_packages("training", "torch")
-    from robotdiffuse.learning.denoisers import DENOISERS
-    from robotdiffuse.learning.training.config import CONFIGS, planner_training
-    from robotdiffuse.learning.training.tasks import train_planner
-
+def run_planner(arguments: Namespace) -> None:
     if arguments.config not in CONFIGS:
         descriptions = [f"{name}: {config.description}" for name, config in CONFIGS.items()]
         raise InputError(f"unknown config {shown(arguments.config)}; known:", descriptions)
@@ -223,7 +85,12 @@ def run_planner(arguments: Namespace) -> int:
             "`robotdiffuse train encoder --encoder compression_autoencoder --scenes rop`, the paper's encoder"
         )
     if arguments.data is None:
-        return _run_for_robot(arguments, options)
+        if arguments.robot is None:
+            raise InputError("give --robot to generate data for an arm, or --data to use existing data")
+        make = partial(planner_training, arguments.config)
+        source = arguments.robot, options, make, arguments.out
+        report, weights = train_for_robot(*source, arguments.trajectories, arguments.workers)
+        return _print_report(report, str(weights))
     if arguments.out is None:
         raise InputError("--data needs --out, a folder for the weights")
     for name in ("trajectories", "workers"):
@@ -237,31 +104,9 @@ def run_planner(arguments: Namespace) -> int:
     if bundled:
         copy_bundled_encoder(Path(arguments.out) / "encoder")
     _print_report(train_planner(settings, arguments.out), arguments.out)
-    return 0
-
-
-def _run_for_robot(arguments: Namespace, given: dict[str, Any]) -> int:
-    from robotdiffuse.learning.training.config import planner_training
-
-    if arguments.robot is None:
-        raise InputError("give --robot to generate data for an arm, or --data to use existing data")
-    report, weights = train_for_robot(
-        arguments.robot,
-        given,
-        partial(planner_training, arguments.config),
-        arguments.out,
-        arguments.trajectories,
-        arguments.workers,
-    )
-    _print_report(report, str(weights))
-    return 0
 
 
 def run_baseline(arguments: Namespace) -> None:
-    need_packages("training", "torch")
-    from robotdiffuse.learning.training.config import planner_training
-    from robotdiffuse.learning.training.tasks import baseline_training, train_baseline, train_planner
-
     options = chosen(arguments, ("data", "robot", *TRAINING_OPTIONS))
     if arguments.name == "trajectory_prior":
         report = train_planner(planner_training(arguments.name, options), arguments.out)
@@ -271,9 +116,6 @@ def run_baseline(arguments: Namespace) -> None:
 
 
 def run_export(arguments: Namespace) -> None:
-    need_packages("the export", "torch")
-    from robotdiffuse.learning.checkpoint import export_weights
-
     print(f"wrote the ONNX files of {', '.join(export_weights(arguments.folder))} into {arguments.folder}")
 
 
@@ -306,10 +148,6 @@ BYTES_PER_TRAINING = 100_000_000
 
 def data_settings(source: str, robot: Robot, motions: int | None, seed: int | None) -> "GenerationSettings":
     """Settings of the training data for an arm."""
-    from robotdiffuse.generation import GenerationSettings
-    from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
-    from robotdiffuse.problems.families.scaled import scale_for
-
     return GenerationSettings(
         robot=source,
         trajectories=motions or MOTIONS,
@@ -327,7 +165,7 @@ def data_settings(source: str, robot: Robot, motions: int | None, seed: int | No
 def train_for_robot(
     source: str,
     given: dict[str, Any],
-    make: Callable[[dict[str, Any]], "PlannerTraining"],
+    make: Callable[[dict[str, Any]], PlannerTraining],
     out: str | None = None,
     motions: int | None = None,
     workers: int | None = None,
@@ -340,12 +178,6 @@ def train_for_robot(
 
     Raises InputError for an unknown robot, a folder of other settings, and too little disk space.
     """
-    from robotdiffuse.cli.console import progress
-    from robotdiffuse.generation import generate
-    from robotdiffuse.learning.training.config import PlannerTraining
-    from robotdiffuse.learning.training.tasks import train_planner
-    from robotdiffuse.learning.weight_files import user_weights
-
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise InputError("torchrun only trains: generate the data first, then give --data")
     robot = load_robot(source)
@@ -357,7 +189,11 @@ def train_for_robot(
     defaults: dict[str, Any] = {"samples": SAMPLES} if given.get("minutes") is None else {}
     defaults |= {"encoder": str(work / "encoder")}
     settings: PlannerTraining = make(defaults | given | {"data": str(work / "data"), "robot": source})
-    _say(f"{robot.name}: {data.trajectories:,} motions, then training; all in {work}")
+    print(
+        f"{robot.name}: {data.trajectories:,} motions, then training; all in {work}",
+        file=sys.stderr,
+        flush=True,
+    )
     with progress("trajectories") as update:
         generate(data, work / "data", workers or os.cpu_count() or 1, progress=update)
     if "encoder" not in given:
@@ -385,16 +221,9 @@ def _check_disk(work: Path, motions: int) -> None:
 
 def copy_bundled_encoder(folder: Path) -> Path:
     """Save the encoder of the bundled weights in the form that the training reads; returns the folder."""
-    from robotdiffuse.learning.checkpoint import load_model, save_network
-    from robotdiffuse.learning.weight_files import BUNDLED
-
     if (folder / "encoder.json").is_file():
         return folder
     encoder = load_model(BUNDLED / "panda").encoder
     assert encoder is not None
     save_network("encoder", encoder, folder, {"from": "the weights that come with the package for panda"})
     return folder
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)

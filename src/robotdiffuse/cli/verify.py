@@ -2,68 +2,31 @@
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from robotdiffuse.cli.arguments import (
-    IGNORE_JOINTS,
-    Commands,
     Namespace,
-    command,
-    group,
-    natural,
-    options,
 )
 from robotdiffuse.cli.console import clearances
-from robotdiffuse.core.errors import InputError
-
-if TYPE_CHECKING:
-    from robotdiffuse.core import types
-    from robotdiffuse.problems.problem import Problem
-    from robotdiffuse.robots.robot import Robot
+from robotdiffuse.core.errors import InputError, joined
+from robotdiffuse.core.output_files import check_output
+from robotdiffuse.core.results import NO_PROBLEM, PlanResult, load_result
+from robotdiffuse.core.types import Path as Waypoints
+from robotdiffuse.core.types import Trajectory
+from robotdiffuse.interop import read_motion
+from robotdiffuse.interop.recorded_motion import motion_of_robot, problem_of_motion
+from robotdiffuse.problems.files import load_problem, problem_from_record
+from robotdiffuse.problems.moveit import read_moveit_scene
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots import DATA, ROBOTS, load_robot
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import contact_notes
+from robotdiffuse.validation.validator import verify, violations
 
 VALID = 0
 NOT_VALID = 1
 
 
-def add_verify(commands: Commands) -> None:
-    parser = command(
-        commands,
-        "verify",
-        "validate a motion from any source",
-        "Validate a motion from any planner: a RobotDiffuse result, CSV, JSON, YAML of a ROS "
-        "JointTrajectory or MoveIt RobotTrajectory, a ROS 2 bag or MCAP. Exit status: 0 valid, 1 not valid, "
-        "2 bad input.",
-        run_verify,
-        ("motion MOTION", "file (.json, .csv, .yaml, .mcap), or the folder of a ROS 2 bag"),
-    )
-    group = parser.add_mutually_exclusive_group()
-    options(
-        group,
-        ("--problem FILE", "problem file (default: the problem in the result or .mcap file)"),
-        (
-            "--scene FILE",
-            "MoveIt planning scene, instead of a problem; start and goal are those of the motion; needs "
-            "--robot",
-        ),
-    )
-    options(
-        parser,
-        ("--index INDEX", "which problem of a .jsonl file (default: 0)", natural, 0),
-        ("--robot NAME", "bundled name or URDF, with --scene"),
-        ("--ignore-joints", IGNORE_JOINTS),
-        ("--topic NAME", "topic to read if the bag or MCAP file has several"),
-        ("--all", "print all violations, not only the first"),
-        (
-            "--certificate FILE.json",
-            "write a proof that the motion is valid, for `robotdiffuse certificate check`",
-        ),
-    )
-
-
 def run_verify(arguments: Namespace) -> int:
-    from robotdiffuse.core.output_files import check_output
-    from robotdiffuse.scenes.scene import contact_notes
-
     out = None if arguments.certificate is None else check_output(arguments.certificate, (".json",))
     problem, motions, notes = _read(arguments)
     for note in (*problem.notes, *notes, *contact_notes(problem.scene)):
@@ -79,12 +42,8 @@ def run_verify(arguments: Namespace) -> int:
     return VALID if valid else NOT_VALID
 
 
-def _validated(
-    problem: "Problem", what: str, motion: "types.Path | types.Trajectory", everything: bool
-) -> bool:
+def _validated(problem: "Problem", what: str, motion: "Waypoints | Trajectory", everything: bool) -> bool:
     """Whether the motion is valid; prints its clearance, or its violations."""
-    from robotdiffuse.validation.validator import verify
-
     report = verify(problem, motion)
     if report.violation is None:
         jerk = "" if report.jerk_share is None else f"; {_jerk(report.jerk_share)}"
@@ -92,8 +51,6 @@ def _validated(
         return True
     shown_violations = (report.violation,)
     if everything:
-        from robotdiffuse.validation.validator import violations
-
         shown_violations = violations(problem, motion) or shown_violations
     for violation in shown_violations:
         print(f"{what}: not valid: {violation.line}")
@@ -107,11 +64,32 @@ def _jerk(share: float) -> str:
     return f"jerk at most {100 * share:.0f} % of the limits"
 
 
+def read_result(file: str) -> "tuple[PlanResult, Problem]":
+    """The result in a file, and its problem. Raises InputError if the file holds no problem."""
+    saved = load_result(file)
+    if saved.problem is None:
+        why = [f" ({note})" for note in saved.result.notes if note.startswith(NO_PROBLEM)]
+        raise InputError(
+            f"{file} holds no problem{''.join(why)}; write it with `robotdiffuse plan PROBLEM --out "
+            "FILE.json`, or with `save` of a result of rd.plan"
+        )
+    return saved.result, problem_from_record(saved.problem)
+
+
+def read_solved(file: str) -> "tuple[PlanResult, Problem]":
+    """The solved result in a file, and its problem. Raises InputError if the file holds no motion or
+    problem."""
+    result, problem = read_result(file)
+    if not result.solved:
+        raise InputError(f"{file} holds no motion: its status is {result.status.value} ({result.reason})")
+    return result, problem
+
+
 def _stored_problem(file: str) -> "Problem":
     """The problem stored in an .mcap file. Raises InputError if there is none."""
     problem = None
     if file.lower().endswith(".mcap"):
-        from robotdiffuse.interop.mcap_file import problem_in
+        from robotdiffuse.interop.ros2 import problem_in
 
         problem = problem_in(Path(file))
     if problem is None:
@@ -121,19 +99,12 @@ def _stored_problem(file: str) -> "Problem":
 
 def _read(
     arguments: Namespace,
-) -> "tuple[Problem, dict[str, types.Path | types.Trajectory], tuple[str, ...]]":
+) -> "tuple[Problem, dict[str, Waypoints | Trajectory], tuple[str, ...]]":
     """The problem, the motions to validate by name, and notes on changes made to read them."""
-    from robotdiffuse.core.types import Trajectory
-    from robotdiffuse.interop import read_motion
-    from robotdiffuse.interop.recorded_motion import motion_of_robot, problem_of_motion
-    from robotdiffuse.problems.files import load_problem
-
     if (arguments.scene is None) != (arguments.robot is None):
         raise InputError("--scene and --robot belong together: a planning scene does not name its robot")
     alone = arguments.problem is None and arguments.scene is None
     if alone and arguments.motion.lower().endswith(".json"):
-        from robotdiffuse.cli.view import read_solved
-
         result, problem = read_solved(arguments.motion)
         both = {"path": result.path, "trajectory": result.trajectory}
         return problem, {label: motion for label, motion in both.items() if motion is not None}, ()
@@ -144,9 +115,6 @@ def _read(
     elif arguments.problem is not None:
         problem = load_problem(arguments.problem, arguments.index, arguments.ignore_joints)
     else:
-        from robotdiffuse.problems.moveit import read_moveit_scene
-        from robotdiffuse.robots import load_robot
-
         robot = load_robot(arguments.robot)
         scene, more = read_moveit_scene(str(arguments.scene), robot, arguments.ignore_joints)
         problem = problem_of_motion(recorded, robot, scene)
@@ -164,28 +132,9 @@ MAX_CHANGES = 4
 """Differences from the bundled robot in a line at most."""
 
 
-def add_certificate(commands: Commands) -> None:
-    actions = group(
-        commands, "certificate", "re-check a certificate of a motion", "Re-check the certificate of a motion."
-    )
-    command(
-        actions,
-        "check",
-        "re-check a certificate, without search",
-        "Re-check a certificate with code that shares nothing with the validator. Exit status: "
-        "0 if it holds, 1 if not, 2 for bad input.",
-        run_check,
-        ("file FILE", "certificate of `robotdiffuse verify --certificate`"),
-        ("--problem FILE", "problem file to check it for (default: the problem in the certificate)"),
-    )
-
-
 def run_check(arguments: Namespace) -> int:
     from robotdiffuse.certificates.certificate import load_certificate
     from robotdiffuse.certificates.requirements import not_checked
-    from robotdiffuse.cli.console import clearances
-    from robotdiffuse.problems.files import load_problem, problem_from_record
-    from robotdiffuse.scenes.scene import contact_notes
 
     certificate = load_certificate(arguments.file)
     problem = None
@@ -210,8 +159,6 @@ def run_check(arguments: Namespace) -> int:
 def described(robot: "Robot") -> str:
     """The robot's name, its source, and whether it is the bundled one."""
     from robotdiffuse.certificates.proof import differences, robot_parts
-    from robotdiffuse.core.errors import joined
-    from robotdiffuse.robots import DATA, ROBOTS, load_robot
 
     name = robot.name if robot.source is None else f"{robot.name} from {robot.source}"
     if robot.name not in ROBOTS:

@@ -2,32 +2,35 @@
 
 import os
 import sys
+import webbrowser
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
 
 from robotdiffuse.cli.arguments import (
+    ENDINGS,
     NO_PLAN,
     SOLVED,
-    Commands,
     Namespace,
-    command,
-    not_negative,
 )
+from robotdiffuse.cli.verify import read_result, read_solved
 from robotdiffuse.core.errors import InputError
-
-if TYPE_CHECKING:
-    from robotdiffuse.core.results import PlanResult
-    from robotdiffuse.core.types import Path as PathOfJoints
-    from robotdiffuse.core.types import Trajectory
-    from robotdiffuse.problems.problem import Problem
-    from robotdiffuse.robots.robot import Robot
-    from robotdiffuse.scenes.scene import Scene
-    from robotdiffuse.simulation.replay import Replay
-
-ENDINGS = (".html", ".png")
+from robotdiffuse.core.input_files import read_json
+from robotdiffuse.core.output_files import check_output
+from robotdiffuse.core.results import PROBLEM_ENDINGS, PlanResult
+from robotdiffuse.core.tables import Column, Table, show
+from robotdiffuse.core.types import Path as PathOfJoints
+from robotdiffuse.core.types import Trajectory
+from robotdiffuse.planning.pipeline.unknown_space import policy_for, predicted_obstacles
+from robotdiffuse.problems.files import load_problem, problem_record
+from robotdiffuse.problems.problem import PREDICTED, Problem
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.visualization.picture import PictureSettings, write_comparison, write_picture
+from robotdiffuse.visualization.replay_page import GalleryEntry, write_gallery, write_problem, write_replay
 
 
 def draw(problem: "Problem", result: "PlanResult | None", file: Path) -> None:
@@ -37,14 +40,9 @@ def draw(problem: "Problem", result: "PlanResult | None", file: Path) -> None:
     For a problem with views and the policy `predicted`, the predicted obstacles are drawn too.
     """
     if result is None or result.path is None:
-        from robotdiffuse.visualization.replay_page import write_problem
-
         return write_problem(problem, file, result)
-    if file.suffix.lower() == ".html":
-        from robotdiffuse.visualization.replay_page import write_replay as write
-    else:
-        from robotdiffuse.visualization.picture import write_picture as write
     robot, scene = _shown(problem)
+    write = write_replay if file.suffix.lower() == ".html" else write_picture
     write(robot, scene, _motion(result), file, result=result, moving=problem.moving_in_world)
 
 
@@ -57,16 +55,12 @@ def draw_several(problem: "Problem", results: "Mapping[str, PlanResult]", file: 
     robot, scene = _shown(problem)
     motions = {name: _motion(result) for name, result in results.items()}
     if file.suffix.lower() == ".html":
-        from robotdiffuse.visualization.replay_page import GalleryEntry, write_gallery
-
         entries = [
             GalleryEntry(name, results[name].planner, scene, motion, problem.moving_in_world)
             for name, motion in motions.items()
         ]
         write_gallery(robot, entries, file, robot.name)
     else:
-        from robotdiffuse.visualization.picture import PictureSettings, write_comparison
-
         settings = PictureSettings(shell=shell)
         write_comparison(robot, scene, motions, file, settings=settings, moving=problem.moving_in_world)
 
@@ -79,89 +73,20 @@ def _motion(result: "PlanResult") -> "PathOfJoints | Trajectory":
 
 def _shown(problem: "Problem") -> "tuple[Robot, Scene]":
     """The robot and the scene of a problem, with predicted obstacles if there are any."""
-    if problem.views and _predicted(problem):
-        from robotdiffuse.planning.pipeline.unknown_space import predicted_obstacles
-        from robotdiffuse.scenes.scene import Scene
-
+    if problem.views and policy_for(problem)[0] == PREDICTED:
         seen = Scene([*problem.scene.shapes, predicted_obstacles(problem)])
         problem = replace(problem, scene=seen, views=())
     return problem.standing()
 
 
-def _predicted(problem: "Problem") -> bool:
-    """Whether the policy for unknown space is `predicted`."""
-    from robotdiffuse.planning.pipeline.unknown_space import policy_for
-
-    return policy_for(problem)[0] == "predicted"
-
-
-def show(file: Path) -> None:
+def open_in_browser(file: Path) -> None:
     """Open a file in the browser, if there is a display."""
-    import webbrowser
-
     if sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
         webbrowser.open(file.resolve().as_uri())
 
 
-def add_view(commands: Commands) -> None:
-    command(
-        commands,
-        "view",
-        "draw results and problems as a replay (.html) or a picture (.png)",
-        "Draw the motions of result files, of several in one picture; of a problem, or a "
-        "result without a motion, the start, the goal and the links that collide. Without --out, write a "
-        "page and open it in the browser.",
-        run_view,
-        (
-            "results RESULT",
-            "result file (.json) of `robotdiffuse plan --out`, or a problem file; several results must be "
-            "of one problem",
-            {"nargs": "+"},
-        ),
-        (
-            "--out FILE *",
-            "replay (.html) or picture (.png); repeatable (default: the name of RESULT with .html)",
-        ),
-        (
-            "--shell M",
-            "with several results: thickness of the safety shell that pictures show about the arm [m] "
-            "(default: 0, none)",
-            not_negative,
-            0.0,
-        ),
-    )
-
-
-def read_result(file: str) -> "tuple[PlanResult, Problem]":
-    """The result in a file, and its problem. Raises InputError if the file holds no problem."""
-    from robotdiffuse.core.results import NO_PROBLEM, load_result
-    from robotdiffuse.problems.files import problem_from_record
-
-    saved = load_result(file)
-    if saved.problem is None:
-        why = [f" ({note})" for note in saved.result.notes if note.startswith(NO_PROBLEM)]
-        raise InputError(
-            f"{file} holds no problem{''.join(why)}; write it with `robotdiffuse plan PROBLEM --out "
-            "FILE.json`, or with `save` of a result of rd.plan"
-        )
-    return saved.result, problem_from_record(saved.problem)
-
-
-def read_solved(file: str) -> "tuple[PlanResult, Problem]":
-    """The solved result in a file, and its problem. Raises InputError if the file holds no motion or
-    problem."""
-    result, problem = read_result(file)
-    if not result.solved:
-        raise InputError(f"{file} holds no motion: its status is {result.status.value} ({result.reason})")
-    return result, problem
-
-
 def _read(file: str) -> "tuple[PlanResult | None, Problem]":
     """The result in a file, and its problem; of a problem file, the problem alone."""
-    from robotdiffuse.core.input_files import read_json
-    from robotdiffuse.core.results import PROBLEM_ENDINGS
-    from robotdiffuse.problems.files import load_problem
-
     ending = Path(file).suffix.lower()
     record = read_json(file) if ending == ".json" else {}
     is_problem = isinstance(record, dict) and "scene" in record and "status" not in record
@@ -171,8 +96,6 @@ def _read(file: str) -> "tuple[PlanResult | None, Problem]":
 
 
 def run_view(arguments: Namespace) -> None:
-    from robotdiffuse.core.output_files import check_output
-
     files = arguments.out or [f"{Path(arguments.results[0]).stem}.html"]
     outputs = [check_output(file, ENDINGS) for file in files]
     if len(arguments.results) == 1:
@@ -185,13 +108,12 @@ def run_view(arguments: Namespace) -> None:
         write(file)
         print(f"wrote {file}")
     if not arguments.out:
-        show(outputs[0])
+        open_in_browser(outputs[0])
 
 
 def _read_several(files: list[str]) -> "tuple[Problem, dict[str, PlanResult]]":
     """The solved results in several files, by name, and the problem of the first. Raises InputError for other
     scenes and for equal names."""
-    from robotdiffuse.problems.files import problem_record
 
     names = [Path(file).stem for file in files]
     (result, problem), *further_results = map(read_solved, files)
@@ -206,33 +128,9 @@ def _read_several(files: list[str]) -> "tuple[Problem, dict[str, PlanResult]]":
     return problem, dict(zip(names, (result, *(one for one, _ in further_results)), strict=True))
 
 
-def add_simulate(commands: Commands) -> None:
-    command(
-        commands,
-        "simulate",
-        "replay a result in the PyBullet simulator",
-        "Replay the motion of a result file in PyBullet with position control, and print "
-        "tracking errors and contacts. Exit status: 0 no contacts, 1 contacts, 2 bad input.",
-        run_simulate,
-        ("result RESULT", "result file (.json) of `robotdiffuse plan --out`"),
-        ("--out FILE *", "replay (.html) or picture (.png) of the simulated motion; repeatable"),
-    )
-
-
 def run_simulate(arguments: Namespace) -> int:
-    import numpy as np
+    from robotdiffuse.simulation import replay
 
-    from robotdiffuse.core.output_files import check_output
-    from robotdiffuse.core.types import Trajectory
-
-    try:
-        from robotdiffuse.simulation import replay
-    except ModuleNotFoundError as error:
-        if error.name != "pybullet":
-            raise
-        raise InputError(
-            "simulate needs PyBullet, which has no wheels above Python 3.11: pip install 'robotdiffuse[sim]'"
-        ) from None
     outputs = [check_output(file, ENDINGS) for file in arguments.out]
     result, problem = read_solved(arguments.result)
     if result.trajectory is None:
@@ -241,50 +139,30 @@ def run_simulate(arguments: Namespace) -> int:
     executed = replay(robot, scene, result.trajectory, moving=problem.moving_in_world)
     for name in (one.name for one in problem.moving if not one.known):
         print(f"note: the motion of {name} is not known; it stands still here")
-    print_replay(problem.robot.name, result.trajectory.duration, executed)
+    rms = float((executed.tip_errors**2).mean() ** 0.5)
+    joints = zip(executed.joint_names, executed.max_errors, executed.rms_errors, strict=True)
+    rows = [
+        (f"error of {name}", f"{1e3 * most:.3f} mrad", f"{1e3 * mean:.3f} mrad")
+        for name, most, mean in joints
+    ]
+    rows.append(("error of the tip", f"{1e3 * executed.tip_errors.max():.3f} mm", f"{1e3 * rms:.3f} mm"))
+    verdict = "free" if executed.free else "contact"
+    title = f"{problem.robot.name}: {verdict}, {result.trajectory.duration:.2f} s"
+    show(Table.of(title, ("", "maximum", "RMS"), rows))
+    if not executed.free:
+        contacts = [
+            (
+                one.link,
+                one.other,
+                f"{one.time:.2f} s",
+                f"{1e3 * one.depth:.1f} mm" if one.depth > 0 else "none: closer than 2 mm",
+            )
+            for one in executed.contacts
+        ]
+        show(Table.of("", ("link", Column("touches", left=True), "at", "depth"), contacts))
     rates = np.gradient(executed.positions, executed.times, axis=0)
     motion = Trajectory(executed.joint_names, executed.times, executed.positions, rates, 0 * rates)
     for file in outputs:
         draw(problem, replace(result, trajectory=motion), file)
         print(f"wrote {file}")
     return SOLVED if executed.free else NO_PLAN
-
-
-def print_replay(robot: str, duration: float, done: "Replay") -> None:
-    """Print tracking errors and contacts."""
-    from robotdiffuse.core.tables import Column, Table, show
-
-    title = f"{robot}: {'free' if done.free else 'contact'}, {duration:.2f} s"
-    rms = float((done.tip_errors**2).mean() ** 0.5)
-    show(
-        Table.of(
-            title,
-            ("", "maximum", "RMS"),
-            [
-                *(
-                    (f"error of {name}", f"{1e3 * max_error:.3f} mrad", f"{1e3 * rms:.3f} mrad")
-                    for name, max_error, rms in zip(
-                        done.joint_names, done.max_errors, done.rms_errors, strict=True
-                    )
-                ),
-                ("error of the tip", f"{1e3 * done.tip_errors.max():.3f} mm", f"{1e3 * rms:.3f} mm"),
-            ],
-        )
-    )
-    if not done.free:
-        columns = ("link", Column("touches", left=True), "at", "depth")
-        show(
-            Table.of(
-                "",
-                columns,
-                [
-                    (
-                        contact.link,
-                        contact.other,
-                        f"{contact.time:.2f} s",
-                        f"{1e3 * contact.depth:.1f} mm" if contact.depth > 0 else "none: closer than 2 mm",
-                    )
-                    for contact in done.contacts
-                ],
-            )
-        )

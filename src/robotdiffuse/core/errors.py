@@ -58,9 +58,14 @@ def reading(file: object) -> Iterator[None]:
         raise InputError(f"{file} is damaged: {type(error).__name__}: {str(error)[:MAX_WORD]}") from None
 
 
-def missing_package(package: str, extra: str) -> InputError:
-    """An InputError for an extra that is not installed."""
-    return InputError(f'this needs {package}, not installed: pip install "robotdiffuse[{extra}]"')
+@contextmanager
+def needs(package: str, extra: str) -> Iterator[None]:
+    """Within the block, an ImportError becomes an InputError that names the extra to install."""
+    try:
+        yield
+    except ImportError:
+        text = f'this needs {package}, not installed: pip install "robotdiffuse[{extra}]"'
+        raise InputError(text) from None
 
 
 def check_type(what: str, value: object, kind: type | tuple[type, ...], wanted: str) -> None:

@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from functools import partial
-from math import pi
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -26,21 +25,11 @@ from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.robots.kinematic_tree import JointNormalizer
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
-from robotdiffuse.scenes.surface_points import VisibleRegion
 
-VIEWS = ("full", "partial")
 SHARDS_PER_BLOCK = 16
 """Shards that are shuffled together; 16 of 500 rows map 57 MB."""
 MAX_THREADS = 8
 """Most threads that prefetch batches."""
-CAMERA_CENTER = (0.0, 0.0, 0.4)
-"""Point that the cameras of partial views look at, in the base frame [m]."""
-CAMERA_DISTANCE = (1.5, 2.5)
-"""From the center [m]; a camera inside an obstacle does not see it."""
-CAMERA_ELEVATION = (0.1, 1.2)
-"""Above the horizontal [rad]."""
-ABOVE_FLOOR = VisibleRegion(floor=0.0, reach=10.0)
-"""Cameras see nothing below the plane that the robot stands on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +67,6 @@ class RopDataset(Dataset[dict[str, Tensor]]):
         split: str = "train",
         points: int = 1400,
         sort_points: bool = False,
-        view: str = "full",
         device: str | torch.device = "cpu",
         seed: int = 0,
         robot: Robot | None = None,
@@ -89,8 +77,6 @@ class RopDataset(Dataset[dict[str, Tensor]]):
         split: train, validation or test; no scene is in two of them.
         points: of each cloud.
         sort_points: whether points are sorted by x, then y, then z.
-        view: "full" for points all around the obstacles, "partial" for those that a camera at a random place
-            sees.
         seed: of clouds and order.
         robot: the robot that the data are used for.
         waypoints: resample to so many, evenly spaced along each path, in memory; None: the stored ones.
@@ -100,18 +86,15 @@ class RopDataset(Dataset[dict[str, Tensor]]):
         """
         if split not in SPLITS:
             raise unknown_name("split", split, SPLITS)
-        if view not in VIEWS:
-            raise unknown_name("view", view, VIEWS)
         if points < 1:
             raise InputError(f"points is {points}; it must be at least 1")
         if waypoints is not None and waypoints < 2:
             raise InputError(f"waypoints is {waypoints}; it must be at least 2")
-        self._arguments = (folder, split, points, sort_points, view, device, seed, robot, waypoints)
+        self._arguments = (folder, split, points, sort_points, device, seed, robot, waypoints)
         self.manifest = read_manifest(folder)
         self.waypoints = waypoints or self.manifest.waypoints
         self.points = points
         self.sort_points = sort_points
-        self.view = view
         self.device = torch.device(device)
         self.seed = seed
         self._generators: dict[int, torch.Generator] = {}
@@ -231,18 +214,5 @@ class RopDataset(Dataset[dict[str, Tensor]]):
         pose, kinds, params = (
             torch.from_numpy(a).to(self.device) for a in (self._poses[indices], scenes.kinds, scenes.params)
         )
-        seen = {}
-        if self.view == "partial":
-            seen = {"camera": _cameras(len(indices), generator), "region": ABOVE_FLOOR}
-        points = surface_clouds(scenes, self.points, generator, ordered=self.sort_points, **seen)
+        points = surface_clouds(scenes, self.points, generator, ordered=self.sort_points)
         return RopBatch(scaled, scaled[:, 0], scaled[:, -1], pose, kinds, params, points)
-
-
-def _cameras(n: int, generator: torch.Generator) -> Float32[Tensor, "n 3"]:
-    """Random positions of cameras [m]."""
-    a, b, c = torch.rand(3, n, generator=generator, device=generator.device)
-    turn = 2 * pi * a
-    up = CAMERA_ELEVATION[0] + (CAMERA_ELEVATION[1] - CAMERA_ELEVATION[0]) * b
-    far = CAMERA_DISTANCE[0] + (CAMERA_DISTANCE[1] - CAMERA_DISTANCE[0]) * c
-    place = torch.stack([up.cos() * turn.cos(), up.cos() * turn.sin(), up.sin()], -1) * far[:, None]
-    return place + place.new_tensor(CAMERA_CENTER)

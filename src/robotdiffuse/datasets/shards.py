@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Int, Int8
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, located, missing_package, reading, shown
+from robotdiffuse.core.errors import InputError, located, needs, reading, shown
 from robotdiffuse.core.input_files import file_name, input_file, read_json
 from robotdiffuse.core.output_files import write_atomically, write_error
 from robotdiffuse.core.settings import Count, Natural, Settings
@@ -239,10 +239,8 @@ def remove_leftovers(folder: str | FilePath) -> None:
 
 
 def _zarr() -> ModuleType:
-    try:
+    with needs("zarr", "data"):
         import zarr
-    except ImportError:
-        raise missing_package("zarr", "data") from None
     return zarr
 
 

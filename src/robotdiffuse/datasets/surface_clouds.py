@@ -14,10 +14,8 @@ from robotdiffuse.core.kernels import kernel
 from robotdiffuse.scenes.scene_arrays import NONE, SPHERE, PackedScenes
 from robotdiffuse.scenes.surface_points import VisibleRegion
 
-# Points sampled at most for each requested one, if some may be hidden or outside the region.
+# Points sampled at most for each requested one, if some may be outside the region.
 _OVERSAMPLING = 8
-# Relative depth inside a shape beyond which it hides a point, so that rounding errors do not count.
-_MARGIN = np.float32(1e-4)
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
 _TWO = np.float32(2.0)
@@ -35,7 +33,6 @@ def surface_clouds(
     generator: Generator,
     *,
     region: VisibleRegion | None = None,
-    camera: Float32[Tensor, "n 3"] | None = None,
     ordered: bool = False,
 ) -> Float32[Tensor, "n count 3"]:
     """`count` points on the obstacles of each scene [m], independent and uniform by area.
@@ -44,21 +41,17 @@ def surface_clouds(
     is all zeros.
 
     region: only points inside it.
-    camera: a position for each scene [m]; only points that are visible from it, on faces turned towards it
-        and neither behind nor inside another shape.
     ordered: sorted by x, then y, then z, for encoders that depend on the order.
     """
     clouds = torch.zeros(len(scenes), count, 3)
     if scenes.kinds.size and count:
         seeds = torch.randint(2**62, (len(scenes),), generator=generator, device=generator.device)
         bounds = () if region is None else (*region.center, region.reach, region.floor)
-        eyes = np.zeros((0, 3), np.float32) if camera is None else camera.cpu().numpy()
         fill_clouds(
             np.ascontiguousarray(scenes.kinds),
             np.ascontiguousarray(scenes.params),
             seeds.cpu().numpy().view(np.uint64),
             np.array(bounds, np.float32),
-            eyes,
             clouds.numpy(),
         )
         if ordered:
@@ -78,40 +71,33 @@ def _next(x):
 
 
 @kernel(nogil=True, error_model="numpy")
-def fill_clouds(kinds, params, seeds, region, eyes, out):
+def fill_clouds(kinds, params, seeds, region, out):
     """Writes points that are uniform by area over the shapes of each scene to out[n, count, 3].
 
     Scenes without shapes get zeros. kinds [n, k] and params [n, k, 10] as in `PackedScenes`; seeds uint64[n];
-    region: center, reach and floor, or empty; eyes [n, 3] or empty.
+    region: center, reach and floor, or empty.
     """
     n, k = kinds.shape
     count = out.shape[1]
     ends = np.empty(k, np.float32)
     faces = np.empty((k, 2), np.float32)
     axes = np.empty((k, 3, 3), np.float32)
-    # a point and the eye in the frames of the shapes, in units of their half sizes
-    into = np.empty((k, 3, 3), np.float32)
-    at = np.empty((k, 3), np.float32)
-    eye = np.empty((k, 3), np.float32)
     bounded = len(region) > 0
-    seen = len(eyes) > 0
     for i in range(n):
         total = _ZERO
         last = 0
         for j in range(k):
-            area = _prepare(kinds[i, j], params[i, j], faces[j], axes[j], into[j])
+            area = _prepare(kinds[i, j], params[i, j], faces[j], axes[j])
             if area > _ZERO and (not bounded or _may_intersect(region, params[i, j], axes[j])):
                 total += area
                 last = j
             ends[j] = total
-        if seen:
-            _localize(kinds[i], params[i], into, eyes[i], eye)
         x = seeds[i] | np.uint64(1)
         for _ in range(8):  # mixes seeds that differ in few bits
             x = _next(x)
         filled = 0
         draws = count
-        if bounded or seen:
+        if bounded:
             draws *= _OVERSAMPLING
         if total <= _ZERO:
             draws = 0
@@ -148,10 +134,6 @@ def fill_clouds(kinds, params, seeds, region, eyes, out):
                     )
             if bounded and not _inside(region, out[i, filled]):
                 continue
-            if seen:
-                _localize(kinds[i], params[i], into, out[i, filled], at)
-                if _hidden(kinds[i], j, at, eye):
-                    continue
             filled += 1
         for p in range(filled, count):
             for r in range(3):
@@ -159,9 +141,9 @@ def fill_clouds(kinds, params, seeds, region, eyes, out):
 
 
 @kernel(error_model="numpy")
-def _prepare(kind, row, faces, axes, into):
-    """Area of a shape [m^2]. Also writes its axes times sizes, the cumulative areas of a box's face pairs,
-    and the rotation into the shape's frame in units of half sizes."""
+def _prepare(kind, row, faces, axes):
+    """Area of a shape [m^2]. Also writes its axes times sizes, and the cumulative areas of a box's face
+    pairs."""
     if kind == NONE:
         return _ZERO
     if kind == SPHERE:
@@ -179,7 +161,6 @@ def _prepare(kind, row, faces, axes, into):
         write_rotation(row[6] / norm, row[7] / norm, row[8] / norm, row[9] / norm, axes)
     for i, size in enumerate((a, b, c)):
         for r in range(3):
-            into[i, r] = axes[r, i] * _TWO / size
             axes[r, i] *= size
     return area
 
@@ -202,58 +183,3 @@ def _inside(region, point):
     y = point[1] - region[1]
     z = point[2] - region[2]
     return point[2] > region[4] and x * x + y * y + z * z < region[3] * region[3]
-
-
-@kernel()
-def _localize(kinds, params, into, point, local):
-    """Write a point in the frames of all shapes."""
-    for j in range(len(kinds)):
-        if kinds[j] != NONE:
-            x = point[0] - params[j, 0]
-            y = point[1] - params[j, 1]
-            z = point[2] - params[j, 2]
-            for c in range(3):
-                local[j, c] = into[j, c, 0] * x + into[j, c, 1] * y + into[j, c, 2] * z
-
-
-@kernel(error_model="numpy")
-def _hidden(kinds, own, at, eye):
-    """Whether a point lies on the far side of its own shape, or another one lies between it and the eye or
-    around it."""
-    face = 0
-    for c in range(1, 3):
-        if abs(at[own, c]) > abs(at[own, face]):
-            face = c
-    towards = at[own, face] * (eye[own, face] - at[own, face])
-    if kinds[own] == SPHERE:
-        towards = _ZERO
-        for c in range(3):
-            towards += at[own, c] * (eye[own, c] - at[own, c])
-    if towards <= _ZERO:
-        return True
-    for j in range(len(kinds)):
-        if j == own or kinds[j] == NONE:
-            continue
-        if kinds[j] == SPHERE:
-            along = _ZERO
-            length_squared = _ZERO
-            start = _ZERO
-            for c in range(3):
-                way = eye[j, c] - at[j, c]
-                along += at[j, c] * way
-                length_squared += way * way
-                start += at[j, c] * at[j, c]
-            t = min(max(-along / length_squared, _ZERO), _ONE)
-            if start + t * (_TWO * along + t * length_squared) < _ONE - _MARGIN:
-                return True
-            continue
-        enter = _ZERO
-        leave = _ONE
-        for c in range(3):
-            inverse = _ONE / (eye[j, c] - at[j, c])
-            width = abs(inverse)
-            enter = max(enter, -at[j, c] * inverse - width)
-            leave = min(leave, width - at[j, c] * inverse)
-        if enter < leave - _MARGIN:
-            return True
-    return False

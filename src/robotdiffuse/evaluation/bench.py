@@ -23,7 +23,8 @@ from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.input_files import is_file
 from robotdiffuse.core.output_files import JsonLines, lock_folder
 from robotdiffuse.core.settings import Count, Filled, OneOf, Positive, Settings
-from robotdiffuse.evaluation.methods import measure_of, planner_calls
+from robotdiffuse.evaluation.methods import planner_calls
+from robotdiffuse.evaluation.metrics import measured
 from robotdiffuse.evaluation.problem_sets import gather_cases, problem_set_name
 from robotdiffuse.evaluation.report import processor, versions
 from robotdiffuse.evaluation.runs import (
@@ -221,7 +222,7 @@ def _warm_up(record: Fields) -> None:
     try:
         for result in _planner.warm_up(problem):
             if result.path is not None and result.trajectory is not None:
-                measure_of(problem.robot)(result.path, result.trajectory, result)
+                measured(problem.robot, result.path, result.trajectory, result)
     except (Exception, SystemExit):  # the timed call will report it
         traceback.print_exc()
 
@@ -383,8 +384,8 @@ class BenchSettings(Settings):
 
 
 Report = Callable[[str], None]
-Done = Callable[[str, int, int], None]
-"""Called with a planner, the number of its calls that are done, and that of all its calls."""
+Done = Callable[[int, int], None]
+"""Called with the number of calls that are done, and that of all."""
 
 
 def run_bench(settings: BenchSettings, report: Report, done: Done) -> int:
@@ -405,12 +406,11 @@ def run_bench(settings: BenchSettings, report: Report, done: Done) -> int:
         labels = [label + of for label in specs for of in ("", RESTARTED)[: 1 + settings.equal_time]]
         files = {label: RecordFile(record_path(settings.out, label)) for label in labels}
         todo = open_runs({label: file.records for label, file in files.items()}, cases, settings)
-        total = len(cases) * settings.seeds
-        for label in specs:
-            done(label, total - sum(run.method == label for run in todo), total)
+        total = len(cases) * settings.seeds * len(specs)
+        done(total - len(todo), total)
         make = on_this_machine if settings.cluster is None else on_cluster
         results = make(settings, todo, session)
-        return keep_records(todo, results, files, lambda label, left: done(label, total - left, total))
+        return keep_records(todo, results, files, lambda left: done(total - left, total))
 
 
 def open_runs(
@@ -544,33 +544,19 @@ PRESETS: dict[str, Preset] = {
 
 
 def preset_settings(
-    name: str,
-    out: FilePath,
-    problems: Sequence[str] = (),
-    count: int | None = None,
-    workers: int = 1,
-    cluster: str | None = None,
+    preset: str, out: FilePath, problems: Sequence[str] = (), count: int | None = None, **more: Any
 ) -> list[BenchSettings]:
-    """The settings of a preset for each of its time limits.
+    """The settings of a preset, by name, for each of its time limits.
 
     problems: sets beside those of the preset.
     count: most problems of each set; None: as the preset says.
+    more: further `BenchSettings`.
 
     Raises InputError for an unknown preset, listing the known.
     """
-    if name not in PRESETS:
-        raise unknown_name("preset", name, PRESETS)
-    preset = PRESETS[name]
-    return [
-        BenchSettings(
-            preset.planners,
-            (*preset.problems, *problems),
-            out,
-            time_limit=limit,
-            count=min(count or preset.count, preset.count),
-            workers=workers,
-            cluster=cluster,
-            equal_time=preset.equal_time,
-        )
-        for limit in preset.limits
-    ]
+    if preset not in PRESETS:
+        raise unknown_name("preset", preset, PRESETS)
+    of = PRESETS[preset]
+    fixed = {"count": min(count or of.count, of.count), "equal_time": of.equal_time}
+    sets = (*of.problems, *problems)
+    return [BenchSettings(of.planners, sets, out, time_limit=limit, **fixed, **more) for limit in of.limits]

@@ -20,10 +20,9 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import JsonLines
 from robotdiffuse.core.tables import Cell, Column, Figure, Table, plain
 from robotdiffuse.core.types import Status, Values
-from robotdiffuse.evaluation import plots
 from robotdiffuse.evaluation.metrics import METRICS, Metric
 from robotdiffuse.evaluation.problem_sets import read_cases
-from robotdiffuse.evaluation.report import Report, interval, share_cell
+from robotdiffuse.evaluation.report import Report, draw_plot, interval, share_cell
 from robotdiffuse.evaluation.runs import (
     CRASHED,
     ENDED_EARLY,
@@ -230,22 +229,16 @@ class Mean(NamedTuple):
 
 @dataclass(frozen=True)
 class Row:
-    """Figures of a planner at a time limit. Means are over the problems that it solved; NaN without any."""
+    """A planner at a time limit."""
 
     planner: str
-    success: float
-    success_interval: tuple[float, float]
-    """95 %, by E. B. Wilson's method over problems."""
-    collision: float
-    """Share of the problems whose last path was in collision."""
-    link_length: float
-    """The paper's path length [m]."""
-    first: float
-    """Median time to the first path [s]."""
-    returned: float
-    """Mean time until the planner returns [s], over all problems; the limit for an unsolved one."""
-    time: float
-    """Mean of the calls' own times [s]."""
+    outcomes: tuple[Outcome, ...]
+    """Of all problems and seeds of the table."""
+    figures: Indicators
+    """The paper's four indicators. The length is that of the solved problems, NaN without any; the time is
+    the mean until the planner returns, the limit for an unsolved problem."""
+    interval: tuple[float, float]
+    """The 95 % interval of the share of solved problems, by E. B. Wilson's method over problems."""
     comscore: float
     """Among the rows of this table."""
     paired: Paired | None
@@ -254,13 +247,24 @@ class Row:
     """Whether all solved calls used up the limit, with restarts or without."""
     timed: str
     """The sessions that made the calls, and the calls at a time in these."""
-    measures: dict[str, Mean]
-    """Measures of the returned motions, by the names of METRICS."""
-    memory: float
-    """Peak memory of the process [MB]."""
-    failures: Counter[str]
-    families: dict[str, tuple[float, tuple[float, float]]]
-    """Share of solved calls with its 95 % interval, by family."""
+
+    @property
+    def solved(self) -> list[Outcome]:
+        return [o for o in self.outcomes if o.solved]
+
+    @property
+    def success(self) -> Figure:
+        """The share of solved problems with its interval."""
+        return share_cell(self.figures.success / 100, self.interval)
+
+    @property
+    def failures(self) -> Counter[str]:
+        """Numbers of FAILURES."""
+        return Counter(o.failure for o in self.outcomes if not o.solved)
+
+    def mean(self, metric: Metric) -> Figure | None:
+        """The mean of a metric over the returned motions."""
+        return Mean.of(o.record.measures.get(metric.name) for o in self.solved).cell(metric)
 
 
 @dataclass(frozen=True)
@@ -287,7 +291,7 @@ class Comparison:
     @property
     def metrics(self) -> list[Metric]:
         """The metrics that some row has."""
-        return [m for m in METRICS.values() if any(row.measures[m.name].value < np.inf for row in self.rows)]
+        return [m for m in METRICS.values() if any(row.mean(m) is not None for row in self.rows)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -412,36 +416,18 @@ def _comparison(
     names = {name for name, _ in keys}
     rows = []
     for planner, of in outcomes.items():
-        records = [o.record for o in of]
-        solved = [o for o in of if o.solved]
         figures = _indicators(of)
-        by_family: dict[str, list[bool]] = {}
-        for o in of:
-            by_family.setdefault(o.record.family, []).append(o.solved)
-        timed = sorted({f"run {record.run or '?'}, {record.workers or '?'} at once" for record in records})
+        timed = {f"run {o.record.run or '?'}, {o.record.workers or '?'} at once" for o in of}
         row = Row(
-            planner=planner,
-            success=figures.success / 100,
+            planner,
+            tuple(of),
+            figures,
             # the seeds of one problem are not independent, so trials are problems
-            success_interval=wilson_interval(round(figures.success / 100 * len(names)), len(names)),
-            collision=figures.collision / 100,
-            link_length=figures.length,
-            first=float(np.median([o.found for o in solved])) if solved else np.nan,
-            returned=figures.time,
-            time=Mean.of(record.time for record in records).value,
-            comscore=scores.get(planner, np.nan),
-            paired=None
-            if planner == bench.reference or reference is None
-            else compare(lengths[planner], reference),
-            full=all(o.full(limit, length) for o, length in zip(of, shortest, strict=True) if o.solved),
-            timed=" or ".join(timed),
-            measures={name: Mean.of(o.record.measures.get(name) for o in solved) for name in METRICS},
-            memory=max((record.memory for record in records if record.memory is not None), default=np.nan),
-            failures=Counter(o.failure for o in of if not o.solved),
-            families={
-                family: (sum(calls) / len(calls), wilson_interval(sum(calls), len(calls)))
-                for family, calls in by_family.items()
-            },
+            wilson_interval(round(figures.success / 100 * len(names)), len(names)),
+            scores.get(planner, np.nan),
+            None if planner == bench.reference or reference is None else compare(lengths[planner], reference),
+            all(o.full(limit, length) for o, length in zip(of, shortest, strict=True) if o.solved),
+            " or ".join(sorted(timed)),
         )
         rows.append(row)
     loads = tuple(o.record.load for of in outcomes.values() for o in of if o.record.load is not None)
@@ -577,11 +563,14 @@ def tables(section: Section, comparison: Comparison, reference: str) -> list[Tab
     compared_rows = [row for row in comparison.rows if row.paired is not None]
     quality: Spec = (
         *map(_metric, comparison.metrics),
-        (Column("memory", "MB", ".0f", "less"), lambda row: row.memory),
+        (
+            Column("memory", "MB", ".0f", "less"),
+            lambda row: max((o.record.memory or 0.0 for o in row.outcomes), default=0.0) or None,
+        ),
     )
     families: Spec = [
-        (Column(family), lambda row, family=family: share_cell(*row.families[family]))
-        for family in comparison.rows[0].families
+        (Column(family), lambda row, family=family: _success_in(family, row))
+        for family in dict.fromkeys(o.record.family for o in comparison.rows[0].outcomes)
     ]
     pairs: Spec = (
         _of_pair("alone solves", lambda pair: pair.a_only),
@@ -606,16 +595,25 @@ def tables(section: Section, comparison: Comparison, reference: str) -> list[Tab
     return [table for table in all_tables if table.rows and len(table.columns) > 2]
 
 
+def _success_in(family: str, row: Row) -> Figure:
+    """The share of a family's calls that are solved."""
+    calls = [o.solved for o in row.outcomes if o.record.family == family]
+    return share_cell(sum(calls) / len(calls), wilson_interval(sum(calls), len(calls)))
+
+
 def main_table(section: Section, comparison: Comparison, reference: str) -> Table:
     """The paper's columns, with intervals and the ratio of lengths to those of the reference."""
     spec: Spec = (
-        (Column("success", "%", better="more"), lambda row: share_cell(row.success, row.success_interval)),
-        (Column("collision", "%", ".1f", "less", scale=100.0), lambda row: row.collision),
-        (Column("link length", "m", ".2f"), lambda row: row.link_length),
+        (Column("success", "%", better="more"), lambda row: row.success),
+        (Column("collision", "%", ".1f", "less"), lambda row: row.figures.collision),
+        (Column("link length", "m", ".2f"), lambda row: row.figures.length),
         _ratio(comparison, reference),
         _metric(METRICS["duration"]),
-        (Column("first", "s", better="less"), lambda row: seconds(row.first)),
-        (Column("returns", "s", better="less"), lambda row: seconds(row.returned)),
+        (
+            Column("first", "s", better="less"),
+            lambda row: seconds(float(np.median([o.found for o in row.solved] or np.nan))),
+        ),
+        (Column("returns", "s", better="less"), lambda row: seconds(row.figures.time)),
         (Column("ComScore", "", ".3f", "more"), lambda row: row.comscore),
         *(() if comparison.alike else ((Column("timed", left=True), lambda row: row.timed),)),
     )
@@ -656,7 +654,7 @@ def _ratio(comparison: Comparison, reference: str) -> tuple[Column, Callable[[Ro
 def _metric(metric: Metric) -> tuple[Column, Callable[[Row], Cell]]:
     """A column with the mean of a metric over the solved problems."""
     column = Column(metric.heading, metric.unit, better=metric.better)
-    return column, lambda row: row.measures[metric.name].cell(metric)
+    return column, lambda row: row.mean(metric)
 
 
 def _of_pair(heading: str, of: Callable[[Paired], Cell]) -> tuple[Column, Callable[[Row], Cell]]:
@@ -713,7 +711,7 @@ def _over_time(
         axes.minorticks_off()
         figure.legend(loc="outside right upper")
 
-    return plots.draw(fill, width=9.0)
+    return draw_plot(fill, width=9.0)
 
 
 # The report

@@ -38,7 +38,7 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.validator import Verifier, VerifySettings
 
 if TYPE_CHECKING:
-    from robotdiffuse.simulation.validator import OracleContact, PyBulletOracle
+    from robotdiffuse.simulation.validator import OracleContact
 
 KINDS: dict[str, str] = {
     "damaged": "shards damaged",
@@ -168,7 +168,7 @@ def check_data(
     robot = load_robot(manifest.robot) if robot is None else robot
     manifest.check_robot(robot)
     if pybullet:
-        _pybullet()
+        import robotdiffuse.simulation  # noqa: F401  (fails at once if PyBullet is not installed)
     indices = existing_shards(folder)
     task = _Task(str(folder), manifest, robot, pybullet)
     motions = min(manifest.trajectories, sys.maxsize if count is None else count)
@@ -205,19 +205,6 @@ def check_data(
     )
 
 
-def _pybullet() -> "type[PyBulletOracle]":
-    try:
-        from robotdiffuse.simulation.validator import PyBulletOracle
-    except ModuleNotFoundError as error:
-        if error.name != "pybullet":
-            raise
-        raise InputError(
-            "the second validator needs PyBullet, whose wheels stop at Python 3.11: pip install "
-            "'robotdiffuse[sim]'; `data check` can leave it out by --no-pybullet (pybullet=False)"
-        ) from None
-    return PyBulletOracle
-
-
 @dataclass(frozen=True, eq=False)
 class _Task:
     """The work of a process; it is pickled."""
@@ -248,7 +235,9 @@ class _Task:
         return sorted(findings, key=lambda finding: finding.row or 0), least_clearance
 
     def _pybullet_findings(self, shard: Shard, rows: Int[ndarray, "n"]) -> Iterator[Finding]:
-        with _pybullet()(self.robot, Scene([])) as oracle:
+        from robotdiffuse.simulation.validator import PyBulletOracle
+
+        with PyBulletOracle(self.robot, Scene([])) as oracle:
             for row in rows.tolist():
                 try:
                     oracle.set_scene(scenes_of(self.manifest, shard, slice(row, row + 1)).scene(0))
@@ -350,7 +339,8 @@ def confirm(out: FilePath, count: int | None, progress: Callable[[int, int], Non
 
     Raises InputError if the folder holds no records or is damaged, and without PyBullet.
     """
-    oracle = _pybullet()
+    from robotdiffuse.simulation.validator import PyBulletOracle
+
     records = [record for of in read_records(out).values() for record in of]
     solved: dict[tuple[str, str], list[Record]] = {}
     for record in records:
@@ -366,7 +356,7 @@ def confirm(out: FilePath, count: int | None, progress: Callable[[int, int], Non
     refuted: list[tuple[Record, OracleContact]] = []
     for number, case in enumerate(chosen, start=1):
         robot = case.problem.robot
-        with oracle(robot, case.problem.scene) as validator:
+        with PyBulletOracle(robot, case.problem.scene) as validator:
             for record in solved[case.key]:
                 contact = validator.check_path(Path(robot.joint_names, record.waypoints), CONFIRM_STEP)
                 checked[record.planner] += 1

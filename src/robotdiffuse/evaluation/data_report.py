@@ -22,8 +22,7 @@ from robotdiffuse.datasets.shards import (
     shard_path,
     split_of,
 )
-from robotdiffuse.evaluation import plots
-from robotdiffuse.evaluation.report import Report
+from robotdiffuse.evaluation.report import Histograms, Report, histograms
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 
@@ -232,12 +231,12 @@ def data_report(data: DataFigures, name: str) -> Report:
     report.plot(
         "motions.svg",
         f"Motions by family; the search keeps {distance} away from the ends. Detours: without trivial ones",
-        plots.histograms(_motions(data), 3),
+        histograms(_motions(data), 3),
     )
     caption = "Goals per problem, and the excess cost of the others over the best one"
-    report.plot("goals.svg", caption, plots.histograms(_goals(data), 2))
+    report.plot("goals.svg", caption, histograms(_goals(data), 2))
     q = data.sample["trajectories"]
-    joints: plots.Histograms = {
+    joints: Histograms = {
         f"{name} [rad]": (
             np.linspace(manifest.lower[j], manifest.upper[j], 41),
             {"all waypoints": q[..., j].reshape(-1), "start": q[:, 0, j], "goal": q[:, -1, j]},
@@ -245,16 +244,16 @@ def data_report(data: DataFigures, name: str) -> Report:
         for j, name in enumerate(manifest.joint_names)
     }
     caption = "Joint values between their limits"
-    report.plot("joints.svg", caption, plots.histograms(joints, min(4, manifest.dof)))
+    report.plot("joints.svg", caption, histograms(joints, min(4, manifest.dof)))
     versions = ", ".join(f"{name} {version}" for name, version in manifest.versions.items())
     note = "The last bar of a histogram holds all larger values."
     report.add(plain(f"Made with {versions}; robot {manifest.robot_fingerprint}. {note}"))
     return report
 
 
-def _motions(data: DataFigures) -> plots.Histograms:
+def _motions(data: DataFigures) -> Histograms:
     """The quantities by family; detours of motions whose straight line is not free."""
-    panels: plots.Histograms = {}
+    panels: Histograms = {}
     for name, column in QUANTITIES.items():
         low = float(name == "detour")
         chosen = ~(low * data.all["line_free"]).astype(bool)
@@ -265,7 +264,7 @@ def _motions(data: DataFigures) -> plots.Histograms:
     return panels
 
 
-def _goals(data: DataFigures) -> plots.Histograms:
+def _goals(data: DataFigures) -> Histograms:
     """The numbers of given and reached goals, and the excess cost of those that are not the best."""
     costs = data.sample["goal_costs"].astype(np.float64)
     numbers = {"given": (~np.isnan(costs)).sum(axis=1), "reached": np.isfinite(costs).sum(axis=1)}

@@ -10,7 +10,6 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, replace
-from functools import lru_cache
 from pathlib import Path as FilePath
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -23,7 +22,7 @@ from robotdiffuse.baselines.controls import Control, ControlSettings
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path, Status, Values
-from robotdiffuse.evaluation.metrics import Measure
+from robotdiffuse.evaluation.metrics import measured
 from robotdiffuse.evaluation.runs import (
     ENDED_EARLY,
     RAISED,
@@ -39,6 +38,7 @@ from robotdiffuse.planning.diffusion import Diffusion, DiffusionSettings, encode
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.held_out import goal_of
 from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.validation.report import Report
 from robotdiffuse.validation.validator import VerifySettings, verifier
 
@@ -48,9 +48,6 @@ if TYPE_CHECKING:
 NETWORK_ALONE = DiffusionSettings(sampling_steps=6, guidance_steps=4)
 """Settings of networks whose samples are measured."""
 UNSOLVED = Status.NO_PATH.value
-
-measure_of = lru_cache(maxsize=8)(Measure)
-"""The Measure of a robot; made once."""
 
 
 # Planners
@@ -75,15 +72,14 @@ def planner_calls(
 ) -> Iterator[Fields]:
     """Yield the fields of a call's record; with `restarts`, if the call ended early, also those of
     `restarted`. An exception is a record too."""
-    measure = measure_of(problem.robot)
     began = time.perf_counter()
     try:
         with Clock() as clock:
             result = planner.plan(problem, time_limit=limit, seed=seed, **request)
-        yield {"cpu": clock.fields["cpu"], **fields_of(result, measure)}
+        yield {"cpu": clock.fields["cpu"], **fields_of(result, problem.robot)}
         if restarts and result.status.value in RESTARTABLE and result.planning_time < ENDED_EARLY * limit:
             count, result = restarted(planner, problem, seed, limit, result, request)
-            yield {"restarts": count, **fields_of(result, measure)}
+            yield {"restarts": count, **fields_of(result, problem.robot)}
     except (Exception, SystemExit) as error:
         traceback.print_exc()
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
@@ -130,7 +126,7 @@ def _length(result: PlanResult) -> float:
     return np.inf if result.path_length is None else result.path_length
 
 
-def fields_of(result: PlanResult, measure: Measure) -> Fields:
+def fields_of(result: PlanResult, robot: Robot) -> Fields:
     """The fields of a result's record."""
     record: dict[str, Any] = {
         "status": result.status.value,
@@ -141,7 +137,7 @@ def fields_of(result: PlanResult, measure: Measure) -> Fields:
         "progress": [[round(at, 6), round(length, 6)] for at, length in result.progress],
     }
     if result.path is not None and result.trajectory is not None:
-        record |= measure(result.path, result.trajectory, result)
+        record |= measured(robot, result.path, result.trajectory, result)
         record["positions"] = np.round(result.path.positions, 9).tolist()
     return record
 
@@ -194,7 +190,7 @@ def sampled(draw: Draw, lengths: Callable[[ndarray], ndarray] = path_lengths) ->
         if verdict.passed.any():
             best = int(np.where(verdict.passed, lengths(verdict.waypoints), np.inf).argmin())
             path = Path(problem.robot.joint_names, verdict.waypoints[best])
-            measures = measure_of(problem.robot)(path, None, verdict.reports[best])
+            measures = measured(problem.robot, path, None, verdict.reports[best])
         yield {
             "status": SOLVED if measures else UNSOLVED,
             "passed": float(verdict.passed.mean()),

@@ -168,19 +168,13 @@ METRICS = {metric.name: metric for metric in _METRICS}
 """Metrics by name, in the order of tables."""
 
 
-class Measure:
-    """Measures motions of one robot by all METRICS."""
-
-    def __init__(self, robot: Robot) -> None:
-        self.robot = robot
-
-    def __call__(
-        self, path: Path, trajectory: Trajectory | None = None, verdict: Verdict | None = None
-    ) -> dict[str, float]:
-        """Values of the metrics that the motion has, by name; lengths are 0 for one that stands still."""
-        motion = Motion(self.robot, path, trajectory, verdict)
-        values = {name: metric.of(motion) for name, metric in METRICS.items()}
-        return {name: float(f"{x:.{DIGITS}g}") for name, x in values.items() if x is not None}
+def measured(
+    robot: Robot, path: Path, trajectory: Trajectory | None = None, verdict: Verdict | None = None
+) -> dict[str, float]:
+    """Values of the METRICS that a motion has, by name; lengths are 0 for one that stands still."""
+    motion = Motion(robot, path, trajectory, verdict)
+    values = {name: metric.of(motion) for name, metric in METRICS.items()}
+    return {name: float(f"{x:.{DIGITS}g}") for name, x in values.items() if x is not None}
 
 
 def bending(positions: Configurations) -> float:

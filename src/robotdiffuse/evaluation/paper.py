@@ -21,10 +21,10 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.tables import Column, Table, plain
 from robotdiffuse.core.types import Configurations, Path
-from robotdiffuse.evaluation import plots
 from robotdiffuse.evaluation.bench import BenchSettings, Done, run_bench
 from robotdiffuse.evaluation.bench_report import (
     Bench,
+    Mean,
     Section,
     about,
     crashes,
@@ -35,7 +35,7 @@ from robotdiffuse.evaluation.bench_report import (
 from robotdiffuse.evaluation.methods import NETWORK_ALONE, from_network, sampled, sampling_digest
 from robotdiffuse.evaluation.metrics import METRICS
 from robotdiffuse.evaluation.problem_sets import hard_cases, read_cases, validator
-from robotdiffuse.evaluation.report import Report, share_cell
+from robotdiffuse.evaluation.report import Report, draw_plot, share_cell
 from robotdiffuse.evaluation.runs import Record, run_all
 from robotdiffuse.evaluation.statistics import Indicators, bootstrap_interval, comscores, wilson_interval
 from robotdiffuse.learning.diffusion import SAMPLERS
@@ -400,7 +400,7 @@ def _table(section: Section, rows: dict[str, Row]) -> Table:
     comparison = section.main
     title = f"Goal: {GOALS[section.problem_set]}; {comparison.problems} problems that are not trivial"
     indicators = {
-        rows[of.planner].name: Indicators(100 * of.success, 100 * of.collision, of.link_length, of.time)
+        rows[of.planner].name: replace(of.figures, time=Mean.of(o.record.time for o in of.outcomes).value)
         for of in comparison.rows
     }
     comscore = scores(tuple(rows.values()), indicators)
@@ -409,13 +409,14 @@ def _table(section: Section, rows: dict[str, Row]) -> Table:
     table = []
     for of in comparison.rows:
         row = rows[of.planner]
-        collisions = wilson_interval(round(of.collision * comparison.problems), comparison.problems)
+        collision = of.figures.collision / 100
+        collisions = wilson_interval(round(collision * comparison.problems), comparison.problems)
         cells = (
             row.name,
-            share_cell(of.success, of.success_interval),
-            share_cell(of.collision, collisions),
-            *(of.measures[name].cell(METRICS[name]) for name in MEASURES),
-            of.time,
+            of.success,
+            share_cell(collision, collisions),
+            *(of.mean(METRICS[name]) for name in MEASURES),
+            indicators[row.name].time,
             comscore[row.name],
         )
         table.append([*cells, *(printed.get(row.paper, (None,) * 5) if printed_beside else ())])
@@ -540,7 +541,7 @@ def plot_success_by_steps(records: dict[str, dict[int, list[Record]]]) -> str:
         axes.set(xscale="log", xlabel="denoising steps T", ylabel="single samples that pass the validator")
         axes.legend()
 
-    return plots.draw(fill)
+    return draw_plot(fill)
 
 
 def plot_success_over_time(bench: Bench) -> str:

@@ -7,7 +7,6 @@ or in the processes of a bench. Runs whose records are kept are not made again.
 
 import os
 import time
-from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, fields
@@ -244,8 +243,6 @@ Method = Callable[[Run], Iterable[Fields]]
 """Yields the fields of one record, or of several if one call answers for several time limits."""
 Results = Generator[tuple[Run, list[Record]], None, None]
 """Runs with their records, in the order in which they end."""
-OnProgress = Callable[[str, int], None]
-"""Called with a method and the number of its runs that are left."""
 
 
 class Clock:
@@ -287,17 +284,20 @@ def keep_records(
     runs: Sequence[Run],
     results: Results,
     files: Mapping[str, RecordFile],
-    on_progress: OnProgress = lambda method, left: None,
+    on_progress: Callable[[int], None] = lambda left: None,
 ) -> int:
-    """Keep the records of runs as they come; returns the number of runs made."""
-    remaining = Counter(run.method for run in runs)
+    """Keep the records of runs as they come; returns the number of runs made.
+
+    on_progress: called with the number of runs that are left.
+    """
+    left = len(runs)
     with closing(results):  # Ctrl-C ends the processes of runs too
-        for run, records in results:
+        for _, records in results:
             for record in records:
                 files[record.planner].append(record)
-            remaining[run.method] -= 1
-            on_progress(run.method, remaining[run.method])
-    return len(runs) - remaining.total()
+            left -= 1
+            on_progress(left)
+    return len(runs) - left
 
 
 def in_this_process(methods: Mapping[str, Method], runs: Sequence[Run]) -> Results:
@@ -328,7 +328,7 @@ def run_all(
     todo = [run for run in runs if (run.method, run.key) not in recorded]
     with Progress(transient=True, console=Console(stderr=True), disable=not bar) as progress:
         task = progress.add_task(title, total=len(runs), completed=len(runs) - len(todo))
-        keep_records(todo, in_this_process(methods, todo), files, lambda *_: progress.advance(task))
+        keep_records(todo, in_this_process(methods, todo), files, lambda _: progress.advance(task))
     order = {run.key: i for i, run in enumerate(runs)}
     return {
         name: sorted((r for r in file.records if r.key in order), key=lambda record: order[record.key])

@@ -1,4 +1,4 @@
-"""Import and export of motions: ROS 2, MCAP and Foxglove, Rerun, rosbridge; a module for each format."""
+"""Import and export of motions: ROS 2, MCAP and Foxglove, Rerun, rosbridge."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -18,8 +18,8 @@ BAG = ".rosbag2"
 WRITERS = Registry(
     "motion format to write",
     {
-        ".mcap": Entry("robotdiffuse.interop.mcap_file:write", "a Foxglove scene, and ROS 2 messages"),
-        ".rosbag2": Entry("robotdiffuse.interop.rosbag:write", "a ROS 2 bag (a folder)"),
+        ".mcap": Entry("robotdiffuse.interop.ros2:write_mcap", "a Foxglove scene, and ROS 2 messages"),
+        ".rosbag2": Entry("robotdiffuse.interop.ros2:write_bag", "a ROS 2 bag (a folder)"),
         ".rrd": Entry("robotdiffuse.interop.rerun_file:write", "a Rerun recording"),
         ".yaml": Entry("robotdiffuse.interop.recorded_motion:write_yaml", "a ROS 2 JointTrajectory"),
     },
@@ -38,8 +38,8 @@ READERS = Registry(
             "robotdiffuse.interop.recorded_motion:read_yaml", "ROS JointTrajectory, MoveIt RobotTrajectory"
         ),
         ".yml": Entry("robotdiffuse.interop.recorded_motion:read_yaml", "the same"),
-        ".mcap": Entry("robotdiffuse.interop.mcap_file:read", "ROS 2 messages"),
-        ".rosbag2": Entry("robotdiffuse.interop.rosbag:read", "a ROS 2 bag (a folder)"),
+        ".mcap": Entry("robotdiffuse.interop.ros2:read_mcap", "ROS 2 messages"),
+        ".rosbag2": Entry("robotdiffuse.interop.ros2:read_bag", "a ROS 2 bag (a folder)"),
     },
 )
 """Functions of a file and an optional topic, by the ending of the file."""

@@ -24,8 +24,16 @@ from robotdiffuse.core.input_files import input_file
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
 from robotdiffuse.core.types import Configuration, JointValues, Pose
-from robotdiffuse.interop.mcap_file import McapWriter, check_chunks, make_reader, messages_in, topics_in
-from robotdiffuse.interop.ros_messages import JOINT_STATE, header_seconds, to_plain
+from robotdiffuse.interop.ros2 import (
+    JOINT_STATE,
+    McapWriter,
+    check_chunks,
+    header_seconds,
+    make_reader,
+    messages_in,
+    to_plain,
+    topics_in,
+)
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.robots.robot import Robot
 
@@ -241,12 +249,17 @@ def insert_by_time(history: list[Stamped], stamped: Stamped) -> None:
     insort(history, stamped, key=itemgetter(0))
 
 
-def neighbors(history: list[Stamped], stamp: float, gap: float) -> list[Stamped]:
-    """The entries on both sides of a time, without those more than `gap` from it [s]; one at the very time
-    counts alone."""
+def around(history: list[Stamped], stamp: float, gap: float) -> tuple[Any, Any, float] | None:
+    """The entries before and after a time, or the same one twice, and which share of the way from the first
+    to the second the time is; None if none is within `gap` of it [s]."""
     i = bisect_left(history, stamp, key=itemgetter(0))
     near = [history[k] for k in (i - 1, i) if 0 <= k < len(history) and abs(history[k][0] - stamp) <= gap]
-    return near[-1:] if near and near[-1][0] <= stamp else near
+    if not near:
+        return None
+    (t0, first), (t1, last) = near[0], near[-1]
+    if t1 <= stamp or len(near) == 1:
+        return last, last, 0.0
+    return first, last, (stamp - t0) / (t1 - t0)
 
 
 class TransformHistory:
@@ -299,13 +312,10 @@ class TransformHistory:
         poses = self._poses[frame]
         if frame in self._static:
             return poses[-1][1]
-        near = neighbors(poses, stamp, gap)
-        if not near:
+        near = around(poses, stamp, gap)
+        if near is None:
             raise InputError(f"there is no transform of {frame} within {gap:g} s of {where}")
-        if len(near) == 1:
-            return near[0][1]
-        (t0, first), (t1, last) = near
-        share = (stamp - t0) / (t1 - t0)
+        first, last, share = near
         turn = Slerp([0, 1], Rotation.from_matrix([first[:3, :3], last[:3, :3]]))(share).as_matrix()
         return transform((1 - share) * first[:3, 3] + share * last[:3, 3], turn)
 
@@ -325,12 +335,10 @@ class _States:
 
     def at(self, stamp: float, where: str) -> Configuration:
         """The configuration at a time. Raises InputError, naming `where`, if none is near."""
-        near = neighbors(self._states, stamp, MAX_GAP)
-        if not near:
+        near = around(self._states, stamp, MAX_GAP)
+        if near is None:
             names = ", ".join(self._robot.joint_names)
             raise InputError(f"there is no joint state of {names} within {MAX_GAP:g} s of {where}")
-        (t0, first), (t1, last) = near[0], near[-1]
-        if len(near) == 1:
-            return first
+        first, last, share = near
         change = last - first
-        return first + (stamp - t0) / (t1 - t0) * (change - self._robot.whole_turns(change))
+        return first + share * (change - self._robot.whole_turns(change))

@@ -15,7 +15,7 @@ import yaml
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, joined, missing_package, reading, shown
+from robotdiffuse.core.errors import InputError, joined, needs, reading, shown
 from robotdiffuse.core.input_files import MAX_YAML_SIZE, parse_yaml, read_json, read_text
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.types import (
@@ -380,10 +380,8 @@ def publish(
     Whether a subscriber received it is not known: ROS does not confirm deliveries. Raises InputError if no
     rosbridge answers within `timeout` [s].
     """
-    try:
+    with needs("roslibpy", "ros"):
         import roslibpy
-    except ImportError:
-        raise missing_package("roslibpy", "ros") from None
     ros = roslibpy.Ros(host, port)
     try:
         ros.run(timeout=timeout)  # type: ignore[arg-type]

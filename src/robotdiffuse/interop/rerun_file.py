@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from robotdiffuse.core.errors import missing_package
+from robotdiffuse.core.errors import needs
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.core.types import Pose, Trajectory
@@ -14,10 +14,8 @@ from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.kinematics import link_poses
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
 
-try:
+with needs("rerun-sdk", "rerun"):
     import rerun as rr
-except ImportError:
-    raise missing_package("rerun-sdk", "rerun") from None
 
 TIMELINE = "time"
 FPS = 60.0

@@ -3,21 +3,15 @@
 import asyncio
 import secrets
 import time
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
-from html import escape
-from importlib.util import find_spec
 from ipaddress import ip_address
-from math import ceil
-from pathlib import Path
 from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
 
 from fastapi import FastAPI, Header, Request, Response
 from fastapi.openapi.constants import REF_TEMPLATE
-from fastapi.openapi.docs import get_swagger_ui_html
-from fastapi.responses import HTMLResponse, JSONResponse, PlainTextResponse
-from fastapi.staticfiles import StaticFiles
+from fastapi.responses import JSONResponse, PlainTextResponse
 from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import BaseModel, ConfigDict, Field
 from pydantic.json_schema import models_json_schema
@@ -33,7 +27,7 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.server.connection import REFUSED, log_access
 from robotdiffuse.server.settings import MAX_ARRIVING, ServeSettings
 from robotdiffuse.server.worker import PLAN, VERIFY, Answer, failed
-from robotdiffuse.server.worker_pool import QueueFullError, WorkerPool
+from robotdiffuse.server.worker_pool import RequestError, WorkerPool
 
 PROBLEM: dict[str, Any] = {
     "robot": "panda",
@@ -220,21 +214,8 @@ ERRORS = {
     500: "the worker failed on this request",
     503: "the server is stopping, or the request took too long",
 }
-NO_SCRIPTS = (
-    "This page becomes interactive with the scripts of Swagger UI, which the browser loads from "
-    "cdn.jsdelivr.net, or from this server if it has them: pip install fastapi-offline\n\n"
-)
 REQUEST_ERRORS = (400, 401, 408, 409, 413, 415, 421, 429, 500, 503)
 RequestID = Annotated[str, Header(alias=REQUEST_ID, description="names the request, to cancel it")]
-
-
-class RequestError(Exception):
-    """A request that is answered with an error before any worker sees it."""
-
-    def __init__(self, code: int, message: str, **headers: str) -> None:
-        super().__init__(message)
-        self.code = code
-        self.headers = headers
 
 
 class AccessLog:
@@ -284,9 +265,8 @@ class AccessControl:
         authorization = request.headers.get("authorization", "")
         token = self.settings.token
         if token and not secrets.compare_digest(authorization.encode(), f"Bearer {token}".encode()):
-            return _error(
-                401, "the header Authorization must be: Bearer TOKEN", **{"WWW-Authenticate": "Bearer"}
-            )
+            text = "the header Authorization must be: Bearer TOKEN"
+            return _error(401, text, {"WWW-Authenticate": "Bearer"})
         return None
 
 
@@ -305,19 +285,16 @@ def make_app(pool: WorkerPool, robots: dict[str, Robot]) -> FastAPI:
         title="RobotDiffuse",
         version=__version__,
         description=ABOUT,
-        docs_url=None,  # see `_add_docs`
         redoc_url=None,
         redirect_slashes=False,
     )
     app.add_middleware(AccessControl, settings=pool.settings)
     app.add_middleware(AccessLog)
     app.exception_handler(RequestError)(_request_error)
-    app.exception_handler(QueueFullError)(_queue_full)
     app.exception_handler(HTTPException)(_http_error)
     app.exception_handler(Exception)(_unexpected)
     _add_requests(app, pool, pool.settings)
     _add_lists(app, pool, robots)
-    _add_docs(app)
     _describe_bodies(app)
     return app
 
@@ -452,33 +429,9 @@ def _add_lists(app: FastAPI, pool: WorkerPool, robots: dict[str, Robot]) -> None
     async def metrics() -> Response:
         return Response(pool.metrics.text(), media_type=CONTENT_TYPE_LATEST)
 
-
-def _add_docs(app: FastAPI) -> None:
-    """A plain list of endpoints, and FastAPI's interactive page, whose scripts are those of the package
-    fastapi-offline if it is installed; else the browser loads them from the internet."""
-    urls: dict[str, Any] = {}
-    offline = find_spec("fastapi_offline")
-    if offline is not None and offline.origin is not None:
-        folder = Path(offline.origin).with_name("static")
-        app.mount("/docs/scripts", StaticFiles(directory=folder))
-        urls = {
-            "swagger_js_url": "/docs/scripts/swagger-ui-bundle.js",
-            "swagger_css_url": "/docs/scripts/swagger-ui.css",
-            "swagger_favicon_url": "/docs/scripts/favicon.png",
-        }
-    page = bytes(get_swagger_ui_html(openapi_url="/openapi.json", title=app.title, **urls).body).decode()
-    empty = '<div id="swagger-ui">'
-    assert empty in page
-
     @app.get("/", include_in_schema=False)
     async def plain() -> Response:
         return PlainTextResponse(endpoint_list(app))
-
-    @app.get("/docs", include_in_schema=False)
-    async def docs() -> Response:
-        return HTMLResponse(
-            page.replace(empty, f"{empty}<pre>{escape(NO_SCRIPTS + endpoint_list(app))}</pre>")
-        )
 
 
 def endpoint_list(app: FastAPI) -> str:
@@ -526,9 +479,7 @@ async def read_body(request: Request, pool: WorkerPool, kind: str) -> bytes:
     content_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if content_type != kind:
         raise RequestError(415, f"Content-Type is {shown(content_type)}; it must be {kind}")
-    too_large = RequestError(
-        413, f"the request is too large: it may have {max_size} bytes", Connection="close"
-    )
+    too_large = RequestError(413, f"the request is too large: it may have {max_size} bytes", CLOSE)
     length = request.headers.get("content-length", "0")
     if not length.isdecimal() or int(length) > max_size:
         raise too_large
@@ -540,7 +491,7 @@ async def read_body(request: Request, pool: WorkerPool, kind: str) -> bytes:
             if len(body) > max_size:
                 raise too_large
             if pool.arriving > MAX_ARRIVING * max_size:
-                raise RequestError(429, "too many requests are arriving", Connection="close")
+                raise RequestError(429, "too many requests are arriving", CLOSE)
     except ClientDisconnect:
         raise RequestError(CLIENT_GONE, "the client closed the connection") from None
     finally:
@@ -564,34 +515,29 @@ def robot_info(name: str, robot: Robot) -> RobotInfo:
     return RobotInfo(name=name, base=robot.base, tip=robot.tip, joints=joints, links=list(robot.link_names))
 
 
-def _error(code: int, message: str, **headers: str) -> Response:
+def _error(code: int, message: str, headers: Mapping[str, str] | None = None) -> Response:
     answer = failed(code, message)
-    return Response(answer.body, code, headers, JSON)
+    return Response(answer.body, code, headers and {**headers}, JSON)
 
 
 def _request_error(_: Request, error: Exception) -> Response:
     assert isinstance(error, RequestError)
-    return _error(error.code, str(error), **error.headers)
+    return _error(error.code, str(error), error.headers)
 
 
 def _unexpected(_: Request, error: Exception) -> Response:
     return _error(500, f"{type(error).__name__}: {error}")
 
 
-def _queue_full(_: Request, error: Exception) -> Response:
-    assert isinstance(error, QueueFullError)
-    seconds = ceil(error.seconds)
-    return _error(429, f"the queue is full; try again in {seconds} s", **{"Retry-After": str(seconds)})
-
-
 def _http_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     if error.status_code == 404:
         return _error(404, f"there is no {shown(request.url.path)}; see /docs")
-    return _error(error.status_code, str(error.detail), **(error.headers or {}))
+    return _error(error.status_code, str(error.detail), error.headers)
 
 
 LINES = "application/x-ndjson"
+CLOSE = {"Connection": "close"}
 CLIENT_GONE = 499
 """Status code of a request whose client closed the connection; nobody reads it."""
 

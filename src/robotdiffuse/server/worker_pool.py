@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import replace
+from math import ceil
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
@@ -27,12 +28,13 @@ GAUGES = {
 }
 
 
-class QueueFullError(Exception):
-    """The queue is full; try again in about `seconds`."""
+class RequestError(Exception):
+    """A request that is answered with an error before any worker sees it."""
 
-    def __init__(self, seconds: float) -> None:
-        super().__init__(f"{seconds:g} s")
-        self.seconds = seconds
+    def __init__(self, code: int, message: str, headers: dict[str, str] | None = None) -> None:
+        super().__init__(message)
+        self.code = code
+        self.headers = headers
 
 
 class StoppingError(Exception):
@@ -69,12 +71,14 @@ class WorkerPool:
 
     @contextmanager
     def admit(self, count: int) -> Iterator[None]:
-        """Count `count` requests as admitted within the block. Raises QueueFullError if the queue lacks
+        """Count `count` requests as admitted within the block. Raises RequestError if the queue lacks
         room."""
         capacity = self.settings.workers + self.settings.queue
         if self.admitted + count > capacity:
             waiting = self.admitted / self.settings.workers
-            raise QueueFullError(max(1.0, waiting * self._request_seconds))
+            seconds = str(ceil(max(1.0, waiting * self._request_seconds)))
+            message = f"the queue is full; try again in {seconds} s"
+            raise RequestError(429, message, {"Retry-After": seconds})
         self.admitted += count
         try:
             yield

@@ -1,9 +1,10 @@
-"""PyBullet simulation (extra `sim`): an independent collision oracle, depth cameras, and replay of
-motions."""
+"""PyBullet simulation (extra `sim`): an independent collision oracle, and replay of motions."""
 
 import os
 import tempfile
 from contextlib import suppress
+
+from robotdiffuse.core.errors import needs
 
 # how the line begins that PyBullet prints as it is imported
 BUILD_TIME = b"pybullet build time"
@@ -20,7 +21,8 @@ def _import_pybullet() -> None:
     try:
         for stream, file in printed.items():
             os.dup2(file.fileno(), stream)
-        import pybullet  # noqa: F401
+        with needs("PyBullet, whose wheels stop at Python 3.11", "sim"):
+            import pybullet  # noqa: F401
     finally:
         for stream, file in printed.items():
             os.dup2(saved[stream], stream)
@@ -34,24 +36,6 @@ _import_pybullet()
 
 from robotdiffuse.simulation.replay import Replay, ReplayContact, ReplaySettings, replay  # noqa: E402
 from robotdiffuse.simulation.validator import OracleContact, PyBulletOracle  # noqa: E402
-from robotdiffuse.simulation.world import (  # noqa: E402
-    DepthCamera,
-    DepthImage,
-    World,
-    point_cloud,
-    render,
-)
+from robotdiffuse.simulation.world import World  # noqa: E402
 
-__all__ = [
-    "DepthCamera",
-    "DepthImage",
-    "OracleContact",
-    "PyBulletOracle",
-    "Replay",
-    "ReplayContact",
-    "ReplaySettings",
-    "World",
-    "point_cloud",
-    "render",
-    "replay",
-]
+__all__ = ["OracleContact", "PyBulletOracle", "Replay", "ReplayContact", "ReplaySettings", "World", "replay"]

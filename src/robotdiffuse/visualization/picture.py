@@ -21,7 +21,7 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.visualization.arm import TRACE_POINTS, DrawnArm, dense, facts
-from robotdiffuse.visualization.rasterizer import blend_ghost, draw, light_lattice, shade
+from robotdiffuse.visualization.rasterizer import blend_ghost, draw, shade
 
 AZIMUTHS = 18
 ELEVATIONS = np.radians((15.0, 25.0))
@@ -182,8 +182,6 @@ SKY_MAP = 320
 # Number of lights of the sky and of the main light, and edge length of the shadow map of each [pixels].
 KEY_LIGHTS = 28
 KEY_MAP = 768
-LIGHT_SPACING = 4
-"""Light is computed at every fourth pixel of the supersampled image."""
 KEY_DIRECTION = np.array([0.35, -0.45, 0.82])
 """Direction towards the main light, in a frame whose x axis points from the scene to the camera."""
 KEY_SPREAD = 0.075
@@ -192,8 +190,6 @@ TUBE_SIDES = 10
 """Corners of the cross-section of the trace."""
 TUBE_RADIUS = 0.006
 """Radius of the trace [m]."""
-GROUND_RADIUS = 3.2
-"""Radius of the visible ground [m]."""
 CAPTION_COLOR = (0xF2, 0xF4, 0xF6)
 """Color to which the picture fades behind the caption."""
 COMPARED = ((0xE3, 0xA8, 0x12), (0xCF, 0x33, 0x3B), (0x2F, 0x6F, 0xD0), (0x8B, 0x55, 0xB8))
@@ -392,15 +388,11 @@ def _paint(camera: Camera, solid: Surface, clear: Sequence[ClearSurface]) -> Flo
     image = np.zeros((*near.shape, 3), np.float32)
     view = (camera.eye, camera.rays())
     height = min(0.0, float(solid.vertices[:, 2].min(initial=0.0)))
-    ground = (height - 1e-4, GROUND_RADIUS, linear((0xE9, 0xEB, 0xEE)), linear((0xC3, 0xC9, 0xD1)))
-    background = (linear((0xF7, 0xF8, 0xFA)), linear((0xE6, 0xE9, 0xED)))
     toward = _key_direction(camera)
     sky = _light_maps(solid, _hemisphere(SKY_LIGHTS), SKY_MAP)
     key = _light_maps(solid, _cone(toward, KEY_LIGHTS), KEY_MAP)
-    light = (np.array([0.72, 0.70, 0.66]), np.array([0.80, 0.82, 0.86]), np.array([0.16, 0.15, 0.14]))
     seen = (ident, screen, solid.faces, solid.normals, _linear_array(solid.colors))
-    lattice = light_lattice(LIGHT_SPACING, near, seen, view, ground[0], sky, key)
-    shade(image, lattice, LIGHT_SPACING, near, seen, view, ground, background, sky, key, light)
+    shade(image, near, seen, view, height - 1e-4, sky, key)
     for one in clear:
         nearness, *shown = drawn_by(camera, one.surface)
         arrays = one.surface.faces, one.surface.normals, _linear_array(one.surface.colors)
@@ -462,7 +454,7 @@ def _light_maps(solid: Surface, toward: Points, size: int) -> tuple:
             [scale * x + 0.5 * size, scale * y + 0.5 * size, z + 100.0], axis=1, dtype=np.float32
         )
         draw(maps[k], ident, screen, solid.faces)
-    return maps, axes, scale, center, size, 2.0 / scale
+    return maps, axes, scale, center
 
 
 def tube(points: Points, first: Color, last: Color) -> Surface:

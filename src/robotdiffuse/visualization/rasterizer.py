@@ -5,6 +5,16 @@ import numpy as np
 
 from robotdiffuse.core.kernels import kernel
 
+GROUND_RADIUS = 3.2
+"""Radius of the visible ground [m]."""
+# Linear colors: of the ground and its lines, of the background at the top and the bottom, and of the lights.
+GROUND = 0.8148, 0.8308, 0.8550
+GROUND_LINES = 0.5457, 0.5841, 0.6376
+BACKGROUND = (0.9301, 0.9387, 0.9560), (0.7913, 0.8148, 0.8469)
+KEY_COLOR = 0.72, 0.70, 0.66
+SKY_COLOR = 0.80, 0.82, 0.86
+BOUNCE_COLOR = 0.16, 0.15, 0.14
+
 
 @kernel()
 def _row(rows, i):
@@ -55,17 +65,19 @@ def draw(near, ident, screen, faces):
 
 
 @kernel()
-def _lit(light, at, n, offset, stride):
-    """Cosine-weighted fraction of directional lights that reach a point; uses every stride-th light.
+def _lit(light, at, n, first):
+    """Cosine-weighted fraction of directional lights that reach a point, by every fourth light from `first`.
 
-    Each light has an orthographic map of the surfaces nearest to it. The point is moved along its normal by
-    `bias` so that surfaces do not shadow themselves.
+    Each light has an orthographic map of the surfaces nearest to it. The point is moved along its normal so
+    that surfaces do not shadow themselves.
     """
-    maps, directions, scale, center, size, bias = light
+    maps, directions, scale, center = light
+    bias = 2 / scale
+    size = maps.shape[1]
     x = at[0] + n[0] * bias - center[0], at[1] + n[1] * bias - center[1], at[2] + n[2] * bias - center[2]
     got = 0.0
     total = 0.0
-    for k in range(offset, maps.shape[0], stride):
+    for k in range(first, maps.shape[0], 4):
         d = directions[k]
         cosine = _dot(n, d[2])
         total += 1.0
@@ -138,67 +150,16 @@ def _mixed(rows, corners, weights):
 
 
 @kernel()
-def light_lattice(spacing, near, seen, camera, height, sky, key):
-    """Light at every `spacing`-th pixel, [rows, columns, 7]: depth, normal, sky, key, whether solid."""
-    rows = near.shape[0] // spacing
-    columns = near.shape[1] // spacing
-    lattice = np.zeros((rows, columns, 7), np.float32)
-    for row in range(rows):
-        for column in range(columns):
-            depth, ray, n, _, solid = _surface(row * spacing, column * spacing, near, seen, camera, height)
-            if depth > 0:
-                x = _point(camera[0], depth, ray)
-                at = lattice[row, column]
-                at[0] = depth
-                at[1], at[2], at[3] = n
-                at[4] = _lit(sky, x, n, 0, 1)
-                at[5] = _lit(key, x, n, 0, 1)
-                at[6] = 1.0 if solid else 0.0
-    return lattice
-
-
-@kernel()
-def _point(eye, depth, ray):
-    return eye[0] + depth * ray[0], eye[1] + depth * ray[1], eye[2] + depth * ray[2]
-
-
-@kernel()
-def _gathered(lattice, spacing, row, column, depth, n, solid):
-    """Light interpolated from the surrounding lattice points that show the same smooth surface."""
-    y = row / spacing
-    x = column / spacing
-    top = int(y)
-    first_column = int(x)
-    sky = 0.0
-    key = 0.0
-    total = 0.0
-    for i in range(top, min(top + 2, lattice.shape[0])):
-        for j in range(first_column, min(first_column + 2, lattice.shape[1])):
-            at = lattice[i, j]
-            far = solid and abs(at[0] - depth) > 0.015 * depth
-            if (at[6] > 0.5) != solid or _dot(n, at[1:]) < 0.96 or far:
-                continue
-            weight = (1 - abs(y - i)) * (1 - abs(x - j))
-            sky += weight * at[4]
-            key += weight * at[5]
-            total += weight
-    return sky, key, total
-
-
-@kernel()
-def shade(image, lattice, spacing, near, seen, camera, ground, background, sky, key, light):
+def shade(image, near, seen, camera, height, sky, key):
     """Compute the linear color of every pixel of the solid surfaces and the ground.
 
     camera: (eye[3], rays[3, 3]) so that the ray through pixel (x, y) is rays @ (x, y, 1), with z-depth 1.
-    seen: (ident, screen, faces, normals, colors) of the surfaces. lattice, spacing: from light_lattice. At
-    edges, where the lattice does not fit, a pixel uses a quarter of the lights itself, a different quarter
-    for each pixel in a square of four. ground: (height, radius, base color[3], line color[3]); background:
-    (top color[3], bottom color[3]); sky, key: (maps, axes, scale, center, size, bias); light: colors[3] of
-    key, sky and bounce.
+    seen: (ident, screen, faces, normals, colors) of the surfaces. height: of the ground [m]. sky, key: (maps,
+    axes, scale, center) of lights. Each pixel uses a quarter of the lights, a different one for each pixel in
+    a square of four, which become one pixel of the picture.
     """
     h, w = near.shape
     eye, rays = camera
-    height, radius, base, line = ground
     toward = key[1][0, 2]
     ident, _, faces, _, colors = seen
     for row in range(h):
@@ -207,23 +168,18 @@ def shade(image, lattice, spacing, near, seen, camera, ground, background, sky, 
             norm = np.sqrt(_dot(ray, ray))
             up = min(1.0, max(0.0, 0.5 + 1.1 * ray[2] / norm))
             for c in range(3):
-                image[row, column, c] = background[0][c] * up + background[1][c] * (1 - up)
+                image[row, column, c] = BACKGROUND[0][c] * up + BACKGROUND[1][c] * (1 - up)
             if depth <= 0:
                 continue
-            x = _point(eye, depth, ray)
-            far = min(1.0, np.sqrt(x[0] * x[0] + x[1] * x[1]) / radius)
+            x = eye[0] + depth * ray[0], eye[1] + depth * ray[1], eye[2] + depth * ray[2]
+            far = min(1.0, np.hypot(x[0], x[1]) / GROUND_RADIUS)
             mix = 1.0 if solid else (1 - far * far) ** 2
             if mix <= 0:
                 continue
-            s, q, total = _gathered(lattice, spacing, row, column, depth, n, solid)
-            if total > 0.25:
-                s = s / total
-                q = q / total
-            else:
-                part = (row % 2) * 2 + column % 2
-                s = _lit(sky, x, n, part, 4)
-                q = _lit(key, x, n, part, 4)
-            base_color = base[0], base[1], base[2]
+            part = (row % 2) * 2 + column % 2
+            s = _lit(sky, x, n, part)
+            q = _lit(key, x, n, part)
+            base_color = GROUND
             stripe = 0.0
             gloss = 0.0
             if solid:
@@ -233,13 +189,13 @@ def shade(image, lattice, spacing, near, seen, camera, ground, background, sky, 
                 edge = 1 + _dot(n, ray) / norm
                 gloss = 0.20 * min(1.0, 3 * q) * half**60 + 0.12 * s * edge**4
             else:
-                pixel = depth * np.sqrt(rays[0, 0] ** 2 + rays[1, 0] ** 2)
+                pixel = depth * np.hypot(rays[0, 0], rays[1, 0])
                 footprint = pixel * norm / max(0.1 * norm, -ray[2])
                 fine = 0.4 * _grid(x[0], x[1], 0.25, 0.003, footprint)
                 stripe = max(fine, _grid(x[0], x[1], 1.0, 0.005, footprint))
             for c in range(3):
-                flat = base_color[c] + stripe * (line[c] - base_color[c])
-                lit = light[0][c] * q + light[1][c] * s + light[2][c] * (0.5 - 0.5 * n[2])
+                flat = base_color[c] + stripe * (GROUND_LINES[c] - base_color[c])
+                lit = KEY_COLOR[c] * q + SKY_COLOR[c] * s + BOUNCE_COLOR[c] * (0.5 - 0.5 * n[2])
                 image[row, column, c] += mix * (flat * lit + gloss - image[row, column, c])
 
 

@@ -14,7 +14,13 @@ from helpers.browsers import CHROMIUM, FLAGS
 from robotdiffuse.core.transforms import rotation_from_quaternion, transform
 from robotdiffuse.problems.goals import PoseGoal
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.visualization.live.session import PageOptions, Session, first_problem, problem_text
+from robotdiffuse.visualization.live.session import (
+    PageOptions,
+    Session,
+    first_problem,
+    moved_to,
+    problem_text,
+)
 
 if TYPE_CHECKING:
     from robotdiffuse.visualization.live.page import Page
@@ -85,12 +91,13 @@ def test_an_obstacle_in_the_way_turns_it_red_and_the_next_plan_green(
     motion = session.state.motion
     assert motion is not None and motion.trajectory is not None
     q = motion.trajectory.positions[len(motion.trajectory.times) // 2]
-    session.move_obstacle("sphere", transform(link_pose(session.state.problem.robot, q, "panda_hand")[:3, 3]))
+    hand = transform(link_pose(session.state.problem.robot, q, "panda_hand")[:3, 3])
+    session.change_obstacle("sphere", lambda shape: moved_to(shape, hand))
     red = view.locator(INVALID)
     red.wait_for()
     assert "inside sphere" in red.inner_text() and "at 0." in red.inner_text()
     assert session.state.motion is motion
-    session.move_obstacle("sphere", transform(np.array([-0.5, 0.0, 1.2])))
+    session.change_obstacle("sphere", lambda shape: moved_to(shape, transform(np.array([-0.5, 0.0, 1.2]))))
     view.locator(VALID).wait_for()
     view.get_by_role("button", name="Delete").click()
     until(lambda: all(shape.name != "sphere" for shape in session.state.problem.scene.shapes))
@@ -105,7 +112,7 @@ def test_a_size_is_typed_beside_its_slider(view: Any, live: "tuple[Page, str]") 
     entry = beside(view, "radius")
     entry.fill("0.05")
     entry.press("Enter")
-    until(lambda: page.session.obstacle("ball").radius == 0.05)  # type: ignore[attr-defined]
+    until(lambda: page.session.state.obstacles["ball"].radius == 0.05)  # type: ignore[attr-defined]
     page.select("")
 
 

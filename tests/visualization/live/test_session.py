@@ -90,7 +90,7 @@ def test_a_motion_is_planned_validated_and_certified(session: Session) -> None:
 def test_the_badge_turns_red_at_once_and_green_with_the_new_plan(session: Session) -> None:
     session.set_options(follow=False)
     first = until(session, settled).motion
-    session.move_obstacle("lamp", in_the_way(session))
+    session.change_obstacle("lamp", lambda shape: moved_to(shape, in_the_way(session)))
     state = until(session, settled)
     assert state.motion is first and state.answer is None
     shown = validity(state)
@@ -105,7 +105,7 @@ def test_the_badge_turns_red_at_once_and_green_with_the_new_plan(session: Sessio
 
 def test_why_there_is_no_plan(session: Session) -> None:
     hand = link_pose(session.state.problem.robot, END, "panda_hand")
-    session.move_obstacle("lamp", transform(hand[:3, 3]))
+    session.change_obstacle("lamp", lambda shape: moved_to(shape, transform(hand[:3, 3])))
     state = until(session, settled)
     assert state.answer is not None and state.answer.status is Status.INVALID_GOAL
     shown = validity(state)
@@ -166,13 +166,13 @@ def test_a_start_out_of_limits_leaves_the_session_as_it_was(session: Session) ->
 def test_obstacles_are_added_resized_and_deleted(session: Session) -> None:
     name = session.add_obstacle("box", np.array([0.5, -0.5, 0.2]))
     assert session.add_obstacle("box", np.array([0.5, -0.6, 0.2])) == "box_2"
-    session.resize_obstacle(name, "size y", 0.5)
-    box = session.obstacle(name)
+    session.change_obstacle(name, lambda shape: resized(shape, "size y", 0.5))
+    box = session.state.obstacles[name]
     assert isinstance(box, Box) and box.size.tolist() == [0.16, 0.5, 0.16]
-    session.delete_obstacle(name)
+    session.change_obstacle(name, lambda _: None)
     assert [shape.name for shape in session.state.problem.scene.shapes] == ["lamp", "box_2"]
     with pytest.raises(InputError, match="unknown obstacle 'box'; known: box_2, lamp"):
-        session.delete_obstacle(name)
+        session.change_obstacle(name, lambda _: None)
     with pytest.raises(InputError, match="known: box, capsule, cylinder, sphere"):
         session.add_obstacle("torus", np.zeros(3))
 
@@ -205,7 +205,9 @@ def test_the_latest_request_wins(slow: type[SlowPlanner]) -> None:
     session.start()
     waiting.until(lambda: slow.calls, PATIENCE)
     for height in (1.6, 1.7, 1.8):
-        session.move_obstacle("lamp", transform(np.array([0.0, 0.0, height])))
+        session.change_obstacle(
+            "lamp", lambda shape, z=height: moved_to(shape, transform(np.array([0.0, 0.0, z])))
+        )
     for _ in range(2):
         slow.go.release()
     state = until(session, settled)
@@ -222,7 +224,7 @@ def test_an_overtaken_plan_is_dropped_if_it_is_no_longer_free(slow: type[SlowPla
     session.start()
     waiting.until(lambda: slow.calls, PATIENCE)
     middle = link_pose(session.state.problem.robot, 0.5 * (START + END), "panda_hand")
-    session.move_obstacle("lamp", transform(middle[:3, 3]))
+    session.change_obstacle("lamp", lambda shape: moved_to(shape, transform(middle[:3, 3])))
     slow.go.release()
 
     def called_again() -> bool:

@@ -147,30 +147,27 @@ class ExplorationSession:
 
     def set_mode(self, mode: str) -> None:
         """Pause, take one step (the one under way, if there is one), or run."""
-        with self._changed:
-            self._state = replace(self._state, mode=mode)
-            if self._run == 0:
-                self._run = 1
-                self._task.submit(self._run)
-            self._changed.notify_all()
-        self.on_change()
+        self._change(self._run == 0, mode=mode)
 
     def set_speed(self, speed: float) -> None:
         """Change the speed of motions."""
-        with self._changed:
-            self._state = replace(self._state, speed=speed)
-        self.on_change()
+        self._change(False, speed=speed)
 
     def restart(self, policy: str | None = None, noise: bool | None = None) -> None:
         """Begin anew, with another policy or noise if given. Raises InputError for an unknown policy."""
+        old = self._state
+        settings = old.settings if policy is None else replace(old.settings, policy=policy)
+        noise = old.noise if noise is None else noise
+        new = ExplorationState(settings, noise, self.problem.start, old.mode, speed=old.speed)
+        self._change(True, **vars(new))
+
+    def _change(self, begin: bool, **changes: Any) -> None:
+        """Change the state; `begin` starts the exploration with it, from the beginning."""
         with self._changed:
-            old = self._state
-            settings = old.settings if policy is None else replace(old.settings, policy=policy)
-            noise = old.noise if noise is None else noise
-            start = self.problem.start
-            self._state = ExplorationState(settings, noise, start, old.mode, speed=old.speed)
-            self._run += 1
-            self._task.submit(self._run)
+            self._state = replace(self._state, **changes)
+            if begin:
+                self._run += 1
+                self._task.submit(self._run)
             self._changed.notify_all()
         self.on_change()
 

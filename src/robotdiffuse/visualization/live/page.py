@@ -44,8 +44,10 @@ from robotdiffuse.visualization.live.session import (
     State,
     Validity,
     dimensions,
+    moved_to,
     problem_text,
     replay_page,
+    resized,
     uploaded_problem,
     validity,
 )
@@ -136,14 +138,16 @@ class Page(LivePage):
 
     def _move_selected(self, T_base_handle: Pose) -> None:
         if self._selected:
-            self.session.move_obstacle(self._selected, T_base_handle)
+            self.session.change_obstacle(self._selected, lambda shape: moved_to(shape, T_base_handle))
 
     def _draw(self) -> None:
         state = self.session.state
         selected = self._selected
         new = self._changes.new
         problem = state.problem
-        robot = state.problem.robot
+        robot = problem.robot
+        motion = None if state.motion is None else state.motion.trajectory
+        violation = None if state.validation is None else state.validation.report.violation
         if new("robot", robot):
             self._new_robot(robot)
         self._drawn.frames(problem.start)  # compiles here, since nothing is sent within the block
@@ -157,14 +161,18 @@ class Page(LivePage):
                 self._show_moving(0.0)
             self._start_gizmo.show(link_pose(robot, problem.start, robot.tip))
             if new("start", problem.start, state.motion):
-                self._arms["start"].show(None if _starts_at_start(state) else problem.start)
+                at_start = motion is None or np.allclose(motion.positions[0], problem.start)
+                self._arms["start"].show(None if at_start else problem.start)
             if new("goal", state.goal_configuration):
                 self._arms["goal"].show(state.goal_configuration)
             self.goal_gizmo.show(state.goal_pose)
             if new("motion", state.motion):
                 self._new_motion(state)
             if new("validation", state.validation):
-                self._arms["contact"].show(_first_collision(state))
+                contact = None
+                if violation is not None and motion is not None and violation.kind in COLLISIONS:
+                    contact = interpolated(np.array([violation.time]), motion.times, motion.positions)[0]
+                self._arms["contact"].show(contact)
             answer = state.answer
             tree_answer = answer if state.options.trees else None
             if (answer is not None or not state.options.trees) and new("trees", tree_answer):
@@ -223,7 +231,7 @@ class Page(LivePage):
 
     def set_playing(self, playing: bool) -> None:
         """Play the motion, or stop."""
-        (self.player.play if playing else self.player.pause)()
+        self.player.set_playing(playing)
         self._panel.show_playing(playing)
 
 
@@ -259,21 +267,6 @@ class _Gizmo:
             place(self.handle, T)
         if self.handle.visible is not (T is not None):
             self.handle.visible = T is not None
-
-
-def _starts_at_start(state: State) -> bool:
-    """Whether the motion shown starts at the problem's start, so that no start arm is needed."""
-    motion = None if state.motion is None else state.motion.trajectory
-    return motion is None or np.allclose(motion.positions[0], state.problem.start)
-
-
-def _first_collision(state: State) -> Configuration | None:
-    """The configuration at the first collision of the motion; None if there is none."""
-    violation = None if state.validation is None else state.validation.report.violation
-    motion = None if state.motion is None else state.motion.trajectory
-    if violation is None or motion is None or violation.kind not in COLLISIONS:
-        return None
-    return interpolated(np.array([violation.time]), motion.times, motion.positions)[0]
 
 
 class Panel:
@@ -325,21 +318,20 @@ class Panel:
         gui = self._server.gui
         session = self._session
         options = self._session.state.options
-        hints = {
-            "follow": "Plan again after each change",
-            "trees": "Search trees from the start (blue) and the goal (green); planners: "
-            + ", ".join(TREE_PLANNERS),
-        }
-        labels = {"follow": "Plan automatically", "trees": "Search trees"}
+        planners = ", ".join(TREE_PLANNERS)
+        trees = f"Search trees from the start (blue) and the goal (green); planners: {planners}"
+        boxes = (
+            ("follow", "Plan automatically", "Plan again after each change"),
+            ("trees", "Search trees", trees),
+        )
         self._options: dict[str, Any] = {
             "planner": gui.add_dropdown("Planner", tuple(PLANNERS), initial_value=options.planner)
         }
         limit = gui.add_slider(
             "Time limit [s]", min=0.05, max=10.0, step=0.05, initial_value=min(options.time_limit, 10.0)
         )
-        for name, hint in hints.items():
-            value = getattr(options, name)
-            self._options[name] = gui.add_checkbox(labels[name], initial_value=value, hint=hint)
+        for name, label, hint in boxes:
+            self._options[name] = gui.add_checkbox(label, getattr(options, name), hint=hint)
         self._now = gui.add_button("Plan now", icon=viser.Icon.ROUTE)
         self._stages = gui.add_html("")
         self._kind = gui.add_dropdown("Plot", PLOTS, initial_value=PLOTS[0])
@@ -361,7 +353,9 @@ class Panel:
         self._add = gui.add_button("Add", icon=viser.Icon.PLUS)
         self._on(self._selected, lambda event: self._page.select(event.target.value))
         self._delete.on_click(
-            lambda event: self._guarded(event, lambda: self._session.delete_obstacle(self._selected.value))
+            lambda event: self._guarded(
+                event, lambda: self._session.change_obstacle(self._selected.value, lambda _: None)
+            )
         )
         self._add.on_click(lambda event: self._guarded(event, self._add_obstacle))
 
@@ -381,17 +375,20 @@ class Panel:
             robot = session.state.problem.robot
             self._guarded(event, lambda: session.open(uploaded_problem(file.content, file.name, robot)))
 
-        save.on_click(lambda event: self._guarded(event, lambda: _send(event, *self._problem_file())))
-        share.on_click(lambda event: self._guarded(event, lambda: _send(event, *self._replay_file())))
+        save.on_click(
+            lambda event: self._guarded(
+                event, lambda: _send(event, "problem.yaml", problem_text(session.state.problem))
+            )
+        )
+        share.on_click(
+            lambda event: self._guarded(event, lambda: _send(event, "replay.html", self._replay()))
+        )
 
-    def _problem_file(self) -> tuple[str, bytes]:
-        return "problem.yaml", problem_text(self._session.state.problem)
-
-    def _replay_file(self) -> tuple[str, bytes]:
+    def _replay(self) -> bytes:
         state = self._session.state
         if state.motion is None:
             raise InputError("there is no motion to save yet")
-        return "replay.html", replay_page(state.problem, state.motion)
+        return replay_page(state.problem, state.motion)
 
     # display
 
@@ -436,7 +433,11 @@ class Panel:
         slider = self._server.gui.add_slider(
             dimension, min=min(MIN_DIMENSION, value), max=max_size, step=0.005, initial_value=value
         )
-        self._on(slider, lambda event: self._session.resize_obstacle(name, dimension, event.target.value))
+        resize = self._session.change_obstacle
+        self._on(
+            slider,
+            lambda event: resize(name, lambda shape: resized(shape, dimension, event.target.value)),
+        )
         return slider
 
     def _new_joints(self, robot: Robot) -> None:

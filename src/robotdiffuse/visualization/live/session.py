@@ -230,29 +230,13 @@ class Session:
             self._set_scene([*self._state.obstacles.values(), obstacle])
             return [*self._state.obstacles][-1]
 
-    def move_obstacle(self, name: str, T_base_handle: Pose) -> None:
-        """Move the handle of an obstacle to a pose."""
-        self._change_obstacle(name, lambda shape: moved_to(shape, T_base_handle))
-
-    def resize_obstacle(self, name: str, dimension: str, value: float) -> None:
-        """Change one dimension of an obstacle [m]."""
-        self._change_obstacle(name, lambda shape: resized(shape, dimension, value))
-
-    def delete_obstacle(self, name: str) -> None:
-        """Delete an obstacle. Raises InputError for an unknown name."""
-        self._change_obstacle(name, lambda _: None)
-
-    def obstacle(self, name: str) -> Shape:
-        """The obstacle of a name. Raises InputError for an unknown one."""
-        obstacles = self._state.obstacles
-        if name not in obstacles:
-            raise unknown_name("obstacle", name, obstacles)
-        return obstacles[name]
-
-    def _change_obstacle(self, name: str, change: Callable[[Shape], Shape | None]) -> None:
-        """Replace an obstacle; delete it for None."""
+    def change_obstacle(self, name: str, change: Callable[[Shape], Shape | None]) -> None:
+        """Replace an obstacle, or delete it for None. Raises InputError for an unknown name."""
         with self._lock:
-            changed = {**self._state.obstacles, name: change(self.obstacle(name))}
+            obstacles = self._state.obstacles
+            if name not in obstacles:
+                raise unknown_name("obstacle", name, obstacles)
+            changed = {**obstacles, name: change(obstacles[name])}
             self._set_scene([shape for shape in changed.values() if shape is not None])
 
     def _set_scene(self, shapes: list[Shape]) -> None:
@@ -276,18 +260,25 @@ class Session:
 
     # Work of the threads
 
+    def _publish(self, fits: Callable[[State], bool], **changes: Any) -> None:
+        """Change the state if what was computed still fits it."""
+        with self._lock:
+            if not fits(self._state):
+                return
+            self._state = replace(self._state, **changes)
+        self.on_change()
+
     def _validate(self, _version: int) -> None:
         state = self._state
         if state.motion is None:
             return
         validation = _validated(state.problem, state.motion, state.version)
-        with self._lock:
-            current_validation = self._state.validation
-            newer = current_validation is not None and current_validation.version > validation.version
-            if self._state.motion is not state.motion or newer:
-                return
-            self._state = replace(self._state, validation=validation)
-        self.on_change()
+
+        def fits(now: State) -> bool:
+            newer = now.validation is not None and now.validation.version > validation.version
+            return now.motion is state.motion and not newer
+
+        self._publish(fits, validation=validation)
 
     def _find_goal_configuration(self, T_base_frame: Pose) -> None:
         """Find a configuration at the goal, close to the previous one."""
@@ -296,11 +287,7 @@ class Session:
         robot = state.problem.robot
         near = state.problem.start if previous is None else previous
         q = _configuration_at(robot, state.goal_frame, T_base_frame, near)
-        with self._lock:
-            if self._state.problem.robot is not robot:
-                return
-            self._state = replace(self._state, goal_configuration=q)
-        self.on_change()
+        self._publish(lambda now: now.problem.robot is robot, goal_configuration=q)
 
     def _move_start(self, T_base_tip: Pose) -> None:
         problem = self._state.problem
@@ -327,7 +314,10 @@ class Session:
                 )
             # an outdated motion is still shown if it is free in the current scene
             same_robot = self._state.problem.robot is state.problem.robot
-            if same_robot and validation is not None and (current or _free(validation)):
+            violation = None if validation is None else validation.report.violation
+            # the goal moves while the target is dragged
+            free = violation is None or violation.kind == "goal"
+            if same_robot and validation is not None and (current or free):
                 self._state = replace(self._state, motion=result, validation=validation)
                 if validation.version != self._state.version:
                     self._validation_task.submit(self._state.version)
@@ -369,21 +359,18 @@ def _configuration_at(
 
 
 def _opened(problem: Problem, options: PageOptions) -> State:
-    frame, T, q = _target(problem)
-    return State(problem, options, goal_pose=T, goal_frame=frame, goal_configuration=q)
-
-
-def _target(problem: Problem) -> tuple[str, Pose, Configuration | None]:
-    """The link that represents the goal, its pose, and the configuration of a joint goal."""
+    """The state of a problem whose goal is represented by one link, its pose, and, for a joint goal, its
+    configuration."""
     goal = problem.goal
     robot = problem.robot
     if isinstance(goal, AnyGoal):
         goal = goal.goals[0]
     if poses := poses_of(goal):
-        return poses[0].frame, poses[0].T_base_frame, None
+        return State(problem, options, goal_pose=poses[0].T_base_frame, goal_frame=poses[0].frame)
     assert isinstance(goal, JointGoal)
     q = goal.positions[0]
-    return robot.tip, link_pose(robot, q, robot.tip), q
+    T = link_pose(robot, q, robot.tip)
+    return State(problem, options, goal_pose=T, goal_frame=robot.tip, goal_configuration=q)
 
 
 def _posed(goal: Goal, frame: str, T_base_frame: Pose) -> PoseGoal | PosesGoal:
@@ -401,12 +388,6 @@ def _validated(problem: Problem, motion: PlanResult, version: int) -> Validation
     began = time.perf_counter()
     report = verify_trajectory(problem, motion.trajectory)
     return Validation(version, report, time.perf_counter() - began)
-
-
-def _free(validation: Validation) -> bool:
-    """Whether a motion is valid except perhaps for its goal, which moves while the target is dragged."""
-    violation = validation.report.violation
-    return violation is None or violation.kind == "goal"
 
 
 def moved_to(shape: Shape, T_base_handle: Pose) -> Shape:
@@ -454,7 +435,9 @@ class Validity:
 def validity(state: State) -> Validity:
     """The badge of a state: clearances, or link, obstacle, depth and time of a violation, or why there is no
     motion."""
-    why_not = _why_not(state)
+    why_not = state.failure
+    if not why_not and state.answer is not None and not state.answer.solved:
+        why_not = f"{state.answer.status.value}: {state.answer.reason}"
     more = (f"no new plan: {why_not}",) if why_not else ()
     validation = state.validation
     if state.motion is None:
@@ -470,31 +453,14 @@ def validity(state: State) -> Validity:
     assert trajectory is not None
     violation = report.violation
     if violation is None:
-        lines = (
-            f"{_to_obstacles(state, report)}, between links {_distance(report.self_clearance)}, "
-            f"over {trajectory.duration:.2f} s",
-            *more,
-        )
+        obstacles = state.problem.scene.shapes or state.problem.moving
+        to_obstacles = f"to obstacles {_distance(report.scene_clearance)}" if obstacles else "no obstacles"
+        between = f"between links {_distance(report.self_clearance)}"
+        lines = (f"{to_obstacles}, {between}, over {trajectory.duration:.2f} s", *more)
         return Validity(VALID, f"free, clearance at least {_distance(report.min_clearance)}", lines)
     title = "collides" if violation.kind in COLLISIONS else "not valid"
     when = f"at {violation.time:.2f} s of {trajectory.duration:.2f} s"
     return Validity(INVALID, f"{title}: {violation.message}", (when, *more))
-
-
-def _to_obstacles(state: State, report: Report) -> str:
-    problem = state.problem
-    if not (problem.scene.shapes or problem.moving):
-        return "no obstacles"
-    return f"to obstacles {_distance(report.scene_clearance)}"
-
-
-def _why_not(state: State) -> str:
-    """Why the last planning call found no motion; "" if it did."""
-    if state.failure:
-        return state.failure
-    if state.answer is None or state.answer.solved:
-        return ""
-    return f"{state.answer.status.value}: {state.answer.reason}"
 
 
 def _distance(meters: float | None) -> str:
@@ -582,19 +548,21 @@ def _check_contained(data: object, robot: Robot) -> None:
 
 def problem_text(problem: Problem) -> bytes:
     """The problem as a YAML file."""
-    with TemporaryDirectory() as folder:
-        file = Path(folder) / "problem.yaml"
-        save_problem(problem, file)
-        return file.read_bytes()
+    return _written("problem.yaml", lambda file: save_problem(problem, file))
 
 
 def replay_page(problem: Problem, result: PlanResult) -> bytes:
     """The replay of a solved result as a self-contained HTML page."""
     motion = result.trajectory or result.path
     assert motion is not None
+    given = *problem.standing(), motion
+    return _written("replay.html", lambda file: write_replay(*given, file, result=result))
+
+
+def _written(name: str, write: Callable[[Path], object]) -> bytes:
     with TemporaryDirectory() as folder:
-        file = Path(folder) / "replay.html"
-        write_replay(*problem.standing(), motion, file, result=result)
+        file = Path(folder) / name
+        write(file)
         return file.read_bytes()
 
 
@@ -685,14 +653,10 @@ class Player:
         """Whether the motion is playing."""
         return self._playing.is_set()
 
-    def play(self) -> None:
-        """Start or resume playing."""
-        self._playing.set()
-
-    def pause(self) -> None:
-        """Stop at the current time."""
+    def set_playing(self, playing: bool) -> None:
+        """Start or resume playing, or stop at the current time."""
         with self._lock:
-            self._playing.clear()
+            (self._playing.set if playing else self._playing.clear)()
 
     def load(self, duration: float) -> None:
         """Switch to a motion of this duration [s], at the same fraction of it."""

@@ -1,37 +1,38 @@
-"""Reads and writes MCAP files: a scene for Foxglove, and the motion as ROS 2 messages.
+"""ROS 2 without ROS: messages, MCAP files and bags (folders with metadata.yaml and a database).
 
-/scene and /tf hold Foxglove messages: the obstacles, the arm as triangles fixed to its links, and the poses
-of the links and of moving obstacles. /joint_trajectory, /joint_states and /robot_description hold ROS 2
-messages; the last is the URDF, if the robot was read from one. The URDF and the problem are attachments, too.
+In MCAP files, /scene and /tf hold Foxglove messages: the obstacles, the arm as triangles fixed to its links,
+and the poses of the links and of moving obstacles. /joint_trajectory, /joint_states and /robot_description
+hold ROS 2 messages; the last is the URDF, if the robot was read from one. The URDF and the problem are
+attachments, too.
 """
 
 import io
 import json
+import sqlite3
 import struct
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import fields, is_dataclass
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
-from robotdiffuse.core.errors import InputError, missing_package, reading
-from robotdiffuse.core.input_files import MEGABYTE, input_file, parse_json
-from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.core.errors import InputError, OutputError, needs, reading, shown
+from robotdiffuse.core.input_files import MEGABYTE, input_file, parse_json, read_yaml
+from robotdiffuse.core.output_files import write_atomically, write_error
 from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.core.types import Pose, Trajectory
 from robotdiffuse.drawables import Color, Drawable, Surface, drawables, link_surfaces
-from robotdiffuse.interop.recorded_motion import RecordedMotion, joint_trajectory
-from robotdiffuse.interop.ros_messages import (
-    DISPLAY_TRAJECTORY,
-    JOINT_STATE,
+from robotdiffuse.interop.recorded_motion import (
     JOINT_TRAJECTORY,
-    STRING,
-    choose_topic,
-    display_trajectory,
-    motion_from_messages,
-    to_message,
-    typestore,
+    RecordedMotion,
+    checked_motion,
+    joint_trajectory,
+    motion_from_record,
 )
 from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.problems.problem import Problem
@@ -39,7 +40,7 @@ from robotdiffuse.robots.kinematics import link_poses
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud, Sphere
 
-try:
+with needs("mcap, mcap-protobuf-support, foxglove-schemas-protobuf and rosbags", "ros"):
     import lz4.frame
     import zstandard
     from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
@@ -49,11 +50,165 @@ try:
     from mcap.records import Schema
     from mcap.writer import Writer
     from mcap_protobuf.schema import register_schema
+    from rosbags.highlevel import AnyReader
+    from rosbags.rosbag2 import Writer as BagWriter
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-except ImportError:
-    raise missing_package(
-        "mcap, mcap-protobuf-support, foxglove-schemas-protobuf and rosbags", "ros"
-    ) from None
+    from rosbags.typesys.store import Typestore
+
+
+ROBOT_TRAJECTORY = "moveit_msgs/msg/RobotTrajectory"
+DISPLAY_TRAJECTORY = "moveit_msgs/msg/DisplayTrajectory"
+JOINT_STATE = "sensor_msgs/msg/JointState"
+STRING = "std_msgs/msg/String"
+
+# Message definitions of moveit_msgs and object_recognition_msgs (ROS 2), by name.
+MOVEIT = {
+    "object_recognition_msgs/msg/ObjectType": "string key\nstring db",
+    "moveit_msgs/msg/CollisionObject": (
+        "std_msgs/Header header\ngeometry_msgs/Pose pose\nstring id\n"
+        "object_recognition_msgs/ObjectType type\n"
+        "shape_msgs/SolidPrimitive[] primitives\ngeometry_msgs/Pose[] primitive_poses\n"
+        "shape_msgs/Mesh[] meshes\ngeometry_msgs/Pose[] mesh_poses\n"
+        "shape_msgs/Plane[] planes\ngeometry_msgs/Pose[] plane_poses\n"
+        "string[] subframe_names\ngeometry_msgs/Pose[] subframe_poses\n"
+        "byte ADD=0\nbyte REMOVE=1\nbyte APPEND=2\nbyte MOVE=3\nbyte operation"
+    ),
+    "moveit_msgs/msg/AttachedCollisionObject": (
+        "string link_name\nCollisionObject object\nstring[] touch_links\n"
+        "trajectory_msgs/JointTrajectory detach_posture\nfloat64 weight"
+    ),
+    "moveit_msgs/msg/RobotState": (
+        "sensor_msgs/JointState joint_state\nsensor_msgs/MultiDOFJointState multi_dof_joint_state\n"
+        "AttachedCollisionObject[] attached_collision_objects\nbool is_diff"
+    ),
+    ROBOT_TRAJECTORY: (
+        "trajectory_msgs/JointTrajectory joint_trajectory\n"
+        "trajectory_msgs/MultiDOFJointTrajectory multi_dof_joint_trajectory"
+    ),
+    DISPLAY_TRAJECTORY: ("string model_id\nRobotTrajectory[] trajectory\nRobotState trajectory_start"),
+}
+
+
+@cache
+def typestore() -> Typestore:
+    """The message types of ROS 2 Humble and MoveIt."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types: dict[str, Any] = {}
+    for name, definition in MOVEIT.items():
+        types |= get_types_from_msg(definition, name)
+    store.register(types)
+    return store
+
+
+def to_message(kind: str, record: Mapping[str, Any]) -> Any:
+    """A message from plain data; missing fields are empty or zero."""
+    store = typestore()
+    field_types = store.fielddefs[kind][1]
+    return store.types[kind](**{name: _value(of, record.get(name)) for name, of in field_types})
+
+
+def _value(definition: Any, value: Any) -> Any:
+    node = int(definition[0])
+    of = definition[1]
+    if node == 1:  # a base type
+        kind = of[0]
+        if kind == "string":
+            return "" if value is None else str(value)
+        return bool(value) if kind == "bool" else (value or 0.0 if kind.startswith("float") else value or 0)
+    if node == 2:  # a message
+        return to_message(of, value or {})
+    element = of[0]
+    items = [] if value is None else value
+    if int(element[0]) == 1 and element[1][0] not in ("string", "bool"):
+        return np.asarray(items, dtype=element[1][0].replace("byte", "uint8"))
+    return [_value(element, item) for item in items]
+
+
+def to_plain(value: Any) -> Any:
+    """A message as plain data."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {
+            f.name: to_plain(getattr(value, f.name)) for f in fields(value) if not f.name.startswith("__")
+        }
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return [to_plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def display_trajectory(problem: Problem, trajectory: Trajectory, record: Mapping[str, Any]) -> dict[str, Any]:
+    """A DisplayTrajectory in plain data: a JointTrajectory, and the state in which the arm starts."""
+    robot = problem.robot
+    names = [*trajectory.joint_names, *robot.locked]
+    values = [*trajectory.positions[0].tolist(), *robot.locked.values()]
+    state = {"joint_state": {"header": record["header"], "name": names, "position": values}}
+    return {
+        "model_id": robot.name,
+        "trajectory": [{"joint_trajectory": record}],
+        "trajectory_start": state,
+    }
+
+
+def header_seconds(stamp: Mapping[str, Any]) -> float:
+    """The time stamp of a message header [s]."""
+    return float(stamp.get("sec", 0)) + 1e-9 * float(stamp.get("nanosec", 0))
+
+
+def choose_topic(topics: Mapping[str, str], requested: str | None, where: str) -> str:
+    """The topic to read a motion from, given all topics and their types.
+
+    This is `requested`, or else the only topic of the first type of JointTrajectory, RobotTrajectory,
+    DisplayTrajectory and JointState that occurs. Raises InputError if there is no such topic or several.
+    """
+    kinds = (JOINT_TRAJECTORY, ROBOT_TRAJECTORY, DISPLAY_TRAJECTORY, JOINT_STATE)
+    motions = {topic: kind for topic, kind in topics.items() if kind in kinds}
+    listed = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items()) or "none"
+    if requested is not None:
+        if requested not in motions:
+            raise InputError(f"{where}: topic {requested!r} holds no motion; topics: {listed}")
+        return requested
+    for kind in kinds:
+        candidates = [topic for topic, of in motions.items() if of == kind]
+        if len(candidates) > 1:
+            raise InputError(
+                f"{where}: several topics hold motions: {', '.join(candidates)}; choose one with --topic"
+            )
+        if candidates:
+            return candidates[0]
+    raise InputError(f"{where} holds no motion; topics: {listed}; known types: {', '.join(kinds)}")
+
+
+def motion_from_messages(kind: str, messages: list[tuple[int, Any]], where: str) -> RecordedMotion:
+    """The motion in messages with their log times [ns]: a single message, or a series of joint states.
+
+    Raises InputError, naming `where`, for no or several motions, and for damaged ones.
+    """
+    if not messages:
+        raise InputError(f"{where} holds no messages")
+    if kind != JOINT_STATE:
+        if len(messages) > 1:
+            raise InputError(f"{where} holds {len(messages)} motions; one is validated at a time")
+        return motion_from_record(to_plain(messages[0][1]), where)
+    states = [to_plain(message) for _, message in messages]
+    names = states[0]["name"]
+    logged = messages[0][0]
+    stamps = [header_seconds(state["header"]["stamp"]) for state in states]
+    if not any(stamps):
+        stamps = [1e-9 * (at - logged) for at, _ in messages]
+    rows: dict[str, list[list[float]]] = {"position": [], "velocity": []}
+    for i, state in enumerate(states):
+        if sorted(state["name"]) != sorted(names):
+            raise InputError(f"{where}: joint state {i} has other joints than the first")
+        column_of = {name: k for k, name in enumerate(state["name"])}
+        order = [column_of[name] for name in names]
+        for quantity, column in rows.items():
+            column.append([state[quantity][k] for k in order] if len(state[quantity]) == len(names) else [])
+    velocities = rows["velocity"] if all(rows["velocity"]) else None
+    first = stamps[0]
+    with reading(where):
+        return checked_motion(names, rows["position"], [stamp - first for stamp in stamps], velocities)
+
+
+# MCAP files
 
 FLOAT32 = 7
 """foxglove.PackedElementField.FLOAT32"""
@@ -93,8 +248,8 @@ class McapWriter:
         self.writer.add_message(self._channels[topic], log_time=at, data=data, publish_time=at)
 
 
-def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
-    """Write the scene and the motion; see `interop.write_motion` and this module's description."""
+def write_mcap(problem: Problem, trajectory: Trajectory, file: Path) -> None:
+    """Write the scene and the motion; see `interop.write_motion` and the module's description."""
     robot = problem.robot
     stream = io.BytesIO()
     out = McapWriter(stream)
@@ -233,7 +388,7 @@ def _transforms(problem: Problem, poses: dict[str, Pose], at: int) -> FrameTrans
 
 
 def problem_in(file: Path) -> Problem | None:
-    """The problem that `write` attached; None if there is none."""
+    """The problem that `write_mcap` attached; None if there is none."""
     path = input_file(file)
     with reading(file), path.open("rb") as stream:
         attached = {attachment.name: attachment.data for attachment in make_reader(stream).iter_attachments()}
@@ -243,7 +398,7 @@ def problem_in(file: Path) -> Problem | None:
     return problem_from_record(record)
 
 
-def read(file: Path, topic: str | None = None) -> RecordedMotion:
+def read_mcap(file: Path, topic: str | None = None) -> RecordedMotion:
     """Read the motion from the ROS 2 messages of a topic; see `choose_topic`."""
     path = input_file(file)
     with reading(file), path.open("rb") as stream:
@@ -314,3 +469,80 @@ def _typestore(schema: Any) -> Any:
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(schema.data.decode(), schema.name))
     return store
+
+
+# Bags
+
+VERSION = 9
+"""Version of the bag's metadata; ROS 2 Humble reads the fields that it knows."""
+
+
+def write_bag(problem: Problem, trajectory: Trajectory, file: Path) -> None:
+    """Write a JointTrajectory on /joint_trajectory and a DisplayTrajectory on /display_planned_path, which
+    RViz's MoveIt plugin shows. An existing bag is replaced; see `interop.write_motion`."""
+    if file.exists() and not (file / "metadata.yaml").is_file():
+        raise InputError(f"{file} cannot be written: it exists and is not a ROS 2 bag")
+    record = joint_trajectory(trajectory.joint_names, trajectory)
+    topics = {
+        "/joint_trajectory": (JOINT_TRAJECTORY, record),
+        "/display_planned_path": (DISPLAY_TRAJECTORY, display_trajectory(problem, trajectory, record)),
+    }
+    try:
+        with TemporaryDirectory(prefix=f".{file.name}.", dir=file.parent, ignore_cleanup_errors=True) as part:
+            new = Path(part, file.name)
+            old = Path(part, "old")
+            with BagWriter(new, version=VERSION) as writer:  # it names the database after the folder
+                for topic, (kind, content) in topics.items():
+                    connection = writer.add_connection(topic, kind, typestore=typestore())
+                    writer.write(connection, 0, typestore().serialize_cdr(to_message(kind, content), kind))
+            _replace(file, new, old)
+    except sqlite3.Error as error:
+        raise OutputError(f"{file} cannot be written: {error}") from None
+    except OSError as error:
+        raise write_error(file, error) from None
+
+
+def _replace(file: Path, new: Path, old: Path) -> None:
+    """Move an existing bag, or a link to one, to `old`, and `new` to its place; if that fails, move it
+    back."""
+    try:
+        with suppress(FileNotFoundError):
+            file.replace(old)
+        new.replace(file)
+    except BaseException:
+        with suppress(OSError):
+            old.replace(file)
+        raise
+
+
+def read_bag(file: Path, topic: str | None = None) -> RecordedMotion:
+    """Read the motion on a topic; see `choose_topic`."""
+    if not (file / "metadata.yaml").is_file():
+        raise InputError(f"{file} is not a ROS 2 bag: it has no metadata.yaml")
+    for part in file.iterdir():
+        if not part.is_dir():
+            input_file(part, largest=sys.maxsize)
+    with reading(file):
+        _check_unpacking(file)
+        with AnyReader([file], default_typestore=typestore()) as reader:
+            topics = {connection.topic: connection.msgtype for connection in reader.connections}
+            name = choose_topic(topics, topic, str(file))
+            chosen = [connection for connection in reader.connections if connection.topic == name]
+            messages = []
+            size = 0
+            for connection, at, raw in reader.messages(chosen):
+                size += len(raw)
+                if size > MAX_UNPACKED:
+                    raise InputError(f"the messages of {name} take more than {MAX_UNPACKED:,} bytes")
+                messages.append((at, reader.deserialize(raw, connection.msgtype)))
+            return motion_from_messages(topics[name], messages, f"{file}, {name}")
+
+
+def _check_unpacking(bag: Path) -> None:
+    """Refuse what may unpack to gigabytes."""
+    information = read_yaml(bag / "metadata.yaml")["rosbag2_bagfile_information"]
+    if mode := information.get("compression_mode"):
+        raise InputError(f"{bag} is compressed (mode {shown(mode)}); write it anew with: ros2 bag convert")
+    for part in bag.glob("*.mcap"):
+        with part.open("rb") as stream:
+            check_chunks(stream, make_reader(stream), str(part))

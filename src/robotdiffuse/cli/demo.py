@@ -1,0 +1,119 @@
+"""The command `robotdiffuse demo`."""
+
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+
+from robotdiffuse.cli.arguments import ENDINGS, NO_PLAN, SOLVED, Namespace
+from robotdiffuse.cli.console import Spinner, print_result
+from robotdiffuse.cli.explore import draw_exploration, simulate
+from robotdiffuse.cli.plan import asked_clearance, load_and_plan
+from robotdiffuse.cli.view import draw
+from robotdiffuse.core.output_files import check_output
+from robotdiffuse.core.types import FIRST
+from robotdiffuse.perception.ray_caster import looking_at, ray_cast
+from robotdiffuse.planning import DEFAULT_PLANNER, load_planner
+from robotdiffuse.planning.exploration.steps import LOOK, ExplorerSettings
+from robotdiffuse.problems.families.furniture import FLOOR
+from robotdiffuse.problems.families.scaled import family_for
+from robotdiffuse.problems.files import load_problem
+from robotdiffuse.problems.problem import PREDICTED, Problem
+from robotdiffuse.robots import load_robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.validation.validator import verify
+
+PROBLEM_FILE = "shelf.yaml"
+FAMILY = "shelf"
+TIME_LIMIT = 10.0
+"""Time limit for planning [s]."""
+READY = "ready"
+"""Where the arm of `demo --explore` starts, if it has such a pose."""
+EXPLORE_TIME_LIMIT = 2.0
+"""Time limit of each of its searches [s]."""
+# Problems that are drawn for another arm, and the time limit of the search that tries each [s].
+MAX_DRAWS = 50
+DRAW_TIME_LIMIT = 1.0
+# Position and target of the camera of `demo --camera` [m].
+CAMERA_POSITION = (-0.5, 1.1, 1.2)
+CAMERA_TARGET = (0.6, 0.0, 0.5)
+# Width, height and focal length of its images [pixels].
+IMAGE_SIZE = (640, 480)
+FOCAL_LENGTH = 460.0
+
+
+def run_demo(arguments: Namespace) -> int:
+    names = ("explore.png", "explore.html") if arguments.explore else ("demo.png", "demo.html")
+    outputs = [check_output(file, ENDINGS) for file in names]
+    if arguments.robot is None:
+        with resources.as_file(resources.files("robotdiffuse") / "examples" / PROBLEM_FILE) as file:
+            problem = load_problem(file)
+    else:
+        problem = shelf_problem(arguments.robot)
+    if arguments.explore:
+        return explore_shelf(problem, outputs)
+    true = problem
+    if arguments.camera:
+        outputs.append(check_output("demo_true.png", ENDINGS))
+        problem = seen_by_camera(true)
+    result = load_and_plan(problem, DEFAULT_PLANNER, picture=True, time_limit=TIME_LIMIT)
+    print_result(result, asked_clearance(problem, DEFAULT_PLANNER))
+    if result.trajectory is None or result.path is None:
+        return NO_PLAN
+    if arguments.camera:
+        violation = verify(true, result.path).violation
+        print("in the true scene:", "free" if violation is None else violation.message)
+    for file in outputs:
+        draw(true if file.name == "demo_true.png" else problem, result, file)
+        print(f"wrote {file.resolve()}")
+    return 0
+
+
+def explore_shelf(problem: "Problem", outputs: list[Path]) -> int:
+    """Take the arm from where it is ready to the problem's goal through space that its cameras see on the
+    way, and draw that."""
+
+    obstacles = [shape for shape in problem.scene.shapes if shape.name != FLOOR.name]
+    start = READY if READY in problem.robot.poses else problem.start
+    problem = Problem(problem.robot, Scene([FLOOR, *obstacles]), start, problem.goal)
+    print("The arm knows the floor, and sees the rest by a camera at its tip and one beside it.")
+    explorer, arrived = simulate(problem, ExplorerSettings(time_limit=EXPLORE_TIME_LIMIT), None, 0)
+    looks = sum(act.step.kind == LOOK for act in explorer.acts)
+    end = "is at the goal" if arrived else "is not at the goal"
+    print(f"The arm {end}: {looks} looks, {len(explorer.views)} images, {explorer.duration:.1f} s in motion.")
+    for file in outputs:
+        draw_exploration(explorer, problem, file)
+        print(f"wrote {file.resolve()}")
+    return SOLVED if arrived else NO_PLAN
+
+
+def shelf_problem(robot: str) -> "Problem":
+    """A problem of the family shelf for another arm that the straight line does not solve and a search does.
+
+    Raises InputError if none can be drawn for it.
+    """
+
+    arm = load_robot(robot)
+    rng = np.random.default_rng(0)
+    search = load_planner("aorrtc")
+    family = family_for(FAMILY, arm)
+    with Spinner(f"drawing a problem for {arm.name}"):
+        for _ in range(MAX_DRAWS):
+            problem = family.draw(arm, rng).problem(arm)
+            result = search.plan(problem, DRAW_TIME_LIMIT, until=FIRST)
+            if result.solved and result.stage != "straight_line":
+                return problem
+    return problem
+
+
+def seen_by_camera(problem: "Problem") -> "Problem":
+    """The problem with one depth view, from behind the arm's shoulder, in place of its scene; the floor stays
+    known."""
+
+    T_base_camera = looking_at(np.array(CAMERA_POSITION), np.array(CAMERA_TARGET))
+    width, height = IMAGE_SIZE
+    intrinsics = (FOCAL_LENGTH, FOCAL_LENGTH, (width - 1) / 2, (height - 1) / 2)
+    true_scene = Scene([FLOOR, *problem.scene.shapes])
+    view = ray_cast(true_scene, T_base_camera, intrinsics, IMAGE_SIZE, problem.robot, problem.start)
+    return replace(problem, scene=Scene([FLOOR]), views=(view,), unknown=PREDICTED)

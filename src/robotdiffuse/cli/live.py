@@ -1,0 +1,48 @@
+"""The command `robotdiffuse live`, and the page of `robotdiffuse explore --live`."""
+
+import os
+import signal
+import sys
+import threading
+from typing import NoReturn
+
+from rich.console import Console
+
+from robotdiffuse.cli.arguments import STOPPED, Namespace
+from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS
+from robotdiffuse.planning.exploration.steps import ExplorerSettings
+from robotdiffuse.problems.files import load_problem
+from robotdiffuse.visualization.live.exploration import ExplorationPage, ExplorationSession
+from robotdiffuse.visualization.live.page import LivePage, Page
+from robotdiffuse.visualization.live.server import PageServer, free_port
+from robotdiffuse.visualization.live.session import PageOptions, Session, first_problem
+
+
+def run_live(arguments: Namespace) -> NoReturn:
+    planner = arguments.planner or DEFAULT_PLANNER
+    PLANNERS.entry(planner)
+    options = PageOptions(planner, arguments.time_limit)
+    number = free_port(arguments.host, arguments.port)
+    with Console(stderr=True).status("loading the robot (preparing a new URDF takes a minute)"):
+        problem = first_problem(arguments.problem, arguments.robot)
+    serve_until_stopped(Page(Session(problem, options), PageServer(arguments.host, number)))
+
+
+def show_live(arguments: Namespace, settings: ExplorerSettings) -> NoReturn:
+    """Serve the page of an exploration until Ctrl-C."""
+    number = free_port(arguments.host, arguments.port)
+    problem = load_problem(arguments.problem)
+    session = ExplorationSession(problem, settings, arguments.noise, arguments.seed, arguments.speed)
+    serve_until_stopped(ExplorationPage(session, PageServer(arguments.host, number)))
+
+
+def serve_until_stopped(page: LivePage) -> NoReturn:
+    """Print the address of a page, serve it until Ctrl-C, and end the process."""
+    ended = threading.Event()
+    for stop_signal in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(stop_signal, lambda *_: ended.set())
+    print(f"the page is at {page.server.url} (stop with Ctrl-C)", flush=True)
+    ended.wait()
+    page.close()
+    print("robotdiffuse: stopped", file=sys.stderr, flush=True)
+    os._exit(STOPPED)  # a normal exit would wait for threads that plan or compile
