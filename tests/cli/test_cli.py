@@ -25,7 +25,8 @@ BAD_CALL = {
         "planner rrt_connect has no weights",
     ),
     "weights of a name that no file has": (
-        ["plan", "problem.json", "--weights", "w" * 5000], "wwww... File name too long"
+        ["plan", "problem.json", "--planner", "diffusion", "--weights", "w" * 5000],
+        "wwww... File name too long",
     ),
     "motion of a name that no file has": (
         ["verify", "--problem", "problem.json", "w" * 5000], "wwww... File name too long"

@@ -38,10 +38,8 @@ def test_bad_input_is_one_line(wrong, monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         number = taken.getsockname()[1]
         assert f"port {number} of 127.0.0.1 cannot be used" in wrong("--port", str(number))
-    monkeypatch.delitem(sys.modules, "robotdiffuse.visualization.live.page", raising=False)
-    for module in [
-        name for name in sys.modules if name.startswith(("robotdiffuse.visualization.live", "viser"))
-    ]:
+    loaded = ("robotdiffuse.cli.live", "robotdiffuse.visualization.live", "viser")
+    for module in [name for name in sys.modules if name.startswith(loaded)]:
         monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, "viser", None)
     assert 'this needs viser, not installed: pip install "robotdiffuse[live]"' in wrong()
