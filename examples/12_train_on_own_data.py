@@ -1,11 +1,10 @@
-"""Make motions, train the diffusion model on them, and plan by search and the new network.
+"""Make motions, train the diffusion model on them, and plan with the new network under guidance.
 
 So few motions and samples make no good network: the bundled one was trained on 31,000 motions.
 """
 
 import robotdiffuse as rd
 from robotdiffuse.cli import main
-from robotdiffuse.planning import planner_settings
 from robotdiffuse.visualization.picture import write_picture
 
 if __name__ == "__main__":  # worker processes import this file again
@@ -21,7 +20,7 @@ if __name__ == "__main__":  # worker processes import this file again
         start=[-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8],
         goal=[1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8],
     )
-    planner = rd.load_planner("robotdiffuse", planner_settings("robotdiffuse", ["weights=own/network"]))
+    planner = rd.load_planner("diffusion", weights="own/network")
     result = planner.plan(problem, time_limit=10.0)
     print(result.status.value, result.reason)
     write_picture(problem.robot, problem.scene, result.trajectory, "12_train_on_own_data.png")

@@ -32,7 +32,10 @@ BAD_CALL = {
         ["verify", "--problem", "problem.json", "w" * 5000], "wwww... File name too long"
     ),
     "option of 5,000 characters": (["plan", "problem.json", "w" * 5000], "unrecognized arguments: wwwwwwww"),
-    "weights that are none": (["plan", "problem.json", "--weights", "."], "holds no model"),
+    "weights that are none": (
+        ["plan", "problem.json", "--planner", "diffusion", "--weights", "."],
+        "holds no model",
+    ),
     "unknown planner": (["plan", "problem.json", "--planner", "rrt"], "known: a_star, aorrtc, control"),
     "no time": (["plan", "problem.json", "--time-limit", "0"], "'0' is not a positive number"),
     "unknown end": (["plan", "problem.json", "--until", "soon"], "'first', 'converged', 'time_limit'"),

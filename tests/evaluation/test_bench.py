@@ -361,7 +361,7 @@ def test_other_weights_of_the_same_name_are_refused(tmp_path: Path, monkeypatch:
         ({"planners": ("rrt_connect:stp=1",)}, "rrt_connect has no setting 'stp'; it has .*tightenings"),
         ({"planners": ("rrt_connect:range=-1",)}, "rrt_connect.range is -1.0; it must be positive"),
         ({"planners": ("rrt_connect:range",)}, "'range' is not NAME=VALUE"),
-        ({"planners": ("robotdiffuse@nowhere",)}, r"there are no weights \S*nowhere"),
+        ({"planners": ("diffusion@nowhere",)}, r"there are no weights \S*nowhere"),
         ({"planners": ("mpnet@nowhere",)}, r"there are no weights \S*nowhere"),
         ({"problems": ("rop", "rop")}, "none twice"),
         ({"problems": ("ropp",)}, "neither a file or folder nor a family"),

@@ -156,7 +156,7 @@ def run_figures(arguments: Namespace) -> int:
     out = settings.out
     count = min(settings.problems, FIGURE_PROBLEMS)
     command = f"robotdiffuse reproduce figures --out FOLDER --problems {settings.problems} "
-    command += f"--time-limit {settings.time_limit:g}"
+    command += f"--time-limit {settings.time_limit:g}{' --cpu-time' * settings.cpu_time}"
     report = paper.paper_report("Figures", command)
     report.add("## Figure 1")
     problem = hard_cases("rop", 1, out / "problems")[0].problem
@@ -169,7 +169,7 @@ def run_figures(arguments: Namespace) -> int:
     by_steps = paper.plot_success_by_steps(paper.success_by_steps(out, count))
     report.plot("figure1_steps.svg", f"Success against T, {count} problems, 95 % intervals", by_steps)
     report.add("## Figure 3")
-    caption = "a: success over time, goals are poses, trivial problems too"
+    caption = "a: success over time, goals are poses, problems that are not trivial"
     report.plot("figure3a.svg", caption, paper.plot_success_over_time(bench))
     compared = paper.compared_motions(bench)
     if compared is not None:

@@ -124,8 +124,6 @@ def _of_call(text: str) -> bool:
     return text.partition("=")[0] in CALL_ARGUMENTS
 
 
-PlannerSpecs = Mapping[str, PlannerSpec]
-"""By their labels, which are the methods of runs."""
 START_TIMEOUT = 300.0
 """For starting and for warming up [s]; the first time ever, kernels are compiled."""
 GRACE = 20.0
