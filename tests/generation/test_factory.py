@@ -24,7 +24,6 @@ from robotdiffuse.datasets.rows import path_of, problem_of
 from robotdiffuse.datasets.shards import check_shard, read_manifest, read_shard
 from robotdiffuse.generation import GenerationSettings, factory, generate
 from robotdiffuse.generation.factory import PROBLEMS_PER_SHARD, draw, make_shard
-from robotdiffuse.problems.families import family, rop
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot, names_a_file
 from robotdiffuse.robots.kinematics import link_pose
@@ -208,12 +207,8 @@ def test_frames_in_time_keep_the_velocity_limits() -> None:
     ("name", "value"),
     [
         ("trajectories", 0),
-        ("seed", -1),
-        ("shard", 0),
-        ("goals", 0),
         ("goals", 128),
         ("waypoints", 1),
-        ("trivial_share", -0.1),
         ("trivial_share", float("nan")),
     ],
 )
@@ -226,14 +221,6 @@ def test_bad_settings_are_refused(name: str, value: float) -> None:
 def test_unknown_kinds_are_refused_with_those_known(name: str, known: str) -> None:
     with pytest.raises(InputError, match=f"{name}.*posse.*{known}"):
         replace(SETTINGS, **{name: "posse"})
-
-
-def test_scenes_out_of_reach_are_refused() -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rop, "ROP", replace(rop.ROP, tip_x=(5.0, 5.1)))
-        patch.setattr(family, "MAX_SCENES", 2)
-        with pytest.raises(InputError, match="no free start and goal in 2 scenes of Rop for panda"):
-            make_shard(replace(SETTINGS, mix={"rop": 1.0}), 0)
 
 
 def change_manifest(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
@@ -321,10 +308,6 @@ def test_workers_and_clusters_that_are_none_are_refused(tmp_path: Path) -> None:
 def test_bad_mixes_are_refused(mix: dict[str, float], message: str) -> None:
     with pytest.raises(InputError, match=message):
         replace(SETTINGS, mix=mix)
-
-
-def test_the_papers_mix_needs_two_slots() -> None:
-    assert GenerationSettings().slots == 2 and SETTINGS.slots == 12
 
 
 def test_furniture_among_the_families(tmp_path: Path) -> None:

@@ -150,10 +150,13 @@ def problem_of(asked: str) -> rd.Problem:
     return ASKED[asked].problem()
 
 
+THROUGH = ("robotdiffuse", "rrt_connect")
+QUICK = ("pose", "any goal", "waypoints", "views", "clearance", "cone", "line", "moving", "start velocity")
+
+
 def marks_of(name: str, asked: str) -> list[pytest.MarkDecorator]:
-    """These two take a second for each path; the pipeline is one for all planners."""
-    quick = ("pose", "any goal", "views", "cone", "clearance")
-    return [pytest.mark.slow] if name in ("edmp", "mpd") and asked not in quick else []
+    """The pipeline is one for all planners: the quick suite takes two of them through every request."""
+    return [] if name in THROUGH or asked in QUICK else [pytest.mark.slow]
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,6 @@ from numpy import ndarray
 from trimesh.triangles import closest_point
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.input_files import read_yaml
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.scenes.files import SHAPES as KINDS
 from robotdiffuse.scenes.files import read_scene, scene_entries
@@ -153,9 +152,7 @@ def test_region_refuses_a_floor_above_the_reach() -> None:
         (lambda: Sphere([0, 0], 1), r"sphere.center is \[0, 0\]; it must be 3 finite numbers"),
         (lambda: Sphere([0, 0, np.nan], 1), "sphere.center"),
         (lambda: Sphere(["a", 0, 0], 1), "sphere.center"),
-        (lambda: Sphere(["1", "2", "3"], 1), "sphere.center"),
         (lambda: Sphere([0, 0, 0], -1), "sphere.radius is -1; it must be a positive number"),
-        (lambda: Sphere([0, 0, 0], True), "sphere.radius is True"),
         (lambda: Sphere([0, 0, 0], 1, name=""), "sphere.name"),
         (lambda: Box([0, 0, 0], [1, 0, 1]), "box.size"),
         (lambda: Box([0, 0, 0], [1, 1, 1], [0, 0, 0, 0]), "must not be zero"),
@@ -169,7 +166,6 @@ def test_region_refuses_a_floor_above_the_reach() -> None:
             r"points\[0\] is \[0.0, 0.0, inf\]; it must be finite numbers",
         ),
         (lambda: PointCloud([[0, 0, 0], [1]]), "not numbers"),
-        (lambda: PointCloud([], point_radius=0), "point_cloud.point_radius is 0"),
         (lambda: Scene(["ball"]), r"scene\[0\] is a str"),  # type: ignore[list-item]
     ],
 )
@@ -177,11 +173,6 @@ def test_wrong_shapes(make: Callable[[], Shape], message: str) -> None:
     with pytest.raises(InputError, match=message) as raised:
         make()
     assert "\n" not in str(raised.value)
-
-
-def test_names_are_made_unique() -> None:
-    ball = Sphere([0, 0, 0], 1)
-    assert [shape.name for shape in Scene([ball, ball, ball]).shapes] == ["sphere", "sphere_2", "sphere_3"]
 
 
 @given(
@@ -442,11 +433,6 @@ def test_shapes_from_files_are_written_as_names_of_files(tmp_path: Path) -> None
     assert written == [{"mesh": {"file": "box.stl", "xyz": [0.0, 0.0, 1.0]}}, entries[1]]
     assert scene_entries(scene, None)[0]["mesh"]["file"] == str((tmp_path / "box.stl").resolve())
     assert_equal(scene, read_scene(written, tmp_path)[0])
-
-
-def test_yaml_numbers_with_exponents(tmp_path: Path) -> None:
-    (tmp_path / "a.yaml").write_text("[1e-3, 2.5e3, -1E+2, .5e1, 1e, e1, 3]")
-    assert read_yaml(tmp_path / "a.yaml") == [1e-3, 2500.0, -100.0, 5.0, "1e", "e1", 3]
 
 
 def test_meshes_and_clouds_from_files_with_a_scale(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path as FilePath
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
@@ -371,7 +372,7 @@ class BenchSettings(Settings):
         """What the planners print."""
         return self.out / "logs"
 
-    @property
+    @cached_property
     def specs(self) -> dict[str, PlannerSpec]:
         """The planners by their names in results. Raises InputError for an unknown planner or two of one
         name."""

@@ -85,8 +85,6 @@ MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
     ("make", "message"),
     [
         (lambda: problem([0, 0]), "start has 2 values; crane has 3 planned joints: swing, spin, lift"),
-        (lambda: problem([0, 0, 0, 0]), "start has 4 values"),
-        (lambda: problem(goal=[1.0]), "goal has 1 values"),
         (lambda: problem(goal=[[0, 0, 0], [1, 1]]), "goal is .* a list of them of one length"),
         (lambda: problem(goal=[[0, 0], [1, 1]]), r"goal\[0\] has 2 values"),
         (
@@ -98,8 +96,6 @@ MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
             r"start: lift is inf; it must be a finite number .* \[m\]",
         ),
         (lambda: problem(goal=[0, 0, np.nan]), "goal: lift is nan"),
-        (lambda: problem([2.1, 0, 0]), "start: swing is 2.1 rad; its limits are -1 to 2"),
-        (lambda: problem([2.002, 0, 0]), "start: swing is 2.002 rad"),
         (
             lambda: problem(goal=[[0, 0, 0], [0, 0, 0.6]]),
             r"goal\[1\]: lift is 0.6 m; its limits are 0 to 0.5",
@@ -216,11 +212,6 @@ WRONG: dict[str, tuple[object, str]] = {
         shape(sphere={"center": [0, 0, 1], "radius": None}),
         r"scene\[1\].sphere.radius is None; it must be a positive number",
     ),
-    "short center": (shape(sphere={"center": [0, 1], "radius": 1}), r"scene\[1\].sphere.center is \[0, 1\]"),
-    "NaN in a shape": (
-        shape(sphere={"center": [0, 1, float("nan")], "radius": 1}),
-        r"scene\[1\].sphere.center .* 3 finite numbers",
-    ),
     "missing mesh": (
         shape(mesh={"file": "none.stl"}),
         r"scene\[1\].mesh: mesh file .*none.stl does not exist",
@@ -231,16 +222,7 @@ WRONG: dict[str, tuple[object, str]] = {
         shape(point_cloud={"file": "none.ply", "points": []}),
         r"unknown field of scene\[1\].point_cloud: 'points'",
     ),
-    "wrong length": (
-        GOOD | {"start": [0, 0, 0]},
-        "start has 3 values; panda has 7 planned joints: panda_joint1,",
-    ),
-    "NaN": (GOOD | {"start": [float("nan"), *READY[1:]]}, "start: panda_joint1 is nan"),
     "start a text": (GOOD | {"start": "home"}, "unknown pose in start: .home.; known: extended, ready"),
-    "out of limits": (
-        GOOD | {"goal": {"joints": [9, *READY[1:]]}},
-        "goal: panda_joint1 is 9 rad; its limits are -2.8",
-    ),
     "goal a list": (
         GOOD | {"goal": 7.0},
         "goal is 7.0; it must be one of joints, joint_set, pose, poses, any, or a configuration",
@@ -259,10 +241,6 @@ WRONG: dict[str, tuple[object, str]] = {
     "pose without a frame": (
         GOOD | {"goal": {"pose": {"xyz": [0, 0, 1], "wxyz": [1, 0, 0, 0]}}},
         "has no frame",
-    ),
-    "unknown frame": (
-        GOOD | {"goal": {"pose": {"frame": "hand", "xyz": [0, 0, 1], "wxyz": [1, 0, 0, 0]}}},
-        "unknown link in goal.frame: 'hand'; known: .*panda_hand",
     ),
     "zero quaternion": (
         GOOD | {"goal": {"pose": {"frame": "panda_hand", "xyz": [0, 0, 1], "wxyz": [0, 0, 0, 0]}}},
