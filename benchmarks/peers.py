@@ -80,7 +80,7 @@ class Answer(NamedTuple):
 
 def robot_files(robot: Robot, folder: Path) -> dict[str, Any]:
     """Writes the robot as a URDF, with joints that are not planned fixed where they are held, and an SRDF."""
-    urdf = write_urdf(robot, folder, visuals=False)
+    urdf = write_urdf(robot, folder)
     tree = ET.parse(urdf)
     for element, joint in zip(tree.iter("joint"), robot.joints, strict=True):
         if joint.kind in MOVING_KINDS and joint.name not in robot.joint_names:
