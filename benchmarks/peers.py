@@ -287,7 +287,8 @@ def main() -> None:
         "rd.verify along the lines between the rows; free: by Coal on the convex meshes every "
         f"{MESH_STEP:g} rad; 1 mm: no deeper contact by PyBullet."
     )
-    print_table(f"{len(cases)} problems of {', '.join(names)}", columns, rows, (about, *notes))
+    of = ", ".join(names if arguments.problems else ("shelf",))
+    print_table(f"{len(cases)} problems of {of}", columns, rows, (about, *notes))
 
 
 if __name__ == "__main__":

@@ -13,6 +13,8 @@ NEEDS = {
     "certificates": ("ompl",),
     "constraints": ("pybullet",),
     "moving_obstacles": ("pybullet",),
+    "mujoco_models": ("mujoco",),
+    "peers": ("pybullet",),
     "planning_requests": ("pybullet", "pinocchio"),
     "robots": ("pybullet",),
     "scene_code": ("accelerate", "matplotlib", "zarr"),
