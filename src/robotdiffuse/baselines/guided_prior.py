@@ -328,6 +328,20 @@ class MPDSettings(PriorSettings, name="mpd"):
     """Places between two waypoints at which the collision cost is evaluated."""
 
 
+def exponential_levels(schedule: NoiseSchedule, steps: int) -> Int[ndarray, "steps"]:
+    """The levels nearest to those of MPD's exponential schedule in log signal-to-noise ratio, falling from T.
+
+    Its betas grow by a constant factor; levels that would fall together are moved apart. Raises InputError
+    unless there are that many levels.
+    """
+    schedule.sampling_levels(steps)
+    betas = np.geomspace(*EXPONENTIAL_BETAS, steps)
+    alpha_bar = np.cumprod(1 - betas)[:-1]
+    target_log_snr = 0.5 * np.log(alpha_bar / (1 - alpha_bar))
+    nearest = np.abs(schedule.half_log_snr[1:, None] - target_log_snr).argmin(0) + 1
+    return falling(np.append(nearest, schedule.steps), schedule.steps)
+
+
 class MPD(GuidedPrior[MPDSettings]):
     """The prior's samples under MPD's guidance; see the head of this file."""
 
@@ -337,10 +351,7 @@ class MPD(GuidedPrior[MPDSettings]):
     noise_scale = 0.5
     quiet_steps = 5
 
-    @staticmethod
-    def levels(schedule: NoiseSchedule, steps: int) -> Int[ndarray, "steps"]:
-        """See `exponential_levels`."""
-        return exponential_levels(schedule, steps)
+    levels = staticmethod(exponential_levels)
 
     def guided(self, checker: CollisionChecker, q: Trajectories, left: int = 0) -> Trajectories:
         """Trajectories after the gradient steps of one denoising step; their ends stay fixed."""
@@ -358,20 +369,6 @@ class MPD(GuidedPrior[MPDSettings]):
             moves[:, [0, -1]] = 0.0
             q = implicit_step((q + moves).astype(np.float32), PRIOR_WEIGHT)
         return q
-
-
-def exponential_levels(schedule: NoiseSchedule, steps: int) -> Int[ndarray, "steps"]:
-    """The levels nearest to those of MPD's exponential schedule in log signal-to-noise ratio, falling from T.
-
-    Its betas grow by a constant factor; levels that would fall together are moved apart. Raises InputError
-    unless there are that many levels.
-    """
-    schedule.sampling_levels(steps)
-    betas = np.geomspace(*EXPONENTIAL_BETAS, steps)
-    alpha_bar = np.cumprod(1 - betas)[:-1]
-    target_log_snr = 0.5 * np.log(alpha_bar / (1 - alpha_bar))
-    nearest = np.abs(schedule.half_log_snr[1:, None] - target_log_snr).argmin(0) + 1
-    return falling(np.append(nearest, schedule.steps), schedule.steps)
 
 
 def state_precision(waypoints: int) -> Float[ndarray, "states states"]:
@@ -481,16 +478,25 @@ class EDMPSettings(PriorSettings, name="edmp"):
         return [slice(a, b) for a, b in pairwise(cuts)]
 
 
+def quadratic_levels(schedule: NoiseSchedule, steps: int) -> Int[ndarray, "steps"]:
+    """`steps` of the levels, falling from T, closer together where there is little noise (Song et al. 2021,
+    D.2).
+
+    Evenly spaced levels would end at a high noise level, and leave the network's error there in the samples.
+    Raises InputError unless there are that many levels.
+    """
+    schedule.sampling_levels(steps)
+    targets = schedule.steps * (np.arange(1, steps + 1) / steps) ** 2
+    return falling(np.maximum(targets.round().astype(np.int64), 1), schedule.steps)
+
+
 class EDMP(GuidedPrior[EDMPSettings]):
     """The prior's samples under an ensemble of guides; see the head of this file."""
 
     name = "edmp"
     settings_class = EDMPSettings
 
-    @staticmethod
-    def levels(schedule: NoiseSchedule, steps: int) -> Int[ndarray, "steps"]:
-        """See `quadratic_levels`."""
-        return quadratic_levels(schedule, steps)
+    levels = staticmethod(quadratic_levels)
 
     def guided(self, checker: CollisionChecker, q: Trajectories, left: int) -> Trajectories:
         """The batch after a gradient step of every guide on its rows; the ends of trajectories stay fixed."""
@@ -504,15 +510,3 @@ class EDMP(GuidedPrior[EDMPSettings]):
             moves = limited(-guide.weight * gradient, settings.push)
             moved[share, 1:-1] += moves[:, 1:-1]
         return moved
-
-
-def quadratic_levels(schedule: NoiseSchedule, steps: int) -> Int[ndarray, "steps"]:
-    """`steps` of the levels, falling from T, closer together where there is little noise (Song et al. 2021,
-    D.2).
-
-    Evenly spaced levels would end at a high noise level, and leave the network's error there in the samples.
-    Raises InputError unless there are that many levels.
-    """
-    schedule.sampling_levels(steps)
-    targets = schedule.steps * (np.arange(1, steps + 1) / steps) ** 2
-    return falling(np.maximum(targets.round().astype(np.int64), 1), schedule.steps)

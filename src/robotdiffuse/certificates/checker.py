@@ -94,7 +94,6 @@ def check(
         if not misplaced:
             errors += requirement_errors(problem, certificate)
             errors += _proof_errors(problem, certificate)
-            errors += _moving_proof_errors(problem, certificate)
     return Findings(tuple(errors))
 
 
@@ -118,37 +117,26 @@ def hash_of(motion: Path | Trajectory) -> str:
 
 
 def _proof_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
-    """Differences in the proof in the scene and between links."""
+    """Differences in the proof in the scene and between links, and in that among moving obstacles."""
     motion = certificate.motion
+    places = motion, certificate.between
+    along = configurations(*places), deviations(*places)
+    prover = Prover(problem.robot, problem.scene, *along)
     proof = certificate.proof
-    q = configurations(motion, certificate.between)
-    off = deviations(motion, certificate.between)
-    prover = Prover(problem.robot, problem.scene, q, off)
     stated = {"scene": certificate.scene_clearance, "self": certificate.self_clearance}
     of_pairs = np.array([claim.against != SCENE for claim in proof.claims], bool)[proof.stretches.claim]
     yield from _bound_errors(prover, proof, {"scene": ~of_pairs, "self": of_pairs}, stated)
-
-
-def _moving_proof_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
-    """Differences in the proof among moving obstacles."""
-    motion = certificate.motion
-    proof = certificate.moving
-    if not problem.moving:
-        if proof is not None:
-            yield "proof: there is one among moving obstacles, which the problem has not"
-        return
-    if not isinstance(motion, Trajectory):
-        return
-    if proof is None:
-        yield "proof: there is none among moving obstacles"
-        return
-    times = places_of(motion, certificate.between)
-    q = configurations(motion, certificate.between)
-    off = deviations(motion, certificate.between)
-    prover = MovingProver(problem.robot, problem.moving, q, times, off)
-    every = np.ones(len(proof.stretches.claim), bool)
-    stated = {"scene": certificate.scene_clearance}
-    yield from _bound_errors(prover, proof, {"scene": every}, stated)
+    moving = certificate.moving
+    if moving is not None and not problem.moving:
+        yield "proof: there is one among moving obstacles, which the problem has not"
+    elif problem.moving and isinstance(motion, Trajectory):
+        if moving is None:
+            yield "proof: there is none among moving obstacles"
+            return
+        prover = MovingProver(problem.robot, problem.moving, along[0], places_of(*places), along[1])
+        yield from _bound_errors(
+            prover, moving, {"scene": np.ones(len(moving.stretches.claim), bool)}, stated
+        )
 
 
 def _bound_errors(

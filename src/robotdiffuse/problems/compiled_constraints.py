@@ -357,7 +357,9 @@ def _arrays(robot: Robot, frames: list[str], rows: list[_Row]) -> Rows:
     for row, chain in zip(joints, chains, strict=True):
         row[: len(chain)] = chain
     kinds = np.array([KINDS[joint.kind] for joint in robot.planned_joints])
-    tools = [robot.T_frame_link(frame) for frame in frames]
+    of_rows: dict[str, ndarray] = {
+        name: np.array([getattr(row, name) for row in rows]) for name in _Row._fields
+    }
     return Rows(
         chain=joints,
         offsets=robot.frame_offsets[joints],
@@ -365,19 +367,12 @@ def _arrays(robot: Robot, frames: list[str], rows: list[_Row]) -> Rows:
         continuous=for_kernels(robot.continuous, np.bool_),
         lower=for_kernels(robot.lower),
         upper=for_kernels(robot.upper),
-        row_kind=np.array([row.row_kind for row in rows]),
         chain_length=np.array([len(chain) for chain in chains]),
         same_frame=np.array([False, *(a == b for a, b in pairwise(frames))]),
-        T_joint_frame=np.stack(tools),
-        reference_pose=np.stack([row.reference_pose for row in rows]),
-        half_size=np.stack([row.half_size for row in rows]),
-        inner_half_size=np.stack([row.inner_half_size for row in rows]),
-        a=np.stack([row.a for row in rows]),
-        b=np.stack([row.b for row in rows]),
-        limit=np.array([row.limit for row in rows]),
-        inner_limit=np.array([PROJECTION_FRACTION * row.limit for row in rows]),
-        tolerance=np.array([row.tolerance for row in rows]),
+        T_joint_frame=np.stack([robot.T_frame_link(frame) for frame in frames]),
+        inner_limit=PROJECTION_FRACTION * of_rows["limit"],
         lever_bounds=np.stack([_lever_bounds(robot, frame) for frame in frames]),
+        **of_rows,
     )
 
 

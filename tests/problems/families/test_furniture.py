@@ -155,7 +155,9 @@ def test_doors_hang_on_the_edges_of_cells_and_drawers_have_room_inside() -> None
     drawers = 0
     rng = np.random.default_rng(8)
     for _ in range(60):
-        shapes, regions = cabinet.build(rng)
+        [piece] = cabinet.build(rng)
+        shapes = piece.shapes
+        regions = piece.regions
         uprights = [s for s in shapes if s.name == "upright" and isinstance(s, Box)]
         for door in (s for s in shapes if s.name == "door" and isinstance(s, Box)):
             ends = door.center + np.array([[0.5], [-0.5]]) * door.size[1] * door.rotation[:, 1]

@@ -6,6 +6,7 @@ table. `sample_target` samples poses with the fingers in a region.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -138,8 +139,8 @@ class Furniture(Ranges, ABC):
         """Maximum number of obstacles of a scene, without the floor."""
 
     @abstractmethod
-    def build(self, rng: Generator) -> "Build":
-        """The shapes and all regions, whether in reach or not. Raises NoRoomError."""
+    def build(self, rng: Generator) -> "Sequence[FurnitureFrame]":
+        """The pieces of furniture, with all regions, whether in reach or not. Raises NoRoomError."""
 
     @property
     def floor(self) -> Box:
@@ -159,10 +160,16 @@ class Furniture(Ranges, ABC):
         """
         for _ in range(MAX_TRIES):
             try:
-                shapes, regions = self.build(rng)
+                pieces = self.build(rng)
             except NoRoomError:
                 continue
-            regions = [r for r in regions if np.linalg.norm(r.center - SHOULDER) <= self.reach]
+            shapes = [shape for piece in pieces for shape in piece.shapes]
+            regions = [
+                r
+                for piece in pieces
+                for r in piece.regions
+                if np.linalg.norm(r.center - SHOULDER) <= self.reach
+            ]
             if len(regions) >= 2 and all(is_clear_of(shape, keep_out) for shape in shapes):
                 return FurnishedScene(Scene([self.floor, *shapes]), tuple(regions))
         raise InputError(
@@ -200,13 +207,14 @@ class Furniture(Ranges, ABC):
 
 
 Corner = tuple[float, float, float]
-Build = tuple[list[Box | Sphere], list[Region]]
 
 
 class FurnitureFrame:
-    """Frame of a piece of furniture: x points away from the arm, y to the left, z up from the ground."""
+    """A piece of furniture in its frame: x points away from the arm, y to the left, z up from the ground."""
 
     def __init__(self, settings: Furniture, distance: Range, rng: Generator) -> None:
+        self.shapes: list[Box | Sphere] = []
+        self.regions: list[Region] = []
         bearing = rng.uniform(*settings.bearing)
         away = rng.uniform(*distance)
         self.yaw = float(bearing + rng.uniform(*settings.turn))
@@ -217,17 +225,23 @@ class FurnitureFrame:
         """A point of this frame, in the base frame [m]."""
         return self.rotation @ xyz + [*self.xy, 0.0]
 
-    def box(self, low: Corner, high: Corner, name: str, turn: float = 0.0) -> Box:
-        """A box with two opposite corners in this frame, then rotated about its middle by `turn` [rad]."""
+    def box(self, low: Corner, high: Corner, name: str, turn: float = 0.0) -> None:
+        """Adds a box with two opposite corners in this frame, then rotated about its middle by `turn`
+        [rad]."""
         half = (self.yaw + turn) / 2
         middle = (np.array(low) + high) / 2
         size = np.subtract(high, low)
-        return Box(self.point(middle), size, (np.cos(half), 0.0, 0.0, np.sin(half)), name)
+        self.shapes.append(Box(self.point(middle), size, (np.cos(half), 0.0, 0.0, np.sin(half)), name))
 
-    def region(self, low: Corner, high: Corner, approach: Vector) -> Region:
+    def region(self, low: Corner, high: Corner, approach: Vector) -> None:
         middle = (np.array(low) + high) / 2
         size = np.subtract(high, low)
-        return Region(self.point(middle), size, self.yaw, self.rotation @ approach)
+        self.regions.append(Region(self.point(middle), size, self.yaw, self.rotation @ approach))
+
+    def boxes(self, corners: Iterable[tuple[Corner, Corner]], name: str) -> None:
+        """Adds several boxes of one name."""
+        for low, high in corners:
+            self.box(low, high, name)
 
 
 class LooseObject:
@@ -242,12 +256,13 @@ class LooseObject:
         self.half = x / 2 if self.ball else float(np.hypot(x, y)) / 2
         """Half the side of a square that contains it at any rotation."""
 
-    def placed(self, frame: FurnitureFrame, x: float, y: float, z: float) -> Box | Sphere:
-        """The shape at x, y of the frame, standing at height z."""
+    def put(self, frame: FurnitureFrame, x: float, y: float, z: float) -> None:
+        """Adds the shape at x, y of the frame, standing at height z."""
         a, b, c = self.size
         if self.ball:
-            return Sphere(frame.point(np.array([x, y, z + c / 2])), c / 2, "ball")
-        return frame.box((x - a / 2, y - b / 2, z), (x + a / 2, y + b / 2, z + c), "thing", self.turn)
+            frame.shapes.append(Sphere(frame.point(np.array([x, y, z + c / 2])), c / 2, "ball"))
+        else:
+            frame.box((x - a / 2, y - b / 2, z), (x + a / 2, y + b / 2, z + c), "thing", self.turn)
 
 
 Rectangle = tuple[float, float, float, float]
@@ -282,24 +297,18 @@ class Surface:
                 return x, y
         raise NoRoomError
 
-    def spots(self, numbers: tuple[int, int], size: Range, rng: Generator) -> list[Region]:
-        """Random free regions, as high as they are wide, where the hand points down."""
-        regions: list[Region] = []
-        for _ in range(count(numbers, rng)):
-            half = rng.uniform(*size) / 2
-            (x, y), top = self.place(half, half, rng), self.height + 2 * half
+    def furnish(self, settings: "Table | Kitchen", rng: Generator) -> None:
+        """Adds random free regions, as high as they are wide, where the hand points down, and then the random
+        loose objects of the settings."""
+        for _ in range(count(settings.spots, rng)):
+            half = rng.uniform(*settings.spot_size) / 2
+            x, y = self.place(half, half, rng)
             low = (x - half, y - half, self.height)
-            high = (x + half, y + half, top)
-            regions.append(self.frame.region(low, high, DOWN))
-        return regions
-
-    def loose_objects(self, settings: Furniture, rng: Generator) -> list[Box | Sphere]:
-        """The random loose objects of the settings."""
-        objects: list[Box | Sphere] = []
+            high = (x + half, y + half, self.height + 2 * half)
+            self.frame.region(low, high, DOWN)
         for _ in range(count(settings.objects, rng)):
             loose = LooseObject(settings, rng)
-            objects.append(loose.placed(self.frame, *self.place(loose.half, loose.half, rng), self.height))
-        return objects
+            loose.put(self.frame, *self.place(loose.half, loose.half, rng), self.height)
 
 
 def is_free(square: Rectangle, taken: list[Rectangle]) -> bool:
@@ -315,10 +324,9 @@ def loose_in_cells(
     cells: list[list[float]],
     rng: Generator,
     at_sides: bool = False,
-) -> list[Box | Sphere]:
-    """Random loose objects, at most one a cell (see `Cell`), whose free part becomes narrower. Objects that
-    would leave too little space are left out."""
-    shapes: list[Box | Sphere] = []
+) -> None:
+    """Adds random loose objects, at most one a cell (see `Cell`), whose free part becomes narrower. Objects
+    that would leave too little space are left out."""
     things = min(count(settings.objects, rng), len(cells))
     for i in rng.permutation(len(cells))[:things]:
         low, high, z, ceiling = cells[i]
@@ -331,9 +339,8 @@ def loose_in_cells(
             y = low + half if rng.random() < 0.5 else high - half
         else:
             y = rng.uniform(low + half, high - half)
-        shapes.append(loose.placed(frame, x, y, z))
+        loose.put(frame, x, y, z)
         cells[i][:2] = (y + half, high) if y < (low + high) / 2 else (low, y - half)
-    return shapes
 
 
 def edges(sizes: Values, t: float) -> Values:
@@ -378,7 +385,7 @@ class Shelf(Furniture):
     def max_obstacles(self) -> int:
         return self.boards[1] + self.columns[1] + 2 + self.objects[1]
 
-    def build(self, rng: Generator) -> Build:
+    def build(self, rng: Generator) -> Sequence[FurnitureFrame]:
         frame = FurnitureFrame(self, self.distance, rng)
         depth = rng.uniform(*self.depth)
         t = rng.uniform(*self.thickness)
@@ -390,24 +397,20 @@ class Shelf(Furniture):
         left = sides[0]
         right = sides[-1] + t
         height = tops[-1]
-        shapes: list[Box | Sphere] = [
-            frame.box((0.0, left + t, z - t), (depth, right - t, z), "board") for z in tops
-        ]
-        shapes += [frame.box((0.0, y, 0.0), (depth, y + t, height), "upright") for y in sides]
+        frame.boxes((((0.0, left + t, z - t), (depth, right - t, z)) for z in tops), "board")
+        frame.boxes((((0.0, y, 0.0), (depth, y + t, height)) for y in sides), "upright")
         if rng.random() < self.back_share:
-            shapes.append(frame.box((depth, left, 0.0), (depth + t, right, height), "back"))
+            frame.box((depth, left, 0.0), (depth + t, right, height), "back")
         ceilings = [*(tops[1:] - t), height + self.row_height[1]]
         compartments = [
             [y + t, y + t + w, z, ceiling]
             for z, ceiling in zip(tops, ceilings, strict=True)
             for y, w in zip(sides[:-1], columns, strict=True)
         ]
-        shapes += loose_in_cells(self, frame, depth, compartments, rng, at_sides=True)
-        regions = [
+        loose_in_cells(self, frame, depth, compartments, rng, at_sides=True)
+        for low, high, z, ceiling in compartments:
             frame.region((0.0, low, z), (depth, high, ceiling), AHEAD)
-            for low, high, z, ceiling in compartments
-        ]
-        return shapes, regions
+        return [frame]
 
 
 SHELF = Shelf()
@@ -441,51 +444,46 @@ class Crate(Furniture):
     def max_obstacles(self) -> int:
         return 6 * self.crates[1] + self.objects[1]
 
-    def build(self, rng: Generator) -> Build:
-        shapes: list[Box | Sphere] = []
-        regions: list[Region] = []
+    def build(self, rng: Generator) -> Sequence[FurnitureFrame]:
+        frames: list[FurnitureFrame] = []
         occupied: list[Rectangle] = []
+
+        def place(half: float) -> FurnitureFrame:
+            """A free place on the ground for an object of this half width, which is then marked as taken."""
+            for _ in range(PLACE_TRIES):
+                frame = FurnitureFrame(self, self.distance, rng)
+                square = (float(frame.xy[0]), float(frame.xy[1]), half, half)
+                if is_free(square, occupied):
+                    occupied.append(square)
+                    frames.append(frame)
+                    return frame
+            raise NoRoomError
+
         for _ in range(count(self.crates, rng)):
             x, y = rng.uniform(*self.length, 2) / 2
             h = rng.uniform(*self.height)
             t = rng.uniform(*self.thickness)
-            frame = _free_place(self, float(np.hypot(x + t, y + t)), occupied, rng)
+            frame = place(float(np.hypot(x + t, y + t)))
             low = 0.0
             if rng.random() < self.raised_share:
                 low = rng.uniform(*self.block_height)
-                shapes.append(frame.box((-x - t, -y - t, 0.0), (x + t, y + t, low), "block"))
+                frame.box((-x - t, -y - t, 0.0), (x + t, y + t, low), "block")
             bottom = low + t
             top = low + t + h
-            shapes.append(frame.box((-x - t, -y - t, low), (x + t, y + t, bottom), "bottom"))
+            frame.box((-x - t, -y - t, low), (x + t, y + t, bottom), "bottom")
             for side in (-1, 1):
                 a, b = sorted((side * x, side * (x + t)))
-                shapes.append(frame.box((a, -y - t, bottom), (b, y + t, top), "wall"))
+                frame.box((a, -y - t, bottom), (b, y + t, top), "wall")
                 a, b = sorted((side * y, side * (y + t)))
-                shapes.append(frame.box((-x, a, bottom), (x, b, top), "wall"))
-            regions.append(frame.region((-x, -y, bottom), (x, y, top), DOWN))
+                frame.box((-x, a, bottom), (x, b, top), "wall")
+            frame.region((-x, -y, bottom), (x, y, top), DOWN)
         for _ in range(count(self.spots, rng)):
             half = rng.uniform(*self.spot_size) / 2
-            frame = _free_place(self, float(np.sqrt(2) * half), occupied, rng)
-            regions.append(frame.region((-half, -half, 0.0), (half, half, 2 * half), DOWN))
+            place(float(np.sqrt(2) * half)).region((-half, -half, 0.0), (half, half, 2 * half), DOWN)
         for _ in range(count(self.objects, rng)):
             loose = LooseObject(self, rng)
-            frame = _free_place(self, loose.half, occupied, rng)
-            shapes.append(loose.placed(frame, 0.0, 0.0, 0.0))
-        return shapes, regions
-
-
-def _free_place(crate: Crate, half: float, taken: list[Rectangle], rng: Generator) -> FurnitureFrame:
-    """A free place on the ground for an object of this half width, which is then marked as taken.
-
-    Raises NoRoomError.
-    """
-    for _ in range(PLACE_TRIES):
-        frame = FurnitureFrame(crate, crate.distance, rng)
-        square = (float(frame.xy[0]), float(frame.xy[1]), half, half)
-        if is_free(square, taken):
-            taken.append(square)
-            return frame
-    raise NoRoomError
+            loose.put(place(loose.half), 0.0, 0.0, 0.0)
+        return frames
 
 
 CRATE = Crate()
@@ -535,7 +533,7 @@ class Table(Furniture):
     def max_obstacles(self) -> int:
         return 6 + self.objects[1]
 
-    def build(self, rng: Generator) -> Build:
+    def build(self, rng: Generator) -> Sequence[FurnitureFrame]:
         frame = FurnitureFrame(self, self.distance, rng)
         length = rng.uniform(*self.length)
         side = rng.uniform(*self.width) / 2
@@ -544,30 +542,28 @@ class Table(Furniture):
         legs = rng.random() < self.legs_share
         under = height - t
         bottom = under if legs else 0.0
-        shapes: list[Box | Sphere] = [frame.box((0.0, -side, bottom), (length, side, height), "table")]
-        regions: list[Region] = []
+        frame.box((0.0, -side, bottom), (length, side, height), "table")
         if legs:
             w = rng.uniform(*self.leg_width)
             for x, y in ((0.0, -side), (0.0, side - w), (length - w, -side), (length - w, side - w)):
-                shapes.append(frame.box((x, y, 0.0), (x + w, y + w, under), "leg"))
+                frame.box((x, y, 0.0), (x + w, y + w, under), "leg")
             if under > MIN_TABLE_HEIGHT:
                 half_width = side - w
-                regions.append(frame.region((0.0, -half_width, 0.0), (length / 2, half_width, under), AHEAD))
+                frame.region((0.0, -half_width, 0.0), (length / 2, half_width, under), AHEAD)
         surface = Surface(frame, length, side, height)
         kind = rng.random()
         top = height + rng.uniform(*self.divider_height)
         if kind < self.wall_share:
             start = rng.uniform(0.0, length / 3)
             y = rng.uniform(-side / 3, side / 3)
-            shapes.append(frame.box((start, y - t / 2, height), (length, y + t / 2, top), "wall"))
+            frame.box((start, y - t / 2, height), (length, y + t / 2, top), "wall")
             surface.taken.append(((start + length) / 2, y, (length - start) / 2, t / 2))
         elif kind < self.wall_share + self.pillar_share:
             w = rng.uniform(*self.pillar_width) / 2
             x, y = surface.place(w, w, rng)
-            shapes.append(frame.box((x - w, y - w, height), (x + w, y + w, top), "pillar"))
-        regions += surface.spots(self.spots, self.spot_size, rng)
-        shapes += surface.loose_objects(self, rng)
-        return shapes, regions
+            frame.box((x - w, y - w, height), (x + w, y + w, top), "pillar")
+        surface.furnish(self, rng)
+        return [frame]
 
 
 TABLE = Table()
@@ -632,32 +628,46 @@ class Kitchen(Furniture):
         cupboards = 3 + 2 * self.cupboards[1]
         return wall + hollow * (1 + self.ovens[1]) + self.solids[1] + cupboards + self.objects[1]
 
-    def build(self, rng: Generator) -> Build:
+    def build(self, rng: Generator) -> Sequence[FurnitureFrame]:
         frame = FurnitureFrame(self, self.distance, rng)
         depth = rng.uniform(*self.depth)
         side = rng.uniform(*self.width) / 2
         height = rng.uniform(*self.height)
         t = rng.uniform(*self.thickness)
-        shapes: list[Box | Sphere] = []
-        regions: list[Region] = []
 
         def hollow(low: Corner, high: Corner, name: str) -> None:
             """Adds a box that is open in front, and its inside as a region."""
             (x, y, z), (far, left, top) = low, high
-            shapes.append(frame.box(low, (far, left, z + t), name))
-            shapes.append(frame.box((x, y, top - t), high, name))
-            shapes.append(frame.box((x, y, z + t), (far, y + t, top - t), name))
-            shapes.append(frame.box((x, left - t, z + t), (far, left, top - t), name))
-            shapes.append(frame.box((far - t, y + t, z + t), (far, left - t, top - t), name))
-            regions.append(frame.region((x, y + t, z + t), (far - t, left - t, top - t), AHEAD))
+            walls = (
+                (low, (far, left, z + t)),
+                ((x, y, top - t), high),
+                ((x, y, z + t), (far, y + t, top - t)),
+                ((x, left - t, z + t), (far, left, top - t)),
+                ((far - t, y + t, z + t), (far, left - t, top - t)),
+            )
+            frame.boxes(walls, name)
+            frame.region((x, y + t, z + t), (far - t, left - t, top - t), AHEAD)
 
-        if height > MIN_COUNTER_HEIGHT and rng.random() < self.open_share:
-            hollow((0.0, -side, 0.0), (depth, side, height), "counter")
-        else:
-            shapes.append(frame.box((0.0, -side, 0.0), (depth, side, height), "counter"))
-        hang = height + rng.uniform(*self.above)
-        top = self._cupboards(frame, depth, hang, t, shapes, regions, rng)
-        shapes.append(frame.box((depth, -side, 0.0), (depth + t, side, top), "wall"))
+        is_open = height > MIN_COUNTER_HEIGHT and rng.random() < self.open_share
+        (hollow if is_open else frame.box)((0.0, -side, 0.0), (depth, side, height), "counter")
+        low = height + rng.uniform(*self.above)
+        widths = rng.uniform(*self.cupboard_width, count(self.cupboards, rng))
+        front = depth - rng.uniform(*self.cupboard_depth)
+        top = low + rng.uniform(*self.cupboard_height)
+        if len(widths):
+            sides = edges(widths, t)
+            sides -= (sides[-1] + t) / 2
+            left = float(sides[0])
+            right = float(sides[-1]) + t
+            ends = (((front, left, z), (depth, right, z + t)) for z in (low, top - t))
+            uprights = (((front, y, low + t), (depth, y + t, top - t)) for y in sides.tolist())
+            frame.boxes((*ends, *uprights), "cupboard")
+            for y, w in zip(sides[:-1].tolist(), widths.tolist(), strict=True):
+                frame.region((front, y + t, low + t), (depth, y + t + w, top - t), AHEAD)
+                if rng.random() < self.door_share:  # open at a right angle, hinged on the left or the right
+                    hinge = y if rng.random() < 0.5 else y + w + t
+                    frame.box((front - w, hinge, low), (front, hinge + t, top), "door")
+        frame.box((depth, -side, 0.0), (depth + t, side, top), "wall")
         counter = Surface(frame, depth, side, height)
         ovens = count(self.ovens, rng)
         solids = count(self.solids, rng)
@@ -666,47 +676,10 @@ class Kitchen(Furniture):
             b = rng.uniform(*self.appliance_width) / 2
             b *= 1.0 if i < ovens else rng.uniform(0.5, 1.0)
             (x, y), high = counter.place(a, b, rng), height + rng.uniform(*self.appliance_height)
-            low_corner = (x - a, y - b, height)
-            high_corner = (x + a, y + b, high)
-            if i < ovens:
-                hollow(low_corner, high_corner, "oven")
-            else:
-                shapes.append(frame.box(low_corner, high_corner, "appliance"))
-        regions += counter.spots(self.spots, self.spot_size, rng)
-        shapes += counter.loose_objects(self, rng)
-        return shapes, regions
-
-    def _cupboards(
-        self,
-        frame: FurnitureFrame,
-        depth: float,
-        low: float,
-        t: float,
-        shapes: list[Box | Sphere],
-        regions: list[Region],
-        rng: Generator,
-    ) -> float:
-        """Adds the cupboards and their insides; returns the height of their top."""
-        widths = rng.uniform(*self.cupboard_width, count(self.cupboards, rng))
-        front = depth - rng.uniform(*self.cupboard_depth)
-        top = low + rng.uniform(*self.cupboard_height)
-        if not len(widths):
-            return top
-        sides = edges(widths, t)
-        sides -= (sides[-1] + t) / 2
-        left = float(sides[0])
-        right = float(sides[-1]) + t
-        for z in (low, top - t):
-            shapes.append(frame.box((front, left, z), (depth, right, z + t), "cupboard"))
-        shapes += [
-            frame.box((front, y, low + t), (depth, y + t, top - t), "cupboard") for y in sides.tolist()
-        ]
-        for y, w in zip(sides[:-1].tolist(), widths.tolist(), strict=True):
-            regions.append(frame.region((front, y + t, low + t), (depth, y + t + w, top - t), AHEAD))
-            if rng.random() < self.door_share:  # open at a right angle, hinged on the left or the right
-                hinge = y if rng.random() < 0.5 else y + w + t
-                shapes.append(frame.box((front - w, hinge, low), (front, hinge + t, top), "door"))
-        return top
+            add, name = (hollow, "oven") if i < ovens else (frame.box, "appliance")
+            add((x - a, y - b, height), (x + a, y + b, high), name)
+        counter.furnish(self, rng)
+        return [frame]
 
 
 KITCHEN = Kitchen()
@@ -767,7 +740,7 @@ class Cabinet(Furniture):
         back = 1
         return boards + uprights + legs + back + doors + DRAWER_SHAPES * self.max_drawers + self.objects[1]
 
-    def build(self, rng: Generator) -> Build:
+    def build(self, rng: Generator) -> Sequence[FurnitureFrame]:
         frame = FurnitureFrame(self, self.distance, rng)
         depth = rng.uniform(*self.depth)
         t = float(np.exp(rng.uniform(*np.log(self.thickness))))
@@ -780,18 +753,17 @@ class Cabinet(Furniture):
         right = float(sides[-1]) + t
         height = float(tops[-1])
         boards = tops if rng.random() < self.top_share else tops[:-1]
-        shapes: list[Box | Sphere] = [
-            frame.box((0.0, left + t, z - t), (depth, right - t, z), "board") for z in boards.tolist()
-        ]
-        shapes += [frame.box((0.0, y, low), (depth, y + t, height), "upright") for y in sides.tolist()]
+        corners = (((0.0, left + t, z - t), (depth, right - t, z)) for z in boards.tolist())
+        frame.boxes(corners, "board")
+        frame.boxes((((0.0, y, low), (depth, y + t, height)) for y in sides.tolist()), "upright")
         if rng.random() < self.back_share:
-            shapes.append(frame.box((depth, left, low), (depth + t, right, height), "back"))
+            frame.box((depth, left, low), (depth + t, right, height), "back")
         regions: list[tuple[Corner, Corner, Vector]] = []
         if not on_ground and rng.random() < self.legs_share:
             w = 2 * t
             for x in (0.0, depth - w):
                 for y in (left, right - w):
-                    shapes.append(frame.box((x, y, 0.0), (x + w, y + w, low), "leg"))
+                    frame.box((x, y, 0.0), (x + w, y + w, low), "leg")
         if low > MIN_OPENING:
             regions.append(((0.0, left + 2 * t, 0.0), (depth / 2, right - 2 * t, low), AHEAD))
         if len(boards) == len(tops):
@@ -807,25 +779,26 @@ class Cabinet(Furniture):
         free = []
         for i, cell in enumerate(cells):
             if i in drawers:
-                walls, inside = self._drawer(frame, cell, depth, t, rng)
-                shapes += walls
-                regions.append((*inside, DOWN))
+                regions.append((*self._drawer(frame, cell, depth, t, rng), DOWN))
             elif kinds[i] > 1 - self.door_share:
                 shut = rng.random() < self.shut_share
                 angle = 0.0 if shut else rng.uniform(self.door_angle[0], widest)
-                shapes.append(_door(frame, cell, t, angle, rng.random() < 0.5))
+                _door(frame, cell, t, angle, rng.random() < 0.5)
                 free += [] if shut else [[*cell]]
             else:
                 free.append([*cell])
-        shapes += loose_in_cells(self, frame, depth, free, rng)
+        loose_in_cells(self, frame, depth, free, rng)
         regions += [((t, y, z), (depth, end, ceiling), AHEAD) for y, end, z, ceiling in free]
-        return shapes, [frame.region(*region) for region in regions if _is_wide(*region)]
+        for region in regions:
+            if _is_wide(*region):
+                frame.region(*region)
+        return [frame]
 
     def _drawer(
         self, frame: FurnitureFrame, cell: Cell, depth: float, t: float, rng: Generator
-    ) -> tuple[list[Box | Sphere], tuple[Corner, Corner]]:
-        """The bottom, front, back and sides of a drawer that is pulled out of a cell, and the part of its
-        inside that is in front of the cabinet."""
+    ) -> tuple[Corner, Corner]:
+        """Adds the bottom, front, back and sides of a drawer that is pulled out of a cell. Returns the part
+        of its inside that is in front of the cabinet."""
         y, end, z, ceiling = cell
         x = -depth * rng.uniform(*self.pulled)
         top = z + (ceiling - z) * rng.uniform(0.4, 1.0)
@@ -837,8 +810,8 @@ class Cabinet(Furniture):
             ((x + t, y, z + t), (far - t, y + t, top)),
             ((x + t, end - t, z + t), (far - t, end, top)),
         )
-        inside = (x + t, y + t, z + t), (min(0.0, far - t), end - t, top)
-        return [frame.box(a, b, "drawer") for a, b in corners], inside
+        frame.boxes(corners, "drawer")
+        return (x + t, y + t, z + t), (min(0.0, far - t), end - t, top)
 
 
 def _is_wide(low: Corner, high: Corner, approach: Vector) -> bool:
@@ -847,15 +820,15 @@ def _is_wide(low: Corner, high: Corner, approach: Vector) -> bool:
     return bool(size.min() > MIN_REGION and (approach is DOWN or size[1:].min() > MIN_OPENING))
 
 
-def _door(frame: FurnitureFrame, cell: Cell, t: float, angle: float, on_left: bool) -> Box:
-    """A door of a cell, open by an angle about its left or right edge [rad]."""
+def _door(frame: FurnitureFrame, cell: Cell, t: float, angle: float, on_left: bool) -> None:
+    """Adds a door of a cell, open by an angle about its left or right edge [rad]."""
     y, end, z, ceiling = cell
     hinge, side = (end, -1.0) if on_left else (y, 1.0)
     half = (end - y) / 2
     middle = np.array([-half * np.sin(angle), hinge + side * half * np.cos(angle)])
     low = (middle[0] - t / 2, middle[1] - half, z)
     high = (middle[0] + t / 2, middle[1] + half, ceiling)
-    return frame.box(low, high, "door", side * angle)
+    frame.box(low, high, "door", side * angle)
 
 
 CABINET = Cabinet()

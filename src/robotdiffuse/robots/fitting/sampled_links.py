@@ -10,21 +10,18 @@ the cell. Other cells are split, down to a fraction of a millimeter of motion.
 # Coal's Python module has no type information.
 # pyright: reportAttributeAccessIssue=false
 
-from collections.abc import Callable
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
 import coal
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
-from scipy.optimize import linprog
 
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.types import Configurations, Mask, Points, Poses, Spheres, Values
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose
-from robotdiffuse.robots.fitting.convex_parts import planes_of
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import ball_distances, deepest_touches
 from robotdiffuse.robots.kinematic_tree import MOVING_KINDS, TURN, Joint, with_mimics
 from robotdiffuse.robots.motion_bounds import motion_radii
@@ -52,27 +49,21 @@ class Links:
         self.joints = [j for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None]
         self.lower = np.array([joint.lower for joint in self.joints])
         self.upper = np.array([joint.upper for joint in self.joints])
-        self._hit: dict[tuple[str, str], tuple[int, int]] = {}
         self.distance_request, self.distance_result = coal.DistanceRequest(), coal.DistanceResult()
         self._leading: dict[frozenset[str], tuple[str, list[Joint]]] = {}
         self.request, self.result = coal.CollisionRequest(), coal.CollisionResult()
 
-    def _of_parts(self, function: Callable[[ConvexMesh], Any]) -> dict[str, list[Any]]:
-        return {link: [function(mesh) for mesh in parts] for link, parts in self.robot.meshes.items()}
-
     @cached_property
     def hulls(self) -> dict[str, list["coal.Convex"]]:
-        return self._of_parts(lambda mesh: coal_convex(mesh.vertices, mesh.faces))
+        return {
+            link: [coal_convex(mesh.vertices, mesh.faces) for mesh in parts]
+            for link, parts in self.robot.meshes.items()
+        }
 
     @cached_property
     def balls(self) -> dict[str, Spheres]:
         """Balls [x y z radius] around each part, by link [m]."""
-        return {link: np.stack(balls) for link, balls in self._of_parts(_ball).items()}
-
-    @cached_property
-    def inner(self) -> dict[str, Spheres]:
-        """Balls [x y z radius] inside each part, by link [m]."""
-        return {link: np.stack(balls) for link, balls in self._of_parts(_inner).items()}
+        return {link: np.stack([_ball(mesh) for mesh in parts]) for link, parts in self.robot.meshes.items()}
 
     def random(self, count: int, rng: np.random.Generator) -> Configurations:
         """Uniform values of all joints within their limits."""
@@ -132,16 +123,10 @@ class Links:
 
     def collide(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> bool:
         """Whether the meshes of two links collide in configuration i."""
-        inside = ball_distances(poses[a][i], poses[b][i], self.inner[a], self.inner[b])
-        if (inside < 0).any():
-            return True
         T_a, T_b, ball_gaps = self._placed(poses, a, b, i)
-        near = list(zip(*np.nonzero(ball_gaps <= 0), strict=True))
-        hit = self._hit.get((a, b))
-        for m, n in [hit, *near] if hit in near else near:
+        for m, n in zip(*np.nonzero(ball_gaps <= 0), strict=True):
             self.result.clear()
             if coal.collide(self.hulls[a][m], T_a, self.hulls[b][n], T_b, self.request, self.result):
-                self._hit[a, b] = m, n
                 return True
         return False
 
@@ -209,19 +194,6 @@ def _ball(mesh: ConvexMesh) -> Float[ndarray, "4"]:
     """Center and radius of a ball that contains a mesh [m]."""
     center = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
     return np.append(center, np.linalg.norm(mesh.vertices - center, axis=1).max() + BALL_MARGIN)
-
-
-@lru_cache(maxsize=1024)
-def _inner(mesh: ConvexMesh) -> Float[ndarray, "4"]:
-    """Center and radius of a largest ball inside a convex mesh [m]."""
-    normals, offsets = planes_of(mesh)
-    planes = np.column_stack([normals, np.ones(len(normals))])
-    solution = linprog([0, 0, 0, -1], planes, offsets, bounds=[(None, None)] * 3 + [(0, None)])
-    return (
-        np.append(solution.x[:3], solution.x[3] - BALL_MARGIN)
-        if solution.success
-        else np.array([0, 0, 0, -np.inf])
-    )
 
 
 CELLS = 128

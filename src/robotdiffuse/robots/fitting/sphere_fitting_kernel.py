@@ -8,7 +8,8 @@ import math
 
 import numpy as np
 
-from robotdiffuse.core.kernels import kernel
+from robotdiffuse.core.kernels import allocation_free, kernel
+from robotdiffuse.robots.frame_kernel import ball_gap, column, dot, length, minus, placed, rotated_back
 
 # Initial step of the search for a center [m]: in the first round, its lower bound, and its factor per
 # round.
@@ -37,14 +38,11 @@ def plane_depths(points, normals, offsets, starts, lowest):
     """
     depths = np.empty(len(points))
     for i in range(len(points)):
-        x, y, z = points[i]
         best = lowest
         for part in range(len(starts) - 1):
             face_distance = 1e9
             for f in range(starts[part], starts[part + 1]):
-                face_distance = min(
-                    face_distance, offsets[f] - normals[f, 0] * x - normals[f, 1] * y - normals[f, 2] * z
-                )
+                face_distance = min(face_distance, offsets[f] - dot(normals[f], points[i]))
                 if face_distance <= best:
                     break
             best = max(best, face_distance)
@@ -52,12 +50,12 @@ def plane_depths(points, normals, offsets, starts, lowest):
     return depths
 
 
-@kernel(fastmath=True)
-def max_radius_at(x, y, z, grid, origin, spacing):
+@allocation_free(fastmath=True)
+def max_radius_at(center, grid, origin, spacing):
     """Grid value interpolated at a point; outside the grid, negative and decreasing with the distance."""
-    u = (x - origin[0]) / spacing
-    v = (y - origin[1]) / spacing
-    w = (z - origin[2]) / spacing
+    u = (center[0] - origin[0]) / spacing
+    v = (center[1] - origin[1]) / spacing
+    w = (center[2] - origin[2]) / spacing
     beyond = 0.0
     for value, count in ((u, grid.shape[0]), (v, grid.shape[1]), (w, grid.shape[2])):
         beyond = max(beyond, -value, value - (count - 1.001))
@@ -66,14 +64,13 @@ def max_radius_at(x, y, z, grid, origin, spacing):
     i = int(u)
     j = int(v)
     k = int(w)
-    u = u - i
-    v = v - j
-    w = w - k
-    low = (grid[i, j, k] * (1 - w) + grid[i, j, k + 1] * w) * (1 - v)
-    low += (grid[i, j + 1, k] * (1 - w) + grid[i, j + 1, k + 1] * w) * v
-    high = (grid[i + 1, j, k] * (1 - w) + grid[i + 1, j, k + 1] * w) * (1 - v)
-    high += (grid[i + 1, j + 1, k] * (1 - w) + grid[i + 1, j + 1, k + 1] * w) * v
-    return low * (1 - u) + high * u
+    total = 0.0
+    for a in range(2):
+        for b in range(2):
+            for c in range(2):
+                share = (1 - abs(u - i - a)) * (1 - abs(v - j - b)) * (1 - abs(w - k - c))
+                total += share * grid[i + a, j + b, k + c]
+    return total
 
 
 @kernel(fastmath=True)
@@ -81,17 +78,24 @@ def max_radii_at(centers, grid, origin, spacing):
     """Grid values [n] interpolated at centers [n, 3]."""
     radii = np.empty(len(centers))
     for i in range(len(centers)):
-        radii[i] = max_radius_at(centers[i, 0], centers[i, 1], centers[i, 2], grid, origin, spacing)
+        radii[i] = max_radius_at(centers[i], grid, origin, spacing)
     return radii
 
 
-@kernel(fastmath=True)
-def squared_distance(a, i, b, j):
-    """Squared distance between row i of a and row j of b."""
-    x = a[i, 0] - b[j, 0]
-    y = a[i, 1] - b[j, 1]
-    z = a[i, 2] - b[j, 2]
-    return x * x + y * y + z * z
+@allocation_free(fastmath=True)
+def squared_distance(a, b):
+    """Squared distance between two points."""
+    d = minus(a, b)
+    return dot(d, d)
+
+
+@allocation_free(fastmath=True)
+def farthest_corner(points, corners, c, center):
+    """The largest squared distance of a cell's corners from a point."""
+    far = 0.0
+    for k in range(3):
+        far = max(far, squared_distance(points[corners[c, k]], center))
+    return far
 
 
 @kernel(fastmath=True)
@@ -113,12 +117,10 @@ def assign(points, corners, centers, depths):
         for i in range(len(centers)):
             # most spheres are too far from the first corner already
             reach = runner + depths[i]
-            far = squared_distance(points, corners[c, 0], centers, i)
-            if reach <= 0.0 or far >= reach * reach:
+            near = squared_distance(points[corners[c, 0]], centers[i])
+            if reach <= 0.0 or near >= reach * reach:
                 continue
-            far = max(far, squared_distance(points, corners[c, 1], centers, i))
-            far = max(far, squared_distance(points, corners[c, 2], centers, i))
-            needed = math.sqrt(far) - depths[i]
+            needed = math.sqrt(farthest_corner(points, corners, c, centers[i])) - depths[i]
             if needed < best:
                 runner = best
                 best = needed
@@ -147,10 +149,7 @@ def greedy_cover(points, corners, places, depths):
         for i in range(len(places)):
             if depths[i] + max(min_excess, 0.0) <= 0.0:
                 continue
-            far = squared_distance(points, corners[c, 0], places, i)
-            far = max(far, squared_distance(points, corners[c, 1], places, i))
-            far = max(far, squared_distance(points, corners[c, 2], places, i))
-            lacks = math.sqrt(far) - depths[i]
+            lacks = math.sqrt(farthest_corner(points, corners, c, places[i])) - depths[i]
             if min_excess > 0.0 and lacks < min_excess:
                 min_excess = max(lacks, 0.0)
                 holds[c, :i] = False
@@ -172,44 +171,32 @@ def greedy_cover(points, corners, places, depths):
 
 @kernel()
 def enclosing(spheres):
-    """Center and radius of a ball that contains spheres."""
-    center = np.array([0.5 * (spheres[:, k].min() + spheres[:, k].max()) for k in range(3)])
-    radius = 0.0
+    """A ball [4] that contains spheres."""
+    ball = np.zeros(4)
+    for k in range(3):
+        ball[k] = 0.5 * (spheres[:, k].min() + spheres[:, k].max())
     for i in range(len(spheres)):
-        x = spheres[i, 0] - center[0]
-        y = spheres[i, 1] - center[1]
-        z = spheres[i, 2] - center[2]
-        radius = max(radius, math.sqrt(x * x + y * y + z * z) + spheres[i, 3])
-    return center, radius
+        ball[3] = max(ball[3], length(minus(spheres[i], ball)) + spheres[i, 3])
+    return ball
 
 
 @kernel()
 def relative(A, B, T):
     """Write the pose [3, 4] of frame B in frame A into T; A and B are poses [4, 4]."""
+    shift = rotated_back(A, minus(column(B, 3), column(A, 3)))
     for i in range(3):
         for j in range(3):
-            T[i, j] = A[0, i] * B[0, j] + A[1, i] * B[1, j] + A[2, i] * B[2, j]
-        T[i, 3] = 0.0
-        for k in range(3):
-            T[i, 3] += A[k, i] * (B[k, 3] - A[k, 3])
+            T[i, j] = dot(column(A, i), column(B, j))
+        T[i, 3] = shift[i]
 
 
 @kernel()
 def ball_distances(T_base_a, T_base_b, first, second):
     """Signed distances [a, b] between the balls of two sets, each set at its pose [4, 4] [m]."""
-    T = np.empty((3, 4))
     gaps_between = np.empty((len(first), len(second)))
-    relative(T_base_a, T_base_b, T)
     for j in range(len(second)):
-        x = T[0, 0] * second[j, 0] + T[0, 1] * second[j, 1] + T[0, 2] * second[j, 2] + T[0, 3]
-        y = T[1, 0] * second[j, 0] + T[1, 1] * second[j, 1] + T[1, 2] * second[j, 2] + T[1, 3]
-        z = T[2, 0] * second[j, 0] + T[2, 1] * second[j, 1] + T[2, 2] * second[j, 2] + T[2, 3]
         for i in range(len(first)):
-            dx = first[i, 0] - x
-            dy = first[i, 1] - y
-            dz = first[i, 2] - z
-            far = math.sqrt(dx * dx + dy * dy + dz * dz)
-            gaps_between[i, j] = far - first[i, 3] - second[j, 3]
+            gaps_between[i, j] = ball_gap(T_base_a, first[i], T_base_b, second[j])
     return gaps_between
 
 
@@ -224,44 +211,32 @@ def deepest_touches(T_base_a, T_base_b, first, second, apart, least):
     """
     depth = np.full(len(T_base_a), least)
     middle = np.zeros((len(T_base_a), 3))
-    a_center, a_radius = enclosing(first)
-    b_center, b_radius = enclosing(second)
+    a = enclosing(first)
+    b = enclosing(second)
     T = np.empty((3, 4))
     for n in range(len(T_base_a)):
         relative(T_base_a[n], T_base_b[n], T)
-        square = 0.0
-        for i in range(3):
-            at = T[i, 0] * b_center[0] + T[i, 1] * b_center[1] + T[i, 2] * b_center[2] + T[i, 3]
-            square += (at - a_center[i]) ** 2
-        far = math.sqrt(square) - a_radius - b_radius
+        far = length(minus(placed(T, b), a)) - a[3] - b[3]
         if far > apart:
             depth[n] = -far
             continue
         for j in range(len(second)):
-            x = T[0, 0] * second[j, 0] + T[0, 1] * second[j, 1] + T[0, 2] * second[j, 2] + T[0, 3]
-            y = T[1, 0] * second[j, 0] + T[1, 1] * second[j, 1] + T[1, 2] * second[j, 2] + T[1, 3]
-            z = T[2, 0] * second[j, 0] + T[2, 1] * second[j, 1] + T[2, 2] * second[j, 2] + T[2, 3]
+            center = placed(T, second[j])
             # skip spheres too far from the first set to overlap more deeply
-            reach = a_radius + second[j, 3] - depth[n]
-            dx = a_center[0] - x
-            dy = a_center[1] - y
-            dz = a_center[2] - z
-            if reach <= 0.0 or dx * dx + dy * dy + dz * dz >= reach * reach:
+            reach = a[3] + second[j, 3] - depth[n]
+            if reach <= 0.0 or squared_distance(a, center) >= reach * reach:
                 continue
             for i in range(len(first)):
-                dx = first[i, 0] - x
-                dy = first[i, 1] - y
-                dz = first[i, 2] - z
                 reach = first[i, 3] + second[j, 3] - depth[n]
-                if reach <= 0.0 or dx * dx + dy * dy + dz * dz >= reach * reach:
+                d = minus(first[i], center)
+                if reach <= 0.0 or dot(d, d) >= reach * reach:
                     continue
-                far = math.sqrt(dx * dx + dy * dy + dz * dz)
+                far = length(d)
                 depth[n] = first[i, 3] + second[j, 3] - far
                 # from b's center towards a's, to the middle of the two surfaces
                 along = (far + second[j, 3] - first[i, 3]) / 2 / max(far, 1e-9)
-                middle[n, 0] = x + along * dx
-                middle[n, 1] = y + along * dy
-                middle[n, 2] = z + along * dz
+                for k in range(3):
+                    middle[n, k] = center[k] + along * d[k]
     return depth, middle
 
 
@@ -273,7 +248,7 @@ def gaps(points, spheres):
         gap = 1e9
         for i in range(len(spheres)):
             reach = gap + spheres[i, 3]
-            square = squared_distance(points, n, spheres, i)
+            square = squared_distance(points[n], spheres[i])
             if reach > 0.0 and square < reach * reach:
                 gap = math.sqrt(square) - spheres[i, 3]
         out[n] = gap
@@ -291,10 +266,8 @@ def held_by_one(triangles, spheres):
             inside = 0
             square = spheres[i, 3] * spheres[i, 3]
             for k in range(3):
-                x = triangles[t, k, 0] - spheres[i, 0]
-                y = triangles[t, k, 1] - spheres[i, 1]
-                z = triangles[t, k, 2] - spheres[i, 2]
-                if x * x + y * y + z * z <= square:
+                d = minus(triangles[t, k], spheres[i])
+                if dot(d, d) <= square:
                     inside += 1
                     bare[3 * t + k] = False
             if inside == 3:
@@ -305,30 +278,25 @@ def held_by_one(triangles, spheres):
     return contained, bare
 
 
-@kernel(fastmath=True)
-def excess_radius(x, y, z, own, count, grid, origin, spacing):
+@allocation_free(fastmath=True)
+def excess_radius(center, own, count, grid, origin, spacing):
     """Excess radius of a sphere at a center that contains the first `count` points of `own`."""
     far = 0.0
     for k in range(count):
-        dx = own[k, 0] - x
-        dy = own[k, 1] - y
-        dz = own[k, 2] - z
-        far = max(far, dx * dx + dy * dy + dz * dz)
-    return math.sqrt(far) - max_radius_at(x, y, z, grid, origin, spacing)
+        far = max(far, squared_distance(own[k], center))
+    return math.sqrt(far) - max_radius_at(center, grid, origin, spacing)
 
 
 @kernel(fastmath=True)
 def move_center(center, own, count, step, grid, origin, spacing, directions):
     """Pattern search for the center of least excess radius, in place."""
-    min_radius = excess_radius(center[0], center[1], center[2], own, count, grid, origin, spacing)
+    min_radius = excess_radius(center, own, count, grid, origin, spacing)
     while step > MIN_STEP:
         best = min_radius - MIN_GAIN
         way = -1
         for k in range(len(directions)):
-            x = center[0] + step * directions[k, 0]
-            y = center[1] + step * directions[k, 1]
-            z = center[2] + step * directions[k, 2]
-            value = excess_radius(x, y, z, own, count, grid, origin, spacing)
+            trial = center + step * directions[k]
+            value = excess_radius(trial, own, count, grid, origin, spacing)
             if value < best:
                 best = value
                 way = k

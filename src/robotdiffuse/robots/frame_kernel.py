@@ -1,0 +1,49 @@
+"""Compiled operations on vectors and frames, for other compiled code."""
+
+import numpy as np
+
+from robotdiffuse.core.kernels import allocation_free
+
+inlined = allocation_free(fastmath={"contract"}, forceinline=True)  # type: ignore[arg-type]  (a set is fine)
+
+
+@inlined
+def dot(a, b):
+    """The scalar product of two vectors."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@inlined
+def minus(a, b):
+    """The difference of two vectors."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@inlined
+def length(a):
+    """The norm of a vector."""
+    return np.sqrt(dot(a, a))
+
+
+@inlined
+def column(R, k):
+    """Column k of a matrix."""
+    return R[0, k], R[1, k], R[2, k]
+
+
+@inlined
+def rotated_back(R, v):
+    """The product of the transpose of R with v."""
+    return dot(column(R, 0), v), dot(column(R, 1), v), dot(column(R, 2), v)
+
+
+@inlined
+def placed(T, p):
+    """The point p of frame T in the base frame."""
+    return dot(T[0], p) + T[0, 3], dot(T[1], p) + T[1, 3], dot(T[2], p) + T[2, 3]
+
+
+@inlined
+def ball_gap(T, ball, T_other, other):
+    """Signed distance of two balls [4] of frames [m]."""
+    return length(minus(placed(T, ball), placed(T_other, other))) - ball[3] - other[3]
