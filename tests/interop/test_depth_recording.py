@@ -6,18 +6,24 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 import robotdiffuse as rd
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.interop.depth_recording import (
+    CAMERA_INFO,
+    IMAGE,
+    TRANSFORMS,
     StampedView,
     TransformHistory,
     read_depth_views,
     write_depth_views,
 )
-from robotdiffuse.interop.ros2 import McapWriter
+from robotdiffuse.interop.ros2 import JOINT_STATE, McapWriter, to_message, typestore
 from robotdiffuse.perception.occupancy_map import OccupancyMap
 from robotdiffuse.planning.exploration.simulated import RecordedExplorer, camera_beside, explore, wrist_camera
 from robotdiffuse.planning.exploration.steps import ExplorerSettings
@@ -56,6 +62,15 @@ def test_a_recorded_exploration_is_read_again_and_gives_the_same_voxels(tmp_path
 TURN = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
 
 
+KINDS = {
+    "/joint_states": JOINT_STATE,
+    "/tf": TRANSFORMS,
+    "/tf_static": TRANSFORMS,
+    "/camera/camera_info": CAMERA_INFO,
+    "/camera/image_rect": IMAGE,
+}
+
+
 def recording(file: Path, change: Callable[[dict[str, Any]], None] = lambda messages: None) -> Path:
     """One image of 16 bits at 1.05 s, joint states and transforms every 0.1 s, and a camera on a link whose
     pose on it is static. `change` changes the messages by topic."""
@@ -87,15 +102,67 @@ def recording(file: Path, change: Callable[[dict[str, Any]], None] = lambda mess
         "/camera/image_rect": [image | {"data": np.frombuffer(pixels.tobytes(), np.uint8)}],
     }
     change(messages)
-    kinds = ("JointState", "TFMessage", "TFMessage", "CameraInfo", "Image")
-    with file.open("wb") as stream:
-        out = McapWriter(stream)
-        for (topic, contents), kind in zip(messages.items(), kinds, strict=True):
-            package = "tf2_msgs" if kind == "TFMessage" else "sensor_msgs"
-            for content in contents:
-                out.ros(topic, f"{package}/msg/{kind}", content, 10**9)
-        out.writer.finish()
+    each = [(topic, KINDS[topic], content) for topic, contents in messages.items() for content in contents]
+    if file.suffix == ".mcap":
+        with file.open("wb") as stream:
+            out = McapWriter(stream)
+            for topic, kind, content in each:
+                out.ros(topic, kind, content, 10**9)
+            out.writer.finish()
+    elif file.suffix == ".bag":
+        ros1_bag(file, each)
+    else:
+        with Writer2(file, version=9) as writer:
+            connections = {
+                topic: writer.add_connection(topic, kind, typestore=typestore())
+                for topic, kind in KINDS.items()
+            }
+            for topic, kind, content in each:
+                data = typestore().serialize_cdr(to_message(kind, content), kind)
+                writer.write(connections[topic], 10**9, data)
     return file
+
+
+ROS1 = get_typestore(Stores.ROS1_NOETIC)
+ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
+
+
+def ros1_message(kind: str, value: Any) -> Any:
+    """A message of ROS 1 from plain data; missing fields are empty or zero."""
+
+    def field(definition: Any, given: Any) -> Any:
+        node, of = int(definition[0]), definition[1]
+        if node == 1:
+            empty: Any = "" if of[0] == "string" else 0
+            return empty if given is None else given
+        if node == 2:
+            return ros1_message(of, given or {})
+        element = of[0]
+        items = [] if given is None else given
+        if int(element[0]) == 1 and element[1][0] != "string":
+            return np.asarray(items, dtype=element[1][0])
+        return [field(element, item) for item in items]
+
+    fields = ROS1.fielddefs[kind][1]
+    return ROS1.types[kind](
+        **{name: field(of, value.get(name, value.get(name.lower()))) for name, of in fields}
+    )
+
+
+def ros1_bag(
+    file: Path, messages: list[tuple[str, str, Any]], compression: Writer1.CompressionFormat | None = None
+) -> None:
+    bag = Writer1(file)
+    if compression is not None:
+        bag.set_compression(compression)
+    with bag as writer:
+        connections = {
+            topic: writer.add_connection(topic, kind, typestore=ROS1)
+            for topic, kind in dict.fromkeys((topic, kind) for topic, kind, _ in messages)
+        }
+        for topic, kind, content in messages:
+            data = ROS1.serialize_ros1(ros1_message(kind, content), kind)
+            writer.write(connections[topic], 10**9, data)
 
 
 def test_poses_and_configurations_are_interpolated_and_millimetres_read(tmp_path: Path) -> None:
@@ -106,6 +173,68 @@ def test_poses_and_configurations_are_interpolated_and_millimetres_read(tmp_path
     np.testing.assert_allclose(view.T_base_camera, transform(np.array([1.55, 0.0, 0.0])), atol=1e-9)
     assert view.configuration is not None
     np.testing.assert_allclose(view.configuration, HOME + 1.05, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ("r.bag", "folder"))
+def test_bags_hold_what_mcap_files_do(name: str, tmp_path: Path) -> None:
+    [(stamp, view)] = read_depth_views(recording(tmp_path / name), PANDA)
+    [(same, twin)] = read_depth_views(recording(tmp_path / "r.mcap"), PANDA)
+    assert stamp == same and view.intrinsics == twin.intrinsics
+    np.testing.assert_array_equal(view.depth, twin.depth)
+    np.testing.assert_array_equal(view.T_base_camera, twin.T_base_camera)
+    assert view.configuration is not None and twin.configuration is not None
+    np.testing.assert_array_equal(view.configuration, twin.configuration)
+    if name == "folder":
+        with pytest.raises(InputError, match="part of a ROS 2 bag: give the folder"):
+            list(read_depth_views(next((tmp_path / name).glob("*.db3")), PANDA))
+
+
+def realsense(file: Path, compression: Writer1.CompressionFormat | None = None, zeros: int = 0) -> Path:
+    """A bag as librealsense writes it: depth in units of 0.1 mm, no joint states and no transforms."""
+    header = {"stamp": {"sec": 3, "nanosec": 0}, "frame_id": "0"}
+    pixels = np.array([[5000, 0], [15000, 20000]], "<u2")
+    data = np.frombuffer(pixels.tobytes() + bytes(zeros), np.uint8)
+    image = {"header": header, "height": 2, "width": 2, "encoding": "mono16", "step": 4, "data": data}
+    k = [300.0, 0.0, 0.5, 0.0, 310.0, 0.4, 0.0, 0.0, 1.0]
+    info = {"header": header, "height": 2, "width": 2, "k": k, "r": np.zeros(9), "p": np.zeros(12)}
+    messages = [
+        ("/device_0/sensor_0/option/Depth_Units/value", "std_msgs/msg/Float32", {"data": 1e-4}),
+        ("/device_0/sensor_0/Depth_0/info/camera_info", CAMERA_INFO, info),
+        ("/device_0/sensor_0/Depth_0/image/data", IMAGE, image),
+    ]
+    ros1_bag(file, messages, compression)
+    return file
+
+
+@pytest.mark.parametrize("compression", (None, *Writer1.CompressionFormat))
+def test_bags_of_librealsense(compression: Writer1.CompressionFormat | None, tmp_path: Path) -> None:
+    file = realsense(tmp_path / "r.bag", compression)
+    T = transform(np.array([1.0, 0.0, 0.5]))
+    [(stamp, view)] = read_depth_views(file, PANDA, T_base_camera=T)
+    assert stamp == 3.0 and view.configuration is None and view.intrinsics == (300.0, 310.0, 0.5, 0.4)
+    np.testing.assert_allclose(view.depth, [[0.5, 0.0], [1.5, 2.0]], rtol=1e-6)
+    np.testing.assert_array_equal(view.T_base_camera, T)
+    with pytest.raises(InputError, match="no transforms lead from panda_link0 to 0"):
+        list(read_depth_views(file, PANDA))
+
+
+@pytest.mark.parametrize("compression", Writer1.CompressionFormat)
+def test_small_bags_that_unpack_to_much_are_refused(
+    compression: Writer1.CompressionFormat, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("robotdiffuse.interop.ros2.MAX_UNPACKED", 10**6)
+    file = realsense(tmp_path / "r.bag", compression, zeros=2 * 10**6)
+    assert file.stat().st_size < 10**5
+    with pytest.raises(InputError, match="a chunk of more than 1,000,000 bytes"):
+        list(read_depth_views(file, PANDA, T_base_camera=np.eye(4)))
+
+
+@pytest.mark.parametrize("size", (0, 40, 5000))
+def test_damaged_bags_are_refused(size: int, tmp_path: Path) -> None:
+    file = realsense(tmp_path / "r.bag")
+    file.write_bytes(file.read_bytes()[:size])
+    with pytest.raises(InputError, match=r"r\.bag is damaged"):
+        list(read_depth_views(file, PANDA, T_base_camera=np.eye(4)))
 
 
 def remove(topic: str) -> Callable[[dict[str, Any]], None]:

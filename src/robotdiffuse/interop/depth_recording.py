@@ -1,15 +1,18 @@
 """Reads and writes depth images with camera parameters, poses and joint states in MCAP files, as ROS 2
-messages.
+messages, and reads those of ROS 1 and ROS 2 bags.
 
 A camera NAME has its images (sensor_msgs/Image) and parameters (sensor_msgs/CameraInfo) on topics of one
 folder, such as /NAME/depth/image_rect_raw and /NAME/depth/camera_info. Its pose is the transform from the
 arm's base to the `frame_id` of the images (tf2_msgs/TFMessage on /tf and /tf_static), and the arm's
-configuration is in sensor_msgs/JointState.
+configuration is in sensor_msgs/JointState. The bags of librealsense have images and parameters alone:
+/device_0/sensor_0/Depth_0/image/data and .../info/camera_info.
 """
 
 import io
 from bisect import bisect_left, insort
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -17,6 +20,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
 
 from robotdiffuse.core.errors import InputError, reading
@@ -27,10 +31,13 @@ from robotdiffuse.core.types import Configuration, JointValues, Pose
 from robotdiffuse.interop.ros2 import (
     JOINT_STATE,
     McapWriter,
+    bag_messages,
+    bag_topics,
     check_chunks,
     header_seconds,
     make_reader,
     messages_in,
+    opened_bag,
     to_plain,
     topics_in,
 )
@@ -128,7 +135,11 @@ def _image(header: dict[str, Any], view: DepthView) -> dict[str, Any]:
 
 
 def read_depth_views(
-    file: str | Path, robot: Robot, topics: Sequence[str] | None = None, base: str | None = None
+    file: str | Path,
+    robot: Robot,
+    topics: Sequence[str] | None = None,
+    base: str | None = None,
+    T_base_camera: ArrayLike | None = None,
 ) -> Iterator[StampedView]:
     """Read the depth images of a recording, as `Explorer.observe` takes them.
 
@@ -137,68 +148,100 @@ def read_depth_views(
     configuration are interpolated to the stamp of each.
 
     Args:
-        file: An .mcap file.
+        file: An .mcap file, a ROS 1 bag (.bag, of librealsense too) or the folder of a ROS 2 bag.
         robot: The robot whose joint states it holds.
         topics: Topics of the images; None: all with depth images (32FC1 in m, 16UC1 or mono16 in mm).
         base: The frame of the arm's base in the file; None: `robot.base`.
+        T_base_camera: The pose of a camera that stands [4, 4], in place of the file's transforms. Views of a
+            file without joint states have no configuration then.
 
     Raises:
         InputError: For a file that is damaged or holds no depth images, if no image has joint states and
             transforms within 0.1 s, and for distorted or compressed images.
     """
-    path = input_file(file, largest=MAX_SIZE)
-    with reading(file):
-        yield from _read(path, robot, topics, base or robot.base)
+    path = Path(file)
+    with reading(file), _opened(path) as (kinds, messages_in):
+        yield from _read(path, kinds, messages_in, robot, topics, base or robot.base, T_base_camera)
 
 
-def _read(path: Path, robot: Robot, topics: Sequence[str] | None, base: str) -> Iterator[StampedView]:
-    with path.open("rb") as stream:
+Messages = Callable[[Sequence[str]], Iterator[tuple[str, int, Any]]]
+"""Topic, log time [ns] and message of all messages on some topics, in the order of their log times."""
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[dict[str, str], Messages]]:
+    """The types of the messages of a recording by topic, and what reads them."""
+    if path.suffix == ".db3":
+        raise InputError(f"{path} is a part of a ROS 2 bag: give the folder that holds it and metadata.yaml")
+    if path.is_dir() or path.suffix == ".bag":
+        with opened_bag(path) as bag:
+            yield bag_topics(bag), partial(bag_messages, bag)
+        return
+    with input_file(path, largest=MAX_SIZE).open("rb") as stream:
         reader = make_reader(stream)
         check_chunks(stream, reader, str(path))
-        kinds = topics_in(reader, str(path))
-        images = _image_topics(kinds, topics)
-        states = _States(robot)
-        transforms = TransformHistory()
-        infos = {}
-        other_topics = [
-            name for name, schema in kinds.items() if schema.name in (JOINT_STATE, TRANSFORMS, CAMERA_INFO)
-        ]
-        for topic, at, message in messages_in(reader, kinds, other_topics):
-            kind = kinds[topic].name
-            if kind == CAMERA_INFO:
-                infos.setdefault(_folder(topic), message)
-            elif kind == JOINT_STATE:
-                states.add(_seconds(message, at), to_plain(message))
-            else:
-                for one in message.transforms:
-                    transforms.add(to_plain(one), static=topic.endswith("static"))
-        has_images = False
-        has_views = False
-        reason: InputError | None = None
-        for topic, at, message in messages_in(reader, kinds, images):
-            if message.encoding not in ENCODINGS and topics is None:
-                continue
-            has_images = True
-            stamp = _seconds(message, at)
-            location = f"the image of {topic} at {stamp:.3f} s"
-            try:
+        schemas = topics_in(reader, str(path))
+        yield {topic: one.name for topic, one in schemas.items()}, partial(messages_in, reader, schemas)
+
+
+def _read(
+    path: Path,
+    kinds: dict[str, str],
+    messages_in: Messages,
+    robot: Robot,
+    topics: Sequence[str] | None,
+    base: str,
+    T_base_camera: ArrayLike | None,
+) -> Iterator[StampedView]:
+    images = _image_topics(kinds, topics)
+    states = _States(robot)
+    transforms = TransformHistory()
+    infos: dict[str, dict[str, Any]] = {}
+    units: dict[str, float] = {}
+    has_states = JOINT_STATE in kinds.values()
+    other_topics = [name for name, kind in kinds.items() if kind in (JOINT_STATE, TRANSFORMS, CAMERA_INFO)]
+    other_topics += [name for name in kinds if _is_unit(name)]
+    for topic, at, message in messages_in(other_topics):
+        kind = kinds[topic]
+        if kind == CAMERA_INFO:  # in ROS 1, K, D and P
+            infos.setdefault(_folder(topic), {k.lower(): value for k, value in to_plain(message).items()})
+        elif kind == JOINT_STATE:
+            states.add(_seconds(message, at), to_plain(message))
+        elif kind == TRANSFORMS:
+            for one in message.transforms:
+                transforms.add(to_plain(one), static=topic.endswith("static"))
+        else:
+            units[topic.partition("/option/")[0]] = float(message.data)
+    has_images = False
+    has_views = False
+    reason: InputError | None = None
+    for topic, at, message in messages_in(images):
+        if message.encoding not in ENCODINGS and topics is None:
+            continue
+        has_images = True
+        stamp = _seconds(message, at)
+        location = f"the image of {topic} at {stamp:.3f} s"
+        try:
+            T = T_base_camera
+            if T is None:
                 T = transforms.at(base, message.header.frame_id, stamp, MAX_GAP, location)
-                q = states.at(stamp, location)
-            except InputError as error:
-                reason = reason or error
-                continue
-            has_views = True
-            intrinsics = _intrinsics(topic, infos.get(_folder(topic)), message)
-            yield StampedView(stamp, DepthView(_depth(location, message), intrinsics, T, q))
+            q = states.at(stamp, location) if has_states or T_base_camera is None else None
+        except InputError as error:
+            reason = reason or error
+            continue
+        has_views = True
+        intrinsics = _intrinsics(topic, infos.get(_folder(topic)), message)
+        unit = next((unit for device, unit in units.items() if topic.startswith(f"{device}/")), None)
+        yield StampedView(stamp, DepthView(_depth(location, message, unit), intrinsics, T, q))
     if reason is not None and not has_views:
         raise reason
     if not has_images:
-        listed = ", ".join(f"{topic} ({schema.name})" for topic, schema in kinds.items()) or "none"
+        listed = ", ".join(f"{topic} ({kind})" for topic, kind in kinds.items()) or "none"
         raise InputError(f"{path} holds no depth images (32FC1 or 16UC1); topics: {listed}")
 
 
-def _image_topics(kinds: Mapping[str, Any], requested: Sequence[str] | None) -> list[str]:
-    image_topics = [topic for topic, schema in kinds.items() if schema.name == IMAGE]
+def _image_topics(kinds: Mapping[str, str], requested: Sequence[str] | None) -> list[str]:
+    image_topics = [topic for topic, kind in kinds.items() if kind == IMAGE]
     for topic in requested or ():
         if topic not in image_topics:
             raise InputError(
@@ -208,7 +251,13 @@ def _image_topics(kinds: Mapping[str, Any], requested: Sequence[str] | None) -> 
 
 
 def _folder(topic: str) -> str:
-    return topic.rpartition("/")[0]
+    folder, _, last = topic.rpartition("/")[0].rpartition("/")
+    return folder if last in ("image", "info") else f"{folder}/{last}"  # librealsense's
+
+
+def _is_unit(topic: str) -> bool:
+    """Whether librealsense writes the meters per unit of a sensor's images there."""
+    return topic.replace(" ", "_").endswith("/option/Depth_Units/value")
 
 
 def _seconds(message: Any, logged: int) -> float:
@@ -220,27 +269,29 @@ def _seconds(message: Any, logged: int) -> float:
 def _intrinsics(topic: str, info: Any, image: Any) -> tuple[float, float, float, float]:
     if info is None:
         raise InputError(f"there is no CameraInfo on {_folder(topic)}/camera_info for {topic}")
-    if (info.width, info.height) != (image.width, image.height):
+    if (info["width"], info["height"]) != (image.width, image.height):
         raise InputError(
             f"images of {topic} have {image.width} x {image.height} pixels; their CameraInfo has "
-            f"{info.width} x {info.height}"
+            f"{info['width']} x {info['height']}"
         )
-    if np.any(np.asarray(info.d) != 0) and "rect" not in topic.rpartition("/")[2]:
+    if np.any(np.asarray(info["d"]) != 0) and "rect" not in topic.rpartition("/")[2]:
         raise InputError(f"images of {topic} are distorted; record the rectified ones (image_rect)")
-    p = np.asarray(info.p).reshape(3, 4)
-    k = np.asarray(info.k).reshape(3, 3)
+    p = np.asarray(info["p"]).reshape(3, 4)
+    k = np.asarray(info["k"]).reshape(3, 3)
     used = p if p[0, 0] else k
     return float(used[0, 0]), float(used[1, 1]), float(used[0, 2]), float(used[1, 2])
 
 
-def _depth(where: str, image: Any) -> Float[ndarray, "h w"]:
-    """The image [m]."""
+def _depth(where: str, image: Any, unit: float | None) -> Float[ndarray, "h w"]:
+    """The image [m]. unit: meters per unit of integers, if the recording has it."""
     if image.encoding not in ENCODINGS:
         raise InputError(f"{where} has the encoding {image.encoding!r}; it must be {' or '.join(ENCODINGS)}")
     kind, scale = ENCODINGS[image.encoding]
     rows = np.asarray(image.data, np.uint8).reshape(image.height, image.step)
     size = np.dtype(kind).itemsize * image.width
     pixels = np.ascontiguousarray(rows[:, :size]).view((">" if image.is_bigendian else "<") + kind)
+    if unit is not None and kind == "u2":
+        scale = unit
     return scale * pixels.astype(np.float32)
 
 

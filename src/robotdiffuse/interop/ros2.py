@@ -1,4 +1,4 @@
-"""ROS 2 without ROS: messages, MCAP files and bags (folders with metadata.yaml and a database).
+"""ROS 2 without ROS: messages, MCAP files and bags (folders with metadata.yaml and a database); ROS 1 bags.
 
 In MCAP files, /scene and /tf hold Foxglove messages: the obstacles, the arm as triangles fixed to its links,
 and the poses of the links and of moving obstacles. /joint_trajectory, /joint_states and /robot_description
@@ -6,15 +6,16 @@ hold ROS 2 messages; the last is the URDF, if the robot was read from one. The U
 attachments, too.
 """
 
+import bz2
 import io
 import json
 import sqlite3
 import struct
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -51,6 +52,7 @@ with needs("mcap, mcap-protobuf-support, foxglove-schemas-protobuf and rosbags",
     from mcap.writer import Writer
     from mcap_protobuf.schema import register_schema
     from rosbags.highlevel import AnyReader
+    from rosbags.rosbag1 import Reader as Ros1Reader
     from rosbags.rosbag2 import Writer as BagWriter
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     from rosbags.typesys.store import Typestore
@@ -473,6 +475,11 @@ def _typestore(schema: Any) -> Any:
 
 # Bags
 
+DECOMPRESSORS: dict[Any, Any] = {
+    bz2.decompress: bz2.BZ2Decompressor,
+    lz4.frame.decompress: lz4.frame.LZ4FrameDecompressor,
+}
+"""Of the chunks of ROS 1 bags: those that can stop early."""
 VERSION = 9
 """Version of the bag's metadata; ROS 2 Humble reads the fields that it knows."""
 
@@ -517,25 +524,60 @@ def _replace(file: Path, new: Path, old: Path) -> None:
 
 def read_bag(file: Path, topic: str | None = None) -> RecordedMotion:
     """Read the motion on a topic; see `choose_topic`."""
-    if not (file / "metadata.yaml").is_file():
-        raise InputError(f"{file} is not a ROS 2 bag: it has no metadata.yaml")
-    for part in file.iterdir():
-        if not part.is_dir():
-            input_file(part, largest=sys.maxsize)
-    with reading(file):
+    with reading(file), opened_bag(file) as reader:
+        topics = bag_topics(reader)
+        name = choose_topic(topics, topic, str(file))
+        messages = [(at, message) for _, at, message in bag_messages(reader, [name], MAX_UNPACKED)]
+        return motion_from_messages(topics[name], messages, f"{file}, {name}")
+
+
+@contextmanager
+def opened_bag(file: Path) -> Iterator[AnyReader]:
+    """A reader of a ROS 1 bag or of the folder of a ROS 2 bag, whose parts unpack to MAX_UNPACKED bytes at
+    most."""
+    if file.is_dir():
+        if not (file / "metadata.yaml").is_file():
+            raise InputError(f"{file} is not a ROS 2 bag: it has no metadata.yaml")
+        for part in file.iterdir():
+            if not part.is_dir():
+                input_file(part, largest=sys.maxsize)
         _check_unpacking(file)
-        with AnyReader([file], default_typestore=typestore()) as reader:
-            topics = {connection.topic: connection.msgtype for connection in reader.connections}
-            name = choose_topic(topics, topic, str(file))
-            chosen = [connection for connection in reader.connections if connection.topic == name]
-            messages = []
-            size = 0
-            for connection, at, raw in reader.messages(chosen):
-                size += len(raw)
-                if size > MAX_UNPACKED:
-                    raise InputError(f"the messages of {name} take more than {MAX_UNPACKED:,} bytes")
-                messages.append((at, reader.deserialize(raw, connection.msgtype)))
-            return motion_from_messages(topics[name], messages, f"{file}, {name}")
+    else:
+        input_file(file, largest=sys.maxsize)
+    with AnyReader([file], default_typestore=typestore()) as reader:
+        for bag in reader.readers:
+            if isinstance(bag, Ros1Reader):
+                bag.chunks |= {
+                    at: chunk._replace(decompressor=partial(_bounded, chunk.decompressor))
+                    for at, chunk in bag.chunks.items()
+                }
+        yield reader
+
+
+def _bounded(decompressor: Callable[[bytes], bytes], packed: bytes) -> bytes:
+    """The content of a chunk of a ROS 1 bag, of MAX_UNPACKED bytes at most."""
+    make = DECOMPRESSORS.get(decompressor)
+    content = packed if make is None else make().decompress(packed, MAX_UNPACKED + 1)
+    if len(content) > MAX_UNPACKED:
+        raise InputError(f"the bag has a chunk of more than {MAX_UNPACKED:,} bytes")
+    return content
+
+
+def bag_topics(reader: AnyReader) -> dict[str, str]:
+    """The topics and the types of their messages."""
+    return {connection.topic: connection.msgtype for connection in reader.connections}
+
+
+def bag_messages(
+    reader: AnyReader, topics: Sequence[str], allowed: int = sys.maxsize
+) -> Iterator[tuple[str, int, Any]]:
+    """As `messages_in`."""
+    chosen = [connection for connection in reader.connections if connection.topic in topics]
+    for connection, at, raw in reader.messages(chosen) if chosen else ():
+        allowed -= len(raw)
+        if allowed < 0:
+            raise InputError(f"the messages of {', '.join(topics)} take more than {MAX_UNPACKED:,} bytes")
+        yield connection.topic, at, reader.deserialize(raw, connection.msgtype)
 
 
 def _check_unpacking(bag: Path) -> None:
