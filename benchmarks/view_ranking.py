@@ -30,7 +30,7 @@ from cameras import PLANNER, Row, expected_error, is_free, known_scene, problems
 from common import CONVERGED, FIRST, header, parse, print_table, use_processor_time
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.output_files import JsonLines
-from robotdiffuse.evaluation.statistics import compare, wilson_interval
+from robotdiffuse.evaluation.statistics import bootstrap_interval, compare, wilson_interval
 from robotdiffuse.learning.completion import predict
 from robotdiffuse.perception.depth_view import DepthNoise
 from robotdiffuse.perception.observed_volume import observe
@@ -278,16 +278,18 @@ def choices(models: list[str]) -> dict[str, Callable[[Row], tuple[list[Row], Row
     def every(row: Row) -> list[Row]:
         return row["motions"]
 
-    def least_unseen(row: Row) -> tuple[list[Row], Row, str]:
-        return every(row), min(every(row), key=lambda motion: motion["features"][UNSEEN_NEAR]), STATED
+    def least(of: Callable[[Row], float]) -> Callable[[Row], tuple[list[Row], Row, str]]:
+        return lambda row: (every(row), min(every(row), key=of), STATED)
 
     return {
         CALL: by(STATED, called),
         "first motion": by(STATED, lambda row: every(row)[:1]),
+        "motion of more time": by(STATED, lambda row: _of(row, CONVERGED) or every(row)[:1]),
         "first motions": by(STATED, lambda row: _of(row, FIRST)),
         "p > 0.03 before": by(STATED, lambda row: _of(row, CAREFUL_KIND) or called(row)),
         "all": by(STATED, every),
-        "all, least unseen near": least_unseen,
+        "all, least unseen near": least(lambda motion: motion["features"][UNSEEN_NEAR]),
+        "all, least probability": least(lambda motion: motion["risk"]),
         **{f"a call, stated by {name}": stated_by(name) for name in models},
         **{f"all, by {name}": by(name, every) for name in models[1:]},
     }
@@ -354,8 +356,13 @@ def compared(title: str, rows: list[Row], models: list[str]) -> None:
         )
         lines.append((name, share, pair.a_only, pair.b_only, f"{pair.p_success:.2g}", *figures))
     some = np.mean([any(motion["free"] for motion in row["motions"]) for row in rows])
+    random = [np.mean([motion["free"] for motion in _of(row, FIRST)]) for row in rows]
+    more = 100 * (base - random)
+    low, high = bootstrap_interval(more)
+    gain = f"a call over a random first motion: {more.mean():+.1f} points ({low:.1f} to {high:.1f})"
     columns = ["choice", "free, %", "gained", "lost", "p", "stated", "error", "ms"]
     print_table(f"{title}: {len(rows)} problems; some motion is free in {100 * some:.1f} %", columns, lines)
+    print(f"{gain}\n")
 
 
 def _chosen_free(row: Row) -> bool:
