@@ -1,5 +1,6 @@
 """Explorer: what its motions promise, against scenes that it sees by simulated cameras alone."""
 
+import re
 from dataclasses import replace
 from itertools import islice, pairwise
 from threading import Thread
@@ -9,6 +10,7 @@ import pytest
 
 import robotdiffuse as rd
 from robotdiffuse.collision.kernel_arrays import compile_robot
+from robotdiffuse.core.results import PlanResult
 from robotdiffuse.perception.depth_view import DepthNoise
 from robotdiffuse.perception.occupancy_map import OccupancyMap, ViewMemory
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
@@ -298,6 +300,26 @@ def test_a_thing_at_the_surface_of_a_goal_is_seen_as_free_by_no_view() -> None:
     left = {tuple(ball) for ball in unseen[1][-1].tolist()}
     assert inside.sum() > 5 and all(tuple(ball) in left for ball in balls[inside].tolist())
     assert balls[-1].tolist() not in unseen[0][-1].tolist()
+
+
+def test_where_little_of_a_goal_was_not_seen_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    goal = np.array([1.2, *LEFT[1:]])
+    x, y, z = surface_balls(PANDA, goal)[-1].tolist()
+    known = OccupancyMap(PANDA)
+    for axis, at in enumerate((x, y, z)):
+        for part in ((-2.0, at - 0.02), (at + 0.02, 2.0)):
+            low, high = np.full(3, -2.0), np.full(3, 2.0)
+            low[axis], high[axis] = part
+            known.declare_free((tuple(low), tuple(high)))
+    seen = GoalSeen(PANDA, known, ViewMemory(PANDA, 1), required=True)
+    path = rd.Path(PANDA.joint_names, np.stack([LEFT, goal]))
+    motion = PlanResult(rd.Status.SOLVED, "", "", PANDA.name, 0.0, 0, path=path)
+    share = len(seen.unseen(LEFT, goal)) / len(surface_balls(PANDA, goal))
+    assert 0 < share < 0.02 and seen.missing(motion).endswith("was not seen")
+    monkeypatch.setattr("robotdiffuse.planning.exploration.seen_free.LITTLE_UNSEEN", 0.02)
+    said = re.search(r"around x (.*), y (.*), z (.*) m$", seen.missing(motion))
+    assert said is not None
+    np.testing.assert_allclose([float(value) for value in said.groups()], (x, y, z), atol=0.025)
 
 
 def test_a_goal_is_seen_by_strict_alone() -> None:

@@ -1,10 +1,10 @@
 """Explorer: takes an arm to goals through space that cameras see on the way.
 
 **Strict.** The arm enters no voxel that was not seen free: the validator accepts each motion among obstacles
-that cover all other space (`seen_free.py`). Exempt is the space within 2 cm of the arm where a motion begins
-and ends; seen points count there too. With `see_goal` the arm's surface at the goal must have been seen free
-as well (`seen_free.GoalSeen`). So the promise is as good as the map: in a scene that does not change,
-with a camera whose poses and errors are as stated, such a motion meets nothing.
+that cover all other space (`seen_free.py`). Exempt are the voxels with centers within 3 cm of the arm where a
+motion begins and ends; seen points count there too. With `see_goal` the arm's surface at the goal must have
+been seen free as well (`seen_free.GoalSeen`). So the promise is as good as the map: in a scene that does not
+change, with a camera whose poses and errors are as stated, such a motion meets nothing.
 
 **Probabilistic.** The arm goes if the motion's stated `confidence` is high enough, and otherwise looks first.
 The confidence follows from the predicted probability of all voxels that the map does not know and the motion

@@ -106,6 +106,8 @@ def _walls() -> list[Box]:
 
 BORDER = np.float32(1.0)
 """Pixels around a ball that count too in images that were filtered: the filter moves edges by about one."""
+LITTLE_UNSEEN = 1e-3
+"""If a smaller part of the surface was not seen, messages say where it is."""
 KEY_DECIMALS = 5
 """Digits of joint positions that tell configurations apart."""
 
@@ -163,15 +165,18 @@ class GoalSeen:
         return out
 
     def missing(self, motion: PlanResult) -> str:
-        """Says how much was not seen of the arm's surface where a motion ends; "" if nothing is missing."""
+        """Says how much was not seen of the arm's surface where a motion ends, and where if it is little; ""
+        if nothing is missing."""
         if not self._required or motion.path is None:
             return ""
         start, q = motion.path.positions[[0, -1]]
-        unseen = len(self.unseen(start, q))
-        if not unseen:
+        unseen = self.unseen(start, q)
+        if not len(unseen):
             return ""
-        share = unseen / len(surface_balls(self._robot, q))
-        return f"{100 * share:.2g} % of the arm's surface at the goal was not seen"
+        share = len(unseen) / len(surface_balls(self._robot, q))
+        x, y, z = unseen.mean(axis=0).tolist()
+        where = f", around x {x:.2f}, y {y:.2f}, z {z:.2f} m" if share < LITTLE_UNSEEN else ""
+        return f"{100 * share:.2g} % of the arm's surface at the goal was not seen{where}"
 
     def _not_shown(self, balls: Points, views: Iterable[DepthView]) -> Points:
         """The balls that no view shows to be free: none sees through them, and the arm was elsewhere."""
