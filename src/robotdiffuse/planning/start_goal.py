@@ -33,6 +33,8 @@ NEAR_POSE_FRACTIONS = (0.1, 0.3, 0.9)
 # Rounds of seeds for that, and number of configurations for each of several poses.
 NEAR_POSE_ROUNDS = 2
 FIRST_TRY_COUNT = 3
+MANY_GOALS = 8
+"""With at least so many goals, the first try for each leaves configurations where they are found."""
 # Number of configurations of a pose whose exact meshes are checked where the covering spheres collide, and
 # number of those that become goals.
 MAX_EXACT_GOALS = 20
@@ -273,7 +275,7 @@ def _any_goals(
     for goal in goals:
         if free and context.elapsed > until:
             break
-        result = _first_try(context, goal, checker)
+        result = _first_try(context, goal, checker, len(goals) >= MANY_GOALS)
         free += [result] if len(result) else []
     if free:
         return np.concatenate(free)
@@ -293,8 +295,10 @@ def _any_goals(
     )
 
 
-def _first_try(context: PlanningContext, goal: OneGoal, checker: CollisionChecker) -> Configurations:
-    """Free configurations of one of several goals, by little work."""
+def _first_try(
+    context: PlanningContext, goal: OneGoal, checker: CollisionChecker, many: bool
+) -> Configurations:
+    """Free configurations of one of several goals, by little work; of one of many, by less."""
     if isinstance(goal, JointGoal):
         constraints = context.validator.constraints
         collision_free = checker.free(goal.positions)
@@ -302,7 +306,12 @@ def _first_try(context: PlanningContext, goal: OneGoal, checker: CollisionChecke
             collision_free if constraints is None else collision_free & constraints.satisfied(goal.positions)
         ]
     configurations = _pose_configurations()(
-        context.problem, goal, context.rng, checker.free, count=FIRST_TRY_COUNT, rounds=1
+        context.problem,
+        goal,
+        context.rng,
+        checker.free,
+        count=FIRST_TRY_COUNT,
+        rounds=0 if many and isinstance(goal, PoseGoal) and not context.problem.constraints else 1,
     )
     return _with_turns(context, configurations) if len(configurations) else configurations
 

@@ -352,6 +352,7 @@ def _pose_rows(pose: PoseGoal, position: float, angle: float) -> list[_Row]:
 
 
 def _arrays(robot: Robot, frames: list[str], rows: list[_Row]) -> Rows:
+    levers = {frame: _lever_bounds(robot, frame) for frame in frames}
     chains = [robot.chain(frame) for frame in frames]
     joints = np.zeros((len(chains), robot.dof), np.int64)
     for row, chain in zip(joints, chains, strict=True):
@@ -371,7 +372,7 @@ def _arrays(robot: Robot, frames: list[str], rows: list[_Row]) -> Rows:
         same_frame=np.array([False, *(a == b for a, b in pairwise(frames))]),
         T_joint_frame=np.stack([robot.T_frame_link(frame) for frame in frames]),
         inner_limit=PROJECTION_FRACTION * of_rows["limit"],
-        lever_bounds=np.stack([_lever_bounds(robot, frame) for frame in frames]),
+        lever_bounds=np.stack([levers[frame] for frame in frames]),
         **of_rows,
     )
 
@@ -379,14 +380,11 @@ def _arrays(robot: Robot, frames: list[str], rows: list[_Row]) -> Rows:
 def _lever_bounds(robot: Robot, frame: str) -> JointValues:
     """For each joint that moves a frame, in order, a bound of the distance from its axis to the frame's
     origin [m]; 1 for prismatic joints, 0 after the last joint."""
+    chain = list(robot.chain(frame))
+    slides = np.array(robot.prismatic)[chain]
+    travel = np.maximum(np.abs(robot.lower), np.abs(robot.upper))[chain] + 1e-3
+    lengths = np.linalg.norm(robot.frame_offsets[chain, :3, 3], axis=1) + np.where(slides, travel, 0.0)
+    beyond = np.linalg.norm(robot.T_frame_link(frame)[:3, 3]) + np.cumsum(lengths[::-1])[::-1] - lengths
     out = np.zeros(robot.dof)
-    length = float(np.linalg.norm(robot.T_frame_link(frame)[:3, 3]))
-    for i, k in reversed([*enumerate(robot.chain(frame))]):
-        joint = robot.planned_joints[k]
-        if robot.prismatic[k]:
-            out[i] = 1.0
-            length += max(abs(joint.lower), abs(joint.upper)) + 1e-3
-        else:
-            out[i] = length
-        length += float(np.linalg.norm(robot.frame_offsets[k, :3, 3]))
+    out[: len(chain)] = np.where(slides, 1.0, beyond)
     return out

@@ -10,7 +10,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.settings import Bound, Natural, NotNegative, Positive, Settings
 from robotdiffuse.core.transforms import inverse, rotation_angle, rpy_from_rotation
-from robotdiffuse.core.types import Configuration, Configurations, JointRows, Values
+from robotdiffuse.core.types import Configuration, Configurations, JointRows, Pose, Values
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PosesGoal
 from robotdiffuse.robots.kinematics import link_origins, link_pose
 from robotdiffuse.robots.robot import Robot
@@ -80,20 +80,27 @@ class GoalError(NamedTuple):
 
 
 def goal_error(
-    robot: Robot, goal: Goal, q: Configuration, settings: VerifySettings = DEFAULT, blend: float = 0.0
+    robot: Robot,
+    goal: Goal,
+    q: Configuration,
+    settings: VerifySettings = DEFAULT,
+    blend: float = 0.0,
+    poses: dict[str, Pose] | None = None,
 ) -> GoalError | None:
     """The error of a configuration with respect to a goal; None at the goal. Of several goals, the smallest
     error.
 
     `blend`: radius within which the goal counts as reached: around a configuration in joint space [rad, L2],
-    around the position of a pose, or the box of its tolerances [m].
+    around the position of a pose, or the box of its tolerances [m]. `poses`: those of links at the
+    configuration, as far as they are known.
     """
+    poses = {} if poses is None else poses
     if isinstance(goal, AnyGoal):
-        errors = [goal_error(robot, one, q, settings, blend) for one in goal.goals]
+        errors = [goal_error(robot, one, q, settings, blend, poses) for one in goal.goals]
         off = [error for error in errors if error is not None]
         return min(off, key=lambda error: error.excess) if len(off) == len(errors) else None
     if isinstance(goal, PosesGoal):
-        errors = [goal_error(robot, one, q, settings, blend) for one in goal.poses]
+        errors = [goal_error(robot, one, q, settings, blend, poses) for one in goal.poses]
         return max((error for error in errors if error), key=lambda error: error.excess, default=None)
     if isinstance(goal, JointGoal):
         differences = goal.positions - q
@@ -102,7 +109,9 @@ def goal_error(
         if off <= settings.goal_tolerance or np.linalg.norm(differences, axis=1).min() <= blend:
             return None
         return GoalError(f"{off:.3g} from the nearest goal configuration (largest joint error)", None, off)
-    T_goal_end = inverse(goal.T_base_frame) @ link_pose(robot, q, goal.frame)
+    if goal.frame not in poses:
+        poses[goal.frame] = link_pose(robot, q, goal.frame)
+    T_goal_end = inverse(goal.T_base_frame) @ poses[goal.frame]
     distance = float(np.linalg.norm(T_goal_end[:3, 3]))
     angle = rotation_angle(T_goal_end[:3, :3])
     xyz = goal.xyz_tolerance
@@ -130,9 +139,10 @@ def goal_index(robot: Robot, goal: Goal, q: Configuration) -> int | None:
     goals: Sequence[Goal] = goal.goals if isinstance(goal, AnyGoal) else (goal,)
     if isinstance(goal, JointGoal):
         goals = [JointGoal(row) for row in goal.positions]
+    poses = dict[str, Pose]()
     for settings in (EXACT, DEFAULT):
         for i, one in enumerate(goals):
-            if goal_error(robot, one, q, settings) is None:
+            if goal_error(robot, one, q, settings, poses=poses) is None:
                 return i
     return None
 
