@@ -97,9 +97,9 @@ MAP = VoxelGrid(
 reaches."""
 
 
-def refined(voxels: Bool[ndarray, "mx my mz"]) -> Voxels:
-    """Coarse voxels of the observed volume as fine ones, of half the edge."""
-    return voxels.repeat(2, 0).repeat(2, 1).repeat(2, 2)
+def refined(voxels: Bool[ndarray, "mx my mz"], parts: int = 2) -> Voxels:
+    """Voxels as finer ones; by default coarse ones of the observed volume as fine ones."""
+    return voxels.repeat(parts, 0).repeat(parts, 1).repeat(parts, 2)
 
 
 @kernel(nogil=True)

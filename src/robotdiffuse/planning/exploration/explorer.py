@@ -2,9 +2,10 @@
 
 **Strict.** The arm enters no voxel that was not seen free: the validator accepts each motion among obstacles
 that cover all other space (`seen_free.py`). Exempt are the voxels with centers within 3 cm of the arm where a
-motion begins and ends; seen points count there too. With `see_goal` the arm's surface at the goal must have
-been seen free as well (`seen_free.GoalSeen`). So the promise is as good as the map: in a scene that does not
-change, with a camera whose poses and errors are as stated, such a motion meets nothing.
+motion begins, and the space within 2 cm of it where it ends; seen points count there too. With `see_goal` the
+arm's surface at the goal must have been seen free as well (`seen_free.GoalSeen`). So the promise is as good
+as the map: in a scene that does not change, with a camera whose poses and errors are as stated, such a motion
+meets nothing.
 
 **Probabilistic.** The arm goes if the motion's stated `confidence` is high enough, and otherwise looks first.
 The confidence follows from the predicted probability of all voxels that the map does not know and the motion
@@ -353,7 +354,7 @@ class Explorer:
 
     def _seen_free(self, problem: Problem, *goals: Configuration) -> Problem:
         """The problem with obstacles that cover all space not seen free, but near the start and the goals."""
-        obstacles = not_seen_free(self.map, self.scene, (problem.start, *goals))
+        obstacles = not_seen_free(self.map, self.scene, problem.start, goals)
         return replace(problem, scene=problem.scene.with_shapes([*problem.scene.shapes, *obstacles]))
 
     def _along(self, problem: Problem, waypoints: Configurations, name: str) -> PlanResult | None:
@@ -375,7 +376,8 @@ class Explorer:
         ends = near_ends(self.map, (as_seen.start, *goals))
         in_vain = self._looked_for & self.map.unknown
         blocked = surface((self.map.occupied | in_vain) & ~ends)
-        avoided = cover(self.map, self.scene, blocked, "occupied, or looked for in vain")
+        name = "occupied, or looked for in vain"
+        avoided = cover(self.map, self.scene, MAP.centers(blocked), MAP.edge, name)
         avoiding = replace(as_seen, scene=as_seen.scene.with_shapes([*as_seen.scene.shapes, avoided]))
         results = list[tuple[PlanResult, Voxels]]()
         for seed in range(self._seed, self._seed + TENTATIVE_MOTIONS):

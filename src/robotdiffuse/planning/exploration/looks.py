@@ -19,6 +19,7 @@ from robotdiffuse.core.types import Configuration, Configurations, Path, Pose
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.occupancy_map import OccupancyMap
 from robotdiffuse.perception.ray_caster import looking_at
+from robotdiffuse.perception.unknown_space import CARVING_MARGIN
 from robotdiffuse.perception.visibility import seen_weights
 from robotdiffuse.perception.voxel_grid import FINE, MAP, Probabilities, Voxels, refined
 from robotdiffuse.planning.exploration.seen_free import COVER_RADIUS, near_ends
@@ -116,8 +117,10 @@ SIMILAR_LOOK = 0.2
 def swept_unseen(known: OccupancyMap, path: Path) -> Voxels:
     """The voxels that the map does not know and whose covering balls a path touches, without those near its
     ends, which count as free."""
-    swept = MAP.swept(known.robot, path, COVER_RADIUS)
-    return swept & known.unknown & ~near_ends(known, (path.positions[0], path.positions[-1]))
+    swept = (
+        MAP.swept(known.robot, path, COVER_RADIUS) & known.unknown & ~near_ends(known, [path.positions[0]])
+    )
+    return swept & ~MAP.filled(known.robot, path.positions[-1:], CARVING_MARGIN)
 
 
 def best_looks(

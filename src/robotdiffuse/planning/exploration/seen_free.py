@@ -11,7 +11,7 @@ what is taken on trust where the motion begins. What is inside of the surface ne
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float, Float32
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import reach_ball
@@ -25,7 +25,7 @@ from robotdiffuse.perception.occupancy_map import OccupancyMap, ViewMemory
 from robotdiffuse.perception.seen_points import sphere_distances
 from robotdiffuse.perception.unknown_space import CARVING_MARGIN, without_known
 from robotdiffuse.perception.visibility import BALL_RADIUS, see_through, surface_balls, within_voxels
-from robotdiffuse.perception.voxel_grid import MAP, Voxels, surface
+from robotdiffuse.perception.voxel_grid import MAP, VoxelGrid, Voxels, refined, surface
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -33,6 +33,9 @@ from robotdiffuse.scenes.shapes import Box, Shape
 
 COVER_RADIUS = MAP.edge * 3**0.5 / 2
 """Radius of the ball around a voxel's center that covers the voxel [m]."""
+PARTS = 4
+"""Parts of a voxel's edge where voxels are split."""
+NOT_SEEN_FREE = "not seen free"
 MIN_FREE_SHARE = 0.8
 """Searches fail where a smaller part of what the arm fills at the goal, and not at the start, was seen free:
 see benchmarks/results/exploring.txt."""
@@ -41,20 +44,39 @@ WALL = 2.0
 
 
 def not_seen_free(
-    known: OccupancyMap, known_scene: Scene, ends: Sequence[Configuration]
+    known: OccupancyMap, known_scene: Scene, start: Configuration, goals: Sequence[Configuration] = ()
 ) -> tuple[Shape, ...]:
     """Obstacles that cover all space that the map does not know to be free, apart from the known scene's.
 
     Balls cover the voxels at the surface of that space, and walls stand around the map, so a motion that the
-    validator accepts among them enters no other voxel. ends: configurations around which CARVING_MARGIN is
-    taken as free; seen points are obstacles of their own.
+    validator accepts among them enters no other voxel. Exempt are the voxels with centers near the start, of
+    which the arm could not get out otherwise, and the space within CARVING_MARGIN of the goals: voxels that
+    reach into it are split, and small balls cover the parts that do not. Seen points are obstacles of their
+    own.
     """
-    points = surface(~known.free & ~near_ends(known, ends))
-    return cover(known, known_scene, points, "not seen free"), *_walls()
+    unseen = ~(known.free | near_ends(known, (start,)))
+    spheres = np.zeros((0, 4))
+    if goals:
+        spheres = np.concatenate([placed_spheres(known.robot, q) for q in goals])
+    near = MAP.within(spheres, CARVING_MARGIN + COVER_RADIUS)
+    at = surface(unseen)
+    points = MAP.centers(at[~near[tuple(at.T)]])
+    obstacles = [cover(known, known_scene, points, MAP.edge, NOT_SEEN_FREE)]
+    split = np.argwhere(near & unseen)
+    if len(split):
+        low = np.maximum(split.min(axis=0) - 1, 0)
+        block = tuple(map(slice, low, split.max(axis=0) + 2))
+        occupied = refined(unseen[block], PARTS)
+        edge = MAP.edge / PARTS
+        grid = VoxelGrid(tuple(MAP.low + low * MAP.edge), occupied.shape, edge)
+        at = surface(occupied & ~grid.within(spheres, CARVING_MARGIN - COVER_RADIUS / PARTS))
+        points = grid.centers(at[near[block][tuple(at.T // PARTS)]])
+        obstacles.append(cover(known, known_scene, points, edge, NOT_SEEN_FREE))
+    return *obstacles, *_walls()
 
 
 def near_ends(known: OccupancyMap, ends: Sequence[Configuration]) -> Voxels:
-    """The voxels around the arm at these configurations that count as free."""
+    """The voxels around the arm at these configurations that count as free, at least in part."""
     return MAP.filled(known.robot, ends, CARVING_MARGIN + MAP.edge / 2)
 
 
@@ -64,13 +86,13 @@ def hardly_seen(known: OccupancyMap, start: Configuration, goal: Configuration) 
     return bool(known.free[filled].sum() < MIN_FREE_SHARE * filled.sum())
 
 
-def cover(known: OccupancyMap, known_scene: Scene, voxels: Int[ndarray, "n 3"], name: str) -> AssumedPoints:
-    """Balls that cover the voxels of these indices, without those in the known scene and out of reach."""
-    points = MAP.centers(voxels)
+def cover(known: OccupancyMap, known_scene: Scene, points: Points, edge: float, name: str) -> AssumedPoints:
+    """Balls that cover the voxels with these centers and this edge [m], without those in the known scene and
+    out of reach."""
+    radius = edge * 3**0.5 / 2
     center, reach = reach_ball(with_covering_spheres(known.robot))
-    points = points[np.linalg.norm(points - center, axis=1) < reach + COVER_RADIUS]
-    points = without_known(points, MAP.edge, known.robot, known_scene)
-    return AssumedPoints(points, COVER_RADIUS, name=name)
+    points = points[np.linalg.norm(points - center, axis=1) < reach + radius]
+    return AssumedPoints(without_known(points, edge, known.robot, known_scene), radius, name=name)
 
 
 def least_unknown(known: OccupancyMap, goals: Configurations) -> Configuration:
