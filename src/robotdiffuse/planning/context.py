@@ -274,7 +274,14 @@ class PlanningContext:
         trajectory: Trajectory | None,
     ) -> PlanResult | None:
         problem = self.problem
-        path = Path(problem.robot.joint_names, np.asarray(waypoints, dtype=np.float64))
+        waypoints = np.asarray(waypoints, dtype=np.float64)
+        turns = np.flatnonzero(problem.robot.wraps(waypoints).any(axis=1))
+        if len(turns):  # a step of nearly a whole turn could be one of a wrapped value: two steps cannot
+            middles = 0.5 * (waypoints[turns] + waypoints[turns + 1])
+            waypoints = np.insert(waypoints, turns + 1, middles, axis=0)
+            if deviations is not None:
+                deviations = np.insert(deviations, turns + 1, self.timing.corner_deviation)
+        path = Path(problem.robot.joint_names, waypoints)
         report = self.validator.path(path)
         if report.violation is not None:
             return self._refuse(report.violation, float(len(path.positions) - 1))

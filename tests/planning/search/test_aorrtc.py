@@ -239,3 +239,25 @@ def test_a_long_detour_is_replaced() -> None:
     problem = replace(held_out_problem("shelf", 3), clearance=0.0)
     result = AORRTC(AORRTCSettings(patience=40_000)).plan(problem, time_limit=60.0)
     assert result.path is not None and result.path.length < 8.0
+
+
+def test_a_step_of_nearly_a_whole_turn_is_two_steps() -> None:
+    """The way that is free turns a continuous joint by 5.84 rad, which the validator refuses as one step."""
+    gen3 = load_robot("gen3")
+    start = np.array([0.22, 1.4, 0.0, 0.3, 0.0, 0.0, 0.0])
+    goal = np.array([-0.22, 1.4, 0.0, 0.3, 0.0, 0.0, 0.0])
+    problem = Problem(gen3, Scene([Box([0.9, 0.0, 0.5], [0.8, 0.02, 1.6])]), start, goal)
+    result = AORRTC().plan(problem, until="first")
+    assert result.solved and result.stage == "straight_line"
+    assert verify(problem, result.path).valid and verify(problem, result.trajectory).valid
+
+
+def test_a_line_that_is_always_refused_does_not_end_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    finish = context.PlanningContext.finish
+
+    def refusing(self: Any, waypoints: np.ndarray, *rest: Any, **options: Any) -> Any:
+        return finish(self, waypoints, *rest, **options) if len(waypoints) > 2 else None
+
+    monkeypatch.setattr(context.PlanningContext, "finish", refusing)
+    result = AORRTC().plan(Problem(PANDA, Scene(), LEFT, RIGHT), time_limit=20.0, until="first")
+    assert result.solved and len(result.path.positions) > 2

@@ -159,6 +159,8 @@ class AnytimeSearch:
         self._lengths = list[tuple[int, float]]()
         self._untightened = False
         """Whether the best path is not tightened yet: the first one is, once there is time to improve it."""
+        self._shortens = True
+        """Whether paths are simplified, and straight lines tried."""
         self._state = random_state(seed)
         self._trees: rrt_kernel.Trees | None = None
         self._round_end = 0
@@ -249,10 +251,11 @@ class AnytimeSearch:
         far; returns whether it was."""
         path = for_kernels(path, np.float32)
         settings = self.settings
-        path = simplify(self.space, path, settings.smoothings)
+        if self._shortens:
+            path = simplify(self.space, path, settings.smoothings)
         length = path_length(path)
         if self.best is None:
-            self._untightened = True
+            self._untightened = self._shortens
         elif length < TIGHTENING_FACTOR * self.length:
             path = tighten(self.space, path, settings.tightenings, self._state)
             length = path_length(path)
@@ -276,8 +279,11 @@ class AnytimeSearch:
 
     def refuse(self, accepted: Configurations | None) -> None:
         """Halve the resolution after the validator refused the best path, and go back to the last accepted
-        one."""
-        self.settings = replace(self.settings, resolution=finer_resolution(self.settings.resolution))
+        one. At the finest resolution, paths stay as they are found from then on: shortened, they could all
+        become the refused one."""
+        finer = finer_resolution(self.settings.resolution)
+        self._shortens = finer < self.settings.resolution
+        self.settings = replace(self.settings, resolution=finer)
         self.best = accepted
         self.length = np.float32(np.inf if accepted is None else path_length(accepted))
         self._trees = None
@@ -289,6 +295,8 @@ class AnytimeSearch:
         self.space = self.start_goal.space(self.settings.resolution, self.clearance)
 
     def _try_straight_lines(self) -> None:
+        if not self._shortens:
+            return
         for goal in sorted(self.goals, key=lambda goal: float(np.linalg.norm(goal - self.start))):
             path = self._line(goal)
             if len(path) and self.offer(path, "straight_line"):
