@@ -2,6 +2,7 @@
 
 import shutil
 import tempfile
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -32,8 +33,9 @@ def small_model(seed: int = 0) -> MotionNetwork:
 
 
 @cache
-def _saved() -> tempfile.TemporaryDirectory[str]:
-    """The export to ONNX takes seconds, so it is done once; the folder goes with the process."""
+def _saved(exports: Callable[[MotionNetwork], object]) -> tempfile.TemporaryDirectory[str]:
+    """The export to ONNX takes seconds, so it is done once, and once without where a test patches
+    `exports`; the folder goes with the process."""
     folder = tempfile.TemporaryDirectory()
     save_network("model", small_model(), folder.name, {})
     return folder
@@ -41,4 +43,4 @@ def _saved() -> tempfile.TemporaryDirectory[str]:
 
 def save_small_model(folder: Path) -> None:
     """Write the files of `small_model()`, as `save_network` does."""
-    shutil.copytree(_saved().name, folder, dirs_exist_ok=True)
+    shutil.copytree(_saved(MotionNetwork.exports).name, folder, dirs_exist_ok=True)
