@@ -1,18 +1,19 @@
-"""The checker's own tests of all requirements but freedom from collision: limits, start, goal, rates, path
-constraints and torques.
+"""The checker's own tests of every requirement except freedom from collision: limits, start, goal, rates,
+path constraints and torques.
 
-Path constraints: between two configurations joints move by dq at constant rates. A frame's origin p then
-leaves the chord by at most an eighth of its second derivative, which is at most sum_jk |dq_j dq_k|
-L_max(j,k), where L_k bounds the distance of p from axis k all along. The distance to a convex body is a
-convex function, so it is bounded by its greater value at the two ends plus that deviation. An axis of the
-frame leaves its chord by at most (sum_j |dq_j|)² / 8, and the angle between two orientations grows no faster
-than the sum of their rotations.
+Path constraints: between two configurations, the joints move by dq at constant rates. The origin p of a frame
+then deviates from its chord by at most an eighth of its second derivative. That derivative is at most
+sum_jk |dq_j dq_k| L_max(j,k), where L_k is an upper bound on the distance of p from joint axis k during the
+motion. The distance to a convex body is a convex function: along the chord it is at most the larger of its
+values at the two ends, and the deviation is added. An axis of the frame deviates from its chord by at most
+(sum_j |dq_j|)² / 8. The angle between two rotating frames changes no faster than the sum of their speeds of
+rotation.
 
-Torques are sampled at the rows of the motion and places between them. Between two samples, positions are
-cubics or straight lines, and velocities and accelerations their derivatives; at rows, accelerations may jump.
-A torque leaves its chord by at most an eighth of its greatest second derivative times the square of the time
-between. Torques are sums and products of vectors that rotate with the links, so the product rule bounds that
-derivative by bounds on the motion of links and joints.
+Torques are sampled at the rows of the motion and at points between them. Between two samples, positions
+follow a cubic or a straight line, and velocities and accelerations are its derivatives; accelerations may
+jump at rows. A torque deviates from linear interpolation by at most an eighth of its largest second
+derivative times the square of the interval. Torques are sums and products of vectors that rotate with the
+links, so the product rule bounds that derivative in terms of bounds on the motion of links and joints.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -53,17 +54,17 @@ from robotdiffuse.robots.bodies import Inertia
 from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.robots.robot import Robot
 
-# Halvings of a step at most, and stretches at a time, to show that a frame keeps its speed.
+# Maximum number of times that a step is halved, and of intervals at a time, to prove a frame's speed limit.
 MAX_HALVINGS = 24
 MAX_OPEN = 100_000
 MIN_LINE_LENGTH = 1e-3
-"""Along shorter lines the frame turns in place [m]."""
+"""Along a shorter Cartesian line the frame is taken to rotate in place [m]."""
 SAME_POSE = 1e-3
-"""Poses at several goals may differ by this for a Cartesian line to end there [m] and in entries of R."""
+"""Largest difference, in [m] and in entries of R, of goal poses that count as one end of a Cartesian line."""
 
 
 class ConstraintBound(NamedTuple):
-    """Upper bounds of one quantity of a constraint."""
+    """Upper bounds on a quantity that a constraint limits, such as a distance or an angle."""
 
     name: str
     limit: float
@@ -79,86 +80,98 @@ class _FrameMotion(NamedTuple):
     R: ndarray
     turn: Values
     """Upper bound of its rotation [rad]."""
-    went: Values
+    travel: Values
     """Upper bound of the path length of its origin [m]."""
-    sag: Values
+    deviation: Values
     """Upper bound of the origin's distance from the chord [m]."""
-    slack: Values
+    sensitivity: Values
     """Upper bound of the origin's displacement if every joint is off by 1 rad or 1 m [m]."""
     joints: int
     """Number of joints that move the frame."""
 
 
 def constraint_bounds(problem: Problem, q: Configurations, chord: float) -> list[ConstraintBound]:
-    """Bounds along straight lines through configurations, and along all motions within `chord` of these lines
-    in each joint [rad] or [m]. Raises InputError for a Cartesian line if the goal is not a single pose."""
+    """Bounds for the straight lines through the configurations, and for every motion whose joints stay within
+    `chord` [rad] or [m] of these lines.
+
+    Raises InputError for a Cartesian line if the goal is not a single pose.
+    """
     linkage = Linkage(problem.robot)
     q = q if len(q) > 1 else np.repeat(q, 2, axis=0)
-    placed = {frame: linkage.place(q, frame) for frame in {one.frame for one in problem.constraints}}
+    placed = {
+        frame: linkage.place(q, frame) for frame in {constraint.frame for constraint in problem.constraints}
+    }
     bounds_of_constraints = []
-    for one in problem.constraints:
-        along = _frame_motion(linkage, placed[one.frame], q, one.frame)
-        name = f"{one.kind} of {one.frame}"
-        if isinstance(one, AxisCone):
-            cosines = along.R @ one.axis @ one.direction
+    for constraint in problem.constraints:
+        along = _frame_motion(linkage, placed[constraint.frame], q, constraint.frame)
+        name = f"{constraint.kind} of {constraint.frame}"
+        if isinstance(constraint, AxisCone):
+            cosines = along.R @ constraint.axis @ constraint.direction
             min_cosine = np.minimum(cosines[1:], cosines[:-1]) - along.turn**2 / 8
             bounds = np.arccos(np.clip(min_cosine, -1.0, 1.0)) + chord * along.joints
-            bounds_of_constraints.append(ConstraintBound(name, one.angle, bounds))
+            bounds_of_constraints.append(ConstraintBound(name, constraint.angle, bounds))
             continue
-        ends = _line_poses(problem, linkage, one) if isinstance(one, CartesianLine) else ()
-        distances_to_box = _distances(along.p, *_box(one, *ends))
-        bounds = np.maximum(distances_to_box[1:], distances_to_box[:-1]) + along.sag + chord * along.slack
-        limit = 0.0 if isinstance(one, PositionBox) else one.tolerance
+        ends = _line_poses(problem, linkage, constraint) if isinstance(constraint, CartesianLine) else ()
+        distances_to_box = _distances(along.p, *_allowed_box(constraint, *ends))
+        bounds = (
+            np.maximum(distances_to_box[1:], distances_to_box[:-1])
+            + along.deviation
+            + chord * along.sensitivity
+        )
+        limit = 0.0 if isinstance(constraint, PositionBox) else constraint.tolerance
         bounds_of_constraints.append(ConstraintBound(name, limit, bounds))
-        if isinstance(one, CartesianLine) and one.angle is not None:
+        if isinstance(constraint, CartesianLine) and constraint.angle is not None:
             bounds = _angle_bounds(along, chord, *ends)
-            bounds_of_constraints.append(ConstraintBound(f"{name}, its angle", one.angle, bounds))
+            bounds_of_constraints.append(ConstraintBound(f"{name}, its angle", constraint.angle, bounds))
     return bounds_of_constraints
 
 
 def frame_speed_errors(problem: Problem, motion: Trajectory, slack: float) -> list[str]:
-    """A line for each frame that is not shown to keep its constraint's speed, but for a share `slack`, along
-    the cubics of the motion.
+    """A message for each frame that is not proved to stay below its constraint's speed limit, raised by the
+    fraction `slack`, along the cubics of the motion.
 
-    A velocity leaves its chord by at most an eighth of its second derivative times the square of the time.
-    The derivatives of a position by several joints are at most the lever of the last of them.
+    A velocity deviates from linear interpolation by at most an eighth of its second derivative times the
+    square of the interval. A derivative of a position by several joints is at most the lever arm of the last
+    of these joints.
     """
     linkage = Linkage(problem.robot)
     lines = []
     cubics = cubics_of(motion)
-    far = np.concatenate([motion.positions, cubics.turns])
-    for one in problem.constraints:
-        if not isinstance(one, CartesianLine) or one.speed is None:
+    extreme_positions = np.concatenate([motion.positions, cubics.turns])
+    for constraint in problem.constraints:
+        if not isinstance(constraint, CartesianLine) or constraint.speed is None:
             continue
-        joints = np.flatnonzero(linkage.moved[linkage.links.index(one.frame)])
+        joints = np.flatnonzero(linkage.moved[linkage.links.index(constraint.frame)])
         speed = np.cumsum(cubics.speeds[:, joints], axis=1)
-        pull = np.cumsum(cubics.pulls[:, joints], axis=1)
-        products = np.diff(3 * pull * speed + speed**3, axis=1, prepend=0.0)
-        bends = (cubics.jerks[:, joints] + products) @ linkage.levers(one.frame, far)
-        row = np.arange(len(bends))
-        start = np.zeros(len(bends))
+        acceleration = np.cumsum(cubics.pulls[:, joints], axis=1)
+        products = np.diff(3 * acceleration * speed + speed**3, axis=1, prepend=0.0)
+        second_derivatives = (cubics.jerks[:, joints] + products) @ linkage.levers(
+            constraint.frame, extreme_positions
+        )
+        row = np.arange(len(second_derivatives))
+        start = np.zeros(len(second_derivatives))
         stop = cubics.steps[:, 0]
-        allowed = one.speed * (1 + slack)
+        allowed = constraint.speed * (1 + slack)
         for _ in range(MAX_HALVINGS):
             max_speeds = np.maximum(
-                *(_frame_speeds(linkage, cubics, one.frame, row, at) for at in (start, stop))
+                *(_frame_speeds(linkage, cubics, constraint.frame, row, at) for at in (start, stop))
             )
-            open_ = ~(max_speeds + bends[row] * (stop - start) ** 2 / 8 <= allowed)
-            if not open_.any() or not (max_speeds <= allowed).all() or open_.sum() > MAX_OPEN:
+            undecided = ~(max_speeds + second_derivatives[row] * (stop - start) ** 2 / 8 <= allowed)
+            if not undecided.any() or not (max_speeds <= allowed).all() or undecided.sum() > MAX_OPEN:
                 break
-            row = row[open_]
-            low = start[open_]
-            high = stop[open_]
+            row = row[undecided]
+            low = start[undecided]
+            high = stop[undecided]
             start = np.append(low, (low + high) / 2)
             stop = np.append((low + high) / 2, high)
             row = np.tile(row, 2)
-        if open_.any():
+        if undecided.any():
             finding = (
                 "is not shown to be slow enough"
                 if max_speeds.max() <= allowed
                 else f"moves at {max_speeds.max():.4g} m/s"
             )
-            lines.append(f"motion: {one.frame} {finding}; {one.speed:g} m/s is allowed")
+            lines.append(f"motion: {constraint.frame} {finding}; {constraint.speed:g} m/s is allowed")
     return lines
 
 
@@ -172,24 +185,24 @@ def _frame_motion(linkage: Linkage, postures: Postures, q: ndarray, frame: str) 
     T, (joints, rates) = postures.T[:, linkage.links.index(frame)], linkage.rates(postures, frame)
     step = np.abs(np.diff(q, axis=0))[:, joints]
     lengths = np.linalg.norm(rates[:-1], axis=2)
-    went = np.zeros(len(step))
-    sag = np.zeros(len(step))
+    travel = np.zeros(len(step))
+    deviation = np.zeros(len(step))
     for j in reversed(range(len(joints))):
         if not linkage.slides[joints[j]]:
-            lengths[:, j] += went  # later joints may have moved it away by so much
-        went = went + step[:, j] * lengths[:, j]
+            lengths[:, j] += travel  # later joints may have moved the origin this far from the axis
+        travel = travel + step[:, j] * lengths[:, j]
         before = step[:, :j].sum(axis=1)
-        sag += lengths[:, j] * step[:, j] * (step[:, j] + 2 * before) / 8
+        deviation += lengths[:, j] * step[:, j] * (step[:, j] + 2 * before) / 8
     turn = step[:, ~linkage.slides[joints]].sum(axis=1)
-    return _FrameMotion(T[:, :3, 3], T[:, :3, :3], turn, went, sag, lengths.sum(axis=1), len(joints))
+    return _FrameMotion(T[:, :3, 3], T[:, :3, :3], turn, travel, deviation, lengths.sum(axis=1), len(joints))
 
 
-def _box(constraint: Constraint, *ends: Pose) -> tuple[Vector, Rotation, Vector]:
-    """Center, rotation and half sizes, which may be 0 or infinite, of where a frame's origin may be; between
-    the ends of a Cartesian line."""
+def _allowed_box(constraint: Constraint, *ends: Pose) -> tuple[Vector, Rotation, Vector]:
+    """The box in which a constraint keeps a frame's origin: center, rotation and half sizes, which may be 0
+    or infinite. `ends` are those of a Cartesian line."""
     if isinstance(constraint, PositionBox):
         T = constraint.T_base_box
-        assert T is not None  # the constructor sees to it
+        assert T is not None  # ensured by the constructor
         middle = (constraint.low + constraint.high) / 2
         half = (constraint.high - constraint.low) / 2
         return T[:3, :3] @ middle + T[:3, 3], T[:3, :3], half
@@ -228,29 +241,29 @@ def _line_poses(problem: Problem, linkage: Linkage, line: CartesianLine) -> tupl
 
 
 def _angle_bounds(along: _FrameMotion, chord: float, *ends: Pose) -> Values:
-    """Bounds of the angle between the frame's orientation and the one interpolated at its place on the
-    line."""
+    """Upper bounds on the angle between the frame's orientation and the one interpolated for its position on
+    the line."""
     T_start, T_goal = ends
-    way = T_goal[:3, 3] - T_start[:3, 3]
-    length = float(np.linalg.norm(way))
+    displacement = T_goal[:3, 3] - T_start[:3, 3]
+    length = float(np.linalg.norm(displacement))
     turn = T_goal[:3, :3] @ T_start[:3, :3].T
     total_angle = float(_angles(turn[None], np.eye(3))[0])
     K = cross_matrix(np.linalg.eigh(turn + turn.T)[1][:, -1])
-    K = K if (turn * K).sum() >= 0 else -K  # the axis, not its opposite
-    if length < MIN_LINE_LENGTH:  # the frame turns in place: the nearest orientation on its way
+    K = K if (turn * K).sum() >= 0 else -K  # an eigenvector's sign is arbitrary
+    if length < MIN_LINE_LENGTH:  # rotation in place: compare with its nearest orientation
         turned = along.R @ T_start[:3, :3].T
         sines = (turned * K).sum(axis=(1, 2))
         cosines = -(turned * (K @ K)).sum(axis=(1, 2))
         angles = np.clip(np.arctan2(sines, cosines), 0.0, total_angle)[:, None, None]
-        reach = 0.0
+        angle_per_length = 0.0
     else:
-        share = np.clip((along.p - T_start[:3, 3]) @ way / length**2, 0.0, 1.0)
-        angles = (share * total_angle)[:, None, None]
-        reach = total_angle / length
+        fraction = np.clip((along.p - T_start[:3, 3]) @ displacement / length**2, 0.0, 1.0)
+        angles = (fraction * total_angle)[:, None, None]
+        angle_per_length = total_angle / length
     target_rotations = (np.eye(3) + np.sin(angles) * K + (1 - np.cos(angles)) * (K @ K)) @ T_start[:3, :3]
-    off = _angles(along.R, target_rotations)
-    return (off[1:] + off[:-1] + along.turn + reach * along.went) / 2 + chord * (
-        along.joints + reach * along.slack
+    errors = _angles(along.R, target_rotations)
+    return (errors[1:] + errors[:-1] + along.turn + angle_per_length * along.travel) / 2 + chord * (
+        along.joints + angle_per_length * along.sensitivity
     )
 
 
@@ -260,17 +273,18 @@ def _angles(first: ndarray, second: ndarray) -> Values:
 
 
 GRAVITY = 9.81
-"""Along -z of the world [m/s²]."""
+"""Gravitational acceleration along -z of the world [m/s²]."""
 MIN_MASS = 1e-9
 """Smaller masses are ignored [kg]."""
 
 
 Bound = Float[ndarray, "3 m"]
-"""Upper bounds of the norm of vectors, or the size of numbers, and of their first two derivatives."""
+"""Upper bounds on the norm of a vector, or on a number, and on its first two derivatives, over m
+intervals."""
 
 
 def _product(one: ndarray, other: ndarray) -> ndarray:
-    """The `Bound` of products."""
+    """The `Bound` of a product, by the product rule."""
     size, first, second = other
     twice = one[2] * size + 2 * one[1] * first + one[0] * second
     return np.stack([one[0] * size, one[1] * size + one[0] * first, twice])
@@ -279,18 +293,21 @@ def _product(one: ndarray, other: ndarray) -> ndarray:
 def torque_bounds(problem: Problem, motion: Path | Trajectory, samples: Values) -> JointRows:
     """Upper bounds of each joint's torque from each sample to the next [N m] or [N].
 
-    Samples are the rows and, between them, `samples`: times, or for a path rows plus shares of the way to the
-    next.
+    Torques are sampled at the rows and at `samples` between them: times, or for a path the row numbers plus
+    the fraction of the way to the next row.
     """
-    ends, durations, bounds = _states(motion, samples)
+    ends, durations, bounds = _intervals(motion, samples)
     torques = np.abs([inverse_dynamics(problem, *end) for end in ends]).max(axis=0)
     return torques + _second_derivative_bounds(problem, bounds) * durations[:, None] ** 2 / 8
 
 
-def _states(motion: Path | Trajectory, samples: Values) -> tuple[ndarray, Values, ndarray]:
-    """The m stretches of a motion from each sample to the next: positions, velocities, accelerations
-    at their starts and ends [2, 3, m, dof]; their durations [s], 1 for a path; and the `Bound` of each of the
-    three [3, 3, m, dof], with derivatives by time (of paths, which are at rest, by the share of the way)."""
+def _intervals(motion: Path | Trajectory, samples: Values) -> tuple[ndarray, Values, ndarray]:
+    """The m intervals between consecutive samples of a motion.
+
+    Returns positions, velocities and accelerations at the start and the end of each interval [2, 3, m, dof];
+    durations [s], 1 for a path; and the `Bound` of each of the three [3, 3, m, dof]. Derivatives are by time;
+    those of a path, which is at rest, by the fraction of the interval.
+    """
     cubics = cubics_of(motion)
     if isinstance(motion, Path) or not len(cubics.times):
         q = configurations(motion, samples)
@@ -316,12 +333,12 @@ def inverse_dynamics(problem: Problem, q: Configurations, v: JointRows, a: Joint
     up = np.eye(4)[2, :3] if problem.T_world_base is None else problem.T_world_base[2, :3]
     still = np.zeros((len(q), 3))
 
-    def of_joint(joint: Joint, j: int | None, seen: None) -> tuple[Any, ...]:
+    def of_joint(joint: Joint, j: int | None, rotation: None) -> tuple[Any, ...]:
         arm = T[joint.child][:, :3, 3] - T[joint.parent][:, :3, 3]
         if j is None:
-            return arm, None, None, None, seen
+            return arm, None, None, None, rotation
         axis = postures.axes[:, j]
-        return arm, axis, v[:, j, None] * axis, a[:, j, None] * axis, seen
+        return arm, axis, v[:, j, None] * axis, a[:, j, None] * axis, rotation
 
     def of_body(body: Inertia, link: str, _: None) -> tuple[ndarray, Callable[[ndarray], ndarray]]:
         R = T[link][:, :3, :3]
@@ -342,41 +359,42 @@ def _newton_euler(
 ) -> list[tuple[ndarray, ndarray]]:
     """The axis of each planned joint, and the force or moment along it: vectors, or the `Bound` of each.
 
-    at_base: what `of_joint` and `of_body` need of a link, angular velocity and acceleration, and acceleration
-        of the origin against gravity, of the base; its angular velocity is 0.
-    of_joint: by the joint, its number and what is needed of the parent: the arm from the parent's origin to
-        the child's; None, or the axis, and the joint's velocity and acceleration along it; and what is needed
-        of the child.
-    of_body: the arm to a body's center of mass, and the product with its inertia.
+    at_base: the motion of the base: its rotation as `of_joint` and `of_body` need it, its angular velocity,
+        which is 0, its angular acceleration, and the acceleration of its origin, opposite to gravity.
+    of_joint: takes a joint, its number (None if it is not planned) and the rotation of the parent link.
+        Returns the arm from the parent's origin to the child's; the axis, and the joint's velocity and
+        acceleration along it, None for a joint that is not planned; and the rotation of the child link.
+    of_body: takes a body, its link and the link's rotation. Returns the arm to the center of mass, and a
+        function that multiplies a vector by the inertia.
     cross: the cross product.
     """
     robot = problem.robot
     number = {joint.name: j for j, joint in enumerate(robot.planned_joints)}
     slides = Linkage(robot).slides
-    turning = {robot.base: at_base}
+    link_motion = {robot.base: at_base}
     arms = dict[str, ndarray]()
     axes = dict[str, ndarray]()
     for joint in robot.joints:
         j = number.get(joint.name)
         link = joint.child
-        needed, w, dw, pull = turning[joint.parent]
-        arms[link], axes[link], along, bent, needed = of_joint(joint, j, needed)
-        pull = pull + cross(dw, arms[link]) + cross(w, cross(w, arms[link]))
+        rotation, w, dw, acceleration = link_motion[joint.parent]
+        arms[link], axes[link], joint_velocity, joint_acceleration, rotation = of_joint(joint, j, rotation)
+        acceleration = acceleration + cross(dw, arms[link]) + cross(w, cross(w, arms[link]))
         if j is not None and slides[j]:
-            pull = pull + bent + 2.0 * cross(w, along)
+            acceleration = acceleration + joint_acceleration + 2.0 * cross(w, joint_velocity)
         elif j is not None:
-            w, dw = w + along, dw + bent + cross(w, along)
-        turning[link] = needed, w, dw, pull
-    carried = _masses(problem)
-    force, moment = ({link: at_base[1] for link in turning} for _ in range(2))
+            w, dw = w + joint_velocity, dw + joint_acceleration + cross(w, joint_velocity)
+        link_motion[link] = rotation, w, dw, acceleration
+    carried = _link_inertias(problem)
+    force, moment = ({link: at_base[1] for link in link_motion} for _ in range(2))
     loads = {}
     for joint in reversed(robot.joints):
         j = number.get(joint.name)
         link = joint.child
-        needed, w, dw, pull = turning[link]
+        rotation, w, dw, acceleration = link_motion[link]
         for body in carried.get(link, ()):
-            arm, inertia = of_body(body, link, needed)
-            body_force = body.mass * (pull + cross(dw, arm) + cross(w, cross(w, arm)))
+            arm, inertia = of_body(body, link, rotation)
+            body_force = body.mass * (acceleration + cross(dw, arm) + cross(w, cross(w, arm)))
             force[link] = force[link] + body_force
             moment[link] = moment[link] + inertia(dw) + cross(w, inertia(w)) + cross(arm, body_force)
         if j is not None:
@@ -387,41 +405,43 @@ def _newton_euler(
 
 
 def _second_derivative_bounds(problem: Problem, bounds: ndarray) -> JointRows:
-    """Upper bounds on the second derivatives of torques from each sample to the next: the same equations on
-    bounds. Of a link, bounds of its rotation are needed."""
+    """Upper bounds on the second derivatives of torques from each sample to the next: the Newton-Euler
+    equations with a `Bound` in place of each vector. The rotation of a link is the `Bound` of its rate."""
     robot = problem.robot
     still = np.zeros((3, bounds.shape[2]))
     slides = Linkage(robot).slides
 
-    def of_joint(joint: Joint, j: int | None, seen: Bound) -> tuple[Any, ...]:
+    def of_joint(joint: Joint, j: int | None, rotation: Bound) -> tuple[Any, ...]:
         fixed_motion = joint.motion(robot.locked.get(joint.name, 0.0)) if j is None else np.eye(4)
-        arm = _rotating(float(np.linalg.norm((joint.T_parent_joint @ fixed_motion)[:3, 3])), seen)
+        arm = _rotating(float(np.linalg.norm((joint.T_parent_joint @ fixed_motion)[:3, 3])), rotation)
         if j is None:
-            return arm, None, None, None, seen
-        axis = _rotating(1.0, seen)
-        place, speed, bent = bounds[..., j]
+            return arm, None, None, None, rotation
+        axis = _rotating(1.0, rotation)
+        position, velocity, acceleration = bounds[..., j]
         if slides[j]:
-            arm = arm + _product(place, axis)
+            arm = arm + _product(position, axis)
         else:
-            seen = seen + _product(np.stack([*place[1:], still[0]]), axis)
-        return arm, axis, _product(speed, axis), _product(bent, axis), seen
+            rotation = rotation + _product(np.stack([*position[1:], still[0]]), axis)
+        return arm, axis, _product(velocity, axis), _product(acceleration, axis), rotation
 
-    def of_body(body: Inertia, _: str, seen: Bound) -> tuple[Bound, Callable[[Bound], Bound]]:
+    def of_body(body: Inertia, _: str, rotation: Bound) -> tuple[Bound, Callable[[Bound], Bound]]:
         max_moment = float(np.linalg.eigvalsh(body.moments)[-1])
-        inertia = max_moment * np.stack([still[0] + 1, 2 * seen[0], 2 * seen[1] + 4 * seen[0] ** 2])
-        return _rotating(float(np.linalg.norm(body.com)), seen), lambda w: _product(inertia, w)
+        inertia = max_moment * np.stack(
+            [still[0] + 1, 2 * rotation[0], 2 * rotation[1] + 4 * rotation[0] ** 2]
+        )
+        return _rotating(float(np.linalg.norm(body.com)), rotation), lambda w: _product(inertia, w)
 
     at_base = still, still, still, np.stack([still[0] + GRAVITY, *still[1:]])
     loads = _newton_euler(problem, at_base, of_joint, of_body, _product)
     return np.stack([_product(*load)[2] for load in loads], axis=1)
 
 
-def _rotating(length: float, seen: Bound) -> Bound:
-    """Bounds of a vector of constant length that rotates with a link whose rotation is bounded by `seen`."""
-    return length * np.stack([1 + 0 * seen[0], seen[0], seen[1] + seen[0] ** 2])
+def _rotating(length: float, rotation: Bound) -> Bound:
+    """The `Bound` of a vector that is fixed to a link, from its length and the `Bound` of the link's rate."""
+    return length * np.stack([1 + 0 * rotation[0], rotation[0], rotation[1] + rotation[0] ** 2])
 
 
-def _masses(problem: Problem) -> dict[str, list[Inertia]]:
+def _link_inertias(problem: Problem) -> dict[str, list[Inertia]]:
     """The inertias of each link, with the payload's."""
     payload = problem.payload
     inertias = {link: [of] for link, of in problem.robot.inertias.items()}
@@ -433,29 +453,30 @@ def _masses(problem: Problem) -> dict[str, list[Inertia]]:
 
 
 AVERAGING_WINDOWS = (1e-3, 4e-3, 16e-3)
-"""Where rows are closer than the first of these [s], mean accelerations are also tested over windows of at
-least these lengths: from one row to the next, the position tolerance would hide any rate."""
+"""Windows over which mean accelerations are tested [s]. The longer ones are used where rows are closer than
+the first: there, the tolerance of positions would hide any acceleration between consecutive rows."""
 AGREEMENT = 0.5
-"""Share of a joint's greatest acceleration by which written accelerations may leave those of the cubics
-beside their row."""
+"""Largest difference between the accelerations of the rows and those of the cubics next to them, as a
+fraction of the joint's largest acceleration."""
 REST_SHARE = 0.01
-"""Accelerations below this share of a limit need not agree."""
+"""In that test, the largest acceleration counts as at least this fraction of the joint's limit."""
 JUMP = 1e-6
-"""Where a jerk is stated, share of a joint's acceleration limit by which its acceleration may jump."""
+"""Largest jump of an acceleration in a motion with stated jerks, as a fraction of the joint's limit."""
 MIN_JERK = 1e-6
 """Jerks below this are rounding errors [rad/s³] or [m/s³]."""
-# A blend is looked for at configurations at most this share of its radius apart, at most so many a step.
+# Samples that show whether a motion passes within a blend: largest spacing, as a fraction of the blend, and
+# largest number per step.
 BLEND_SHARE = 0.25
 MAX_LOOKS = 10_000
 MIN_TIME = 1e-12
-"""Shorter times are taken as this [s], so that rates over them are finite."""
+"""Shorter intervals count as this [s], so that mean rates over them are finite."""
 
 
 def configurations(motion: Path | Trajectory, between: Values) -> Configurations:
     """The rows of a motion and further configurations between them, in order.
 
-    `between`: times [s], for which the configurations are on the cubics through the rows' positions and
-    velocities; for a path, rows plus shares of the way to the next, on its straight lines.
+    `between`: times [s] on the cubics through the rows' positions and velocities; for a path, the row numbers
+    plus the fraction of the way to the next row, on the straight line between them.
     """
     cubics = cubics_of(motion)
     rows = cubics.rows(between)
@@ -464,29 +485,29 @@ def configurations(motion: Path | Trajectory, between: Values) -> Configurations
 
 
 def deviations(motion: Path | Trajectory, between: Values) -> JointRows:
-    """How far a motion leaves the straight line from each of its `configurations` to the next."""
+    """Upper bounds on how far each joint deviates from the straight lines between the `configurations`."""
     return cubics_of(motion).deviations(places_of(motion, between))
 
 
 def not_covered(problem: Problem, motion: Path | Trajectory) -> str:
-    """What the problem requires and no certificate of such a motion can prove; "" for nothing."""
+    """The requirement of the problem that no certificate of such a motion can prove; "" if there is none."""
     return "moving, without times" if problem.moving and isinstance(motion, Path) else ""
 
 
 def not_checked(problem: Problem, motion: Path | Trajectory) -> list[str]:
-    """What the checker leaves to the validator, or cannot see, in words."""
+    """Descriptions of what the checker does not check and leaves to the validator."""
     path = isinstance(motion, Path)
     parts = {
         "sharp reversals": True,
-        "velocities, accelerations and times, which a path has not": path,
+        "velocities, accelerations and times, which a path does not have": path,
         "start_velocity": path and problem.start_velocity is not None,
-        "what no view has seen": problem.views,
+        "space that no view has observed": problem.views,
     }
     return [description for description, unchecked in parts.items() if unchecked]
 
 
 def requirement_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
-    """A line for each requirement that the motion fails, or is not shown to meet."""
+    """A message for each requirement that the motion violates, or is not proved to meet."""
     robot = problem.robot
     motion = certificate.motion
     tolerances = certificate.tolerances
@@ -514,8 +535,8 @@ def requirement_errors(problem: Problem, certificate: MotionProof) -> Iterator[s
 
 
 def place_errors(problem: Problem, certificate: MotionProof) -> list[str]:
-    """What would make the other tests meaningless: joints that are not the robot's, times that do not begin
-    at 0 or do not increase, and places of the proof that are not on the motion."""
+    """Errors that would make the other tests meaningless: joints of another robot, times that do not begin at
+    0 or do not increase, and samples of the proof that are not between the rows of the motion."""
     motion = certificate.motion
     robot = problem.robot
     if tuple(motion.joint_names) != robot.joint_names:
@@ -534,8 +555,8 @@ def place_errors(problem: Problem, certificate: MotionProof) -> list[str]:
 
 
 def cubic_jerks(robot: Robot, motion: Path | Trajectory) -> JointValues | None:
-    """The largest jerk of each joint along the cubics; None for a path, and where accelerations jump or are
-    written otherwise."""
+    """The largest jerk of each joint along the cubics; None for a path, and for a trajectory whose
+    accelerations jump or differ from those of its cubics."""
     if isinstance(motion, Path) or len(motion.times) < 2:
         return None
     cubics = cubics_of(motion)
@@ -548,7 +569,7 @@ def cubic_jerks(robot: Robot, motion: Path | Trajectory) -> JointValues | None:
 
 
 def _jerk_errors(robot: Robot, motion: Trajectory, certificate: MotionProof) -> Iterator[str]:
-    """Jerks, where the proof states them, that are larger than it says."""
+    """Jerks that are larger than those that the proof states, if it states any."""
     stated = dict(certificate.jerks)
     if not stated:
         return
@@ -565,8 +586,8 @@ def _jerk_errors(robot: Robot, motion: Trajectory, certificate: MotionProof) -> 
 
 
 def _waypoint_errors(problem: Problem, motion: Path | Trajectory, tolerances: Tolerances) -> Iterator[str]:
-    """The first waypoint at which the motion does not stop, or that it does not pass within its blend, after
-    those before it."""
+    """The first waypoint that the motion misses. It must reach the waypoints in order, and either stop at
+    each or pass within its blend."""
     robot = problem.robot
     after = 0.0
     for k, (goal, blend) in enumerate(zip(problem.waypoints, problem.blend, strict=True)):
@@ -577,7 +598,7 @@ def _waypoint_errors(problem: Problem, motion: Path | Trajectory, tolerances: To
             still = np.ones(len(rows), bool)
         places = rows[still].astype(float)
         if blend:
-            # straight lines between rows, looked at more often than the blend is wide
+            # samples on the straight lines between rows, closer together than the blend is wide
             lengths = np.linalg.norm(np.diff(motion.positions, axis=0), axis=1)
             counts = np.clip(np.ceil(lengths / (BLEND_SHARE * blend)), 1, MAX_LOOKS).astype(int)
             within = [i + np.arange(count) / count for i, count in enumerate(counts)]
@@ -637,8 +658,8 @@ def _stated_errors(
 def _rate_errors(
     robot: Robot, motion: Trajectory, certificate: MotionProof, begins: JointValues
 ) -> Iterator[str]:
-    """Joints that exceed their limits of velocity or acceleration, by any measure of them, cubics that leave
-    what was certified, and motions that do not begin as they must or end at rest."""
+    """Joints that exceed a limit of velocity or acceleration by any of several measures, cubics that leave
+    the certified straight lines, and motions that do not begin at the required velocity or end at rest."""
     tolerances = certificate.tolerances
     times = motion.times
     step = np.diff(times)[:, None]
@@ -650,25 +671,33 @@ def _rate_errors(
     v = motion.velocities
     a = motion.accelerations
     share = 1 + tolerances.rate_slack
-    unsure = 2 * tolerances.limit_slack
+    position_slack = 2 * tolerances.limit_slack
     speed = robot.velocity
-    pull = robot.acceleration
+    acceleration = robot.acceleration
     change = np.diff(v, axis=0) / step
-    # velocities of cubics contain up to 3/2 of the mean velocity, accelerations 6 of it over the step
-    blur = 6 * unsure / step**2
-    yield from _agreement_errors(robot, motion, cubics, begins, blur)
-    for quantity, values, limit, room in (
+    # an error of the mean velocity enters the cubic's velocity times up to 3/2, its acceleration times 6 /
+    # step
+    acceleration_slack = 6 * position_slack / step**2
+    yield from _agreement_errors(robot, motion, cubics, begins, acceleration_slack)
+    for quantity, values, limit, slack in (
         ("velocity", v, speed, 0.0),
-        ("mean velocity between rows", np.diff(q, axis=0) / step, speed, unsure / np.maximum(step, MIN_TIME)),
-        ("acceleration", a, pull, 0.0),
-        ("mean acceleration between rows", change, pull, 0.0),
-        ("velocity along its cubics", cubics.speeds, speed, 1.5 * unsure / step),
-        ("acceleration along its cubics", cubics.pulls, pull, blur),
+        (
+            "mean velocity between rows",
+            np.diff(q, axis=0) / step,
+            speed,
+            position_slack / np.maximum(step, MIN_TIME),
+        ),
+        ("acceleration", a, acceleration, 0.0),
+        ("mean acceleration between rows", change, acceleration, 0.0),
+        ("velocity along its cubics", cubics.speeds, speed, 1.5 * position_slack / step),
+        ("acceleration along its cubics", cubics.pulls, acceleration, acceleration_slack),
     ):
-        yield from _exceeded(robot, quantity, np.abs(values), limit, share * limit + room)
-    beyond = _furthest(motion, share, unsure, speed)
-    message = "it gets {:.3g} further than {:.4g} allows"
-    yield from _exceeded(robot, "mean velocity from one row to another", beyond, speed, unsure, message)
+        yield from _exceeded(robot, quantity, np.abs(values), limit, share * limit + slack)
+    beyond = _excess_displacement(motion, share, position_slack, speed)
+    message = "it moves {:.3g} further than {:.4g} allows"
+    yield from _exceeded(
+        robot, "mean velocity from one row to another", beyond, speed, position_slack, message
+    )
     fine_steps = step.min(initial=np.inf) < AVERAGING_WINDOWS[0]
     for window in AVERAGING_WINDOWS if fine_steps else AVERAGING_WINDOWS[:1]:
         # before the first row the arm moves at its start velocity, and after the last it stands still
@@ -679,12 +708,16 @@ def _rate_errors(
         before = (times - at[first])[:, None]
         after = (at[last] - times)[:, None]
         spacing = (before + after) / 2
-        # from the mean velocity before a row to that after it: a value that the joint must have reached
-        bent = np.abs((rows[last] - q) / after - (q - rows[first]) / before) / spacing
+        # second divided difference: by the mean value theorem, the joint reaches this acceleration
+        mean_acceleration = np.abs((rows[last] - q) / after - (q - rows[first]) / before) / spacing
         outside = ((first == 0) * 1.0 + (last == len(at) - 1))[:, None]
-        room = unsure / before + unsure / after + outside * tolerances.rate_slack * speed
+        slack = position_slack / before + position_slack / after + outside * tolerances.rate_slack * speed
         quantity = "mean acceleration by its positions"
-        lines = [*_exceeded(robot, quantity, bent, pull, share * pull + room / spacing)]
+        lines = [
+            *_exceeded(
+                robot, quantity, mean_acceleration, acceleration, share * acceleration + slack / spacing
+            )
+        ]
         yield from lines
         if lines:
             break
@@ -703,24 +736,26 @@ def _exceeded(
     allowed: ndarray | float,
     how: str = "{:.4g} > {:.4g}",
 ) -> Iterator[str]:
-    """A line for each joint with a limit some of whose values are not within what is allowed."""
+    """A message for each joint that has a limit and exceeds the allowed value in any row."""
     over = ~(values <= allowed) & (limit > 0)
     for j in np.flatnonzero(over.any(axis=0)):
         excess = how.format(values[over[:, j], j].max(), limit[j])
         yield f"motion: {robot.joint_names[j]} exceeds its limit of {what}: {excess}"
 
 
-def _furthest(motion: Trajectory, share: float, unsure: float, speed: JointValues) -> JointRows:
-    """How much further each joint moves at most, from any row to any later one, than its velocity limit
+def _excess_displacement(
+    motion: Trajectory, share: float, position_slack: float, speed: JointValues
+) -> JointRows:
+    """The largest excess, over all pairs of rows, of each joint's displacement over what its velocity limit
     allows in that time [1, dof].
 
-    Positions have a tolerance of `unsure`: once for the two rows and, for rows far apart, once for each step
-    between them.
+    Each step between the two rows adds a tolerance of `position_slack`, less for a step shorter than
+    the first averaging window. The caller allows it once more, for the two rows themselves.
     """
     step = np.diff(motion.times)[:, None]
     q = motion.positions
     allowed = np.zeros_like(q)
-    max_travel = share * speed * step + unsure * np.minimum(step / AVERAGING_WINDOWS[0], 1.0)
+    max_travel = share * speed * step + position_slack * np.minimum(step / AVERAGING_WINDOWS[0], 1.0)
     np.cumsum(max_travel, axis=0, out=allowed[1:])
     # largest excess over all earlier rows, by a running minimum
     advance = np.stack([q, -q]) - allowed
@@ -728,19 +763,22 @@ def _furthest(motion: Trajectory, share: float, unsure: float, speed: JointValue
 
 
 def _agreement_errors(
-    robot: Robot, motion: Trajectory, cubics: Cubics, begins: JointValues, blur: ndarray
+    robot: Robot, motion: Trajectory, cubics: Cubics, begins: JointValues, acceleration_slack: ndarray
 ) -> Iterator[str]:
-    """Joints whose written accelerations are not near those of the cubics beside their rows."""
+    """Joints whose accelerations at the rows are not close to those of the cubics next to them."""
     before = np.concatenate([cubics.start[:1], cubics.end])
     after = np.concatenate([cubics.start, cubics.end[-1:]])
     a = motion.accelerations
     off = np.maximum(np.minimum(before, after) - a, a - np.maximum(before, after)).clip(0.0)
     if begins.any():
-        off[:1] = 0.0  # the motion before may have ended in any acceleration
+        off[:1] = 0.0  # the acceleration of the motion before this one is not known
     peak = np.abs(np.concatenate([cubics.pulls, a])).max(axis=0)
     peak = np.maximum(peak, REST_SHARE * robot.acceleration)
-    room = np.maximum(np.concatenate([blur[:1], blur]), np.concatenate([blur, blur[-1:]]))
-    for j in np.flatnonzero(~(off <= AGREEMENT * peak + room).all(axis=0)):
+    slack = np.maximum(
+        np.concatenate([acceleration_slack[:1], acceleration_slack]),
+        np.concatenate([acceleration_slack, acceleration_slack[-1:]]),
+    )
+    for j in np.flatnonzero(~(off <= AGREEMENT * peak + slack).all(axis=0)):
         name = robot.joint_names[j]
         yield f"motion: accelerations of {name} are {off[:, j].max():.4g} off those of its cubics"
 
@@ -748,8 +786,11 @@ def _agreement_errors(
 def at_goal(
     robot: Robot, goal: Goal, q: Configurations, tolerances: Tolerances, blend: float = 0.0
 ) -> Bool[ndarray, "n"]:
-    """Which configurations are at a goal, or within `blend` of it: of a configuration in joint space, of a
-    pose by its position or its box of tolerances."""
+    """Which configurations reach a goal, or pass within `blend` of it.
+
+    `blend` is a distance in joint space for a joint goal, and of positions for a pose, measured from the box
+    of its position tolerances if it has them.
+    """
     if isinstance(goal, AnyGoal):
         return np.any([at_goal(robot, one, q, tolerances, blend) for one in goal.goals], axis=0)
     if isinstance(goal, PosesGoal):
@@ -775,7 +816,7 @@ def at_goal(
     roll = np.arctan2(turn[:, 2, 1], turn[:, 2, 2])
     pitch = np.arcsin(np.clip(-turn[:, 2, 0], -1.0, 1.0))
     yaw = np.arctan2(turn[:, 1, 0], turn[:, 0, 0])
-    ways = np.stack([(roll, pitch, yaw), (roll + np.pi, np.pi - pitch, yaw + np.pi)])
-    ways = (ways + np.pi) % (2 * np.pi) - np.pi
+    rpy_solutions = np.stack([(roll, pitch, yaw), (roll + np.pi, np.pi - pitch, yaw + np.pi)])
+    rpy_solutions = (rpy_solutions + np.pi) % (2 * np.pi) - np.pi
     allowed = (goal.rpy_tolerance + tolerances.goal_slack)[:, None]
-    return within_distance & (np.abs(ways) <= allowed).all(axis=1).any(axis=0)
+    return within_distance & (np.abs(rpy_solutions) <= allowed).all(axis=1).any(axis=0)

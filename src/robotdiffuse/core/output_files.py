@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 from robotdiffuse.core.errors import InputError, OutputError, shown
 from robotdiffuse.core.input_files import file_name
 
-# failures of a disk rather than of a file's name: it is full, over a quota or a limit, or broken
+# errors of the disk (full, over a quota, file too large, input/output error) rather than of the file's name
 DISK_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
@@ -28,10 +28,10 @@ def write_atomically(
 ) -> None:
     """Write a temporary file and rename it over `file`, so that no reader sees it half written.
 
-    content: text, bytes, or what writes them to a stream.
+    content: text, bytes, or a function that writes to a stream.
 
-    An interruption or a full disk leaves the old file, if there was one. Raises InputError if the file cannot
-    be written: OutputError if the disk is full.
+    If writing fails or is interrupted, the old file stays as it is. Raises InputError if the file cannot be
+    written, and its subclass OutputError if the disk is full.
     """
     temporary = file.with_name(f".{file.name}.{secrets.token_hex(8)}.tmp")
     try:
@@ -70,8 +70,8 @@ def check_output(file: str | Path, endings: tuple[str, ...]) -> Path:
 
 
 class JsonLines:
-    """A file of JSON objects, one a line. A row is on disk when `append` returns; without a file, in
-    memory."""
+    """A file of JSON objects, one per line. `append` returns once the row is on disk. Without a file, rows
+    are kept in memory only."""
 
     def __init__(self, file: Path | None) -> None:
         """Read the existing rows; a last line that was cut off is dropped.
@@ -107,7 +107,7 @@ class JsonLines:
 
     def _write(self, file: Path, line: str) -> None:
         if self._without_cut_line is not None:
-            # not earlier: another process may still have been writing that line
+            # removed only now: when the file was read, another process may still have been writing this line
             write_atomically(file, self._without_cut_line)
             self._without_cut_line = None
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -1,9 +1,9 @@
-"""Rows of a data set: as motions and problems, and as training reads them, with copies turned about the
-vertical.
+"""Converts rows of a data set to motions and problems, and reads them for training, with rotated copies.
 
-If the first joint turns about the base's z axis, a scene turned by an angle needs the same motion with that
-angle added to the first joint: such copies cost no planning. Only the base link does not turn (nor do the
-floor's corners, which are out of reach): copies that would touch the base link are left out.
+If the first joint rotates about the base's z axis, a motion also solves the scene rotated about that axis,
+with the angle added to the first joint. Such copies need no planning. The base link does not rotate with
+them, so copies that would touch it are left out. The corners of the floor do not rotate either, but are out
+of reach.
 """
 
 from collections.abc import Iterator
@@ -35,7 +35,7 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import PackedScenes, floor_row
 
 Row = dict[str, ndarray | np.generic]
-"""One row of each of ARRAYS."""
+"""A row of a shard: the row of each array, by its name in `shards.ARRAYS`."""
 
 
 def row_of(
@@ -58,18 +58,18 @@ def row_of(
 
     clearances: of the waypoints [m].
     T_base_tip: the target.
-    most_goals: rows for goals.
+    most_goals: number of goals in a row of the data set; missing ones are NaN.
 
-    The other arguments are the values of the arrays of their names.
+    The other arguments are the values of the arrays with their names, see `shards.ARRAYS`.
     """
-    missing = [(0, most_goals - len(goals)), (0, 0)]
+    padding = [(0, most_goals - len(goals)), (0, 0)]
     straight = float(np.linalg.norm(q[-1].astype(np.float64) - q[0]))
     wxyz = quaternion_from_rotation(T_base_tip[:3, :3])
     row: Row = {
         "trajectories": q,
         "start": q[0],
-        "goals": np.pad(goals.astype(np.float32), missing, constant_values=np.nan),
-        "goal_costs": np.pad(goal_costs.astype(np.float32), missing[0], constant_values=np.nan),
+        "goals": np.pad(goals.astype(np.float32), padding, constant_values=np.nan),
+        "goal_costs": np.pad(goal_costs.astype(np.float32), padding[0], constant_values=np.nan),
         "goal_index": np.int8(goal_index),
         "target_pose": np.concatenate([wxyz, T_base_tip[:3, 3]]).astype(np.float32),
         "obstacle_kinds": scene.kinds[0],
@@ -105,7 +105,7 @@ def scenes_of(manifest: Manifest, shard: Shard, rows: slice = slice(None)) -> Pa
 def problem_of(manifest: Manifest, robot: Robot, shard: Shard, row: int) -> Problem:
     """The problem that a row solves, with all its goal configurations.
 
-    Raises InputError if the row is no valid problem, as with a start outside the limits.
+    Raises InputError if the row is not a valid problem, for example if its start is outside the limits.
     """
     goals = np.asarray(shard["goals"][row], np.float64)
     goals = goals[~np.isnan(goals).any(axis=1)]
@@ -120,8 +120,8 @@ def path_of(robot: Robot, shard: Shard, row: int) -> Path:
 
 
 def motion_of(robot: Robot, shard: Shard, row: int) -> Path | Trajectory:
-    """The motion of a row: a trajectory, its rates by finite differences, if the data have times, else a
-    path."""
+    """The motion of a row: a path, or, if the data have times, a trajectory with velocities and accelerations
+    by finite differences."""
     path = path_of(robot, shard, row)
     times = np.asarray(shard.arrays.get("times", ()), np.float64)
     if not len(times) or not (np.diff(times[row]) > 0).all():
@@ -134,7 +134,7 @@ def motion_of(robot: Robot, shard: Shard, row: int) -> Path | Trajectory:
 # Training
 
 ARRAYS_READ = ("trajectories", "target_pose", "obstacle_kinds", "obstacle_params", "family")
-"""Arrays that are read from shards that are not fully checked."""
+"""The arrays that `read_rows` reads if it does not check whole shards."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +142,7 @@ class Rows:
     """The rows of a shard, or copies turned about the vertical."""
 
     shard: Shard
-    """The shard with the other arrays; these are not turned."""
+    """The shard that the rows come from; its arrays are never turned."""
     turn: int
     """Number of the copy; 0 for the rows themselves."""
     q: Float32[ndarray, "n waypoints dof"]
@@ -159,9 +159,10 @@ def read_rows(
     """Read the rows of all shards, each shard followed by its turned copies.
 
     robot: the robot that the data are used for.
-    waypoints: resample to so many, evenly spaced along each path, in memory; shards are then fully checked.
-        None: the stored ones, mapped to memory; only their shapes are checked.
-    turns: copies of the training rows, see `turned`; these need `waypoints` and a robot.
+    waypoints: number of waypoints to which each motion is resampled, see `resample`; shards are then fully
+        checked. None: the stored waypoints, mapped to memory; only their shapes are checked.
+    turns: number of turned copies of the training rows, see `turned`; above 0, `waypoints` and `robot` are
+        needed.
 
     Raises InputError, naming the shard, if data are missing, damaged or of another robot.
     """
@@ -181,11 +182,11 @@ def read_rows(
         for turn in range(1, turns + 1):
             assert robot is not None and waypoints is not None
             rng = np.random.default_rng([int(shard.fingerprint, 16), turn])
-            q, around, clear = turned(robot, stored, scenes, rng)
+            q, turned_scenes, clear = turned(robot, stored, scenes, rng)
             usable = (split == SPLITS.index("train")) & clear
-            even = np.zeros((len(q), waypoints, q.shape[2]), np.float32)
-            even[usable] = resample(q[usable], waypoints)
-            yield Rows(shard, turn, even, around, np.where(usable, split, -1).astype(np.int8))
+            resampled = np.zeros((len(q), waypoints, q.shape[2]), np.float32)
+            resampled[usable] = resample(q[usable], waypoints)
+            yield Rows(shard, turn, resampled, turned_scenes, np.where(usable, split, -1).astype(np.int8))
 
 
 def resample(q: Float[ndarray, "n stored dof"], waypoints: int) -> Float[ndarray, "n {waypoints} dof"]:
@@ -194,24 +195,26 @@ def resample(q: Float[ndarray, "n stored dof"], waypoints: int) -> Float[ndarray
     """
     n, stored = q.shape[:2]
     steps = np.linalg.norm(np.diff(q, axis=1), axis=2)
-    at = np.concatenate([np.zeros((n, 1)), np.cumsum(steps, axis=1, dtype=np.float64)], axis=1)
-    target_lengths = np.linspace(0.0, at[:, -1], waypoints, axis=1)
-    # offsets make the rows one ascending list, for a single search
-    row = 2.0 * at.max(initial=0.0) * np.arange(n)[:, None]
-    after = np.searchsorted((at + row).reshape(-1), (target_lengths + row).reshape(-1), side="right")
+    lengths = np.concatenate([np.zeros((n, 1)), np.cumsum(steps, axis=1, dtype=np.float64)], axis=1)
+    target_lengths = np.linspace(0.0, lengths[:, -1], waypoints, axis=1)
+    # offsets that make all rows together one ascending array, for a single call of searchsorted
+    row_offsets = 2.0 * lengths.max(initial=0.0) * np.arange(n)[:, None]
+    after = np.searchsorted(
+        (lengths + row_offsets).reshape(-1), (target_lengths + row_offsets).reshape(-1), side="right"
+    )
     after = np.clip(after.reshape(n, waypoints) - np.arange(n)[:, None] * stored, 1, stored - 1)
-    low, high = (np.take_along_axis(at, i, 1)[..., None] for i in (after - 1, after))
+    low, high = (np.take_along_axis(lengths, i, 1)[..., None] for i in (after - 1, after))
     below, above = (np.take_along_axis(q, i[..., None], 1) for i in (after - 1, after))
     into = target_lengths[..., None] - low
     interval = np.maximum(high - low, np.finfo(np.float64).tiny)
-    even = ((above.astype(np.float64) - below) / interval * into + below).astype(q.dtype)
-    even[:, 0] = q[:, 0]
-    even[:, -1] = q[:, -1]
-    return even
+    resampled = ((above.astype(np.float64) - below) / interval * into + below).astype(q.dtype)
+    resampled[:, 0] = q[:, 0]
+    resampled[:, -1] = q[:, -1]
+    return resampled
 
 
 def turns_about_vertical(robot: Robot) -> bool:
-    """Whether the first joint turns about the z axis of the base, and all of the robot with it."""
+    """Whether the first joint rotates about the z axis of the base and moves all other links."""
     T_base_joint = robot.frame_offsets[0]
     on_axis = np.allclose(T_base_joint[:2, 3], 0.0, atol=1e-6) and bool(robot.moved_by[1:, 0].all())
     return not robot.prismatic[0] and on_axis and bool(np.isclose(T_base_joint[2, 2], 1.0, atol=1e-9))

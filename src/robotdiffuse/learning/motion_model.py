@@ -1,4 +1,4 @@
-"""MotionModel: encoder, denoiser and sampler put together; all that planning needs of the learned part.
+"""MotionModel: encoder, denoiser and sampler together, which is the learned part of planning.
 
 Everything here is NumPy. The encoder and the denoiser are functions that a subclass provides: exported
 networks in planning (`exported_model`), PyTorch modules in training (`motion_network`).
@@ -59,18 +59,18 @@ class Reference(NamedTuple):
 
 
 class Statistics(NamedTuple):
-    """What a representation takes from the training data; float32."""
+    """Statistics of the training data that x is scaled by; float32."""
 
     residual_scale: Configuration
     """Standard deviation of the trajectories about their reference, in units of the joint limits."""
     residual_mean: Configuration
-    """Their mean, for the target `absolute`; else zero."""
+    """Mean of the trajectories, in the same units, for the target `absolute`; else zero."""
     noise_factor: Float[ndarray, "waypoints waypoints"]
-    """The matrix that makes noise of white noise, see `diffusion.noise_factor`."""
+    """Matrix that turns white noise into the noise of the forward process, see `diffusion.noise_factor`."""
 
     @staticmethod
     def without_data(waypoints: int, dof: int) -> "Statistics":
-        """Those of the target `limits`, and of the others before training."""
+        """The statistics of the target `limits`, and placeholders for other targets before training."""
         white = white_noise_factor(waypoints).astype(np.float32)
         return Statistics(np.ones(dof, np.float32), np.zeros(dof, np.float32), white)
 
@@ -88,33 +88,33 @@ class SamplingSettings(Settings, name="sampling"):
     guided_share: Share = 0.5
     """Share of the denoising steps that are guided, the last ones: 0 none, 1 all (the paper's)."""
     guidance_scale: float = 1.0
-    """Scale of classifier-free guidance: 1 takes the network's prediction as it is, more follows the
-    condition further, 0 hides the condition. Other than 1 needs weights that were trained with a
-    condition_drop above 0."""
+    """Scale of classifier-free guidance: 1 uses the network's prediction as it is, larger values strengthen
+    the condition, 0 ignores it. Values other than 1 need weights that were trained with a condition_drop
+    above 0."""
 
 
 MIN_CLEARANCE = -0.1
 MAX_CLEARANCE = 0.4
 """Clearances are clipped to this range before they enter the denoiser [m]."""
 GRADIENT_MARGIN = 0.1
-"""Gradients are those of the links closer than this [m]."""
+"""Only links closer to an obstacle than this contribute to the gradients [m]."""
 GRADIENT_UNIT = 2.0
-"""Gradients of this size and larger ones enter the denoiser as 1 [m/rad]."""
+"""Gradients are divided by this and clipped to [-1, 1] before they enter the denoiser [m/rad]."""
 MAX_POINTS = 2048
-"""Larger clouds are thinned at random to this many points before they are encoded, or to the encoder's own
-size if it does not take clouds of any size."""
+"""Larger clouds are reduced to this many random points before they are encoded. For an encoder that needs
+clouds of one size, that size holds instead."""
 
 ClearanceFn = Callable[[ndarray], ndarray]
-"""From joint values [count, waypoints, dof] (float32) to the clearances of the links [m], [count, waypoints,
-links]; for a model with `clearance_gradients` to [count, waypoints, links + dof], see
+"""A function from joint values [count, waypoints, dof] (float32) to the clearances of the links [count,
+waypoints, links] [m]. For a model with `clearance_gradients` it returns [count, waypoints, links + dof], see
 `CollisionChecker.clearances_and_gradients`."""
 GuideFn = Callable[[ndarray, float], ndarray]
-"""From predicted joint values [count, waypoints, dof] (float32) and the noise level in (0, 1] to improved
-joint values."""
+"""A function from predicted joint values [count, waypoints, dof] (float32) and the noise level in (0, 1] to
+improved joint values."""
 
 
 MAX_WAYPOINTS = 4096.0
-"""Bounds the memory of the waypoints x waypoints matrices."""
+"""Largest number of waypoints, which bounds the memory of the waypoints x waypoints matrices."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class ModelParts(Settings):
     clearance_features: bool = True
     """Whether the links' clearances along the noisy trajectory are network inputs (beyond the paper)."""
     clearance_gradients: bool = False
-    """Whether gradients are network inputs too: the direction in which the joints bring the arm too close to
+    """Whether gradients are network inputs too: the direction in joint space that brings the arm closer to
     obstacles, see `CollisionChecker.clearances_and_gradients`."""
 
     def __post_init__(self) -> None:
@@ -151,7 +151,7 @@ class ModelParts(Settings):
 
 
 def check_points(where: str, encoder: str | None, denoiser: str) -> None:
-    """Raises InputError, naming the encoder's field, if only one of both handles a scene as points."""
+    """Raises InputError, naming the encoder's field, if only one of encoder and denoiser works on points."""
     if (encoder == "points") != (denoiser == "cross_attention"):
         raise InputError(
             f"{where} is {encoder} and denoiser is {denoiser}; "
@@ -164,8 +164,8 @@ class MotionModelSettings(ModelParts, name="model"):
     """The parts of the model and its defaults for sampling."""
 
     encoder: Annotated[str, OneOf(ENCODERS)] | None = "point_autoencoder"
-    """Encoder of the scene. None for a prior, which has neither scene nor start and goal as its condition; it
-    finds start and goal in the noisy trajectory, whose ends they are."""
+    """Encoder of the scene. None for a prior, which has no condition: it reads start and goal from the ends
+    of the noisy trajectory."""
     encoder_settings: Annotated[EncoderSettings | None, SettingsOf("encoder", ENCODERS)] = field(
         default_factory=PointAutoencoderSettings
     )
@@ -200,8 +200,8 @@ class MotionModelSettings(ModelParts, name="model"):
 class MotionModel(ABC):
     """The diffusion model over trajectories.
 
-    The numbers x that are diffused are the waypoints of a trajectory, normalized, relative to a reference,
-    scaled. With the targets `residual` and `absolute`, x is in units of the training data's standard
+    The diffused variable x is a trajectory: its waypoints, normalized, relative to a reference, and scaled.
+    With the targets `residual` and `absolute`, x is in units of the training data's standard
     deviation, and relative to the straight line from start to goal (residual) or to the mean of the data
     (absolute, the paper's). With the target `limits`, x is the joint values in units of their limits, the
     noise is white, and nothing is taken from the data, as in MPD and EDMP. The first and the last waypoint
@@ -225,7 +225,7 @@ class MotionModel(ABC):
         """The statistics of the training data."""
 
     def clipped(self, x: Trajectories) -> Trajectories:
-        """A predicted x within the joint limits where x is in units of them; other targets: x as it is."""
+        """A predicted x, clipped to the joint limits for the target `limits`; unchanged for other targets."""
         return np.clip(x, -1.0, 1.0) if self.is_unit_joints else x
 
     def reference(self, start: Joints, goal: Joints) -> Reference:
@@ -243,7 +243,7 @@ class MotionModel(ABC):
         return self.normalizer.to_unit(np.asarray(q, np.float32))
 
     def normalize(self, q: Trajectories, reference: Reference) -> Trajectories:
-        """x of trajectories [rad]; its ends are those of the reference."""
+        """Converts trajectories [rad] to x, with the ends of the reference."""
         unit = self._unit(q)
         return self.hold_ends((unit - reference.base) / self.statistics.residual_scale, reference)
 
@@ -268,7 +268,7 @@ class MotionModel(ABC):
 
     @property
     def feature_count(self) -> int:
-        """Numbers per waypoint that the denoiser is given, see `features`."""
+        """Number of features of a waypoint, see `features`."""
         settings = self.settings
         clearances = len(self.robot.links) if settings.clearance_features else 0
         gradients = self.dof if settings.clearance_gradients else 0
@@ -276,7 +276,7 @@ class MotionModel(ABC):
 
     @property
     def condition_count(self) -> int:
-        """Numbers of the condition, see `condition`."""
+        """Size of the condition, see `condition`."""
         return 1 if self.settings.encoder is None else self.settings.code + 2 * self.dof
 
     @abstractmethod
@@ -296,31 +296,31 @@ class MotionModel(ABC):
 
     @abstractmethod
     def code_of(self, cloud: Cloud) -> Code:
-        """z of a cloud as by `EncoderSettings.prepared`, by the encoder, which there must be."""
+        """z of a cloud from `EncoderSettings.prepared`. The model must have an encoder."""
 
     def encode(
         self, points: Float[ndarray, "n 3"], rng: np.random.Generator | None = None
     ) -> Float[ndarray, "code"]:
         """z of a point cloud of the obstacles' surfaces (base frame, [m]); an empty cloud is allowed.
 
-        z of a model without an encoder has no numbers.
+        Without an encoder, z is empty.
         """
-        of_encoder = self.settings.encoder_settings
-        if of_encoder is None:
+        encoder_settings = self.settings.encoder_settings
+        if encoder_settings is None:
             return np.zeros(0, np.float32)
         points = np.asarray(points, np.float32).reshape(-1, 3)
-        points = points[of_encoder.region.holds(points)]
-        max_points = MAX_POINTS if of_encoder.any_size else of_encoder.cloud
+        points = points[encoder_settings.region.holds(points)]
+        max_points = MAX_POINTS if encoder_settings.any_size else encoder_settings.cloud
         if len(points) > max_points:
             rng = np.random.default_rng(0) if rng is None else rng
             points = points[rng.choice(len(points), max_points, replace=False)]
-        return self.code_of(of_encoder.prepared(points))
+        return self.code_of(encoder_settings.prepared(points))
 
     def features(
         self, x: Float[ndarray, "batch waypoints dof"], reference: Reference, clearances: ClearanceFn
     ) -> Features:
-        """The denoiser's input for a noisy x: x, the normalized joint values where x is something else, and
-        the clearances of the links and their gradients if the settings include them."""
+        """The denoiser's input for a noisy x: x; the normalized joint values, unless x is these; and the
+        clearances of the links and their gradients, if the settings include them."""
         unit = self.unit_joints(x, reference)
         parts = [x] if self.is_unit_joints else [x, unit]
         if not self.settings.clearance_features:
@@ -341,8 +341,8 @@ class MotionModel(ABC):
         start: Joints,
         goal: Joints,
     ) -> Float[ndarray, "*batch condition"]:
-        """C = [z, start, goal], normalized; a single zero without an encoder, since denoisers need a
-        number."""
+        """C = [z, start, goal], normalized. Without an encoder, C is a single zero, because the condition of
+        a denoiser must not be empty."""
         if self.settings.encoder is None:
             return np.zeros((*np.shape(start)[:-1], 1), np.float32)
         ends = [self._unit(q) for q in (start, goal)]
@@ -355,10 +355,10 @@ class MotionModel(ABC):
         condition: Conditions,
         scale: float,
     ) -> Outputs:
-        """Classifier-free guidance: u + scale (c - u), of the predictions c with the condition and u without.
+        """Classifier-free guidance: u + scale (c - u), where c is the prediction with the condition and u the
+        one without it.
 
-        A scale of 1 is c and one of 0 is u, at the cost of one prediction; others take a batch of twice the
-        size.
+        Scales of 1 and 0 need only c or u; any other scale needs a batch of twice the size.
         """
         if scale == 1.0:
             return self.denoised(features, level, condition)
@@ -387,8 +387,8 @@ class MotionModel(ABC):
         guide: improves the predicted clean trajectories in the guided steps (paper, section Motion Guided
             Generation). It need not keep the ends.
 
-        Raises InputError for steps that the schedule lacks, and for a guidance_scale other than 1 of a model
-        that was trained without dropping its condition.
+        Raises InputError for more steps than the schedule has, and for a guidance_scale other than 1 if the
+        model was trained without dropping its condition.
         """
         settings = settings or SamplingSettings()
         scale = settings.guidance_scale
@@ -425,7 +425,8 @@ class MotionModel(ABC):
         clearances: ClearanceFn,
         guidance_scale: float = 1.0,
     ) -> Predict:
-        """The function that samplers call: from a noisy x to the predicted clean x, the ends held in both.
+        """The function that samplers call: it predicts the clean x from a noisy x, and fixes the ends of
+        both.
 
         guidance_scale: see `denoised_guided`.
         """
@@ -444,12 +445,11 @@ class MotionModel(ABC):
 
 
 PackedClearanceFn = Callable[[PackedScenes, ndarray], ndarray]
-"""From one scene for each trajectory and joint values [n, waypoints, dof] to the output of a
-`ClearanceFn`."""
+"""A `ClearanceFn` that also takes scenes, one for each of its n trajectories."""
 
 
 def link_clearances(checker: CollisionChecker, settings: MotionModelSettings) -> ClearanceFn:
-    """The inputs for a model with these settings, in planning: all trajectories in the checker's scene."""
+    """The clearance inputs of a model in planning, where all trajectories are in the checker's scene."""
     arm_links, carriers = _carriers(checker)
 
     def clearances(q: ndarray) -> ndarray:
@@ -467,9 +467,9 @@ def link_clearances(checker: CollisionChecker, settings: MotionModelSettings) ->
 
 
 def _carriers(checker: CollisionChecker) -> tuple[int, list[int]]:
-    """The number of the checker's links that belong to the bare arm; and for each body after them, the index
-    of the arm's link that carries it: the link that it is fixed to, or the last one that moves no later than
-    it."""
+    """The number of the checker's links that belong to the bare arm, and the carrier of each attached body
+    that follows them: the index of the arm's link that it is fixed to, or else of the last link that is not
+    after it in the kinematic tree."""
     robot = checker.robot
     arm = [link for link in checker.links if link in robot.arm.link_names]
     fixed_to = {body.name: body.link for body in robot.attached}
@@ -497,7 +497,7 @@ def _of_bare_arm(links: ndarray, arm_links: int, carriers: list[int]) -> ndarray
 
 
 def packed_clearances(robot: Robot, settings: MotionModelSettings) -> PackedClearanceFn:
-    """The inputs for a model with these settings, in training: each trajectory in a scene of its own."""
+    """The clearance inputs of a model in training, where each trajectory has its own scene."""
     arrays = compile_robot(robot)
 
     def clearances(scenes: PackedScenes, q: ndarray) -> ndarray:

@@ -134,9 +134,10 @@ FORMAT = 2
 
 
 def stamp(folder: FilePath, name: str) -> tuple[int, int] | None:
-    """Time [ns] and inode of NAME.json, which is written last; None if there is none.
+    """Modification time [ns] and inode of NAME.json, the file that training writes last; None if there is
+    none.
 
-    Loaded networks are kept for as long as it stays the same.
+    Cached networks are reused while it stays the same.
     """
     try:
         status = (folder / f"{name}.json").stat()
@@ -146,8 +147,8 @@ def stamp(folder: FilePath, name: str) -> tuple[int, int] | None:
 
 
 def kept_by_stamp(load: Callable[[str, FilePath], Any]) -> Callable[[str, FilePath], Any]:
-    """A function that loads a network by name and folder, kept for as long as its description is the
-    same."""
+    """Decorator of a function that loads a network by name and folder: caches the network until its
+    NAME.json changes."""
     cached = lru_cache(maxsize=16)(lambda name, folder, _stamp: load(name, folder))
     return lambda name, folder: cached(name, folder, stamp(folder, name))
 
@@ -193,7 +194,7 @@ def exported_files(folder: FilePath, name: str, about: dict[str, Any]) -> dict[s
 def read_arrays(
     folder: FilePath, name: str, about: dict[str, Any], keys: Iterable[str]
 ) -> dict[str, ndarray]:
-    """Those of the named tensors that NAME.safetensors holds. Raises InputError if it cannot be read."""
+    """The tensors `keys`, as far as NAME.safetensors has them. Raises InputError if it cannot be read."""
     file = folder / f"{name}.safetensors"
     data = checked_bytes(file, about.get("weights_sha256"), f"{name}.json")
     try:
@@ -204,9 +205,9 @@ def read_arrays(
 
 
 BUNDLED = FilePath(__file__).parent / "weights"
-"""Folder of the weights that come with the package; those for a robot are in a folder of its name."""
+"""Folder of the weights that come with the package; a robot's weights are in the subfolder with its name."""
 POINTS = "panda_points"
-"""Weights of config `points` in that folder: without clearances as inputs."""
+"""Subfolder with the weights of the config `points`, whose network has no clearances as inputs."""
 
 
 def user_weights(robot: Robot) -> FilePath:
@@ -238,7 +239,7 @@ def _identity(name: str, folder: FilePath) -> RobotIdentity:
 
 
 def folder_of(folder: str | FilePath) -> FilePath:
-    """The folder of weights; the name of one that comes with the package stands for it."""
+    """The folder of weights, given by its path or, for one that comes with the package, by its name."""
     place = FilePath(folder)
     return place if os.path.exists(place) or not os.path.isdir(BUNDLED / folder) else BUNDLED / folder
 
@@ -261,7 +262,7 @@ def weights_folder(name: str, folder: str | FilePath | None, robot: Robot) -> Fi
         return folder_of(folder)
     folder_found = weights_for(name, robot)
     if folder_found is None and (BUNDLED / robot.name / f"{name}.json").is_file():
-        return BUNDLED / robot.name  # made for another arm of that name, which the caller finds
+        return BUNDLED / robot.name  # made for another arm of the same name; the caller reports that
     if folder_found is None:
         raise no_weights_error(
             name, f"no weights of the network {name} come with the package for {robot.name}"
@@ -270,7 +271,7 @@ def weights_folder(name: str, folder: str | FilePath | None, robot: Robot) -> Fi
 
 
 def completion_folder(folder: str | FilePath | None) -> FilePath:
-    """The folder with weights of the completion network; None: of those that come with the package.
+    """The folder with weights of the completion network: the given one, or that of the package.
 
     Raises InputError if it holds none, naming the command that trains them.
     """
@@ -284,6 +285,6 @@ def completion_folder(folder: str | FilePath | None) -> FilePath:
 
 
 def no_weights_error(name: str, what: str) -> InputError:
-    """The error for missing weights: `what` is missing, and the command that trains it."""
+    """The error for missing weights: `what` says what is missing, and the command that trains it follows."""
     command = NETWORKS[name].kind or f"baseline {name} --data FOLDER --out FOLDER"
     return InputError(f"{what}; train them: robotdiffuse train {command}")

@@ -1,5 +1,6 @@
-"""An arm that explores a simulated scene: cameras by ray casting, motions executed as planned; and an
-Explorer that keeps what it saw, knew and did, for pictures, replays and recordings of it.
+"""Simulated exploration: images are ray cast, and motions are executed exactly as planned.
+
+A RecordedExplorer keeps all views, occupancy maps and steps, for pictures, replays and recordings.
 """
 
 from collections.abc import Iterator
@@ -26,20 +27,20 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.validator import verify, verify_trajectory
 
 SAME_POSE = 1e-9
-"""Largest difference of an entry of two poses that are the same."""
+"""Poses are the same if their entries differ by less than this."""
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedView:
-    """A view, and what was known of each voxel after it."""
+    """A view, and the occupancy map after it."""
 
     time: float
     """Time since the first step, without pauses [s]."""
     act: int
-    """The number of the step under way; -1 before the first."""
+    """Index of the step that was being executed; -1 before the first."""
     view: DepthView
     camera: int | None
-    """The number of the camera on the arm; None: another one."""
+    """Index of the arm's camera that took the view; None for a camera that is not on the arm."""
     occupied: Voxels
     free: Voxels
 
@@ -50,7 +51,7 @@ class RecordedView:
 
 @dataclass(frozen=True, eq=False)
 class RecordedAct:
-    """A step, and where the arm was."""
+    """A step, and the state of the arm when it began."""
 
     begins: float
     """When the step begins, since the first step [s]."""
@@ -78,9 +79,10 @@ class RecordedAct:
 
 
 class RecordedExplorer(Explorer):
-    """An Explorer that records all views and steps. Steps count as executed at once and to the end.
+    """An Explorer that records all views and steps, on the assumption that each step is executed immediately
+    and completely.
 
-    A view counts as taken where the motion comes nearest to its configuration.
+    The time of a view is when the motion comes closest to the view's configuration.
     """
 
     def __init__(self, *values: Any, **named: Any) -> None:
@@ -136,41 +138,41 @@ def _waypoints(step: Step, q: Configuration) -> Configurations:
 
 WRIST_OFFSET = (0.04, 0.0, 0.03)
 """Position of the simulated camera in the frame of the arm's tip [m]."""
-# Width and height of its images [pixels], and horizontal and vertical field of view [rad].
+# Width and height of the images of that camera [pixels], and its horizontal and vertical field of view [rad].
 SIZE = (320, 240)
 FIELD_OF_VIEW = (1.22, 0.96)
 LENS_RADIUS = 0.005
 """A camera nearer to an obstacle than this sees nothing [m]."""
 MIN_DEPTH = 0.15
 """Nearer surfaces give no return [m]."""
-# Of the camera beside the arm [m].
+# Position and target of the camera beside the arm [m].
 BESIDE_POSITION = (-0.5, 1.1, 1.2)
 BESIDE_TARGET = (0.6, 0.0, 0.5)
 # Width, height and focal length of its images [pixels].
 BESIDE_SIZE = (640, 480)
 BESIDE_FOCAL_LENGTH = 460.0
 FLOOR = "floor"
-"""Shapes of this name are known without being seen."""
+"""Name of the shapes that the explorer knows from the start."""
 FREE_ZONE = ((-0.36, -0.36, 0.0), (0.36, 0.36, 0.7))
 """The space around the base that is declared free [m]."""
 UNSUPPORTED = (
     "waypoints", "constraints", "moving", "payload", "start_velocity", "views", "unknown", "clearance"
 )  # fmt: skip
 """Fields of problems that an Explorer does not take into account."""
-# Time between images during a motion [s], and the most images of a motion, that at its end included.
+# Time between images during a motion [s], and largest number of images per motion, including the last one.
 IMAGE_PERIOD = 0.25
 MAX_IMAGES = 8
 
 
 @dataclass(frozen=True, eq=False)
 class Event:
-    """A step of the loop."""
+    """A step of `explore`, after its execution."""
 
     step: Step
     configuration: Configuration
     """Configuration of the arm after the step."""
     violation: str = ""
-    """Why the validator refuses the motion in the true scene; "" if it accepts it, and without a motion."""
+    """Why the validator refuses the motion in the true scene; "" if it accepts it or there is no motion."""
 
     @property
     def free(self) -> bool:
@@ -185,7 +187,7 @@ def wrist_camera(robot: Robot) -> ArmCamera:
 
 
 def camera_beside(problem: Problem, noise: DepthNoise | None, seed: int) -> DepthView:
-    """The image of a camera that stands beside the arm, behind its shoulder, with the arm at the start."""
+    """The image of a fixed camera beside the arm and behind its shoulder, with the arm at the start."""
     T = looking_at(np.array(BESIDE_POSITION), np.array(BESIDE_TARGET))
     width, height = BESIDE_SIZE
     intrinsics = (BESIDE_FOCAL_LENGTH, BESIDE_FOCAL_LENGTH, (width - 1) / 2, (height - 1) / 2)
@@ -196,8 +198,8 @@ def camera_beside(problem: Problem, noise: DepthNoise | None, seed: int) -> Dept
 def simulated_explorer(
     problem: Problem, settings: ExplorerSettings, noise: DepthNoise | None, seed: int
 ) -> RecordedExplorer:
-    """An explorer with a camera at the arm's tip that knows the floor, and one image of a camera beside the
-    arm.
+    """An explorer with a camera at the arm's tip. It knows the floor, and has observed one image of the
+    camera beside the arm.
 
     Raises InputError for a problem with fields that exploring would ignore.
     """
@@ -224,13 +226,14 @@ def taken(
     view = ray_cast(problem.scene, T, camera.intrinsics, camera.size, problem.robot, q)
     obstacles = compile_scene_for(problem.robot, problem.scene)
     if near_scene(obstacles, T[None, :3, 3].astype(np.float32), np.float32(LENS_RADIUS))[0]:
-        # the ray caster leaves out shapes around a camera, which would be seen as free
+        # the ray caster ignores shapes that enclose the camera, so their inside would appear free
         view = replace(view, depth=np.zeros_like(view.depth))
     return measured(view, camera.range, noise, rng)
 
 
 def measured(view: DepthView, reach: float, noise: DepthNoise | None, rng: np.random.Generator) -> DepthView:
-    """An image as a sensor of a range gives it: without a return where it is too near, infinite beyond."""
+    """The image as a sensor measures it: 0 below MIN_DEPTH, infinite beyond `reach`, and with noise if
+    given."""
     depth = np.where(view.depth > reach, np.inf, np.where(view.depth < MIN_DEPTH, 0.0, view.depth))
     view = replace(view, depth=depth, range=reach if np.isfinite(reach) else MAX_RANGE)
     return view if noise is None else noise.applied(view, rng)
@@ -243,11 +246,13 @@ def explore(
     seed: int = 0,
     beside: DepthView | None = None,
 ) -> Iterator[Event]:
-    """The loop from the problem's start to its goal, in the problem's scene; ends with a step without a
-    motion, and after a collision.
+    """Explore the problem's scene from its start to its goal, and yield each step; ends with a step without a
+    motion, or after a collision.
 
-    The cameras on the arm take images during each motion. beside: an image of a camera that stands; it takes
-    another one after each motion, of what the arm hid before.
+    The cameras on the arm take images during each motion.
+
+    beside: an image of a fixed camera. It takes another one after each motion, because the arm no longer
+        hides the same part of the scene.
     """
     rng = np.random.default_rng(seed)
     q = problem.start
@@ -262,12 +267,12 @@ def explore(
         path = step.motion.path
         trajectory = step.motion.trajectory
         planned_problem = step.motion.problem
-        true = Problem(problem.robot, problem.scene, planned_problem.start, planned_problem.goal)
-        violation = verify(true, path).violation
+        true_problem = Problem(problem.robot, problem.scene, planned_problem.start, planned_problem.goal)
+        violation = verify(true_problem, path).violation
         if violation is None and trajectory is not None:
-            violation = verify_trajectory(true, trajectory).violation
+            violation = verify_trajectory(true_problem, trajectory).violation
         for camera in explorer.cameras:
-            for at in _during(step.motion):
+            for at in _image_configurations(step.motion):
                 explorer.observe(taken(problem, camera, at, noise, rng))
         q = path.positions[-1]
         if beside is not None:
@@ -281,8 +286,8 @@ def explore(
             return
 
 
-def _during(motion: PlanResult) -> Configurations:
-    """The configurations of a motion in which images are taken, its end the last."""
+def _image_configurations(motion: PlanResult) -> Configurations:
+    """The configurations of a motion at which images are taken; the last one is its end."""
     assert motion.path is not None
     end = motion.path.positions[-1:]
     if motion.trajectory is None:
