@@ -29,16 +29,16 @@ FAMILY = "shelf"
 TIME_LIMIT = 10.0
 """Time limit for planning [s]."""
 READY = "ready"
-"""Where the arm of `demo --explore` starts, if it has such a pose."""
+"""Named pose at which `demo --explore` starts, if the robot has it."""
 EXPLORE_TIME_LIMIT = 2.0
-"""Time limit of each of its searches [s]."""
-# Problems that are drawn for another arm, and the time limit of the search that tries each [s].
+"""Time limit of each search of `demo --explore` [s]."""
+# Largest number of problems drawn for another arm, and the time limit of the search for each [s].
 MAX_DRAWS = 50
 DRAW_TIME_LIMIT = 1.0
 # Position and target of the camera of `demo --camera` [m].
 CAMERA_POSITION = (-0.5, 1.1, 1.2)
 CAMERA_TARGET = (0.6, 0.0, 0.5)
-# Width, height and focal length of its images [pixels].
+# Width, height and focal length of the images of that camera [pixels].
 IMAGE_SIZE = (640, 480)
 FOCAL_LENGTH = 460.0
 
@@ -53,31 +53,30 @@ def run_demo(arguments: Namespace) -> int:
         problem = shelf_problem(arguments.robot)
     if arguments.explore:
         return explore_shelf(problem, outputs)
-    true = problem
+    true_problem = problem
     if arguments.camera:
         outputs.append(check_output("demo_true.png", ENDINGS))
-        problem = seen_by_camera(true)
+        problem = seen_by_camera(true_problem)
     result = load_and_plan(problem, DEFAULT_PLANNER, picture=True, time_limit=TIME_LIMIT)
     print_result(result, asked_clearance(problem, DEFAULT_PLANNER))
     if result.trajectory is None or result.path is None:
         return NO_PLAN
     if arguments.camera:
-        violation = verify(true, result.path).violation
+        violation = verify(true_problem, result.path).violation
         print("in the true scene:", "free" if violation is None else violation.message)
     for file in outputs:
-        draw(true if file.name == "demo_true.png" else problem, result, file)
+        draw(true_problem if file.name == "demo_true.png" else problem, result, file)
         print(f"wrote {file.resolve()}")
     return 0
 
 
 def explore_shelf(problem: "Problem", outputs: list[Path]) -> int:
-    """Take the arm from where it is ready to the problem's goal through space that its cameras see on the
-    way, and draw that."""
-
+    """Move the arm from its ready pose to the problem's goal, through space that its cameras observe on the
+    way, and draw the exploration."""
     obstacles = [shape for shape in problem.scene.shapes if shape.name != FLOOR.name]
     start = READY if READY in problem.robot.poses else problem.start
     problem = Problem(problem.robot, Scene([FLOOR, *obstacles]), start, problem.goal)
-    print("The arm knows the floor, and sees the rest by a camera at its tip and one beside it.")
+    print("The arm knows the floor. A camera at its tip and one beside it observe the rest.")
     explorer, arrived = simulate(problem, ExplorerSettings(time_limit=EXPLORE_TIME_LIMIT), None, 0)
     looks = sum(act.step.kind == LOOK for act in explorer.acts)
     end = "is at the goal" if arrived else "is not at the goal"
@@ -89,11 +88,11 @@ def explore_shelf(problem: "Problem", outputs: list[Path]) -> int:
 
 
 def shelf_problem(robot: str) -> "Problem":
-    """A problem of the family shelf for another arm that the straight line does not solve and a search does.
+    """A problem of the family shelf for another arm. A search solves it, and the straight line does not.
 
-    Raises InputError if none can be drawn for it.
+    After MAX_DRAWS without such a problem, returns the last one. Raises InputError if the family has no
+    problems for the arm.
     """
-
     arm = load_robot(robot)
     rng = np.random.default_rng(0)
     search = load_planner("aorrtc")
@@ -108,9 +107,8 @@ def shelf_problem(robot: str) -> "Problem":
 
 
 def seen_by_camera(problem: "Problem") -> "Problem":
-    """The problem with one depth view, from behind the arm's shoulder, in place of its scene; the floor stays
+    """The problem with one depth view in place of its scene, from behind the arm's shoulder. The floor stays
     known."""
-
     T_base_camera = looking_at(np.array(CAMERA_POSITION), np.array(CAMERA_TARGET))
     width, height = IMAGE_SIZE
     intrinsics = (FOCAL_LENGTH, FOCAL_LENGTH, (width - 1) / 2, (height - 1) / 2)

@@ -47,7 +47,7 @@ class Manifest(Settings):
     robot_fingerprint: str
     joint_names: tuple[str, ...]
     lower: tuple[float, ...]
-    """Limits [rad]."""
+    """Joint limits [rad], [m] for prismatic joints."""
     upper: tuple[float, ...]
     waypoints: Count
     timing: str
@@ -57,9 +57,9 @@ class Manifest(Settings):
     floors: dict[str, dict[str, list[float]] | None]
     """`center` and `size` of the box that the scenes of each family stand on [m]; None without one."""
     slots: Natural
-    """Most obstacles of a scene."""
+    """Largest number of obstacles in a scene."""
     goals: Count
-    """Most goal configurations of a problem."""
+    """Largest number of goal configurations of a problem."""
     trajectories: Natural
     """Number of trajectories of the whole set."""
     shard: Count
@@ -86,7 +86,8 @@ class Manifest(Settings):
     def of(
         cls, robot: Robot, source: str, *, floors: Mapping[str, Box | None], timing: str = "arc", **rest: Any
     ) -> "Manifest":
-        """The manifest of data of a robot, which `source` names: the fields, with floors as boxes."""
+        """The manifest of data of a robot, named by `source`; other arguments are fields, with boxes as
+        floors."""
         records = {
             name: None if floor is None else {"center": floor.center.tolist(), "size": floor.size.tolist()}
             for name, floor in floors.items()
@@ -175,15 +176,15 @@ ARRAYS: dict[str, tuple[str, tuple[str | int, ...]]] = {
     "detour": ("<f4", ()),
     "seed": ("<u8", ()),
 }
-"""Type and row shape of each array; names are fields of the manifest. `times` exists only if `timing` is
-"time".
+"""Type and row shape of each array; names in shapes are fields of the manifest. `times` exists only if
+`timing` is "time".
 
 Joint values [rad], times [s], lengths [m]. `trajectories` begin exactly at `start` and end at
 `goals[goal_index]`. Unused rows of `goals` and `goal_costs` are NaN; the cost of a goal that was not reached
 is inf. `target_pose` is wxyz_xyz of the tip in the base frame. Obstacles are packed as in `PackedScenes`,
 without the floor. `cost` is the joint-space length of the path [rad], `clearance` a lower bound of its
 distance to obstacles [m], `end_clearance` that of start and reached goal alone, `safety_distance` the
-distance that the search kept except near ends that are closer themselves [m], `line_free` whether the
+distance that the search kept, except near a start or goal that is closer [m], `line_free` whether the
 straight line is free, `detour` the cost over that of the straight line, `seed` the number of the problem.
 """
 UNBOUNDED = {"goals", "goal_costs"}
@@ -231,7 +232,7 @@ def existing_shards(folder: str | FilePath) -> list[int]:
 
 
 def remove_leftovers(folder: str | FilePath) -> None:
-    """Remove incomplete files of killed runs. Call it only while nobody writes to the folder."""
+    """Remove incomplete files of killed runs. Call it only while no process writes to the folder."""
     for path in FilePath(folder).glob(".shard_*.zarr.*"):
         shutil.rmtree(path, ignore_errors=True)
     for path in FilePath(folder).glob(f".{MANIFEST}.*"):
@@ -258,14 +259,14 @@ def write_shard(
     rows = {name: len(array) for name, array in arrays.items()}
     if wrong or len(set(rows.values())) != 1:
         raise InputError(f"shard {index}: missing or unknown arrays {sorted(wrong)}, or unequal rows: {rows}")
-    ready = {
+    converted = {
         name: np.ascontiguousarray(arrays[name], ARRAYS[name][0]).reshape(arrays[name].shape)
         for name in sorted(arrays)
     }
     attributes = {
         "format": FORMAT,
         "index": index,
-        "fingerprint": _fingerprint(ready),
+        "fingerprint": _fingerprint(converted),
         "counts": {name: int(counts[name]) for name in sorted(counts)},
     }
     scratch_folder: str | None = None
@@ -273,9 +274,9 @@ def write_shard(
         FilePath(folder).mkdir(parents=True, exist_ok=True)
         scratch_folder = tempfile.mkdtemp(prefix=f".{target.name}.", dir=folder)
         new_folder = FilePath(scratch_folder, "new")
-        old = FilePath(scratch_folder, "old")
+        old_folder = FilePath(scratch_folder, "old")
         group = zarr.open_group(new_folder, mode="w", zarr_format=3, attributes=attributes)
-        for name, array in ready.items():
+        for name, array in converted.items():
             group.create_array(
                 name,
                 data=array,
@@ -288,7 +289,7 @@ def write_shard(
                 config={"write_empty_chunks": True},
             )
         if target.exists():
-            target.rename(old)
+            target.rename(old_folder)
         new_folder.rename(target)
     except OSError as error:
         raise write_error(target, error) from None
@@ -298,7 +299,7 @@ def write_shard(
 
 
 def _fingerprint(arrays: dict[str, ndarray]) -> str:
-    """The fingerprint of the arrays' fingerprints, in the order of their names."""
+    """A hash of the hashes of the arrays, in the order of their names."""
     fingerprints = []
     for name, array in sorted(arrays.items()):
         digest = hashlib.sha256(f"{array.dtype.str} {array.shape}".encode())
@@ -403,7 +404,7 @@ def split_of(scenes: PackedScenes) -> Int8[ndarray, "n"]:
 
 
 def pick_rows(sizes: dict[int, int], count: int | None, seed: int) -> dict[int, Int[ndarray, "n"]]:
-    """Random rows without repetition from shards of these sizes; all if `count` is None."""
+    """Random rows, without repetition, of each of the shards with these sizes; all if `count` is None."""
     ends = np.cumsum([0, *sizes.values()])
     total = int(ends[-1])
     rows = np.arange(total)

@@ -19,15 +19,15 @@ with needs("rerun-sdk", "rerun"):
 
 TIMELINE = "time"
 FPS = 60.0
-"""Most poses of each link per second."""
+"""Largest number of poses of each link per second."""
 
 
 def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
-    """Write the entities scene/NAME, robot/LINK with its meshes, and joints/NAME/positions and velocities
-    over time, in the world's frame if the problem has one; see `interop.write_motion`."""
+    """Write the entities scene/NAME, robot/LINK with its meshes, joints/NAME/positions and
+    joints/NAME/velocities, in the world's frame if the problem has one; see `interop.write_motion`."""
     robot = problem.robot
     recording = rr.RecordingStream("robotdiffuse", recording_id=file.stem)
-    # in memory: what Rerun cannot write to a disk ends a thread of its own, with messages of several lines
+    # recorded in memory: a failed write would end a thread of Rerun, with messages of several lines
     content = recording.memory_recording()
     recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     if problem.T_world_base is not None:
@@ -39,25 +39,29 @@ def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
         recording.log(_entity(obstacle.name), _archetype(obstacle.fixed), static=True)
     for link, surface in link_surfaces(robot).items():
         recording.log(f"robot/{link}/surface", _mesh(surface), static=True)
-    _motion(recording, problem, trajectory)
+    _log_motion(recording, problem, trajectory)
     write_atomically(file, content.drain_as_bytes())
 
 
-def _motion(recording: rr.RecordingStream, problem: Problem, trajectory: Trajectory) -> None:
+def _log_motion(recording: rr.RecordingStream, problem: Problem, trajectory: Trajectory) -> None:
     robot = problem.robot
     times = trajectory.times
     frames = max(int(np.ceil(times[-1] * FPS)), 1) + 1
     frame_rows = np.unique(np.searchsorted(times, np.linspace(0, times[-1], frames)).clip(0, len(times) - 1))
-    at = rr.TimeColumn(TIMELINE, duration=times[frame_rows])
+    frame_times = rr.TimeColumn(TIMELINE, duration=times[frame_rows])
     for link in robot.link_names:
-        _send_poses(recording, f"robot/{link}", at, link_poses(robot, trajectory.positions[frame_rows], link))
+        _send_poses(
+            recording, f"robot/{link}", frame_times, link_poses(robot, trajectory.positions[frame_rows], link)
+        )
     for moving in problem.moving:
-        _send_poses(recording, _entity(moving.name), at, [moving.pose(t) for t in times[frame_rows].tolist()])
-    every = rr.TimeColumn(TIMELINE, duration=times)
+        _send_poses(
+            recording, _entity(moving.name), frame_times, [moving.pose(t) for t in times[frame_rows].tolist()]
+        )
+    row_times = rr.TimeColumn(TIMELINE, duration=times)
     for j, name in enumerate(trajectory.joint_names):
         for quantity in ("positions", "velocities"):
             columns = rr.Scalars.columns(scalars=getattr(trajectory, quantity)[:, j])
-            recording.send_columns(f"joints/{name}/{quantity}", [every], columns)
+            recording.send_columns(f"joints/{name}/{quantity}", [row_times], columns)
 
 
 def _send_poses(recording: rr.RecordingStream, entity: str, at: rr.TimeColumn, poses: Iterable[Pose]) -> None:
@@ -90,7 +94,8 @@ def _archetype(obstacle: Drawable) -> rr.AsComponents:
         case Cylinder():
             return rr.Cylinders3D(radii=[shape.radius], lengths=[shape.height], centers=[T[:3, 3]], **placed)
         case _:
-            begin = (T @ [0.0, 0.0, -0.5 * shape.height, 1.0])[:3]  # Rerun's capsules begin at an end
+            # the origin of a capsule of Rerun is at one end
+            begin = (T @ [0.0, 0.0, -0.5 * shape.height, 1.0])[:3]
             return rr.Capsules3D(radii=[shape.radius], lengths=[shape.height], translations=[begin], **placed)
 
 

@@ -23,8 +23,8 @@ SAMPLES_PER_GOAL = 4
 @dataclass(frozen=True)
 class LearnedSettings(Settings):
     weights: str | None = None
-    """Folder of trained weights, or panda_points: those of the package without clearances as inputs. None:
-    those trained on this machine for the robot, or those of the package."""
+    """Folder of trained weights, or panda_points, the bundled weights without clearances as inputs. None: the
+    weights trained on this machine for the robot, or else the bundled ones."""
 
 
 LearnedPlannerSettings = TypeVar("LearnedPlannerSettings", bound=LearnedSettings)
@@ -44,7 +44,7 @@ class LearnedPlanner(Planner[LearnedPlannerSettings]):
     def network(self, robot: Robot) -> Any:
         """The trained network for a robot, here as a PyTorch module.
 
-        Raises InputError, naming the command that trains one, if there is none, and if PyTorch is not
+        Raises InputError if there is none, naming the command that trains one, or if PyTorch is not
         installed.
         """
         need_packages(f"the planner {self.name}", "torch")
@@ -68,7 +68,7 @@ class ExportedPlanner(LearnedPlanner[LearnedPlannerSettings]):
 
 
 def nearest_goals(start: Configuration, goals: Configurations, samples: int) -> Configurations:
-    """The goals that a batch of `samples` samples is divided among: the nearest ones, nearest first."""
+    """The goals among which a batch of `samples` samples is divided: those nearest to the start, in order."""
     order = np.argsort(np.linalg.norm(goals - start, axis=1))
     return goals[order[: max(samples // SAMPLES_PER_GOAL, 1)]]
 
@@ -76,7 +76,7 @@ def nearest_goals(start: Configuration, goals: Configurations, samples: int) -> 
 def scene_clouds(
     checker: CollisionChecker, region: VisibleRegion, points: int, count: int, rng: np.random.Generator
 ) -> Float32[ndarray, "count points 3"]:
-    """Random clouds of the scene's obstacles [m]; zeros if nothing is in the region."""
+    """Clouds of random points on the obstacles' surfaces in the region [m]; zeros if there are none."""
     clouds = np.zeros((count, points, 3), np.float32)
     for cloud in clouds:
         surface_points = sample_surface(checker.scene, points, rng, region)

@@ -41,7 +41,7 @@ from robotdiffuse.robots.robot import Robot
 Probabilities = Float32[ndarray, "m"]
 Truth = Bool[ndarray, "m"]
 NICENESS = 5
-"""Workers give way to the training itself."""
+"""Niceness of the workers: the training process has priority."""
 BATCHES_AHEAD = 3
 """Batches drawn in advance, for each worker."""
 SEED_LIMIT = 2**62
@@ -49,9 +49,10 @@ SEED_LIMIT = 2**62
 
 
 class SamplePrefetcher:
-    """Batches of samples for a training that draws nothing else from its random number generator.
+    """Draws batches of samples in advance, in worker processes.
 
-    A copy of the generator tells the seeds of the next batches, so a resumed run has the same batches.
+    The seeds of the next batches are drawn from a copy of the training's random number generator, which must
+    serve nothing else. Thus a resumed run has the same batches.
     """
 
     def __init__(self, families: Sequence[str], robot: Robot, batch: int, workers: int) -> None:
@@ -136,8 +137,8 @@ def train_completion(settings: CompletionTraining, out: str) -> dict[str, float]
     """Train the network; write completion.safetensors and completion.json into the folder `out`.
 
     The same call continues a run that was interrupted. Returns the cross-entropy per voxel on held-out
-    scenes, precision and recall by family, the expected calibration error, and `samples`. Raises as
-    `task.train`.
+    scenes, precision and recall by family, the expected calibration error, and `samples`. Raises the
+    errors of `loop.train`.
     """
     processes = Processes(settings.device)
     task = CompletionTask(settings, processes)
@@ -206,10 +207,10 @@ class CompletionTask(TrainingTask):
             p = 1 / (1 + np.exp(-logits / float(network.temperature)))
             p = p[unknown]
             truth = truth[unknown]
-            called = p > OCCUPIED_PROBABILITY
-            right = float((called & truth).sum())
-            report[f"precision {name}"] = right / max(1.0, float(called.sum()))
-            report[f"recall {name}"] = right / max(1.0, float(truth.sum()))
+            predicted_occupied = p > OCCUPIED_PROBABILITY
+            true_positives = float((predicted_occupied & truth).sum())
+            report[f"precision {name}"] = true_positives / max(1.0, float(predicted_occupied.sum()))
+            report[f"recall {name}"] = true_positives / max(1.0, float(truth.sum()))
             report[f"average precision {name}"] = average_precision(p, truth)
             report[f"calibration error {name}"] = calibration_error(p, truth)
             if name in families:
@@ -228,32 +229,34 @@ class CompletionTask(TrainingTask):
         save_network("completion", self._trained, folder, training)
 
     def _held_out(self, families: tuple[str, ...], first: int, count: int) -> Samples:
-        """`count` held-out samples of each family, from the sample number `first` on."""
+        """`count` held-out samples of each family, beginning with sample number `first`."""
         parts = []
         for name in families:
-            place = list(FAMILIES).index(name)
-            rng = np.random.default_rng([HELD_OUT_SEED, place])
+            index = list(FAMILIES).index(name)
+            rng = np.random.default_rng([HELD_OUT_SEED, index])
             seeds = rng.integers(SEED_LIMIT, size=first + count)[first:]
             parts.append(draw_samples((name,), self.robot, seeds.tolist()))
         return Samples(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
-    def _counts(self, samples: Samples) -> Bool[ndarray, "n 56 56 32"]:
-        """The voxels that are predicted: those not seen free, within the arm's reach."""
+    def _predicted_voxels(self, samples: Samples) -> Bool[ndarray, "n 56 56 32"]:
+        """The voxels that the network predicts: those within the arm's reach that are not seen to be free."""
         return ((samples.seen & FREE) == 0) & self._reachable
 
-    def _rows(self, samples: Samples, counts: Bool[ndarray, "n 56 56 32"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Logits [m 8] and truth [m 8] of the voxels that count, and the indices of these [m]."""
-        counted = folded(torch.from_numpy(counts)).reshape(-1).nonzero()[:, 0]
-        truth = folded(torch.from_numpy(samples.truth)).reshape(-1)[counted].numpy()
+    def _logits_and_truth(
+        self, samples: Samples, selected: Bool[ndarray, "n 56 56 32"]
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Logits [m 8] and truth [m 8] of the selected voxels, and their indices [m]."""
+        indices = folded(torch.from_numpy(selected)).reshape(-1).nonzero()[:, 0]
+        truth = folded(torch.from_numpy(samples.truth)).reshape(-1)[indices].numpy()
         device = self.processes.device
         with self.processes.autocast():
             seen, depth_behind = (torch.from_numpy(a).to(device) for a in (samples.seen, samples.behind))
             logits = self.module(seen, depth_behind)
-        rows = logits.reshape(-1, 8).index_select(0, counted.to(device))
-        return rows.float(), torch.from_numpy(unpack_fine(truth)).to(device), counted
+        rows = logits.reshape(-1, 8).index_select(0, indices.to(device))
+        return rows.float(), torch.from_numpy(unpack_fine(truth)).to(device), indices
 
     def _loss(self, samples: Samples) -> Float[Tensor, ""]:
-        logits, truth, _ = self._rows(samples, self._counts(samples))
+        logits, truth, _ = self._logits_and_truth(samples, self._predicted_voxels(samples))
         return binary_cross_entropy_with_logits(logits, truth.float())
 
     def _predictions(self, samples: Samples) -> tuple[Probabilities, Truth, Truth]:
@@ -262,7 +265,7 @@ class CompletionTask(TrainingTask):
         for part in _split(samples):
             hidden = ((part.seen & OCCUPIED) == 0) & self._above
             with torch.no_grad():
-                logits, truth, counted = self._rows(part, self._counts(part))
+                logits, truth, counted = self._logits_and_truth(part, self._predicted_voxels(part))
             unknown = folded(torch.from_numpy(hidden)).reshape(-1)[counted].numpy().repeat(8)
             predictions.append((logits.cpu().numpy().ravel(), truth.cpu().numpy().ravel(), unknown))
         logits, truth, unknown = (np.concatenate(parts) for parts in zip(*predictions, strict=True))
@@ -287,7 +290,7 @@ def fitted_temperature(logits: Probabilities, truth: Truth) -> float:
 
 
 def reliability(p: Probabilities, truth: Truth) -> list[list[float]]:
-    """By bin of the predicted probability: its mean, the share of true voxels, and their number."""
+    """For each bin of predicted probabilities: their mean, the share of occupied voxels, and the count."""
     bin_indices = np.minimum((p * CALIBRATION_BINS).astype(int), CALIBRATION_BINS - 1)
     count = np.bincount(bin_indices, minlength=CALIBRATION_BINS)
     predicted, true_share = (
@@ -298,8 +301,8 @@ def reliability(p: Probabilities, truth: Truth) -> list[list[float]]:
 
 
 def calibration_error(p: Probabilities, truth: Truth) -> float:
-    """Expected calibration error: mean over voxels of |predicted probability - share of true voxels| of their
-    bin."""
+    """Expected calibration error: the mean over the voxels of |mean predicted probability - share of occupied
+    voxels| of their bins."""
     rows = np.array(reliability(p, truth))
     return float((np.abs(rows[:, 0] - rows[:, 1]) * rows[:, 2]).sum() / max(1.0, rows[:, 2].sum()))
 

@@ -1,8 +1,8 @@
 """Furniture: base of the families with shelves, crates and tables around an arm that stands on the ground.
 
-All shapes are spheres, and boxes rotated about the vertical axis, so that the scenes can be packed like
-ROP's. Each scene has regions in which the arm works: in compartments, in crates and between the objects on a
-table. `sample_target` samples poses with the fingers in a region.
+All shapes are spheres, and boxes rotated about the vertical axis, so that the scenes can be packed like those
+of the family `rop`. Each scene has regions in which the arm works: in compartments, in crates and between the
+objects on a table. `sample_target` samples poses with the fingers in a region.
 """
 
 from abc import ABC, abstractmethod
@@ -41,7 +41,7 @@ from robotdiffuse.scenes.shapes import Box, Sphere
 FLOOR = Box((0.0, 0.0, -0.05), (3.0, 3.0, 0.1), name="floor")
 """A floor with its top at z = 0, large enough for all furniture around the arm."""
 SHOULDER = np.array([0.0, 0.0, 0.33])
-"""Origin of reaches: a Panda's shoulder [m]."""
+"""Point from which reaches are measured: a Panda's shoulder, in the base frame [m]."""
 REGION_MARGIN = 0.03
 """Distance of targets from the sides of their region, if it is wide enough [m]."""
 FINGER_LENGTH = 0.1
@@ -67,6 +67,7 @@ TOP_HEIGHT = 0.3
 MIN_REGION = 0.1
 """Minimum edge of a region [m]."""
 DRAWER_SHAPES = 5
+"""Number of boxes that make up a drawer."""
 Cell = tuple[float, float, float, float]
 """Right and left side, bottom and top [m]."""
 AtLeastTwo = Annotated[int, Bound(least=2.0)]
@@ -140,7 +141,8 @@ class Furniture(Ranges, ABC):
 
     @abstractmethod
     def build(self, rng: Generator) -> "Sequence[FurnitureFrame]":
-        """The pieces of furniture, with all regions, whether in reach or not. Raises NoRoomError."""
+        """The pieces of furniture, with all regions, in reach or not. Raises NoRoomError if objects do not
+        fit."""
 
     @property
     def floor(self) -> Box:
@@ -148,7 +150,7 @@ class Furniture(Ranges, ABC):
 
     @property
     def region(self) -> Float[ndarray, "2 3"]:
-        """Box of tip positions: the hand may be outside the region that contains its fingers."""
+        """Box of tip positions [m]. The hand may be outside the region that contains its fingers."""
         far = self.reach + HAND_LENGTH
         return np.array([[-far, -far, 0.0], [far, far, SHOULDER[2] + far]])
 
@@ -311,9 +313,9 @@ class Surface:
             loose.put(self.frame, *self.place(loose.half, loose.half, rng), self.height)
 
 
-def is_free(square: Rectangle, taken: list[Rectangle]) -> bool:
+def is_free(rectangle: Rectangle, taken: list[Rectangle]) -> bool:
     """Whether a rectangle keeps MIN_GAP from all those that are taken."""
-    x, y, a, b = square
+    x, y, a, b = rectangle
     return all(abs(x - u) >= a + c + MIN_GAP or abs(y - v) >= b + d + MIN_GAP for u, v, c, d in taken)
 
 
@@ -325,10 +327,10 @@ def loose_in_cells(
     rng: Generator,
     at_sides: bool = False,
 ) -> None:
-    """Adds random loose objects, at most one a cell (see `Cell`), whose free part becomes narrower. Objects
-    that would leave too little space are left out."""
-    things = min(count(settings.objects, rng), len(cells))
-    for i in rng.permutation(len(cells))[:things]:
+    """Adds random loose objects, at most one per cell (see `Cell`), and narrows these cells to their free
+    part. Objects that would leave too little space are left out."""
+    object_count = min(count(settings.objects, rng), len(cells))
+    for i in rng.permutation(len(cells))[:object_count]:
         low, high, z, ceiling = cells[i]
         loose = LooseObject(settings, rng, ceiling - z - MIN_GAP)
         half = loose.half
@@ -344,12 +346,12 @@ def loose_in_cells(
 
 
 def edges(sizes: Values, t: float) -> Values:
-    """Positions of the boards between gaps of these sizes, beginning with 0."""
+    """Positions of boards of thickness `t` that are separated by gaps of these sizes; the first is 0."""
     return np.concatenate([[0.0], np.cumsum(sizes + t)])
 
 
 def count(numbers: tuple[int, int], rng: Generator) -> int:
-    """A random number between two, inclusive."""
+    """A random integer between the two numbers, inclusive."""
     return int(rng.integers(numbers[0], numbers[1] + 1))
 
 
@@ -689,9 +691,9 @@ KITCHEN = Kitchen()
 class Cabinet(Furniture):
     """A grid of cells between thin or thick boards, from a desk to a tall bookcase. Lengths in [m].
 
-    A cell is open, has a door that is shut or stands at any angle, or a drawer that is pulled out. The
-    cabinet stands on the ground or on legs, or hangs. Regions are open cells, the insides of drawers, where
-    the hand points down, the top, and the space between the legs.
+    A cell is open, has a door (shut, or open at any angle), or has a drawer that is pulled out. The cabinet
+    stands on the ground or on legs, or hangs. Regions are the open cells, the insides of drawers, and the
+    spaces above and below the cabinet. The hand points down into drawers, and forward elsewhere.
     """
 
     turn: Range = (-0.5, 0.5)
@@ -815,13 +817,13 @@ class Cabinet(Furniture):
 
 
 def _is_wide(low: Corner, high: Corner, approach: Vector) -> bool:
-    """Whether the hand gets into a region."""
+    """Whether a region is wide enough for the hand."""
     size = np.subtract(high, low)
     return bool(size.min() > MIN_REGION and (approach is DOWN or size[1:].min() > MIN_OPENING))
 
 
 def _door(frame: FurnitureFrame, cell: Cell, t: float, angle: float, on_left: bool) -> None:
-    """Adds a door of a cell, open by an angle about its left or right edge [rad]."""
+    """Adds a door of a cell, opened by an angle about the cell's left or right edge [rad]."""
     y, end, z, ceiling = cell
     hinge, side = (end, -1.0) if on_left else (y, 1.0)
     half = (end - y) / 2
