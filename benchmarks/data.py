@@ -158,8 +158,6 @@ def loader(trajectories: int, threads_tried: list[int]) -> None:
     cases = {
         "full": {},
         "full, sorted": {"sort_points": True},
-        "partial view": {"view": "partial"},
-        "partial view, sorted": {"view": "partial", "sort_points": True},
     }
     with tempfile.TemporaryDirectory() as folder:
         write_store(folder, load_robot("panda"), trajectories)

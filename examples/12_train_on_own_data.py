@@ -16,7 +16,7 @@ if __name__ == "__main__":  # worker processes import this file again
 
     problem = rd.Problem(
         robot=rd.load_robot("panda"),
-        scene=rd.Scene([rd.Sphere([0.5, 0.0, 0.5], 0.2)]),
+        scene=rd.Scene([rd.Sphere([0.5, 0.0, 0.5], 0.1)]),
         start=[-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8],
         goal=[1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8],
     )
