@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from helpers import waiting
+from robotdiffuse.processes import workers as module
 from robotdiffuse.processes.workers import EndedError, OverrunError, Worker, Workers, allow, cancelled, renew
 
 ROOT = Path(__file__).parents[2]
@@ -106,7 +107,8 @@ def test_errors_of_calls_keep_the_process() -> None:
         worker.close(0.0)
 
 
-def test_running_and_waiting_calls_are_cancelled() -> None:
+def test_running_and_waiting_calls_are_cancelled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "CANCEL_TIMEOUT", HELD)
     with Workers(1) as workers:
         first = workers.submit(os.getpid).result(HELD)
         running = workers.submit(wait_until_cancelled)
@@ -115,6 +117,7 @@ def test_running_and_waiting_calls_are_cancelled() -> None:
         assert later.cancel() and not running.cancel()
         assert running.result(HELD) is None
         assert workers.submit(os.getpid).result(HELD) == first
+        monkeypatch.undo()
         deaf = workers.submit(time.sleep, float(HELD))
         waiting.until(deaf.running, HELD)
         deaf.cancel()
