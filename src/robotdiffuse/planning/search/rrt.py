@@ -378,9 +378,10 @@ class ConstrainedSearch(AnytimeSearch):
 
     def offer(self, path: Configurations, stage: str) -> bool:
         """See `AnytimeSearch`; the path also keeps the constraints, and the one of the least cost is kept."""
-        path = self._code.simplify(
-            self.space, self.limits, path, self.settings.smoothings, SHORTCUTS, self._state
-        )
+        if self._shortens:
+            path = self._code.simplify(
+                self.space, self.limits, path, self.settings.smoothings, SHORTCUTS, self._state
+            )
         cost = self._cost_of(path)
         if cost >= self.cost:
             return False
