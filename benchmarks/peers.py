@@ -47,7 +47,7 @@ from common import (
     progress,
     use_processor_time,
 )
-from robotdiffuse.core.transforms import quaternion_from_rotation
+from robotdiffuse.core.transforms import pose_entry
 from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.problems.files import ProblemEntry, load_motion_bench_maker
 from robotdiffuse.problems.held_out import goal_of
@@ -123,10 +123,6 @@ def robot_files(robot: Robot, folder: Path) -> dict[str, Any]:
         "fixed_links": [link for link in solid if robot.link_frame(link) == 0],
         "unchecked": unchecked,
     }
-
-
-def pose_entry(T: ndarray) -> dict[str, list[float]]:
-    return {"xyz": T[:3, 3].tolist(), "wxyz": quaternion_from_rotation(T[:3, :3]).tolist()}
 
 
 def problem_entry(case: ProblemEntry, goal: str) -> dict[str, Any]:

@@ -13,8 +13,8 @@ from robotdiffuse.cli.plan import asked_clearance, load_and_plan
 from robotdiffuse.cli.view import draw
 from robotdiffuse.core.output_files import check_output
 from robotdiffuse.core.types import FIRST
-from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.planning import DEFAULT_PLANNER, load_planner
+from robotdiffuse.planning.exploration.simulated import seen_from_beside
 from robotdiffuse.planning.exploration.steps import LOOK, ExplorerSettings
 from robotdiffuse.problems.families.furniture import FLOOR
 from robotdiffuse.problems.families.scaled import family_for
@@ -35,12 +35,6 @@ EXPLORE_TIME_LIMIT = 2.0
 # Largest number of problems drawn for another arm, and the time limit of the search for each [s].
 MAX_DRAWS = 50
 DRAW_TIME_LIMIT = 1.0
-# Position and target of the camera of `demo --camera` [m].
-CAMERA_POSITION = (-0.5, 1.1, 1.2)
-CAMERA_TARGET = (0.6, 0.0, 0.5)
-# Width, height and focal length of the images of that camera [pixels].
-IMAGE_SIZE = (640, 480)
-FOCAL_LENGTH = 460.0
 
 
 def run_demo(arguments: Namespace) -> int:
@@ -70,7 +64,7 @@ def run_demo(arguments: Namespace) -> int:
     return 0
 
 
-def explore_shelf(problem: "Problem", outputs: list[Path]) -> int:
+def explore_shelf(problem: Problem, outputs: list[Path]) -> int:
     """Move the arm from its ready pose to the problem's goal, through space that its cameras observe on the
     way, and draw the exploration."""
     obstacles = [shape for shape in problem.scene.shapes if shape.name != FLOOR.name]
@@ -87,7 +81,7 @@ def explore_shelf(problem: "Problem", outputs: list[Path]) -> int:
     return SOLVED if arrived else NO_PLAN
 
 
-def shelf_problem(robot: str) -> "Problem":
+def shelf_problem(robot: str) -> Problem:
     """A problem of the family shelf for another arm. A search solves it, and the straight line does not.
 
     After MAX_DRAWS without such a problem, returns the last one. Raises InputError if the family has no
@@ -106,12 +100,8 @@ def shelf_problem(robot: str) -> "Problem":
     return problem
 
 
-def seen_by_camera(problem: "Problem") -> "Problem":
+def seen_by_camera(problem: Problem) -> Problem:
     """The problem with one depth view in place of its scene, from behind the arm's shoulder. The floor stays
     known."""
-    T_base_camera = looking_at(np.array(CAMERA_POSITION), np.array(CAMERA_TARGET))
-    width, height = IMAGE_SIZE
-    intrinsics = (FOCAL_LENGTH, FOCAL_LENGTH, (width - 1) / 2, (height - 1) / 2)
-    true_scene = Scene([FLOOR, *problem.scene.shapes])
-    view = ray_cast(true_scene, T_base_camera, intrinsics, IMAGE_SIZE, problem.robot, problem.start)
+    view = seen_from_beside(replace(problem, scene=Scene([FLOOR, *problem.scene.shapes])))
     return replace(problem, scene=Scene([FLOOR]), views=(view,), unknown=PREDICTED)

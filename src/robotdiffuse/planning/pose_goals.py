@@ -61,16 +61,12 @@ def pose_configurations(
     drawn towards the start, as far as the goal allows. Other arms of the robot stay at the start.
 
     accept: which configurations are acceptable, such as those free of collision.
-    rounds: most rounds of seeds; 0, for one pose without path constraints: one round, and configurations are
-    not drawn towards the start.
+    rounds: most rounds of seeds.
     exact: tolerances of poses that give none [m], [rad].
     """
     robot = problem.robot
     start = problem.start
     poses = poses_of(goal)
-    if rounds == 0:
-        found = at_pose(problem, poses[0], count, rng, exact)
-        return _accepted(robot.nearest_turns(found, start), accept)
     all_constraints = PathConstraints(problem, poses, exact)
     solutions = [np.zeros((0, robot.dof))] * len(poses)
     configurations = np.zeros((0, robot.dof))

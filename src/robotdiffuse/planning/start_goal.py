@@ -1,7 +1,8 @@
 """Start and goal states: usable configurations for a search, or the reason why there are none."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -305,14 +306,16 @@ def _first_try(
         return goal.positions[
             collision_free if constraints is None else collision_free & constraints.satisfied(goal.positions)
         ]
-    configurations = _pose_configurations()(
-        context.problem,
-        goal,
-        context.rng,
-        checker.free,
-        count=FIRST_TRY_COUNT,
-        rounds=0 if many and isinstance(goal, PoseGoal) and not context.problem.constraints else 1,
-    )
+    pose_goals = _pose_goals_module()
+    problem = context.problem
+    if many and isinstance(goal, PoseGoal) and not problem.constraints:
+        found = pose_goals.at_pose(problem, goal, FIRST_TRY_COUNT, context.rng, pose_goals.EXACT)
+        found = problem.robot.nearest_turns(found, problem.start)
+        configurations = found[checker.free(found)] if len(found) else found
+    else:
+        configurations = pose_goals.pose_configurations(
+            problem, goal, context.rng, checker.free, count=FIRST_TRY_COUNT, rounds=1
+        )
     return _with_turns(context, configurations) if len(configurations) else configurations
 
 
@@ -346,7 +349,7 @@ def _free_goals(
 def _pose_goals(
     context: PlanningContext, goal: PoseGoal | PosesGoal, checker: CollisionChecker
 ) -> Configurations | PlanResult:
-    pose_configurations = _pose_configurations()
+    pose_configurations = _pose_goals_module().pose_configurations
     problem = context.problem
     rng = context.rng
     robot = problem.robot
@@ -414,12 +417,12 @@ def _pose_goals(
     )
 
 
-def _pose_configurations() -> "Callable[..., Float[ndarray, 'k dof']]":
-    """The function `pose_configurations`, imported here because it imports compiled code, rarely needed."""
+def _pose_goals_module() -> ModuleType:
+    """The module `pose_goals`, imported here because it imports compiled code, rarely needed."""
     with loading():
-        from robotdiffuse.planning.pose_goals import pose_configurations
+        from robotdiffuse.planning import pose_goals
 
-    return pose_configurations
+    return pose_goals
 
 
 def _with_turns(context: PlanningContext, goals: Iterable[ndarray]) -> Configurations:

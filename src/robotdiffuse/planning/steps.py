@@ -16,7 +16,7 @@ from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.transforms import pose
 from robotdiffuse.core.types import AnyConfiguration, Configuration, Trajectory
 from robotdiffuse.planning.context import clock
-from robotdiffuse.planning.pipeline.waypoints import one_after_another
+from robotdiffuse.planning.pipeline.waypoints import MIN_TIME_LIMIT, one_after_another
 from robotdiffuse.problems.constraints import Constraint
 from robotdiffuse.problems.goals import AnyGoal, JointGoal, PoseGoal
 from robotdiffuse.problems.problem import Problem
@@ -28,8 +28,6 @@ TIP = "tip"
 WORLD = "world"
 LINE_TIME_LIMIT = 0.3
 """Longest time for one straight line, while another end of an earlier step may be tried instead [s]."""
-MIN_TIME_LIMIT = 1e-2
-"""Time limit of a motion that is planned when time has nearly run out [s]."""
 SAME_END = 0.1
 """Ends of a motion differ by more than this in at least one joint [rad] or [m]."""
 

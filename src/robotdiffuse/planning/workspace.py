@@ -333,13 +333,10 @@ class Workspace:
     def _exact(self, goal: PoseGoal, q: ndarray) -> PoseGoal:
         """A pose within the tolerances of a goal, near to that of its link at a configuration."""
         T = inverse(goal.T_base_frame) @ self.robot.fk(q, goal.frame)
-        xyz, rpy = (
-            np.clip(value, -tolerance, tolerance) if tolerance is not None else np.zeros(3)
-            for value, tolerance in (
-                (T[:3, 3], goal.xyz_tolerance),
-                (rpy_from_rotation(T[:3, :3]), goal.rpy_tolerance),
-            )
-        )
+        xyz_tolerance = np.zeros(3) if goal.xyz_tolerance is None else goal.xyz_tolerance
+        rpy_tolerance = np.zeros(3) if goal.rpy_tolerance is None else goal.rpy_tolerance
+        xyz = np.clip(T[:3, 3], -xyz_tolerance, xyz_tolerance)
+        rpy = np.clip(rpy_from_rotation(T[:3, :3]), -rpy_tolerance, rpy_tolerance)
         return PoseGoal(goal.frame, goal.T_base_frame @ pose_matrix(xyz, rpy=rpy))
 
     def _goal(self, goal: Any) -> Any:

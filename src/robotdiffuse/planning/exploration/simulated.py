@@ -186,13 +186,17 @@ def wrist_camera(robot: Robot) -> ArmCamera:
     return ArmCamera(robot.tip, T_tip_camera, (*focal, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2), SIZE)
 
 
-def camera_beside(problem: Problem, noise: DepthNoise | None, seed: int) -> DepthView:
-    """The image of a fixed camera beside the arm and behind its shoulder, with the arm at the start."""
+def seen_from_beside(problem: Problem) -> DepthView:
+    """What a fixed camera beside the arm and behind its shoulder sees, with the arm at the start."""
     T = looking_at(np.array(BESIDE_POSITION), np.array(BESIDE_TARGET))
     width, height = BESIDE_SIZE
     intrinsics = (BESIDE_FOCAL_LENGTH, BESIDE_FOCAL_LENGTH, (width - 1) / 2, (height - 1) / 2)
-    view = ray_cast(problem.scene, T, intrinsics, BESIDE_SIZE, problem.robot, problem.start)
-    return measured(view, np.inf, noise, np.random.default_rng(seed))
+    return ray_cast(problem.scene, T, intrinsics, BESIDE_SIZE, problem.robot, problem.start)
+
+
+def camera_beside(problem: Problem, noise: DepthNoise | None, seed: int) -> DepthView:
+    """The image of that camera, as a depth camera measures it."""
+    return measured(seen_from_beside(problem), np.inf, noise, np.random.default_rng(seed))
 
 
 def simulated_explorer(

@@ -97,6 +97,17 @@ def driven_joints(model: Any) -> set[int]:
     }
 
 
+def placing_joints(model: Any, bodies: list[int]) -> set[int]:
+    """The joints that only place the base: slides without range and actuator, beside other joints."""
+    joints = _joints_of(model, bodies)
+    unlimited = {
+        joint
+        for joint in joints
+        if kind_of("Joint", model.jnt_type[joint]) == "slide" and not model.jnt_limited[joint]
+    }
+    return unlimited - driven_joints(model) if len(unlimited) < len(joints) else set()
+
+
 def kind_of(enumeration: str, value: Any) -> str:
     """The name of a value of one of MuJoCo's enumerations (Joint, Geom, Trn, Eq), such as "hinge"."""
     return getattr(imported_mujoco(), f"mjt{enumeration}")(int(value)).name.rpartition("_")[2].lower()
@@ -123,6 +134,7 @@ class ConvertedModel:
         """Holds the mesh files that the URDF names."""
         self.root = ET.Element("robot", name=bytes(model.names).partition(b"\0")[0].decode() or path.stem)
         self.bodies = robot_bodies(model)
+        self.held = placing_joints(model, self.bodies)
         self.masks = model.geom_contype | model.geom_conaffinity
         """Not 0 for geoms that collide with anything."""
         self.notes: list[str] = []
@@ -177,7 +189,7 @@ class ConvertedModel:
         for joint in joints:
             label = self.joint_name(joint)
             kind = self.joint_kind(joint)
-            if kind == "free" or self._held(joint):
+            if kind == "free" or joint in self.held:
                 what = f"the free joint of {name}"
                 if kind == "slide":
                     what = f"slide joint {label}, which has no range and no actuator,"
@@ -196,16 +208,6 @@ class ConvertedModel:
         if above != name:
             self._element(f"{name}_fixed", "fixed", above, name, T)
         self._geometry(self._link(name), body)
-
-    def _held(self, joint: int) -> bool:
-        """Whether a joint only places the base: a slide without range and actuator, beside other joints."""
-
-        def places(joint: int) -> bool:
-            return self.joint_kind(joint) == "slide" and not self.model.jnt_limited[joint]
-
-        if not places(joint) or joint in driven_joints(self.model):
-            return False
-        return not all(places(other) for other in _joints_of(self.model, self.bodies))
 
     def _moved(self, joint: int, value: float) -> Pose:
         """The motion of a joint by a value."""
@@ -261,7 +263,7 @@ class ConvertedModel:
             follower = int(model.eq_obj1id[k])
             leader = int(model.eq_obj2id[k])
             offset, slope, *higher = model.eq_data[k, :5].tolist()
-            if leader < 0 or self._held(leader):
+            if leader < 0 or leader in self.held:
                 continue
             if any(higher):
                 self.notes.append(
@@ -371,7 +373,7 @@ class ConvertedModel:
         places = {
             self.joint_name(joint): model.jnt_qposadr[joint]
             for joint in _joints_of(model, self.bodies)
-            if self.joint_kind(joint) in MOVABLE and not self._held(joint)
+            if self.joint_kind(joint) in MOVABLE and joint not in self.held
         }
         return {
             self.name("key", key): {name: float(model.key_qpos[key, place]) for name, place in places.items()}
