@@ -379,7 +379,7 @@ def main():
         try:
             duration, rows = peer.plan(problem["start"], problem["goal"])
             answer |= {"duration": duration, "rows": np.asarray(rows).tolist()}
-        except Exception as error:  # of whatever kind the planner raises: it has no motion
+        except Exception as error:  # planners raise several kinds of errors: there is no motion
             answer["reason"] = (
                 f"{error}" if isinstance(error, UnsolvedError) else f"{type(error).__name__}: {error}"
             )

@@ -1,4 +1,4 @@
-"""MPlib's methods, arguments and results: motions reach what was asked, and failures have a reason."""
+"""MPlib's methods, arguments and results: motions end at the requested goal, and failures have a reason."""
 
 from types import SimpleNamespace
 

@@ -50,7 +50,7 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def _bench_settings(arguments: Namespace) -> "list[BenchSettings]":
+def _bench_settings(arguments: Namespace) -> list[BenchSettings]:
     """The settings of each pass: of the preset, or one from the options."""
     if arguments.cluster is not None and arguments.workers is not None:
         raise InputError("--workers sets the processes on this machine; --cluster always uses all its cores")
@@ -82,7 +82,7 @@ def run_report(arguments: Namespace) -> None:
     print(f"wrote {', '.join(str(out / name) for name in files)} and {len(report.plots)} plots as .svg")
 
 
-def _write_replays(bench: "Bench", parts: "list[Section]", file: "Path") -> str | None:
+def _write_replays(bench: Bench, parts: list[Section], file: Path) -> str | None:
     """The name of the written file; None if there is no motion to replay."""
     motions = motions_to_replay(bench, parts)
     if not motions:

@@ -84,7 +84,7 @@ def run_view(arguments: Namespace) -> None:
         open_in_browser(out)
 
 
-def _gallery_entries(folder: Path, robot: "Robot", number: int, seed: int) -> "Iterator[GalleryEntry]":
+def _gallery_entries(folder: Path, robot: Robot, number: int, seed: int) -> Iterator[GalleryEntry]:
     """Random motions, in the order of the shards."""
     manifest = read_manifest(folder)
     for shard, rows in random_rows(folder, number, seed):

@@ -57,8 +57,8 @@ def run_explore(arguments: Namespace) -> int:
 
 
 def simulate(
-    problem: "Problem", settings: "ExplorerSettings", noise: "DepthNoise | None", seed: int
-) -> "tuple[RecordedExplorer, bool]":
+    problem: Problem, settings: ExplorerSettings, noise: DepthNoise | None, seed: int
+) -> tuple[RecordedExplorer, bool]:
     """Simulate the loop and print its steps; returns the explorer, and whether the arm got to the goal
     without a collision."""
 
@@ -77,13 +77,13 @@ def simulate(
     return explorer, reached and free
 
 
-def draw_exploration(explorer: "RecordedExplorer", problem: "Problem", file: Path) -> None:
+def draw_exploration(explorer: RecordedExplorer, problem: Problem, file: Path) -> None:
     """Draw an exploration as a replay or a strip of pictures, as the ending of the file says."""
     write = write_exploration if file.suffix.lower() == ".html" else write_exploration_picture
     write(explorer, problem.scene, file)
 
 
-def record(explorer: "RecordedExplorer", file: Path) -> None:
+def record(explorer: RecordedExplorer, file: Path) -> None:
     """Write all views that an explorer observed; the camera on the arm is `wrist`, others are `beside`."""
     from robotdiffuse.interop.depth_recording import StampedView, write_depth_views
 

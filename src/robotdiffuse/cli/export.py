@@ -18,7 +18,7 @@ def run_export(arguments: Namespace) -> None:
         print(f"wrote {file}")
 
 
-def validated_motion(file: str, rate: float | None = None) -> "tuple[Problem, Trajectory]":
+def validated_motion(file: str, rate: float | None = None) -> tuple[Problem, Trajectory]:
     """The problem and the motion of a result file, resampled at `rate` [Hz] if it is given.
 
     Raises InputError if it holds no timed motion, and if the validator rejects the motion, because other

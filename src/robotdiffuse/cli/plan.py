@@ -59,7 +59,7 @@ def _outputs(arguments: Namespace) -> list[Path]:
     return files
 
 
-def _problem(arguments: Namespace) -> "Problem":
+def _problem(arguments: Namespace) -> Problem:
     """The problem of the file, changed by --unknown and --blend."""
     problem = load_problem(arguments.problem, arguments.index, arguments.ignore_joints)
     unknown = arguments.unknown
@@ -73,7 +73,7 @@ def _problem(arguments: Namespace) -> "Problem":
     return problem if arguments.blend is None else replace(problem, blend=arguments.blend)
 
 
-def _write(problem: "Problem", result: "PlanResult", file: Path) -> bool:
+def _write(problem: Problem, result: PlanResult, file: Path) -> bool:
     """Write a file by its ending; returns False for one that needs a motion if there is none."""
     ending = file.suffix.lower()
     if ending == ".json":
@@ -89,7 +89,7 @@ def _write(problem: "Problem", result: "PlanResult", file: Path) -> bool:
     return True
 
 
-def asked_clearance(problem: "Problem", planner: str, clearance: float | None = None) -> float | None:
+def asked_clearance(problem: Problem, planner: str, clearance: float | None = None) -> float | None:
     """The clearance that a call asks for, the problem's or the default one [m]; None for a planner that keeps
     none."""
 
@@ -99,13 +99,13 @@ def asked_clearance(problem: "Problem", planner: str, clearance: float | None = 
 
 
 def load_and_plan(
-    problem: "Problem",
+    problem: Problem,
     planner: str,
-    settings: "Settings | None" = None,
+    settings: Settings | None = None,
     weights: str | None = None,
     picture: bool = False,
     **request: Any,
-) -> "PlanResult":
+) -> PlanResult:
     """Load a planner and plan, with a spinner that names what is compiled.
 
     picture: whether a picture follows. `request` holds arguments of `rd.plan`.

@@ -132,7 +132,7 @@ def _print_pairs(report: "AddReport") -> None:
     show(Table.of(title, columns, rows) if rows else Table.pairs("", [(title, "none")]))
 
 
-def print_robot(robot: "Robot") -> None:
+def print_robot(robot: Robot) -> None:
     """Print joints, limits, collision model and notes of a robot."""
     columns = ("joint", Column("kind", left=True), "lower", "upper", "velocity", "accel.", "jerk")
     joints = [(j.name, j.kind, *_range(j), j.velocity, j.acceleration, j.jerk) for j in robot.planned_joints]
@@ -153,11 +153,11 @@ def print_robot(robot: "Robot") -> None:
     show(Table.of(robot.name, columns, joints), Table.pairs("", pairs))
 
 
-def _range(joint: "Joint") -> tuple[float | None, float | None]:
+def _range(joint: Joint) -> tuple[float | None, float | None]:
     return (None, None) if joint.kind == "continuous" else (joint.lower, joint.upper)
 
 
-def _place(T: "Float[ndarray, '4 4']") -> str:
+def _place(T: Float[ndarray, "4 4"]) -> str:
     xyz = T[:3, 3]
     wxyz = quaternion_from_rotation(T[:3, :3])
     return " ".join(["xyz", *(f"{value:g}" for value in xyz), "wxyz", *(f"{value:.4g}" for value in wxyz)])

@@ -29,7 +29,7 @@ def run(arguments: Namespace) -> None:
     serve(served_robots(arguments.robot), settings, lambda line: print(line, flush=True))
 
 
-def served_robots(names: Sequence[str]) -> "dict[str, Robot]":
+def served_robots(names: Sequence[str]) -> dict[str, Robot]:
     """The bundled robots and those named, by the names for requests; a robot from a URDF has its own name.
 
     Raises InputError if two robots have the same name.

@@ -146,7 +146,7 @@ BYTES_PER_TRAINING = 100_000_000
 """Disk space for checkpoints and weights."""
 
 
-def data_settings(source: str, robot: Robot, motions: int | None, seed: int | None) -> "GenerationSettings":
+def data_settings(source: str, robot: Robot, motions: int | None, seed: int | None) -> GenerationSettings:
     """Settings of the training data for an arm."""
     return GenerationSettings(
         robot=source,

@@ -42,7 +42,7 @@ def run_verify(arguments: Namespace) -> int:
     return VALID if valid else NOT_VALID
 
 
-def _validated(problem: "Problem", what: str, motion: "Waypoints | Trajectory", everything: bool) -> bool:
+def _validated(problem: Problem, what: str, motion: Waypoints | Trajectory, everything: bool) -> bool:
     """Whether the motion is valid; prints its clearance, or its violations."""
     report = verify(problem, motion)
     if report.violation is None:
@@ -64,7 +64,7 @@ def _jerk(share: float) -> str:
     return f"jerk at most {100 * share:.0f} % of the limits"
 
 
-def read_result(file: str) -> "tuple[PlanResult, Problem]":
+def read_result(file: str) -> tuple[PlanResult, Problem]:
     """The result in a file, and its problem. Raises InputError if the file holds no problem."""
     saved = load_result(file)
     if saved.problem is None:
@@ -76,7 +76,7 @@ def read_result(file: str) -> "tuple[PlanResult, Problem]":
     return saved.result, problem_from_record(saved.problem)
 
 
-def read_solved(file: str) -> "tuple[PlanResult, Problem]":
+def read_solved(file: str) -> tuple[PlanResult, Problem]:
     """The solved result in a file, and its problem. Raises InputError if the file holds no motion or
     problem."""
     result, problem = read_result(file)
@@ -85,7 +85,7 @@ def read_solved(file: str) -> "tuple[PlanResult, Problem]":
     return result, problem
 
 
-def _stored_problem(file: str) -> "Problem":
+def _stored_problem(file: str) -> Problem:
     """The problem stored in an .mcap file. Raises InputError if there is none."""
     problem = None
     if file.lower().endswith(".mcap"):
@@ -99,7 +99,7 @@ def _stored_problem(file: str) -> "Problem":
 
 def _read(
     arguments: Namespace,
-) -> "tuple[Problem, dict[str, Waypoints | Trajectory], tuple[str, ...]]":
+) -> tuple[Problem, dict[str, Waypoints | Trajectory], tuple[str, ...]]:
     """The problem, the motions to validate by name, and notes on changes made to read them."""
     if (arguments.scene is None) != (arguments.robot is None):
         raise InputError("--scene and --robot belong together: a planning scene does not name its robot")
@@ -156,7 +156,7 @@ def run_check(arguments: Namespace) -> int:
     return FAILS if differences else HOLDS
 
 
-def described(robot: "Robot") -> str:
+def described(robot: Robot) -> str:
     """The robot's name, its source, and whether it is the bundled one."""
     from robotdiffuse.certificates.proof import differences, robot_parts
 

@@ -33,7 +33,7 @@ from robotdiffuse.visualization.picture import PictureSettings, write_comparison
 from robotdiffuse.visualization.replay_page import GalleryEntry, write_gallery, write_problem, write_replay
 
 
-def draw(problem: "Problem", result: "PlanResult | None", file: Path) -> None:
+def draw(problem: Problem, result: PlanResult | None, file: Path) -> None:
     """Draw the motion of a result in its scene, as the ending of the file says; without a motion, the start,
     the goal and the links that collide.
 
@@ -46,7 +46,7 @@ def draw(problem: "Problem", result: "PlanResult | None", file: Path) -> None:
     write(robot, scene, _motion(result), file, result=result, moving=problem.moving_in_world)
 
 
-def draw_several(problem: "Problem", results: "Mapping[str, PlanResult]", file: Path, shell: float) -> None:
+def draw_several(problem: Problem, results: Mapping[str, PlanResult], file: Path, shell: float) -> None:
     """Draw the motions of several solved results, by name, in the scene of one problem: in one picture, or as
     replays side by side.
 
@@ -65,13 +65,13 @@ def draw_several(problem: "Problem", results: "Mapping[str, PlanResult]", file: 
         write_comparison(robot, scene, motions, file, settings=settings, moving=problem.moving_in_world)
 
 
-def _motion(result: "PlanResult") -> "PathOfJoints | Trajectory":
+def _motion(result: PlanResult) -> PathOfJoints | Trajectory:
     motion = result.trajectory or result.path
     assert motion is not None, "only a solved result has a motion"
     return motion
 
 
-def _shown(problem: "Problem") -> "tuple[Robot, Scene]":
+def _shown(problem: Problem) -> tuple[Robot, Scene]:
     """The robot and the scene of a problem, with predicted obstacles if there are any."""
     if problem.views and policy_for(problem)[0] == PREDICTED:
         seen = Scene([*problem.scene.shapes, predicted_obstacles(problem)])
@@ -85,7 +85,7 @@ def open_in_browser(file: Path) -> None:
         webbrowser.open(file.resolve().as_uri())
 
 
-def _read(file: str) -> "tuple[PlanResult | None, Problem]":
+def _read(file: str) -> tuple[PlanResult | None, Problem]:
     """The result in a file, and its problem; of a problem file, the problem alone."""
     ending = Path(file).suffix.lower()
     record = read_json(file) if ending == ".json" else {}
@@ -111,7 +111,7 @@ def run_view(arguments: Namespace) -> None:
         open_in_browser(outputs[0])
 
 
-def _read_several(files: list[str]) -> "tuple[Problem, dict[str, PlanResult]]":
+def _read_several(files: list[str]) -> tuple[Problem, dict[str, PlanResult]]:
     """The solved results in several files, by name, and the problem of the first. Raises InputError for other
     scenes and for equal names."""
 
