@@ -1,6 +1,7 @@
 """Unknown space: motions planned on depth views, validated in the true scene; and where to look next.
 
-    python benchmarks/cameras.py [--problems 300] [--views 1] [--noise] [--cameras far] [--records FILE]
+    python benchmarks/cameras.py [--problems 300] [--views 1] [--images real] [--walls]
+        [--cameras far] [--records FILE]
     python benchmarks/cameras.py --weights FOLDER ... --families shelf clutter
     python benchmarks/cameras.py --report [--odd] --records FILE
     python benchmarks/cameras.py --next-view [--problems 210] --records FILE
@@ -14,6 +15,9 @@ where a person would place them, 1.4 to 1.8 m away (--cameras: near, 0.8 to 1.2 
 in front more often than behind; the floor is known, all else must be seen. Every method plans with AORRTC and
 has the same CPU time. A motion is free if the validator accepts path and timed motion in the true scene.
 Records are kept in FILE and not made again; --report prints their tables.
+
+--images says what cameras get wrong, and what is stated of it: see IMAGES. --walls puts the scene into a
+room; without it, what is beyond the obstacles and the floor gives no return.
 
 --weights adds the method 'predicted' with other weights of the occupancy completion network, folders of
 `train completion`; methods are named by the folder. Those of a training that left families out are tried on
@@ -34,9 +38,10 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from common import FIRST, TIME_LIMIT, header, parse, print_table, progress, use_processor_time
 from robotdiffuse.core.output_files import JsonLines
@@ -53,7 +58,7 @@ from robotdiffuse.learning.completion import (
 )
 from robotdiffuse.perception.depth_view import DepthNoise, DepthView
 from robotdiffuse.perception.observed_volume import observe
-from robotdiffuse.perception.ray_caster import ray_cast
+from robotdiffuse.perception.ray_caster import MAX_RANGE, ray_cast
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.exploration.looks import next_view, poses_around
@@ -63,6 +68,7 @@ from robotdiffuse.problems.files import load_problems
 from robotdiffuse.problems.held_out import SEED, held_out_problem, line_length
 from robotdiffuse.problems.problem import PREDICTED, Problem
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box
 from robotdiffuse.validation.validator import verify, verify_trajectory
 
 LIMIT = 1.0
@@ -95,6 +101,61 @@ UNSURE = 0.9
 """Another view is most wanted if the motion of one view has a stated confidence below this."""
 PLANNER = load_planner("aorrtc")
 Row = dict[str, Any]
+RECORDED = DepthNoise(spread=0.004, correlation=1.5, missing=0.01, zeros=True)
+"""As recorded sensors have it: errors of neighboring pixels have a correlation of 0.8, and 0 stands for no
+return and for nothing in range."""
+OFF = (0.005, float(np.radians(1.0)))
+"""By how much a calibration is off: position [m] and angle [rad]."""
+POSE, NOISE, RANGE, FAR = "pose not stated", "noise not stated", "range not stated", "0 taken as far"
+"""Steps of docs/how_to/real_camera.md that are skipped."""
+
+
+class Images(NamedTuple):
+    """What cameras get wrong, and what is stated of it in their views."""
+
+    noise: DepthNoise | None = None
+    off: bool = False
+    """Whether the stated pose of each camera is off by OFF, in a direction and about an axis drawn once."""
+    skipped: str = ""
+    """What is not stated, or mistaken."""
+
+    def stated(self, view: DepthView, seed: int) -> DepthView:
+        """A view with noise, with the pose and the errors that are stated of it."""
+        T = view.T_base_camera.copy()
+        if self.off:
+            rng = np.random.default_rng([seed, view.depth.size])
+            shift, axis = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
+            T[:3, 3] += OFF[0] * T[:3, :3] @ shift
+            T[:3, :3] @= Rotation.from_rotvec(OFF[1] * axis).as_matrix()
+        return replace(
+            view,
+            depth=np.where(view.depth == 0, np.inf, view.depth) if self.skipped == FAR else view.depth,
+            T_base_camera=T,
+            range=None if self.skipped == RANGE else view.range or MAX_RANGE,
+            noise=None if self.skipped == NOISE else self.noise,
+            pose_deviation=OFF if self.off and self.skipped != POSE else (0.0, 0.0),
+        )
+
+
+IDEAL = "ideal"
+IMAGES = {
+    IDEAL: Images(),
+    "white noise": Images(DepthNoise()),
+    "recorded noise": Images(RECORDED),
+    "off": Images(off=True),
+    "real": Images(RECORDED, off=True),
+    **{skipped: Images(RECORDED, True, skipped) for skipped in (POSE, NOISE, RANGE, FAR)},
+}
+WALL = "wall"
+ROOM = 2.2
+"""Distance of the walls from the base's axis [m]: ring cameras stand within, and see the opposite one."""
+
+
+def with_walls(problem: Problem) -> Problem:
+    """The problem in a room."""
+    ends = ((ROOM, 0.0), (-ROOM, 0.0), (0.0, ROOM), (0.0, -ROOM))
+    walls = [Box((x, y, 1.0), (0.1 + 2 * abs(y), 0.1 + 2 * abs(x), 4.0), name=WALL) for x, y in ends]
+    return replace(problem, scene=Scene([*problem.scene.shapes, *walls]))
 
 
 def problems(family: str, count: int, known: set[int]) -> Iterator[tuple[int, Problem]]:
@@ -130,8 +191,9 @@ def views(
     place = list(FAMILIES).index(family) if family in FAMILIES else zlib.crc32(Path(family).name.encode())
     rng = np.random.default_rng([SEED, place, number, 14])
     taken = []
+    inner = Scene([shape for shape in problem.scene.shapes if shape.name != WALL])
     for _ in range(count):
-        T, angle = CAMERAS[cameras].draw(problem.scene, rng)
+        T, angle = CAMERAS[cameras].draw(inner, rng)
         focal = SIZE[1] / 2 / np.tan(angle / 2)
         intrinsics = (focal, focal, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
         view = ray_cast(problem.scene, T, intrinsics, SIZE, problem.robot, problem.start)
@@ -171,12 +233,17 @@ def is_free(problem: Problem, result: PlanResult) -> bool:
     return verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
 
 
+PLACE = ("views", "images", "walls", "cameras")
+"""Arguments that records are told apart by."""
+
+
 def run(arguments: argparse.Namespace) -> None:
     """Make the records that are missing."""
     networks = {BY + Path(folder).name: exported_completion(folder) for folder in arguments.weights}
     methods = [*arguments.methods, *networks]
     kept = JsonLines(Path(arguments.records))
-    place = {"views": arguments.views, "noise": arguments.noise, "cameras": arguments.cameras}
+    images = IMAGES[arguments.images]
+    place = {name: vars(arguments)[name] for name in PLACE}
     done = {(r["family"], r["number"], r["method"]) for r in kept.rows if place.items() <= r.items()}
     each = arguments.problems // len(arguments.families)
     warm = True
@@ -186,8 +253,9 @@ def run(arguments: argparse.Namespace) -> None:
             missing = [method for method in methods if (family, number, method) not in done]
             if not missing:
                 continue
-            noise = DepthNoise() if arguments.noise else None
-            taken = views(problem, family, number, arguments.views, noise, arguments.cameras)
+            problem = with_walls(problem) if arguments.walls else problem
+            taken = views(problem, family, number, arguments.views, images.noise, arguments.cameras)
+            taken = [images.stated(view, number) for view in taken]
             began = time.process_time()
             known = known_scene(problem)
             partial = Problem(problem.robot, known, problem.start, problem.goal, views=taken)
@@ -285,16 +353,17 @@ def expected_error(stated: Values, free: Values) -> float:
 
 
 def report(rows: list[Row]) -> None:
-    """Print the tables of each number of views, with noise and without."""
-    rows = [{"cameras": RING} | row for row in rows]
-    places = dict.fromkeys((row["views"], row["noise"], row["cameras"]) for row in rows)
-    for count, noisy, cameras in places:
-        some = [
-            row for row in rows if (row["views"], row["noise"], row["cameras"]) == (count, noisy, cameras)
-        ]
-        table(some, f"{count} {'noisy ' if noisy else ''}view{'s' if count > 1 else ''}, cameras: {cameras}")
-        calibration([row for row in some if row["family"] in FAMILIES], "families")
-        calibration([row for row in some if row["family"] not in FAMILIES], "other problems")
+    """Print the tables of each number and kind of views."""
+    places = dict.fromkeys(tuple(row[name] for name in PLACE) for row in rows)
+    for place in places:
+        some = [row for row in rows if tuple(row[name] for name in PLACE) == place]
+        count, images, walls, cameras = place
+        title = f"views: {count}, images: {images}, {'a room' if walls else 'no walls'}, cameras: {cameras}"
+        for own in (True, False):
+            mine = [row for row in some if (row["family"] in FAMILIES) == own]
+            if mine:
+                table(mine, f"{'Families' if own else 'Other problems'}, {title}")
+                calibration(mine, "families" if own else "other problems")
     spent = [row["view_time"] for row in rows]
     print(f"From views to the problem's scene: {1e3 * np.median(spent):.0f} ms of CPU time (median)")
 
@@ -319,7 +388,8 @@ def times(families: list[str]) -> None:
 
 def fit(rows: list[Row]) -> None:
     """Print the constants RATES of perception/confidence.py."""
-    rows = [r for r in rows if r["solved"] and r["number"] % 2 == 0 and r["views"] == 1 and not r["noise"]]
+    rows = [r for r in rows if r["solved"] and r["number"] % 2 == 0 and r["views"] == 1]
+    rows = [row for row in rows if row["images"] == IDEAL and not row["walls"]]
     plain = [row for row in rows if row["risk"] is None]
     for assumption in dict.fromkeys(row["assumption"] for row in plain):
         free = [row["free"] for row in plain if row["assumption"] == assumption]
@@ -401,7 +471,8 @@ def main() -> None:
     every = [*METHODS, TRUE]
     parser.add_argument("--methods", nargs="+", default=every, choices=every, metavar="NAME", help="(all)")
     parser.add_argument("--views", type=int, default=1, help="(1)")
-    parser.add_argument("--noise", action="store_true", help="of depth cameras")
+    parser.add_argument("--images", default=IDEAL, choices=IMAGES, metavar="NAME", help="(ideal)")
+    parser.add_argument("--walls", action="store_true", help="a room around the scene")
     parser.add_argument("--cameras", default=RING, choices=CAMERAS, help="where they stand (ring)")
     parser.add_argument("--weights", nargs="*", default=[], metavar="FOLDER", help="of completion networks")
     parser.add_argument("--records", default="unknown_space.jsonl", help="(unknown_space.jsonl)")

@@ -1,6 +1,7 @@
 """Explorer: an arm with a camera at its tip goes to goals through simulated scenes.
 
-    python benchmarks/exploring.py [--problems 28] [--noise] [--methods strict ...] --records FILE
+    python benchmarks/exploring.py [--problems 28] [--images real] [--walls] [--methods strict ...]
+        --records FILE
     python benchmarks/exploring.py --families FOLDER ... --records FILE
     python benchmarks/exploring.py --report --records FILE
 
@@ -8,6 +9,9 @@ Prints benchmarks/results/exploring.txt. Problems are those of benchmarks/camera
 arm's pose "ready" free: from there the arm goes to the problem's start, and on to its goal, with one memory.
 Settings and the stated confidence were chosen on the first 12 of each of seven families (not `cabinet`);
 --skip 12 leaves them out.
+
+--images and --walls: see benchmarks/cameras.py. The camera on the arm and the one beside it are off in
+different ways.
 
 A camera beside the arm takes one image at first and one after each motion; the one on the arm (320 x 240
 pixels, 70 x 55 degrees, 0.15 to 2 m) one every 0.25 s of a motion, up to eight. Every executed motion is
@@ -33,7 +37,18 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 from scipy.ndimage import binary_dilation
 
-from cameras import PLANNER, is_free, known_scene, problems, unknown_scene, views
+from cameras import (
+    IDEAL,
+    IMAGES,
+    PLANNER,
+    Images,
+    is_free,
+    known_scene,
+    problems,
+    unknown_scene,
+    views,
+    with_walls,
+)
 from common import header, parse, print_table, progress, use_processor_time
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
@@ -42,7 +57,7 @@ from robotdiffuse.core.types import FIRST
 from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.evaluation.statistics import wilson_interval
 from robotdiffuse.learning.completion import true_voxels
-from robotdiffuse.perception.depth_view import DepthNoise, DepthView
+from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.occupancy_map import Corners
 from robotdiffuse.perception.voxel_grid import FINE_VOXEL_SIZE, LOW
 from robotdiffuse.planning.context import PlanRequest
@@ -110,8 +125,12 @@ class TimedExplorer(Explorer):
 
     spent = 0.0
     """[s]"""
+    images = Images()
+    number = 0
+    """Of the problem."""
 
     def observe(self, view: DepthView, stamp: float = 0.0) -> None:
+        view = self.images.stated(view, self.number)
         began = time.process_time()
         super().observe(view, stamp)
         self.spent += time.process_time() - began
@@ -130,16 +149,16 @@ class FrontierExplorer(TimedExplorer):
         return self.map.unknown & binary_dilation(self.map.free)
 
 
-def play(problem: Problem, family: str, number: int, method: str, noisy: bool) -> Row:
+def play(problem: Problem, family: str, number: int, method: str, images: Images) -> Row:
     """A record of one problem and method: from the arm's pose "ready" to the start, and on to the goal."""
-    noise = DepthNoise() if noisy else None
+    noise = images.noise
     rng = np.random.default_rng([number, 16])
     camera = wrist_camera(problem.robot)
     known = known_scene(problem)
     legs = [replace(problem, start=HOME, goal=JointGoal(problem.start[None])), problem]
     [beside] = views(legs[0], family, number, 1, None)
     seen = [measured(beside, np.inf, noise, rng)]
-    reason = ""
+    reason = violation = ""
     reached = collided = False
     about = METHODS.get(method, METHODS["strict"])
     settings = ExplorerSettings(
@@ -148,6 +167,8 @@ def play(problem: Problem, family: str, number: int, method: str, noisy: bool) -
     zone = free_zone(problem) if about.free_zone else None
     kind = FrontierExplorer if about.frontier else TimedExplorer
     explorer = kind(problem.robot, [camera], known, zone, settings)
+    explorer.images = images
+    explorer.number = number
     spent = list[float]()
     looks = list[int]()
     if method not in ONCE and about.standing:
@@ -157,7 +178,8 @@ def play(problem: Problem, family: str, number: int, method: str, noisy: bool) -
         if method in ONCE:
             seen.append(taken(leg, camera, leg.start, noise, rng))
             began = time.process_time()
-            partial = Problem(leg.robot, known, leg.start, leg.goal, views=seen, unknown=ONCE[method])
+            stated = [images.stated(view, number) for view in seen]
+            partial = Problem(leg.robot, known, leg.start, leg.goal, views=stated, unknown=ONCE[method])
             result = plan_with_unknown_space(PLANNER, partial, PlanRequest(TIME_LIMIT, until=FIRST))
             explorer.spent = time.process_time() - began
             reached = is_free(leg, result)
@@ -170,10 +192,12 @@ def play(problem: Problem, family: str, number: int, method: str, noisy: bool) -
             collided = not all(event.free for event in events)
             looks.append(sum(event.step.kind == LOOK for event in events))
             reason = events[-1].step.reason
+            violation = events[-1].violation
         spent.append(explorer.spent)
         if not reached:
             break
-    return {"reached": reached, "collided": collided, "looks": looks, "reason": reason, "times": spent}
+    row: Row = {"reached": reached, "collided": collided, "looks": looks, "times": spent}
+    return row | {"reason": reason, "violation": violation}
 
 
 def free_zone(problem: Problem) -> Corners | None:
@@ -208,7 +232,11 @@ def usable(problem: Problem, clearance: float) -> bool:
 def run(arguments: argparse.Namespace) -> None:
     """Make the records that are missing."""
     kept = JsonLines(Path(arguments.records))
-    done = {(row["family"], row["number"], row["method"], row["noise"]) for row in kept.rows}
+    images = IMAGES[arguments.images]
+    place = {"images": arguments.images, "walls": arguments.walls}
+    done = {
+        (row["family"], row["number"], row["method"]) for row in kept.rows if place.items() <= row.items()
+    }
     warm = False
     for family in arguments.families:
         some = (one for one in problems(family, MAX_PROBLEMS, set()) if usable(one[1], arguments.clear))
@@ -216,31 +244,35 @@ def run(arguments: argparse.Namespace) -> None:
         some = list(islice(some, arguments.skip, end))
         for number, problem in progress(some, family):
             for method in arguments.methods:
-                if (family, number, method, arguments.noise) in done:
+                if (family, number, method) in done:
                     continue
+                problem = with_walls(problem) if arguments.walls else problem
                 if not warm:
-                    play(problem, family, number, PROBABILISTIC, arguments.noise)
+                    play(problem, family, number, PROBABILISTIC, images)
                     warm = True
-                row = play(problem, family, number, method, arguments.noise)
-                place = {"family": family, "number": number, "method": method, "noise": arguments.noise}
-                kept.append(place | row)
+                row = play(problem, family, number, method, images)
+                kept.append({"family": family, "number": number, "method": method, **place, **row})
 
 
 def report(rows: list[Row]) -> None:
-    """Print reached goals, collisions, looks and times of the methods, by where problems come from and with
-    noise or without."""
-    for own, noisy in product((True, False), (False, True)):
+    """Print reached goals, collisions, looks and times of the methods, by where problems come from and what
+    cameras get wrong."""
+    places = dict.fromkeys((row["images"], row["walls"]) for row in rows)
+    for own, (images, walls) in product((True, False), places):
         lines = []
-        some = [row for row in rows if (row["family"] in FAMILIES, row["noise"]) == (own, noisy)]
+        some = [
+            row
+            for row in rows
+            if (row["family"] in FAMILIES, row["images"], row["walls"]) == (own, images, walls)
+        ]
         for method in (*ONCE, *METHODS):
             mine = [row for row in some if row["method"] == method]
             if mine:
                 lines.append(line(method, mine))
         if lines:
             columns = ["method", "problems", "reached, %", "collisions", "looks a leg, mean / p90"]
-            title = (
-                f"{'Families' if own else 'Other problems'}, {'noise of sensors' if noisy else 'ideal depth'}"
-            )
+            of = "Families" if own else "Other problems"
+            title = f"{of}, images: {images}, {'a room' if walls else 'no walls'}"
             print_table(title, [*columns, "CPU s a leg, median / p90"], lines)
     print("CPU time is the Explorer's (observe and next), without simulated images and the validation.")
 
@@ -268,7 +300,8 @@ def main() -> None:
     parser.add_argument("--clear", type=float, default=0.0, help="least clearance of start and goal [m] (0)")
     parser.add_argument("--families", nargs="+", default=list(FAMILIES), help="(all)")
     parser.add_argument("--methods", nargs="+", default=every, choices=every, metavar="NAME", help="(all)")
-    parser.add_argument("--noise", action="store_true", help="of depth cameras")
+    parser.add_argument("--images", default=IDEAL, choices=IMAGES, metavar="NAME", help="(ideal)")
+    parser.add_argument("--walls", action="store_true", help="a room around the scene")
     parser.add_argument("--records", default="exploring.jsonl", help="(exploring.jsonl)")
     parser.add_argument("--report", action="store_true", help="only print the tables of the records")
     arguments = parse(parser, problems=1, families=["rop"], methods=["strict"])
