@@ -459,7 +459,7 @@ AGREEMENT = 0.5
 """Largest difference between the accelerations of the rows and those of the cubics next to them, as a
 fraction of the joint's largest acceleration."""
 REST_SHARE = 0.01
-"""In that test, the largest acceleration counts as at least this fraction of the joint's limit."""
+"""For AGREEMENT, the largest acceleration counts as at least this fraction of the joint's limit."""
 JUMP = 1e-6
 """Largest jump of an acceleration in a motion with stated jerks, as a fraction of the joint's limit."""
 MIN_JERK = 1e-6
@@ -467,9 +467,9 @@ MIN_JERK = 1e-6
 # Samples that show whether a motion passes within a blend: largest spacing, as a fraction of the blend, and
 # largest number per step.
 BLEND_SHARE = 0.25
-MAX_LOOKS = 10_000
+MAX_BLEND_SAMPLES = 10_000
 MIN_TIME = 1e-12
-"""Shorter intervals count as this [s], so that mean rates over them are finite."""
+"""Shorter intervals count as this long [s], so that mean rates over them are finite."""
 
 
 def configurations(motion: Path | Trajectory, between: Values) -> Configurations:
@@ -514,8 +514,8 @@ def requirement_errors(problem: Problem, certificate: MotionProof) -> Iterator[s
     name = not_covered(problem, motion)
     if name:
         yield f"problem: certificates do not prove anything about {name}"
-    every = np.concatenate([motion.positions, cubics_of(motion).turns])
-    beyond = np.maximum(robot.lower - every, every - robot.upper)
+    extreme_positions = np.concatenate([motion.positions, cubics_of(motion).turns])
+    beyond = np.maximum(robot.lower - extreme_positions, extreme_positions - robot.upper)
     beyond[:, robot.continuous] = 0.0
     for j in np.flatnonzero(~(beyond <= tolerances.limit_slack).all(axis=0)):
         yield f"motion: {robot.joint_names[j]} leaves its limits by {beyond[:, j].max():.3g}"
@@ -526,8 +526,8 @@ def requirement_errors(problem: Problem, certificate: MotionProof) -> Iterator[s
         yield "motion: it does not end at the goal"
     yield from _waypoint_errors(problem, motion, tolerances)
     if isinstance(motion, Trajectory):
-        begins = np.zeros(robot.dof) if problem.start_velocity is None else problem.start_velocity
-        yield from _rate_errors(robot, motion, certificate, begins)
+        start_velocity = np.zeros(robot.dof) if problem.start_velocity is None else problem.start_velocity
+        yield from _rate_errors(robot, motion, certificate, start_velocity)
         yield from frame_speed_errors(problem, motion, tolerances.rate_slack)
         yield from _jerk_errors(robot, motion, certificate)
     yield from _constraint_errors(problem, certificate)
@@ -600,7 +600,7 @@ def _waypoint_errors(problem: Problem, motion: Path | Trajectory, tolerances: To
         if blend:
             # samples on the straight lines between rows, closer together than the blend is wide
             lengths = np.linalg.norm(np.diff(motion.positions, axis=0), axis=1)
-            counts = np.clip(np.ceil(lengths / (BLEND_SHARE * blend)), 1, MAX_LOOKS).astype(int)
+            counts = np.clip(np.ceil(lengths / (BLEND_SHARE * blend)), 1, MAX_BLEND_SAMPLES).astype(int)
             within = [i + np.arange(count) / count for i, count in enumerate(counts)]
             places = np.concatenate([*within, rows[-1:]])
         places = places[places >= after]
@@ -636,11 +636,11 @@ def _constraint_errors(problem: Problem, certificate: MotionProof) -> Iterator[s
         return
     q = configurations(certificate.motion, certificate.between)
     bounds = constraint_bounds(problem, q, certificate.tolerances.chord)
-    if [one.name for one in bounds] != [name for name, _ in certificate.constraints]:
+    if [bound.name for bound in bounds] != [name for name, _ in certificate.constraints]:
         yield "constraints: they are not those of the problem"
         return
-    max_values = [float(one.bounds.max()) for one in bounds]
-    limits = [one.limit for one in bounds]
+    max_values = [float(bound.bounds.max()) for bound in bounds]
+    limits = [bound.limit for bound in bounds]
     yield from _stated_errors("constraints", certificate.constraints, max_values, limits)
 
 
@@ -656,7 +656,7 @@ def _stated_errors(
 
 
 def _rate_errors(
-    robot: Robot, motion: Trajectory, certificate: MotionProof, begins: JointValues
+    robot: Robot, motion: Trajectory, certificate: MotionProof, start_velocity: JointValues
 ) -> Iterator[str]:
     """Joints that exceed a limit of velocity or acceleration by any of several measures, cubics that leave
     the certified straight lines, and motions that do not begin at the required velocity or end at rest."""
@@ -670,7 +670,7 @@ def _rate_errors(
     q = motion.positions
     v = motion.velocities
     a = motion.accelerations
-    share = 1 + tolerances.rate_slack
+    rate_factor = 1 + tolerances.rate_slack
     position_slack = 2 * tolerances.limit_slack
     speed = robot.velocity
     acceleration = robot.acceleration
@@ -678,7 +678,7 @@ def _rate_errors(
     # an error of the mean velocity enters the cubic's velocity times up to 3/2, its acceleration times 6 /
     # step
     acceleration_slack = 6 * position_slack / step**2
-    yield from _agreement_errors(robot, motion, cubics, begins, acceleration_slack)
+    yield from _agreement_errors(robot, motion, cubics, start_velocity, acceleration_slack)
     for quantity, values, limit, slack in (
         ("velocity", v, speed, 0.0),
         (
@@ -692,8 +692,8 @@ def _rate_errors(
         ("velocity along its cubics", cubics.speeds, speed, 1.5 * position_slack / step),
         ("acceleration along its cubics", cubics.pulls, acceleration, acceleration_slack),
     ):
-        yield from _exceeded(robot, quantity, np.abs(values), limit, share * limit + slack)
-    beyond = _excess_displacement(motion, share, position_slack, speed)
+        yield from _exceeded(robot, quantity, np.abs(values), limit, rate_factor * limit + slack)
+    beyond = _excess_displacement(motion, rate_factor, position_slack, speed)
     message = "it moves {:.3g} further than {:.4g} allows"
     yield from _exceeded(
         robot, "mean velocity from one row to another", beyond, speed, position_slack, message
@@ -702,7 +702,7 @@ def _rate_errors(
     for window in AVERAGING_WINDOWS if fine_steps else AVERAGING_WINDOWS[:1]:
         # before the first row the arm moves at its start velocity, and after the last it stands still
         at = np.concatenate([[times[0] - window], times, [times[-1] + window]])
-        rows = np.concatenate([q[:1] - window * begins, q, q[-1:]])
+        rows = np.concatenate([q[:1] - window * start_velocity, q, q[-1:]])
         first = np.searchsorted(at, times - window, side="right") - 1
         last = np.searchsorted(at, times + window, side="left")
         before = (times - at[first])[:, None]
@@ -715,16 +715,16 @@ def _rate_errors(
         quantity = "mean acceleration by its positions"
         lines = [
             *_exceeded(
-                robot, quantity, mean_acceleration, acceleration, share * acceleration + slack / spacing
+                robot, quantity, mean_acceleration, acceleration, rate_factor * acceleration + slack / spacing
             )
         ]
         yield from lines
         if lines:
             break
     reference_speed = np.where(speed > 0, speed, np.abs(v).max(axis=0, initial=0.0))
-    off = np.abs(np.stack([v[0] - begins, v[-1]]))
+    off = np.abs(np.stack([v[0] - start_velocity, v[-1]]))
     if (off > tolerances.rate_slack * reference_speed + tolerances.rest).any():
-        message = "at the problem's start_velocity, or end" if begins.any() else "and end"
+        message = "at the problem's start_velocity, or end" if start_velocity.any() else "and end"
         yield f"motion: it does not begin {message} at rest"
 
 
@@ -744,7 +744,7 @@ def _exceeded(
 
 
 def _excess_displacement(
-    motion: Trajectory, share: float, position_slack: float, speed: JointValues
+    motion: Trajectory, rate_factor: float, position_slack: float, speed: JointValues
 ) -> JointRows:
     """The largest excess, over all pairs of rows, of each joint's displacement over what its velocity limit
     allows in that time [1, dof].
@@ -755,7 +755,7 @@ def _excess_displacement(
     step = np.diff(motion.times)[:, None]
     q = motion.positions
     allowed = np.zeros_like(q)
-    max_travel = share * speed * step + position_slack * np.minimum(step / AVERAGING_WINDOWS[0], 1.0)
+    max_travel = rate_factor * speed * step + position_slack * np.minimum(step / AVERAGING_WINDOWS[0], 1.0)
     np.cumsum(max_travel, axis=0, out=allowed[1:])
     # largest excess over all earlier rows, by a running minimum
     advance = np.stack([q, -q]) - allowed
@@ -763,14 +763,14 @@ def _excess_displacement(
 
 
 def _agreement_errors(
-    robot: Robot, motion: Trajectory, cubics: Cubics, begins: JointValues, acceleration_slack: ndarray
+    robot: Robot, motion: Trajectory, cubics: Cubics, start_velocity: JointValues, acceleration_slack: ndarray
 ) -> Iterator[str]:
     """Joints whose accelerations at the rows are not close to those of the cubics next to them."""
     before = np.concatenate([cubics.start[:1], cubics.end])
     after = np.concatenate([cubics.start, cubics.end[-1:]])
     a = motion.accelerations
     off = np.maximum(np.minimum(before, after) - a, a - np.maximum(before, after)).clip(0.0)
-    if begins.any():
+    if start_velocity.any():
         off[:1] = 0.0  # the acceleration of the motion before this one is not known
     peak = np.abs(np.concatenate([cubics.pulls, a])).max(axis=0)
     peak = np.maximum(peak, REST_SHARE * robot.acceleration)

@@ -211,8 +211,7 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
     Raises:
         NotValidError: If the validator rejects the motion; an InputError with the first violation.
         InputError: For obstacles and requirements that certificates do not support, and if no proof of
-            reasonable
-            size is found.
+            reasonable size is found.
     """
     check_problem(problem)
     check_motion("motion", motion, (Path, Trajectory))

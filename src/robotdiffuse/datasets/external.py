@@ -72,17 +72,14 @@ def write_dataset(
     """Make a data set of motions, to train on.
 
     Motions are not validated: `robotdiffuse data check` does. The target is the pose of the robot's tip at
-    the last
-    waypoint. Training, validation and test are split by scene, so give many.
+    the last waypoint. Training, validation and test are split by scene, so give many.
 
     Args:
         paths: Joint values of each motion [n, dof], in the order of the robot's planned joints [rad] or [m];
-            or
-            paths and trajectories, of which the positions are taken. They are resampled evenly in joint
+            or paths and trajectories, of which the positions are taken. They are resampled evenly in joint
             space.
         scenes: The scene of each motion, of spheres and boxes; or one for all. A first box named "floor" that
-            all
-            scenes share is what the arm stands on, not an obstacle.
+            all scenes share is what the arm stands on, not an obstacle.
         folder: An empty folder.
         robot: A robot, or what `load_robot` takes.
         waypoints: Rows of a stored motion.
@@ -92,8 +89,7 @@ def write_dataset(
 
     Raises:
         InputError: For joint values of the wrong shape or out of limits, other shapes, a folder that holds
-            data,
-            and scenes of which none falls into the training split.
+            data, and scenes of which none falls into the training split.
     """
     arm = robot if isinstance(robot, Robot) else load_robot(robot)
     if waypoints < 2:

@@ -155,8 +155,8 @@ class RopDataset(Dataset[dict[str, Tensor]]):
             batch_size: Motions of a batch; the last batch may be smaller.
             shuffle: Whether the order is random.
             generator: Draws order and clouds, on the CPU: the same state gives the same batches for any
-                number of
-                threads. None: a generator made from `seed`, so that every call gives the same epoch.
+                number of threads. None: a generator made from `seed`, so that every call gives the same
+                epoch.
         """
         if batch_size < 1:
             raise InputError(f"batch_size is {batch_size}; it must be at least 1")

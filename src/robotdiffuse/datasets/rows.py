@@ -1,9 +1,9 @@
 """Converts rows of a data set to motions and problems, and reads them for training, with rotated copies.
 
-If the first joint rotates about the base's z axis, a motion also solves the scene rotated about that axis,
-with the angle added to the first joint. Such copies need no planning. The base link does not rotate with
-them, so copies that would touch it are left out. The corners of the floor do not rotate either, but are out
-of reach.
+If the first joint rotates about the base's z axis, a scene and its motion can be rotated about that axis
+together: the angle is added to the first joint. Such copies need no planning. The base link does not rotate
+with them, so copies that would touch it are left out. The corners of the floor do not rotate either, but they
+are out of reach.
 """
 
 from collections.abc import Iterator

@@ -1,8 +1,8 @@
-"""The bench: calls planners on problems and keeps a record of each call; kept calls are not repeated.
+"""The bench: calls planners on problems and stores a record of each call, so that none is repeated.
 
-Planners under test each have a process of their own, so that a crash, an endless loop or a leak affects no
-other planner; on this machine, or on a Ray cluster. Warming up (compiled code, imports) is not timed. Presets
-are comparisons of planners by name, the tables of docs/results.md.
+Each planner under test runs in its own process, so that a crash, an endless loop or a leak affects no other
+planner. Processes run on this machine or on a Ray cluster. Warming up (compiled code, imports) is not timed.
+Presets are named comparisons of planners, such as the tables of docs/results.md.
 """
 
 import os
@@ -63,7 +63,7 @@ class PlannerSpec:
     name: str
     """In `planning.PLANNERS`."""
     weights: str | None = None
-    """A folder; None: those that come with the package."""
+    """Folder of its weights; None: the bundled ones."""
     settings: tuple[str, ...] = ()
     """NAME=VALUE of the planner's settings and of its calls' arguments (`PlanRequest`)."""
 
@@ -126,12 +126,13 @@ def _of_call(text: str) -> bool:
 
 
 START_TIMEOUT = 300.0
-"""For starting and for warming up [s]; the first time ever, kernels are compiled."""
+"""Timeout for starting a process, and for warming it up [s]; on a new machine this compiles kernels."""
 GRACE = 20.0
-"""A process that has not answered this long after the time limit is killed [s]; validating and timing the
-motion take part of it."""
+"""A process that has not answered this long after the time limit is killed [s]. This time includes the
+validation and timing of the motion."""
 RESTARTS_TIMEOUT_FACTOR = 20.0
-"""Timeout of planners that restart, in time limits: the time for timing each path does not count."""
+"""Timeout of planners that restart, as a multiple of the time limit. It is long because the limit does not
+include the timing of each path."""
 RUNS_PER_TASK = 20
 """Runs of one planner that a node of a cluster makes with one start of the process."""
 
@@ -194,7 +195,7 @@ _planner: Planner
 _request: Fields
 """Further arguments of the planner's calls."""
 _answers: Iterator[Fields]
-"""Those that are left of the current run."""
+"""Answers of the current run that are not yet sent."""
 _warm: set[Robot] = set()
 """Robots that the planner is warmed up for."""
 
@@ -247,7 +248,7 @@ def _next_answer() -> Fields | None:
 
 
 def on_this_machine(settings: "BenchSettings", runs: Sequence[Run], session: str) -> Results:
-    """Make runs in a process for each planner, of which some run at a time.
+    """Make runs, with one process for each planner; `settings.workers` of them work at the same time.
 
     All processes are warmed up before the first call is timed. They take turns, so that other work on the
     machine affects all planners alike.
@@ -303,7 +304,7 @@ def on_cluster(settings: "BenchSettings", runs: Sequence[Run], session: str) -> 
 
 
 def records_of(run: Run, answers: Sequence[Fields], about: Fields) -> list[Record]:
-    """The records of a run; the second is that of restarts."""
+    """The records of a run: the first call's, and that of the restarts if there is one."""
     labels = (run.method, run.method + RESTARTED)
     pairs = zip(labels, answers, strict=False)
     return [run.record({"planner": label, **about, **answer}) for label, answer in pairs]
@@ -350,8 +351,8 @@ class BenchSettings(Settings):
     cluster: Annotated[str, OneOf(CLUSTERS)] | None = None
     """ray: on the cluster that RAY_ADDRESS names; None: this machine."""
     equal_time: bool = False
-    """Whether planners that end early are called again with other seeds until the limit, in rows of their
-    own, so that lengths can be compared at equal time."""
+    """Whether planners that end early are called again with other seeds until the limit, so that lengths can
+    be compared at equal time. Such calls have their own rows in results."""
     cpu_time: bool = False
     """Whether limits and times are CPU time of the planner's process; not on a cluster."""
 
@@ -361,10 +362,10 @@ class BenchSettings(Settings):
         super().__post_init__()
         _ = self.specs
         if len(set(self.problems)) < len(self.problems):
-            raise InputError(f"problems are {', '.join(self.problems)!r}; they must name none twice")
+            raise InputError(f"problems are {', '.join(self.problems)!r}; each may be named only once")
         if self.cpu_time and self.cluster is not None:
             raise InputError(
-                f"cpu_time is True and cluster is {self.cluster}; CPU time is measured here alone"
+                f"cpu_time is True and cluster is {self.cluster}; CPU time is measured only on this machine"
             )
 
     @property
@@ -378,19 +379,19 @@ class BenchSettings(Settings):
         name."""
         specs = {spec.label: spec for spec in map(PlannerSpec.parse, self.planners)}
         if len(specs) < len(self.planners):
-            raise InputError(f"planners is {', '.join(self.planners)!r}; two are called the same")
+            raise InputError(f"planners is {', '.join(self.planners)!r}; two have the same name in results")
         return specs
 
 
 Report = Callable[[str], None]
 Done = Callable[[int, int], None]
-"""Called with the number of calls that are done, and that of all."""
+"""Called with the number of finished calls and the number of all calls."""
 
 
 def run_bench(settings: BenchSettings, report: Report, done: Done) -> int:
     """Make the calls that are missing in the folder; returns how many were made.
 
-    A call that ended by itself with a shorter time limit is not repeated: more time gives the same. Raises
+    A call that ended before a shorter time limit is not repeated, since more time would not change it. Raises
     InputError, before any call, for bad settings or a planner that cannot be loaded, and KeyboardInterrupt on
     Ctrl-C; another call with the same settings continues.
     """
@@ -415,7 +416,7 @@ def run_bench(settings: BenchSettings, report: Report, done: Done) -> int:
 def open_runs(
     records: Mapping[str, Sequence[Record]], cases: Sequence[Case], settings: BenchSettings
 ) -> list[Run]:
-    """The runs that the records, by planner, do not answer."""
+    """The runs that have no record yet; `records` are given by planner."""
     answered: set[tuple[str, str, str, int]] = set()
     for label in settings.specs:
         restarted = {record.key for record in records.get(label + RESTARTED, ())}
@@ -444,7 +445,8 @@ def _check_weights(settings: BenchSettings, sessions: Sequence[Mapping[str, Any]
 
 
 def _note_session(settings: BenchSettings, sessions: JsonLines) -> str:
-    """Append machine, versions and settings of this session to runs.jsonl; its name in records."""
+    """Append machine, versions and settings of this session to runs.jsonl. Returns the session's name, which
+    its records contain."""
     now = datetime.now(UTC)
     session = now.strftime("%Y-%m-%d %H:%M:%S")
     note = {
@@ -471,7 +473,7 @@ def _note_session(settings: BenchSettings, sessions: JsonLines) -> str:
 # Presets
 
 BY_LENGTH = ":objective=length"
-"""Suffix of planners that compete in the length of paths."""
+"""Suffix for planners that shall minimize path length."""
 ROP = ("rop_nontrivial", "rop_dense_nontrivial")
 
 
@@ -547,15 +549,17 @@ def preset_settings(
 ) -> list[BenchSettings]:
     """The settings of a preset, by name, for each of its time limits.
 
-    problems: sets beside those of the preset.
-    count: most problems of each set; None: as the preset says.
+    problems: further problem sets, besides those of the preset.
+    count: largest number of problems of each set; None: the preset's.
     more: further `BenchSettings`.
 
-    Raises InputError for an unknown preset, listing the known.
+    Raises InputError for an unknown preset, and lists the known ones.
     """
     if preset not in PRESETS:
         raise unknown_name("preset", preset, PRESETS)
-    of = PRESETS[preset]
-    fixed = {"count": min(count or of.count, of.count), "equal_time": of.equal_time}
-    sets = (*of.problems, *problems)
-    return [BenchSettings(of.planners, sets, out, time_limit=limit, **fixed, **more) for limit in of.limits]
+    entry = PRESETS[preset]
+    fixed = {"count": min(count or entry.count, entry.count), "equal_time": entry.equal_time}
+    sets = (*entry.problems, *problems)
+    return [
+        BenchSettings(entry.planners, sets, out, time_limit=limit, **fixed, **more) for limit in entry.limits
+    ]

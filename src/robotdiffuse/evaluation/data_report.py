@@ -31,7 +31,7 @@ QUANTITIES = {
     "detour": Column("detour", "", ".3f"),
     "clearance": Column("clearance", "[cm]", ".3f", scale=100.0),
 }
-"""Arrays whose values are shown for all motions, and their columns."""
+"""Arrays shown in tables and plots, with their columns."""
 SPREAD = {"least": 0.0, "5 %": 0.05, "median": 0.5, "95 %": 0.95, "most": 1.0}
 """Quantiles of each quantity over the motions."""
 SAMPLED_MOTIONS = 20_000
@@ -39,11 +39,11 @@ SAMPLED_MOTIONS = 20_000
 SAMPLED_WAYPOINTS = 24
 """Waypoints of each of these motions, spread evenly."""
 ARRAYS_OF_ALL = ("cost", "clearance", "end_clearance", "safety_distance", "line_free", "detour", "family")
-"""Arrays that are kept of all motions."""
+"""Arrays that are read for all motions."""
 ARRAYS_OF_SAMPLE = ("goal_costs", "trajectories")
-"""Arrays that are kept of the sample."""
+"""Arrays that are read for the sampled motions only."""
 ARRAYS_OF_SCENES = ("obstacle_kinds", "obstacle_params")
-"""Arrays that tell the split of a row."""
+"""Arrays from which the split of a row follows."""
 OUTCOMES = ("solved", "unsolved", "refused", "thinned")
 """Outcomes of problems."""
 DETOURS = {
@@ -60,12 +60,13 @@ CLEARANCES = {
 }
 """Classes of motions: those with a free line, by detour, and by clearance [m]."""
 SAFETY_TOLERANCE = 0.002
-"""A motion keeps the safety distance if it comes closer by at most this, as waypoints cut corners [m]."""
+"""A motion may come closer than the safety distance by this much [m], since straight lines between waypoints
+cut corners."""
 
 
 @dataclass(frozen=True, eq=False)
 class DataFigures:
-    """Arrays of a data set, in the order of the shards, and figures of them."""
+    """Arrays of a data set, in the order of its shards, and figures computed from them."""
 
     manifest: Manifest
     shards: int
@@ -92,7 +93,7 @@ class DataFigures:
 
     @property
     def safety_distance(self) -> float:
-        """The safety distance that searches begin with [m]: the largest that any of them kept."""
+        """The safety distance with which searches begin [m]: the largest one in the data."""
         return float(self.all["safety_distance"].max())
 
 

@@ -70,7 +70,7 @@ class Statistics(NamedTuple):
 
     @staticmethod
     def without_data(waypoints: int, dof: int) -> "Statistics":
-        """The statistics of the target `limits`, which other targets have until they are trained."""
+        """Statistics that scale nothing: those of the target `limits`, and of any target before training."""
         white = white_noise_factor(waypoints).astype(np.float32)
         return Statistics(np.ones(dof, np.float32), np.zeros(dof, np.float32), white)
 

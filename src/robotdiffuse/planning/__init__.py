@@ -138,8 +138,7 @@ def load_planner(name: str, settings: object | None = None, weights: str | None 
         name: A name that `robotdiffuse planner list` shows.
         settings: Those that differ from the defaults, such as {"range": 0.5}, or the planner's own dataclass.
         weights: Folder with weights for a learned planner, in place of the bundled ones. With settings, name
-            the
-            folder there instead.
+            the folder there instead.
 
     Raises:
         InputError: For an unknown name, settings of another planner, both settings and weights, weights that
@@ -201,21 +200,17 @@ def plan(
         time_limit: Wall time of the call, without what is loaded once (code, weights, a robot's arrays) [s].
         seed: Seed of all random numbers, at least 0. The same seed gives the same path, unless time runs out.
         until: "first" returns the first verified motion, "converged" searches on until more time hardly
-            improves
-            it, "time_limit" until time runs out. Planners that cannot improve a path return their first.
+            improves it, "time_limit" until time runs out. Planners that cannot improve a path return their
+            first.
         clearance: Distance to obstacles that aorrtc, rrt_connect and robotdiffuse keep wherever start, goal
-            and
-            passages allow it, up to 0.5 m [m]; where they do not, it is smaller, and a note says so. None:
-            the
-            problem's, or 1 cm. Other planners refuse a clearance.
+            and passages allow it, up to 0.5 m [m]; where they do not, it is smaller, and a note says so.
+            None: the problem's, or 1 cm. Other planners refuse a clearance.
         velocity_scaling: Fraction of the velocity limits that the motion uses, from 0.001 to 1.
         acceleration_scaling: Fraction of the acceleration limits that it uses, from 0.001 to 1.
         jerk: Largest jerk of any joint [rad/s³], at least 0.01. None: the robot's jerk limits, or 10 / s
-            times
-            the acceleration limit of joints without one; infinite: no limit.
+            times the acceleration limit of joints without one; infinite: no limit.
         objective: What aorrtc, rrt_connect and robotdiffuse minimize: "time", the motion's duration, or
-            "length"
-            of the path in joint space.
+            "length" of the path in joint space.
         planner: A name that `robotdiffuse planner list` shows. A planner is loaded once for its settings.
         settings: Settings of the planner that differ from the defaults, such as {"range": 0.5}, or its
             dataclass.
@@ -225,8 +220,7 @@ def plan(
 
     Raises:
         InputError: One line, for arguments of the wrong type or out of bounds, unknown planners and settings,
-            and
-            problems that the planner does not support.
+            and problems that the planner does not support.
 
     Examples:
         >>> ball = rd.Sphere([0.5, 0.0, 0.7], 0.2)

@@ -46,10 +46,8 @@ def plan_many(
     """Plan many problems in parallel.
 
     A problem that raises an error, or kills its process, has a result with status ERROR; the others continue.
-    On a
-    cluster, a problem that kills its process ends the call. Each process loads its compiled code before its
-    first
-    problem, outside the time limit. Processes import the main script: without the line
+    On a cluster, a problem that kills its process ends the call. Each process loads its compiled code before
+    its first problem, outside the time limit. Processes import the main script: without the line
     `if __name__ == "__main__":` above what it does, all results have status ERROR.
 
     Args:
@@ -67,8 +65,8 @@ def plan_many(
         An iterator over the results in the order of the problems, each as soon as those before it are there.
 
     Raises:
-        InputError: At once, for an unknown planner, settings or weights that do not fit it, unknown
-            arguments or arguments out of bounds, a number of workers below 1, and an unknown cluster.
+        InputError: At once, for an unknown planner, settings or weights that do not fit it, unknown arguments
+            or arguments out of bounds, a number of workers below 1, and an unknown cluster.
     """
     check_not_importing()
     if isinstance(problems, str) or not isinstance(problems, Iterable):

@@ -13,8 +13,8 @@ from robotdiffuse.problems.goals import PoseGoal, PosesGoal, poses_of
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.inverse_kinematics import (
     InverseKinematicsSettings,
-    beside,
     inverse_kinematics,
+    on_other_arm,
     random_seeds,
 )
 
@@ -114,7 +114,7 @@ def at_pose(
             robot, pose.frame, pose.T_base_frame, count, rng=rng, settings=ROUND, near=start, rest=start
         )
     seeds = random_seeds(robot, robot.lower, robot.upper, SEEDS, rng, start)
-    seeds = np.where(beside(robot, pose.frame), start, seeds)
+    seeds = np.where(on_other_arm(robot, pose.frame), start, seeds)
     seeds[0] = start
     pose_constraints = PathConstraints(replace(problem, constraints=()), [pose], exact)
     return pose_constraints.projected(seeds, TOLERANCE_FRACTION, count)
@@ -138,7 +138,7 @@ def _combined(
     values of one of them."""
     seeds = np.tile(problem.start, (SEEDS if all(len(alone) for alone in solutions) else 0, 1))
     for k in rng.permutation(len(poses)):
-        moving = ~beside(problem.robot, poses[k].frame)
+        moving = ~on_other_arm(problem.robot, poses[k].frame)
         if len(seeds):
             seeds[:, moving] = solutions[k][rng.integers(len(solutions[k]), size=SEEDS)][:, moving]
     return seeds

@@ -62,16 +62,14 @@ def load_problem(file: str | Path, index: int = 0, ignore_joints: bool = False) 
 
     Args:
         file: A .yaml, .yml, .json or .jsonl file. File names in it are relative to its folder. `scene` may
-            name a
-            MoveIt planning scene, and `request` a motion plan request, which replaces start and goal.
+            name a MoveIt planning scene, and `request` a motion plan request, which replaces start and goal.
         index: The problem of a .jsonl file, from 0.
         ignore_joints: Whether joints of MoveIt files that the robot does not have are noted, instead of
             refused.
 
     Raises:
         InputError: One line that names the file and the field, for unknown or missing fields and shapes,
-            values
-            of the wrong type, and what `rd.Problem` does not accept.
+            values of the wrong type, and what `rd.Problem` does not accept.
     """
     file = file_name(file, "problem file")
     check_type("index", index, Integral, "a whole number from 0 on")

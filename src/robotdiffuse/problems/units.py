@@ -14,12 +14,12 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape
 
 MAX_EXTENT = 10.0
-"""Meshes, clouds and views that are larger get a note; so do other shapes of which every edge is longer: a
-floor may be large, but it is flat [m]."""
+"""Meshes, clouds and views larger than this get a note [m]. Other shapes get one only if all their edges are
+longer: a floor may be wide, but it is flat."""
 VIEW_STRIDE = 4
-"""One pixel of so many, along rows and columns, is looked at."""
+"""Every fourth row and column of a depth image is checked."""
 MIN_POINTS_IN_ARM = 10
-"""Fewer points than this within the arm are noise."""
+"""Fewer points than this inside the arm count as noise."""
 ADVICE = "lengths are in meters: divide millimeters by 1000"
 
 
@@ -44,7 +44,7 @@ def unit_notes(problem: Problem) -> tuple[str, ...]:
 
 
 def arm_in_cloud_note(robot: Robot, scene: Scene, q: Configuration) -> str:
-    """A note on the cloud that has most points within the arm at a configuration; "" if none has many."""
+    """A note on the cloud with the most points inside the arm at a configuration; "" if no cloud has many."""
     clouds = [shape for shape in scene.shapes if type(shape) is PointCloud]
     spheres = placed_spheres(robot, q)
     counts = [_points_within(cloud.points, spheres) for cloud in clouds]

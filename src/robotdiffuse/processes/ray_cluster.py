@@ -15,7 +15,7 @@ from robotdiffuse.processes.workers import RERUN_HINT, Results
 CONNECT_TIMEOUT = 5.0
 """Time for a Ray cluster to answer [s]; Ray itself would try for minutes."""
 MAX_RETRIES = 20
-"""How often a call is repeated on another node of a Ray cluster after its node is lost."""
+"""Number of times that a call is repeated on another node of a Ray cluster after the loss of its node."""
 
 
 def on_ray(call: Callable[..., Any], calls: Sequence[tuple]) -> Results:
@@ -53,7 +53,7 @@ def ray_cluster() -> Iterator[Any]:
     Raises InputError if Ray is not installed, if its cluster cannot be reached or fails, if a task raises
     InputError, and if a node lacks this package.
     """
-    # Ray reads these on import. Its messages about a lost node are pages long, except the one about the task
+    # Ray reads these variables on import. The first hides its page-long messages about a lost node.
     os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", "Raylet is terminated")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:

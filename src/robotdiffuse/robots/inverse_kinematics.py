@@ -64,22 +64,25 @@ def inverse_kinematics(
     random values. The result depends only on the arguments and the state of `rng`.
 
     Args:
-        robot: The robot. frame: Name of the link. T_base_frame: Wanted pose of the link [m]. count: Largest
-        number of configurations. rng: Source of the seeds. accept: Called with batches of solutions; returns
-        which to keep, e.g. those free of collision. A rejected
-            solution does not block solutions close to it.
+        robot: The robot.
+        frame: Name of the link.
+        T_base_frame: Pose that the link shall reach [m].
+        count: Largest number of configurations.
+        rng: Source of the seeds.
+        accept: Called with batches of solutions; returns which to keep, e.g. those free of collision. A
+            rejected solution does not block solutions close to it.
         settings: Tolerances and effort.
-        near: First seed: if the pose moves slightly, so does the first solution. Results have their whole
-            turns nearest to it, and are sorted by the distance from it.
-        rest: Values for joints that are on another arm, neither before nor after the link; random without it.
+        near: A configuration, used as the first seed: if the pose moves slightly, so does the first solution.
+            The results are sorted by their distance from it; joints that can turn more than once take the
+            turn nearest to it.
+        rest: Values for joints of another arm, which are neither before nor after the link; None: random.
 
     Returns:
         Configurations, one per row; no rows if the pose was not reached.
 
     Raises:
         InputError: For an unknown link, a link that no planned joint moves, a count below 1, or a matrix that
-        is
-            not a finite rigid transform.
+            is not a finite rigid transform.
     """
     settings = settings or InverseKinematicsSettings()
     if robot.link_frame(frame) == 0:
@@ -132,8 +135,9 @@ def inverse_kinematics(
 
 
 def ik_chain(robot: KinematicTree, frame: str, limit_margin: float) -> tuple[Int[ndarray, "k"], IKChain]:
-    """The joints that move a link, or come after it, and their arrays, within the limits less a margin."""
-    arm = np.flatnonzero(~beside(robot, frame))
+    """The joints that move a link or come after it, and their kinematic chain with limits narrowed by a
+    margin."""
+    arm = np.flatnonzero(~on_other_arm(robot, frame))
     kinds = np.array([KINDS[joint.kind] for joint in robot.planned_joints])[arm]
     lower = robot.lower[arm] + limit_margin
     upper = robot.upper[arm] - limit_margin
@@ -149,8 +153,11 @@ def random_seeds(
     rng: np.random.Generator,
     near: Configuration | None = None,
 ) -> Configurations:
-    """Uniformly random configurations; or, with `near`, random places on the way from there to such ones,
-    with joints that turn within half a turn of it."""
+    """Uniformly random configurations.
+
+    With `near`, random points on the straight lines from `near` to random configurations, whose rotating
+    joints are within half a turn of it.
+    """
     if near is None:
         return rng.uniform(lower, upper, (count, robot.dof))
     reach = np.where(robot.prismatic, np.inf, np.pi)
@@ -161,8 +168,8 @@ def random_seeds(
     return near + rng.uniform(0.0, 1.0, (count, 1)) * (anywhere - near)
 
 
-def beside(robot: KinematicTree, link: str) -> Bool[ndarray, "dof"]:
-    """Which planned joints are neither before nor after a link: those of another arm."""
+def on_other_arm(robot: KinematicTree, link: str) -> Bool[ndarray, "dof"]:
+    """Mask of the planned joints that are neither before nor after a link: those of another arm."""
     frame = robot.link_frame(link)
     before = robot.moved_by[frame]
     downstream = robot.moved_by[1:, frame - 1] if frame else np.ones(robot.dof, bool)

@@ -496,8 +496,7 @@ def show(result: PlanResult | ResultFile, problem: Problem | None = None, height
     """The replay of a result, for the last line of a notebook cell.
 
     Elsewhere in a cell, use `display(rd.show(result))`. Without a motion it shows the start, the goal and the
-    links
-    that collide.
+    links that collide.
 
     Args:
         result: A result of `plan`, or a result file.

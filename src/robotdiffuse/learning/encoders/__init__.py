@@ -31,20 +31,20 @@ class EncoderSettings(Settings, name="encoder"):
     cloud: Count = 512
     """Points of an input cloud."""
     region: VisibleRegion = PANDA_REGION
-    """Points outside are ignored, for the arm does not reach them. Within a large reach whole surfaces
-    count."""
+    """Points outside this region are ignored, since the arm does not reach them. For a robot with a large
+    reach, the region contains whole surfaces."""
 
     def prepared(self, points: Float32[ndarray, "n 3"]) -> Float32[ndarray, "m 3"]:
         """Points within the region in the form that the exported encoder takes [m]."""
         if self.ordered:
             return in_order(points, self.cloud, self.along_curve)
-        # zeros count for nothing; the exported network needs a point, and exactly `cloud` unless any_size
+        # zeros have no effect; the exported network needs at least one point, or exactly `cloud` points
         needed = 1 if self.any_size else self.cloud
         return np.pad(points, ((0, max(needed - len(points), 0)), (0, 0)))
 
 
 ORDER_STEPS = 2**20 - 1
-"""Coordinates are sorted in so many steps from zero to the largest one of a cloud."""
+"""Coordinates are rounded to this many steps between zero and the cloud's largest one before sorting."""
 
 
 CURVE_STEP = 2.0**-16
@@ -57,8 +57,8 @@ SPREADS = (
 
 
 def curve_keys(points: Any) -> Any:
-    """Places of points [..., 3] in meters along the Z-order curve (Morton 1966), as 63-bit integers, of an
-    array or a tensor. Neighbors along the curve are close to each other."""
+    """Positions of points along the Z-order curve (Morton 1966), as 63-bit integers. Neighbors along the
+    curve are close to each other. points: array or tensor [..., 3] [m]."""
     key = 0
     for axis in range(3):
         bits = (points[..., axis] / CURVE_STEP).round() + 2**20
@@ -73,11 +73,11 @@ def curve_keys(points: Any) -> Any:
 def in_order(
     points: Float32[ndarray, "n 3"], count: int, along_curve: bool = False
 ) -> Float32[ndarray, "{count} 3"]:
-    """`count` of the points, sorted by x, then y, then z, or along a curve: thinned evenly, or repeated if
-    there are fewer.
+    """`count` points of a cloud, sorted by x, then y, then z, or along the Z-order curve. A larger cloud is
+    thinned evenly; points of a smaller one are repeated; an empty one gives zeros.
 
-    Sorted by x, y and z, coordinates are rounded to a millionth of the largest one. Zeros without any point.
-    See also `Encoder.arrange`, for batches of tensors.
+    Before sorting by x, y and z, coordinates are rounded to a millionth of the largest one. `Encoder.arrange`
+    does the same for batches of tensors.
     """
     if not len(points):
         return np.zeros((count, 3), np.float32)
@@ -191,9 +191,9 @@ ENCODERS = Registry(
         ),
     },
 )
-"""By the name in settings and checkpoints. Two kinds: "alone" is trained with a loss of its own and then
-frozen; "jointly" is a part of the planner's network, whose loss trains what weights it has, on fresh clouds
-for every batch."""
+"""Encoders by their name in settings and checkpoints. There are two kinds. An encoder of kind "alone" is
+trained with its own loss and then frozen. One of kind "jointly" is a part of the planner's network and is
+trained with its loss, on new clouds in every batch."""
 
 
 def make_encoder(name: str, settings: EncoderSettings | None = None) -> Any:

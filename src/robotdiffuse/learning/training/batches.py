@@ -1,4 +1,5 @@
-"""Training data: planned trajectories with the codes of their scenes, random scenes, and batches of these."""
+"""Training data: planned trajectories with the embeddings (codes) of their scenes, random scenes, and batches
+drawn from both."""
 
 import hashlib
 from collections.abc import Callable
@@ -32,9 +33,9 @@ Trajectories = Float[ndarray, "n waypoints dof"]
 def random_scenes(
     count: int, max_obstacles: int, rng: np.random.Generator, rop: bool = False
 ) -> PackedScenes:
-    """Random scenes for training an encoder. A third each: two large obstacles as in ROP; several of the
-    sizes of dense ROP; any number of boxes and spheres of any size and orientation. rop: only the first
-    third."""
+    """Random scenes for training an encoder, of three kinds in equal parts: two large obstacles as in ROP;
+    several obstacles with the sizes of dense ROP; any number of boxes and spheres of any size and
+    orientation. rop: only scenes of the first kind."""
     family = rng.integers(0, 1 if rop else 3, count)
     number = np.where(family == 0, 2, rng.integers(0, max_obstacles + 1, count))
     shape = (count, max_obstacles)
@@ -106,7 +107,7 @@ class TrajectoryData:
 
 
 _Part = tuple[ndarray, PackedScenes, ndarray, ndarray]
-"""Trajectories, scenes, whether they are trivial, codes."""
+"""Trajectories, their scenes, whether they are trivial, and the codes of the scenes."""
 
 
 def load_data(
@@ -120,9 +121,9 @@ def load_data(
     """The rows of a data set for training and validation, resampled to `waypoints`, with codes of their
     scenes.
 
-    turned_copies: copies of each training row that are turned by random angles, see `datasets.augmentation`;
-        none if the robot's first joint is not vertical.
-    report: called with messages on the progress.
+    turned_copies: copies of each training row that are turned by random angles, see `datasets.rows.turned`;
+        none if the robot's first joint does not rotate about the vertical.
+    report: called with messages about the progress.
 
     Codes are cached beside the shards, in files named by shard and encoder; if the folder cannot be written,
     they are computed at every call. Without an encoder there are none. Raises InputError, naming the file, if
@@ -163,7 +164,7 @@ def _codes(
     encoder: Encoder | None,
     key: str,
 ) -> Float[ndarray, "n code"]:
-    """Codes of scenes, cached in a file named by `key`; without an encoder they have no numbers."""
+    """Codes of scenes, cached in a file named by `key`; empty ones without an encoder."""
     if encoder is None:
         return np.zeros((len(scenes), 0), np.float16)
     cache = folder / "codes" / f"{key}.npy"
@@ -218,7 +219,7 @@ class Batch:
     level: Values
     """t / T"""
     condition: Float[ndarray, "n condition"]
-    """With zeros for z if there are clouds."""
+    """C = [z, start, goal]; z is zero if there are clouds."""
     clouds: Float32[Tensor, "n points 3"] | None
     """Clouds of the scenes [m], for an encoder that is trained jointly."""
     clean: Trajectories
@@ -228,7 +229,7 @@ class Batch:
     weight: Values
     """Weight of the squared error of the output, by level."""
     clean_weight: Values
-    """Weight of the squared error of the clean trajectory that the output stands for."""
+    """Weight of the squared error of the clean trajectory that follows from the output."""
     base: Trajectories
     """`Reference.base` of the trajectories."""
     signal: Float[ndarray, "n 1 1"]
@@ -238,7 +239,8 @@ class Batch:
 
 @dataclass(frozen=True, eq=False)
 class Batches:
-    """Draws training batches: rows of the data at random levels, half of them reversed, which are as good."""
+    """Draws training batches: rows of the data at random noise levels. Half of the trajectories are reversed,
+    since the reverse of a valid trajectory is valid too."""
 
     data: TrajectoryData
     model: MotionNetwork

@@ -239,7 +239,7 @@ class CompletionTask(TrainingTask):
         return Samples(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     def _predicted_voxels(self, samples: Samples) -> Bool[ndarray, "n 56 56 32"]:
-        """The voxels that the network predicts: those within the arm's reach that are not seen to be free."""
+        """The voxels that the network predicts: those within the arm's reach that no view observed free."""
         return ((samples.seen & FREE) == 0) & self._reachable
 
     def _logits_and_truth(

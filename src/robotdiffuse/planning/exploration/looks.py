@@ -226,10 +226,9 @@ def next_view(problem: Problem, result: PlanResult, poses: Sequence[Pose] | None
     """The camera pose that shows most of what a motion may collide with.
 
     It is the pose from which a camera like that of the first view sees most of the probability that the
-    motion
-    sweeps. A voxel counts by the chance that nothing hides it: neither what was seen, nor what is predicted,
-    nor the
-    arm at the start. With a policy other than "predicted", all swept unknown voxels count the same.
+    motion sweeps. A voxel counts by the chance that nothing hides it: neither what was seen, nor what is
+    predicted, nor the arm at the start. With a policy other than "predicted", all swept unknown voxels count
+    the same.
 
     Args:
         problem: A problem with views.

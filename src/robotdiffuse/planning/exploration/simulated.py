@@ -61,7 +61,7 @@ class RecordedAct:
     predicted: Probabilities | None
     """The probability that each voxel is occupied, when the step was chosen; None without the network."""
     T_base_camera: Pose | None
-    """Where the arm's first camera is at the end of a look; None for other steps."""
+    """Pose of the arm's first camera at the end of a step of kind `look`; None for other steps."""
 
     @property
     def trajectory(self) -> Trajectory | None:
@@ -82,7 +82,7 @@ class RecordedExplorer(Explorer):
     """An Explorer that records all views and steps, on the assumption that each step is executed immediately
     and completely.
 
-    The time of a view is when the motion comes closest to the view's configuration.
+    A view gets the time at which the motion is closest to the view's configuration.
     """
 
     def __init__(self, *values: Any, **named: Any) -> None:
@@ -142,7 +142,7 @@ WRIST_OFFSET = (0.04, 0.0, 0.03)
 SIZE = (320, 240)
 FIELD_OF_VIEW = (1.22, 0.96)
 LENS_RADIUS = 0.005
-"""A camera nearer to an obstacle than this sees nothing [m]."""
+"""A camera closer to an obstacle than this gets an image without returns [m]."""
 MIN_DEPTH = 0.15
 """Nearer surfaces give no return [m]."""
 # Position and target of the camera beside the arm [m].

@@ -292,14 +292,12 @@ class Replanner:
 
         Args:
             observation: T_base_obstacle [4, 4], or only the origin of the obstacle's frame [3], by name. An
-                obstacle
-                that is missing may be anywhere that it can have reached since it was last seen.
+                obstacle that is missing may be anywhere that it can have reached since it was last seen.
             now: Time of the observation [s]; it must grow from step to step.
 
         Raises:
             InputError: For unknown names, invalid poses, time that does not grow, and obstacles that were
-                faster than
-                their maximum speed, which voids the guarantee.
+                faster than their maximum speed, which voids the guarantee.
         """
         clock = numbers(now)
         if clock is None or clock.ndim != 0 or not np.isfinite(clock):

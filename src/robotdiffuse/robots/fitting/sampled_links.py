@@ -1,5 +1,5 @@
-"""Distances and contacts of the links of a robot at samples of all its joints; tables for pairs of links
-that pass closer to each other than covering spheres can resolve, as a flange in a fork.
+"""Distances and contacts between the links of a robot at sampled joint values, and tables for pairs of links
+that pass so close to each other that covering spheres overlap, such as a flange in a fork.
 
 The relative pose of two links depends only on the joints between them. If these are one or two joints, a
 table over their values tells where the convex parts of the links are apart. A cell counts as free if the
@@ -32,12 +32,12 @@ BINS = 24
 MAX_STOPPED_RANGE = 5.2
 """A joint with a narrower range has mechanical stops [rad]; limits of wider ranges may be arbitrary."""
 MAX_UNEXPLAINED = 0.25
-"""For the reason `limits`: the largest fraction of the variance of colliding that the joint with the stop
-leaves unexplained."""
+"""For the reason `limits`: largest fraction of the variance of "the links collide" that the joint's value may
+leave unexplained."""
 BALL_MARGIN = 1e-9
 """Margin of bounding and inscribed balls of meshes [m], larger than rounding errors."""
 NEAR_DISTANCE = 0.1
-"""For pairs of links that stay further apart than this, fewer descents are made [m]."""
+"""Pairs of links that stay further apart than this need fewer searches for a collision [m]."""
 
 
 class Links:
@@ -222,7 +222,9 @@ def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float
     separated = np.ones((CELLS,) * len(joints), dtype=bool)
     size = np.full(len(joints), float(CELLS))
     parts = np.indices([len(robot.meshes[link]) for link in pair]).reshape(2, -1)
-    low = np.zeros((parts.shape[1], len(joints)))  # one row per pair of parts and cell where they may touch
+    low = np.zeros(
+        (parts.shape[1], len(joints))
+    )  # a row for each cell and pair of parts that may touch there
     while len(low):
         cells, cell = np.unique(low, axis=0, return_inverse=True)
         q = np.tile(nominal, (len(cells), 1))
@@ -241,7 +243,7 @@ def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float
         parts = parts[:, touch & ~given_up]
         low = np.concatenate([low, low + size * (np.arange(len(size)) == axis)])
         parts = np.tile(parts, 2)
-        if (size <= 1).all():  # one contact decides a cell, so drop its other pairs
+        if (size <= 1).all():  # a cell with one contact is decided: drop its other pairs
             is_open = separated[tuple(_cells(low, size)[0].T)]
             low = low[is_open]
             parts = parts[:, is_open]

@@ -81,17 +81,16 @@ def find_allowed_collisions(
 
     These pairs are allowed, the first four as in MoveIt's Setup Assistant:
 
-    - adjacent: a joint connects the links; links without geometry between them are skipped. - always: the
-    links collide in nearly all samples. - never: the links collide in no sample, and no descent finds a
-    collision. - default: the links collide in the default pose, with the joints between them at zero. If the
-    limits include that
-      pose, the manufacturer considers it safe, so the meshes are too coarse there. Both links must belong to
-      the arm, since the limits do not account for a tool on the last link or for another arm. A link after
-      one held joint belongs to the arm too, if the pair also collides at that joint's held value: planning
-      cannot move it away.
+    - adjacent: a joint connects the links; links without geometry between them are skipped.
+    - always: the links collide in nearly all samples.
+    - never: the links collide in no sample, and no descent finds a collision.
+    - default: the links collide in the default pose, with the joints between them at zero. If the limits
+      include that pose, the manufacturer considers it safe, so the meshes are too coarse there. Both links
+      must belong to the arm, since the limits do not account for a tool on the last link or for another arm.
+      A link after one held joint belongs to the arm too, if the pair also collides at that joint's held
+      value: planning cannot move it away.
     - limits: the links collide in at least a fifth of the samples, up to a stop of one joint between them,
-    which alone
-      determines where. Joints have stops where the links on both sides meet.
+      which alone determines where. Joints have stops where the links on both sides meet.
     - pose: the links overlap slightly in a named pose of the SRDF, such as a tucked one.
 
     Coal tests the meshes unless the covering spheres show that they are apart. For pairs without collisions,

@@ -178,17 +178,15 @@ class UrdfTree:
         or at zero clipped into their limits. Locked mimic joints follow their leaders.
 
         Acceleration and jerk limits, which URDF lacks, are 4 / s times the velocity limit and 10 / s times
-        the acceleration limit (`with_limits` changes them). Collision elements become convex hulls
-        in the link's frame; cylinders, capsules and spheres become polyhedra around them. If no link has
-        collision elements, visual elements are used, with a note.
+        the acceleration limit (`with_limits` changes them). Collision elements become convex hulls in the
+        link's frame; cylinders, capsules and spheres become polyhedra around them. If no link has collision
+        elements, visual elements are used, with a note.
 
         Args:
             base: First link of the robot; by default the root. Links above it are left out, but its pose in
-            the
-                root's frame is kept, for scenes given in that frame.
-            tip: Last link. By default the link where a gripper or a hand begins (see
-                `robots.parsing.srdf`), such as panda_hand for a Panda with fingers, or else the
-                deepest link.
+                the root's frame is kept, for scenes given in that frame.
+            tip: Last link. By default the link where a gripper or a hand begins (see `robots.parsing.srdf`),
+                such as panda_hand for a Panda with fingers, or else the deepest link.
             locked: Values of locked joints by name [rad] or [m].
             group: A group of the SRDF, the common prefix of an arm's joint names, or "both" or "all". A group
                 of several chains, such as two arms, is one robot with several tips. Without group and tip,
