@@ -36,8 +36,8 @@ def test_moments_show_what_was_known_before_them() -> None:
     assert [moment.number for moment in found] == list(range(1, len(explorer.acts) + 1))
     for moment in found:
         assert moment.known.act < moment.number - 1 or moment.known.act == -1
-        shown = shown_voxels(moment.known, moment.act, known)
-        assert not (shown.occupied & known).any() and not (shown.predicted & ~shown.unknown).any()
+        (occupied, _), (predicted, _), (unknown, _) = shown_voxels(moment.known, moment.act, known)
+        assert not (occupied & known).any() and not (predicted & ~unknown).any()
         assert title(moment.act).startswith(
             {"done": "at the goal"}.get(moment.act.step.kind, moment.act.step.kind)
         )

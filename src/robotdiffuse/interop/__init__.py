@@ -38,8 +38,8 @@ READERS = Registry(
             "robotdiffuse.interop.recorded_motion:read_yaml", "ROS JointTrajectory, MoveIt RobotTrajectory"
         ),
         ".yml": Entry("robotdiffuse.interop.recorded_motion:read_yaml", "the same"),
-        ".mcap": Entry("robotdiffuse.interop.ros2:read_mcap", "ROS 2 messages"),
-        ".rosbag2": Entry("robotdiffuse.interop.ros2:read_bag", "a ROS 2 bag (a folder)"),
+        ".mcap": Entry("robotdiffuse.interop.ros2:read_recording", "ROS 2 messages"),
+        ".rosbag2": Entry("robotdiffuse.interop.ros2:read_recording", "a ROS 2 bag (a folder)"),
     },
 )
 """Functions of a file and an optional topic, by the ending of the file."""

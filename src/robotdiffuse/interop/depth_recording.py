@@ -10,9 +10,7 @@ configuration is in sensor_msgs/JointState. The bags of librealsense have images
 
 import io
 from bisect import bisect_left, insort
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from functools import partial
+from collections.abc import Iterator, Mapping, Sequence
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -24,22 +22,16 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
 
 from robotdiffuse.core.errors import InputError, reading
-from robotdiffuse.core.input_files import input_file
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
 from robotdiffuse.core.types import Configuration, JointValues, Pose
 from robotdiffuse.interop.ros2 import (
     JOINT_STATE,
     McapWriter,
-    bag_messages,
-    bag_topics,
-    check_chunks,
+    Recording,
     header_seconds,
-    make_reader,
-    messages_in,
-    opened_bag,
+    opened_recording,
     to_plain,
-    topics_in,
 )
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.robots.robot import Robot
@@ -160,39 +152,21 @@ def read_depth_views(
             transforms within 0.1 s, and for distorted or compressed images.
     """
     path = Path(file)
-    with reading(file), _opened(path) as (kinds, messages_in):
-        yield from _read(path, kinds, messages_in, robot, topics, base or robot.base, T_base_camera)
-
-
-Messages = Callable[[Sequence[str]], Iterator[tuple[str, int, Any]]]
-"""Topic, log time [ns] and message of all messages on some topics, in the order of their log times."""
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[tuple[dict[str, str], Messages]]:
-    """The types of the messages of a recording by topic, and what reads them."""
     if path.suffix == ".db3":
         raise InputError(f"{path} is a part of a ROS 2 bag: give the folder that holds it and metadata.yaml")
-    if path.is_dir() or path.suffix == ".bag":
-        with opened_bag(path) as bag:
-            yield bag_topics(bag), partial(bag_messages, bag)
-        return
-    with input_file(path, largest=MAX_SIZE).open("rb") as stream:
-        reader = make_reader(stream)
-        check_chunks(stream, reader, str(path))
-        schemas = topics_in(reader, str(path))
-        yield {topic: one.name for topic, one in schemas.items()}, partial(messages_in, reader, schemas)
+    with reading(file), opened_recording(path, MAX_SIZE) as recording:
+        yield from _read(path, recording, robot, topics, base or robot.base, T_base_camera)
 
 
 def _read(
     path: Path,
-    kinds: dict[str, str],
-    messages_in: Messages,
+    recording: Recording,
     robot: Robot,
     topics: Sequence[str] | None,
     base: str,
     T_base_camera: ArrayLike | None,
 ) -> Iterator[StampedView]:
+    kinds = recording.kinds
     images = _image_topics(kinds, topics)
     states = _States(robot)
     transforms = TransformHistory()
@@ -201,7 +175,7 @@ def _read(
     has_states = JOINT_STATE in kinds.values()
     other_topics = [name for name, kind in kinds.items() if kind in (JOINT_STATE, TRANSFORMS, CAMERA_INFO)]
     other_topics += [name for name in kinds if _is_unit(name)]
-    for topic, at, message in messages_in(other_topics):
+    for topic, at, message in recording.messages(other_topics):
         kind = kinds[topic]
         if kind == CAMERA_INFO:  # in ROS 1, K, D and P
             infos.setdefault(_folder(topic), {k.lower(): value for k, value in to_plain(message).items()})
@@ -215,7 +189,7 @@ def _read(
     has_images = False
     has_views = False
     reason: InputError | None = None
-    for topic, at, message in messages_in(images):
+    for topic, at, message in recording.messages(images):
         if message.encoding not in ENCODINGS and topics is None:
             continue
         has_images = True

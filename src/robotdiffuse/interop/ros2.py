@@ -18,12 +18,12 @@ from dataclasses import fields, is_dataclass
 from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from robotdiffuse.core.errors import InputError, OutputError, needs, reading, shown
-from robotdiffuse.core.input_files import MEGABYTE, input_file, parse_json, read_yaml
+from robotdiffuse.core.input_files import MAX_FILE_SIZE, MEGABYTE, input_file, parse_json, read_yaml
 from robotdiffuse.core.output_files import write_atomically, write_error
 from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.core.types import Pose, Trajectory
@@ -48,7 +48,6 @@ with needs("mcap, mcap-protobuf-support, foxglove-schemas-protobuf and rosbags",
     from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud as PointCloudMessage
     from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
     from mcap.reader import McapReader, make_reader
-    from mcap.records import Schema
     from mcap.writer import Writer
     from mcap_protobuf.schema import register_schema
     from rosbags.highlevel import AnyReader
@@ -400,31 +399,6 @@ def problem_in(file: Path) -> Problem | None:
     return problem_from_record(record)
 
 
-def read_mcap(file: Path, topic: str | None = None) -> RecordedMotion:
-    """Read the motion from the ROS 2 messages of a topic; see `choose_topic`."""
-    path = input_file(file)
-    with reading(file), path.open("rb") as stream:
-        reader = make_reader(stream)
-        check_chunks(stream, reader, str(file))
-        ros = topics_in(reader, str(file))
-        name = choose_topic({topic: schema.name for topic, schema in ros.items()}, topic, str(file))
-        messages = [(at, message) for _, at, message in messages_in(reader, ros, [name], MAX_UNPACKED)]
-        return motion_from_messages(ros[name].name, messages, f"{file}, {name}")
-
-
-def topics_in(reader: McapReader, where: str) -> dict[str, Schema]:
-    """The topics with ROS 2 messages, and their types. Raises InputError, naming `where`, for a file without
-    a summary."""
-    summary = reader.get_summary()
-    if summary is None:
-        raise InputError(f"{where} is damaged: it ends before its summary")
-    return {
-        channel.topic: summary.schemas[channel.schema_id]
-        for channel in summary.channels.values()
-        if channel.message_encoding == "cdr" and channel.schema_id in summary.schemas
-    }
-
-
 def check_chunks(stream: io.BufferedReader, reader: McapReader, where: str) -> None:
     """Raise InputError, naming `where`, for a file with a chunk that unpacks to more than MAX_UNPACKED bytes;
     small files may unpack to gigabytes."""
@@ -442,26 +416,6 @@ def check_chunks(stream: io.BufferedReader, reader: McapReader, where: str) -> N
             size = max(size, lz4.frame.get_frame_info(start)["content_size"])
         if size > MAX_UNPACKED:
             raise InputError(f"{where} has a chunk of {size:,} bytes; {MAX_UNPACKED:,} are allowed")
-
-
-def messages_in(
-    reader: McapReader, kinds: Mapping[str, Schema], topics: Sequence[str], allowed: int = sys.maxsize
-) -> Iterator[tuple[str, int, Any]]:
-    """Topic, log time [ns] and message of all messages on some topics, in the order of their log times.
-
-    kinds: see `topics_in`.
-    allowed: size of all the messages together [bytes].
-    """
-    if not topics:
-        return
-    stores = {topic: _typestore(kinds[topic]) for topic in topics}
-    for _, channel, record in reader.iter_messages(topics=topics):
-        allowed -= len(record.data)
-        if allowed < 0:
-            raise InputError(f"the messages of {', '.join(topics)} take more than {MAX_UNPACKED:,} bytes")
-        store = stores[channel.topic]
-        kind = kinds[channel.topic].name
-        yield channel.topic, record.log_time, store.deserialize_cdr(record.data, kind)
 
 
 def _typestore(schema: Any) -> Any:
@@ -522,17 +476,8 @@ def _replace(file: Path, new: Path, old: Path) -> None:
         raise
 
 
-def read_bag(file: Path, topic: str | None = None) -> RecordedMotion:
-    """Read the motion on a topic; see `choose_topic`."""
-    with reading(file), opened_bag(file) as reader:
-        topics = bag_topics(reader)
-        name = choose_topic(topics, topic, str(file))
-        messages = [(at, message) for _, at, message in bag_messages(reader, [name], MAX_UNPACKED)]
-        return motion_from_messages(topics[name], messages, f"{file}, {name}")
-
-
 @contextmanager
-def opened_bag(file: Path) -> Iterator[AnyReader]:
+def _opened_bag(file: Path) -> Iterator[AnyReader]:
     """A reader of a ROS 1 bag or of the folder of a ROS 2 bag, whose parts unpack to MAX_UNPACKED bytes at
     most."""
     if file.is_dir():
@@ -563,23 +508,6 @@ def _bounded(decompressor: Callable[[bytes], bytes], packed: bytes) -> bytes:
     return content
 
 
-def bag_topics(reader: AnyReader) -> dict[str, str]:
-    """The topics and the types of their messages."""
-    return {connection.topic: connection.msgtype for connection in reader.connections}
-
-
-def bag_messages(
-    reader: AnyReader, topics: Sequence[str], allowed: int = sys.maxsize
-) -> Iterator[tuple[str, int, Any]]:
-    """As `messages_in`."""
-    chosen = [connection for connection in reader.connections if connection.topic in topics]
-    for connection, at, raw in reader.messages(chosen) if chosen else ():
-        allowed -= len(raw)
-        if allowed < 0:
-            raise InputError(f"the messages of {', '.join(topics)} take more than {MAX_UNPACKED:,} bytes")
-        yield connection.topic, at, reader.deserialize(raw, connection.msgtype)
-
-
 def _check_unpacking(bag: Path) -> None:
     """Refuse what may unpack to gigabytes."""
     information = read_yaml(bag / "metadata.yaml")["rosbag2_bagfile_information"]
@@ -588,3 +516,72 @@ def _check_unpacking(bag: Path) -> None:
     for part in bag.glob("*.mcap"):
         with part.open("rb") as stream:
             check_chunks(stream, make_reader(stream), str(part))
+
+
+# Motions in MCAP files and bags
+
+Record = tuple[str, int, bytes, Callable[[bytes], Any]]
+"""Topic and log time [ns] of a message, its bytes, and what makes a message of them."""
+
+
+class Recording(NamedTuple):
+    """An open MCAP file or bag."""
+
+    kinds: dict[str, str]
+    """The types of the ROS messages by topic."""
+    records: Callable[[Sequence[str]], Iterator[Record]]
+    """The messages on some topics, in the order of their log times."""
+
+    def messages(self, topics: Sequence[str], allowed: int = sys.maxsize) -> Iterator[tuple[str, int, Any]]:
+        """Topic, log time [ns] and message of all messages on some topics, in the order of their log times.
+
+        allowed: size of all the messages together [bytes].
+        """
+        for topic, at, content, read in self.records(topics) if topics else ():
+            allowed -= len(content)
+            if allowed < 0:
+                raise InputError(f"the messages of {', '.join(topics)} take more than {MAX_UNPACKED:,} bytes")
+            yield topic, at, read(content)
+
+
+@contextmanager
+def opened_recording(file: Path, largest: int = MAX_FILE_SIZE) -> Iterator[Recording]:
+    """An MCAP file of at most `largest` bytes, a ROS 1 bag, or the folder of a ROS 2 bag."""
+    if file.is_dir() or file.suffix == ".bag":
+        with _opened_bag(file) as bag:
+
+            def of_bag(topics: Sequence[str]) -> Iterator[Record]:
+                for of, at, raw in bag.messages([one for one in bag.connections if one.topic in topics]):
+                    yield of.topic, at, raw, partial(bag.deserialize, typ=of.msgtype)
+
+            yield Recording({one.topic: one.msgtype for one in bag.connections}, of_bag)
+        return
+    with input_file(file, largest=largest).open("rb") as stream:
+        reader = make_reader(stream)
+        check_chunks(stream, reader, str(file))
+        summary = reader.get_summary()
+        if summary is None:
+            raise InputError(f"{file} is damaged: it ends before its summary")
+        schemas = {
+            channel.topic: summary.schemas[channel.schema_id]
+            for channel in summary.channels.values()
+            if channel.message_encoding == "cdr" and channel.schema_id in summary.schemas
+        }
+
+        kinds = {topic: one.name for topic, one in schemas.items()}
+
+        def of_file(topics: Sequence[str]) -> Iterator[Record]:
+            stores = {topic: _typestore(schemas[topic]) for topic in topics}
+            for _, channel, one in reader.iter_messages(topics=topics):
+                read = partial(stores[channel.topic].deserialize_cdr, typename=kinds[channel.topic])
+                yield channel.topic, one.log_time, one.data, read
+
+        yield Recording(kinds, of_file)
+
+
+def read_recording(file: Path, topic: str | None = None) -> RecordedMotion:
+    """Read the motion on a topic of an MCAP file or bag; see `choose_topic`."""
+    with reading(file), opened_recording(file) as recording:
+        name = choose_topic(recording.kinds, topic, str(file))
+        messages = [(at, message) for _, at, message in recording.messages([name], MAX_UNPACKED)]
+        return motion_from_messages(recording.kinds[name], messages, f"{file}, {name}")

@@ -71,12 +71,18 @@ Voxels = Bool[ndarray, "nx ny nz"]
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """An act, and what was known when it was chosen."""
+    """An act, and what was known when it was chosen and during its motion."""
 
     number: int
     """From 1 on."""
     act: RecordedAct
-    known: RecordedView
+    views: list[RecordedView]
+    """The last view before the act, then those that were taken during its motion."""
+
+    @property
+    def known(self) -> RecordedView:
+        """What was known when the act was chosen."""
+        return self.views[0]
 
 
 def shares(known: RecordedView) -> list[tuple[str, str]]:
@@ -90,8 +96,9 @@ def moments(explorer: RecordedExplorer) -> list[Moment]:
     recorded = []
     for number, act in enumerate(explorer.acts):
         before = [view for view in explorer.views if view.act < number]
+        during = [view for view in explorer.views if view.act == number]
         if before:
-            recorded.append(Moment(number + 1, act, before[-1]))
+            recorded.append(Moment(number + 1, act, [before[-1], *during]))
     return recorded
 
 
@@ -103,33 +110,17 @@ def title(act: RecordedAct) -> str:
     return f"{name} ({duration:.1f} s)" if duration else name
 
 
-@dataclass(frozen=True, eq=False)
-class ShownVoxels:
-    """Sets of voxels that are shown, without those in the scene that is known anyway."""
-
-    occupied: Voxels
-    predicted: Voxels
-    """Unknown, and probably occupied."""
-    unknown: Voxels
-    free: Voxels
-
-    @property
-    def layers(self) -> tuple[tuple[Voxels, Voxels], ...]:
-        """The voxels inside and outside of the occupied, predicted and unknown layer; the faces between
-        them are shown."""
-        return (
-            (self.occupied, ~self.occupied),
-            (self.predicted, ~self.predicted),
-            (self.unknown, self.free),
-        )
-
-
-def shown_voxels(view: RecordedView, act: RecordedAct | None, in_known_scene: Voxels) -> ShownVoxels:
-    """What is shown after a view, with the prediction of an act."""
+def shown_voxels(
+    view: RecordedView, act: RecordedAct | None, in_known_scene: Voxels
+) -> tuple[tuple[Voxels, Voxels], ...]:
+    """What is shown after a view, with the prediction of an act, without the scene that is known anyway: the
+    voxels inside and outside of the occupied, the predicted (unknown, and probably occupied) and the unknown
+    layer; the faces between them are shown."""
+    occupied = view.occupied & ~in_known_scene
     unknown = view.unknown & ~in_known_scene
     probability = None if act is None else act.predicted
     predicted = np.zeros_like(unknown) if probability is None else unknown & (probability > LIKELY)
-    return ShownVoxels(view.occupied & ~in_known_scene, predicted, unknown, view.free)
+    return (occupied, ~occupied), (predicted, ~predicted), (unknown, view.free)
 
 
 def in_known_scene(explorer: RecordedExplorer) -> Voxels:
@@ -233,10 +224,9 @@ def _tile(
 ) -> Image.Image:
     robot = explorer.robot
     act = moment.act
-    voxels = shown_voxels(moment.known, act, known)
+    layers = shown_voxels(moment.known, act, known)
     occupied, predicted, unknown = (
-        faces_surface(*pair, color)
-        for pair, color in zip(voxels.layers, (OBSERVED, WHITE, WHITE), strict=True)
+        faces_surface(*pair, color) for pair, color in zip(layers, (OBSERVED, WHITE, WHITE), strict=True)
     )
     clear = [
         ClearSurface(unknown, linear(UNKNOWN), UNKNOWN_ALPHA),
@@ -317,14 +307,12 @@ def _known(explorer: RecordedExplorer) -> list[dict[str, Any]]:
     known_scene = in_known_scene(explorer)
     before = [np.zeros(0, np.int64) for _ in LAYERS]
     states = []
-    for number, act in enumerate(explorer.acts):
-        views = [view for view in explorer.views if view.act == number]
-        earlier = [view for view in explorer.views if view.act < number]
-        times = [_page_time(view.time, number) for view in views]
-        for time, view in zip(
-            (_page_time(act.begins, number - 1), *times), (*earlier[-1:], *views), strict=True
-        ):
-            layers = shown_voxels(view, act, known_scene).layers
+    for moment in moments(explorer):
+        act = moment.act
+        for i, view in enumerate(moment.views):
+            number = moment.number - 1
+            time = _page_time(view.time, number) if i else _page_time(act.begins, number - 1)
+            layers = shown_voxels(view, act, known_scene)
             after = [faces_between(*pair)[0] for pair in layers]
             changed = [np.setxor1d(a, b) for a, b in zip(before, after, strict=True)]
             states.append({"time": time, "layers": [_packed(faces) for faces in changed]})

@@ -45,6 +45,7 @@ from robotdiffuse.visualization.exploration import (
     faces_surface,
     frustum,
     in_known_scene,
+    moments,
     shares,
     shown_voxels,
     title,
@@ -220,11 +221,9 @@ class ExplorationSession:
 
     def _execute(self, run: int, explorer: RecordedExplorer) -> None:
         """Execute the last step, in which the views are those that were taken during its motion."""
-        act = explorer.acts[-1]
-        number = len(explorer.acts) - 1
-        before = [view for view in explorer.views if view.act < number]
-        views = [*before[-1:], *(view for view in explorer.views if view.act == number)]
-        self._update(run, phase=MOVING, acts=tuple(explorer.acts), known=views[0])
+        moment = moments(explorer)[-1]
+        act = moment.act
+        self._update(run, phase=MOVING, acts=tuple(explorer.acts), known=moment.known)
         at = -READING_TIME
         last = time.perf_counter()
         while act.trajectory is not None and at < act.duration:
@@ -236,7 +235,7 @@ class ExplorationSession:
             at = min(at + speed * (now - last), act.duration)
             last = now
             if at > 0:
-                taken_views = [view for view in views if view.time <= act.begins + at]
+                taken_views = [view for view in moment.views if view.time <= act.begins + at]
                 q = act.trajectory.at(at).positions
                 self._update(run, configuration=q, known=taken_views[-1])
 
@@ -373,7 +372,7 @@ class ExplorationPage(LivePage):
         """Show what is known, with the prediction of a step, and what the look under way is to show."""
         if known is None:
             return
-        occupied, predicted, unknown = shown_voxels(known, act, self._known_scene).layers
+        occupied, predicted, unknown = shown_voxels(known, act, self._known_scene)
         to_view = None if under_way is None else under_way.step.wanted
         to_view = np.zeros_like(known.free) if to_view is None else to_view & known.unknown
         nothing = np.zeros_like(known.free), known.free
