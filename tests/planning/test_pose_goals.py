@@ -1,7 +1,7 @@
 """Poses as goals: the nearest configuration, tolerances of arms of few joints, several goals; a pose for each
 of several links: configurations that bring all of them there, verdicts, files."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -321,16 +321,23 @@ def many_grasps() -> tuple[rd.Problem, ndarray]:
 
 def test_of_several_goals_each_is_tried_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocked goals took the whole effort of inverse kinematics before the search began."""
-    rounds = []
-    at_pose = pose_goals.at_pose
-    monkeypatch.setattr(pose_goals, "at_pose", lambda *given: rounds.append(given[1]) or at_pose(*given))
+    tried = []
+    each_pose = pose_goals.each_pose
+
+    def counted(*given: Any) -> Iterator[ndarray]:
+        for T, configurations in zip(given[2], each_pose(*given), strict=True):
+            tried.append(T)
+            yield configurations
+
+    monkeypatch.setattr(pose_goals, "each_pose", counted)
+    monkeypatch.setattr(pose_goals, "at_pose", lambda *_: pytest.fail("a goal is tried again"))
     problem, q_free = many_grasps()
     assert isinstance(problem.goal, rd.AnyGoal) and len(problem.goal.goals) == 20 and len(q_free) == 10
     result = rd.plan(problem, 20.0)
     assert result.path is not None and result.goal_index is not None and result.goal_index >= 10
     reached = problem.goal.goals[result.goal_index]
     assert goal_error(problem.robot, reached, result.path.positions[-1]) is None
-    assert rounds == list(problem.goal.goals)
+    assert len(tried) == 20
     again = rd.plan(problem, 20.0)
     assert again.path is not None and np.array_equal(again.path.positions, result.path.positions)
 
@@ -338,15 +345,16 @@ def test_of_several_goals_each_is_tried_once(monkeypatch: pytest.MonkeyPatch) ->
 def test_of_several_goals_no_more_are_tried_late(monkeypatch: pytest.MonkeyPatch) -> None:
     """After half of the time limit the search begins with what is free."""
     tried = []
-    at_pose = pose_goals.at_pose
+    each_pose = pose_goals.each_pose
 
-    def slow(*given: Any) -> ndarray:
-        tried.append(given[1])
-        clock[0] += 0.1
-        return at_pose(*given)
+    def slow(*given: Any) -> Iterator[ndarray]:
+        for configurations in each_pose(*given):
+            tried.append(configurations)
+            clock[0] += 0.1
+            yield configurations
 
     clock = [0.0]
-    monkeypatch.setattr(pose_goals, "at_pose", slow)
+    monkeypatch.setattr(pose_goals, "each_pose", slow)
     monkeypatch.setattr(context.time, "perf_counter", lambda: clock[0])
     problem, _ = many_grasps()
     assert isinstance(problem.goal, rd.AnyGoal)

@@ -21,7 +21,8 @@ MAX_DURATION = 1e6
 """Longest motion in files and requests [s]."""
 RIGID_SLACK = 1e-4
 """Largest deviation of any entry: of the rotation from orthonormal, of the last row from 0 0 0 1."""
-LAST_ROW = (0.0, 0.0, 0.0, 1.0)
+IDENTITY = np.eye(4)
+IDENTITY.setflags(write=False)
 
 T = TypeVar("T")
 
@@ -204,10 +205,10 @@ def rigid_transform(what: str, value: object, slack: float = RIGID_SLACK) -> nda
             f"{what} is {shown(value)}; it must be 4 x 4 finite numbers within ±{MAX_COORDINATE:g}"
         )
     rotation = T[:3, :3]
-    off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(T[3] - LAST_ROW).max())
+    off = max(np.abs(rotation @ rotation.T - IDENTITY[:3, :3]).max(), np.abs(T[3] - IDENTITY[3]).max())
     if off > slack or np.linalg.det(rotation) < 0:
         raise InputError(f"{what} is {shown(T)}; it must be a rotation and a translation over a row 0 0 0 1")
-    T[3] = LAST_ROW
+    T[3] = IDENTITY[3]
     return T
 
 

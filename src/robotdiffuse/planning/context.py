@@ -52,6 +52,8 @@ TOLERANCE_FRACTION = 0.95
 """Planners keep this part of each tolerance of path constraints."""
 MAX_RESERVED_FRACTION = 0.5
 """Largest part of the time limit that is reserved for validation and timing."""
+RESERVED_FACTOR = 1.5
+"""Time that is reserved for validating and timing a path, by the longest that the call has taken for one."""
 EXPECTED_VALIDATION_TIME = 0.003
 """Time that is reserved for validating and timing a path before the call has done so once [s]."""
 
@@ -260,7 +262,7 @@ class PlanningContext:
         except OutOfTimeError as error:
             self._ended = Status.TIMEOUT, self._too_short(error)
             return None
-        self._reserved = max(self._reserved, self.elapsed - began)
+        self._reserved = max(self._reserved, RESERVED_FACTOR * (self.elapsed - began))
         return result
 
     def _finished(

@@ -1,6 +1,6 @@
 """Goal configurations for poses of one link, or of several links at once: those nearest to the start."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from robotdiffuse.problems.goals import PoseGoal, PosesGoal, poses_of
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.inverse_kinematics import (
     InverseKinematicsSettings,
+    each_pose,
     inverse_kinematics,
     on_other_arm,
     random_seeds,
@@ -118,6 +119,20 @@ def at_pose(
     seeds[0] = start
     pose_constraints = PathConstraints(replace(problem, constraints=()), [pose], exact)
     return pose_constraints.projected(seeds, TOLERANCE_FRACTION, count)
+
+
+def at_poses(
+    problem: Problem, poses: Sequence[PoseGoal], count: int, rng: np.random.Generator
+) -> Iterator[Configurations]:
+    """At most `count` configurations for each of many poses of a link without tolerances, from the same
+    seeds, of which the first is the start."""
+    robot = problem.robot
+    start = problem.start
+    seeds = random_seeds(robot, robot.lower, robot.upper, SEEDS, rng, start)
+    seeds[0] = start
+    targets = [pose.T_base_frame for pose in poses]
+    for found in each_pose(robot, poses[0].frame, targets, count, seeds, start):
+        yield robot.nearest_turns(found, start)
 
 
 def _within(pose: PoseGoal, part: float) -> PoseGoal:

@@ -35,7 +35,7 @@ NEAR_POSE_FRACTIONS = (0.1, 0.3, 0.9)
 NEAR_POSE_ROUNDS = 2
 FIRST_TRY_COUNT = 3
 MANY_GOALS = 8
-"""With at least so many goals, the first try for each leaves configurations where they are found."""
+"""The first try for at least so many poses of a link is one from the same seeds for all."""
 # Number of configurations of a pose whose exact meshes are checked where the covering spheres collide, and
 # number of those that become goals.
 MAX_EXACT_GOALS = 20
@@ -273,11 +273,25 @@ def _any_goals(
     """The free configurations of several goals, by one try for each; if none is free, by more for each."""
     until = GOAL_TIME_FRACTION * context.request.time_limit
     free = list[ndarray]()
-    for goal in goals:
-        if free and context.elapsed > until:
-            break
-        result = _first_try(context, goal, checker, len(goals) >= MANY_GOALS)
-        free += [result] if len(result) else []
+    exact = [goal for goal in goals if isinstance(goal, PoseGoal) and not goal.tolerant]
+    many = MANY_GOALS <= len(goals) == len(exact) and len({goal.frame for goal in exact}) == 1
+    if many and not context.problem.constraints:
+        found = list[ndarray]()
+        for configurations in _pose_goals_module().at_poses(
+            context.problem, exact, FIRST_TRY_COUNT, context.rng
+        ):
+            found.append(configurations)
+            if context.elapsed > until and checker.free(np.concatenate(found)).any():
+                break
+        every = np.concatenate(found)
+        every = every[checker.free(every)]
+        free = [_with_turns(context, every)] if len(every) else []
+    else:
+        for goal in goals:
+            if free and context.elapsed > until:
+                break
+            result = _first_try(context, goal, checker)
+            free += [result] if len(result) else []
     if free:
         return np.concatenate(free)
     failures = list[PlanResult]()
@@ -296,26 +310,15 @@ def _any_goals(
     )
 
 
-def _first_try(
-    context: PlanningContext, goal: OneGoal, checker: CollisionChecker, many: bool
-) -> Configurations:
-    """Free configurations of one of several goals, by little work; of one of many, by less."""
+def _first_try(context: PlanningContext, goal: OneGoal, checker: CollisionChecker) -> Configurations:
+    """Free configurations of one of several goals, by little work."""
     if isinstance(goal, JointGoal):
         constraints = context.validator.constraints
-        collision_free = checker.free(goal.positions)
-        return goal.positions[
-            collision_free if constraints is None else collision_free & constraints.satisfied(goal.positions)
-        ]
-    pose_goals = _pose_goals_module()
-    problem = context.problem
-    if many and isinstance(goal, PoseGoal) and not problem.constraints:
-        found = pose_goals.at_pose(problem, goal, FIRST_TRY_COUNT, context.rng, pose_goals.EXACT)
-        found = problem.robot.nearest_turns(found, problem.start)
-        configurations = found[checker.free(found)] if len(found) else found
-    else:
-        configurations = pose_goals.pose_configurations(
-            problem, goal, context.rng, checker.free, count=FIRST_TRY_COUNT, rounds=1
-        )
+        free = checker.free(goal.positions)
+        return goal.positions[free if constraints is None else free & constraints.satisfied(goal.positions)]
+    configurations = _pose_goals_module().pose_configurations(
+        context.problem, goal, context.rng, checker.free, count=FIRST_TRY_COUNT, rounds=1
+    )
     return _with_turns(context, configurations) if len(configurations) else configurations
 
 

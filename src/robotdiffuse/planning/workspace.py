@@ -205,7 +205,12 @@ class Workspace:
         return self._problem(self.scene).clearance_at(q)
 
     def plan(
-        self, goal: Any, start: AnyConfiguration, constraints: Sequence[Constraint] = (), **request: Any
+        self,
+        goal: Any,
+        start: AnyConfiguration,
+        constraints: Sequence[Constraint] = (),
+        time_limit: float = 1.0,
+        **request: Any,
     ) -> PlanResult:
         """Plan a motion among the obstacles as they are now.
 
@@ -214,13 +219,16 @@ class Workspace:
                 be reached; or a goal as of `rd.Problem` in the frame of the base.
             start: Start configuration [dof], values by joint, or the name of a pose.
             constraints: Path constraints, in the frame of the base.
-            request: Arguments of `rd.plan`: time_limit, seed, until, ...
+            time_limit: Wall time of the call, with what it takes to read many goals [s].
+            request: Further arguments of `rd.plan`: seed, until, ...
 
         Returns:
             A result with a verified motion, or with a status and a reason why there is none.
         """
+        began = clock()
         problem = Problem(self.robot, self.scene, start, self._goal(goal), constraints=constraints)
-        return plan(problem, **request)
+        left = min(time_limit, max(time_limit - (clock() - began), MIN_TIME_LIMIT))
+        return plan(problem, left, **request)
 
     def plan_steps(
         self, steps: Sequence[Step], start: AnyConfiguration, time_limit: float = 10.0, **request: Any

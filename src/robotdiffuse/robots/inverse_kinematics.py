@@ -1,6 +1,6 @@
 """Inverse kinematics: several distinct configurations for a pose of a link."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +29,9 @@ MAX_ITERATIONS = 60
 """Damped Newton steps per seed."""
 ROTATION_WEIGHT = 0.3
 """Weight of orientation errors against position errors [m/rad]."""
+PARAMETERS = IKParameters(
+    False, ROTATION_WEIGHT, POSITION_TOLERANCE, ROTATION_TOLERANCE, MAX_ITERATIONS, MIN_DISTANCE
+)
 
 
 @dataclass(frozen=True)
@@ -85,28 +88,16 @@ def inverse_kinematics(
             is not a finite rigid transform.
     """
     settings = settings or InverseKinematicsSettings()
-    if robot.link_frame(frame) == 0:
-        raise InputError(f"inverse kinematics: no planned joint moves the link {shown(frame)}")
     if count < 1:
         raise InputError(f"inverse kinematics: count is {count}; it must be at least 1")
     target = rigid_transform("inverse kinematics: T_base_frame", T_base_frame)
     arm, chain = ik_chain(robot, frame, LIMIT_MARGIN)
     accepted = np.zeros((0, robot.dof))
-    joints = chain.length
-    travel = np.maximum(abs(chain.lower), abs(chain.upper))[chain.kinds == PRISMATIC].sum()
-    reach = np.linalg.norm(chain.offsets[1:joints, :3, 3], axis=1).sum() + np.linalg.norm(chain.tool[:3, 3])
-    if np.linalg.norm(target[:3, 3] - chain.offsets[0, :3, 3]) > reach + travel + POSITION_TOLERANCE:
+    if _out_of_reach(chain, target):
         return accepted
     lower = robot.lower + LIMIT_MARGIN
     upper = robot.upper - LIMIT_MARGIN
-    parameters = IKParameters(
-        settings.position_only,
-        ROTATION_WEIGHT,
-        POSITION_TOLERANCE,
-        ROTATION_TOLERANCE,
-        MAX_ITERATIONS,
-        MIN_DISTANCE,
-    )
+    parameters = PARAMETERS._replace(position_only=settings.position_only)
     stale_rounds = 0
     for i in range(settings.max_rounds):
         seeds = random_seeds(robot, lower, upper, settings.seeds_per_round, rng, near)
@@ -134,9 +125,41 @@ def inverse_kinematics(
     return accepted[np.argsort(np.linalg.norm(accepted - near, axis=1), kind="stable")]
 
 
+def each_pose(
+    robot: KinematicTree,
+    frame: str,
+    poses: Iterable[Pose],
+    count: int,
+    seeds: Configurations,
+    rest: Configuration,
+) -> Iterator[Configurations]:
+    """Up to `count` distinct configurations for each of several poses of a link, all from these seeds; joints
+    that are on another arm have their values of `rest`."""
+    arm, chain = ik_chain(robot, frame, LIMIT_MARGIN)
+    seeds = np.clip(np.ascontiguousarray(seeds[:, arm]), chain.lower, chain.upper)
+    for T in poses:
+        found = seeds[:0]
+        if not _out_of_reach(chain, T):
+            found = solve_seeds(seeds, found, count, chain, for_kernels(T), PARAMETERS)[0]
+        q = np.tile(rest, (len(found), 1))
+        q[:, arm] = found
+        yield q
+
+
+def _out_of_reach(chain: IKChain, target: Pose) -> bool:
+    """Whether a pose is further from the first joint than the chain is long."""
+    joints = chain.length
+    travel = np.maximum(abs(chain.lower), abs(chain.upper))[chain.kinds == PRISMATIC].sum()
+    reach = np.linalg.norm(chain.offsets[1:joints, :3, 3], axis=1).sum() + np.linalg.norm(chain.tool[:3, 3])
+    away = np.linalg.norm(target[:3, 3] - chain.offsets[0, :3, 3])
+    return bool(away > reach + travel + POSITION_TOLERANCE)
+
+
 def ik_chain(robot: KinematicTree, frame: str, limit_margin: float) -> tuple[Int[ndarray, "k"], IKChain]:
     """The joints that move a link or come after it, and their kinematic chain with limits narrowed by a
-    margin."""
+    margin. Raises InputError if no planned joint moves the link."""
+    if robot.link_frame(frame) == 0:
+        raise InputError(f"inverse kinematics: no planned joint moves the link {shown(frame)}")
     arm = np.flatnonzero(~on_other_arm(robot, frame))
     kinds = np.array([KINDS[joint.kind] for joint in robot.planned_joints])[arm]
     lower = robot.lower[arm] + limit_margin

@@ -231,6 +231,8 @@ class KinematicTree(Value):
     def _turned(self, q: ndarray, start: ndarray, joints: JointMask) -> ndarray:
         """The configurations with whole turns added to these joints, to be as close to `start` as the limits
         allow."""
+        if not joints.any():
+            return q
         limited = joints & ~self.continuous
         nearest = np.where(joints, q - TURN * np.round((q - start) / TURN), q)
         nearest = np.where(limited & (nearest > self.upper), nearest - TURN, nearest)

@@ -96,9 +96,13 @@ def goal_error(
     """
     poses = {} if poses is None else poses
     if isinstance(goal, AnyGoal):
-        errors = [goal_error(robot, one, q, settings, blend, poses) for one in goal.goals]
-        off = [error for error in errors if error is not None]
-        return min(off, key=lambda error: error.excess) if len(off) == len(errors) else None
+        errors = list[GoalError]()
+        for one in goal.goals:
+            error = goal_error(robot, one, q, settings, blend, poses)
+            if error is None:
+                return None
+            errors.append(error)
+        return min(errors, key=lambda error: error.excess)
     if isinstance(goal, PosesGoal):
         errors = [goal_error(robot, one, q, settings, blend, poses) for one in goal.poses]
         return max((error for error in errors if error), key=lambda error: error.excess, default=None)
