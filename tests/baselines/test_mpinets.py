@@ -27,7 +27,7 @@ LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 WALL = [0.45, 0.0, 0.25, 0.3, 0.05, 0.5, 1.0, 0.0, 0.0, 0.0]
 SMALL = MPiNetsNetworkSettings(
-    scene_points=48, robot_points=4, target_points=2, centres=(24, 8), neighbours=(6, 4),
+    scene_points=48, robot_points=4, target_points=2, centers=(24, 8), neighbors=(6, 4),
     first_widths=(16, 16), second_widths=(24, 32), all_widths=(48,), cloud_widths=(32, 16),
 )  # fmt: skip
 
@@ -67,17 +67,17 @@ def test_grouping_is_that_of_brute_force(points: int) -> None:
     count = 12
     most = 7
     radius = 0.8
-    centres, around = group_points(torch.from_numpy(cloud), count, most, radius)
-    for x, chosen, near in zip(cloud.astype(np.float64), centres, around, strict=True):
+    centers, around = group_points(torch.from_numpy(cloud), count, most, radius)
+    for x, chosen, near in zip(cloud.astype(np.float64), centers, around, strict=True):
         distance = np.linalg.norm(x[:, None] - x[None], axis=2)
         expected = [int(np.linalg.norm(x - x.mean(0), axis=1).argmax())]
         while len(expected) < count:
             expected.append(int(distance[expected].min(0).argmax()))
         assert chosen.tolist() == expected
-        for centre, found in zip(chosen, near, strict=True):
-            order = np.argsort(distance[centre])
-            inside = order[distance[centre][order] < radius][:most].tolist()
-            assert found.tolist() == inside + [int(centre)] * (most - len(inside))
+        for center, found in zip(chosen, near, strict=True):
+            order = np.argsort(distance[center])
+            inside = order[distance[center][order] < radius][:most].tolist()
+            assert found.tolist() == inside + [int(center)] * (most - len(inside))
 
 
 def test_order_of_the_scene_points_makes_no_difference(network: MPiNetsNetwork) -> None:
@@ -187,7 +187,7 @@ def test_trained_weights_are_read_and_the_same_seed_gives_the_same_path(
     [
         ({"scene_points": 0}, "scene_points is 0"),
         ({"target_points": 13}, "target_points is 13; it must be at most robot_points, 12"),
-        ({"centres": (64, 65)}, "centres is"),
+        ({"centers": (64, 65)}, "centers is"),
         ({"first_widths": ()}, "first_widths is"),
         ({"cloud_widths": (30, 16)}, "cloud_widths is"),
     ],

@@ -22,7 +22,7 @@ from helpers.sphere_oracles import (
     random_shape,
     rows,
     solids,
-    sphere_centres,
+    sphere_centers,
     with_spheres,
 )
 from robotdiffuse.collision import CollisionChecker
@@ -231,7 +231,7 @@ def test_a_huge_floor_is_as_exact_as_a_small_one(size: float) -> None:
         np.stack(
             [
                 c[..., 2].min(axis=1) * 0 + (c[..., 2] - r).min(axis=1)
-                for c, r in zip(*sphere_centres(robot, q), strict=True)
+                for c, r in zip(*sphere_centers(robot, q), strict=True)
             ],
             axis=1,
         )[:, 1:]
@@ -322,14 +322,14 @@ def test_adding_an_obstacle_compiles_nothing() -> None:
 def cost(robot: rd.Robot, scene: rd.Scene, q: ndarray, margin: float, self_margin: float) -> ndarray:
     """The squared hinge loss over all spheres and pairs of spheres, by the oracles."""
     index = {link: i for i, link in enumerate(robot_groups(robot))}
-    centres, radii = sphere_centres(robot, q)
+    centers, radii = sphere_centers(robot, q)
     total = np.zeros(len(q))
     for link, i in index.items():
         if robot.link_frame(link) > 0:
-            nearest = np.min([distance(shape, centres[i]) for shape in scene.shapes], axis=0) - radii[i]
+            nearest = np.min([distance(shape, centers[i]) for shape in scene.shapes], axis=0) - radii[i]
             total += 0.5 * (np.maximum(margin - nearest, 0) ** 2).sum(axis=1)
     for a, b in ((index[a], index[b]) for a, b in robot.checked_pairs()):
-        gap = np.linalg.norm(centres[a][:, :, None] - centres[b][:, None], axis=-1)
+        gap = np.linalg.norm(centers[a][:, :, None] - centers[b][:, None], axis=-1)
         gap -= radii[a][:, None] + radii[b]
         total += 0.5 * (np.maximum(self_margin - gap, 0) ** 2).sum(axis=(1, 2))
     return total

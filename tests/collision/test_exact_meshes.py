@@ -128,7 +128,7 @@ def test_a_mesh_is_its_surface() -> None:
     assert 0 < a.collides(rows).mean() < 1
 
 
-def test_nearest_honours_cutoffs_and_stops() -> None:
+def test_nearest_honors_cutoffs_and_stops() -> None:
     exact = ExactCollision(box_arm(), Scene([Sphere(vector(0.2, 0.5, 0), 0.1)]))
     q = np.zeros((4, 3))
     checks = np.array([0, 0, 2, 0])

@@ -177,14 +177,14 @@ def test_the_grid_is_a_lower_bound() -> None:
     voxel = found.grid_frame[3]
     shape = found.grid_frame[8:11].astype(int)
     axes = [low[i] + voxel * (np.arange(shape[i]) + 0.5) for i in range(3)]
-    centres = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    pick = rng.integers(len(centres), size=3000)
-    gap = np.linalg.norm(centres[pick, None] - cloud[:, :3], axis=-1).min(axis=1)
+    centers = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    pick = rng.integers(len(centers), size=3000)
+    gap = np.linalg.norm(centers[pick, None] - cloud[:, :3], axis=-1).min(axis=1)
     assert (found.grid[pick] <= gap + 1e-5).all()
     exact = found.grid[pick] < found.grid_frame[7]
     np.testing.assert_allclose(found.grid[pick][exact], gap[exact], atol=1e-5)
     np.testing.assert_array_equal(exact, gap < found.grid_frame[7])
-    to_known = np.linalg.norm(centres[pick] - found.points[found.nearest[pick], :3], axis=-1)
+    to_known = np.linalg.norm(centers[pick] - found.points[found.nearest[pick], :3], axis=-1)
     np.testing.assert_allclose(to_known[exact], gap[exact], atol=1e-5)
     assert (to_known - gap < 2 * np.sqrt(3) * voxel)[found.nearest[pick] >= 0].all()
     assert compile_scene(Scene()).grid.shape == (0,)

@@ -44,7 +44,7 @@ def corners(file: Path, notes: list[str] | None = None) -> ndarray:
     return vertices[np.argsort(np.linalg.norm(vertices, axis=1))]
 
 
-def test_collada_is_read_in_metres(tmp_path: Path) -> None:
+def test_collada_is_read_in_meters(tmp_path: Path) -> None:
     """100 mm were read as 100 m."""
     notes: list[str] = []
     np.testing.assert_allclose(corners(collada(tmp_path, "0.001"), notes), 1e-3 * np.diag([1, 2, 3]))

@@ -104,7 +104,7 @@ def test_failures_of_every_kind_are_records_and_the_run_goes_on(tmp_path: Path) 
     assert found[faulty_planner.SOLVES].solved and found[faulty_planner.TALKS].solved
     assert found[faulty_planner.RAISES].status == "exception"
     assert found[faulty_planner.RAISES].reason == "ValueError: no such thing"
-    assert found[faulty_planner.EXITS].reason == "SystemExit: no licence"
+    assert found[faulty_planner.EXITS].reason == "SystemExit: no license"
     assert found[faulty_planner.DIES].status == "crashed" and "SIGKILL" in found[faulty_planner.DIES].reason
     assert found[faulty_planner.HANGS].status == "overran"
     log = (tmp_path / "logs" / "faulty.log").read_text()
@@ -356,14 +356,14 @@ def test_other_weights_of_the_same_name_are_refused(tmp_path: Path, monkeypatch:
     ("change", "match"),
     [
         ({"planners": ("rrt",)}, "unknown planner 'rrt'; known:"),
-        ({"planners": ("rrt_connect", "rrt_connect")}, "called the same"),
+        ({"planners": ("rrt_connect", "rrt_connect")}, "the same name"),
         ({"planners": ("rrt_connect@.",)}, "rrt_connect has no weights"),
         ({"planners": ("rrt_connect:stp=1",)}, "rrt_connect has no setting 'stp'; it has .*tightenings"),
         ({"planners": ("rrt_connect:range=-1",)}, "rrt_connect.range is -1.0; it must be positive"),
         ({"planners": ("rrt_connect:range",)}, "'range' is not NAME=VALUE"),
         ({"planners": ("diffusion@nowhere",)}, r"there are no weights \S*nowhere"),
         ({"planners": ("mpnet@nowhere",)}, r"there are no weights \S*nowhere"),
-        ({"problems": ("rop", "rop")}, "none twice"),
+        ({"problems": ("rop", "rop")}, "named only once"),
         ({"problems": ("ropp",)}, "neither a file or folder nor a family"),
         ({"time_limit": 0.0}, "time_limit is 0.0"),
         ({"count": 0}, "count is 0"),

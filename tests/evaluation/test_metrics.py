@@ -239,7 +239,7 @@ def panda_verdict(rows: np.ndarray, goal: PoseGoal | None = None, **settings: fl
 @pytest.mark.parametrize(
     ("shift", "angle", "kind"), [(0.009, 0.0, ""), (0.011, 0.0, "goal"), (0.0, 14.0, ""), (0.0, 16.0, "goal")]
 )
-def test_one_centimetre_and_fifteen_degrees_are_settings(shift: float, angle: float, kind: str) -> None:
+def test_one_centimeter_and_fifteen_degrees_are_settings(shift: float, angle: float, kind: str) -> None:
     axis = np.array([0.6, 0.0, 0.8])
     T = link_pose(PANDA, END, "panda_hand")
     T = transform(T[:3, 3] + shift * axis, rotation_about(axis, np.radians(angle)) @ T[:3, :3])

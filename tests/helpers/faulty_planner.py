@@ -24,7 +24,7 @@ class Faulty(RRTConnect):
         if seed == RAISES:
             raise ValueError("no such\nthing")
         if seed == EXITS:
-            sys.exit("no licence")
+            sys.exit("no license")
         if seed == DIES:
             print("about to die", flush=True)
             os.kill(os.getpid(), signal.SIGKILL)

@@ -28,17 +28,17 @@ def least_clearance(checker: CollisionChecker, q: ndarray) -> ndarray:
     return np.concatenate(every, axis=1).min(axis=1)
 
 
-def sphere_centres(robot: Robot, q: ndarray) -> tuple[list[ndarray], list[ndarray]]:
+def sphere_centers(robot: Robot, q: ndarray) -> tuple[list[ndarray], list[ndarray]]:
     """Centers [n, k, 3] and radii [k] of the spheres of each group, base frame."""
     frames = forward_frames(robot, q)
-    centres = []
+    centers = []
     radii = []
     for link in robot_groups(robot):
         T = frames[:, robot.link_frame(link)] @ robot.T_frame_link(link)
         spheres = robot.spheres[link]
-        centres.append(np.einsum("nij,kj->nki", T[:, :3, :3], spheres[:, :3]) + T[:, None, :3, 3])
+        centers.append(np.einsum("nij,kj->nki", T[:, :3, :3], spheres[:, :3]) + T[:, None, :3, 3])
         radii.append(spheres[:, 3])
-    return centres, radii
+    return centers, radii
 
 
 def distance(shape: Shape, points: ndarray) -> ndarray:
@@ -64,9 +64,9 @@ def distance(shape: Shape, points: ndarray) -> ndarray:
 def link_distances(robot: Robot, scene: Scene, q: ndarray) -> ndarray:
     """[n, moving links], at most 1 m."""
     columns = []
-    for link, centres, radii in zip(robot_groups(robot), *sphere_centres(robot, q), strict=True):
+    for link, centers, radii in zip(robot_groups(robot), *sphere_centers(robot, q), strict=True):
         if robot.link_frame(link) > 0:
-            found = [(distance(shape, centres) - radii).min(axis=1) for shape in scene.shapes]
+            found = [(distance(shape, centers) - radii).min(axis=1) for shape in scene.shapes]
             columns.append(np.min([np.ones(len(q)), *found], axis=0))
     return np.stack(columns, axis=1)
 
@@ -74,10 +74,10 @@ def link_distances(robot: Robot, scene: Scene, q: ndarray) -> ndarray:
 def pair_distances(robot: Robot, q: ndarray) -> ndarray:
     """[n, pairs], at most 1 m."""
     index = {link: i for i, link in enumerate(robot_groups(robot))}
-    centres, radii = sphere_centres(robot, q)
+    centers, radii = sphere_centers(robot, q)
     columns = [np.zeros((len(q), 0))]
     for a, b in ((index[a], index[b]) for a, b in robot.checked_pairs()):
-        gap = np.linalg.norm(centres[a][:, :, None] - centres[b][:, None], axis=-1)
+        gap = np.linalg.norm(centers[a][:, :, None] - centers[b][:, None], axis=-1)
         gap -= radii[a][:, None] + radii[b]
         columns.append(np.minimum(gap.reshape(len(q), -1).min(axis=1), 1)[:, None])
     return np.concatenate(columns, axis=1)

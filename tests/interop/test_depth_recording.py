@@ -165,7 +165,7 @@ def ros1_bag(
             writer.write(connections[topic], 10**9, data)
 
 
-def test_poses_and_configurations_are_interpolated_and_millimetres_read(tmp_path: Path) -> None:
+def test_poses_and_configurations_are_interpolated_and_millimeters_read(tmp_path: Path) -> None:
     [(stamp, view)] = read_depth_views(recording(tmp_path / "r.mcap"), PANDA)
     assert stamp == pytest.approx(1.05)
     np.testing.assert_allclose(view.depth, [[0.5, 0.0], [1.5, 2.0]], rtol=1e-6)
@@ -281,7 +281,7 @@ def test_continuous_joints_are_interpolated_the_short_way(tmp_path: Path) -> Non
     np.testing.assert_allclose(np.cos(view.configuration), halfway, atol=1e-9)
 
 
-def in_colour(messages: dict[str, Any]) -> None:
+def in_color(messages: dict[str, Any]) -> None:
     messages["/camera/image_rect"][0]["encoding"] = "rgb8"
 
 
@@ -310,7 +310,7 @@ def test_an_image_without_a_joint_state_leaves_the_rest(tmp_path: Path) -> None:
         (remove("/camera/image_rect"), "holds no depth images"),
         (remove("/tf"), "no transforms lead from panda_link0 to camera_optical.*panda_hand"),
         (late, "no joint state of panda_joint1.* within 0.1 s of the image"),
-        (in_colour, "holds no depth images"),
+        (in_color, "holds no depth images"),
         (of_another_size, "2 x 2 pixels; their CameraInfo has 3 x 2"),
     ],
 )

@@ -32,7 +32,7 @@ from robotdiffuse.learning.encoders.networks import (
     Autoencoder,
     CompressionAutoencoder,
     EdgeConvolution,
-    neighbours,
+    neighbors,
 )
 from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.learning.motion_model import MotionModelSettings
@@ -53,7 +53,7 @@ SMALL = {
     "pointnet": PointNetSettings(
         code=8, cloud=32, first=(8, 12), second=(12, 24), transform=(8, 8), transform_head=(8,), head=(16,)
     ),
-    "dgcnn": DGCNNSettings(code=8, cloud=32, neighbours=4, edges=(8, 12), embedding=16, head=(16,)),
+    "dgcnn": DGCNNSettings(code=8, cloud=32, neighbors=4, edges=(8, 12), embedding=16, head=(16,)),
     "points": PointsSettings(code=24, cloud=8),
 }
 ALONE = [name for name, entry in ENCODERS.items() if entry.kind == "alone"]
@@ -121,7 +121,7 @@ def test_order_does_not_matter(name, n, seed):
 @pytest.mark.parametrize("name", [name for name in ENCODERS if name != "dgcnn"])
 @pytest.mark.parametrize("n", [1, 2, 20])
 def test_repetition_does_not_matter(name, n):
-    """DGCNN is left out: repeated points are each other's nearest neighbours."""
+    """DGCNN is left out: repeated points are each other's nearest neighbors."""
     encoder = small(name)
     points = cloud(n)
     torch.testing.assert_close(encoder(points.repeat(1, 3, 1)), encoder(points), atol=1e-5, rtol=1e-5)
@@ -141,7 +141,7 @@ def test_points_out_of_the_region_do_not_count(name):
 
 @with_weights
 def test_gradients_reach_every_parameter(name):
-    """Some clouds are empty, and one has fewer points than neighbours: no gradient may be NaN there."""
+    """Some clouds are empty, and one has fewer points than neighbors: no gradient may be NaN there."""
     encoder = small(name)
     clouds = torch.cat([cloud(40, 6), torch.zeros(2, 40, 3)])
     clouds[5, 2:] = 0.0
@@ -189,7 +189,7 @@ def test_sizes_of_the_papers(name):
     sizes: dict[str, Any] = {
         "compression_autoencoder": {},
         "pointnet": wide | {"cloud": 1024, "transform_head": (512, 256), "head": (512, 256)},
-        "dgcnn": {"cloud": 1024, "neighbours": 20, "edges": (64, 64, 128, 256), "embedding": 1024},
+        "dgcnn": {"cloud": 1024, "neighbors": 20, "edges": (64, 64, 128, 256), "embedding": 1024},
     }
     sizes["dgcnn"]["head"] = (512, 256)
     encoder = make_encoder(name, replace(ENCODERS.defaults(name), code=60, **sizes[name]))
@@ -204,7 +204,7 @@ def test_sizes_of_the_papers(name):
     [
         (PointAutoencoderSettings, {"points": ()}, "encoder.points is ()"),
         (PointNetSettings, {"second": (8, 0)}, "encoder.second is"),
-        (DGCNNSettings, {"neighbours": 0}, "encoder.neighbours is 0"),
+        (DGCNNSettings, {"neighbors": 0}, "encoder.neighbors is 0"),
         (CompressionAutoencoderSettings, {"code": 0}, "encoder.code is 0"),
         (PointsSettings, {"cloud": 20}, "points.code is 96; it must be three times cloud, 60"),
     ],
@@ -243,7 +243,7 @@ def test_arranged_clouds():
 
 
 def test_clouds_along_a_curve():
-    """The order does not depend on that of the input, and neighbours are close to each other."""
+    """The order does not depend on that of the input, and neighbors are close to each other."""
     encoder = CompressionAutoencoder(replace(SMALL_CAE, cloud=400))
     loose = cloud(400, 5)
     arranged = encoder.arrange(loose)
@@ -278,7 +278,7 @@ def test_edge_convolution_is_the_maximum_over_edges():
     layer = EdgeConvolution(5, 7, 4)
     x = torch.randn(2, 12, 5)
     near = torch.ones(2, 12, dtype=torch.bool)
-    index = neighbours(x, near, 4)
+    index = neighbors(x, near, 4)
     for b in range(2):
         apart = torch.cdist(x[b], x[b])
         for i in range(12):
@@ -290,10 +290,10 @@ def test_edge_convolution_is_the_maximum_over_edges():
     torch.testing.assert_close(layer(x, near), wanted, atol=1e-5, rtol=1e-5)
 
 
-def test_neighbours_count():
+def test_neighbors_count():
     x = torch.tensor([[[0.0], [1.0], [3.0], [1.1]]])
     near = torch.tensor([[True, True, True, False]])
-    index = neighbours(x, near, 4)[0]
+    index = neighbors(x, near, 4)[0]
     assert [set(row.tolist()) for row in index] == [{0, 1, 2}] * 3 + [{0, 1, 2, 3}]
 
 

@@ -38,10 +38,10 @@ def test_the_estimated_noise_is_that_of_the_sensor(
     """Differences of neighboring pixels showed an eighth of noise that is correlated as recorded."""
     noise = DepthNoise(spread=spread, correlation=correlation)
     noisy = noise.applied(view_from(distance), np.random.default_rng(0))
-    found, neighbours = patch_noise(noisy.depth)
+    found, neighbors = patch_noise(noisy.depth)
     assert 0.75 < found / spread < 1.2, "planes take away what goes together over a patch"
     by_hand = np.exp(-0.5 / correlation**2) if correlation else 0.0
-    assert neighbours == pytest.approx(by_hand, abs=0.12)
+    assert neighbors == pytest.approx(by_hand, abs=0.12)
 
 
 def test_noise_is_measured_on_images_of_a_still_scene() -> None:

@@ -35,8 +35,8 @@ def picture(spheres: Float[ndarray, "n 4"]) -> Float[ndarray, "h w"]:
     rays = np.stack([(u - K[2]) / K[0], (v - K[3]) / K[1], np.ones_like(u)], -1) @ T[:3, :3].T
     depth = np.full(u.shape, np.inf)
     square = (rays**2).sum(-1)
-    for *centre, radius in spheres:
-        away = np.array(centre) - T[:3, 3]
+    for *center, radius in spheres:
+        away = np.array(center) - T[:3, 3]
         along = rays @ away / square
         rest = radius**2 - (away @ away - along**2 * square)
         with np.errstate(invalid="ignore"):

@@ -16,12 +16,12 @@ def test_swept_voxels_are_those_in_the_spheres_along_the_way() -> None:
     path = np.stack([START, GOAL]).astype(np.float32)
     swept = np.zeros(SHAPE, np.bool_)
     sweep(compile_robot(PANDA), path, np.float32(0), np.array(LOW, np.float32), np.float32(VOXEL), swept)
-    centres = (np.argwhere(np.ones(SHAPE)) + 0.5) * VOXEL + LOW
+    centers = (np.argwhere(np.ones(SHAPE)) + 0.5) * VOXEL + LOW
     moving = {link for link in PANDA.spheres if PANDA.link_frame(link) > 0}
     fixed = sum(len(spheres) for link, spheres in PANDA.spheres.items() if link not in moving)
     for t in (0.0, 0.5, 1.0):
         spheres = placed_spheres(PANDA, START + t * (GOAL - START))[fixed:]
-        distances = np.linalg.norm(centres[:, None] - spheres[None, :, :3], axis=2) - spheres[:, 3]
+        distances = np.linalg.norm(centers[:, None] - spheres[None, :, :3], axis=2) - spheres[:, 3]
         within = (distances < -0.002).any(axis=1).reshape(SHAPE)
         assert within.any() and swept[within].all()
 

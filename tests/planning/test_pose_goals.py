@@ -273,8 +273,8 @@ def four_joints(folder: Path) -> rd.Robot:
     joints = chain("base", ["turn", "lift", "bend", "wrist"])
     robot = read_urdf(written(folder, joints), tip="wrist_link")
     balls = {link: np.array([[0.0, 0.0, 0.0, 0.045]]) for link in robot.meshes}
-    neighbours = frozenset(frozenset((joint.parent, joint.child)) for joint in robot.joints)
-    return replace(robot, spheres=balls, allowed_collisions=neighbours)
+    neighbors = frozenset(frozenset((joint.parent, joint.child)) for joint in robot.joints)
+    return replace(robot, spheres=balls, allowed_collisions=neighbors)
 
 
 @pytest.mark.parametrize("arm", ["so101", "four joints"])

@@ -27,12 +27,12 @@ def _notes(*shapes: rd.Box | rd.Mesh | rd.PointCloud | rd.Sphere, **options: obj
         (rd.Sphere([0, 5, 0], 0.2), "beyond the arm's reach of"),
     ],
 )
-def test_obstacles_in_millimetres_are_noted(shape: rd.Box, text: str) -> None:
+def test_obstacles_in_millimeters_are_noted(shape: rd.Box, text: str) -> None:
     [note] = _notes(shape)
     assert note.startswith("check the units") and text in note and "millimeters" in note
 
 
-def test_scenes_in_metres_have_no_notes_on_units() -> None:
+def test_scenes_in_meters_have_no_notes_on_units() -> None:
     floor = rd.Box([0, 0, -0.6], [30, 30, 1], name="floor")
     assert (
         _notes() == _notes(floor) == _notes(rd.Sphere([0.5, 0.3, 0.6], 0.1), rd.Sphere([0, 9, 0], 0.1)) == ()
@@ -40,7 +40,7 @@ def test_scenes_in_metres_have_no_notes_on_units() -> None:
     assert _notes(rd.PointCloud(CUBE), rd.PointCloud(np.zeros((0, 3)))) == ()
 
 
-def test_a_depth_image_in_millimetres_is_noted() -> None:
+def test_a_depth_image_in_millimeters_is_noted() -> None:
     T_base_camera = looking_at(np.array([1.7, 0.0, 0.6]), np.array([0.4, 0.0, 0.3]))
     scene = rd.Scene([rd.Box([0.0, -0.8, 0.3], [0.2, 0.2, 0.6])])
     view = ray_cast(scene, T_base_camera, (75.0, 75.0, 39.5, 29.5), (80, 60), PANDA, np.array(START))

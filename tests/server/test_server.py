@@ -319,7 +319,7 @@ def test_a_planner_that_exits_stops_neither_server_nor_worker(server: httpx.Clie
     """Its SystemExit reached the server's event loop and stopped it."""
     lost = gauge(server, "workers_lost_total")
     answer = server.post("/plan", json=asked(EXITS, "faulty"))
-    assert answer.status_code == 500 and error(answer) == "SystemExit: no licence"
+    assert answer.status_code == 500 and error(answer) == "SystemExit: no license"
     assert server.post("/plan", json=asked(3)).json()["status"] == "solved"
     assert gauge(server, "workers_lost_total") == lost
 

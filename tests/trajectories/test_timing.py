@@ -531,7 +531,7 @@ def test_joints_without_a_jerk_limit_have_the_stated_default() -> None:
     assert (np.abs(jerk) <= 10 * np.array(ACCELERATION) * (1 + 1e-9)).all()
 
 
-def test_a_corner_that_its_neighbour_leaves_more_room_is_checked_again() -> None:
+def test_a_corner_that_its_neighbor_leaves_more_room_is_checked_again() -> None:
     """The second corner, accepted beside a wide neighbor, grew when that shrank, and left the clearance."""
     robot = arm()
     q = np.zeros((4, 7))

@@ -33,14 +33,14 @@ def test_picture_shows_the_tip_where_kinematics_puts_it(arm, motion, tmp_path):
         assert image.format == "PNG" and image.size == (320, 200)
 
 
-def test_picture_shows_obstacles_in_their_colour(arm, scene, motion):
+def test_picture_shows_obstacles_in_their_color(arm, scene, motion):
     pixels, camera = render(arm, Scene([scene.shapes[0]]), motion, SMALL)
     column, row, _ = camera.project(np.array([[-0.5, 0.4, 0.5]]))[0].astype(int)
     r, g, b = pixels[row, column].astype(int)
     assert r > g + 25 > b + 25
 
 
-def test_several_motions_have_traces_of_their_own_colours(arm, motion, tmp_path):
+def test_several_motions_have_traces_of_their_own_colors(arm, motion, tmp_path):
     back = Path(arm.joint_names, motion.positions[::-1].copy() * 0.7)
     few = replace(SMALL, ghosts=0)
     pixels, _ = render(arm, Scene(), motion, few, others=[back])

@@ -83,9 +83,9 @@ class MPiNetsNetworkSettings(Settings, name="mpinets"):
     """So many of these points, the first, are also given at the goal (paper: 128 in all, of the gripper)."""
     region: VisibleRegion = field(default_factory=VisibleRegion)
     """The region in which points of the scene count."""
-    centres: tuple[Count, Count] = (96, 24)
+    centers: tuple[Count, Count] = (96, 24)
     """Centers of the two set abstractions (paper: 512, 128)."""
-    neighbours: tuple[Count, Count] = (16, 16)
+    neighbors: tuple[Count, Count] = (16, 16)
     """Points around each center (paper: 128, 128)."""
     first_widths: Sizes = (32, 32, 64)
     """Widths of the layers of the first set abstraction (paper: 64, 64, 64)."""
@@ -105,12 +105,12 @@ class MPiNetsNetworkSettings(Settings, name="mpinets"):
                 f"mpinets.target_points is {self.target_points}; it must be at most robot_points, "
                 f"{self.robot_points}"
             )
-        for name in ("centres", "neighbours"):
+        for name in ("centers", "neighbors"):
             if len(getattr(self, name)) != 2:
                 raise InputError(f"mpinets.{name} is {getattr(self, name)}; it must be two numbers")
-        if self.centres[0] > self.scene_points or self.centres[1] > self.centres[0]:
+        if self.centers[0] > self.scene_points or self.centers[1] > self.centers[0]:
             raise InputError(
-                f"mpinets.centres is {self.centres}; it must fall, from at most scene_points, "
+                f"mpinets.centers is {self.centers}; it must fall, from at most scene_points, "
                 f"{self.scene_points}"
             )
         if len(self.cloud_widths) != 2 or self.cloud_widths[0] % GROUPS:
@@ -149,12 +149,12 @@ class SetAbstraction(nn.Module):
     """
 
     def __init__(
-        self, channels: int, widths: tuple[int, ...], centres: int, neighbours: int, radius: float
+        self, channels: int, widths: tuple[int, ...], centers: int, neighbors: int, radius: float
     ) -> None:
         """`channels` of each point's features; `widths` of the layers; `radius` of the balls [m]."""
         super().__init__()
-        self.centres = centres
-        self.neighbours = neighbours
+        self.centers = centers
+        self.neighbors = neighbors
         self.radius = radius
         self.layers = PooledLayers(3 + channels, widths)
 
@@ -162,14 +162,14 @@ class SetAbstraction(nn.Module):
         self, points: Float[Tensor, "b n 3"], features: Float[Tensor, "b n channels"]
     ) -> tuple[Float[Tensor, "b m 3"], Float[Tensor, "b m width"]]:
         """The centers and their features; points and centers in [m]."""
-        centres, around = group_points(points.detach(), self.centres, self.neighbours, self.radius)
-        at = _rows(points, centres)
+        centers, around = group_points(points.detach(), self.centers, self.neighbors, self.radius)
+        at = _rows(points, centers)
         offsets = (_rows(points, around) - at[:, :, None]) / self.radius
         return at, self.layers(torch.cat([offsets, _rows(features, around)], -1))
 
 
 def group_points(
-    points: Float[Tensor, "b n 3"], count: int, neighbours: int, radius: float
+    points: Float[Tensor, "b n 3"], count: int, neighbors: int, radius: float
 ) -> tuple[Int64[Tensor, "b m"], Int64[Tensor, "b m k"]]:
     """Indices of centers, by furthest point sampling, and of the points around each.
 
@@ -186,9 +186,9 @@ def group_points(
         center_indices.append(chosen)
         min_distances = torch.minimum(min_distances, distances[clouds, chosen])
         chosen = min_distances.argmax(1)
-    centres = torch.stack(center_indices, 1)
-    nearest = _rows(distances, centres).topk(min(neighbours, points.shape[1]), largest=False)
-    return centres, torch.where(nearest.values < radius, nearest.indices, centres[..., None])
+    centers = torch.stack(center_indices, 1)
+    nearest = _rows(distances, centers).topk(min(neighbors, points.shape[1]), largest=False)
+    return centers, torch.where(nearest.values < radius, nearest.indices, centers[..., None])
 
 
 def _rows(values: Float[Tensor, "b n c"], at: Int64[Tensor, "b *m"]) -> Float[Tensor, "b *m c"]:
@@ -232,9 +232,9 @@ class MPiNetsNetwork(BaselineNetwork):
         label = torch.cat([part.reshape(-1) for part in labels])
         self._labels = nn.functional.one_hot(label, 1 + 2 * links).float()
         """One-hot labels: scene, each link of the robot, each link of the target."""
-        self.first = SetAbstraction(1 + 2 * links, s.first_widths, s.centres[0], s.neighbours[0], RADII[0])
+        self.first = SetAbstraction(1 + 2 * links, s.first_widths, s.centers[0], s.neighbors[0], RADII[0])
         self.second = SetAbstraction(
-            s.first_widths[-1], s.second_widths, s.centres[1], s.neighbours[1], RADII[1]
+            s.first_widths[-1], s.second_widths, s.centers[1], s.neighbors[1], RADII[1]
         )
         # all points together; named as in the weights
         self.together = nn.ModuleDict({"layers": PooledLayers(3 + s.second_widths[-1], s.all_widths)})

@@ -140,7 +140,7 @@ def test_a_robot_without_weights_is_refused() -> None:
 
 
 def test_an_encoder_of_one_size_gets_clouds_of_that_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = DGCNNSettings(code=8, cloud=50, neighbours=4, edges=(8,), embedding=16, head=(16,))
+    settings = DGCNNSettings(code=8, cloud=50, neighbors=4, edges=(8,), embedding=16, head=(16,))
     model = MotionNetwork(
         RobotIdentity.of(PANDA), MotionModelSettings(encoder="dgcnn", encoder_settings=settings)
     )

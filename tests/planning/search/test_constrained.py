@@ -74,7 +74,7 @@ def excess(constraint: Constraint, q: np.ndarray) -> float:
         for case in CASES
     ],
 )
-def test_motions_keep_constraints_at_every_millimetre(
+def test_motions_keep_constraints_at_every_millimeter(
     name: str, stage: str, constraints: list[Constraint], scene: rd.Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(rrt.RRTConnect, "follows_lines", False)

@@ -55,7 +55,7 @@ def test_around_a_wall_and_the_same_again():
     assert other.path is not None and not np.array_equal(first.path.positions, other.path.positions)
 
 
-def test_longer_optimisation_does_not_lengthen():
+def test_longer_optimization_does_not_lengthen():
     problem = Problem(PANDA, WALL, LEFT, JointGoal(RIGHT[None]))
     once = RRTConnect().plan(problem, 60.0, objective="length")
     longer = RRTConnect(RRTConnectSettings(optimize_time=0.3)).plan(problem, 60.0, objective="length")

@@ -164,7 +164,7 @@ def test_an_arm_on_a_long_rail_is_no_larger(tmp_path: Path) -> None:
     assert counts[0] == counts[1]
 
 
-def test_settings_are_those_of_arms_of_up_to_a_metre_and_a_half() -> None:
+def test_settings_are_those_of_arms_of_up_to_a_meter_and_a_half() -> None:
     settings = PreparationSettings()
     assert settings.for_reach(0.9) == settings
     twice = settings.for_reach(2 * LARGE_REACH)

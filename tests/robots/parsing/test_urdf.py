@@ -97,7 +97,7 @@ def test_base_and_tip_are_selectable(tmp_path: Path) -> None:
     ],
 )
 def test_what_has_no_thickness_is_given_some(corners: list[list[float]], thin: int) -> None:
-    """The hulls of a sheet, a line and a point are thickened by half a millimetre to each side."""
+    """The hulls of a sheet, a line and a point are thickened by half a millimeter to each side."""
     turned = np.array(corners, float) @ rotation_from_rpy(0.3, -0.8, 1.2).T
     hull = convex_hull(turned)
     solid = trimesh.Trimesh(hull.vertices, hull.faces, process=False)

@@ -155,7 +155,7 @@ class DGCNNSettings(EncoderSettings):
     any_size = False  # distances to neighbors depend on the density of the cloud
     cloud: Count = 128
     """Points of an input cloud (1024)."""
-    neighbours: Count = 8
+    neighbors: Count = 8
     """Nearest points that each point is joined with (20)."""
     edges: Sizes = (32, 32, 64)
     """Widths of the layers of edge convolution (64, 64, 128, 256)."""

@@ -397,7 +397,7 @@ IGNORED_DISTANCE = 1e9
 """Squared distance that is given to points that do not count."""
 
 
-def neighbours(x: Features, near: Near, count: int) -> Int64[Tensor, "batch points neighbors"]:
+def neighbors(x: Features, near: Near, count: int) -> Int64[Tensor, "batch points neighbors"]:
     """Indices of each point's `count` nearest neighbors, itself included; where there are fewer, itself
     again."""
     with torch.no_grad(), fp32(x):
@@ -427,7 +427,7 @@ class EdgeConvolution(nn.Module):
         self.norm = nn.LayerNorm(out)
 
     def forward(self, x: Features, near: Near) -> Float[Tensor, "batch points out"]:
-        index = neighbours(x, near, self.count)
+        index = neighbors(x, near, self.count)
         neighbor_features = self.other(x)
         offset = (
             neighbor_features.shape[1] * torch.arange(len(neighbor_features), device=x.device)[:, None, None]
@@ -447,7 +447,7 @@ class DGCNN(Encoder):
     def __init__(self, settings: DGCNNSettings) -> None:
         super().__init__(settings)
         self.edges = nn.ModuleList(
-            EdgeConvolution(a, b, settings.neighbours) for a, b in pairwise((3, *settings.edges))
+            EdgeConvolution(a, b, settings.neighbors) for a, b in pairwise((3, *settings.edges))
         )
         activation = nn.LeakyReLU(NEGATIVE_SLOPE)
         self.embed = layers((sum(settings.edges), settings.embedding), activation)
