@@ -1,8 +1,8 @@
 """Damaged inputs of seventeen kinds: each must give an answer or a one-line error, in bounded time.
 
 An input is a kind and a seed; `outcome_of(kind, seed, folder)` makes the same one again. Texts are changed
-value by value, line by line or byte by byte, all others by bytes. `benchmarks/robustness.py` runs as many as there is time
-for.
+value by value, line by line or byte by byte, all others by bytes. `benchmarks/robustness.py` runs as many as
+there is time for.
 """
 
 import copy
