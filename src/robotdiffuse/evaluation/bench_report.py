@@ -1,8 +1,8 @@
 """The report of a bench: planners beside each other for every problem set and time limit, as tables, plots
 and the motions to replay.
 
-A time limit needs no calls of its own: records of a longer limit say what was found by then, and a call that
-ended by itself says what a longer limit would have given.
+A time limit needs no calls of its own. Records of a longer limit show what a planner had found by then; a
+call that ended before its limit shows what a longer limit would have given.
 """
 
 import re
@@ -41,12 +41,12 @@ from robotdiffuse.problems.held_out import Case
 from robotdiffuse.problems.problem import JointGoal
 
 LIMITS = (0.1, 1.0, 10.0, 60.0)
-"""Time limits of a report beside those of its records, up to the longest of these [s]."""
+"""Time limits that a report adds to those of its records, up to the longest of those [s]."""
 NONTRIVIAL_LABEL = ", non-trivial"
 LATE_SHARE = 0.1
 LATE_SECONDS = 0.05
-"""A returned motion counts if it is at most this share of the limit, or this time [s], late: planners stop in
-time, and validation follows."""
+"""A motion counts if it is late by at most this fraction of the limit, or this time [s]: planners stop
+searching in time, but validation follows."""
 RAN_OUT = "time ran out"
 GAVE_UP = "gave up before"
 LATER = "found one later"
@@ -172,8 +172,11 @@ class Outcome:
 
 
 def deciding_record(records: Sequence[Record], limit: float) -> Record | None:
-    """The record that says what a planner finds within a limit [s]: that of the shortest limit as long, else
-    the last that ended by itself. `records` are those of one problem and seed, shorter limits first."""
+    """The record that shows what a planner finds within a limit [s]: the one with the shortest time limit
+    that is at least as long, else the last one that ended by itself.
+
+    records: those of one problem and seed, shorter limits first.
+    """
     for record in records:
         if record.time_limit >= limit:
             return record
@@ -372,8 +375,8 @@ def _counted(
 ) -> dict[Key, Record]:
     """The records that count for a limit.
 
-    If a planner had this limit on the first problems only, the others do not count: of these only calls that
-    ended by themselves are known, which are the easy ones.
+    If a planner was run with this limit on the first problems only, the other problems do not count. For
+    them, only calls that ended by themselves would be known, and those are the easy ones.
     """
     counted = {key: record for key, of in calls.items() if (record := deciding_record(of, limit)) is not None}
     if len(counted) == len(calls):
@@ -634,8 +637,8 @@ def _table(heading: str, rows: Sequence[Row], spec: Spec) -> Table:
 
 
 def _ratio(comparison: Comparison, reference: str) -> tuple[Column, Callable[[Row], Cell]]:
-    """A column with the ratio of lengths to those of the reference and its interval; none for a planner
-    whose restarts have it."""
+    """A column with the ratio of lengths to those of the reference and its interval; empty for a planner
+    whose restarts have this ratio."""
     full = {row.planner: row.full for row in comparison.rows}
 
     def ratio(row: Row) -> Cell:
@@ -816,9 +819,11 @@ class Replay(NamedTuple):
 
 
 def motions_to_replay(bench: Bench, parts: Sequence[Section]) -> list[Replay]:
-    """The shortest and the longest motion of the problems with the longest detours, then motions of problems
-    on which the reference, or else another planner, failed; at the main limit of their set, for cases that
-    the folder keeps."""
+    """The shortest and the longest motion for the problems with the longest detours, then motions for
+    problems on which the reference, or else another planner, failed.
+
+    They are from the main time limit of their set, and only for problems that are stored in the folder.
+    """
     tries: list[tuple[Case, list[Record], dict[str, str]]] = []
     for section in (section for section in parts if section.name == section.problem_set):
         main = section.main

@@ -88,17 +88,17 @@ class GenerationSettings(Settings):
     trivial_share: Share = 1.0
     """Share of the problems solved by the straight line that is kept; 1 is the paper's distribution."""
     target: Annotated[str, OneOf(TARGETS)] = POSITION
-    """Goal of the tip: its position alone, as in the paper, or its pose. Among furniture it is always the
-    pose, such as with the fingers in a compartment."""
+    """Goal of the tip: its position alone, as in the paper, or its pose. Families of furniture always use the
+    pose."""
     goals: Annotated[int, Bound(least=1.0, most=127.0)] = 10
-    """Most goal configurations of a target, found by inverse kinematics (the paper's k)."""
+    """Largest number of goal configurations of a target, found by inverse kinematics (the paper's k)."""
     waypoints: Annotated[int, Bound(least=2.0)] = 254
     """Waypoints of a trajectory (the authors' number)."""
     timing: Annotated[str, OneOf(TIMINGS)] = "arc"
     """Spacing of waypoints: evenly in joint-space length (arc), or in time by time parameterization
     (time)."""
     shard: Count = 500
-    """Trajectories in a shard, the most that an interruption loses."""
+    """Trajectories in a shard. An interruption loses at most one shard."""
     planner: Annotated[str, OneOf(SEARCHES)] = "shared_tree_rrt_star"
     """Planner that solves the problems; the default is the paper's."""
     search: Annotated[SharedTreeSettings | AORRTCSearchSettings, SettingsOf("planner", SEARCHES)] = field(
@@ -106,7 +106,8 @@ class GenerationSettings(Settings):
             resolution=0.02, improvement=0.01, patience=6, step_rounds=5, connect_iterations=800
         )
     )
-    """Settings of that planner; for the paper's planner faster than its defaults, at 1 % more length."""
+    """Settings of that planner. Those of the paper's planner make it faster than with its own defaults, and
+    paths 1 % longer."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -142,7 +143,7 @@ class GenerationSettings(Settings):
 
 MAX_PROBLEMS_PER_ROW = 50
 EXTRA_PROBLEMS = 1_000
-"""A shard is given up after so many problems for each row, and as many extra ones."""
+"""A shard fails after MAX_PROBLEMS_PER_ROW problems for each of its rows and EXTRA_PROBLEMS more."""
 PROBLEMS_PER_SHARD = 2**32
 """Problem numbers reserved for each shard, so that shards share none."""
 
@@ -179,7 +180,7 @@ def make_shard(settings: GenerationSettings, index: int) -> tuple[Arrays, Counts
 
 
 def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
-    """Solve the problem of a number: its row, or thinned, unsolved or refused."""
+    """Solve the problem with a number. Returns its row, or "thinned", "unsolved" or "refused"."""
     rng = np.random.default_rng([settings.seed, number])
     family, sample = draw(settings, robot, rng)
     # goals of continuous joints are moved by whole turns as near to the start as possible
@@ -190,7 +191,7 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
     lines_free = [bool(motions_free(space, np.stack([sample.start, goal]))[0]) for goal in goals]
     thinned = rng.random() >= settings.trivial_share
     if thinned and all(lines_free):
-        return "thinned"  # for whichever goal a search chooses
+        return "thinned"  # the straight line is free whichever goal a search would choose
     search: SharedTreeSearch | AORRTCSearch = SEARCHES.load(settings.planner)(
         checker, sample.start, sample.goals, settings.search, random_state(settings.seed, number)
     )
@@ -339,7 +340,7 @@ def _make_on_node(settings: GenerationSettings, index: int, wanted: dict[str, st
 
 
 def _reproducibility_record(settings: GenerationSettings) -> dict[str, str]:
-    """Versions and robot that two machines must share to make the same data."""
+    """Versions and robot that must be the same on two machines for the same data."""
     return versions() | {f"robot {settings.robot}": robot_fingerprint(load_robot(settings.robot))}
 
 

@@ -1,20 +1,21 @@
 """Planning in a scene of which cameras saw a part: assumptions about unknown space, for any planner.
 
-An assumption is the scene as seen with more obstacles. The assumptions of the problem's policy are tried from
-the most careful to the least, and the first one with a motion gives the result. So every motion keeps clear
-of what was seen, and of as much more as lets it pass:
+An assumption adds obstacles to the scene as seen. Each policy has a list of assumptions, the most careful one
+first. They are tried in this order, and the first one that leaves a motion gives the result. So every motion
+avoids what was seen, and as many assumed obstacles as possible:
 
 - padded: observed points, inflated by 9 cm, by 6, by 4; then as seen.
 - predicted: voxels that the occupancy completion network predicts occupied with a probability above 0.1, 0.2,
-  0.35, 0.5; then as seen. Of several motions under an assumption, one that sweeps little probability.
-- occupied: every voxel that no view saw, and nothing after it.
+  0.35, 0.5; then as seen. Among several motions under an assumption, one is chosen that sweeps little
+  probability.
+- occupied: every voxel that no view saw; no other assumption is tried.
 - optimistic: as seen.
 
 By default, the policy is predicted where the network covers the arm's reach, else padded. A motion under any
-but the first assumption has a note that names those that failed.
+assumption but the first has a note that names those that failed.
 
-Start and goal are taken to be free: the space around them is carved out of the assumed obstacles, not of what
-was seen.
+Start and goal are assumed to be free: the space around them is removed from the assumed obstacles, but not
+from observed ones.
 """
 
 from collections.abc import Iterator
@@ -46,28 +47,29 @@ from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.problem import OCCUPIED, OPTIMISTIC, PADDED, PREDICTED, JointGoal, Problem
 from robotdiffuse.robots.kinematics import placed_spheres
 
-# First motions under an assumption that the one of least probability is chosen from: most and fewest ...
+# Under an assumption, the motion with the least probability is chosen from several: largest and smallest
+# number.
 MAX_FIRST_MOTIONS = 8
 MIN_FIRST_MOTIONS = 4
-# ... the search for more of them ends after the fewest once one sweeps a summed probability of no more than
-# the first, and at once when one sweeps no more than the second.
+# With the smallest number of motions, the search for more ends if one sweeps a summed probability of at most
+# ACCEPTABLE_RISK; it ends at once if one sweeps at most NEGLIGIBLE_RISK.
 ACCEPTABLE_RISK = 2.0
 NEGLIGIBLE_RISK = 0.1
 CONFIDENCE_TOLERANCE = 0.01
 """A shorter motion is preferred if its confidence is lower by no more than this."""
 AS_SEEN_TIME_FRACTION = 0.3
-"""Part of the time limit that is reserved for the motion as seen, unless the policy excludes it."""
+"""Fraction of the time limit that is reserved for the assumption "as seen", unless the policy excludes it."""
 ASSUMPTION_TIME_FRACTION = 0.25
-"""Part of the other time left that each assumption gets, if others come after it."""
+"""Fraction of the remaining other time that an assumption gets if others follow."""
 MIN_TIME_FRACTION = 0.1
-"""Part of the time limit that every attempt of the planner gets at least."""
+"""Smallest fraction of the time limit for an attempt of the planner."""
 PICTURE_THRESHOLD = 0.2
 """Pictures show voxels with a probability above this."""
 FREE_UNKNOWN_SPACE = "unknown space taken as free"
 MIN_MEASURED_SHARE = 0.01
-"""No motion is planned on views none of which measures something at this part of its pixels."""
+"""Nothing is planned if every view measures something at fewer pixels than this fraction."""
 NOTED_SHARE = 0.8
-"""A note names views that measure something at a smaller part."""
+"""A note names each view that measures something at fewer pixels than this fraction."""
 AS_SEEN = "as seen"
 """Name of the assumption without additional obstacles."""
 
@@ -82,10 +84,10 @@ def plan_with_unknown_space(
     """A motion under the problem's policy for unknown space, within the time limit; see the head of this
     file.
 
-    predicted: the probability that each fine voxel of the observed volume is occupied; None: as the occupancy
-    completion network predicts, if the policy needs it. unknown: the space that no view saw, if the problem's
-    scene holds the points of views already; None: that of the problem's views. With it, the policy is padded
-    or predicted.
+    predicted: the probability that each fine voxel of the observed volume is occupied; None: the occupancy
+    completion network predicts it if the policy needs it. unknown: the space that no view saw, for a problem
+    whose scene contains the observed points already, under the policy padded or predicted; None: computed
+    from the problem's views.
 
     The result says which assumption it comes from, its confidence (how likely the motion is free in the true
     scene), and which unknown space it crosses.
@@ -173,7 +175,7 @@ def _lesser(failed: list[str], used: str) -> str:
 
 
 def _with_notes(context: PlanningContext, result: PlanResult, *notes: str) -> PlanResult:
-    """The result with the notes of the call, which an attempt does not have, and with more."""
+    """The result with the notes of the call, which results of attempts lack, and with further notes."""
     every = (*context.notes, *result.notes, *(note for note in notes if note))
     return replace(result, notes=tuple(dict.fromkeys(every)))
 
@@ -220,7 +222,8 @@ def predicted_obstacles(problem: Problem) -> AssumedPoints:
 
 
 def _goals(context: PlanningContext, as_seen: Problem) -> Configurations | PlanResult:
-    """The goal configurations, of a pose those that are free of what was seen; or the result without any."""
+    """The goal configurations, for a pose those that are free of observed obstacles; or the failed result if
+    there are none."""
     if isinstance(as_seen.goal, JointGoal):
         return as_seen.goal.positions
     start_goal = usable_start_goal(PlanningContext(context.planner_name, as_seen, context.request))
@@ -228,8 +231,8 @@ def _goals(context: PlanningContext, as_seen: Problem) -> Configurations | PlanR
 
 
 def with_assumption(problem: Problem, assumption: Assumption, goals: Configurations) -> Problem:
-    """The problem in the scene as seen with an assumption's obstacles, and with those goals that need the
-    least carving."""
+    """The problem in the scene as seen with the obstacles of an assumption, and with those goals that require
+    the fewest obstacles to be removed."""
     start, *at_goals = (placed_spheres(problem.robot, q).astype(np.float32) for q in (problem.start, *goals))
     needed = np.array([assumption.touched(spheres) for spheres in at_goals] if len(at_goals) > 1 else [0])
     easiest = np.flatnonzero(needed == needed.min())

@@ -2,10 +2,10 @@
 are replanned while the arm moves.
 
 For jerk limits, a motion within velocity and acceleration limits is sampled on a grid of times, averaged over
-a window, and read as the control points of a uniform cubic B-spline. Each value of the spline depends on
-samples up to its own time only, so that a new motion from then on changes nothing before. Velocities and
-accelerations are weighted means of the motion's, and the jerk is at most twice the acceleration over the
-window's time.
+a window, and used as the control points of a uniform cubic B-spline. Each value of the spline depends only on
+samples up to its own time, so a motion that begins then does not change earlier values. Velocities and
+accelerations are weighted means of the motion's, and the jerk is at most twice the acceleration divided by
+the duration of the window.
 """
 
 from dataclasses import dataclass, replace
@@ -28,11 +28,11 @@ from robotdiffuse.trajectories.timing_kernel import controllable, sample_positio
 from robotdiffuse.validation.tolerances import DEFAULT
 from robotdiffuse.validation.validator import Verifier, verifier
 
-# Parts of the limits that are used at the grid points; the rest covers what lies between them.
+# Fractions of the limits that are used at the grid points; the margin is for the motion between them.
 VELOCITY_FRACTION = 0.99
 ACCELERATION_FRACTION = 0.96
 CORNER_SAMPLES = 65
-"""Configurations of a rounded corner that are checked with a distance."""
+"""Number of configurations of a rounded corner at which distances are checked."""
 MIN_LENGTH = 1e-4
 """Paths are longer than this [rad]."""
 LINE_INTERVAL = 0.03
@@ -88,8 +88,8 @@ class TimedPath:
     ) -> "TimedPath | None":
         """The path through waypoints; None if the validator refuses it, or all waypoints are the same.
 
-        Rounded corners are free even where the arm is up to `displacement` [m] off the path; at one that
-        cannot be, the arm stops.
+        Rounded corners are free even if the arm is up to `displacement` [m] off the path. The arm stops at a
+        corner that cannot be rounded so.
         """
         path = Path(robot.joint_names, waypoints)
         if path.length < MIN_LENGTH or not validator.collision_free(path):
@@ -173,11 +173,12 @@ class TimedPath:
 
 
 MAX_DISPLACEMENT = 0.005
-"""Averaging moves no point of the arm further than this off its path, where the path bends [m]."""
+"""Largest distance by which averaging moves a point of the arm off its path, where the path bends [m]."""
 SHARE_FACTOR = 0.9
-"""Factor of the accelerations that are tried next where it would."""
+"""The accelerations are reduced by this factor until MAX_DISPLACEMENT is kept."""
 GRID_TOLERANCE = 1e-4
-"""Part of a step by which a motion may begin before a time of the grid and count as beginning there."""
+"""A motion that begins before a time of the grid by at most this fraction of a step counts as beginning
+there."""
 STILL = 1e-9
 """Samples that differ by less are equal [rad]."""
 
@@ -186,7 +187,7 @@ class JerkFilter:
     """The jerk-limited motion that follows an acceleration-limited one."""
 
     def __init__(self, robot: Robot, jerk: Configuration, step: float, q: Configuration) -> None:
-        """At rest at q; `step`: between two times of the grid [s]."""
+        """A filter that is at rest at q. step: time between two times of the grid [s]."""
         reach = float((motion_radii(robot) @ robot.acceleration).max())
         self.joint_names = robot.joint_names
         self.step = step
@@ -201,11 +202,11 @@ class JerkFilter:
         self.acceleration = share * robot.acceleration
         """Acceleration limits that the given motions must keep [dof]."""
         self.displacement = displacement
-        """Bound on the distance of any point of the arm to where the given path takes it [m]; 0 on straight
+        """Upper bound on how far any point of the arm is from its place on the given path [m]; 0 on straight
         lines."""
         self._window = window
         self._samples = np.repeat(q[None], window + 3, axis=0)
-        """At the last times of the grid, up to the one with index `_index`."""
+        """Configurations at the last times of the grid, up to the one with index `_index`."""
         self._origin = -np.inf
         self._index = 0
         self._ago = 0.0

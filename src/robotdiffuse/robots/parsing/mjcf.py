@@ -35,7 +35,7 @@ WORLD = 0
 EXCLUDED = "excluded by the model"
 """Why a pair of links is not checked."""
 MIN_SHIFT = 1e-9
-"""Joints closer to the origin of their body are at it [m]."""
+"""Joints closer to the origin of their body than this count as being at it [m]."""
 
 
 def imported_mujoco() -> Any:
@@ -67,8 +67,8 @@ def compiled_model(path: Path) -> Any:
 
 
 def robot_bodies(model: Any) -> list[int]:
-    """The bodies of the robot, parents before children: of the trees below the world that actuators move, or
-    else of all trees with hinges or slides and without a free joint."""
+    """The bodies of the robot, parents before children. They are those of the kinematic trees that actuators
+    move; without actuators, those of all trees with hinges or slides and without a free joint."""
     trees: dict[int, list[int]] = {}
     for body in range(1, model.nbody):
         trees.setdefault(int(model.body_rootid[body]), []).append(body)
@@ -98,7 +98,8 @@ def driven_joints(model: Any) -> set[int]:
 
 
 def placing_joints(model: Any, bodies: list[int]) -> set[int]:
-    """The joints that only place the base: slides without range and actuator, beside other joints."""
+    """The joints that only place the base: slides without range and actuator, if the robot has other
+    joints."""
     joints = _joints_of(model, bodies)
     unlimited = {
         joint
@@ -179,7 +180,8 @@ class ConvertedModel:
         return ET.SubElement(self.root, "link", name=name)
 
     def _body(self, body: int, mimics: dict[int, dict[str, str]]) -> None:
-        """The link of a body, and its joints: each at its anchor, which the frame of the body may leave."""
+        """The link of a body, and its joints. Each joint is at its anchor, which need not be the
+        origin of the body's frame."""
         model = self.model
         name = self.name("body", body)
         parent = int(model.body_parentid[body])
@@ -254,7 +256,7 @@ class ConvertedModel:
         )
 
     def _mimics(self) -> dict[int, dict[str, str]]:
-        """Attributes of <mimic> by joint, of equality constraints that are linear."""
+        """The attributes of <mimic> for each joint that a linear equality constraint ties to another."""
         model = self.model
         mimics: dict[int, dict[str, str]] = {}
         for k in range(model.neq):
@@ -298,7 +300,7 @@ class ConvertedModel:
             self._shape(ET.SubElement(element, "geometry"), geom)
 
     def _shape(self, parent: ET.Element, geom: int) -> None:
-        """The shape of a geom; of a mesh that collides the hull, with which MuJoCo collides."""
+        """The shape of a geom. A mesh that collides is replaced by its hull, as in MuJoCo."""
         kind = kind_of("Geom", self.model.geom_type[geom])
         size = self.model.geom_size[geom]
         if kind == "sphere":
@@ -345,8 +347,8 @@ class ConvertedModel:
             self._link(link)
 
     def _excluded(self) -> dict[frozenset[str], str]:
-        """Pairs of links that MuJoCo does not let collide: those that are excluded, that move as one, or of
-        which one carries the other; and those of which no two geoms may collide by their masks."""
+        """Pairs of links that MuJoCo does not let collide: excluded pairs, links that move as one, a link
+        and the link that carries it, and links whose masks let no two of their geoms collide."""
         model = self.model
         excluded = {frozenset(divmod(int(signature), 2**16)) for signature in model.exclude_signature}
         unfiltered = bool(model.opt.disableflags & int(self.mujoco.mjtDisableBit.mjDSBL_FILTERPARENT))
@@ -401,7 +403,8 @@ def _geoms_of(model: Any, body: int) -> range:
 
 
 def _related(model: Any, first: int, second: int, unfiltered: bool) -> bool:
-    """Whether two bodies are joined rigidly, or by the joints of one of them, and not to the world."""
+    """Whether two bodies, neither of which is the world, are joined rigidly or by the joints of one of
+    them."""
     welded = [int(model.body_weldid[body]) for body in (first, second)]
     above = [int(model.body_weldid[model.body_parentid[body]]) for body in welded]
     carried = welded[0] == above[1] or welded[1] == above[0]
