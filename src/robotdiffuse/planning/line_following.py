@@ -4,31 +4,35 @@ That takes milliseconds and gives smooth motions; where it ends early, the searc
 (`search/constrained.py`) goes on, and the result says how far the line was followed, and why no further.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.transforms import rotation_about, transform
+from robotdiffuse.core.transforms import rotation_about
 from robotdiffuse.core.types import Status
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.problems.compiled_constraints import line_end, rotation_vector
 from robotdiffuse.problems.constraints import CartesianLine
 from robotdiffuse.problems.goals import JointGoal, PoseGoal
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots.ik_kernel import IKParameters, follow
+from robotdiffuse.robots.ik_kernel import IKChain, IKParameters, follow, solve_seeds
 from robotdiffuse.robots.inverse_kinematics import (
     MAX_ITERATIONS,
+    PARAMETERS,
     ROTATION_WEIGHT,
     InverseKinematicsSettings,
     ik_chain,
     inverse_kinematics,
 )
-from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.kinematics import link_jacobians, link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.curve_timing import time_curve
+from robotdiffuse.trajectories.speed_limits import scaled_limits, symmetric_bounds
+from robotdiffuse.trajectories.timing_kernel import fastest_speeds
 
 STAGE = "line"
 # Distance [m] and angle [rad] between poses of the line, and their number.
@@ -44,6 +48,8 @@ NEAR_LIMIT = 1e-2
 """A joint this close to its limit is named as the reason for the end of a line [rad] or [m]."""
 OTHER_ENDS = 4
 """Configurations of the end pose that motions are steered to where following from the start ends early."""
+END_STEPS = np.array([0.1, 0.3, 0.7])
+"""Steps of the joints, without a motion of the link, to other configurations of the end [rad, L2]."""
 HERE = 1e-5
 """A link whose pose differs by less from the end of the line is there [m] and in entries of R."""
 SAME = 1e-5
@@ -72,19 +78,30 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
     targets = _poses(T_start, T_end)
     fraction = 0.0
     why = ""
-    candidates = list[Float[ndarray, "n dof"]]()
+    candidates = list[tuple[float, Float[ndarray, "n dof"]]]()
+    chain = ik_chain(robot, line.frame, LIMIT_MARGIN)
+    limits = scaled_limits(robot, context.timing)
+
+    def cost(rows: Float[ndarray, "n dof"]) -> float:
+        """Least duration of a motion through rows within limits of velocity and acceleration, roughly [s]."""
+        first = np.gradient(rows, axis=0)
+        second = np.diff(rows, 2, axis=0)
+        second = np.concatenate([second[:1], second, second[-1:]])
+        bounds = symmetric_bounds(limits[1], len(rows))
+        speeds = fastest_speeds(first, second, np.arange(float(len(rows))), limits[0], *bounds)
+        return float((2 / (speeds[1:] + speeds[:-1])).sum())
 
     def tried(end: Float[ndarray, "dof"] | None) -> bool:
         """Whether the line can be followed to an end."""
         nonlocal fraction, why
-        rows = _followed(problem, line, targets, end)
+        rows = _followed(problem, line, targets, *chain, end)
         fraction_followed = (len(rows) - 1) / len(targets)
         if fraction_followed < 1.0:
             if fraction_followed >= fraction:
                 fraction = fraction_followed
                 why = _obstruction(robot, rows[-1])
         elif end is None or np.abs(rows[-1] - end).max() < SAME:
-            candidates.append(rows)
+            candidates.append((cost(rows), rows))
         else:
             why = why or "there the arm has another configuration than the goal"
         return fraction_followed == 1.0
@@ -106,8 +123,10 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
         )
         for end in ends:
             tried(end)
-    timed = [time_curve(robot, rows, context.timing, context.beside) for rows in candidates]
-    for trajectory, rows in sorted(zip(timed, candidates, strict=True), key=lambda one: one[0].duration):
+    elif line.speed is None:
+        candidates += _other_ends(problem, line, targets, *chain, *candidates[0], cost)
+    for _, rows in sorted(candidates, key=lambda one: one[0]):
+        trajectory = time_curve(robot, rows, context.timing, context.beside)
         context.improved(float(np.linalg.norm(np.diff(rows, axis=0), axis=1).sum()))
         result = context.finish(rows, STAGE, "solved along the straight line", trajectory=trajectory)
         if result is not None:
@@ -128,28 +147,61 @@ def _poses(T_start: Float[ndarray, "4 4"], T_end: Float[ndarray, "4 4"]) -> Floa
     turn = rotation_vector(T_end[:3, :3] @ T_start[:3, :3].T)
     angle = float(np.linalg.norm(turn))
     count = max(np.linalg.norm(way) / STEP, angle / TURN_STEP, MIN_STEPS)
-    shares = np.linspace(0, 1, min(int(np.ceil(count)), MAX_STEPS) + 1)[1:]
+    shares = np.linspace(0, 1, min(int(np.ceil(count)), MAX_STEPS) + 1)[1:, None]
     axis = turn / angle if angle > 0 else np.eye(3)[2]
-    poses = [
-        transform(T_start[:3, 3] + share * way, rotation_about(axis, share * angle) @ T_start[:3, :3])
-        for share in shares
-    ]
-    return np.array([*poses[:-1], T_end])
+    poses = np.tile(T_end, (len(shares), 1, 1))
+    poses[:-1, :3, 3] = T_start[:3, 3] + shares[:-1] * way
+    poses[:-1, :3, :3] = rotation_about(axis, angle * shares[:-1, None]) @ T_start[:3, :3]
+    return poses
+
+
+def _other_ends(
+    problem: Problem,
+    line: CartesianLine,
+    targets: Float[ndarray, "n 4 4"],
+    arm: Int[ndarray, "j"],
+    joints: IKChain,
+    least: float,
+    rows: Float[ndarray, "k dof"],
+    cost: Callable[[Float[ndarray, "k dof"]], float],
+) -> list[tuple[float, Float[ndarray, "k dof"]]]:
+    """Costs and motions along the line to other configurations of its end than these rows lead to, each of
+    less cost than those before."""
+    end = rows[-1]
+    constrained = 3 if line.angle is None else 6
+    parameters = PARAMETERS._replace(position_only=line.angle is None)
+    jacobian = link_jacobians(problem.robot, end[None], line.frame)[0][:constrained, arm]
+    faster = list[tuple[float, Float[ndarray, "k dof"]]]()
+    for direction in np.linalg.svd(jacobian)[2][constrained:]:
+        for steps in (np.zeros(1), END_STEPS, -END_STEPS):
+            for step in steps:
+                seed = np.clip(end[arm] + step * direction, joints.lower, joints.upper)
+                found = solve_seeds(seed[None], seed[None][:0], 1, joints, targets[-1], parameters)[0]
+                moved = end.copy()
+                moved[arm] = found[0] if len(found) else seed
+                rows = _followed(problem, line, targets, arm, joints, moved)
+                there = len(rows) > len(targets) and np.abs(rows[-1] - moved).max() < SAME
+                estimated = cost(rows) if there else np.inf
+                if estimated >= least:
+                    break
+                least = estimated
+                faster.append((least, rows))
+    return faster
 
 
 def _followed(
     problem: Problem,
     line: CartesianLine,
     targets: Float[ndarray, "n 4 4"],
+    arm: Int[ndarray, "j"],
+    joints: IKChain,
     end: Float[ndarray, "dof"] | None,
 ) -> Float[ndarray, "k dof"]:
     """Configurations at the start and at these poses, as far as joints can follow; joints that do not move
     the link go straight to the end, or stay."""
-    robot = problem.robot
     start = problem.start
     steer = end is not None
     goal = start if end is None else end
-    arm, joints = ik_chain(robot, line.frame, LIMIT_MARGIN)
     joints = joints._replace(
         lower=np.minimum(joints.lower, np.minimum(start, goal)[arm]),
         upper=np.maximum(joints.upper, np.maximum(start, goal)[arm]),

@@ -49,16 +49,15 @@ def link_jacobians(robot: KinematicTree, q: Configurations, link: str) -> Float[
 
     Rows are linear, then angular, in the axes of the base frame; the linear ones are of the link's origin.
     """
-    _, *frames = _frames(robot, q, link)
-    origins = link_origins(robot, q, link)
+    frames = _frames(robot, q, link)
+    origins = (frames[-1] @ robot.T_frame_link(link))[:, :3, 3]
+    chain = list(robot.chain(link))
+    slides = np.array(robot.prismatic)[chain, None, None]
+    T = np.array(frames)[1:]
+    axes = T[..., :3, 2]
     J = np.zeros((len(q), 6, robot.dof))
-    for j, T in zip(robot.chain(link), frames, strict=True):
-        axis = T[:, :3, 2]
-        if robot.prismatic[j]:
-            J[:, :3, j] = axis
-        else:
-            J[:, :3, j] = np.cross(axis, origins - T[:, :3, 3])
-            J[:, 3:, j] = axis
+    J[:, :3, chain] = np.where(slides, axes, np.cross(axes, origins - T[..., :3, 3])).transpose(1, 2, 0)
+    J[:, 3:, chain] = np.where(slides, 0.0, axes).transpose(1, 2, 0)
     return J
 
 
