@@ -11,11 +11,6 @@ from helpers.commands import run, write_problem
 TRAIN = ["train", "planner", "--data", "d", "--encoder", "dgcnn", "--out", "o"]
 
 
-@pytest.fixture(autouse=True)
-def in_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-
-
 BAD_CALL = {
     "no command": ([], "COMMAND"),
     "unknown command": (["plann"], "plann"),

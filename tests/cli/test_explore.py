@@ -14,11 +14,6 @@ from helpers.commands import START, run, write_problem
 NEAR = {"joints": [-0.95, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]}
 
 
-@pytest.fixture(autouse=True)
-def in_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-
-
 def test_explore_writes_a_replay_a_strip_and_a_recording(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -24,11 +24,6 @@ ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted(ROOT.glob("examples/*.yaml")) + sorted(ROOT.glob("src/robotdiffuse/examples/*.yaml"))
 
 
-@pytest.fixture(autouse=True)
-def in_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-
-
 def test_plan_writes_files_that_view_and_verify_read(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -12,11 +12,6 @@ from robotdiffuse.core import registry
 from robotdiffuse.planning import PLANNERS
 
 
-@pytest.fixture(autouse=True)
-def in_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-
-
 def test_planner_list_shows_them_all_without_loading_them() -> None:
     code = "from robotdiffuse.cli import *; main(['planner', 'list']); sys.exit('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

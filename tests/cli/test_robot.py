@@ -10,11 +10,6 @@ from helpers.quick_preparation import QUICK, coarse_grids
 from robotdiffuse.robots import load_robot
 
 
-@pytest.fixture(autouse=True)
-def in_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-
-
 def test_robot_add_with_srdf_and_robot_list(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,11 +12,6 @@ from robotdiffuse.learning.training.config import CONFIGS, PlannerTraining
 TRAIN = ["train", "planner", "--data", "d", "--encoder", "dgcnn", "--out", "o"]
 
 
-@pytest.fixture(autouse=True)
-def in_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-
-
 @pytest.fixture
 def trained(monkeypatch: pytest.MonkeyPatch) -> list[PlannerTraining]:
     """The settings of the trainings that are asked for, in place of these."""

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from robotdiffuse import Box, Capsule, Cylinder, InputError, PointCloud, Scene, Sphere, load_robot
+from helpers.sphere_oracles import solids
+from robotdiffuse import Box, InputError, PointCloud, Scene, Sphere, load_robot
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.batched_clearances import packed_clearances_and_gradients, packed_link_clearances
 from robotdiffuse.collision.kernel_arrays import compile_robot
@@ -28,14 +29,7 @@ from robotdiffuse.scenes.scene_arrays import PackedScenes
 PANDA = load_robot("panda")
 LIMIT = 0.4
 MARGIN = 0.1
-SHAPES = Scene(
-    [
-        Sphere((0.5, 0.3, 0.6), 0.2),
-        Box((0.0, 0.6, 0.4), (0.2, 0.3, 0.2), (0.9, 0.1, 0.3, 0.1)),
-        Cylinder((0.4, -0.4, 0.3), 0.08, 0.5, (0.9, 0.3, 0.0, 0.1)),
-        Capsule((-0.4, -0.3, 0.5), 0.06, 0.5, (0.9, 0.3, 0.5, 0.1)),
-    ]
-)
+SHAPES = solids()
 
 
 def configurations(*shape: int, seed: int = 0) -> np.ndarray:

@@ -12,7 +12,7 @@ from robotdiffuse.robots.robot import Robot
 TURNED = transform(np.array([0.1, 0.0, 0.3]), rotation_about(np.array([0.6, 0.0, 0.8]), 0.7))
 
 
-def pendulum(effort: float) -> Robot:
+def pendulum(effort: float = 10.0) -> Robot:
     """A rod of 2 kg and 1 m that hangs down at 0, about y."""
     y = np.array([0.0, 1.0, 0.0])
     hinge = Joint("hinge", "revolute", "base", "rod", np.eye(4), y, -3.0, 3.0, 2.0, 8.0, 80.0, effort=effort)

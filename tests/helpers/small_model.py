@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from helpers.box_arm import box_arm
@@ -30,6 +31,11 @@ def small_model(seed: int = 0) -> MotionNetwork:
     model = MotionNetwork(RobotIdentity.of(box_arm()), settings)
     torch.nn.init.normal_(model.denoiser.out.weight, std=0.2)
     return model
+
+
+def cloud(n: int, seed: int = 0) -> torch.Tensor:
+    points = np.random.default_rng(seed).uniform([-0.5, -0.5, 0.1], [0.5, 0.5, 0.8], (1, n, 3))
+    return torch.from_numpy(points.astype(np.float32))
 
 
 @cache

@@ -12,6 +12,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 import robotdiffuse as rd
+from helpers.explorations import FLOOR, HOME, WALL
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.interop.depth_recording import (
@@ -29,9 +30,6 @@ from robotdiffuse.planning.exploration.simulated import RecordedExplorer, camera
 from robotdiffuse.planning.exploration.steps import ExplorerSettings
 
 PANDA = rd.load_robot("panda")
-HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
-FLOOR = rd.Box((0, 0, -0.06), (6, 6, 0.1), name="floor")
-WALL = rd.Box((0.45, -0.2, 0.3), (0.5, 0.02, 0.6), name="wall")
 PROBLEM = rd.Problem(PANDA, rd.Scene([FLOOR, WALL]), HOME, HOME + 0.2)
 
 

@@ -9,7 +9,7 @@ import torch
 
 from helpers.box_arm import box_arm
 from helpers.example_robots import planar_arm
-from helpers.small_model import SMALL_ENCODER, save_small_model, small_model
+from helpers.small_model import SMALL_ENCODER, cloud, save_small_model, small_model
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.checkpoint import (
     fingerprint,
@@ -22,11 +22,6 @@ from robotdiffuse.learning.encoders.networks import (
 )
 
 pytestmark = pytest.mark.usefixtures("no_export")
-
-
-def cloud(n: int, seed: int = 0) -> torch.Tensor:
-    points = np.random.default_rng(seed).uniform([-0.5, -0.5, 0.1], [0.5, 0.5, 0.8], (1, n, 3))
-    return torch.from_numpy(points.astype(np.float32))
 
 
 def test_checkpoint_round_trip(tmp_path):

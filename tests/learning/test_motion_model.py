@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from helpers.box_arm import box_arm
-from helpers.small_model import SMALL_ENCODER, small_model
+from helpers.small_model import SMALL_ENCODER, cloud, small_model
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.diffusion import SAMPLERS, noise_factor
 from robotdiffuse.learning.encoders.networks import (
@@ -19,11 +19,6 @@ from robotdiffuse.learning.motion_model import GuideFn, MotionModelSettings, Sam
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.robots.kinematic_tree import JointNormalizer
-
-
-def cloud(n: int, seed: int = 0) -> torch.Tensor:
-    points = np.random.default_rng(seed).uniform([-0.5, -0.5, 0.1], [0.5, 0.5, 0.8], (1, n, 3))
-    return torch.from_numpy(points.astype(np.float32))
 
 
 def test_standardized_codes():

@@ -25,13 +25,13 @@ def seen(q: ndarray, seed: int = 0) -> rd.DepthView:
     """The image that a sensor with correlated noise has of the arm and the scene."""
     view = ray_cast(SCENE, T, K, (320, 240))
     balls = surface_balls(PANDA, q)
-    rows = np.zeros((len(balls), 16), np.float32)
+    rows = np.zeros((len(balls), 17), np.float32)
     rows[:, :3] = balls
-    rows[:, 3:12] = np.eye(3).ravel()
-    rows[:, [12, 15]] = 0.0035
+    rows[:, [3, 7, 11]] = 1.0
+    rows[:, 15] = 0.0035
     depth = np.where(np.isfinite(view.depth), view.depth, 9.0).astype(np.float32)
     intrinsics = np.array(K, np.float32)
-    render_depth(np.zeros(len(balls), np.int64), rows, intrinsics, T.astype(np.float32), depth)
+    render_depth(rows, intrinsics, T.astype(np.float32), depth)
     clean = replace(view, depth=np.where(depth < 4.0, depth, np.inf), configuration=q)
     return DepthNoise(0.003, correlation=1.5, zeros=True).applied(clean, np.random.default_rng(seed))
 

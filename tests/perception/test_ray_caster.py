@@ -8,6 +8,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from helpers.sphere_oracles import distance
 from robotdiffuse import Box, Capsule, Cylinder, InputError, PointCloud, Scene, Sphere, load_robot
 from robotdiffuse.perception.ray_caster import MAX_RANGE, looking_at, ray_cast, voxels_within
 from robotdiffuse.perception.voxel_grid import VoxelGrid
@@ -17,23 +18,6 @@ from robotdiffuse.scenes.shapes import Shape
 PANDA = load_robot("panda")
 SIZE = (64, 48)
 INTRINSICS = (60.0, 60.0, 31.5, 23.5)
-
-
-def distance(shape: Shape, points: np.ndarray) -> np.ndarray:
-    """Signed, by the formulas of each shape."""
-    if isinstance(shape, Sphere):
-        return np.linalg.norm(points - shape.center, axis=-1) - shape.radius
-    assert isinstance(shape, Box | Cylinder | Capsule)
-    local = (points - shape.center) @ shape.rotation
-    if isinstance(shape, Box):
-        beyond = np.abs(local) - shape.size / 2
-    elif isinstance(shape, Capsule):
-        along = np.maximum(np.abs(local[..., 2]) - shape.height / 2, 0)
-        return np.hypot(np.linalg.norm(local[..., :2], axis=-1), along) - shape.radius
-    else:
-        around = np.linalg.norm(local[..., :2], axis=-1) - shape.radius
-        beyond = np.stack([around, np.abs(local[..., 2]) - shape.height / 2], axis=-1)
-    return np.linalg.norm(np.maximum(beyond, 0), axis=-1) + np.minimum(beyond.max(axis=-1), 0)
 
 
 def random_scene(rng: np.random.Generator, count: int = 6) -> Scene:

@@ -15,6 +15,7 @@ from robotdiffuse.perception.visibility import (
     surface_balls,
     within_voxels,
 )
+from robotdiffuse.perception.voxel_grid import VoxelGrid
 from robotdiffuse.robots.kinematics import link_pose
 
 PANDA = rd.load_robot("panda")
@@ -92,11 +93,10 @@ def test_noise_asks_for_more_distance_and_filtered_images_for_more_pixels() -> N
 
 def test_balls_lie_within_voxels_if_all_of_them_do() -> None:
     marked = RNG.random((30, 30, 30)) < 0.95
-    low = np.array((0.2, -0.3, 0.2))
+    low = 0.2, -0.3, 0.2
     edge = 0.02
     radius = 0.008
-    within = np.zeros(len(BALLS), np.bool_)
-    within_voxels(BALLS, np.float32(radius), marked, low.astype(np.float32), np.float32(edge), within)
+    within = within_voxels(BALLS, radius, marked, VoxelGrid(low, marked.shape, edge))
     for ball, found in zip(BALLS[:500].astype(np.float64), within[:500], strict=True):
         corners = np.stack(np.meshgrid(*np.stack([ball - radius, ball + radius], axis=1)), -1).reshape(-1, 3)
         at = np.floor((corners - low) / edge).astype(int)

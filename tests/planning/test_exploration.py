@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial import KDTree
 
 import robotdiffuse as rd
+from helpers.explorations import FLOOR, HOME, WALL, ZONE
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.perception.depth_view import DepthNoise
@@ -31,10 +32,6 @@ from robotdiffuse.planning.exploration.steps import DONE
 from robotdiffuse.robots.kinematics import link_pose, placed_spheres
 
 PANDA = rd.load_robot("panda")
-HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
-FLOOR = rd.Box((0, 0, -0.06), (6, 6, 0.1), name="floor")
-WALL = rd.Box((0.45, -0.2, 0.3), (0.5, 0.02, 0.6), name="wall")
-ZONE = ((-0.36, -0.36, 0.0), (0.36, 0.36, 0.7))
 LEFT, RIGHT = (np.array([turn, *HOME[1:]]) for turn in (0.5, -1.7))
 OUTSIDE = np.array([-1.7, 0.3, 0.0, -1.8, 0.0, 2.0, 0.785])
 PROBLEM = rd.Problem(PANDA, rd.Scene([FLOOR, WALL]), LEFT, RIGHT)

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.explorations import FLOOR, HOME
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.planning.exploration.stopping import braked
 from robotdiffuse.trajectories.speed_limits import jerk_limits
 
 PANDA = rd.load_robot("panda")
-HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
-FLOOR = rd.Box((0, 0, -0.06), (6, 6, 0.1), name="floor")
 LEFT, RIGHT = (np.array([turn, *HOME[1:]]) for turn in (1.0, -0.9))
 EMPTY = rd.Problem(PANDA, rd.Scene([FLOOR]), LEFT, RIGHT)
 BALL = rd.Sphere([0.29, -0.13, 0.52], 0.06, name="ball")

@@ -10,6 +10,11 @@ from robotdiffuse.problems.units import arm_in_cloud_note, unit_notes
 PANDA = rd.load_robot("panda")
 START = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
 GOAL = [0.4, -0.7, 0.0, -2.3, 0.0, 1.571, 0.785]
+VIEW = ray_cast(
+    rd.Scene([rd.Box([0.0, -0.8, 0.3], [0.2, 0.2, 0.6])]),
+    looking_at(np.array([1.7, 0.0, 0.6]), np.array([0.4, 0.0, 0.3])),
+    *((75.0, 75.0, 39.5, 29.5), (80, 60), PANDA, np.array(START)),
+)
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
 FACES = [[0, 1, 3], [0, 3, 2], [4, 5, 7], [4, 7, 6], [0, 1, 5], [0, 5, 4]]
 
@@ -41,11 +46,8 @@ def test_scenes_in_meters_have_no_notes_on_units() -> None:
 
 
 def test_a_depth_image_in_millimeters_is_noted() -> None:
-    T_base_camera = looking_at(np.array([1.7, 0.0, 0.6]), np.array([0.4, 0.0, 0.3]))
-    scene = rd.Scene([rd.Box([0.0, -0.8, 0.3], [0.2, 0.2, 0.6])])
-    view = ray_cast(scene, T_base_camera, (75.0, 75.0, 39.5, 29.5), (80, 60), PANDA, np.array(START))
-    assert _notes(views=[view]) == ()
-    wrong = [rd.DepthView(1000 * view.depth, view.intrinsics, T_base_camera)]
+    assert _notes(views=[VIEW]) == ()
+    wrong = [rd.DepthView(1000 * VIEW.depth, VIEW.intrinsics, VIEW.T_base_camera)]
     [note] = _notes(views=wrong)
     assert "depths of views[0] begin at" in note and "millimeters" in note
     problem = rd.Problem(PANDA, rd.Scene(), START, GOAL, views=wrong, unknown="padded")
@@ -53,11 +55,8 @@ def test_a_depth_image_in_millimeters_is_noted() -> None:
 
 
 def test_what_views_see_in_reach_is_no_scene_beyond_it() -> None:
-    T_base_camera = looking_at(np.array([1.7, 0.0, 0.6]), np.array([0.4, 0.0, 0.3]))
-    scene = rd.Scene([rd.Box([0.0, -0.8, 0.3], [0.2, 0.2, 0.6])])
-    view = ray_cast(scene, T_base_camera, (75.0, 75.0, 39.5, 29.5), (80, 60), PANDA, np.array(START))
     far = rd.Scene([rd.Sphere([0, 5, 0], 0.2)])
-    problem = rd.Problem(PANDA, far, START, GOAL, views=[view], unknown="padded")
+    problem = rd.Problem(PANDA, far, START, GOAL, views=[VIEW], unknown="padded")
     notes = rd.load_planner("aorrtc").plan(problem).notes
     assert all(note.startswith("compiled for") for note in notes), notes
 

@@ -10,15 +10,14 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.example_robots import urdf_file
+from helpers.heavy_arms import pendulum
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.core.types import Status
 from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
-from robotdiffuse.robots.bodies import Payload, inertia_of
+from robotdiffuse.robots.bodies import Payload
 from robotdiffuse.robots.dynamics import GRAVITY, Dynamics
-from robotdiffuse.robots.kinematic_tree import Joint
-from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
 from robotdiffuse.validation.validator import verify, verify_trajectory
 
@@ -27,13 +26,6 @@ PANDA = rd.load_robot("panda")
 LOW = [-0.6, 0.2, 0, -1.2, 0, 2.2, 0.2]
 FAR = [0.6, 0.6, 0, -1.0, 0, 2.2, 0.2]
 Y = np.array([0.0, 1.0, 0.0])
-
-
-def pendulum(effort: float = 10.0) -> Robot:
-    """A rod of 2 kg and 1 m that rotates about y and hangs down at 0."""
-    hinge = Joint("hinge", "revolute", "base", "rod", np.eye(4), Y, -3.0, 3.0, 2.0, 8.0, 80.0, effort=effort)
-    rod = inertia_of([2.0, 0.0, 0.0, -0.5, 2 / 12, 0, 0, 2 / 12, 0, 0])
-    return Robot("pendulum", "base", "rod", (hinge,), inertias={"rod": rod})
 
 
 def test_a_pendulum_by_hand() -> None:

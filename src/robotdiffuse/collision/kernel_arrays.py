@@ -23,7 +23,7 @@ from robotdiffuse.collision.point_cloud_grid import (
 )
 from robotdiffuse.collision.sphere_pair_tables import build_pair_tables, no_tables
 from robotdiffuse.core.deadline import check_time
-from robotdiffuse.core.transforms import transform
+from robotdiffuse.core.transforms import placed, transform
 from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import LinkPairTable, Robot
@@ -111,9 +111,9 @@ def robot_groups(robot: Robot) -> tuple[str, ...]:
 def compile_robot(robot: Robot) -> RobotArrays:
     """The arrays of a robot, with its locked joints at their values."""
     groups = robot_groups(robot)
-    placed = [_placed_groups(robot)[link] for link in groups]
-    spheres = [group.spheres for group in placed]
-    clusters = [group.rows for group in placed]
+    of_links = [_placed_groups(robot)[link] for link in groups]
+    spheres = [group.spheres for group in of_links]
+    clusters = [group.rows for group in of_links]
     rows = [row for of_group in clusters for row in of_group]
     index = {link: i for i, link in enumerate(groups)}
     T = robot.frame_offsets
@@ -125,11 +125,11 @@ def compile_robot(robot: Robot) -> RobotArrays:
         spheres=np.concatenate(spheres).astype(np.float32) if spheres else np.zeros((0, 4), np.float32),
         first=np.cumsum([0] + [len(s) for s in spheres]).astype(np.int32),
         rows=np.concatenate([by_sixteen(row, row[-1:]) for row in [NO_SPHERES, *rows]]),
-        row_bounds=np.array([row for group in placed for row in group.row_bounds], np.float32).reshape(-1, 4),
+        row_bounds=np.array([row for of in of_links for row in of.row_bounds], np.float32).reshape(-1, 4),
         row_sizes=np.array([len(row) for row in rows], np.int64),
         first_row=np.cumsum([0] + [len(of_group) for of_group in clusters]).astype(np.int32),
         frame=np.array([robot.link_frame(link) for link in groups], np.int32),
-        bounds=np.array([group.bounds for group in placed], np.float32).reshape(-1, 4),
+        bounds=np.array([group.bounds for group in of_links], np.float32).reshape(-1, 4),
         pairs=np.array([(a, b, -1, 0) for a, b in pairs], np.int32).reshape(-1, 4),
         pair_tables=no_tables(),
         parents=robot.kernel_parents,
@@ -170,21 +170,20 @@ class _Group(NamedTuple):
 @once_per_robot
 def _placed_groups(robot: Robot) -> dict[str, _Group]:
     """The groups by link. A robot that holds something reuses those of the bare arm."""
-    placed = {} if robot.bare is None else dict(_placed_groups(robot.bare))
-    links = [link for link in robot_groups(robot) if link not in placed]
+    of_link = {} if robot.bare is None else dict(_placed_groups(robot.bare))
+    links = [link for link in robot_groups(robot) if link not in of_link]
     link_spheres = []
     parts = []
     for link in links:
-        T = robot.T_frame_link(link)
         local = np.asarray(robot.spheres[link], np.float64)
-        centers = local[:, :3] @ T[:3, :3].T + T[:3, 3]
+        centers = placed(robot.T_frame_link(link), local[:, :3])
         link_spheres.append(np.column_stack([centers, local[:, 3]]))
         parts.append(_clusters(link_spheres[-1]))
-    bounds = _bounding_spheres([*link_spheres, *(part for of_link in parts for part in of_link)])
+    bounds = _bounding_spheres([*link_spheres, *(part for group in parts for part in group)])
     of_parts = iter(bounds[len(link_spheres) :])
     for link, spheres, rows, around in zip(links, link_spheres, parts, bounds, strict=False):
-        placed[link] = _Group(spheres, rows, around, list(islice(of_parts, len(rows))))
-    return placed
+        of_link[link] = _Group(spheres, rows, around, list(islice(of_parts, len(rows))))
+    return of_link
 
 
 @once_per_robot

@@ -4,9 +4,10 @@ Rays are cast through the pixels that a shape may cover.
 """
 
 import numpy as np
-from jaxtyping import Float, Float32, Int64
+from jaxtyping import Float, Float32
 from numpy import ndarray
 
+from robotdiffuse.collision.kernel_arrays import compile_scene
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.transforms import transform
@@ -16,12 +17,8 @@ from robotdiffuse.perception.voxel_grid import VoxelGrid, Voxels
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Shape, Sphere
+from robotdiffuse.scenes.shapes import PointCloud, Triangulated
 
-SPHERE = 0
-BOX = 1
-CYLINDER = 2
-CAPSULE = 3
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 _NEAR = np.float32(0.02)
 _MISS = np.float32(1e9)
@@ -84,21 +81,26 @@ def _slab(o, d, half):
 
 
 @kernel(fastmath={"contract", "reassoc", "arcp", "nsz"})
-def _intersect(kind, ox, oy, oz, dx, dy, dz, a, b, c):
-    """The parameter, in lengths of its direction, at which a ray enters a shape at the origin; or _MISS."""
-    if kind == SPHERE:
-        return _sphere(ox, oy, oz, dx, dy, dz, a)
-    if kind == BOX:
+def _intersect(solid, ox, oy, oz, dx, dy, dz):
+    """The parameter, in lengths of its direction, at which a ray in the frame of a solid enters it; or
+    _MISS."""
+    a = solid[12]
+    c = solid[14]
+    r = solid[15]
+    if r > _ZERO and c <= _ZERO:
+        return _sphere(ox, oy, oz, dx, dy, dz, r)
+    if r <= _ZERO and solid[16] <= _ZERO:
         x0, x1 = _slab(ox, dx, a)
-        y0, y1 = _slab(oy, dy, b)
+        y0, y1 = _slab(oy, dy, solid[13])
         z0, z1 = _slab(oz, dz, c)
         enter = max(x0, y0, z0)
         return enter if enter < min(x1, y1, z1) else _MISS
+    a += r
     square = dx * dx + dy * dy
     mixed = ox * dx + oy * dy
     offset = ox * ox + oy * oy - a * a
-    if kind == CYLINDER:
-        z0, z1 = _slab(oz, dz, b)
+    if solid[16] > _ZERO:
+        z0, z1 = _slab(oz, dz, c)
         if square < np.float32(1e-12):
             return z0 if offset < _ZERO else _MISS
         enter = _quadratic(square, mixed, offset, False)
@@ -106,30 +108,34 @@ def _intersect(kind, ox, oy, oz, dx, dy, dz, a, b, c):
         enter = max(enter, z0)
         return enter if enter < min(leave, z1) else _MISS
     side = _quadratic(square, mixed, offset, False)
-    if abs(oz + side * dz) > b:
+    if abs(oz + side * dz) > c:
         side = _MISS
-    return min(side, _sphere(ox, oy, oz - b, dx, dy, dz, a), _sphere(ox, oy, oz + b, dx, dy, dz, a))
+    return min(side, _sphere(ox, oy, oz - c, dx, dy, dz, r), _sphere(ox, oy, oz + c, dx, dy, dz, r))
+
+
+@kernel(inline="always")
+def _radius(solid):
+    """The radius of a ball around a solid."""
+    return np.sqrt(solid[12] ** 2 + solid[13] ** 2 + solid[14] ** 2) + solid[15]
 
 
 @kernel(fastmath={"contract", "reassoc", "arcp", "nsz"})
-def render_depth(kinds, rows, intrinsics, T, depth):
-    """Lowers each pixel of `depth` [h w] to the depth of the nearest shape.
+def render_depth(solids, intrinsics, T, depth):
+    """Lowers each pixel of `depth` [h w] to the depth of the nearest of `SceneArrays.solids`.
 
-    Shapes that contain the camera are not rendered. rows [n, 16]: center, rotation from the base's frame to
-    the shape's, half sizes or radius and half height, radius of a bounding sphere; T: T_base_camera. All
-    arrays are float32, except kinds.
+    Solids that contain the camera are not rendered. T: T_base_camera. All arrays are float32.
     """
     h, w = depth.shape
     fx, fy, cx, cy = intrinsics
     M = np.empty((3, 3), np.float32)
     o = np.empty(3, np.float32)
-    for s in range(len(kinds)):
-        row = rows[s]
+    for s in range(len(solids)):
+        row = solids[s]
         px = row[0] - T[0, 3]
         py = row[1] - T[1, 3]
         pz = row[2] - T[2, 3]
         x, y, z = in_camera(T, px, py, pz)
-        v0, v1, u0, u1 = rectangle(x, y, z, row[15], intrinsics, h, w)
+        v0, v1, u0, u1 = rectangle(x, y, z, _radius(row), intrinsics, h, w)
         if v1 < v0 or u1 < u0:
             continue
         for i in range(3):
@@ -146,11 +152,7 @@ def render_depth(kinds, rows, intrinsics, T, depth):
             dz = M[2, 1] * q + M[2, 2]
             for u in range(u0, u1 + 1):
                 p = (np.float32(u) - cx) / fx
-                t = _intersect(
-                    kinds[s], o[0], o[1], o[2],
-                    dx + M[0, 0] * p, dy + M[1, 0] * p, dz + M[2, 0] * p,
-                    row[12], row[13], row[14],
-                )  # fmt: skip
+                t = _intersect(row, o[0], o[1], o[2], dx + M[0, 0] * p, dy + M[1, 0] * p, dz + M[2, 0] * p)
                 if _NEAR < t < depth[v, u]:
                     depth[v, u] = t
 
@@ -159,51 +161,38 @@ _HALF = np.float32(0.5)
 
 
 @kernel()
-def _squared_distance(kind, x, y, z, a, b, c):
-    """Squared distance of a point to a shape at the origin; 0 inside it."""
-    if kind == SPHERE:
-        out = max(np.sqrt(x * x + y * y + z * z) - a, _ZERO)
-        return out * out
-    if kind == BOX:
-        x = max(abs(x) - a, _ZERO)
-        y = max(abs(y) - b, _ZERO)
-        z = max(abs(z) - c, _ZERO)
-        return x * x + y * y + z * z
-    along = max(abs(z) - b, _ZERO)
-    if kind == CYLINDER:
-        out = max(np.sqrt(x * x + y * y) - a, _ZERO)
-        return out * out + along * along
-    out = max(np.sqrt(x * x + y * y + along * along) - a, _ZERO)
-    return out * out
+def fill_voxels(solids, low, voxel, margin, out):
+    """Sets the voxels of out [nx ny nz] whose center is in a solid, or at most `margin` [m] from it.
 
-
-@kernel()
-def fill_voxels(kinds, rows, low, voxel, margin, out):
-    """Sets the voxels of out [nx ny nz] whose center is in a shape, or at most `margin` [m] from it.
-
-    rows: as in `render_depth`; low: lower corner of the grid. All arrays are float32, except kinds
-    and `out`, bool.
+    low: lower corner of the grid. All arrays are float32, except `out`, bool.
     """
     nx, ny, nz = out.shape
-    for s in range(len(kinds)):
-        row = rows[s]
-        reach = rows[s, 15] + margin
+    for s in range(len(solids)):
+        row = solids[s]
+        reach = _radius(row) + margin
         i0 = int(max((row[0] - reach - low[0]) / voxel, _ZERO))
         i1 = int((row[0] + reach - low[0]) / voxel + 1)
         j0 = int(max((row[1] - reach - low[1]) / voxel, _ZERO))
         j1 = int((row[1] + reach - low[1]) / voxel + 1)
         k0 = int(max((row[2] - reach - low[2]) / voxel, _ZERO))
         k1 = int((row[2] + reach - low[2]) / voxel + 1)
+        square = (margin + row[15]) ** 2
         for i in range(i0, min(i1, nx)):
             px = low[0] + (np.float32(i) + _HALF) * voxel - row[0]
             for j in range(j0, min(j1, ny)):
                 py = low[1] + (np.float32(j) + _HALF) * voxel - row[1]
                 for k in range(k0, min(k1, nz)):
                     pz = low[2] + (np.float32(k) + _HALF) * voxel - row[2]
-                    x = row[3] * px + row[4] * py + row[5] * pz
-                    y = row[6] * px + row[7] * py + row[8] * pz
-                    z = row[9] * px + row[10] * py + row[11] * pz
-                    if _squared_distance(kinds[s], x, y, z, row[12], row[13], row[14]) <= margin * margin:
+                    x = abs(row[3] * px + row[4] * py + row[5] * pz)
+                    y = abs(row[6] * px + row[7] * py + row[8] * pz)
+                    z = abs(row[9] * px + row[10] * py + row[11] * pz)
+                    if row[16] > _ZERO:
+                        x = np.sqrt(x * x + y * y)
+                        y = _ZERO
+                    x = max(x - row[12], _ZERO)
+                    y = max(y - row[13], _ZERO)
+                    z = max(z - row[14], _ZERO)
+                    if x * x + y * y + z * z <= square:
                         out[i, j, k] = True
 
 
@@ -239,13 +228,15 @@ def ray_cast(
     size: width and height [pixels]; intrinsics: see DepthView. Depth is infinite for pixels without an
     obstacle within MAX_RANGE. Raises InputError for shapes other than spheres, boxes, cylinders and capsules.
     """
-    kinds, rows = _rows(scene)
+    solids = _solids(scene)
     if robot is not None and configuration is not None:
-        spheres = [_sphere_row(sphere) for sphere in placed_spheres(robot, configuration)]
-        kinds = np.append(kinds, np.full(len(spheres), SPHERE))
-        rows = np.concatenate([rows, np.array(spheres, np.float32).reshape(-1, 16)])
+        spheres = placed_spheres(robot, configuration)
+        balls = np.zeros((len(spheres), solids.shape[1]), np.float32)
+        balls[:, [0, 1, 2, 15]] = spheres
+        balls[:, [3, 7, 11]] = _ONE
+        solids = np.concatenate([solids, balls])
     depth = np.full((size[1], size[0]), MAX_RANGE, np.float32)
-    render_depth(kinds, rows, np.array(intrinsics, np.float32), np.asarray(T_base_camera, np.float32), depth)
+    render_depth(solids, np.array(intrinsics, np.float32), np.asarray(T_base_camera, np.float32), depth)
     depth[depth >= MAX_RANGE] = np.inf
     return DepthView(depth, intrinsics, T_base_camera, configuration)
 
@@ -261,37 +252,15 @@ def voxels_within(
     InputError for shapes other than spheres, boxes, cylinders and capsules.
     """
     out = np.zeros(grid.shape, np.bool_)
-    fill_voxels(*_rows(scene), *grid.frame, np.float32(margin), out)
+    fill_voxels(_solids(scene), *grid.frame, np.float32(margin), out)
     return out
 
 
-def _rows(scene: Scene) -> tuple[Int64[ndarray, "n"], Float32[ndarray, "n 16"]]:
-    """Kinds and parameter rows of the shapes for the Numba kernels."""
-    kinds = np.array([_kind(shape) for shape in scene.shapes], np.int64)
-    return kinds, np.array([_row(shape) for shape in scene.shapes], np.float32).reshape(-1, 16)
-
-
-def _kind(shape: Shape) -> int:
-    kind = {Sphere: SPHERE, Box: BOX, Cylinder: CYLINDER, Capsule: CAPSULE}.get(type(shape))
-    if kind is None:
-        raise InputError(
-            f"{shape.name} is a {shape.kind}; only spheres, boxes, cylinders and capsules can be rendered"
-        )
-    return kind
-
-
-def _row(shape: Shape) -> ndarray:
-    if isinstance(shape, Sphere):
-        return _sphere_row(np.append(shape.center, shape.radius))
-    assert isinstance(shape, Box | Cylinder | Capsule)  # by _kind
-    if isinstance(shape, Box):
-        half = shape.size / 2
-        around = float(np.linalg.norm(shape.size)) / 2
-    else:
-        half = np.array([shape.radius, shape.height / 2, 0.0])
-        around = float(np.hypot(*half[:2]) if isinstance(shape, Cylinder) else half[:2].sum())
-    return np.concatenate([shape.center, shape.rotation.T.ravel(), half, [around]])
-
-
-def _sphere_row(sphere: Float[ndarray, "4"]) -> ndarray:
-    return np.concatenate([sphere[:3], np.eye(3).ravel(), [sphere[3], 0.0, 0.0, sphere[3]]])
+def _solids(scene: Scene) -> Float32[ndarray, "n 17"]:
+    """`SceneArrays.solids` of a scene."""
+    for shape in scene.shapes:
+        if isinstance(shape, PointCloud | Triangulated):
+            raise InputError(
+                f"{shape.name} is a {shape.kind}; only spheres, boxes, cylinders and capsules can be rendered"
+            )
+    return compile_scene(scene).solids

@@ -22,6 +22,8 @@ at that depth, or by less than this fraction of the depth."""
 MAX_DEPTH = np.float32(1e6)
 """Larger depths are no returns [m]."""
 _NEAREST = np.float32(NEAREST)
+RECENT = 256
+"""Cells whose rows are kept at hand: a power of two."""
 
 
 @kernel(nogil=True, inline="always")
@@ -77,105 +79,77 @@ def _add(sums, row, x, y, z):
 
 
 @kernel(nogil=True)
-def gather_cloud(points, reach, spheres, voxel, keys, cells, sums, count):
-    """Adds a point cloud to the cells; arguments and result as in `gather_image`."""
+def gather(points, reach, spheres, voxel, keys, cells, sums, count):
+    """Adds points [3, n] to cells `voxel` wide. Returns the number of cells; -1 if `sums` is too small.
+
+    Points beyond `reach` of the origin, NaN, and points inside one of the spheres [n, 4] are left out. keys,
+    int64, and cells, int32, are an open-addressing hash table, with keys of -1 in empty slots; sums [m, 4]
+    are the sums of coordinates and the number of points of each cell.
+    """
     box = _box(spheres)
     columns = _columns(spheres)
-    before = np.int64(-1)
-    row = np.int32(0)
-    for p in range(len(points)):
+    # of the last cells: most points are in the cell of a neighboring pixel
+    recent = np.full(RECENT, -1, np.int64)
+    rows = np.zeros(RECENT, np.int32)
+    for p in range(points.shape[1]):
         if count >= len(sums):
             return -1
-        x = np.float32(points[p, 0])
-        y = np.float32(points[p, 1])
-        z = np.float32(points[p, 2])
+        x = points[0, p]
+        y = points[1, p]
+        z = points[2, p]
         if not x * x + y * y + z * z <= reach * reach:
             continue
         if _in_box(box, x, y, z) and _within(x, y, z, *columns):
             continue
         key = _key(x, y, z, voxel)
-        if key != before:  # most points are in the cell of the previous point
-            before = key
-            row, count = _row(keys, cells, count, key)
-        _add(sums, row, x, y, z)
+        at = (key ^ (key >> 18) ^ (key >> 37)) & (RECENT - 1)
+        if recent[at] != key:
+            recent[at] = key
+            rows[at], count = _row(keys, cells, count, key)
+        _add(sums, rows[at], x, y, z)
     return count
 
 
 @kernel(nogil=True)
-def gather_image(depth, intrinsics, T, reach, spheres, voxel, keys, cells, sums, count):
-    """Adds a depth image to cells `voxel` wide. Returns the number of cells; -1 if `sums` is too small.
+def image_points(depth, intrinsics, T):
+    """The points of a depth image [3, h w] in the base frame; NaN for pixels without a return, and for flying
+    pixels: those with fewer than two of their eight neighbors on the same surface. At edges, sensors mix the
+    depths of the near and the far surface.
 
-    depth [h, w], intrinsics fx, fy, cx, cy, T: T_base_camera [4, 4]. Points beyond `reach` of the origin,
-    points inside one of the spheres [n, 4] and flying pixels are left out. keys, int64, and cells, int32, are
-    an open-addressing hash table, with keys of -1 in empty slots; sums [m, 4] are the sums of coordinates and
-    the number of points of each cell.
+    depth [h, w], intrinsics fx, fy, cx, cy, T: T_base_camera [4, 4]; all float32.
     """
     h, w = depth.shape
     fx, fy, cx, cy = intrinsics
-    box = _box(spheres)
-    columns = _columns(spheres)
     around = np.full((h + 2, w + 2), np.nan, np.float32)
     around[1:-1, 1:-1] = depth
-    x = np.empty(w, np.float32)
-    y = np.empty(w, np.float32)
-    z = np.empty(w, np.float32)
-    valid = np.empty(w, np.bool_)
-    cell = np.empty(w, np.int64)
-    # cells of the row of pixels above: most points are in the cell of a neighboring pixel
-    slots = np.full(w + 1, -1, np.int64)
-    rows = np.zeros(w + 1, np.int32)
+    out = np.empty((3, h, w), np.float32)
+    pixel = SAME_SURFACE_PIXELS / fx
     for v in range(h):
         b = (np.float32(v) - cy) / fy
-        _place_row(around[v : v + 3], b, fx, cx, T, reach, voxel, x, y, z, valid, cell)
+        rx = T[0, 1] * b + T[0, 2]
+        ry = T[1, 1] * b + T[1, 2]
+        rz = T[2, 1] * b + T[2, 2]
+        above = around[v]
+        middle = around[v + 1]
+        below = around[v + 2]
+        x = out[0, v]
+        y = out[1, v]
+        z = out[2, v]
         for u in range(w):
-            if not valid[u]:
-                continue
-            if count >= len(sums):
-                return -1
-            if _in_box(box, x[u], y[u], z[u]) and _within(x[u], y[u], z[u], *columns):
-                continue
-            if slots[u] == cell[u]:
-                rows[u + 1] = rows[u]
-            elif slots[u + 1] != cell[u]:
-                rows[u + 1], count = _row(keys, cells, count, cell[u])
-            slots[u + 1] = cell[u]
-            _add(sums, rows[u + 1], x[u], y[u], z[u])
-    return count
-
-
-@kernel(nogil=True)
-def _place_row(around, b, fx, cx, T, reach, voxel, x, y, z, kept, cell):
-    """Computes the points of a row of pixels, their cells, and which of them to keep.
-
-    Points within reach are kept, except flying pixels: those with fewer than two of their eight neighbors on
-    the same surface. At edges, sensors mix the depths of the near and the far surface.
-    around [3, w + 2]: the row above, the row and the row below, with one more pixel at either end.
-    """
-    above = around[0]
-    middle = around[1]
-    below = around[2]
-    rx = T[0, 1] * b + T[0, 2]
-    ry = T[1, 1] * b + T[1, 2]
-    rz = T[2, 1] * b + T[2, 2]
-    pixel = SAME_SURFACE_PIXELS / fx
-    max_square = reach * reach
-    for u in range(len(x)):
-        d = middle[u + 1]
-        a = (np.float32(u) - cx) / fx
-        px = (T[0, 0] * a + rx) * d + T[0, 3]
-        py = (T[1, 0] * a + ry) * d + T[1, 3]
-        pz = (T[2, 0] * a + rz) * d + T[2, 3]
-        jump = max(pixel, SAME_SURFACE_FRACTION) * d
-        alike = np.int32(0)
-        for row in (above, middle, below):
-            alike += np.int32(abs(row[u] - d) < jump)
-            alike += np.int32(abs(row[u + 1] - d) < jump)
-            alike += np.int32(abs(row[u + 2] - d) < jump)
-        x[u], y[u], z[u], cell[u] = px, py, pz, _key(px, py, pz, voxel)
-        # the pixel itself is one of three
-        kept[u] = (
-            (alike > 2) & (d >= _NEAREST) & (d < MAX_DEPTH) & (px * px + py * py + pz * pz <= max_square)
-        )
+            d = middle[u + 1]
+            a = (np.float32(u) - cx) / fx
+            jump = max(pixel, SAME_SURFACE_FRACTION) * d
+            alike = np.int32(0)
+            for row in (above, middle, below):
+                alike += np.int32(abs(row[u] - d) < jump)
+                alike += np.int32(abs(row[u + 1] - d) < jump)
+                alike += np.int32(abs(row[u + 2] - d) < jump)
+            # the pixel itself is one of three
+            d = d if (alike > 2) & (d >= _NEAREST) & (d < MAX_DEPTH) else np.float32(np.nan)
+            x[u] = (T[0, 0] * a + rx) * d + T[0, 3]
+            y[u] = (T[1, 0] * a + ry) * d + T[1, 3]
+            z[u] = (T[2, 0] * a + rz) * d + T[2, 3]
+    return out.reshape(3, h * w)
 
 
 @kernel(nogil=True)
@@ -294,20 +268,13 @@ def seen_points(
             depth, spread, _ = filtered(view)
             spheres = grown_for_errors(spheres, view, spread)
             spheres = (spheres + np.array([0, 0, 0, ARM_DISTANCE])).astype(np.float32)
-            rest = (
-                np.float32(reach_bound(robot) + REACH_MARGIN),
-                spheres,
-                np.float32(voxel),
-                keys,
-                cells,
-                sums,
-                count,
-            )
             if view.cloud is not None:
-                count = gather_cloud(for_kernels(view.cloud), *rest)
+                points = for_kernels(view.cloud.T, np.float32)
             else:
                 intrinsics = tuple(map(np.float32, view.intrinsics))
-                count = gather_image(depth, intrinsics, view.T_base_camera.astype(np.float32), *rest)
+                points = image_points(depth, intrinsics, view.T_base_camera.astype(np.float32))
+            reach = np.float32(reach_bound(robot) + REACH_MARGIN)
+            count = gather(points, reach, spheres, np.float32(voxel), keys, cells, sums, count)
             if count < 0:
                 break
         if count >= 0:

@@ -37,7 +37,6 @@ from robotdiffuse.perception.voxel_grid import (
     VoxelGrid,
     Voxels,
     heaviest_part,
-    summed,
     surface,
 )
 from robotdiffuse.robots.robot import Robot
@@ -156,21 +155,15 @@ TILE = 64
 """Coarse voxels of the periodic field along each axis: a power of two, and more than the observed volume."""
 
 
-@kernel(nogil=True)
-def highest_in_cells(probability, marked):
-    """Coarse voxels with marked fine voxels that may be occupied: indices int64[n, 3], and the highest
-    probability of these in each, float32[n], the highest first."""
-    nx, ny, nz = marked.shape
-    highest = np.zeros((nx // 2, ny // 2, nz // 2), np.float32)
-    for i in range(nx):
-        for j in range(ny):
-            for k in range(nz):
-                if marked[i, j, k] and probability[i, j, k] > highest[i // 2, j // 2, k // 2]:
-                    highest[i // 2, j // 2, k // 2] = probability[i, j, k]
-    cells = np.argwhere(highest > 0)
-    values = np.empty(len(cells), np.float32)
-    for n in range(len(cells)):
-        values[n] = highest[cells[n, 0], cells[n, 1], cells[n, 2]]
+def highest_in_cells(
+    probability: Probabilities, marked: Voxels
+) -> tuple[Int64[ndarray, "n 3"], Float32[ndarray, "n"]]:
+    """Coarse voxels with marked fine voxels that may be occupied, and the highest probability of these in
+    each, the highest first."""
+    highest = np.zeros(SHAPE, np.float32)
+    np.maximum.at(highest, tuple(at // 2 for at in np.nonzero(marked)), probability[marked])
+    cells = np.argwhere(highest)
+    values = highest[tuple(cells.T)]
     order = np.argsort(-values)
     return cells[order], values[order]
 
@@ -286,7 +279,7 @@ class CrossedSpace:
     @cached_property
     def risk(self) -> float | None:
         """The summed probability of the voxels; None without a prediction."""
-        return None if self.probability is None else float(summed(self.probability, self.voxels))
+        return None if self.probability is None else float(self.probability[self.voxels].sum(dtype=float))
 
     @cached_property
     def free_share(self) -> float | None:

@@ -1,17 +1,22 @@
 """What cameras would see: voxels past an arm and through voxels that may be occupied, and the small balls
 that cover an arm's surface."""
 
+from itertools import product
+
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.collision.convex_geometry import Part, parts_of
 from robotdiffuse.collision.exact_meshes import forward_frames
-from robotdiffuse.collision.kernels.collision_cost import frames_of, placed
+from robotdiffuse.collision.kernels.collision_cost import frames_of
+from robotdiffuse.collision.kernels.collision_cost import placed as placed_point
 from robotdiffuse.core.kernels import kernel
+from robotdiffuse.core.transforms import placed
 from robotdiffuse.core.types import Configuration, Points
 from robotdiffuse.perception.observed_volume import MAX_DEPTH, usable_depth
 from robotdiffuse.perception.ray_caster import in_camera
+from robotdiffuse.perception.voxel_grid import VoxelGrid, Voxels
 from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot
 
@@ -92,7 +97,7 @@ def _arm_ahead(robot, q, T, intrinsics, margin, depth):
     for g in range(len(robot.frame)):
         for s in range(robot.first[g], robot.first[g + 1]):
             sphere = robot.spheres[s]
-            x, y, z = placed(frames[robot.frame[g]], sphere[0], sphere[1], sphere[2])
+            x, y, z = placed_point(frames[robot.frame[g]], sphere[0], sphere[1], sphere[2])
             x = x - T[0, 3]
             y = y - T[1, 3]
             z = z - T[2, 3]
@@ -167,28 +172,13 @@ def _all_behind(depth, v0, v1, u0, u1, least):
     return True
 
 
-@kernel(nogil=True)
-def within_voxels(balls, radius, marked, low, edge, within):
-    """Mark the balls all of whose voxels are marked; arguments as above, marked bool[nx, ny, nz]."""
-    nx, ny, nz = marked.shape
-    for n in range(len(balls)):
-        x = balls[n, 0] - low[0]
-        y = balls[n, 1] - low[1]
-        z = balls[n, 2] - low[2]
-        i0 = int(np.floor((x - radius) / edge))
-        i1 = int(np.floor((x + radius) / edge))
-        j0 = int(np.floor((y - radius) / edge))
-        j1 = int(np.floor((y + radius) / edge))
-        k0 = int(np.floor((z - radius) / edge))
-        k1 = int(np.floor((z + radius) / edge))
-        if i0 < 0 or j0 < 0 or k0 < 0 or i1 >= nx or j1 >= ny or k1 >= nz:
-            continue
-        all_marked = True
-        for i in range(i0, i1 + 1):
-            for j in range(j0, j1 + 1):
-                for k in range(k0, k1 + 1):
-                    all_marked = all_marked and marked[i, j, k]
-        within[n] |= all_marked
+def within_voxels(balls: Points, radius: float, marked: Voxels, grid: VoxelGrid) -> Bool[ndarray, "n"]:
+    """Which balls lie in marked voxels of the grid alone. radius: at most half an edge [m]."""
+    corners = balls[:, None] + list(product((-radius, radius), repeat=3))
+    at = grid.indices(corners.reshape(-1, 3))
+    within = grid.contains(at)
+    within[within] = marked[tuple(at[within].T)]
+    return np.asarray(within.reshape(-1, 8).all(axis=1))
 
 
 # Edge of the cells of a grid of which those on the surface are kept; largest distance of a point of the
@@ -202,11 +192,8 @@ BALL_RADIUS = BALL_CELL * 3**0.5 / 2 + SAMPLE_DISTANCE
 def surface_balls(robot: Robot, q: Configuration) -> Points:
     """The centers of balls of BALL_RADIUS that cover the surface of moving links and of what they hold, at a
     configuration, in the base frame [m]."""
-    placed = [
-        points @ T[:3, :3].T + T[:3, 3]
-        for T, points in zip(forward_frames(robot, q[None])[0], _balls_by_frame(robot), strict=True)
-    ]
-    return np.concatenate(placed).astype(np.float32)
+    frames = forward_frames(robot, q[None])[0]
+    return np.concatenate(list(map(placed, frames, _balls_by_frame(robot)))).astype(np.float32)
 
 
 @once_per_robot

@@ -144,26 +144,14 @@ def mark(spheres, low, voxel, marked):
         _mark(spheres[s, 0], spheres[s, 1], spheres[s, 2], spheres[s, 3], low, voxel, marked)
 
 
-@kernel(nogil=True)
-def surface(marked):
-    """Indices int64[n, 3] of the marked voxels that share a face with one that is not, in order."""
-    nx, ny, nz = marked.shape
-    out = np.empty((marked.sum(), 3), np.int64)
-    count = 0
-    for i in range(nx):
-        for j in range(ny):
-            for k in range(nz):
-                if not marked[i, j, k]:
-                    continue
-                within = (i == 0 or marked[i - 1, j, k]) and (i == nx - 1 or marked[i + 1, j, k])
-                within = within and (j == 0 or marked[i, j - 1, k]) and (j == ny - 1 or marked[i, j + 1, k])
-                within = within and (k == 0 or marked[i, j, k - 1]) and (k == nz - 1 or marked[i, j, k + 1])
-                if not within:
-                    out[count, 0] = i
-                    out[count, 1] = j
-                    out[count, 2] = k
-                    count += 1
-    return out[:count]
+def surface(marked: Voxels) -> Int[ndarray, "n 3"]:
+    """Indices of the marked voxels that share a face with one that is not, in order."""
+    inner = np.pad(marked, 1, constant_values=True)
+    within = marked.copy()
+    for axis in range(3):
+        for step in (-1, 1):
+            within &= np.roll(inner, step, axis)[1:-1, 1:-1, 1:-1]
+    return np.argwhere(marked & ~within)
 
 
 @kernel(nogil=True)
@@ -189,54 +177,14 @@ def _mark(x, y, z, radius, low, voxel, marked):
                 marked[i, j, k] = True
 
 
-@kernel(nogil=True, fastmath=True)
-def summed(weights, marked):
-    """The sum of the weights of the marked voxels; both [nx, ny, nz]."""
-    total = 0.0
-    weight = weights.ravel()
-    mark = marked.ravel()
-    for i in range(len(mark)):
-        total += weight[i] if mark[i] else np.float32(0.0)
-    return total
+def heaviest_part(marked: Voxels, weights: Probabilities) -> Int[ndarray, "2 3"]:
+    """Bounding box of the connected part of the marked voxels with the largest sum of weights: first voxel
+    and one beyond the last. Voxels that share a face are connected."""
+    from scipy import ndimage
 
-
-@kernel(nogil=True)
-def heaviest_part(marked, weights):
-    """Bounding box int64[2, 3] of the connected part of the marked voxels with the largest sum of weights:
-    first voxel and one beyond the last. Voxels that share a face are connected."""
-    todo = np.empty((marked.sum(), 3), np.int64)
-    unvisited = marked.copy()
-    best = np.zeros((2, 3), np.int64)
-    max_weight = -1.0
-    for i, j, k in np.argwhere(marked):
-        count = _push(i, j, k, unvisited, todo, 0)
-        visited = 0
-        weight = 0.0
-        while visited < count:
-            x = todo[visited, 0]
-            y = todo[visited, 1]
-            z = todo[visited, 2]
-            visited += 1
-            weight += weights[x, y, z]
-            for way in (-1, 1):
-                count = _push(x + way, y, z, unvisited, todo, count)
-                count = _push(x, y + way, z, unvisited, todo, count)
-                count = _push(x, y, z + way, unvisited, todo, count)
-        if weight > max_weight and count:
-            max_weight = weight
-            for axis in range(3):
-                best[0, axis], best[1, axis] = todo[:count, axis].min(), todo[:count, axis].max() + 1
-    return best
-
-
-@kernel(nogil=True, inline="always")
-def _push(i, j, k, left, todo, count):
-    """Move a voxel from `left` to the list `todo`; returns the length of the list."""
-    nx, ny, nz = left.shape
-    if 0 <= i < nx and 0 <= j < ny and 0 <= k < nz and left[i, j, k]:
-        left[i, j, k] = False
-        todo[count, 0] = i
-        todo[count, 1] = j
-        todo[count, 2] = k
-        count += 1
-    return count
+    parts, count = ndimage.label(marked)  # type: ignore[misc]
+    if not count:
+        return np.zeros((2, 3), np.int64)
+    heaviest = np.argmax(np.bincount(parts.ravel(), weights.ravel())[1:])
+    box = ndimage.find_objects(parts)[heaviest]
+    return np.array([[side.start for side in box], [side.stop for side in box]])

@@ -7,16 +7,14 @@ import pytest
 import torch
 
 from helpers.box_arm import box_arm
+from helpers.small_model import SMALL_ENCODER
 from helpers.stores import WAYPOINTS as STORED
 from helpers.stores import manifest_of, random_arrays
 from robotdiffuse.datasets.shards import write_manifest, write_shard
 from robotdiffuse.learning.checkpoint import save_network
-from robotdiffuse.learning.encoders import PointAutoencoderSettings
 from robotdiffuse.learning.encoders.networks import PointAutoencoder
 from robotdiffuse.learning.training import tasks as training
 from robotdiffuse.scenes.scene_arrays import SPHERE
-
-SMALL_ENCODER = PointAutoencoderSettings(code=8, points=(16, 24), hidden=16, decoded=12)
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.small_model import SMALL_ENCODER
 from helpers.training_log import read_log
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
@@ -21,7 +22,7 @@ from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.learning.checkpoint import load_encoder, load_model, read_tensors
 from robotdiffuse.learning.denoisers import DENOISERS, TransformerSettings, UNetSettings
 from robotdiffuse.learning.diffusion import OBJECTIVES
-from robotdiffuse.learning.encoders import PointAutoencoderSettings, make_encoder
+from robotdiffuse.learning.encoders import make_encoder
 from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.learning.motion_model import SamplingSettings
 from robotdiffuse.learning.motion_network import MotionNetwork
@@ -45,7 +46,6 @@ from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.shapes import Box, Sphere
 from robotdiffuse.scenes.surface_points import sample_surface
 
-SMALL_ENCODER = PointAutoencoderSettings(code=8, points=(16, 24), hidden=16, decoded=12)
 SMALL_DENOISER = TransformerSettings(width=32, layers=2, heads=2, hidden=48, patch=8)
 WAYPOINTS = 48
 

@@ -174,9 +174,8 @@ class GoalSeen:
         if key not in self._unseen:
             self._unseen[key] = self._not_shown(surface_balls(self._robot, q), self._views.views)
         balls = self._unseen[key]
-        within = self._distances(balls, start) < CARVING_MARGIN - BALL_RADIUS
-        within_voxels(balls, np.float32(BALL_RADIUS), self._known.free, *MAP.frame, within)
-        return balls[~within]
+        near = self._distances(balls, start) < CARVING_MARGIN - BALL_RADIUS
+        return balls[~(near | within_voxels(balls, BALL_RADIUS, self._known.free, MAP))]
 
     def wanted(self, path: Path) -> Voxels:
         """The voxels that views are to show of the surface where a path ends."""
