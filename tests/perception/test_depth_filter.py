@@ -111,7 +111,7 @@ def test_images_without_noise_are_taken_as_they_are() -> None:
     assert patch_noise(np.zeros((240, 320), np.float32))[0] == 0.0, "without returns"
 
 
-def test_the_filter_takes_the_median_of_the_returns_and_adds_none() -> None:
+def test_the_filter_takes_the_median_of_the_returns_and_adds_none_but_in_single_holes() -> None:
     rng = np.random.default_rng(2)
     depth = rng.uniform(1.0, 2.0, (120, 100)).astype(np.float32)
     depth[rng.random(depth.shape) < 0.2] = 0.0
@@ -119,7 +119,7 @@ def test_the_filter_takes_the_median_of_the_returns_and_adds_none() -> None:
     for v, u in np.ndindex(depth.shape):
         around = depth[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2]
         returns = np.sort(around[around > 0])
-        enough = depth[v, u] > 0 and len(returns) >= 4
+        enough = len(returns) >= (4 if depth[v, u] > 0 else 6)
         assert found[v, u] == (returns[(len(returns) - 1) // 2] if enough else 0.0)
 
 
@@ -156,4 +156,4 @@ def test_a_pose_that_may_be_off_narrows_free_space() -> None:
     view = view_from(1.2)
     seen = observe([view], PANDA, HOME)
     narrowed = observe([replace(view, pose_deviation=(0.005, 0.0175))], PANDA, HOME).free
-    assert not (narrowed & ~(seen.free | seen.occupied)).any() and narrowed.sum() < 0.8 * seen.free.sum()
+    assert not (narrowed & ~(seen.free | seen.occupied)).any() and narrowed.sum() < 0.9 * seen.free.sum()

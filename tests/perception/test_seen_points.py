@@ -9,6 +9,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse import Box, DepthView, InputError, Problem, Scene, Sphere, load_problem, load_robot
+from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.perception.depth_view import SeenPoints
 from robotdiffuse.perception.seen_points import (
@@ -16,6 +17,7 @@ from robotdiffuse.perception.seen_points import (
     CELL,
     MIN_POINT_RADIUS,
     POINT_RADIUS,
+    point_shapes,
     seen_points,
 )
 from robotdiffuse.problems.files import problem_from_record, problem_record, save_problem
@@ -144,3 +146,18 @@ def test_what_the_arm_holds_is_not_seen_as_an_obstacle() -> None:
     alone = DepthView(picture(spheres), K, T)
     assert not len(seen_points([alone], held, START))
     assert len(seen_points([alone], PANDA, START)), "the bare arm sees the parcel"
+
+
+def test_points_of_a_pose_that_may_be_off_are_larger_and_leave_start_and_goals_free() -> None:
+    """Checks join large points to larger spheres: starts collided with points that did not touch them."""
+    error = 0.04
+    spheres = placed_spheres(PANDA, START)
+    rng = np.random.default_rng(0)
+    points = spheres[rng.integers(len(spheres), size=4000), :3] + rng.uniform(-0.3, 0.3, (4000, 3))
+    shapes = point_shapes(points, PANDA, Scene([]), START, START[None], error)
+    distances = np.linalg.norm(points[:, None] - spheres[None, :, :3], axis=2) - spheres[:, 3]
+    kept = np.concatenate([shape.points for shape in shapes])
+    assert max(shape.point_radius for shape in shapes) == POINT_RADIUS + error
+    assert len(kept) == ((distances.min(axis=1) >= MIN_POINT_RADIUS) | (distances.min(axis=1) < -error)).sum()
+    outside = point_shapes(points[distances.min(axis=1) > 0], PANDA, Scene([]), START, START[None], error)
+    assert CollisionChecker(PANDA, Scene(outside)).free(START[None])[0]

@@ -17,19 +17,19 @@ from robotdiffuse.perception.depth_view import NEAREST, DepthNoise, DepthView
 
 MIN_RETURNS = 4
 """A pixel with fewer returns among its 3 x 3 counts as without a return."""
+MIN_AROUND = 6
+"""A pixel without a return but with so many around it is a dropout of a surface, not a thing of its own."""
 
 
 @kernel(nogil=True)
 def median_filter(depth):
-    """Each pixel with a return as the median of the returns of its 3 x 3 pixels, the nearer one of two; 0
-    elsewhere."""
+    """Each pixel with a return, and those without one among many with, as the median of the returns of its
+    3 x 3 pixels, the nearer one of two; 0 elsewhere."""
     h, w = depth.shape
     out = np.zeros((h, w), np.float32)
     some = np.empty(9, np.float32)
     for v in range(h):
         for u in range(w):
-            if not depth[v, u] > 0:
-                continue
             count = 0
             for row in range(max(v - 1, 0), min(v + 2, h)):
                 for column in range(max(u - 1, 0), min(u + 2, w)):
@@ -42,7 +42,7 @@ def median_filter(depth):
                         at -= 1
                     some[at] = d
                     count += 1
-            if count >= MIN_RETURNS:
+            if count >= (MIN_RETURNS if depth[v, u] > 0 else MIN_AROUND):
                 out[v, u] = some[(count - 1) // 2]
     return out
 

@@ -144,7 +144,10 @@ def usable_image(
     spheres = spheres.astype(np.float32)
     if empty is not None:
         depth = np.where(empty, np.float32(-np.inf if view.range is None else np.inf), depth)
-        _hide_arm(depth, empty, np.array(view.intrinsics, np.float32), spheres)
+        # not enlarged by errors: the rectangles that must be seen through are
+        radii = placed_spheres(robot, q)[:, 3] + margin
+        outline = np.column_stack([spheres[:, :3], radii]).astype(np.float32)
+        _hide_arm(depth, empty, np.array(view.intrinsics, np.float32), outline)
     return depth, spread, spheres
 
 
@@ -300,6 +303,24 @@ def carve(depth, intrinsics, T, spheres, low, voxel, errors, state, behind, coun
 
 
 @kernel(fastmath=FASTMATH)
+def _half_sizes(T, x, y, half, error):
+    """Half the width and height, at a depth of 1, of the rectangle in the image around a cube, half of whose
+    edge is `half`, and which may be off by an error [m]; x, y: its center's direction."""
+    du = _ZERO
+    dv = _ZERO
+    u_square = _ZERO
+    v_square = _ZERO
+    for c in range(3):
+        across = T[c, 0] - x * T[c, 2]
+        along = T[c, 1] - y * T[c, 2]
+        du += abs(across)
+        dv += abs(along)
+        u_square += across * across
+        v_square += along * along
+    return half * du + error * np.sqrt(u_square), half * dv + error * np.sqrt(v_square)
+
+
+@kernel(fastmath=FASTMATH)
 def _state_of_block(first, intrinsics, T, low, voxel, errors, size, factor, table, missing):
     """OUT or FREE if all voxels of a block are so, by the rectangle that it covers in the image, else -1.
 
@@ -320,19 +341,15 @@ def _state_of_block(first, intrinsics, T, low, voxel, errors, size, factor, tabl
         return -1
     x = x / z
     y = y / z
-    du = _ZERO
-    dv = _ZERO
-    for c in range(3):
-        du += abs(T[c, 0] - x * T[c, 2])
-        dv += abs(T[c, 1] - y * T[c, 2])
     # no rectangle of a voxel, which is a little larger than the voxel in the image, reaches beyond this
     more = errors[0] + errors[1] * far
-    half_width = (middle * voxel + more) / near * (_ONE + ez / near)
-    far = far + more * ez / (_HALF * voxel) + errors[2] * far * far
+    du, dv = _half_sizes(T, x, y, middle * voxel, more)
+    wider = (_ONE + ez / near) / near
+    far = far + more * (_ONE + far / near) + errors[2] * far * far
     u = fx * x + cx
     v = fy * y + cy
-    du = fx * half_width * du + PIXEL_SLACK
-    dv = fy * half_width * dv + PIXEL_SLACK
+    du = fx * wider * du + PIXEL_SLACK
+    dv = fy * wider * dv + PIXEL_SLACK
     h, w = size
     if (
         u + du < -_HALF
@@ -390,16 +407,14 @@ def _carve_block(
                 front = raw[row, column]
                 nothing = front
                 if front > z + ez or front <= _ZERO:
-                    grown = half + errors[0] + errors[1] * z
-                    beyond = z + ez * grown / half + errors[2] * z * z
-                    # half the width and height of the rectangle that the voxel covers in the image
-                    du = _ZERO
-                    dv = _ZERO
-                    for c in range(3):
-                        du += abs(T[c, 0] - x * T[c, 2])
-                        dv += abs(T[c, 1] - y * T[c, 2])
-                    du = fx * grown * du / (z - ez)
-                    dv = fy * grown * dv / (z - ez)
+                    # a turned camera moves things across the ray, along the optical axis only beside it
+                    aside = errors[1] * z * np.sqrt(x * x + y * y)
+                    beyond = z + ez + errors[0] + aside + errors[2] * z * z
+                    du0, dv0 = _half_sizes(T, x, y, half, _ZERO)
+                    du, dv = _half_sizes(T, x, y, half, errors[0] + errors[1] * z)
+                    own_share = du0 * dv0 / (du * dv)
+                    du = fx * du / (z - ez)
+                    dv = fy * dv / (z - ez)
                     u0 = int((u - du + _HALF) * share)
                     u1 = int((u + du + _HALF) * share)
                     v0 = int((v - dv + _HALF) * share)
@@ -412,7 +427,7 @@ def _carve_block(
                     lost = (
                         missing[v1 + 1, u1 + 1] - missing[v0, u1 + 1] - missing[v1 + 1, u0] + missing[v0, u0]
                     )
-                    pixels = np.float32((v1 + 1 - v0) * (u1 + 1 - u0) * factor * factor) * (half / grown) ** 2
+                    pixels = np.float32((v1 + 1 - v0) * (u1 + 1 - u0) * factor * factor) * own_share
                     nearest = _rectangle_minimum(table, v0, v1, u0, u1)
                     if (
                         inside
@@ -454,6 +469,9 @@ def add_evidence(state, counts, evidence, hit, miss, largest):
 ARM_MARGIN = 0.015
 """Points within this distance of the arm's covering spheres are points of the arm [m]; more with noise: see
 `grown_for_errors`."""
+NARROWED_SHARE = 0.35
+"""Free space is narrowed by this part of what a camera's pose may be off. Surfaces that it sees are obstacles
+larger by all of it; the rest is for what hides right behind an edge."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -536,6 +554,7 @@ def carve_view(
     are points of the arm; more with noise [m].
     """
     depth, spread, spheres = usable_image(view, robot, q, arm_margin)
+    position, angle = NARROWED_SHARE * np.array(view.pose_deviation)
     state = np.empty(grid.shape, np.uint8)
     depth_behind = np.empty(grid.shape, np.float32)
     counts = np.empty(grid.shape, np.int32)
@@ -545,7 +564,7 @@ def carve_view(
         view.T_base_camera.astype(np.float32),
         spheres,
         *grid.frame,
-        np.array([*view.pose_deviation, spread, MAX_DEPTH if view.range is None else view.range], np.float32),
+        np.array([position, angle, spread, MAX_DEPTH if view.range is None else view.range], np.float32),
         state,
         depth_behind,
         counts,

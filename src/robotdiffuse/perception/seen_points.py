@@ -234,6 +234,9 @@ POINT_RADIUS = 0.01
 """Radius of the obstacle around each point [m]."""
 MIN_POINT_RADIUS = 0.001
 """Radius of points that would otherwise collide at start or goal [m]."""
+JOINED = 1.4
+"""Collision checks join large points that are near each other to spheres that are larger by about this
+factor."""
 ARM_DISTANCE = 0.02
 """Points within this distance of the arm, at its configuration in the view, are points of the arm [m]; more
 with noise: see `grown_for_errors`."""
@@ -330,10 +333,10 @@ def point_shapes(
     )
     shapes = list[SeenPoints]()
     name = "seen"
-    for radius in dict.fromkeys(
-        (POINT_RADIUS + error, POINT_RADIUS + error / 2, POINT_RADIUS, MIN_POINT_RADIUS)
-    ):
-        part = outside & (distances >= radius + MIN_POINT_RADIUS) if radius > MIN_POINT_RADIUS else outside
+    padded = POINT_RADIUS + error * np.array((1.0, 2 / 3, 1 / 3, 0.0))
+    for radius in (*dict.fromkeys(padded.tolist()), MIN_POINT_RADIUS):
+        distance = (JOINED if radius > POINT_RADIUS else 1.0) * radius + MIN_POINT_RADIUS
+        part = outside & (distances >= distance) if radius > MIN_POINT_RADIUS else outside
         outside = outside & ~part
         shapes += [SeenPoints(points[part], radius, name=name)] if part.any() else []
         name = "seen_at_ends"
