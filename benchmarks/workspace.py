@@ -55,13 +55,13 @@ def moved_obstacles(calls: int) -> None:
         rd.Problem(space.robot, space.scene, "ready", rd.PoseGoal(HAND, goal))
         overhead.append(1e3 * (moving + time.process_time() - began))
         solved += result.solved
-        if call in (calls // 5, calls - 1):
+        if (call + 1) % (calls // 5) == 0:
             sizes.append(memory())
     rows = [
         ("solved", f"{solved} of {calls}"),
         ("CPU time of plan, median / p95", "{:.1f} / {:.1f} ms".format(*np.percentile(spent, [50, 95]))),
         ("move and problem, median / p95", "{:.2f} / {:.2f} ms".format(*np.percentile(overhead, [50, 95]))),
-        ("memory after a fifth of the calls, at the end", " / ".join(f"{size:.1f} MB" for size in sizes)),
+        ("memory after each fifth of the calls [MB]", " / ".join(f"{size:.1f}" for size in sizes)),
     ]
     print_table("One obstacle moved before each call", ("", "Workspace"), rows)
 
