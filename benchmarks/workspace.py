@@ -1,6 +1,6 @@
 """A workspace that is called again and again, and goals of 20 grasp poses.
 
-    python benchmarks/workspace.py [--calls 1000] [--grasps 30]
+    python benchmarks/workspace.py [--calls 3000] [--grasps 30]
 
 Prints benchmarks/results/workspace.txt. Calls: among 12 obstacles one is moved before each call, which plans
 to a pose until the first motion. The overhead is the CPU time of the move and of what `Workspace.plan` takes
@@ -110,7 +110,7 @@ def grasps(number: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Workspace: repeated calls, many grasp poses.")
-    parser.add_argument("--calls", type=int, default=1000, help="with a moved obstacle each (1000)")
+    parser.add_argument("--calls", type=int, default=3000, help="with a moved obstacle each (3000)")
     parser.add_argument("--grasps", type=int, default=30, help="sets of 20 grasp poses (30)")
     arguments = parse(parser, calls=5, grasps=1)
     use_processor_time()
