@@ -31,10 +31,10 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud, Triangulated
 
 FLOAT32_ROUNDING = 4e-7
-"""Obstacles grow by this share of their coordinates, which is more than float32 rounding."""
+"""Obstacles grow by this fraction of their coordinates, which is more than the rounding errors of float32."""
 
 BOX_SLACK = 1e-6
-"""Boxes around obstacles grow by this, absolutely [m] and relatively, which is more than rounding."""
+"""Boxes around obstacles grow by this length [m] and by this fraction, which is more than rounding errors."""
 
 EMPTY_BOX = np.repeat([[1e18, -1e18]], 3, axis=1)
 """Lower and upper corner of a box that is far from everything [m]."""
@@ -199,8 +199,8 @@ def reach_bound(robot: Robot) -> float:
 
 @once_per_robot
 def reach_ball(robot: Robot) -> tuple[ndarray, float]:
-    """Center [3] and radius of a ball around all spheres of moving links [m]. It is about the first joint if
-    that moves them all, and then smaller than the one about the base's origin."""
+    """Center [3] and radius of a ball around all spheres of moving links [m]. The center is at the first
+    joint if that moves all of them, which makes the ball smaller, else at the base's origin."""
     first = robot.frame_offsets[0, :3, 3]
     reach = reach_bound(robot)
     return (
@@ -243,8 +243,8 @@ GRID_SECONDS_PER_POINT = 7e-7
 
 @lru_cache(maxsize=8)
 def compile_scene_for(robot: Robot, scene: Scene) -> SceneArrays:
-    """The arrays of the part of a scene that the robot can come near. The last few are cached, because a
-    search and the validator use the same."""
+    """The arrays of the part of a scene that the robot can come near. The last few are cached, since a search
+    and the validator share them."""
     largest = float(compile_robot(robot).spheres[:, 3].max(initial=0.0))
     return compile_scene(scene, reach_bound(robot), largest, robot_groups(robot))
 
@@ -287,8 +287,8 @@ def _may_touch(scene: Scene, groups: tuple[str, ...], names: list[str]) -> ndarr
 
 
 def _rows(solids: Sequence[Solid], reach: float) -> ndarray:
-    """`SceneArrays.solids`, cropped along straight edges to what the robot can come near, and then grown by
-    what rounding to float32 may take away.
+    """`SceneArrays.solids`, cropped along straight edges to the part that the robot can come near, and then
+    enlarged by more than the rounding to float32.
 
     Cropping does not change the distance to points within reach, and keeps the precision of a floor of 1 km
     in float32.

@@ -6,10 +6,10 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 
 LONG = 0.2
-"""Steps shorter than this start whenever any time is left [s]."""
+"""Steps shorter than this begin as long as any time is left [s]."""
 _remaining: ContextVar[Callable[[], float] | None] = ContextVar("remaining", default=None)
 _cancel_check: ContextVar[Callable[[], None] | None] = ContextVar("cancel_check", default=None)
-# What a time limit may be too short for.
+# Ends of the message "the time limit is too short ...".
 PREPARING = "to prepare the scene"
 TIMING = "for timing"
 
@@ -57,8 +57,8 @@ def check_cancelled() -> None:
 def check_timing(step: str, seconds: float = 0.0) -> None:
     """`check_time` for a step of timing, which may run up to LONG past the time limit.
 
-    Planners reserve the time that timing took in earlier calls, so it exceeds the limit rarely; then a path
-    that was found late is still returned.
+    Planners reserve as much time as timing took in earlier calls, so it rarely exceeds the limit. If it does,
+    the overrun lets a path that was found late be returned.
     """
     _check(step, seconds, TIMING, LONG)
 

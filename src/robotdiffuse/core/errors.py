@@ -12,13 +12,14 @@ MAX_QUOTE = 60
 MAX_WORD = 300
 """Longest word of a message, such as a file name [characters]."""
 MAX_NAMES = 100
-"""Most known names that a message lists."""
+"""Largest number of known names that a message lists."""
 
 
 class InputError(ValueError):
     """Bad input. The message is one line that names the field, its value and what would be right.
 
-    `listed` adds one line each below it. The command line prints the message and exits with status 2.
+    Each entry of `listed` is a further line below it. The command line prints the message and exits with
+    status 2.
     """
 
     def __init__(self, message: str = "", listed: Iterable[str] = ()) -> None:
@@ -38,7 +39,8 @@ class OutputError(InputError):
 
 @contextmanager
 def located(where: object) -> Iterator[None]:
-    """Names the place in the message of an InputError, unless it begins with it already."""
+    """Within the block, the message of an InputError gets the place `where` in front, unless it begins with
+    it."""
     try:
         yield
     except InputError as error:
@@ -48,7 +50,8 @@ def located(where: object) -> Iterator[None]:
 
 @contextmanager
 def reading(file: object) -> Iterator[None]:
-    """As `located`, while a file is read; of errors of other kinds, its damage is taken to be the cause."""
+    """As `located`, for reading a file. An error of another kind becomes an InputError that says that the
+    file is damaged."""
     try:
         with located(file):
             yield
@@ -75,8 +78,8 @@ def check_type(what: str, value: object, kind: type | tuple[type, ...], wanted: 
 
 
 def distinct(*values: float | int, digits: int = 6) -> list[str]:
-    """The numbers as texts, for messages that compare them: different numbers differ, if need be by more
-    digits than `digits`."""
+    """The numbers as texts, for messages that compare them. Different numbers get different texts, with more
+    digits than `digits` if necessary."""
     texts = [f"{value:.{digits}g}" for value in values]
     if len({*texts}) < len({*values}) and digits < 17:
         return distinct(*values, digits=digits + 1)
@@ -103,7 +106,8 @@ def shortened(text: str) -> str:
 
 
 def joined(names: Iterable[object], most: int = MAX_NAMES) -> str:
-    """Names from a user's input as one line: the first `most`, each shortened, and how many more follow."""
+    """Names from a user's input as one line: the first `most`, each shortened, and the number of the
+    others."""
     short_names = [shortened(str(name)) for name in names]
     more = f" and {len(short_names) - most} more" if len(short_names) > most else ""
     return ", ".join(short_names[:most]) + more

@@ -123,8 +123,7 @@ class PlanResult:
             file: A .json file for everything, with the problem as in a problem file, or a .csv file for the
                 trajectory alone.
             problem: The content of a problem file; None: the problem of the result. A robot that is neither
-                bundled
-                nor read from a file has no name; then the file holds no problem, and a note says so.
+                bundled nor read from a file has no name; then the file holds no problem, and a note says so.
 
         Raises:
             InputError: For another ending, a file that cannot be written, or .csv without a trajectory.

@@ -194,7 +194,7 @@ class Trajectory(Value):
     def stops(self) -> Float[ndarray, "k"]:
         """Times [s] at which the whole arm rests between start and end; a wait counts once, at its middle.
 
-        Looks at the rows alone: ask before resampling, which may have no row at a stop.
+        Only the rows are checked, so call this before `resample`, whose rows may miss a stop.
         """
         speed = np.linalg.norm(self.velocities, axis=1)
         edges = np.diff((speed <= REST * speed.max()).astype(int), prepend=0, append=0)
@@ -214,10 +214,9 @@ class Trajectory(Value):
     def at(self, time: float | int | Float[ndarray, "n"]) -> State:
         """The state at a time or at several.
 
-        Positions are on the cubics through the rows, velocities are their derivatives. Accelerations are
-        linear between
-        rows and jerks are their slopes, at a row that of the step after it. A trajectory of one row rests
-        there.
+        Positions are on the cubics through the rows, and velocities are their derivatives. Accelerations are
+        linear between rows, and jerks are their slopes; at a row, the jerk is that of the step after it. A
+        trajectory of one row rests there.
 
         Args:
             time: Time, or times [n], from 0 to the duration [s].
@@ -263,13 +262,10 @@ class Trajectory(Value):
     def resample(self, rate: float | int) -> "Trajectory":
         """The motion with a row at each multiple of a sample time, and the last row.
 
-        Where the acceleration changes quickly, the cubics between fewer rows can need more of it. Then a
-        motion from
-        rest to rest is averaged: its rows lie on the uniform cubic B-spline of these configurations. It
-        leaves the path
-        by up to a sixth of the acceleration over rate², and lasts up to three steps longer. Validate the new
-        motion:
-        between its rows it may differ from this one.
+        With fewer rows, the cubics between them may need larger accelerations where the acceleration changes
+        quickly. A motion from rest to rest is then averaged: its rows lie on the uniform cubic B-spline of
+        the new rows. Such a motion leaves the path by up to a sixth of the acceleration divided by rate², and
+        lasts up to three steps longer. Validate the new motion: between its rows it may differ from this one.
 
         Args:
             rate: Rows in a second [Hz], above 0 and at most 100,000.
@@ -301,8 +297,7 @@ class Trajectory(Value):
 
         Args:
             file: A .json or .csv file. The header of .csv is time, then <joint>_position, <joint>_velocity
-                and
-                <joint>_acceleration.
+                and <joint>_acceleration.
             rate: Rows in a second [Hz]; None: the rows of the motion.
 
         Raises:

@@ -1,4 +1,4 @@
-"""Noise of depth images: how large it is, and images without most of it."""
+"""Noise of depth images: estimates its size, and filters most of it."""
 
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
@@ -48,25 +48,25 @@ def median_filter(depth):
 
 
 PATCH = 20
-"""Edge of the patches that noise is estimated on [pixels]: a few times the length over which the errors of
-recorded sensors go together."""
-# Fewest patches that tell, and most that are used, spread over the image.
+"""Edge of the patches on which noise is estimated [pixels]: a few times the correlation length of the errors
+of recorded sensors."""
+# Smallest number of patches for an estimate, and largest number that is used, spread over the image.
 MIN_PATCHES = 12
 MAX_PATCHES = 100
 MIN_PATCH_RETURNS = 0.7
-"""Patches with a smaller part of returns tell nothing."""
+"""Patches with a smaller fraction of returns are ignored."""
 FLAT_SHARE = 0.3
-"""The noise is that of the patch with this share of the patches below it: others hold edges and objects."""
+"""The noise is this quantile of the patches' noise, since patches with more hold edges and objects."""
 FIT_ROUNDS = 3
-"""Rounds of the fit of a plane, without pixels farther from it than OUTLIER_SPREADS after the first."""
+"""Rounds of the fit of a plane; each round after the first ignores pixels beyond OUTLIER_SPREADS."""
 OUTLIER_SPREADS = 3.0
 MIN_SPREAD = 4e-4
-"""Images with less noise are taken as they are: the filter takes away what is a pixel wide. At a distance of
-1 m [m]."""
+"""Images with less noise than this, at a distance of 1 m [m], are not filtered, since the filter removes
+objects that are one pixel wide."""
 MARGIN_SPREADS = 3.75
-"""Points of the arm may lie this many standard deviations of filtered depth farther from it."""
+"""Points within this many standard deviations of the filtered depth from the arm may be points of the arm."""
 MEDIAN_SPREAD = 0.4
-"""Standard deviation of the median of nine independent numbers, as a part of theirs."""
+"""Standard deviation of the median of nine independent numbers, relative to theirs."""
 
 
 class FilteredDepth(NamedTuple):
@@ -78,15 +78,15 @@ class FilteredDepth(NamedTuple):
     """Standard deviation of a filtered pixel's depth at a distance of 1 m [m]; it grows with the square of
     the distance."""
     empty: Bool[ndarray, "h w"] | None = None
-    """Pixels of 0 that seem to have nothing in range; None: there are none."""
+    """Pixels without a return where nothing seems to be in range; None: there are none."""
 
 
 @lru_cache(maxsize=32)
 def filtered(view: DepthView) -> FilteredDepth:
-    """The view's image; if it is noisy, each pixel with a return is the median of those of the 3 x 3 around.
+    """The view's image; if it is noisy, filtered by `median_filter`.
 
-    Images made of clouds have no pixels of their own, and count as without noise. The last results are
-    cached: a call with views asks for the same ones several times.
+    Images made from clouds count as images without noise, since their pixels are not those of a sensor. The
+    last results are cached: a call with views uses the same ones several times.
     """
     depth = for_kernels(view.depth, np.float32)
     if view.cloud is not None:
@@ -98,17 +98,17 @@ def filtered(view: DepthView) -> FilteredDepth:
     depth = median_filter(depth)
     if view.noise is None:
         return FilteredDepth(depth, patch_noise(depth)[0], empty)
-    # the errors of near pixels, as far as they go together, are not filtered out
+    # the correlated part of the errors of near pixels is not filtered out
     together = np.exp(-1 / view.noise.correlation**2) if view.noise.correlation > 0 else 0.0
     return FilteredDepth(depth, spread * (MEDIAN_SPREAD + (1 - MEDIAN_SPREAD) * float(together)), empty)
 
 
 def patch_noise(depth: Float32[ndarray, "h w"]) -> tuple[float, float]:
-    """The standard deviation of an image's depth at a distance of 1 m [m], as flat patches show, and the
-    correlation of the errors of neighboring pixels.
+    """The standard deviation of an image's depth at a distance of 1 m [m], measured on flat patches, and the
+    correlation of the errors of neighboring pixels; 0, 0 for images with few returns.
 
-    Of a flat surface, inverse depth is linear in the pixels; where the error of depth grows with its square,
-    that of inverse depth is the same everywhere. 0, 0 for images with few returns.
+    On a flat surface, inverse depth is a linear function of the pixel. If the error of depth grows with the
+    square of the depth, the error of inverse depth is the same everywhere.
     """
     rows, columns = (n // PATCH for n in depth.shape)
     cut = depth[: rows * PATCH, : columns * PATCH].reshape(rows, PATCH, columns, PATCH).swapaxes(1, 2)
@@ -142,25 +142,26 @@ def patch_noise(depth: Float32[ndarray, "h w"]) -> tuple[float, float]:
 
 
 EMPTY_EDGE = 6
-"""Regions of 0 count as empty where they are at least so wide and high [two pixels]: dropouts at edges, and
-of surfaces at a small angle, are thinner."""
+"""Smallest width and height of a region without returns that may count as empty [two pixels]. Dropouts at
+edges and on surfaces at a small angle are thinner."""
 CUT_SHARE = 0.25
-"""Returns that end along one row, or column, over this part of the image are cut off: the edges of things
-are hardly ever so straight."""
+"""If the returns end along one row or column over this fraction of the image, the image counts as cropped,
+since the edges of objects are hardly ever so straight."""
 AT_RANGE = 0.8
-"""Surfaces farther than this part of the range may end there."""
+"""Surfaces beyond this fraction of the range may leave the range there."""
 TOO_NEAR = 0.3
-"""A region of 0 beside returns nearer than this may be a surface that is too near to be measured [m]..."""
+"""A region without returns may be a surface too near to be measured, if returns beside it are nearer than
+this [m]..."""
 NEAR_SHARE = 0.05
-"""... if it has this part of its border there."""
+"""... along at least this fraction of its border."""
 
 
 def empty_regions(depth: Float32[ndarray, "h w"], reach: float | None = None) -> Bool[ndarray, "h w"] | None:
-    """The pixels of 0 (or NaN) that seem to have nothing in range: large regions that reach the border of the
-    image, and whose neighbors are not near. None if there are none, or if the image is cut.
+    """The pixels without a return (0 or NaN) where nothing seems to be in range: large regions that reach the
+    border of the image, and whose neighbors are not near. None if there are none, or if the image is cropped.
 
-    Regions that returns surround are holes: what is dark or reflects may be there. reach: the sensor's range
-    [m], if it is known: a floor may end there along one row.
+    A region inside the image may be a dark or reflecting surface, and does not count. reach: the sensor's
+    range [m] if known; a floor may end there along one row.
     """
     every = ~(depth > 0)
     lost = every[::2, ::2]
@@ -189,12 +190,13 @@ def empty_regions(depth: Float32[ndarray, "h w"], reach: float | None = None) ->
 
 
 MIN_RETURN_SHARE = 1e-3
-"""Images with a smaller part of returns measure nothing: the camera is covered, broken, or faces nothing."""
+"""Images with a smaller fraction of returns measure nothing: the camera is covered, broken or faces
+nothing."""
 
 
 def measured_share(view: DepthView) -> float:
-    """The part of an image's pixels that measure something: a surface, or that nothing is in range. 0 if
-    there is hardly a surface."""
+    """The fraction of an image's pixels that measure something: a surface, or that nothing is in range. 0 if
+    hardly a pixel measures a surface."""
     depth, _, empty = filtered(view)
     measured = depth >= NEAREST
     if (measured & np.isfinite(depth)).mean() < MIN_RETURN_SHARE:
@@ -209,11 +211,11 @@ def measure_noise(images: Sequence[ArrayLike]) -> DepthNoise:
         images: Depth images [m], at least two of the same size, of a camera and a scene at rest.
 
     Returns:
-        Spread, correlation length and dropouts, as the larger of what changes from image to image and what
-        bends flat surfaces.
+        Spread, correlation length and dropouts: those between the images, or those within flat patches of one
+        image if they are larger.
 
     Raises:
-        InputError: For fewer than two images, and images without returns in common.
+        InputError: For fewer than two images, and if no pixel has a return in all images.
     """
     arrays = [np.asarray(image, np.float32) for image in images]
     if len(arrays) < 2 or len({image.shape for image in arrays}) > 1 or arrays[0].ndim != 2:
@@ -240,20 +242,21 @@ def measure_noise(images: Sequence[ArrayLike]) -> DepthNoise:
 
 
 def pose_error(view: DepthView, distance: ArrayLike) -> Values:
-    """How far off a point may be by the deviation of the camera's pose, at distances from the camera [m]."""
+    """How far the inexact pose of the camera may displace points at these distances from the camera [m]."""
     position, angle = view.pose_deviation
     return position + angle * np.asarray(distance)
 
 
 def points_error(views: Iterable[DepthView]) -> float:
-    """How far off observed points near the base may be, by pose and noise [m]: the most of all views."""
+    """How far inexact poses and noise may displace observed points near the base [m]: the maximum over all
+    views."""
     far = [(view, float(np.linalg.norm(view.T_base_camera[:3, 3]))) for view in views]
     return max((float(pose_error(view, d)) + filtered(view).spread * d**2 for view, d in far), default=0.0)
 
 
 def grown_for_errors(spheres: Float[ndarray, "n 4"], view: DepthView, spread: float) -> Float[ndarray, "n 4"]:
-    """The arm's spheres, in the base frame, enlarged by the noise of depth where they are, and by what the
-    camera's pose may be off."""
+    """The arm's spheres, in the base frame, enlarged by the noise of depth at their distance and by the error
+    of the camera's pose."""
     T = view.T_base_camera
     offset = spheres[:, :3] - T[:3, 3]
     forward = np.maximum(offset @ T[:3, 2], 0.0)

@@ -142,15 +142,13 @@ class DepthView(Value):
         """The depth image that a camera has of a point cloud.
 
         Each pixel holds its nearest point. The image covers the cloud, and its pixels are large enough that
-        most of
-        them contain points. Points behind the camera are ignored.
+        most of them contain points. Points behind the camera are ignored.
 
         Args:
             points: The cloud [n, 3] in the frame of the base [m].
             T_base_camera: Pose of the optical frame [4, 4]: x right in the image, y down, z ahead.
             configuration: Configuration of the arm at the exposure, by which its own points are removed;
-                None: the
-                start of the problem.
+                None: the start of the problem.
             source: The file of the cloud, for problem files.
 
         Raises:

@@ -33,7 +33,7 @@ LOST = 5
 NO_RETURN = np.float32(-1.0)
 """Depth of a pixel without a return."""
 EMPTY = np.float32(-2.0)
-"""The same where nothing seems to be in range."""
+"""Depth of a pixel without a return where nothing seems to be in range."""
 MAX_DEPTH = np.float32(1e6)
 """Depth of a pixel without an obstacle in range, and of unknown pixels [m]."""
 POOLED_FOCAL_LENGTH = 250.0
@@ -49,7 +49,7 @@ FLYING_PIXEL_STEP = np.float32(0.03)
 FLYING_PIXEL_WIDTHS = np.float32(4.0)
 """... or, if that is more, by this many widths of a pixel at its distance."""
 BLOCK = 4
-"""Edge of the blocks of voxels of which all are tried at once, in voxels."""
+"""Edge of the blocks of voxels that are first tested as a whole [voxels]."""
 PIXEL_SLACK, DEPTH_SLACK = np.float32(0.01), np.float32(1e-4)
 """More than the rounding errors of a place in the image [pixels] and of a depth [m]."""
 FASTMATH = {"contract", "reassoc", "arcp", "nsz"}
@@ -110,7 +110,8 @@ def _arm_pixels(depth, intrinsics, spheres):
 
 @kernel(fastmath=FASTMATH)
 def _hide_arm(depth, empty, intrinsics, spheres):
-    """Take back as empty the pixels whose rays meet one of the spheres, but for those around the camera."""
+    """Set empty pixels whose rays meet one of the spheres to NO_RETURN. Spheres that contain the camera are
+    ignored."""
     h, w = depth.shape
     fx, fy, cx, cy = intrinsics
     for s in range(len(spheres)):
@@ -132,10 +133,10 @@ def usable_image(
     view: DepthView, robot: Robot, q: Configuration, margin: float
 ) -> tuple[Float32[ndarray, "h w"], float, Float32[ndarray, "n 4"]]:
     """The view's filtered image, its noise, and the arm's spheres in the camera's frame, enlarged by the
-    margin [m], by noise and by what the camera's pose may be off.
+    margin [m], by noise and by the error of the camera's pose.
 
-    Where nothing seems to be in range, the image is infinite if the view states its range and the arm is not
-    there, else -inf.
+    Where nothing seems to be in range, the image is infinite if the view states its range, else -inf. Pixels
+    on the arm are excepted: they have no return.
     """
     T, (depth, spread, empty) = view.T_base_camera, filtered(view)
     spheres = grown_for_errors(placed_spheres(robot, q), view, spread)
@@ -322,7 +323,8 @@ def _half_sizes(T, x, y, half, error):
 
 @kernel(fastmath=FASTMATH)
 def _state_of_block(first, intrinsics, T, low, voxel, errors, size, factor, table, missing):
-    """OUT or FREE if all voxels of a block are so, by the rectangle that it covers in the image, else -1.
+    """OUT or FREE if all voxels of a block have this state, judged by the rectangle that the block covers in
+    the image; else -1.
 
     first: indices of its first voxel.
     """
@@ -376,7 +378,7 @@ def _state_of_block(first, intrinsics, T, low, voxel, errors, size, factor, tabl
 def _carve_block(
     first, end, raw, arm, intrinsics, T, low, voxel, errors, factor, table, missing, state, behind, counts
 ):
-    """Does for the voxels of a block what `carve` does for all."""
+    """As `carve`, for the voxels of one block."""
     fx, fy, cx, cy = intrinsics
     h, w = table.shape[1:]
     share = _ONE / np.float32(factor)
@@ -450,8 +452,9 @@ def _carve_block(
 
 @kernel()
 def add_evidence(state, counts, evidence, hit, miss, largest):
-    """Add what a view shows to the evidence for each voxel [nx ny nz]; returns for how many there was none:
-    `hit` for voxels with points, else -`miss` for those that are free. It stays within `largest`."""
+    """Add the evidence of a view for each voxel [nx ny nz]: `hit` for voxels with points, -`miss` for free
+    ones. The sum is clipped to [-largest, largest]. Returns the number of voxels that had no evidence
+    before."""
     state = state.ravel()
     counts = counts.ravel()
     evidence = evidence.ravel()
@@ -476,7 +479,7 @@ larger by all of it; the rest is for what hides right behind an edge."""
 
 @dataclass(frozen=True, eq=False)
 class ObservedVolume:
-    """What the views tell about each voxel. Voxels observed neither occupied nor free are unknown."""
+    """The states of voxels according to views. Voxels observed neither occupied nor free are unknown."""
 
     occupied: Bool[ndarray, "56 56 32"]
     """The voxel contains points that are not the arm's."""
@@ -489,7 +492,7 @@ class ObservedVolume:
     behind: Float32[ndarray, "56 56 32"]
     """Depth behind an observed surface, the minimum over all views [m]; 0 if it is behind none."""
     lost: Bool[ndarray, "56 56 32"]
-    """Unknown, on rays of some view that should have a return and have none."""
+    """Unknown, on a ray of some view that has no return though something should be in range."""
 
     @cached_property
     def unknown(self) -> Bool[ndarray, "56 56 32"]:
@@ -509,7 +512,7 @@ def observe(views: Sequence[DepthView], robot: Robot, start: Configuration) -> O
 
 
 def merged(volumes: Sequence[ObservedVolume]) -> ObservedVolume:
-    """What several volumes tell together: a voxel is occupied, or else free, if any of them says so."""
+    """Several volumes as one: a voxel is occupied if it is in any of them, else free if it is in any."""
     occupied, free, shadow, lost = (np.zeros(SHAPE, np.bool_) for _ in range(4))
     out = np.ones(SHAPE, np.bool_)
     depth_behind = np.full(SHAPE, np.inf, np.float32)
@@ -547,8 +550,8 @@ def carve_view(
     arm_margin: float,
     grid: VoxelGrid,
 ) -> tuple[UInt8[ndarray, "nx ny nz"], Float32[ndarray, "nx ny nz"], Int32[ndarray, "nx ny nz"]]:
-    """What one view tells of each voxel, by its filtered image: its state, its depth behind a surface [m],
-    and its number of points; see `carve`.
+    """The state of each voxel in the filtered image of one view, its depth behind a surface [m], and its
+    number of points; see `carve`.
 
     q: the arm's configuration in the view. arm_margin: points within this distance of its covering spheres
     are points of the arm; more with noise [m].

@@ -1,5 +1,5 @@
-"""What cameras would see: voxels past an arm and through voxels that may be occupied, and the small balls
-that cover an arm's surface."""
+"""What a camera would see from a pose: voxels, some of which the arm or other voxels may hide, and the small
+balls that cover the surface of the arm."""
 
 from itertools import product
 
@@ -21,22 +21,23 @@ from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot
 
 OCCLUSION_START = np.float32(2.0)
-"""Voxels nearer to a voxel than this do not hide it, in edges: its neighbors are as unknown as it is."""
+"""Voxels within this distance of a voxel do not hide it, since they are as unknown as it is [edges of
+voxels]."""
 MIN_VISIBILITY = np.float32(0.02)
-"""Smaller probabilities of seeing through count as zero."""
+"""Smaller probabilities that a voxel is visible count as zero."""
 ARM_CELL = 16
-"""The arm hides cells of so many pixels by as many."""
+"""Edge of the square cells of pixels for which it is decided whether the arm hides them [pixels]."""
 
 
 @kernel(nogil=True)
 def seen_weights(robot, configurations, poses, intrinsics, size, reach, voxels, weights, filled, low, edge):
-    """For each camera the sum of the weights of the voxels, each times the probability that the camera sees
-    it.
+    """For each camera, the sum over the voxels of weight times the probability that the camera sees the
+    voxel.
 
-    robot: RobotArrays; configurations float32[m, dof]: of the arm when a camera looks; poses [m, 4, 4]:
+    robot: RobotArrays; configurations float32[m, dof]: the arm's, one for each camera; poses [m, 4, 4]:
     T_base_camera; intrinsics fx, fy, cx, cy; size: height and width of the image; reach: farther voxels are
-    not seen [m]; voxels int64[n, 3]; weights [n]; filled [nx, ny, nz]: the probability that a voxel hides
-    what is behind; low corner of the grid and edge of a voxel [m].
+    not seen [m]; voxels int64[n, 3]; weights [n]; filled [nx, ny, nz]: probability that a voxel is occupied
+    and hides what is behind it; low: lower corner of the grid [m]; edge: that of a voxel [m].
     """
     fx, fy, cx, cy = intrinsics
     half = np.float32(0.5)
@@ -87,9 +88,9 @@ def seen_weights(robot, configurations, poses, intrinsics, size, reach, voxels, 
 
 @kernel(nogil=True)
 def _arm_ahead(robot, q, T, intrinsics, margin, depth):
-    """Set `depth` of each cell of an image to that of the arm's nearest covering sphere, inflated by
-    `margin`, on the ray through the cell's middle [m]; infinite without one. Spheres around the camera are
-    left out."""
+    """Write the arm's depth in each cell of an image [m]: that of the nearest covering sphere, inflated by
+    `margin`, on the ray through the middle of the cell; infinite if the ray meets none. Spheres that contain
+    the camera are left out."""
     fx, fy, cx, cy = intrinsics
     depth[:] = np.inf
     frames = np.zeros((len(q) + 1, 12), np.float32)
@@ -122,14 +123,15 @@ _HALF, _ZERO = np.float32(0.5), np.float32(0.0)
 
 @kernel(nogil=True)
 def see_through(depth, intrinsics, T, balls, radius, errors, border, seen):
-    """Mark the balls that an image sees through: their projection lies within the image, and all returns of
-    its pixels are behind the ball; a few pixels may have none.
+    """Mark the balls that are empty in an image: the projection of the ball is inside the image, and all
+    returns of its pixels are behind the ball. A few of these pixels may have no return.
 
-    depth: float32[h, w], infinite where nothing is in range, and not above 0 without a return; intrinsics fx,
-    fy, cx, cy; T [4, 4]: T_base_camera; balls [n, 3]: their centers, and their radius [m]; errors: by
-    how much a ball counts as larger at the camera and for each meter from it, and how far behind it a return
-    must lie at a distance of 1 m, which grows with the square of the distance [m];
-    border: pixels around the projection that count too. All numbers are float32; seen bool[n].
+    depth: float32[h, w], infinite where nothing is in range, 0 or less without a return; intrinsics fx, fy,
+    cx, cy; T [4, 4]: T_base_camera; balls [n, 3]: their centers [m]; radius: that of all balls [m]; errors:
+    three numbers: how much the radius grows at the camera [m], how much for each meter of distance, and how
+    far behind the ball a return must be at a distance of 1 m [m], which grows with the square of the
+    distance; border: width of the margin around the projection that is checked too [pixels]. All numbers are
+    float32; seen bool[n].
     """
     raw = usable_depth(depth, intrinsics[0])
     h, w = raw.shape
@@ -158,8 +160,8 @@ def see_through(depth, intrinsics, T, balls, radius, errors, border, seen):
 
 @kernel(nogil=True)
 def _all_behind(depth, v0, v1, u0, u1, least):
-    """Whether all returns of a rectangle of pixels, whose bounds are inclusive, are deeper than `least`, and
-    no more pixels than may are without one."""
+    """Whether all returns in a rectangle of pixels, with inclusive bounds, are deeper than `least`, and at
+    most MAX_LOST_FRACTION of the pixels have no return."""
     lost = 0
     max_lost = MAX_LOST_FRACTION * (v1 + 1 - v0) * (u1 + 1 - u0)
     for v in range(v0, v1 + 1):
@@ -181,12 +183,13 @@ def within_voxels(balls: Points, radius: float, marked: Voxels, grid: VoxelGrid)
     return np.asarray(within.reshape(-1, 8).all(axis=1))
 
 
-# Edge of the cells of a grid of which those on the surface are kept; largest distance of a point of the
-# surface from a sample of it [m].
+# Edge of the grid cells by which surface samples are merged; largest distance of a surface point from the
+# nearest sample [m].
 BALL_CELL = 0.005
 SAMPLE_DISTANCE = 0.0012
 BALL_RADIUS = BALL_CELL * 3**0.5 / 2 + SAMPLE_DISTANCE
-"""Radius of a ball around a cell that covers the samples in it, and what is near them [m]."""
+"""Radius of a ball around a cell's center that covers the samples in the cell and the surface near them
+[m]."""
 
 
 def surface_balls(robot: Robot, q: Configuration) -> Points:
@@ -198,7 +201,7 @@ def surface_balls(robot: Robot, q: Configuration) -> Points:
 
 @once_per_robot
 def _balls_by_frame(robot: Robot) -> list[Points]:
-    """The balls' centers by frame, in its coordinates; none in that of the base."""
+    """The balls' centers for each frame, in coordinates of the frame; empty for the base."""
     parts = [part for of_link in parts_of(robot).values() for part in of_link]
     out = [np.zeros((0, 3)) for _ in range(robot.dof + 1)]
     for frame in range(1, robot.dof + 1):
@@ -225,7 +228,7 @@ def _triangle(corners: Float[ndarray, "3 3"]) -> Points:
 
 
 def _sphere(center: Float[ndarray, "3"], radius: float) -> Points:
-    """Points on a sphere, on a spiral."""
+    """Points on a sphere, along a spiral, within about SAMPLE_DISTANCE of each other."""
     count = max(int(4 * np.pi * (radius / SAMPLE_DISTANCE) ** 2), 1)
     z = 1 - (2 * np.arange(count) + 1) / count
     angle = np.pi * (1 + 5**0.5) * np.arange(count)

@@ -23,7 +23,7 @@ from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape, Sphere
 from robotdiffuse.validation.tolerances import goal_index
 
 PlannerSettings = TypeVar("PlannerSettings", bound=Settings)
-# Time limits of the calls of `warm_up`: of the easy ones, and of the one that only begins a search [s].
+# Time limits of the calls of `warm_up` [s]: for easy problems, and for the one whose search need not end.
 EASY_TIME_LIMIT = 1.0
 SHORT_TIME_LIMIT = 0.02
 WARM_UP_RADIUS = 0.08
@@ -125,8 +125,8 @@ class Planner(ABC, Generic[PlannerSettings]):
 
 
 def pipeline_for(problem: Problem) -> Callable[[Solver, Problem, PlanRequest], PlanResult]:
-    """The function that plans for a problem: the first part of the pipeline that applies, or `attempt` alone.
-    A part is imported when it is needed."""
+    """The function that plans for a problem: the first part of the pipeline that applies, else `attempt`.
+    Each part is imported only when it is needed."""
     if problem.moving:
         from robotdiffuse.planning.pipeline.moving_obstacles import plan_among_moving_obstacles
 
@@ -147,7 +147,7 @@ def pipeline_for(problem: Problem) -> Callable[[Solver, Problem, PlanRequest], P
 
 
 def ever_finer(context: PlanningContext, settings: PlannerSettings) -> Iterator[tuple[PlannerSettings, int]]:
-    """Yields settings and attempt number until time runs out, each time at half the resolution: for searches
+    """Yields settings and attempt number until time runs out, each time with a finer resolution: for searches
     whose path the validator refused."""
     attempt = 0
     while attempt == 0 or context.remaining > 0:
@@ -157,7 +157,8 @@ def ever_finer(context: PlanningContext, settings: PlannerSettings) -> Iterator[
 
 
 def one_of_each(scene: Scene) -> Scene:
-    """A scene with the first shape of each kind; of meshes one triangle, of point clouds one point."""
+    """A scene with the first shape of each kind, where meshes have one triangle and point clouds one
+    point."""
     shapes: dict[str, Shape] = {}
     for shape in scene.shapes:
         if isinstance(shape, Mesh):

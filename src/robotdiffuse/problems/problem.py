@@ -418,8 +418,7 @@ class Problem(Value):
             T_world_base: Pose of the base [4, 4].
             robot: The robot.
             scene: Obstacles in the frame of the world, which are moved into that of the base. So are the
-                poses of
-                goals and waypoints, views, constraints and moving obstacles.
+                poses of goals and waypoints, views, constraints and moving obstacles.
             start: Start configuration [dof], values by joint, or the name of a pose.
             goal: As of `rd.Problem`.
             options: Further fields of `rd.Problem`.
@@ -449,16 +448,14 @@ class Problem(Value):
         """Lower bound of the distance of the arm to obstacles and between its links.
 
         The spheres that cover the links are measured, so the bound may be negative by some millimeters where
-        the
-        links are apart. Moving obstacles are ignored.
+        the links are apart. Moving obstacles are ignored.
 
         Args:
             q: A configuration [dof], or several [n, dof].
 
         Returns:
             The bound [m], one for each row; positive: free of collision. It is at most 1 m, to point clouds
-            and
-            meshes 0.3 m.
+            and meshes 0.3 m.
 
         Raises:
             InputError: For q of the wrong shape.

@@ -80,8 +80,8 @@ def _content(value: Any) -> object:
 
 
 SLACK = 1e-6
-"""How negative the smallest principal moment of a link may be, relative to the largest entry, for rounding in
-files."""
+"""Rounded files may have a slightly negative principal moment: largest such value, relative to the largest
+entry of the inertia matrix."""
 
 
 class Inertia(NamedTuple):

@@ -20,8 +20,8 @@ from robotdiffuse.robots.bodies import Inertia, Payload
 from robotdiffuse.robots.robot import Robot
 
 Jet = Float[ndarray, "3 n"]
-"""Upper bounds on the length of a vector or number and of its first two derivatives, along n stretches of a
-motion."""
+"""Upper bounds on the length of a vector, or the absolute value of a number, and on its first two
+derivatives, for n stretches of a motion."""
 
 
 class Stretches(NamedTuple):
@@ -32,7 +32,7 @@ class Stretches(NamedTuple):
     v: Float[ndarray, "3 n dof"]
     """Largest absolute values of their first three derivatives."""
     speed: Float[ndarray, "3 n dof"]
-    """Largest absolute joint velocities, and of their first two derivatives."""
+    """Largest absolute values of the joint velocities and of their first two derivatives."""
     pull: Float[ndarray, "3 n dof"]
     """The same for joint accelerations. Velocities and accelerations are zero where the motion holds a
     position."""
@@ -46,7 +46,7 @@ class Body(NamedTuple):
     slides: bool
     """Whether the joint is prismatic."""
     offset: float
-    """Distance between the origins of both frames, at zero displacement of a prismatic joint [m]."""
+    """Distance of the frame's origin from the parent's, with a prismatic joint at zero [m]."""
     mass: float
     """[kg]"""
     lever: float

@@ -251,16 +251,14 @@ class Robot(KinematicTree):
         """The robot with joints held at values. Mimic joints follow.
 
         Values beyond the URDF's limits are accepted, since gripper openings in published problems exceed
-        them. Equal
-        values give the same object.
+        them. Equal values give the same object.
 
         Args:
             locked: Values [rad] or [m] by the names of joints, which may be planned joints.
 
         Raises:
             InputError: For an unknown or fixed joint, a value that is not finite, or a value of a mimic joint
-                that
-                contradicts its leader.
+                that contradicts its leader.
         """
         movable = {joint.name: joint for joint in self.joints if joint.kind in MOVING_KINDS}
         for name, value in locked.items():
@@ -295,13 +293,11 @@ class Robot(KinematicTree):
         """The robot holding an object.
 
         The object becomes a link of its name, so goals may name it. Collision checks keep it clear of
-        obstacles and of
-        all links but those that move with it.
+        obstacles and of all links but those that move with it.
 
         Args:
             shape: The object, at its pose in the frame of the link. A curved shape is replaced by a
-                polyhedron around
-                it that exceeds it by at most 2 % of its radius.
+                polyhedron around it that exceeds it by at most 2 % of its radius.
             link: The link that holds it.
             touch_links: Further links that it may touch.
 
@@ -355,8 +351,7 @@ class Robot(KinematicTree):
 
         Raises:
             InputError: For unknown links, a link that no planned joint moves, a name that a link has, and
-                shapes that
-                cannot be held.
+                shapes that cannot be held.
         """
         field = TOOL if body.tool else "attached"
         moved = [link for link in self.link_names if self.link_frame(link) > 0]

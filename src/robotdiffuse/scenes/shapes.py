@@ -311,8 +311,7 @@ class PointCloud(Shape):
 
         Args:
             file: A .ply, .pcd, .xyz, .csv, .npy or .npz file, or an octomap (.bt), of which the occupied
-                voxels are
-                taken; in the frame of the base.
+                voxels are taken; in the frame of the base.
             point_radius: Radius of the sphere around each point [m]; None: 1 cm, or around a voxel of the
                 octomap.
             scale: Meters for each unit of the file: 0.001 for millimeters.

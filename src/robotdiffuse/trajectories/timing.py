@@ -34,9 +34,9 @@ MIN_DEVIATION = 2e-4
 MAX_TIMINGS = 8
 """Times that a motion is timed and validated before it stops at every corner."""
 MAX_SLOWER_TIMINGS = 4
-"""The first of these timings, which may lower the accelerations of a motion whose corners are each free."""
+"""Number of these timings that may use lower accelerations if each corner alone is free."""
 CORNER_SAMPLES = 17
-"""Configurations of a rounded corner that are checked."""
+"""Number of configurations of a rounded corner that are checked."""
 CORNER_PLACES = np.linspace(-1, 1, CORNER_SAMPLES)
 """Their places, in half widths from its middle."""
 SAME_WAYPOINT_DISTANCE = 1e-6
@@ -127,7 +127,7 @@ def _round_and_time(
     start_speed: float,
     extra: ExtraLimits = NO_EXTRA_LIMITS,
 ) -> tuple[Values, Trajectory]:
-    """By how much each corner is rounded, at most by the deviations, and the resulting motion; see
+    """How far each corner is rounded, at most by the deviations, and the resulting motion; see
     `time_parameterize`."""
     deviations = _shrunk(waypoints, deviations, keeps, MIN_DEVIATION)
     while start_speed and deviations[:1].any():
@@ -250,9 +250,10 @@ def _joined(pieces: Sequence[tuple[ndarray, ...]]) -> tuple[ndarray, ...]:
 
 
 PATH_PARTS = 8
-"""Number of parts of about equal length between stops; more take longer and gain little."""
+"""Number of parts of about equal length into which stops divide a path; more parts take longer and gain
+little."""
 SPEED_FACTORS = (1.0, 0.5)
-"""Each motion is offered at these shares of its highest speed."""
+"""The graph has each motion at these fractions of its highest speed."""
 MIN_DISTANCE = 1e-3
 """Stops closer to each other than this are merged [rad]."""
 

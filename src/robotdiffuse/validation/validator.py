@@ -55,8 +55,7 @@ def verify(problem: Problem, motion: Path | Trajectory, settings: VerifySettings
     Args:
         problem: The problem that the motion is to solve.
         motion: A trajectory, which is checked as it will be executed, with its times and rates; or a path,
-            which is
-            checked for everything but moving obstacles, since it has no times.
+            which is checked for everything but moving obstacles, since it has no times.
         settings: Tolerances of the validator.
 
     Returns:

@@ -282,8 +282,8 @@ def pair_along(robot, p, moving, work):
         p, q, r = _velocity(twists, f, x, y, z) if moving else (zero, zero, zero)
         for t in range(robot.first[b], robot.first[b + 1]):
             dx, dy, dz = _at(work.positions, t)
-            # only the difference of the velocities along the line between the centers counts, whatever frame
-            # it is seen from
+            # only the difference of the velocities along the line between the centers counts; it is the same
+            # in every frame
             i, j, k = _velocity(twists, g, dx, dy, dz) if moving else (zero, zero, zero)
             dx = x - dx
             dy = y - dy

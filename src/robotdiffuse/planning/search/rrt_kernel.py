@@ -124,7 +124,7 @@ def extended_straight(space, trees, tree, near, q, longest, bound, scratch):
 def search(space, limits, trees, bound, longest, iterations, state):
     """Grow both trees for a number of iterations, or until they hold a path shorter than `bound` [rad].
 
-    RRT_CONNECT_PLANNER of Kuffner and LaValle (figure 5), with balanced trees in place of SWAP. With a
+    RRT_CONNECT_PLANNER of Kuffner and LaValle, with balanced trees in place of SWAP. With a
     bound, which is c_max of AORRTC, the trees grow in the space of configurations and costs: T_a is `tree`,
     T_b is `other_tree`.
 
@@ -407,7 +407,7 @@ def goal_shares(start, goals, bound):
 @allocation_free(inner=False)
 def sample_within(space, start, goal, bound, q, state):
     """Sample q uniformly in the prolate hyperspheroid of paths from the start to a goal shorter than `bound`,
-    clamped to the limits (algorithm 2, Sample, of Informed RRT*: `bound` is c_max)."""
+    clamped to the limits (Sample of Informed RRT*; `bound` is c_max)."""
     dof = len(q)
     c_min = distance(start, goal)
     # L: half axes c_max / 2 and sqrt(c_max^2 - c_min^2) / 2
