@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from robotdiffuse.core.kernels import allocation_free
+from robotdiffuse.core.kernels import allocation_free, inner_kernel
 
 inlined = allocation_free(fastmath={"contract"}, forceinline=True)  # type: ignore[arg-type]  (a set is fine)
 
@@ -47,3 +47,19 @@ def placed(T, p):
 def ball_gap(T, ball, T_other, other):
     """Signed distance of two balls [4] of frames [m]."""
     return length(minus(placed(T, ball), placed(T_other, other))) - ball[3] - other[3]
+
+
+@inner_kernel()
+def step(parent, offset, slides, q, child):
+    """Writes the frame behind a joint at q [rad or m]: T_base_child from T_base_parent, which may be the same
+    array, and T_parent_joint [4, 4]."""
+    c, s, slide = (1.0, 0.0, q) if slides else (np.cos(q), np.sin(q), 0.0)
+    for r in range(3):
+        x = parent[r, 0] * offset[0, 0] + parent[r, 1] * offset[1, 0] + parent[r, 2] * offset[2, 0]
+        y = parent[r, 0] * offset[0, 1] + parent[r, 1] * offset[1, 1] + parent[r, 2] * offset[2, 1]
+        z = parent[r, 0] * offset[0, 2] + parent[r, 1] * offset[1, 2] + parent[r, 2] * offset[2, 2]
+        t = parent[r, 0] * offset[0, 3] + parent[r, 1] * offset[1, 3] + parent[r, 2] * offset[2, 3]
+        child[r, 0] = x * c + y * s
+        child[r, 1] = y * c - x * s
+        child[r, 2] = z
+        child[r, 3] = t + parent[r, 3] + z * slide

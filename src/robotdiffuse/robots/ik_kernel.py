@@ -10,6 +10,7 @@ import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.core.kernels import inner_kernel, kernel
+from robotdiffuse.robots.frame_kernel import step
 
 REVOLUTE = 0
 PRISMATIC = 1
@@ -36,41 +37,15 @@ def forward(q, offsets, tool, kinds, frame, T, axes, origins):
     q [dof] is the configuration, offsets [dof, 4, 4], tool [4, 4] and kinds [dof] are as in `IKChain`; axes
     and origins are [dof, 3], in the base frame.
     """
+    T[:] = 0.0
     for i in range(3):
-        for k in range(4):
-            T[i, k] = 1.0 if i == k else 0.0
+        T[i, i] = 1.0
     for j in range(frame):
-        offset = offsets[j]
-        cosine = np.cos(q[j])
-        sine = np.sin(q[j])
+        step(T, offsets[j], kinds[j] == PRISMATIC, q[j], T)
         for i in range(3):
-            a = T[i, 0]
-            b = T[i, 1]
-            c = T[i, 2]
-            d = T[i, 3]
-            x = a * offset[0, 0] + b * offset[1, 0] + c * offset[2, 0]
-            y = a * offset[0, 1] + b * offset[1, 1] + c * offset[2, 1]
-            z = a * offset[0, 2] + b * offset[1, 2] + c * offset[2, 2]
-            p = a * offset[0, 3] + b * offset[1, 3] + c * offset[2, 3] + d
-            axes[j, i] = z
-            origins[j, i] = p
-            T[i, 2] = z
-            if kinds[j] == PRISMATIC:
-                T[i, 0] = x
-                T[i, 1] = y
-                T[i, 3] = p + z * q[j]
-            else:
-                T[i, 0] = x * cosine + y * sine
-                T[i, 1] = y * cosine - x * sine
-                T[i, 3] = p
-    for i in range(3):
-        a = T[i, 0]
-        b = T[i, 1]
-        c = T[i, 2]
-        d = T[i, 3]
-        for k in range(3):
-            T[i, k] = a * tool[0, k] + b * tool[1, k] + c * tool[2, k]
-        T[i, 3] = a * tool[0, 3] + b * tool[1, 3] + c * tool[2, 3] + d
+            axes[j, i] = T[i, 2]
+            origins[j, i] = T[i, 3]
+    step(T, tool, True, 0.0, T)
 
 
 @inner_kernel()

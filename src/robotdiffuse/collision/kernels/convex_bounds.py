@@ -11,8 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robotdiffuse.collision.kernels.frames import parent_of, placed, point_to_box, step
+from robotdiffuse.collision.kernels.frames import parent_of, placed, point_to_box
 from robotdiffuse.core.kernels import inner_kernel, kernel
+from robotdiffuse.robots.frame_kernel import step
 
 MAX_GJK_STEPS = 32
 """Iterations of GJK at most; usually it takes three to eight."""

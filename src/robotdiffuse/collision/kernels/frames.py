@@ -20,22 +20,6 @@ def _parent_of(parents, j):
 
 
 @inner_kernel()
-def step(parent, offset, slides, q, child):
-    """Writes the frame behind a joint at q [rad or m]: T_base_child from T_base_parent and T_parent_joint[4,
-    4]."""
-    c, s, slide = (1.0, 0.0, q) if slides else (np.cos(q), np.sin(q), 0.0)
-    for r in range(3):
-        x = parent[r, 0] * offset[0, 0] + parent[r, 1] * offset[1, 0] + parent[r, 2] * offset[2, 0]
-        y = parent[r, 0] * offset[0, 1] + parent[r, 1] * offset[1, 1] + parent[r, 2] * offset[2, 1]
-        z = parent[r, 0] * offset[0, 2] + parent[r, 1] * offset[1, 2] + parent[r, 2] * offset[2, 2]
-        t = parent[r, 0] * offset[0, 3] + parent[r, 1] * offset[1, 3] + parent[r, 2] * offset[2, 3]
-        child[r, 0] = x * c + y * s
-        child[r, 1] = y * c - x * s
-        child[r, 2] = z
-        child[r, 3] = t + parent[r, 3] + z * slide
-
-
-@inner_kernel()
 def placed(T, p, r):
     """Coordinate r in the base frame of the point p of frame T."""
     return T[r, 0] * p[0] + T[r, 1] * p[1] + T[r, 2] * p[2] + T[r, 3]

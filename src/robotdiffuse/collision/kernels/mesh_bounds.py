@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from robotdiffuse.collision.kernels.frames import parent_of, placed, point_to_box, step
+from robotdiffuse.collision.kernels.frames import parent_of, placed, point_to_box
 from robotdiffuse.core.kernels import kernel
+from robotdiffuse.robots.frame_kernel import step
 
 
 @kernel()

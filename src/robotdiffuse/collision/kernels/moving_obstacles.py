@@ -10,8 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robotdiffuse.collision.kernels.frames import parent_of, placed, step, write_rotation
+from robotdiffuse.collision.kernels.frames import parent_of, placed, write_rotation
 from robotdiffuse.core.kernels import inner_kernel, kernel
+from robotdiffuse.robots.frame_kernel import step
 
 CLEARANCE_CAP = 1.0
 """Clearances beyond this [m] are reported as this."""
