@@ -90,7 +90,7 @@ def test_no_slower_than_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_ends_where_the_arm_gets_sooner(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the configurations of the last pose, following leads to one that may be reached late."""
     found = {name: planned(T).duration for name, T in LINES.items()}
-    monkeypatch.setattr(line_following, "_other_ends", lambda *_: [])
+    monkeypatch.setattr(line_following, "faster_ends", lambda *_: [])
     plain = {name: planned(T).duration for name, T in LINES.items()}
     ratios = [found[name] / plain[name] for name in LINES]
     assert max(ratios) < 1.02 and min(ratios) < 0.97, ratios

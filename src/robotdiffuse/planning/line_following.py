@@ -50,6 +50,8 @@ OTHER_ENDS = 4
 """Configurations of the end pose that motions are steered to where following from the start ends early."""
 END_STEPS = np.array([0.1, 0.3, 0.7])
 """Steps of the joints, without a motion of the link, to other configurations of the end [rad, L2]."""
+LONGER = 1.08
+"""So much longer may the way to another end be in joint space than to the one that following leads to."""
 HERE = 1e-5
 """A link whose pose differs by less from the end of the line is there [m] and in entries of R."""
 SAME = 1e-5
@@ -124,10 +126,10 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
         for end in ends:
             tried(end)
     elif line.speed is None:
-        candidates += _other_ends(problem, line, targets, *chain, *candidates[0], cost)
+        candidates += faster_ends(problem, line, targets, *chain, *candidates[0], cost)
     for _, rows in sorted(candidates, key=lambda one: one[0]):
         trajectory = time_curve(robot, rows, context.timing, context.beside)
-        context.improved(float(np.linalg.norm(np.diff(rows, axis=0), axis=1).sum()))
+        context.improved(_length(rows))
         result = context.finish(rows, STAGE, "solved along the straight line", trajectory=trajectory)
         if result is not None:
             return result
@@ -155,7 +157,7 @@ def _poses(T_start: Float[ndarray, "4 4"], T_end: Float[ndarray, "4 4"]) -> Floa
     return poses
 
 
-def _other_ends(
+def faster_ends(
     problem: Problem,
     line: CartesianLine,
     targets: Float[ndarray, "n 4 4"],
@@ -166,8 +168,9 @@ def _other_ends(
     cost: Callable[[Float[ndarray, "k dof"]], float],
 ) -> list[tuple[float, Float[ndarray, "k dof"]]]:
     """Costs and motions along the line to other configurations of its end than these rows lead to, each of
-    less cost than those before."""
+    less cost than those before and not much longer than these rows."""
     end = rows[-1]
+    max_length = LONGER * _length(rows)
     constrained = 3 if line.angle is None else 6
     parameters = PARAMETERS._replace(position_only=line.angle is None)
     jacobian = link_jacobians(problem.robot, end[None], line.frame)[0][:constrained, arm]
@@ -181,12 +184,17 @@ def _other_ends(
                 moved[arm] = found[0] if len(found) else seed
                 rows = _followed(problem, line, targets, arm, joints, moved)
                 there = len(rows) > len(targets) and np.abs(rows[-1] - moved).max() < SAME
-                estimated = cost(rows) if there else np.inf
+                estimated = cost(rows) if there and _length(rows) <= max_length else np.inf
                 if estimated >= least:
                     break
                 least = estimated
                 faster.append((least, rows))
     return faster
+
+
+def _length(rows: Float[ndarray, "k dof"]) -> float:
+    """Length of a motion through rows in joint space [rad, L2]."""
+    return float(np.linalg.norm(np.diff(rows, axis=0), axis=1).sum())
 
 
 def _followed(
