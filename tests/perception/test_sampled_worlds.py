@@ -49,3 +49,10 @@ def test_near_voxels_are_occupied_together() -> None:
     near[50:60, 50:60, 30:40] = True
     probability = np.full(FINE_SHAPE, 0.01, np.float32)
     assert 0.9 < free_share(probability, near) < 0.99
+
+
+def test_a_grid_larger_than_the_observed_volume() -> None:
+    """The map of an exploration is one; an index was out of bounds."""
+    shape = tuple(size + 9 for size in FINE_SHAPE)
+    assert free_share(np.zeros(shape, np.float32), np.ones(shape, np.bool_)) == 1
+    assert free_share(np.ones(shape, np.float32), np.ones(shape, np.bool_)) == 0

@@ -160,7 +160,7 @@ def highest_in_cells(
 ) -> tuple[Int64[ndarray, "n 3"], Float32[ndarray, "n"]]:
     """Coarse voxels with marked fine voxels that may be occupied, and the highest probability of these in
     each, the highest first."""
-    highest = np.zeros(SHAPE, np.float32)
+    highest = np.zeros([-(-size // 2) for size in marked.shape], np.float32)
     np.maximum.at(highest, tuple(at // 2 for at in np.nonzero(marked)), probability[marked])
     cells = np.argwhere(highest)
     values = highest[tuple(cells.T)]
