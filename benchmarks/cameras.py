@@ -234,7 +234,7 @@ def is_free(problem: Problem, result: PlanResult) -> bool:
 
 
 PLACE = ("views", "images", "walls", "cameras")
-"""Arguments that records are told apart by."""
+"""Arguments that identify records."""
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -139,15 +139,15 @@ def usable_image(
     on the arm are excepted: they have no return.
     """
     T, (depth, spread, empty) = view.T_base_camera, filtered(view)
-    spheres = grown_for_errors(placed_spheres(robot, q), view, spread)
+    arm = placed_spheres(robot, q)
+    spheres = grown_for_errors(arm, view, spread)
     spheres[:, :3] = (spheres[:, :3] - T[:3, 3]) @ T[:3, :3]
     spheres[:, 3] += margin
     spheres = spheres.astype(np.float32)
     if empty is not None:
         depth = np.where(empty, np.float32(-np.inf if view.range is None else np.inf), depth)
         # not enlarged by errors: the rectangles that must be seen through are
-        radii = placed_spheres(robot, q)[:, 3] + margin
-        outline = np.column_stack([spheres[:, :3], radii]).astype(np.float32)
+        outline = np.column_stack([spheres[:, :3], arm[:, 3] + margin]).astype(np.float32)
         _hide_arm(depth, empty, np.array(view.intrinsics, np.float32), outline)
     return depth, spread, spheres
 

@@ -23,7 +23,7 @@ MAX_DEPTH = np.float32(1e6)
 """Larger depths are no returns [m]."""
 _NEAREST = np.float32(NEAREST)
 RECENT = 256
-"""Cells whose rows are kept at hand: a power of two."""
+"""Number of cells whose rows are cached: a power of two."""
 
 
 @kernel(nogil=True, inline="always")

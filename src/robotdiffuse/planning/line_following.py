@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from robotdiffuse.collision.kernels.motions import path_length
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.transforms import rotation_about
 from robotdiffuse.core.types import Status
@@ -129,7 +130,7 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
         candidates += faster_ends(problem, line, targets, *chain, *candidates[0], cost)
     for _, rows in sorted(candidates, key=lambda one: one[0]):
         trajectory = time_curve(robot, rows, context.timing, context.beside)
-        context.improved(_length(rows))
+        context.improved(float(path_length(rows)))
         result = context.finish(rows, STAGE, "solved along the straight line", trajectory=trajectory)
         if result is not None:
             return result
@@ -170,31 +171,30 @@ def faster_ends(
     """Costs and motions along the line to other configurations of its end than these rows lead to, each of
     less cost than those before and not much longer than these rows."""
     end = rows[-1]
-    max_length = LONGER * _length(rows)
+    max_length = LONGER * path_length(rows)
     constrained = 3 if line.angle is None else 6
     parameters = PARAMETERS._replace(position_only=line.angle is None)
     jacobian = link_jacobians(problem.robot, end[None], line.frame)[0][:constrained, arm]
     faster = list[tuple[float, Float[ndarray, "k dof"]]]()
-    for direction in np.linalg.svd(jacobian)[2][constrained:]:
-        for steps in (np.zeros(1), END_STEPS, -END_STEPS):
-            for step in steps:
-                seed = np.clip(end[arm] + step * direction, joints.lower, joints.upper)
-                found = solve_seeds(seed[None], seed[None][:0], 1, joints, targets[-1], parameters)[0]
-                moved = end.copy()
-                moved[arm] = found[0] if len(found) else seed
-                rows = _followed(problem, line, targets, arm, joints, moved)
-                there = len(rows) > len(targets) and np.abs(rows[-1] - moved).max() < SAME
-                estimated = cost(rows) if there and _length(rows) <= max_length else np.inf
-                if estimated >= least:
-                    break
-                least = estimated
-                faster.append((least, rows))
+    redundant = np.linalg.svd(jacobian)[2][constrained:]
+    # first the same end once more, now steered to
+    offsets = [
+        0 * redundant[:1],
+        *(np.outer(steps, direction) for direction in redundant for steps in (END_STEPS, -END_STEPS)),
+    ]
+    for offset in offsets:
+        for seed in np.clip(end[arm] + offset, joints.lower, joints.upper):
+            found = solve_seeds(seed[None], seed[None][:0], 1, joints, targets[-1], parameters)[0]
+            moved = end.copy()
+            moved[arm] = found[0] if len(found) else seed
+            rows = _followed(problem, line, targets, arm, joints, moved)
+            there = len(rows) > len(targets) and np.abs(rows[-1] - moved).max() < SAME
+            estimated = cost(rows) if there and path_length(rows) <= max_length else np.inf
+            if estimated >= least:
+                break
+            least = estimated
+            faster.append((least, rows))
     return faster
-
-
-def _length(rows: Float[ndarray, "k dof"]) -> float:
-    """Length of a motion through rows in joint space [rad, L2]."""
-    return float(np.linalg.norm(np.diff(rows, axis=0), axis=1).sum())
 
 
 def _followed(
