@@ -1,6 +1,5 @@
 """Mesh files, packages and xacro files."""
 
-import os
 import sys
 from pathlib import Path
 
@@ -68,14 +67,6 @@ def test_xacro_is_compiled_with_what_it_includes(tmp_path: Path) -> None:
     digest = UrdfTree(file, {}, compile_xacro=True).digest
     xacro(part / "urdf", macro.replace("0.04", "0.05"), "solid.xacro")
     assert UrdfTree(file, {}, compile_xacro=True).digest != digest  # of the compiled URDF, not of the file
-
-
-def test_xacro_does_not_wait_for_a_pipe(tmp_path: Path) -> None:
-    pytest.importorskip("xacrodoc")
-    os.mkfifo(tmp_path / "part.xacro")
-    file = xacro(tmp_path, '<xacro:include filename="part.xacro"/>')
-    with pytest.raises(InputError, match="it is a device or a pipe"):
-        read_urdf(file)
 
 
 def test_xacro_includes_files_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

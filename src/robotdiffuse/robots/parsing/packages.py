@@ -10,7 +10,7 @@ from typing import Any
 from urllib.parse import unquote
 
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.core.input_files import input_file, is_file
+from robotdiffuse.core.input_files import is_file
 
 MAX_PACKAGES = 32
 """Largest number of packages that a xacro file may refer to."""
@@ -113,13 +113,7 @@ def compiled_xacro(path: Path, packages: Packages) -> bytes:
             f"compile it elsewhere: xacro {path.name} > {path.name.split('.')[0]}.urdf"
         ) from None
     with XACRO:
-        for module in (xacro, known):  # it would wait for ever for a pipe that is included
-            module.open = lambda file, mode="r": input_file(file).open(mode)  # type: ignore[attr-defined]
-        try:
-            return _by_xacro(xacro, known, path, packages)
-        finally:
-            for module in (xacro, known):
-                del module.open  # type: ignore[attr-defined]
+        return _by_xacro(xacro, known, path, packages)
 
 
 def _by_xacro(xacro: Any, known: Any, path: Path, packages: Packages) -> bytes:
