@@ -15,18 +15,20 @@ from robotdiffuse.perception.depth_filter import (
     patch_noise,
 )
 from robotdiffuse.perception.depth_view import DepthNoise
-from robotdiffuse.perception.observed_volume import observe
-from robotdiffuse.perception.ray_caster import looking_at, ray_cast
+from robotdiffuse.perception.observed_volume import ARM_MARGIN, FREE, carve_view, observe
+from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
 from robotdiffuse.perception.seen_points import seen_points
+from robotdiffuse.perception.voxel_grid import FINE
 
 PANDA = load_robot("panda")
 HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
+FOCAL = 290.0
 FLOOR, CRATE = Box((0, 0, -0.05), (6, 6, 0.1)), Box((0.6, 0.3, 0.2), (0.3, 0.3, 0.4))
 
 
 def view_from(distance: float) -> DepthView:
     T = looking_at(np.array([distance, 0.0, 0.8]), np.array([0.2, 0.0, 0.3]))
-    return ray_cast(Scene([FLOOR, CRATE]), T, (290.0, 290.0, 159.5, 119.5), (320, 240), PANDA, HOME)
+    return ray_cast(Scene([FLOOR, CRATE]), T, (FOCAL, FOCAL, 159.5, 119.5), (320, 240), PANDA, HOME)
 
 
 @pytest.mark.parametrize("spread", (0.001, 0.0015, 0.004))
@@ -65,29 +67,41 @@ def test_zeros_are_told_from_nothing_in_range() -> None:
     noisy = DepthNoise(spread=0.003, correlation=1.5, missing=0.02, zeros=True)
     view = noisy.applied(clean, np.random.default_rng(0))
     nothing = np.isinf(clean.depth)
-    found = empty_regions(view.depth, 2.0)
+    found = empty_regions(view.depth, FOCAL, 2.0)
     assert nothing.mean() > 0.2 and found is not None
-    assert found[nothing].mean() > 0.95 and found[~nothing].mean() < 0.01
+    assert found[nothing].mean() > 0.8 and found[~nothing].mean() < 0.01
     hole = view.depth.copy()
     hole[150:190, 100:160] = 0.0
-    empty = empty_regions(hole, 2.0)
+    empty = empty_regions(hole, FOCAL, 2.0)
     assert empty is not None
     assert not (empty & (clean.depth < 1.9))[150:190, 100:160].any(), "surrounded: a hole"
-    assert empty_regions(np.where(np.arange(320) < 160, view.depth, 0.0), 2.0) is None, (
+    assert empty_regions(np.where(np.arange(320) < 160, view.depth, 0.0), FOCAL, 2.0) is None, (
         "half an image is lost"
     )
     near = np.where(nothing, 0.0, 0.2 * clean.depth)
-    assert empty_regions(near, 2.0) is None, "a surface too near to be measured"
+    assert empty_regions(near, FOCAL, 2.0) is None, "a surface too near to be measured"
     stated, silent = view, replace(view, range=None)
     free = [observe([one], PANDA, HOME).free for one in (clean, stated, silent)]
-    assert free[1].sum() > 0.9 * free[0].sum() > 2 * free[2].sum()
-    assert measured_share(stated) > 0.9 > measured_share(silent)
+    assert free[1].sum() > 0.8 * free[0].sum() > 2 * free[2].sum()
+    assert measured_share(stated) > 0.85 > measured_share(silent)
+
+
+@pytest.mark.parametrize("height", (0.55, 0.6))
+def test_a_board_seen_almost_edge_on_is_not_empty(height: float) -> None:
+    """Regression: its surface gives no return, like the open space behind it, and was seen free."""
+    board = Scene([Box((0.5, 0.0, 0.5), (0.4, 0.8, 0.02))])
+    T = looking_at(np.array([1.6, 0.1, height]), np.array([0.5, 0.0, 0.5]), roll=0.1)
+    clean = ray_cast(board, T, (FOCAL, FOCAL, 159.5, 119.5), (320, 240))
+    noisy = DepthNoise(spread=0.004, correlation=1.5, zeros=True).applied(clean, np.random.default_rng(0))
+    state, _, _ = carve_view(replace(noisy, range=4.0), PANDA, HOME, ARM_MARGIN, FINE)
+    free = state == FREE
+    assert free.mean() > 0.4 and not free[voxels_within(board, FINE, 0.0)].any()
 
 
 def test_rays_through_the_arm_are_not_empty() -> None:
     """A gripper too near to be measured is 0 too; what is behind it was not seen."""
     T = looking_at(np.array([0.9, 0.0, 0.8]), np.array([0.0, 0.0, 0.8]))
-    view = ray_cast(Scene([]), T, (290.0, 290.0, 159.5, 119.5), (320, 240), PANDA, HOME)
+    view = ray_cast(Scene([]), T, (FOCAL, FOCAL, 159.5, 119.5), (320, 240), PANDA, HOME)
     few = np.zeros((240, 320))
     few[:20, :20] = 3.0
     blank = DepthView(few, view.intrinsics, T, range=4.0)
@@ -98,7 +112,7 @@ def test_rays_through_the_arm_are_not_empty() -> None:
 
 def test_a_covered_lens_measures_nothing() -> None:
     for value in (0.0, np.nan, 0.02, -1.0):
-        view = DepthView(np.full((240, 320), value), (290.0, 290.0, 159.5, 119.5), np.eye(4), range=3.0)
+        view = DepthView(np.full((240, 320), value), (FOCAL, FOCAL, 159.5, 119.5), np.eye(4), range=3.0)
         assert measured_share(view) == 0.0
         assert not observe([view], PANDA, HOME).free.any()
 
