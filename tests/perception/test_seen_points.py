@@ -11,10 +11,12 @@ from numpy import ndarray
 from robotdiffuse import Box, DepthView, InputError, Problem, Scene, Sphere, load_problem, load_robot
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.transforms import transform
+from robotdiffuse.perception.depth_filter import points_error
 from robotdiffuse.perception.depth_view import SeenPoints
 from robotdiffuse.perception.seen_points import (
     ARM_DISTANCE,
     CELL,
+    ERROR_STEP,
     MIN_POINT_RADIUS,
     POINT_RADIUS,
     point_shapes,
@@ -154,10 +156,27 @@ def test_points_of_a_pose_that_may_be_off_are_larger_and_leave_start_and_goals_f
     spheres = placed_spheres(PANDA, START)
     rng = np.random.default_rng(0)
     points = spheres[rng.integers(len(spheres), size=4000), :3] + rng.uniform(-0.3, 0.3, (4000, 3))
-    shapes = point_shapes(points, PANDA, Scene([]), START, START[None], error)
+    shapes = point_shapes(points, PANDA, Scene([]), START, START[None], np.full(len(points), error))
     distances = np.linalg.norm(points[:, None] - spheres[None, :, :3], axis=2) - spheres[:, 3]
     kept = np.concatenate([shape.points for shape in shapes])
     assert max(shape.point_radius for shape in shapes) == POINT_RADIUS + error
     assert len(kept) == ((distances.min(axis=1) >= MIN_POINT_RADIUS) | (distances.min(axis=1) < -error)).sum()
-    outside = point_shapes(points[distances.min(axis=1) > 0], PANDA, Scene([]), START, START[None], error)
+    apart = points[distances.min(axis=1) > 0]
+    outside = point_shapes(apart, PANDA, Scene([]), START, START[None], np.full(len(apart), error))
     assert CollisionChecker(PANDA, Scene(outside)).free(START[None])[0]
+
+
+def test_each_point_is_larger_by_what_its_own_view_may_be_off() -> None:
+    """Regression: all points were as large as those seen from farthest away, and left no way between them."""
+    points = np.random.default_rng(0).uniform(1.5, 2.5, (500, 3))
+    errors = points_error([replace(view(BALL_ROW), pose_deviation=(0.005, 0.02))], points)
+    by_hand = 0.005 + 0.02 * np.linalg.norm(points - T[:3, 3], axis=1)
+    np.testing.assert_allclose(errors, by_hand)
+    shapes = point_shapes(points, PANDA, Scene([]), START, START[None], errors)
+    single = points.astype(np.float32)
+    for shape in shapes:
+        of_shape = np.isin(single, shape.points.astype(np.float32)).all(axis=1)
+        own = errors[of_shape]
+        grown = shape.point_radius - POINT_RADIUS
+        assert len(own) == len(shape.points)
+        assert grown - ERROR_STEP < own.min() and own.max() <= grown + 1e-9

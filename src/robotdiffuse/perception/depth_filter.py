@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.kernels import kernel
-from robotdiffuse.core.types import Values
+from robotdiffuse.core.types import Points, Values
 from robotdiffuse.perception.depth_view import NEAREST, DepthNoise, DepthView
 
 MIN_RETURNS = 4
@@ -260,11 +260,14 @@ def pose_error(view: DepthView, distance: ArrayLike) -> Values:
     return position + angle * np.asarray(distance)
 
 
-def points_error(views: Iterable[DepthView]) -> float:
-    """How far inexact poses and noise may displace observed points near the base [m]: the maximum over all
-    views."""
-    far = [(view, float(np.linalg.norm(view.T_base_camera[:3, 3]))) for view in views]
-    return max((float(pose_error(view, d)) + filtered(view).spread * d**2 for view, d in far), default=0.0)
+def points_error(views: Iterable[DepthView], points: Points) -> Values:
+    """How far inexact poses and noise may displace each observed point [m]: the maximum over all views."""
+    errors = np.zeros(len(points))
+    for view in views:
+        distance = np.linalg.norm(points - view.T_base_camera[:3, 3], axis=1)
+        error = pose_error(view, distance) + filtered(view).spread * distance**2
+        errors = np.maximum(errors, error)
+    return errors
 
 
 def grown_for_errors(spheres: Float[ndarray, "n 4"], view: DepthView, spread: float) -> Float[ndarray, "n 4"]:

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.locked import locked
-from robotdiffuse.core.types import Configuration, Points
+from robotdiffuse.core.types import Configuration, Points, Values
 from robotdiffuse.perception.depth_filter import filtered, points_error
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import (
@@ -172,6 +172,10 @@ class _Kept:
     def points(self) -> Points:
         return seen_points([self.view], self._robot, self._configuration)
 
+    @cached_property
+    def errors(self) -> Values:
+        return points_error([self.view], self.points)
+
     @property
     def _configuration(self) -> Configuration:
         assert self.view.configuration is not None
@@ -200,17 +204,13 @@ class ViewMemory:
         """The kept views."""
         return [memory.view for memory in self._kept]
 
-    @property
-    def error(self) -> float:
-        """How far off observed points may be [m]."""
-        return points_error(self.views)
-
     def volume(self) -> ObservedVolume:
         """What the kept views together tell of each voxel of 4 cm."""
         return merged([memory.volume for memory in self._kept])
 
-    def points(self, free: Voxels) -> Points:
-        """The mean of the points that the kept views observed in each cell of a grid [m]; see `seen_points`.
+    def points(self, free: Voxels) -> tuple[Points, Values]:
+        """The mean of the points that the kept views observed in each cell of a grid [m], see `seen_points`,
+        and how far off each may be [m].
 
         Stray points are left out: those in the free voxels of a map, since more views see through them, and
         with noise those of one view that have no other point near: surfaces show more.
@@ -219,6 +219,8 @@ class ViewMemory:
         _, cell, counts = np.unique(_cells(every), return_inverse=True, return_counts=True)
         sums = [np.bincount(cell, every[:, axis], len(counts)) for axis in range(3)]
         points = np.stack(sums, axis=1) / counts[:, None]
+        errors = np.zeros(len(counts))
+        np.maximum.at(errors, cell, np.concatenate([memory.errors for memory in self._kept]))
         at = MAP.indices(points)
         inside = MAP.contains(at)
         stray = np.zeros(len(points), np.bool_)
@@ -227,7 +229,7 @@ class ViewMemory:
             once = counts == 1
             distances, _ = KDTree(points).query(points[once], k=2, distance_upper_bound=ALONE_DISTANCE)
             stray[once] |= np.isinf(distances[:, 1])
-        return points[~stray]
+        return points[~stray], errors[~stray]
 
 
 def _cells(points: Points) -> ndarray:

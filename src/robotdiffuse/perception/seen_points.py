@@ -9,7 +9,7 @@ from robotdiffuse.collision.kernel_arrays import compile_scene_for, reach_bound
 from robotdiffuse.collision.kernels.collision_cost import scene_distance
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.kernels import kernel
-from robotdiffuse.core.types import Configuration, Configurations, Points
+from robotdiffuse.core.types import Configuration, Configurations, Points, Values
 from robotdiffuse.perception.depth_filter import filtered, grown_for_errors, points_error
 from robotdiffuse.perception.depth_view import NEAREST, DepthView, SeenPoints
 from robotdiffuse.robots.kinematics import placed_spheres
@@ -301,7 +301,12 @@ def seen_shapes(
     goals: Configurations,
 ) -> tuple[SeenPoints, ...]:
     """The points that views observed as obstacles; see `point_shapes`."""
-    return point_shapes(seen_points(views, robot, start), robot, known, start, goals, points_error(views))
+    points = seen_points(views, robot, start)
+    return point_shapes(points, robot, known, start, goals, points_error(views, points))
+
+
+ERROR_STEP = 0.005
+"""Points whose errors round up to the same multiple of this are one shape [m]."""
 
 
 def point_shapes(
@@ -310,34 +315,36 @@ def point_shapes(
     known: Scene,
     start: Configuration,
     goals: Configurations,
-    error: float = 0.0,
+    errors: Values,
 ) -> tuple[SeenPoints, ...]:
     """Observed points as obstacles, without those of known shapes.
 
-    Points get POINT_RADIUS and the error, but those that the arm's spheres at start or goals would then touch
-    get less, at least MIN_POINT_RADIUS: this safety margin must not make a free start or goal invalid. Points
-    that are no deeper than the error within the arm there, and those within KNOWN_DISTANCE of a known shape,
-    and the error, are left out.
+    Points get POINT_RADIUS and their error, but those that the arm's spheres at start or goals would then
+    touch get less, at least MIN_POINT_RADIUS: this safety margin must not make a free start or goal invalid.
+    Points that are no deeper than their error within the arm there, and those within KNOWN_DISTANCE and their
+    error of a known shape, are left out.
 
-    error: how far off points may be [m], see `points_error`.
+    errors: how far off each point may be [m], see `points_error`.
     """
     points = points.astype(np.float32)
-    if known.shapes:
-        points = points[
-            ~near_scene(compile_scene_for(robot, known), points, np.float32(KNOWN_DISTANCE + error))
-        ]
+    errors = ERROR_STEP * np.ceil(errors / ERROR_STEP)
     ends = np.concatenate([placed_spheres(robot, q) for q in (start, *goals)]).astype(np.float32)
-    distances = sphere_distances(points, ends)
-    outside = (
-        (distances >= MIN_POINT_RADIUS) | (distances < -error) if error else np.ones(len(points), np.bool_)
-    )
+    arrays = compile_scene_for(robot, known) if known.shapes else None
     shapes = list[SeenPoints]()
-    name = "seen"
-    padded = POINT_RADIUS + error * np.array((1.0, 2 / 3, 1 / 3, 0.0))
-    for radius in (*dict.fromkeys(padded.tolist()), MIN_POINT_RADIUS):
-        distance = (JOINED if radius > POINT_RADIUS else 1.0) * radius + MIN_POINT_RADIUS
-        part = outside & (distances >= distance) if radius > MIN_POINT_RADIUS else outside
-        outside = outside & ~part
-        shapes += [SeenPoints(points[part], radius, name=name)] if part.any() else []
-        name = "seen_at_ends"
+    for error in np.unique(errors):
+        alike = points[errors == error]
+        if arrays is not None:
+            alike = alike[~near_scene(arrays, alike, np.float32(KNOWN_DISTANCE + error))]
+        distances = sphere_distances(alike, ends)
+        outside = np.ones(len(alike), np.bool_)
+        if error:
+            outside = (distances >= MIN_POINT_RADIUS) | (distances < -error)
+        padded = POINT_RADIUS + error * np.array((1.0, 2 / 3, 1 / 3, 0.0))
+        name = "seen"
+        for radius in (*dict.fromkeys(padded.tolist()), MIN_POINT_RADIUS):
+            distance = (JOINED if radius > POINT_RADIUS else 1.0) * radius + MIN_POINT_RADIUS
+            part = outside & (distances >= distance) if radius > MIN_POINT_RADIUS else outside
+            outside = outside & ~part
+            shapes += [SeenPoints(alike[part], radius, name=name)] if part.any() else []
+            name = "seen_at_ends"
     return tuple(shapes)

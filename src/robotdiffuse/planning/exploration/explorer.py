@@ -175,9 +175,8 @@ class Explorer:
         if not len(self._views):
             return Step(LOOK, "nothing was seen yet: observe a view from here")
         goals = self._goal.positions if isinstance(self._goal, JointGoal) else q[None]
-        seen = point_shapes(
-            self._views.points(self.map.free), self.robot, self.scene, q, goals, self._views.error
-        )
+        points, errors = self._views.points(self.map.free)
+        seen = point_shapes(points, self.robot, self.scene, q, goals, errors)
         scene = self.scene.with_shapes([*self.scene.shapes, *seen])
         problem = Problem(self.robot, scene, q, self._goal)
         self._seed += TENTATIVE_MOTIONS  # what one step's searches did not find, those of the next one may
