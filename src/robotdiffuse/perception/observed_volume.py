@@ -15,7 +15,7 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import Configuration
-from robotdiffuse.perception.depth_filter import filtered, grown_for_errors
+from robotdiffuse.perception.depth_filter import beside_surfaces, filtered, grown_for_errors
 from robotdiffuse.perception.depth_view import NEAREST, DepthView
 from robotdiffuse.perception.ray_caster import in_camera, rectangle
 from robotdiffuse.perception.voxel_grid import COARSE, SHAPE, VoxelGrid
@@ -136,7 +136,7 @@ def usable_image(
     margin [m], by noise and by the error of the camera's pose.
 
     Where nothing seems to be in range, the image is infinite if the view states its range, else -inf. Pixels
-    on the arm are excepted: they have no return.
+    on the arm and beside surfaces are excepted: they have no return.
     """
     T, (depth, spread, empty) = view.T_base_camera, filtered(view)
     arm = placed_spheres(robot, q)
@@ -145,10 +145,13 @@ def usable_image(
     spheres[:, 3] += margin
     spheres = spheres.astype(np.float32)
     if empty is not None:
+        intrinsics = np.array(view.intrinsics, np.float32)
+        arm_pixels = _arm_pixels(depth, intrinsics, spheres)
+        empty = empty & ~beside_surfaces(depth, arm_pixels, view.intrinsics[0])
         depth = np.where(empty, np.float32(-np.inf if view.range is None else np.inf), depth)
         # not enlarged by errors: the rectangles that must be seen through are
         outline = np.column_stack([spheres[:, :3], arm[:, 3] + margin]).astype(np.float32)
-        _hide_arm(depth, empty, np.array(view.intrinsics, np.float32), outline)
+        _hide_arm(depth, empty, intrinsics, outline)
     return depth, spread, spheres
 
 
