@@ -88,7 +88,7 @@ def filtered(view: DepthView) -> FilteredDepth:
     Images made from clouds count as images without noise, since their pixels are not those of a sensor. The
     last results are cached: a call with views uses the same ones several times.
     """
-    depth = for_kernels(view.depth, np.float32)
+    depth = np.maximum(for_kernels(view.depth, np.float32), np.float32(0.0))
     if view.cloud is not None:
         return FilteredDepth(depth, 0.0)
     empty = empty_regions(depth, view.range)
@@ -190,25 +190,27 @@ def empty_regions(depth: Float32[ndarray, "h w"], reach: float | None = None) ->
 
 
 GRAZED_WIDTH = 0.05
-"""Open space ends this far from a surface in the image, at its depth [m]: a board that is seen almost edge-on
-gives no return either. In 64 simulated images, this leaves 2 % of the voxels of obstacles that were seen free
-there, and costs 5 % of the free voxels."""
+"""Open space begins this far from a surface in the image, at its depth [m]: a board that is seen almost
+edge-on gives no return either. In 64 simulated images, this leaves 4 % of the voxels of obstacles that were
+seen free, and costs 3 % of the free voxels."""
 
 
-def beside_surfaces(
+def open_depth(
     depth: Float32[ndarray, "h w"], arm: Bool[ndarray, "h w"], focal: float
-) -> Bool[ndarray, "h w"]:
-    """The pixels within GRAZED_WIDTH of a surface that is not the arm's. focal: focal length [pixels]."""
+) -> Float32[ndarray, "h w"]:
+    """For pixels without a return where nothing seems to be in range: infinite, but -d within GRAZED_WIDTH of
+    a surface of depth d that is not the arm's, see `observed_volume`. focal: focal length [pixels]."""
     from scipy.ndimage import distance_transform_edt
 
     part = depth[::2, ::2]
     surface = (part > 0) & np.isfinite(part) & ~arm[::2, ::2]
     if not surface.any():
-        return np.zeros(depth.shape, np.bool_)
+        return np.full(depth.shape, np.inf, np.float32)
     distance, nearest = distance_transform_edt(~surface, return_indices=True)  # type: ignore[misc]
-    beside = 2 * distance * part[tuple(nearest)] <= GRAZED_WIDTH * focal
+    beside = part[tuple(nearest)]
+    opening = np.where(2 * distance * beside > GRAZED_WIDTH * focal, np.float32(np.inf), -beside)
     height, width = depth.shape
-    return beside.repeat(2, 0).repeat(2, 1)[:height, :width]
+    return opening.repeat(2, 0).repeat(2, 1)[:height, :width]
 
 
 MIN_RETURN_SHARE = 1e-3

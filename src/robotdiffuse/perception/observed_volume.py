@@ -15,7 +15,7 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import Configuration
-from robotdiffuse.perception.depth_filter import beside_surfaces, filtered, grown_for_errors
+from robotdiffuse.perception.depth_filter import filtered, grown_for_errors, open_depth
 from robotdiffuse.perception.depth_view import NEAREST, DepthView
 from robotdiffuse.perception.ray_caster import in_camera, rectangle
 from robotdiffuse.perception.voxel_grid import COARSE, SHAPE, VoxelGrid
@@ -30,10 +30,10 @@ BEHIND = 2
 SHADOW = 3
 OUT = 4
 LOST = 5
-NO_RETURN = np.float32(-1.0)
-"""Depth of a pixel without a return."""
-EMPTY = np.float32(-2.0)
-"""Depth of a pixel without a return where nothing seems to be in range."""
+# A pixel of depth -d has no return, and nothing is within d of the camera.
+NO_RETURN = np.float32(0.0)
+EMPTY = np.float32(-1e-6)
+"""Depth of a pixel without a return where nothing seems to be in range, which is not stated."""
 MAX_DEPTH = np.float32(1e6)
 """Depth of a pixel without an obstacle in range, and of unknown pixels [m]."""
 POOLED_FOCAL_LENGTH = 250.0
@@ -61,13 +61,13 @@ _NEAREST = np.float32(NEAREST)
 @kernel(fastmath=FASTMATH)
 def usable_depth(depth, focal):
     """The depths, with MAX_DEPTH for rays without an obstacle, NO_RETURN for missing returns and flying
-    pixels, and EMPTY for -inf."""
+    pixels."""
     h, w = depth.shape
     out = np.empty((h, w), np.float32)
     for v in range(h):
         for u in range(w):
             d = depth[v, u]
-            out[v, u] = min(d, MAX_DEPTH) if d >= _NEAREST else (EMPTY if d == -np.inf else NO_RETURN)
+            out[v, u] = min(d, MAX_DEPTH) if d >= _NEAREST else (d if d < _ZERO else NO_RETURN)
     flying = np.zeros((h, w), np.bool_)
     for v in range(1, h - 1):
         for u in range(1, w - 1):
@@ -135,8 +135,8 @@ def usable_image(
     """The view's filtered image, its noise, and the arm's spheres in the camera's frame, enlarged by the
     margin [m], by noise and by the error of the camera's pose.
 
-    Where nothing seems to be in range, the image is infinite if the view states its range, else -inf. Pixels
-    on the arm and beside surfaces are excepted: they have no return.
+    Where nothing seems to be in range, the image is infinite if the view states its range, else EMPTY. Pixels
+    on the arm are excepted: they have no return. Beside surfaces, nothing is before them.
     """
     T, (depth, spread, empty) = view.T_base_camera, filtered(view)
     arm = placed_spheres(robot, q)
@@ -147,8 +147,8 @@ def usable_image(
     if empty is not None:
         intrinsics = np.array(view.intrinsics, np.float32)
         arm_pixels = _arm_pixels(depth, intrinsics, spheres)
-        empty = empty & ~beside_surfaces(depth, arm_pixels, view.intrinsics[0])
-        depth = np.where(empty, np.float32(-np.inf if view.range is None else np.inf), depth)
+        opening = EMPTY if view.range is None else open_depth(depth, arm_pixels, view.intrinsics[0])
+        depth = np.where(empty, opening, depth)
         # not enlarged by errors: the rectangles that must be seen through are
         outline = np.column_stack([spheres[:, :3], arm[:, 3] + margin]).astype(np.float32)
         _hide_arm(depth, empty, intrinsics, outline)
@@ -170,8 +170,8 @@ def _min_pooled(depth, factor):
         for v in range(block * factor, min((block + 1) * factor, depth.shape[0])):
             row = depth[v]
             for u in range(depth.shape[1]):
-                measured = row[u] > _ZERO
-                nearest[u] = min(nearest[u], row[u] if measured else MAX_DEPTH)
+                measured = abs(row[u]) >= _NEAREST
+                nearest[u] = min(nearest[u], abs(row[u]) if measured else MAX_DEPTH)
                 lost[u] += np.int32(0) if measured else np.int32(1)
         total = np.int32(0)
         for u in range(depth.shape[1]):
@@ -446,6 +446,8 @@ def _carve_block(
                 state[i, j, k] = HIDDEN
                 if arm[row, column]:
                     state[i, j, k] = SHADOW
+                elif nothing <= -_NEAREST:
+                    state[i, j, k] = LOST
                 elif front < z:
                     state[i, j, k] = BEHIND
                     behind[i, j, k] = z - front

@@ -126,12 +126,12 @@ def see_through(depth, intrinsics, T, balls, radius, errors, border, seen):
     """Mark the balls that are empty in an image: the projection of the ball is inside the image, and all
     returns of its pixels are behind the ball. A few of these pixels may have no return.
 
-    depth: float32[h, w], infinite where nothing is in range, 0 or less without a return; intrinsics fx, fy,
-    cx, cy; T [4, 4]: T_base_camera; balls [n, 3]: their centers [m]; radius: that of all balls [m]; errors:
-    three numbers: how much the radius grows at the camera [m], how much for each meter of distance, and how
-    far behind the ball a return must be at a distance of 1 m [m], which grows with the square of the
-    distance; border: width of the margin around the projection that is checked too [pixels]. All numbers are
-    float32; seen bool[n].
+    depth: float32[h, w], infinite where nothing is in range, 0 without a return, less if nothing is within as
+    much; intrinsics fx, fy, cx, cy; T [4, 4]: T_base_camera; balls [n, 3]: their centers [m]; radius: that of
+    all balls [m]; errors: three numbers: how much the radius grows at the camera [m], how much for each meter
+    of distance, and how far behind the ball a return must be at a distance of 1 m [m], which grows with the
+    square of the distance; border: width of the margin around the projection that is checked too [pixels].
+    All numbers are float32; seen bool[n].
     """
     raw = usable_depth(depth, intrinsics[0])
     h, w = raw.shape
@@ -166,7 +166,7 @@ def _all_behind(depth, v0, v1, u0, u1, least):
     max_lost = MAX_LOST_FRACTION * (v1 + 1 - v0) * (u1 + 1 - u0)
     for v in range(v0, v1 + 1):
         for u in range(u0, u1 + 1):
-            if depth[v, u] > least:
+            if abs(depth[v, u]) > least:
                 continue
             lost += 1
             if depth[v, u] > _ZERO or lost > max_lost:
