@@ -127,6 +127,7 @@ def test_bench_on_a_cluster_is_as_on_this_machine(cluster: Any, tmp_path: Path) 
     assert [record.positions for record in sorted(there, key=lambda r: r.name)] == [r.positions for r in here]
 
 
+@pytest.mark.slow
 def test_a_node_killed_during_a_bench_loses_no_call_and_doubles_none(
     cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

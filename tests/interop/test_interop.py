@@ -2,6 +2,8 @@
 
 import json
 import os
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -97,30 +99,11 @@ def test_mcap_holds_scene_urdf_frames_and_joint_states(
     assert any(name.startswith("panda_link5/") for name in entities)
     frames = {transform.child_frame_id for transform in transforms[0].transforms}
     assert {entity.frame_id for entity in scene.entities} <= frames | {"panda_link0"}
-    again = json.loads(attached["problem.json"])
-    assert again["start"] == START
-
-
-def test_mcap_knows_where_the_base_stands(planned: tuple[Problem, Trajectory], tmp_path: Path) -> None:
-    from mcap.reader import make_reader
-    from mcap_protobuf.decoder import DecoderFactory
-
-    from robotdiffuse.interop.ros2 import problem_in
-
-    problem, trajectory = planned
-    T = np.eye(4)
-    T[:3, 3] = [1.0, 2.0, 3.0]
-    raised = replace(problem, T_world_base=T)
+    assert json.loads(attached["problem.json"])["start"] == START
+    raised = replace(problem, T_world_base=transform(np.array([1.0, 2.0, 3.0])))
     write_motion(raised, trajectory, tmp_path / "m.mcap")
-    with (tmp_path / "m.mcap").open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        first = next(found for *_, found in reader.iter_decoded_messages(topics=["/tf"]))
-    [base] = [found for found in first.transforms if found.parent_frame_id == "world"]
-    assert base.child_frame_id == "panda_link0"
-    assert (base.translation.x, base.translation.y, base.translation.z) == (1.0, 2.0, 3.0)
-    again = problem_in(tmp_path / "m.mcap")
-    assert again is not None
-    assert verify_trajectory(again, trajectory).valid
+    again = ros2.problem_in(tmp_path / "m.mcap")
+    assert again is not None and verify_trajectory(again, trajectory).valid
 
 
 def test_a_urdf_goes_along(tmp_path: Path) -> None:
@@ -307,7 +290,6 @@ def test_positions_and_times_alone_are_validated_on_the_smoothest_curve() -> Non
 
 
 REFUSED: dict[str, tuple[Callable[[], object], str]] = {
-    "no joints": (lambda: checked_motion([], [[]]), "joint_names is \\[\\]; it must be a list of names"),
     "twice": (lambda: checked_motion(["a", "a"], [[0, 0]]), "joint_names has a more than once"),
     "no rows": (lambda: checked_motion(["a"], []), "positions is empty; it must be n x 1 finite numbers"),
     "ragged": (
@@ -328,14 +310,6 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "two weeks": (
         lambda: checked_motion(["a"], [[0], [1]], [0, 1.2e6]),
         "times span 1.2e\\+06 s; a motion must",
-    ),
-    "few times": (
-        lambda: checked_motion(["a"], [[0], [1]], [0]),
-        "must be 2 finite numbers, one for each row",
-    ),
-    "another robot": (
-        lambda: motion_of_robot(checked_motion(["shoulder", "elbow"], [[0, 0]]), rd.load_robot("panda")),
-        "the motion lacks panda_joint1, .* and has shoulder, elbow, which panda lacks",
     ),
     "a joint is missing": (
         lambda: motion_of_robot(
@@ -364,7 +338,6 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
         "moves panda_finger_joint1 from 0 to 0.04, which the problem locks at 0.04",
     ),
     "no points": (lambda: motion_from_record(panda_record(points=[]), "it"), "it: points is empty"),
-    "points of text": (lambda: motion_from_record(panda_record(points=["x"]), "it"), r"points\[0\] is 'x'"),
     "no time": (
         lambda: motion_from_record(
             panda_record(points=[{"positions": START, "time_from_start": "soon"}]), "it"
@@ -381,10 +354,6 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "no plan": (
         lambda: motion_from_record({"status": "timeout"}, "it"),
         "it holds no motion: its status is 'timeout'",
-    ),
-    "nothing": (
-        lambda: motion_from_record({}, "it"),
-        "it holds no motion: it must hold a RobotDiffuse result",
     ),
 }
 
@@ -479,28 +448,20 @@ def test_unknown_endings_list_the_known_ones(planned: tuple[Problem, Trajectory]
 
 
 @pytest.mark.parametrize(
-    ("module", "package", "extra"),
+    ("module", "package", "extra", "use"),
     [
-        ("rosbags", "rosbags", "ros"),
-        ("mcap", "mcap", "ros"),
-        ("rerun", "rerun-sdk", "rerun"),
-        ("roslibpy", "roslibpy", "ros"),
+        ("mcap", "mcap", "ros", "import robotdiffuse.interop.ros2"),
+        ("rerun", "rerun-sdk", "rerun", "import robotdiffuse.interop.rerun_file"),
+        (
+            "roslibpy",
+            "roslibpy",
+            "ros",
+            "from robotdiffuse.interop.recorded_motion import publish; publish(None, '')",
+        ),
     ],
 )
-def test_a_missing_extra_says_what_to_install(module: str, package: str, extra: str) -> None:
-    import subprocess
-    import sys
-
-    uses = {
-        "rosbags": "import robotdiffuse.interop.ros2",
-        "mcap": "import robotdiffuse.interop.ros2",
-        "rerun": "import robotdiffuse.interop.rerun_file",
-        "roslibpy": "from robotdiffuse.interop.recorded_motion import publish; publish(None, '')",
-    }
-    code = (
-        f"import sys; sys.modules[{module!r}] = None\n"
-        f"try: {uses[module]}\nexcept ValueError as error: print(error)"
-    )
+def test_a_missing_extra_says_what_to_install(module: str, package: str, extra: str, use: str) -> None:
+    code = f"import sys; sys.modules[{module!r}] = None\ntry: {use}\nexcept ValueError as error: print(error)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert package in done.stdout, done.stderr
     assert f'pip install "robotdiffuse[{extra}]"' in done.stdout
@@ -581,12 +542,12 @@ def test_a_bag_that_cannot_be_replaced_stays(tmp_path: Path, monkeypatch: pytest
     """The old bag was removed before the new one was in its place."""
     bag = tmp_path / "m.rosbag2"
     write_motion(PROBLEM, MOTION, bag)
-    replace = Path.replace
+    move = Path.replace
 
     def failing(path: Path, target: Path) -> Path:
         if path.name == target.name == bag.name:
             raise OSError("interrupted")
-        return replace(path, target)
+        return move(path, target)
 
     monkeypatch.setattr(Path, "replace", failing)
     with pytest.raises(InputError, match=r"m\.rosbag2 cannot be written: interrupted"):
@@ -611,7 +572,7 @@ def test_two_exports_to_one_bag_do_not_share_a_folder(
     assert read_motion(bag).joint_names == ARM.joint_names and [*tmp_path.iterdir()] == [bag]
 
 
-def test_mcap_shows_moving_obstacles_in_frames_of_their_own(tmp_path: Path) -> None:
+def test_mcap_shows_moving_obstacles_in_frames_of_their_own_and_where_the_base_stands(tmp_path: Path) -> None:
     """They were left out."""
     from mcap.reader import make_reader
     from mcap_protobuf.decoder import DecoderFactory
@@ -626,6 +587,8 @@ def test_mcap_shows_moving_obstacles_in_frames_of_their_own(tmp_path: Path) -> N
     places = [{of.child_frame_id: of.translation for of in update.transforms} for update in updates]
     assert [place["moving/cart"].x for place in places] == [2.0, 3.0]
     assert [place["moving/person"].y for place in places] == [3.0, 3.0]
+    [base] = [found for found in updates[0].transforms if found.parent_frame_id == "world"]
+    assert base.child_frame_id == ARM.base and base.translation.z == 1.0
 
 
 def test_rerun_shows_moving_obstacles_and_where_the_base_stands(tmp_path: Path) -> None:

@@ -68,13 +68,6 @@ def test_a_voxel_is_the_same_wherever_its_block_begins() -> None:
     assert (states[0][1:, 1:, 1:] != states[1][:-1, :-1, :-1]).mean() < 1e-4
 
 
-def test_pixels_without_a_return_say_nothing() -> None:
-    view = view_from(0.0)
-    known = OccupancyMap(PANDA)
-    known.add(replace(view, depth=np.zeros_like(view.depth)))
-    assert known.unknown.all()
-
-
 def test_what_went_away_becomes_free_and_old_evidence_is_forgotten() -> None:
     middle = tuple(np.floor((np.array([0.451, 0.29, 0.31]) - MAP.low) / MAP.edge).astype(int))
     known = OccupancyMap(PANDA)

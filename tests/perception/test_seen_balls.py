@@ -107,23 +107,27 @@ def test_balls_lie_within_voxels_if_all_of_them_do() -> None:
 
 def test_balls_cover_the_surface_of_the_arm_and_of_what_it_holds() -> None:
     held = PANDA.attach(rd.Box((0, 0, 0.1), (0.04, 0.06, 0.1), name="held"), "panda_hand")
+    points = dict[str, np.ndarray]()
     for link in ("panda_link3", "panda_hand", "held"):
-        for mesh in held.meshes[link]:
-            corners = mesh.vertices[mesh.faces[RNG.integers(len(mesh.faces), size=200)]]
-            points = (RNG.dirichlet((1, 1, 1), 200)[:, None] @ corners)[:, 0]
-            assert from_balls(held, link, points).max() <= BALL_RADIUS
+        corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in held.meshes[link]])
+        corners = corners[RNG.integers(len(corners), size=400)]
+        points[link] = (RNG.dirichlet((1, 1, 1), 400)[:, None] @ corners)[:, 0]
+    check_covered(held, points)
     assert len(surface_balls(held, Q)) > len(surface_balls(PANDA, Q))
 
 
 def test_balls_cover_the_spheres_of_a_link_without_meshes() -> None:
-    bare = replace(PANDA, meshes={})
-    for sphere in bare.spheres["panda_hand"]:
-        ways = RNG.standard_normal((200, 3))
-        points = sphere[:3] + sphere[3] * ways / np.linalg.norm(ways, axis=1)[:, None]
-        assert from_balls(bare, "panda_hand", points).max() <= BALL_RADIUS
+    bare = replace(PANDA, meshes={}, spheres={link: PANDA.spheres[link] for link in ("panda_hand",)})
+    ways = RNG.standard_normal((200, 3))
+    ways /= np.linalg.norm(ways, axis=1)[:, None]
+    spheres = bare.spheres["panda_hand"]
+    points = spheres[:, None, :3] + spheres[:, None, 3:] * ways
+    check_covered(bare, {"panda_hand": points.reshape(-1, 3)})
 
 
-def from_balls(robot: rd.Robot, link: str, points: np.ndarray) -> np.ndarray:
-    """Distances of points in a link's frame to the nearest of the arm's balls at Q [m]."""
-    T = link_pose(robot, Q, link)
-    return KDTree(surface_balls(robot, Q)).query(points @ T[:3, :3].T + T[:3, 3])[0]
+def check_covered(robot: rd.Robot, points: dict[str, np.ndarray]) -> None:
+    """Points in frames of links are within the arm's balls at Q."""
+    tree = KDTree(surface_balls(robot, Q))
+    for link, of_link in points.items():
+        T = link_pose(robot, Q, link)
+        assert tree.query(of_link @ T[:3, :3].T + T[:3, 3])[0].max() <= BALL_RADIUS

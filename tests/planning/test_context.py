@@ -1,8 +1,5 @@
 """What a call of a planner records: shorter and shorter paths, refusals of the validator, compile time."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from numba import njit
@@ -84,16 +81,3 @@ def test_a_limit_that_runs_out_says_what_took_the_time(monkeypatch: pytest.Monke
         context.improved(1.0)
         late = context.out_of_time(OutOfTimeError("the fastest speeds", TIMING))
     assert "the search began after 0.70 s, its first path came after 100.70 s" in late.reason
-
-
-def test_a_solved_call_imports_no_toppra_and_no_matplotlib() -> None:
-    """toppra, which imports matplotlib, once cost the first call over a second; now only tests import it."""
-    code = (
-        "import sys, numpy as np, robotdiffuse as rd\n"
-        f"start = np.array({START.tolist()})\n"
-        "problem = rd.Problem(rd.load_robot('panda'), rd.Scene([]), start, start + 0.2)\n"
-        "assert rd.plan(problem, time_limit=300.0, until='first').solved\n"
-        "print([name for name in ('toppra', 'matplotlib') if name in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0 and done.stdout.strip() == "[]", done.stdout + done.stderr

@@ -50,6 +50,8 @@ def test_motion_is_on_the_line_at_every_millisecond(name: str) -> None:
     assert (result.stage, result.fraction) == ("line", 1.0)
     t = result.trajectory
     assert rd.verify(result.problem, t).valid
+    if name == "tilt in place":
+        assert rd.certify(result.problem, t) is not None
     clock = np.arange(0.0, t.duration, 1e-3)
     T = link_poses(PANDA, CubicHermiteSpline(t.times, t.positions, t.velocities)(clock), HAND)
     way = T_end[:3, 3] - T_START[:3, 3]
@@ -104,13 +106,6 @@ def test_configuration_at_the_end_is_reached() -> None:
     assert np.abs(result.path.positions[-1] - end).max() < 1e-4
 
 
-def test_speed_of_the_hand() -> None:
-    result = planned(LINES["down"], line=rd.CartesianLine(HAND, speed=0.1))
-    t = result.trajectory
-    speeds = np.linalg.norm(np.diff(link_poses(PANDA, t.positions, HAND)[:, :3, 3], axis=0), axis=1)
-    assert 0.095 < (speeds / np.diff(t.times)).max() <= 0.1 * 1.001
-
-
 def test_line_out_of_reach_ends_where_the_arm_does() -> None:
     result = planned(moved([0.6, 0, 0]), time_limit=0.3)
     assert not result.solved
@@ -128,12 +123,6 @@ def test_line_into_a_box_ends_at_the_box() -> None:
     # fingertips are 0.112 m below the hand's origin; the table's top is at 0.1 m
     gap = T_START[2, 3] - 0.112 - 0.1
     assert result.fraction == pytest.approx(gap / 0.3, abs=0.05)
-
-
-def test_certificates_hold_for_turns_in_place() -> None:
-    result = planned(LINES["tilt in place"])
-    certificate = rd.certify(result.problem, result.trajectory)
-    assert certificate is not None
 
 
 def test_link_that_is_at_the_end_already_stays() -> None:

@@ -37,13 +37,6 @@ def test_results_are_in_order_and_as_alone() -> None:
         assert np.array_equal(together.path.positions, one.path.positions)
 
 
-def test_settings_may_be_a_table() -> None:
-    problem = problems()[0]
-    [result] = rd.plan_many([problem], "aorrtc", {"range": 0.3}, workers=1, until="first", time_limit=300.0)
-    alone = rd.plan(problem, planner="aorrtc", settings={"range": 0.3}, until="first", time_limit=300.0)
-    assert np.array_equal(result.path.positions, alone.path.positions)
-
-
 def test_a_process_that_dies_costs_one_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = problems()[:3]
     deadly = rd.Scene([rd.Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.4], name="deadly")])
@@ -75,12 +68,14 @@ def test_arguments_are_checked_at_once(arguments: dict, message: str) -> None:
         rd.plan_many(problems()[:1], **arguments)
 
 
-def test_robots_that_hold_something_go_to_processes_too() -> None:
+def test_robots_that_hold_something_go_to_processes_with_settings_of_a_table() -> None:
     cup = rd.Cylinder([0, 0, 0.16], 0.03, 0.12, name="cup")
-    held = [replace(problem, robot=PANDA.attach(cup, "panda_hand")) for problem in problems()[:2]]
-    results = list(rd.plan_many(held, "rrt_connect", workers=1, time_limit=300.0))
-    for problem, result in zip(held, results, strict=True):
-        assert result.path is not None and rd.verify(problem, result.path).valid
+    problem = replace(problems()[0], robot=PANDA.attach(cup, "panda_hand"))
+    asked = {"settings": {"range": 0.3}, "until": "first", "time_limit": 300.0}
+    [result] = rd.plan_many([problem], "aorrtc", workers=1, **asked)  # type: ignore[arg-type]
+    alone = rd.plan(problem, planner="aorrtc", **asked)  # type: ignore[arg-type]
+    assert result.path is not None and rd.verify(problem, result.path).valid
+    assert alone.path is not None and np.array_equal(result.path.positions, alone.path.positions)
 
 
 PLANS = """
@@ -114,13 +109,3 @@ def test_a_script_that_processes_cannot_import_is_an_error(beginning: str, tmp_p
     assert len(lines) == 2 and len({*lines}) == 1
     assert lines[0].startswith("error a worker process could not import the main script")
     assert lines[0].endswith('below the line: if __name__ == "__main__":')
-
-
-def test_a_script_from_standard_input_is_an_error_that_says_what_to_do() -> None:
-    ended = subprocess.run(
-        [sys.executable, "-"], input=PLANS, capture_output=True, text=True, timeout=500, check=True
-    )
-    for line in ended.stdout.splitlines():
-        assert line.startswith("error worker processes cannot import a script from standard input; save it")
-        assert line.endswith('below the line: if __name__ == "__main__":')
-    assert len(ended.stdout.splitlines()) == 2 and ended.stderr == ""

@@ -1,4 +1,4 @@
-"""Planning among moving obstacles."""
+"""Planning among moving obstacles, and from a start velocity."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.deadline import OutOfTimeError, deadline
 from robotdiffuse.planning.pipeline.moving_obstacles import GRID_STEP, WAITED, earliest
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.trajectories.speed_limits import TimingSettings
+from robotdiffuse.trajectories.speed_limits import TimingSettings, jerk_limits
 from robotdiffuse.trajectories.timing import StopGraph
 from robotdiffuse.validation.validator import verify_trajectory
 
@@ -26,8 +26,16 @@ def problem(*moving: rd.MovingObstacle, **more: object) -> rd.Problem:
     return rd.Problem(PANDA, rd.Scene(), START, END, moving=moving, **more)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("obstacle", [CROSSING, PASSING])
-@pytest.mark.parametrize("jerk", [None, 300.0])
+def clearances(motion: rd.Trajectory, obstacle: rd.MovingObstacle) -> list[float]:
+    """The least distances at times 20 ms apart."""
+    found = list[float]()
+    for t in np.arange(0.0, motion.duration, 0.02):
+        exact = ExactCollision(PANDA, rd.Scene([obstacle.at(t)]))
+        found.append(min(d.distance for d in exact.link_distances(motion.at(t).positions)))
+    return found
+
+
+@pytest.mark.parametrize(("obstacle", "jerk"), [(CROSSING, None), (PASSING, 300.0)])
 def test_motion_is_certified_in_time(obstacle: rd.MovingObstacle, jerk: float | None) -> None:
     task = problem(obstacle)
     planner = rd.load_planner("rrt_connect")
@@ -37,14 +45,8 @@ def test_motion_is_certified_in_time(obstacle: rd.MovingObstacle, jerk: float | 
     assert found.status is rd.Status.SOLVED, found.reason
     assert found.trajectory is not None
     assert verify_trajectory(task, found.trajectory).valid
-    motion = found.trajectory
-    least = np.inf
-    for t in np.arange(0.0, motion.duration, 0.02):
-        q = np.array([np.interp(t, motion.times, column) for column in motion.positions.T])
-        exact = ExactCollision(PANDA, rd.Scene([obstacle.at(t)]))
-        least = min(least, *(d.distance for d in exact.link_distances(q)))
     assert found.scene_clearance is not None
-    assert 0 < found.scene_clearance <= least + 1e-9
+    assert 0 < found.scene_clearance <= min(clearances(found.trajectory, obstacle)) + 1e-9
 
 
 def test_a_start_that_is_hit_at_once_is_invalid() -> None:
@@ -99,12 +101,10 @@ def test_other_requests_hold_among_moving_obstacles(asked: str) -> None:
     assert found.trajectory is not None, found.reason
     motion = found.trajectory
     assert verify_trajectory(task, motion).valid
-    for t in np.arange(0.0, motion.duration, 0.02):
-        q = np.array([np.interp(t, motion.times, column) for column in motion.positions.T])
-        exact = ExactCollision(PANDA, rd.Scene([obstacle.at(t)]))
-        assert min(d.distance for d in exact.link_distances(q)) > 0
-        tilt = np.arccos(min(-link_pose(PANDA, q, "panda_hand")[2, 2], 1.0))
-        assert "constraints" not in BESIDE[asked] or tilt <= UPRIGHT.angle + 1e-6
+    assert min(clearances(motion, obstacle)) > 0
+    if task.constraints:
+        down = min(-link_pose(PANDA, q, "panda_hand")[2, 2] for q in motion.positions)
+        assert down >= np.cos(UPRIGHT.angle + 1e-6)
     resting = np.abs(motion.velocities).max(axis=1) < 1e-9
     for waypoint in task.waypoints:
         there = np.abs(motion.positions - waypoint.positions[0]).max(axis=1) < 1e-6  # type: ignore[union-attr]
@@ -156,3 +156,67 @@ def test_each_row_of_a_path_through_waypoints_has_its_corner_deviation() -> None
     assert len(found.corner_deviations) == len(found.path.positions)
     there = np.abs(found.path.positions - task.waypoints[0].positions[0]).max(axis=1) < 1e-6  # type: ignore[union-attr]
     assert there.any() and not np.array(found.corner_deviations)[there].any()
+
+
+VELOCITIES = [np.eye(7)[0] * 2.0, np.array([0.5, 0.1, 0.3, -0.4, 0.1, 0, 0.6]), -np.eye(7)[0]]
+
+
+@pytest.mark.parametrize("velocity", VELOCITIES)
+def test_motions_begin_with_the_start_velocity(velocity: np.ndarray) -> None:
+    task = rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=velocity)
+    found = rd.load_planner("rrt_connect").plan(task, 60.0)
+    assert found.status is rd.Status.SOLVED, found.reason
+    assert found.trajectory is not None
+    assert np.allclose(found.trajectory.velocities[0], velocity, atol=1e-9)
+    assert (np.abs(found.trajectory.velocities) <= PANDA.velocity * (1 + 1e-6)).all()
+    assert (np.abs(found.trajectory.accelerations) <= PANDA.acceleration * (1 + 1e-3)).all()
+    assert not found.stops and not found.notes
+    states = found.trajectory.at(np.arange(0.0, found.trajectory.duration, 1e-4))
+    assert (np.abs(states.jerks) <= jerk_limits(PANDA)).all()
+    assert not found.trajectory.accelerations[0].any()
+    assert verify_trajectory(task, found.trajectory).valid
+    at_rest = verify_trajectory(replace(task, start_velocity=None), found.trajectory).violation
+    assert at_rest is not None
+    assert at_rest.kind in ("rest", "acceleration")
+
+
+@pytest.mark.parametrize(
+    ("velocity", "message"),
+    [
+        ([0.1] * 6, "start_velocity is .*; it must be 7 finite numbers"),
+        ([np.nan] * 7, "start_velocity is .*; it must be 7 finite numbers"),
+        ([9.0, 0, 0, 0, 0, 0, 0], "start_velocity: panda_joint1 is 9; its velocity limit is 2.17"),
+        ((1.00001 * PANDA.velocity).tolist(), r"panda_joint1 is 2\.17502; its velocity limit is 2\.175$"),
+    ],
+)
+def test_invalid_start_velocities_are_refused(velocity: list[float], message: str) -> None:
+    with pytest.raises(rd.InputError, match=message):
+        rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=velocity)
+
+
+def test_a_start_velocity_in_float32_at_the_limit_is_clamped() -> None:
+    limit = np.nextafter(PANDA.velocity.astype(np.float32), np.float32(np.inf))
+    assert (limit > PANDA.velocity).all()
+    for sign in (1, -1):
+        task = rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=sign * limit)
+        assert task.start_velocity is not None and task.notes
+        assert (np.abs(task.start_velocity) <= PANDA.velocity).all()
+        assert all("clamped from" in note for note in task.notes)
+
+
+@pytest.mark.parametrize(("first", "jerk"), [(PANDA.upper[0] - 0.01, None), (START[0], 0.1)])
+def test_a_start_velocity_that_cannot_stop_is_invalid(first: float, jerk: float | None) -> None:
+    """Before a limit, and with little jerk."""
+    start = np.array([first, *START[1:]])
+    task = rd.Problem(PANDA, rd.Scene(), start, END, start_velocity=np.eye(7)[0] * 2.0)
+    found = rd.load_planner("rrt_connect").plan(task, jerk=jerk)
+    assert found.status is rd.Status.INVALID_START
+    assert "panda_joint1 cannot stop" in found.reason
+    with pytest.raises(rd.InputError, match=r"velocity_scaling leaves it 1\.08"):
+        rd.load_planner("rrt_connect").plan(task, velocity_scaling=0.5)
+
+
+def test_start_velocities_of_nearly_nothing_are_rest() -> None:
+    """1e-300 rad/s divided by its square's root, which is 0."""
+    assert rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=[1e-300] * 7).start_velocity is None
+    assert rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=[1e-5] * 7).start_velocity is not None

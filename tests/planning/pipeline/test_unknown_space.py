@@ -164,8 +164,10 @@ def test_later_assumptions_have_fewer_voxels() -> None:
     assert all((b <= a).all() and b.sum() < a.sum() for a, b in pairwise(occupied))
 
 
-@pytest.mark.parametrize("depth", [0.0, np.nan, np.inf, -1.0, 0.02])
-@pytest.mark.parametrize("unknown", ["optimistic", "padded", "predicted"])
+@pytest.mark.parametrize(
+    ("unknown", "depth"),
+    [("optimistic", 0.0), ("padded", np.nan), ("predicted", np.inf), ("padded", -1.0), ("predicted", 0.02)],
+)
 def test_images_without_returns_are_refused(planner: Planner, unknown: str, depth: float) -> None:
     """A covered lens got a confidence of 0.995, and no note."""
     covered = replace(taken(DEEP), depth=np.full((60, 80), depth))

@@ -147,10 +147,3 @@ def test_more_iterations_give_no_slower_motion(case: int, monkeypatch: pytest.Mo
         durations.append(result.duration)
     assert durations == sorted(durations, reverse=True)
     assert durations[-1] < 0.95 * durations[0]
-
-
-def test_same_seed_same_path() -> None:
-    made = problem([UPRIGHT], rd.Scene([WALL]))
-    a, b = (rd.load_planner("aorrtc").plan(made, time_limit=20.0, seed=3) for _ in range(2))
-    assert a.path is not None and b.path is not None
-    np.testing.assert_array_equal(a.path.positions, b.path.positions)

@@ -77,7 +77,6 @@ def test_values_of_continuous_joints_are_kept(angle: float) -> None:
     assert made.start[1] == angle and made.notes == ()
 
 
-SKEWED = np.eye(4) * [1.1, 1, 1, 1]
 MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
 
 
@@ -85,38 +84,25 @@ MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
     ("make", "message"),
     [
         (lambda: problem([0, 0]), "start has 2 values; crane has 3 planned joints: swing, spin, lift"),
-        (lambda: problem(goal=[[0, 0, 0], [1, 1]]), "goal is .* a list of them of one length"),
         (lambda: problem(goal=[[0, 0], [1, 1]]), r"goal\[0\] has 2 values"),
         (
             lambda: problem([0, np.nan, 0]),
             r"start: spin is nan; it must be a finite number .* \[rad\]",
         ),
         (
-            lambda: problem([0, 0, np.inf]),
-            r"start: lift is inf; it must be a finite number .* \[m\]",
-        ),
-        (lambda: problem(goal=[0, 0, np.nan]), "goal: lift is nan"),
-        (
             lambda: problem(goal=[[0, 0, 0], [0, 0, 0.6]]),
             r"goal\[1\]: lift is 0.6 m; its limits are 0 to 0.5",
         ),
         (lambda: problem("home"), "start is 'home'; it must be a list of 3 numbers: swing, spin, lift"),
-        (lambda: problem(["0", "0", "0"]), "it must be a list of 3 numbers"),
-        (lambda: problem([True, False, True]), "it must be a list of 3 numbers"),
         (lambda: problem(None), "start is None"),
-        (lambda: problem(goal=None), "goal is None"),
         (lambda: problem(goal=[]), r"goal is \[\]; it must be a configuration or a list of them"),
         (
             lambda: problem(goal=rd.PoseGoal("claw", np.eye(4))),
             "unknown link in goal.frame: 'claw'; known: hook, jib, tower",
         ),
         (lambda: problem(goal=rd.PoseGoal("plinth", np.eye(4))), "no planned joint moves 'plinth'"),
-        (lambda: rd.PoseGoal(7, np.eye(4)), "goal.frame is 7"),  # type: ignore[arg-type]
-        (lambda: rd.PoseGoal("hook", np.eye(3)), "it must be 4 x 4 finite numbers"),
         (lambda: rd.PoseGoal("hook", np.eye(4) * np.nan), "it must be 4 x 4 finite numbers"),
-        (lambda: rd.PoseGoal("hook", SKEWED), "it must be a rotation and a translation"),
         (lambda: rd.PoseGoal("hook", MIRROR), "it must be a rotation and a translation"),
-        (lambda: rd.PoseGoal("hook", 2 * np.eye(4)), "it must be a rotation and a translation"),
         (lambda: rd.Problem("panda", rd.Scene(), [0], [0]), "robot is 'panda'; it must be a Robot"),  # type: ignore[arg-type]
         (lambda: rd.Problem(crane(), [], [0], [0]), "scene is .*; it must be a Scene"),  # type: ignore[arg-type]
     ],
@@ -155,6 +141,10 @@ def test_problem_file(ending: str, tmp_path: Path) -> None:
     assert loaded.start.tolist() == READY
     assert isinstance(loaded.goal, rd.JointGoal) and loaded.goal.positions.shape == (1, 7)
     assert rd.Problem.load(tmp_path / f"problem.{ending}").start.tolist() == READY
+    [entry] = load_problems(tmp_path / f"problem.{ending}")
+    assert entry.load().start.tolist() == READY
+    with pytest.raises(rd.InputError, match=r"index is 2; .* holds (one|1) problem"):
+        rd.load_problem(tmp_path / f"problem.{ending}", 2)
 
 
 def test_goal_sets_and_poses_in_files(tmp_path: Path) -> None:
@@ -184,19 +174,14 @@ WRONG: dict[str, tuple[object, str]] = {
         GOOD | {"strat": []},
         "unknown field of problem: 'strat'; known: allowed_contacts, attached, base, blend",
     ),
-    "field not a text": (GOOD | {1: 2}, "unknown field of problem: '?1'?"),
     "no start": (without("start"), "problem has no start"),
     "no goal, no robot": (without("goal") | {"robot": None}, "problem has no goal"),
     "unknown robot": (GOOD | {"robot": "pandora"}, "unknown robot 'pandora'; known: .*panda"),
     "robot not a text": (GOOD | {"robot": 7}, "robot is 7; it must be a bundled name"),
     "missing URDF": (GOOD | {"robot": "none/arm.urdf"}, "none/arm.urdf"),
+    "a goal that is a number": (GOOD | {"goal": 7.0}, "goal is 7.0; .* any, or a configuration"),
     "unknown locked joint": (GOOD | {"locked": {"thumb": 0}}, "unknown joint in locked 'thumb'"),
-    "locked not a number": (
-        GOOD | {"locked": {"panda_finger_joint1": "open"}},
-        "'open'; it must be a number",
-    ),
     "locked NaN": (GOOD | {"locked": {"panda_finger_joint1": float("nan")}}, "panda_finger_joint1 is nan"),
-    "locked a list": (GOOD | {"locked": [1]}, "locked is .* it must map joint names to values"),
     "unknown shape": (shape(pyramid={}), r"unknown shape in scene\[1\]: 'pyramid'; known: box, capsule"),
     "unknown shape field": (
         shape(sphere={"center": [0, 0, 1], "radius": 1, "color": "red"}),
@@ -204,28 +189,15 @@ WRONG: dict[str, tuple[object, str]] = {
     ),
     "shape without a field": (shape(sphere={"center": [0, 0, 1]}), r"scene\[1\].sphere has no radius"),
     "two shapes in one": (shape(sphere={}, box={}), r"scene\[1\] is .* it must be one shape"),
-    "shape a text": (GOOD | {"scene": ["sphere"]}, r"scene\[0\] is 'sphere'; it must be one shape"),
-    "shape not a mapping": (shape(sphere=3), r"scene\[1\].sphere is 3; it must be a mapping"),
     "scene a number": (GOOD | {"scene": 3}, "scene is 3; it must be a list of shapes"),
     "missing scene file": (GOOD | {"scene": "none.yaml"}, "none.yaml does not exist"),
-    "radius of nothing": (
-        shape(sphere={"center": [0, 0, 1], "radius": None}),
-        r"scene\[1\].sphere.radius is None; it must be a positive number",
-    ),
     "missing mesh": (
         shape(mesh={"file": "none.stl"}),
         r"scene\[1\].mesh: mesh file .*none.stl does not exist",
     ),
-    "mesh file a number": (shape(mesh={"file": 3}), r"scene\[1\].mesh.file is 3"),
-    "missing cloud": (shape(point_cloud={"file": "none.ply"}), "none.ply does not exist"),
     "file and points": (
         shape(point_cloud={"file": "none.ply", "points": []}),
         r"unknown field of scene\[1\].point_cloud: 'points'",
-    ),
-    "start a text": (GOOD | {"start": "home"}, "unknown pose in start: .home.; known: extended, ready"),
-    "goal a list": (
-        GOOD | {"goal": 7.0},
-        "goal is 7.0; it must be one of joints, joint_set, pose, poses, any, or a configuration",
     ),
     "unknown goal": (
         GOOD | {"goal": {"place": []}},
@@ -236,8 +208,6 @@ WRONG: dict[str, tuple[object, str]] = {
         "it must be one of joints, joint_set, pose, poses, any",
     ),
     "set as joints": (GOOD | {"goal": {"joints": [READY]}}, "goal.joints is .* it must be a list of numbers"),
-    "joints as set": (GOOD | {"goal": {"joint_set": READY}}, "goal.joint_set is .* a list of configurations"),
-    "empty set": (GOOD | {"goal": {"joint_set": []}}, "goal.joint_set is"),
     "pose without a frame": (
         GOOD | {"goal": {"pose": {"xyz": [0, 0, 1], "wxyz": [1, 0, 0, 0]}}},
         "has no frame",
@@ -252,12 +222,11 @@ WRONG: dict[str, tuple[object, str]] = {
 @pytest.mark.parametrize("case", WRONG)
 def test_wrong_problem_files(case: str, tmp_path: Path) -> None:
     data, message = WRONG[case]
-    for ending in ("yaml", "json"):
-        file = written(tmp_path, data, ending)
-        with pytest.raises(rd.InputError, match=message) as raised:
-            rd.load_problem(file)
-        assert str(raised.value).startswith(str(file)), "the file is named first"
-        assert "\n" not in str(raised.value)
+    file = written(tmp_path, data)
+    with pytest.raises(rd.InputError, match=message) as raised:
+        rd.load_problem(file)
+    assert str(raised.value).startswith(str(file)), "the file is named first"
+    assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize(
@@ -296,14 +265,6 @@ def test_lines_of_problems(tmp_path: Path) -> None:
     file.write_text(lines[0] + "\n" + json.dumps(GOOD | {"start": []}) + "\n")
     with pytest.raises(rd.InputError, match=r"many\.jsonl, line 2: start has 0 values"):
         load_problems(file)
-
-
-def test_one_problem_counts_as_many(tmp_path: Path) -> None:
-    file = written(tmp_path, GOOD)
-    [entry] = load_problems(file)
-    assert entry.name == "problem" and entry.load().start.tolist() == READY
-    with pytest.raises(rd.InputError, match=r"index is 2; .* holds one problem"):
-        rd.load_problem(file, 2)
 
 
 def full_problem(goal: Any) -> rd.Problem:
@@ -357,9 +318,6 @@ def test_places_that_cannot_be_written_to(tmp_path: Path) -> None:
             save_problem(made, file)
     with pytest.raises(rd.InputError, match="problem file format"):
         save_problem(made, tmp_path / "a.txt")
-
-
-def test_a_robot_that_could_not_be_found_again() -> None:
     with pytest.raises(rd.InputError, match="'crane' is neither bundled nor read from a file"):
         problem_record(problem())
     assert problem_record(problem(), robot="crane.urdf")["robot"] == "crane.urdf"
@@ -414,20 +372,17 @@ def test_moveit_files_in_a_problem(tmp_path: Path) -> None:
 )
 def test_records_of_others_name_no_files_that_are_read(changed: dict[str, Any]) -> None:
     record = {"robot": "panda", "scene": [], "start": READY, "goal": {"joints": READY}} | changed
+    robots = {"panda": rd.load_robot("panda")}
     with pytest.raises(rd.InputError, match="is a file, and files are not read here"):
-        problem_from_record(record, {"panda": rd.load_robot("panda")})
+        problem_from_record(record, robots)
+    with pytest.raises(rd.InputError, match="files are not read here"):
+        problem_from_record({"robot": "panda", "scene": [], "request": "/etc/passwd"}, robots)
 
 
 @pytest.mark.parametrize("robot", ["ur5", "panda/robot.json", "../panda", "/etc/passwd", "a.urdf", 1, None])
 def test_records_of_others_have_the_robots_that_are_given(robot: object) -> None:
     record = {"robot": robot, "scene": [], "start": READY, "goal": {"joints": READY}}
     with pytest.raises(rd.InputError, match=r"unknown robot .*; known: panda"):
-        problem_from_record(record, {"panda": rd.load_robot("panda")})
-
-
-def test_a_request_of_others_is_a_file_too() -> None:
-    record = {"robot": "panda", "scene": [], "request": "/etc/passwd"}
-    with pytest.raises(rd.InputError, match="files are not read here"):
         problem_from_record(record, {"panda": rd.load_robot("panda")})
 
 
@@ -452,17 +407,9 @@ def test_goals_are_given_as_in_python(goal: object, rows: list[list[float]]) -> 
     assert np.array_equal(rd.Problem(problem.robot, rd.Scene(), "ready", "ready").start, problem.start)
 
 
-def test_any_of_a_list_of_goals() -> None:
-    pose = {"pose": {"frame": "panda_hand", "xyz": [0.5, 0, 0.4], "rpy": [np.pi, 0, 0]}}
-    goal = problem_from_record(BASIC | {"goal": [pose, "ready"]}).goal
-    assert isinstance(goal, rd.AnyGoal)
-    np.testing.assert_allclose(goal.goals[0].T_base_frame[:3, :3], np.diag([1, -1, -1]), atol=1e-12)  # type: ignore[union-attr]
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"start": "home"}, "unknown pose in start: 'home'; known: extended, ready"),
         ({"goal": {"joints": "home"}}, "unknown pose in goal.joints: 'home'"),
         ({"robot": "iiwa14", "start": "home"}, "(iiwa14 has no named poses)"),
         (
@@ -482,6 +429,11 @@ def test_wrong_names_and_angles(changes: dict[str, object], message: str) -> Non
 
 
 def test_roll_pitch_yaw_are_in_the_order_of_urdfs() -> None:
+    """In goals of a list, of which any will do, too."""
+    pose = {"pose": {"frame": "panda_hand", "xyz": [0.5, 0, 0.4], "rpy": [np.pi, 0, 0]}}
+    goal = problem_from_record(BASIC | {"goal": [pose, "ready"]}).goal
+    assert isinstance(goal, rd.AnyGoal)
+    np.testing.assert_allclose(goal.goals[0].T_base_frame[:3, :3], np.diag([1, -1, -1]), atol=1e-12)  # type: ignore[union-attr]
     box = {"center": [0.9, 0, 0], "size": [0.1, 0.2, 0.3], "rpy": [0.1, 0.2, 0.3]}
     [shape] = problem_from_record(BASIC | {"scene": [{"box": box}]}).scene.shapes
     np.testing.assert_allclose(shape.T_base_shape[:3, :3], rotation_from_rpy(0.1, 0.2, 0.3), atol=1e-12)

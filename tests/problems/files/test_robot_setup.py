@@ -166,15 +166,12 @@ def test_commands_plan_verify_simulate_and_draw(tmp_path: Path, monkeypatch: pyt
 WRONG = {
     "base of MoveIt": ({"base": {}, "scene": "scene.yaml"}, "base cannot be combined with MoveIt files"),
     "base": ({"base": {"euler": [0, 0, 0]}}, "unknown field of base: .euler.; known: rpy, wxyz, xyz"),
-    "base xyz": ({"base": {"xyz": [0, 0]}}, r"base.xyz is \[0, 0\]; it must be 3 finite numbers"),
     "tool link": ({"tool": {"xyz": [0, 0, 0]}}, "tool has no link"),
     "unknown tool link": ({"tool": {"link": "hand"}}, "unknown link in tool.link: 'hand'"),
     "tool shape": ({"tool": TOOL | {"shapes": [{"cone": {}}]}}, r"unknown shape in tool.shapes\[0\]: 'cone'"),
     "touch_links": ({"tool": TOOL | {"touch_links": "x"}}, "tool.touch_links is 'x'; it must be a list"),
     "attached": ({"attached": CUP}, "attached is .*; it must be a list of objects"),
     "no link": ({"attached": [WALL]}, r"attached\[0\] is .*; it must be a shape with its link"),
-    "no shape": ({"attached": [{"link": "panda_hand"}]}, r"attached\[0\] is {}; it must be one shape"),
-    "shape": ({"attached": [{"link": "panda_hand", "cone": {}}]}, r"unknown shape in attached\[0\]: 'cone'"),
     "radius": (
         {"attached": [{"link": "panda_hand", "sphere": {"center": [0, 0, 0], "radius": -1}}]},
         r"attached\[0\].sphere.radius is -1; it must be a positive number",

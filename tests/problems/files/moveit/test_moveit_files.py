@@ -1,0 +1,663 @@
+"""MoveIt scenes, requests, joints and contacts: what is read, and what is refused rather than ignored."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+import yaml
+
+from helpers.moveit_files import MOTION_BENCH_MAKER, MOUNTED, QUARTER, ball, change, request_data, scene_data
+from helpers.urdfs import read_urdf
+from robotdiffuse import (
+    Box,
+    Cylinder,
+    InputError,
+    JointGoal,
+    Mesh,
+    PointCloud,
+    PoseGoal,
+    Robot,
+    Sphere,
+    load_problem,
+    load_robot,
+)
+from robotdiffuse.core.input_files import read_yaml
+from robotdiffuse.core.transforms import (
+    quaternion_from_rotation,
+    rotation_about,
+    rotation_from_quaternion,
+    transform,
+)
+from robotdiffuse.problems.files import (
+    load_motion_bench_maker,
+    load_problems,
+    problem_record,
+)
+from robotdiffuse.problems.moveit import (
+    MoveItFrames,
+    matrix_contacts,
+    moveit_frames,
+    moveit_request,
+    moveit_scene,
+    object_shapes,
+    read_moveit_scene,
+    scene_robot_notes,
+)
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
+
+
+def test_scene_as_motion_bench_maker_writes_it() -> None:
+    can, board = read_moveit_scene(MOTION_BENCH_MAKER / "scene0001.yaml")[0].shapes
+    assert isinstance(can, Cylinder) and (can.name, can.height, can.radius) == ("can", 0.14, 0.03)
+    assert can.center.tolist() == [0.5, -0.4, 0.3]
+    assert isinstance(board, Box) and board.size.tolist() == [1.2, 0.8, 0.04]
+    # A quarter turn about z: the long side lies along y.
+    np.testing.assert_allclose(board.bounds[1] - board.bounds[0], [0.8, 1.2, 0.04], atol=1e-12)
+
+
+def test_folder() -> None:
+    good, bad = load_motion_bench_maker(MOTION_BENCH_MAKER)
+    assert good.name == "motion_bench_maker/0001" and good.error == ""
+    problem = good.load()
+    assert problem.start.tolist() == [0, -0.785, 0, -2.356, 0, 1.571, 0.785]
+    assert isinstance(problem.goal, JointGoal)
+    assert problem.goal.positions.tolist() == [[1.2, -0.3, 0.5, -1.9, -0.2, 2.1, 0.1]]
+    assert problem.robot.locked == {"panda_finger_joint1": 0.065, "panda_finger_joint2": 0.065}
+    assert [shape.name for shape in problem.scene.shapes] == ["can", "board"]
+    assert bad.problem is None
+    with pytest.raises(
+        InputError, match=r"request0002.yaml: goal: panda_joint1 is 3.1 rad; its limits are -2.8"
+    ):
+        bad.load()
+    assert [entry.name for entry in load_problems(MOTION_BENCH_MAKER)] == [good.name, bad.name]
+    robot = load_robot("panda")
+    assert load_motion_bench_maker(MOTION_BENCH_MAKER, robot)[0].load().robot.locked == problem.robot.locked
+    assert robot.locked["panda_finger_joint1"] == 0.04
+
+
+def test_unusable_folders(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"has no files scene\*.yaml"):
+        load_motion_bench_maker(tmp_path)
+    shutil.copy(MOTION_BENCH_MAKER / "scene0001.yaml", tmp_path)
+    [entry] = load_motion_bench_maker(tmp_path)
+    assert "request0001.yaml does not exist" in entry.error
+    (tmp_path / "scene0001.yaml").write_text("robot_model_name: r2d2")
+    [entry] = load_motion_bench_maker(tmp_path)
+    assert "scene0001.yaml: unknown robot 'r2d2'" in entry.error
+    (tmp_path / "scene0001.yaml").write_text("[")
+    [entry] = load_motion_bench_maker(tmp_path)
+    assert "not valid YAML" in entry.error and "\n" not in entry.error
+
+
+def test_vectors_as_mappings_types_as_numbers() -> None:
+    data = scene_data(
+        id=3,
+        primitives=[{"type": 3, "dimensions": [0.4, 0.1]}],
+        primitive_poses=[
+            {"position": {"x": 1, "y": 2, "z": 3}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}},
+        ],
+    )
+    [shape] = moveit_scene(data, moveit_frames(data), Path()).shapes
+    assert isinstance(shape, Cylinder) and shape.center.tolist() == [1, 2, 3]
+    assert (shape.name, shape.height, shape.radius) == ("3", 0.4, 0.1)
+
+
+def test_pose_of_the_object_alone_is_enough() -> None:
+    entry = ball(pose={"position": [0, 0, 2], "orientation": [0, 0, 0, 1]})
+    del entry["primitive_poses"]
+    [shape] = moveit_scene(scene_data(**entry), moveit_frames({}), Path()).shapes
+    assert isinstance(shape, Sphere) and shape.center.tolist() == [0, 0, 2]
+
+
+def test_meshes(tmp_path: Path) -> None:
+    trimesh.creation.box([1, 1, 1]).export(tmp_path / "cube.stl")
+    at = {"position": [0, 0, 1], "orientation": QUARTER}
+    rows = [{"x": 0, "y": 0, "z": 0}, {"x": 1, "y": 0, "z": 0}, {"x": 0, "y": 1, "z": 0}]
+    data = scene_data(
+        id="things",
+        meshes=[
+            {"triangles": [{"vertex_indices": [0, 1, 2]}], "vertices": rows},
+            {"resource": "cube.stl", "dimensions": [2, 1, 1]},
+        ],
+        mesh_poses=[at, at],
+    )
+    triangle, cube = moveit_scene(data, moveit_frames(data), tmp_path).shapes
+    assert isinstance(triangle, Mesh) and isinstance(cube, Mesh)
+    np.testing.assert_allclose(triangle.world_vertices, [[0, 0, 1], [0, 1, 1], [-1, 0, 1]], atol=1e-12)
+    np.testing.assert_allclose(cube.bounds, [[-0.5, -1, 0.5], [0.5, 1, 1.5]], atol=1e-12)
+    assert (triangle.name, cube.name) == ("things", "things_2")
+
+
+CONE = {"type": "cone", "dimensions": [0.4, 0.1]}
+SHORT = {"type": "box", "dimensions": [0.4, 0.1]}
+
+
+def octomap(data: list[int]) -> dict[str, object]:
+    message = {"binary": True, "id": "OcTree", "resolution": 0.1, "data": data}
+    origin = {"position": [0, 0, 1], "orientation": [0, 0, 0, 1]}
+    return {"world": {"octomap": {"header": {"frame_id": "world"}, "origin": origin, "octomap": message}}}
+
+
+def test_cones_planes_and_octomaps() -> None:
+    place = {"position": [1, 0, 0], "orientation": [0, 0, 0, 1]}
+    data = scene_data(**ball(primitives=[CONE], primitive_poses=[place]))
+    [cone] = moveit_scene(data, moveit_frames(data), Path()).shapes
+    assert isinstance(cone, Mesh)
+    np.testing.assert_allclose(cone.bounds, [[0.9, -0.1, -0.2], [1.1, 0.1, 0.2]], atol=1e-3)
+    flat = {"id": "ground", "planes": [{"coef": [0, 0, 2, -1]}], "plane_poses": [place]}
+    data = scene_data(**flat)
+    [ground] = moveit_scene(data, moveit_frames(data), Path()).shapes
+    assert isinstance(ground, Box) and ground.name == "ground"
+    np.testing.assert_allclose(ground.bounds[1], [11, 10, 0.5])
+    data = octomap([-1 & 3, 0] + 14 * [3, 0] + [2, 0])  # the voxel at the lower end of everything
+    [cloud] = moveit_scene(data, moveit_frames(data), Path()).shapes
+    assert isinstance(cloud, PointCloud) and cloud.point_radius == pytest.approx(0.05 * 3**0.5)
+    np.testing.assert_allclose(cloud.points, [np.array([0, 0, 1]) - 0.1 * (2**15 - 0.5)])
+
+
+WRONG_SCENES: dict[str, tuple[object, str]] = {
+    "number": (3, "a planning scene is 3; it must be a mapping"),
+    "prism": (
+        scene_data(**ball(primitives=[CONE | {"type": 5}])),
+        "object ball: unknown type of .*'prism'; known: box, cone, cylinder",
+    ),
+    "dimensions": (scene_data(**ball(primitives=[SHORT])), r"primitives\[0\].dimensions .* 3 finite numbers"),
+    "poses": (scene_data(**ball(primitive_poses=[])), "has 1 primitives and 0 primitive_poses"),
+    "quaternion": (
+        scene_data(**ball(primitive_poses=[{"position": [0, 0, 0], "orientation": [0, 0, 0, 0]}])),
+        r"ball: primitive_poses\[0\].orientation .* must not be zero",
+    ),
+    "frame": (
+        scene_data(**ball(header={"frame_id": "moon"})),
+        "unknown frame_id of header: 'moon'; known: world",
+    ),
+    "plane": (scene_data(**ball(planes=[{"coef": [0, 0, 0, 1]}])), "must not all be zero"),
+    "package": (
+        scene_data(**ball(meshes=[{"resource": "package://a/b.stl"}], mesh_poses=ball()["primitive_poses"])),
+        r"object ball: meshes\[0\].resource is package://a/b.stl",
+    ),
+    "objects": ({"world": {"collision_objects": {}, "octomap": {"octomap": {"data": [1]}}}}, "not binary"),
+    "octomap": (octomap([3, 0]), "world.octomap: the tree ends too soon"),
+    "attached": ({"robot_state": {"attached_collision_objects": [1]}}, "attached_collision_objects"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_SCENES)
+def test_wrong_scenes(case: str, tmp_path: Path) -> None:
+    data, message = WRONG_SCENES[case]
+    file = tmp_path / "scene.yaml"
+    file.write_text(yaml.safe_dump(data))
+    with pytest.raises(InputError, match=message) as raised:
+        read_moveit_scene(file)
+    assert str(raised.value).startswith(str(file)) and "\n" not in str(raised.value)
+
+
+LINKS = ("hand", "finger")
+
+
+def matrix(names: list[str], pairs: list[tuple[str, str]], **defaults: bool) -> dict[str, Any]:
+    enabled = {frozenset(pair) for pair in pairs}
+    rows = [{"enabled": [frozenset((a, b)) in enabled for b in names]} for a in names]
+    return {
+        "entry_names": names,
+        "entry_values": rows,
+        "default_entry_names": list(defaults),
+        "default_entry_values": list(defaults.values()),
+    }
+
+
+def test_pairs_of_links_and_objects_count() -> None:
+    names = ["hand", "finger", "can", "stale"]
+    found = matrix_contacts(
+        matrix(names, [("hand", "can"), ("hand", "finger"), ("stale", "can")]), ["can", "board"], LINKS
+    )
+    assert found == {"can": ("hand",)}
+
+
+def test_defaults_decide_where_no_pair_does() -> None:
+    data = matrix(["hand", "can"], [], can=True, board=True, finger=False)
+    assert matrix_contacts(data, ["can", "board"], LINKS) == {"board": ("hand",)}
+    assert matrix_contacts(matrix([], [], can=True), ["can"], LINKS) == {"can": LINKS}
+    assert matrix_contacts(None, ["can"], LINKS) == {}
+    rows = {"entry_names": ["hand", "<octomap>"], "entry_values": [[0, 1], [1, 0]]}
+    assert matrix_contacts(rows, ["octomap"], LINKS) == {"octomap": ("hand",)}
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        {"entry_names": ["hand", "can"], "entry_values": [[0, 1]]},
+        {"entry_names": ["hand"], "entry_values": [[0, 1]]},
+        {"entry_names": "hand"},
+        ["hand"],
+    ],
+)
+def test_a_damaged_matrix_is_an_error(data: object) -> None:
+    with pytest.raises(InputError, match="allowed_collision_matrix"):
+        matrix_contacts(data, ["can"], LINKS)
+
+
+def test_a_scene_and_a_problem_file_allow_contacts(tmp_path: Path) -> None:
+    shutil.copytree(MOTION_BENCH_MAKER, tmp_path, dirs_exist_ok=True)
+    file = tmp_path / "scene0001.yaml"
+    data = read_yaml(file)
+    names = [entry["id"] for entry in data["world"]["collision_objects"]]
+    data["allowed_collision_matrix"] = matrix(["panda_hand", names[0], "gone"], [("panda_hand", names[0])])
+    file.write_text(yaml.safe_dump(data))
+    scene, _ = read_moveit_scene(file, load_robot("panda"))
+    assert scene.allowed_contacts == ((names[0], ("panda_hand",)),)
+
+    problem = {"robot": "panda", "scene": "scene0001.yaml", "request": "request0001.yaml"}
+    (tmp_path / "problem.yaml").write_text(yaml.safe_dump(problem | {"allowed_contacts": {names[1]: "all"}}))
+    loaded = load_problem(tmp_path / "problem.yaml")
+    assert loaded.scene.allowed_contacts == ((names[0], ("panda_hand",)), (names[1], "all"))
+
+
+UR5_JOINTS = [
+    *("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"),
+    *("wrist_1_joint", "wrist_2_joint", "wrist_3_joint"),
+]
+
+
+def ur5_files(folder: Path, model: str, more: list[str]) -> Path:
+    """A problem file of `ur5`, beside a MoveIt scene and request of a robot with further joints."""
+    names = [*UR5_JOINTS, *more]
+    zeros = [0.0] * (6 + len(more))
+    here = {"joint_state": {"name": names, "position": zeros}}
+    here["multi_dof_joint_state"] = {"joint_names": ["virtual_joint"]}
+    goal = [{"joint_name": name, "position": 0.1} for name in UR5_JOINTS]
+    scene = {"robot_model_name": model, "robot_state": here, "world": {}}
+    request = {"start_state": here, "goal_constraints": [{"joint_constraints": goal}]}
+    problem = {"robot": "ur5", "scene": "scene0001.yaml", "request": "request0001.yaml"}
+    for name, data in {"scene0001": scene, "request0001": request, "problem": problem}.items():
+        (folder / f"{name}.yaml").write_text(yaml.safe_dump(data))
+    return folder / "problem.yaml"
+
+
+def test_files_of_another_robot_are_refused_by_its_joints(tmp_path: Path) -> None:
+    """A UR5 on the table took scenes of one on a stand with a gripper: 224 of 238 motions met something."""
+    file = ur5_files(tmp_path, "ur5_robotiq85", ["gripper_finger1_joint"])
+    with pytest.raises(InputError) as raised:
+        load_problem(file)
+    text = str(raised.value)
+    assert (
+        "robot_state.joint_state has values of gripper_finger1_joint, movable joints that ur5 lacks" in text
+    )
+    assert "robot_model_name is ur5_robotiq85" in text and "its own are shoulder_pan_joint, " in text
+    with pytest.raises(InputError, match=r"scene0001.yaml: .* gripper_finger1_joint"):
+        read_moveit_scene(tmp_path / "scene0001.yaml", load_robot("ur5"))
+    [entry] = load_motion_bench_maker(tmp_path, load_robot("ur5"))
+    assert "gripper_finger1_joint" in entry.error
+    scene = read_yaml(tmp_path / "scene0001.yaml")
+    assert isinstance(scene, dict)
+    del scene["robot_state"]["joint_state"]
+    (tmp_path / "scene0001.yaml").write_text(yaml.safe_dump(scene))
+    with pytest.raises(InputError, match=r"start_state.joint_state has values of gripper_finger1_joint"):
+        load_problem(file)
+
+
+def test_joints_that_the_robot_lacks_can_be_ignored(tmp_path: Path) -> None:
+    file = ur5_files(tmp_path, "ur5_robotiq85", ["gripper_finger1_joint"])
+    notes = load_problem(file, ignore_joints=True).notes
+    assert "the scene's robot_model_name is ur5_robotiq85; planned for ur5" in notes
+    assert "start_state.joint_state: ignored gripper_finger1_joint, which ur5 lacks" in notes
+    [entry] = load_motion_bench_maker(tmp_path, load_robot("ur5"), ignore_joints=True)
+    assert entry.load().notes == notes
+    read_moveit_scene(tmp_path / "scene0001.yaml", load_robot("ur5"), ignore_joints=True)
+
+
+def test_another_model_name_with_known_joints_is_a_note(tmp_path: Path) -> None:
+    notes = load_problem(ur5_files(tmp_path, "ur5_lab", [])).notes
+    assert notes == ("the scene's robot_model_name is ur5_lab; planned for ur5",)
+    assert load_problem(ur5_files(tmp_path, "ur5", [])).notes == ()
+
+
+def test_fixed_joints_of_the_robot_are_known_where_they_stand(tmp_path: Path) -> None:
+    fixed = next(joint.name for joint in load_robot("ur5").joints if joint.kind == "fixed")
+    file = ur5_files(tmp_path, "ur5", [fixed])
+    assert load_problem(file).notes == ()
+    request = read_yaml(tmp_path / "request0001.yaml")
+    change(request, ["start_state", "joint_state", "position", 6], 0.3)  # type: ignore[arg-type]
+    (tmp_path / "request0001.yaml").write_text(yaml.safe_dump(request))
+    with pytest.raises(InputError, match=f"has values of {fixed}, movable joints that ur5 lacks"):
+        load_problem(file)
+
+
+def test_a_mimic_joint_elsewhere_than_its_master_puts_it_is_a_note(tmp_path: Path) -> None:
+    fingers = """<link name="left"/><link name="right"/>
+      <joint name="grip" type="prismatic"><parent link="arm"/><child link="left"/><axis xyz="0 1 0"/>
+        <limit lower="0" upper="0.04" velocity="1" effort="1"/></joint>
+      <joint name="follow" type="prismatic"><parent link="arm"/><child link="right"/><axis xyz="0 1 0"/>
+        <limit lower="0" upper="0.04" velocity="1" effort="1"/><mimic joint="grip"/></joint></robot>"""
+    (tmp_path / "arm.urdf").write_text(MOUNTED.format(kind="fixed").replace("</robot>", fingers))
+    robot = read_urdf(tmp_path / "arm.urdf", base="base", tip="arm")
+    here = {"joint_state": {"name": ["turn", "grip", "follow"], "position": [0, 0.03, 0.01]}}
+    goal = {"joint_constraints": [{"joint_name": "turn", "position": 0.1}]}
+    (tmp_path / "scene0001.yaml").write_text("{}")
+    request = {"start_state": here, "goal_constraints": [goal]}
+    (tmp_path / "request0001.yaml").write_text(yaml.safe_dump(request))
+    [entry] = load_motion_bench_maker(tmp_path, robot)
+    assert entry.load().notes == ("start_state: follow is 0.01; planned at 0.03, which grip implies",)
+
+
+def test_padding_and_scale_of_links_are_noted() -> None:
+    data = {
+        "link_padding": [
+            {"link_name": "panda_hand", "padding": 0.02},
+            {"link_name": "b", "padding": 0.0},
+        ],
+        "link_scale": [{"link_name": "panda_hand", "scale": 1.1}, {"link_name": "other", "scale": 1.0}],
+    }
+    assert scene_robot_notes(data, load_robot("panda")) == (
+        "the scene's link_padding of panda_hand is ignored",
+        "the scene's link_scale of panda_hand is ignored",
+    )
+
+
+def test_an_object_of_too_many_planes_is_one_line() -> None:
+    planes = [{"coef": [0, 0, 1, 1]}] * 100_000
+    with pytest.raises(InputError, match="has 100,000 planes; at most 1,000"):
+        object_shapes({"id": "a", "planes": planes}, moveit_frames({}), Path())
+
+
+def pose_constraint() -> dict[str, Any]:
+    region = {"primitive_poses": [{"position": [0.4, 0, 0.5], "orientation": [0, 0, 0, 1]}]}
+    return {
+        "position_constraints": [{"link_name": "panda_hand", "constraint_region": region}],
+        "orientation_constraints": [{"link_name": "panda_hand", "orientation": [1, 0, 0, 0]}],
+    }
+
+
+def test_several_goal_constraints_are_a_set() -> None:
+    data = request_data()
+    data["goal_constraints"].append(data["goal_constraints"][0])
+    assert len(moveit_request(data, moveit_frames({})).joint_goals) == 2
+
+
+def test_pose_goal(tmp_path: Path) -> None:
+    for file in MOTION_BENCH_MAKER.glob("*0001.yaml"):
+        shutil.copy(file, tmp_path)
+    data = request_data() | {"goal_constraints": [pose_constraint()]}
+    (tmp_path / "request0001.yaml").write_text(yaml.safe_dump(data))
+    goal = load_motion_bench_maker(tmp_path)[0].load().goal
+    assert isinstance(goal, PoseGoal) and goal.frame == "panda_hand"
+    np.testing.assert_allclose(goal.T_base_frame[:3, 3], [0.4, 0, 0.5])
+    np.testing.assert_allclose(goal.T_base_frame[:3, :3], np.diag([1.0, -1, -1]), atol=1e-12)
+    link, T = moveit_request(data, MoveItFrames(None, np.diag([-1.0, -1, 1, 1]))).pose_goal or ("", np.eye(4))
+    assert link == "panda_hand"
+    np.testing.assert_allclose(T[:3, 3], [-0.4, 0, 0.5])
+    flipped = np.diag([-1.0, -1, 1]) @ rotation_from_quaternion(np.array([0.0, 1, 0, 0]))
+    np.testing.assert_allclose(T[:3, :3], flipped, atol=1e-12)
+
+
+@pytest.mark.parametrize("frame", ["panda_hand", "world"])
+def test_objects_are_held_at_the_start(frame: str, tmp_path: Path) -> None:
+    for file in MOTION_BENCH_MAKER.glob("*0001.yaml"):
+        shutil.copy(file, tmp_path)
+    bare = load_motion_bench_maker(tmp_path)[0].load()
+    T_base_hand = link_pose(bare.robot, bare.start, "panda_hand")
+    T = (
+        T_base_hand @ transform(np.array([0.0, 0.0, 0.2]))
+        if frame == "world"
+        else transform(np.array([0, 0, 0.2]))
+    )
+    x, y, z, w = np.roll(quaternion_from_rotation(T[:3, :3]), -1).tolist()
+    held = {
+        "link_name": "panda_hand",
+        "touch_links": ["panda_link6", "no_link_of_it"],
+        "object": {
+            "header": {"frame_id": frame},
+            "id": "rod",
+            "primitives": [{"type": "cylinder", "dimensions": [0.2, 0.01]}],
+            "primitive_poses": [{"position": T[:3, 3].tolist(), "orientation": [x, y, z, w]}],
+        },
+    }
+    data = change(request_data(), ["start_state", "attached_collision_objects"], [held])
+    (tmp_path / "request0001.yaml").write_text(yaml.safe_dump(data))
+    problem = load_motion_bench_maker(tmp_path)[0].load()
+    [rod] = problem.robot.attached
+    assert rod.name == "rod" and rod.touch_links == ("panda_link6",)
+    np.testing.assert_allclose(rod.T_link_body, transform(np.array([0.0, 0.0, 0.2])), atol=1e-9)
+    T_world = problem_record(problem)["attached"][0]["cylinder"]  # type: ignore[index]
+    np.testing.assert_allclose(T_world["center"], [0, 0, 0.2], atol=1e-9)
+
+
+def pose_request(path: list[Any], value: object) -> dict[str, Any]:
+    return request_data() | {"goal_constraints": [change(pose_constraint(), path, value)]}
+
+
+def test_scaling_factors_and_the_velocity_of_a_start_state_are_noted() -> None:
+    asked = {"max_velocity_scaling_factor": 0.1, "max_acceleration_scaling_factor": 1.0}
+    data = request_data() | asked
+    data["start_state"]["joint_state"]["velocity"] = [0.0, 0.3]
+    assert {*moveit_request(data, moveit_frames({}, load_robot("panda"))).notes} == {
+        "the request's max_velocity_scaling_factor 0.1 is ignored: plan with velocity_scaling=0.1",
+        "start_state.joint_state.velocity [0.0, 0.3] is ignored: the motion begins at rest",
+    }
+
+
+WRONG_REQUESTS: dict[str, tuple[object, str]] = {
+    "number": (3, "a motion plan request is 3"),
+    "no goal": (request_data() | {"goal_constraints": []}, "goal_constraints is empty"),
+    "path constraints": (
+        request_data() | {"path_constraints": {"joint_constraints": [1]}},
+        "path_constraints",
+    ),
+    "reference": (request_data() | {"reference_trajectories": [{}]}, "reference_trajectories is not supp"),
+    "scaling": (
+        request_data() | {"max_velocity_scaling_factor": 2},
+        "max_velocity_scaling_factor is 2; it must be a number from 0 to 1",
+    ),
+    "attached": (
+        change(request_data(), ["start_state", "attached_collision_objects"], [1]),
+        r"attached_collision_objects\[0\] is 1; it must be a mapping",
+    ),
+    "attached shape": (
+        change(
+            request_data(),
+            ["start_state", "attached_collision_objects"],
+            [{"link_name": "panda_hand", "object": {"planes": [1], "header": {"frame_id": "panda_hand"}}}],
+        ),
+        r"attached_collision_objects\[0\].object: planes\[0\] is 1; it must be a mapping",
+    ),
+    "value": (
+        change(request_data(), ["goal_constraints", 0, "joint_constraints", 2, "position"], None),
+        r"goal_constraints\[0\].joint_constraints\[2\].position is \[None\]",
+    ),
+    "two poses": (
+        request_data() | {"goal_constraints": [pose_constraint(), pose_constraint()]},
+        "joint_constraints alone, or be the only goal",
+    ),
+    "position alone": (pose_request(["orientation_constraints"], []), "one position and one orientation"),
+    "two links": (
+        pose_request(["orientation_constraints", 0, "link_name"], "x"),
+        "both must constrain one link",
+    ),
+    "offset": (pose_request(["position_constraints", 0, "target_point_offset"], [0, 0, 1]), "must be zero"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_REQUESTS)
+def test_wrong_requests(case: str) -> None:
+    data, message = WRONG_REQUESTS[case]
+    with pytest.raises(InputError, match=message) as raised:
+        moveit_request(data, moveit_frames({}))
+    assert "\n" not in str(raised.value)
+
+
+def test_goal_without_a_joint(tmp_path: Path) -> None:
+    for file in MOTION_BENCH_MAKER.glob("*0001.yaml"):
+        shutil.copy(file, tmp_path)
+    data = request_data()
+    del data["goal_constraints"][0]["joint_constraints"][3]
+    (tmp_path / "request0001.yaml").write_text(yaml.safe_dump(data))
+    [entry] = load_motion_bench_maker(tmp_path)
+    assert "goal_constraints[0] has no value for panda_joint4" in entry.error
+
+
+Z = np.array([0.0, 0.0, 1.0])
+WHEELED = """<robot name="wheeled">
+  <link name="root"/><link name="x"/><link name="y"/>
+  <link name="base"><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
+  <link name="arm"><collision>
+    <origin xyz="0.3 0 0"/><geometry><box size="0.4 0.05 0.05"/></geometry></collision>
+  </link>
+  {above}
+  <joint name="turn" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
+    <limit lower="-3" upper="3" velocity="1" effort="1"/></joint>
+</robot>"""
+"""An arm on wheels; joints above its base stand for these."""
+SLIDES = "".join(
+    f'<joint name="to_{child}" type="prismatic"><parent link="{parent}"/><child link="{child}"/>'
+    f'<axis xyz="{axis}"/><limit lower="-9" upper="9" velocity="1" effort="1"/></joint>'
+    for parent, child, axis in (("root", "x", "1 0 0"), ("x", "y", "0 1 0"))
+)
+WHEELS = {
+    "three joints": SLIDES + '<joint name="yaw" type="continuous"><parent link="y"/><child link="base"/>'
+    '<axis xyz="0 0 1"/></joint>',
+    "a planar joint": '<joint name="drive" type="planar"><parent link="root"/><child link="base"/></joint>'
+    '<joint name="a" type="fixed"><parent link="base"/><child link="x"/></joint>'
+    '<joint name="b" type="fixed"><parent link="base"/><child link="y"/></joint>',
+}
+
+
+def place(data: dict[str, Any], robot: Robot | None = None) -> list[float]:
+    [shape] = moveit_scene(data, moveit_frames(data, robot), Path()).shapes
+    assert isinstance(shape, Sphere)
+    return shape.center.round(9).tolist()
+
+
+def at(frame: str, **more: object) -> dict[str, Any]:
+    pose = {"position": [0, 0, 0], "orientation": [0, 0, 0, 1]}
+    return scene_data(**ball(header={"frame_id": frame}, primitive_poses=[pose])) | more
+
+
+def state(frame: str, *translations: list[float]) -> dict[str, Any]:
+    transforms = [{"translation": xyz, "rotation": [0, 0, 0, 1]} for xyz in translations]
+    floating = {"header": {"frame_id": frame}, "joint_names": ["virtual"], "transforms": transforms}
+    return {"robot_state": {"multi_dof_joint_state": floating}}
+
+
+def mounted(folder: Path, kind: str) -> Robot:
+    """As `robot add --base base` keeps it, less the spheres, which take their time."""
+    (folder / "mounted.urdf").write_text(MOUNTED.format(kind=kind))
+    write_robot_folder(read_urdf(folder / "mounted.urdf", base="base"), folder / "mounted", {})
+    return read_robot_folder(folder / "mounted")
+
+
+def test_poses_compose_from_the_base_outwards() -> None:
+    """The base stands at [1, 0, 0] and is turned; a frame, the object and its part are offset and turned."""
+    data = scene_data(
+        **ball(
+            header={"frame_id": "table"},
+            pose={"position": [0, 2, 0], "orientation": QUARTER},
+        )
+    )
+    data["robot_state"] = {
+        "multi_dof_joint_state": {"transforms": [{"translation": [1, 0, 0], "rotation": QUARTER}]}
+    }
+    table = {"translation": [0, 0, 5], "rotation": QUARTER}
+    data["fixed_frame_transforms"] = [
+        {"transform": {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1]}, "child_frame_id": "world"},
+        {"header": {"frame_id": "world"}, "transform": table, "child_frame_id": "table"},
+    ]
+    [shape] = moveit_scene(data, moveit_frames(data), Path()).shapes
+    turn = rotation_about(Z, np.pi / 2)
+    in_object = np.array([1.0, 0, 0])
+    in_world = np.array([0, 0, 5.0]) + turn @ (np.array([0, 2.0, 0]) + turn @ in_object)
+    expected = turn.T @ (in_world - np.array([1.0, 0, 0]))
+    assert isinstance(shape, Sphere)
+    np.testing.assert_allclose(shape.center, expected, atol=1e-12)
+    data["world"]["collision_objects"][0]["header"]["frame_id"] = "panda_link0"
+    [shape] = moveit_scene(data, moveit_frames(data, load_robot("panda")), Path()).shapes
+    assert isinstance(shape, Sphere)
+    np.testing.assert_allclose(shape.center, np.array([0, 2.0, 0]) + turn @ in_object, atol=1e-12)
+
+
+def test_scene_in_the_world_of_a_robot_whose_base_is_not_its_root(tmp_path: Path) -> None:
+    """`robot add --base` once dropped the transform between them: verified motions met obstacles by 8 cm."""
+    robot = mounted(tmp_path, "fixed")
+    in_base = np.array([0.5, 0.0, 0.1])
+    turn = rotation_about(Z, np.pi / 2)
+    in_world = turn @ in_base + [1, 2, 0.8]
+    for frame, at in {
+        "": in_world,
+        "world": in_world,
+        "stand": in_base + np.array([0, 0, 0.3]),
+        "base": in_base,
+    }.items():
+        pose = {"position": at.tolist(), "orientation": [0, 0, 0, 1]}
+        data = scene_data(**ball(header={"frame_id": frame}, primitive_poses=[pose]))
+        [shape] = moveit_scene(data, moveit_frames(data, robot), tmp_path).shapes
+        assert isinstance(shape, Sphere)
+        np.testing.assert_allclose(shape.center, in_base, atol=1e-9, err_msg=frame)
+
+
+def test_scene_in_the_world_of_a_robot_whose_base_moves_there_is_refused(tmp_path: Path) -> None:
+    robot = mounted(tmp_path, "prismatic")
+    data = scene_data(**ball(header={"frame_id": "world"}))
+    data["fixed_frame_transforms"] = [
+        {"transform": {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1]}, "child_frame_id": "world"}
+    ]
+    with pytest.raises(InputError, match="a joint moves base in world"):
+        moveit_scene(data, moveit_frames(data, robot), tmp_path)
+    data = scene_data(**ball(header={"frame_id": "base"}))
+    [shape] = moveit_scene(data, moveit_frames(data, robot), tmp_path).shapes
+    assert isinstance(shape, Sphere) and shape.center.tolist() == [1, 0, 0]
+
+
+@pytest.mark.parametrize("wheels", WHEELS)
+def test_a_scene_places_what_a_mobile_base_carries(tmp_path: Path, wheels: str) -> None:
+    """Every scene of a Fetch whose URDF has joints for its wheels was refused: a joint moves its base."""
+    (tmp_path / "wheeled.urdf").write_text(WHEELED.format(above=WHEELS[wheels]))
+    robot = read_urdf(tmp_path / "wheeled.urdf", base="base")
+    assert robot.root == robot.base == "base"
+    data = scene_data(**ball(header={"frame_id": "world"})) | state("world", [0.5, 0, 0])
+    assert place(data, robot) == [0.5, 0, 0]
+
+
+def test_a_lift_is_no_mobile_base(tmp_path: Path) -> None:
+    tilted = WHEELS["three joints"].replace('"0 1 0"', '"0 0 1"')
+    (tmp_path / "wheeled.urdf").write_text(WHEELED.format(above=tilted))
+    assert read_urdf(tmp_path / "wheeled.urdf", base="base").root == "root"
+
+
+def test_scene_in_a_frame_that_the_robot_is_placed_in(tmp_path: Path) -> None:
+    """Objects in `odom`, where multi_dof_joint_state says that the root stands; `world` is then unknown."""
+    robot = mounted(tmp_path, "fixed")
+    base_in_root = np.array([1, 2, 0.8])
+    turn = rotation_about(Z, np.pi / 2).T
+    expected = (turn @ (-np.array([3.0, 0, 0]) - base_in_root)).round(9).tolist()
+    for frame in ("odom", "/odom", ""):
+        assert place(at(frame, **state("odom", [3, 0, 0])), robot) == expected
+    panda = load_robot("panda")
+    with pytest.raises(InputError, match=r"unknown frame_id of header: 'world'; known: odom, panda_link0"):
+        place(at("world", **state("odom", [3, 0, 0])), panda)
+    for named in ("world", "panda_link0", ""):
+        assert place(at("world", **state(named, [3, 0, 0])), panda) == [-3, 0, 0]
+    with pytest.raises(InputError, match="has 2 transforms; it must have one"):
+        place(at("world", **state("odom", [3, 0, 0], [0, 0, 0])), panda)
+
+
+def test_links_of_the_robot_are_frames_where_they_stand(tmp_path: Path) -> None:
+    """Also a link called world that is not the root; a file cannot place a link of the robot anew."""
+    text = MOUNTED.format(kind="fixed").replace(
+        '<link name="world"/>',
+        """<link name="map"/><link name="world"/><link name="camera"/>
+        <joint name="on" type="fixed"><parent link="map"/><child link="world"/><origin xyz="0 0 7"/></joint>
+        <joint name="eye" type="fixed"><parent link="base"/><child link="camera"/>
+        <origin xyz="0 0 1"/></joint>""",
+    )
+    (tmp_path / "arm.urdf").write_text(text)
+    robot = read_urdf(tmp_path / "arm.urdf", base="base")
+    assert place(at("camera"), robot) == [0, 0, 1]
+    assert place(at("world"), robot) == [-2, 1, -0.8]
+    assert place(at(""), robot) == [-2, 1, -7.8]
+    fixed = {"transform": {"translation": [9, 9, 9], "rotation": [0, 0, 0, 1]}, "child_frame_id": "stand"}
+    assert place(at("stand", fixed_frame_transforms=[fixed]), robot) == [0, 0, -0.3]
+    with pytest.raises(InputError, match=r"unknown frame_id of header: 'arm'; known: base, camera, map"):
+        place(at("arm"), robot)
