@@ -1,4 +1,4 @@
-"""Controls: fixed vias, nearest motions, smooth noise."""
+"""Controls: the straight line, fixed vias, nearest motions, smooth noise."""
 
 from pathlib import Path
 
@@ -7,10 +7,21 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.example_robots import planar_arm
-from robotdiffuse.baselines import controls
-from robotdiffuse.baselines.controls import NEAREST, NOISE, VIAS, Control, ControlSettings
+from robotdiffuse.baselines import controls, straight_line
+from robotdiffuse.baselines.controls import (
+    MAX_HALF_RANGE,
+    NEAREST,
+    NOISE,
+    SPREAD,
+    VIAS,
+    Control,
+    ControlSettings,
+    smooth_noise,
+)
+from robotdiffuse.baselines.straight_line import StraightLine, StraightLineSettings
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.learning.exported_model import exported_model
 
 PANDA = rd.load_robot("panda")
 START = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
@@ -58,3 +69,38 @@ def test_data_are_for_the_nearest_motions_alone(tmp_path: Path) -> None:
         ControlSettings(source=NEAREST)
     with pytest.raises(InputError, match="needs data"):
         ControlSettings(data=str(tmp_path))
+
+
+MIDDLE = 0.5 * (PANDA.lower + PANDA.upper)
+GOALS = np.stack([MIDDLE, MIDDLE + 0.1])
+
+
+def test_smooth_noise_keeps_ends_and_limits() -> None:
+    q = smooth_noise(PANDA.lower, GOALS, 5, 48, PANDA, np.random.default_rng(0))
+    assert q.shape == (5, 48, 7) and q.dtype == np.float32
+    assert np.array_equal(q[:, 0], np.repeat(PANDA.lower[None], 5, 0).astype(np.float32))
+    assert np.array_equal(q[:, -1], GOALS[[0, 1, 0, 1, 0]].astype(np.float32))
+    assert (q >= PANDA.lower.astype(np.float32)).all() and (q <= PANDA.upper.astype(np.float32)).all()
+
+
+def test_the_covariance_of_smooth_noise_is_about_that_of_the_pandas_weights() -> None:
+    """Eigenvalues agree to a hundredth of their sum, and the standard deviation on average."""
+    q = smooth_noise(MIDDLE, MIDDLE[None], 4000, 48, PANDA, np.random.default_rng(1)) - MIDDLE
+    half = np.minimum(0.5 * (PANDA.upper - PANDA.lower), MAX_HALF_RANGE)
+    rows = np.moveaxis(q / half, 1, 2).reshape(-1, 48)
+    assert abs(rows.std() - SPREAD) < 0.005
+    model = exported_model("model", None, PANDA)
+    factor = model.statistics.noise_factor.astype(np.float64)
+    shares = [np.linalg.eigvalsh(c)[::-1] / np.trace(c) for c in (rows.T @ rows, factor @ factor.T)]
+    assert np.abs(shares[0] - shares[1]).max() < 0.012
+
+
+def test_any_goal_is_tried_where_the_nearest_is_blocked() -> None:
+    free = np.append(2.8, GOAL[1:])
+    problem = rd.Problem(PANDA, WALL, START, rd.JointGoal([GOAL, free]))
+    found = StraightLine().plan(problem, 5.0)
+    assert found.solved and found.path is not None
+    np.testing.assert_array_equal(found.path.positions, [START, free])
+    alone = StraightLine(StraightLineSettings(goals=straight_line.NEAREST)).plan(problem, 5.0)
+    assert not alone.solved and alone.refused == "scene_collision"
+    assert "the straight line is refused" in alone.reason

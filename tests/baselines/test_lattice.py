@@ -228,10 +228,7 @@ def test_no_path_on_the_lattice(planner):
 
 @pytest.mark.parametrize(
     "planner",
-    [
-        AStar(AStarSettings(spacing=0.05, inflation=1.0)),
-        DStarLite(DStarLiteSettings(spacing=0.1)),
-    ],
+    [AStar(AStarSettings(spacing=0.05, inflation=1.0)), DStarLite(DStarLiteSettings(spacing=0.1))],
 )
 def test_time_limit(planner):
     problem = Problem(PANDA, WALL, LEFT, JointGoal(RIGHT[None]))

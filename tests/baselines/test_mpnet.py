@@ -14,11 +14,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import path_length
 from robotdiffuse.datasets.rows import resample
 from robotdiffuse.learning.checkpoint import save_network
-from robotdiffuse.learning.mpnet import (
-    MPNetNetwork,
-    MPNetSettings,
-    sorted_along_curve,
-)
+from robotdiffuse.learning.mpnet import MPNetNetwork, MPNetSettings, sorted_along_curve
 from robotdiffuse.learning.training.batches import TrajectoryData
 from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
@@ -266,13 +262,7 @@ def test_giving_up_says_what_was_wrong(weights: str) -> None:
     assert result.refused == "scene_collision" and "hybrid" in result.reason
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("layers", ()),
-        ("steady_layers", 12),
-    ],
-)
+@pytest.mark.parametrize(("name", "value"), [("layers", ()), ("steady_layers", 12)])
 def test_bad_settings_of_the_network_are_refused(name: str, value: object) -> None:
     with pytest.raises(InputError, match=f"mpnet.{name} is "):
         replace(MPNetSettings(), **{name: value})

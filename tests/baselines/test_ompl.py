@@ -24,12 +24,7 @@ RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 READY = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 WALL = rd.Scene([rd.Box([0.45, 0.0, 0.25], [0.3, 0.05, 0.5], name="wall")])
 FIRST = (planners.OmplRRT, planners.OmplRRTConnect, planners.OmplPRM)
-ANYTIME = (
-    planners.OmplRRTStar,
-    planners.OmplInformedRRTStar,
-    planners.OmplBITStar,
-    planners.OmplAORRTC,
-)
+ANYTIME = (planners.OmplRRTStar, planners.OmplInformedRRTStar, planners.OmplBITStar, planners.OmplAORRTC)
 every = pytest.mark.parametrize("planner", FIRST + ANYTIME, ids=lambda planner: planner.name)
 anytime = pytest.mark.parametrize("planner", ANYTIME, ids=lambda planner: planner.name)
 

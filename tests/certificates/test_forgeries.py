@@ -111,17 +111,16 @@ def scaled_time(factor: float) -> Callable[[Record], None]:
     def forge(record: Record) -> None:
         for name, power in (("times", 1), ("velocities", -1), ("accelerations", -2)):
             scaled_rows(name, factor**power)(record)
-        record["between"] = (factor * np.array(record["between"])).tolist()
-        record["looks"] = (factor * np.array(record["looks"])).tolist()
+        for name in ("between", "looks"):
+            record[name] = (factor * np.array(record[name])).tolist()
 
     return forge
 
 
 def shifted_time(by: float) -> Callable[[Record], None]:
     def forge(record: Record) -> None:
-        record["motion"]["times"] = (np.array(record["motion"]["times"]) + by).tolist()
-        record["between"] = (np.array(record["between"]) + by).tolist()
-        record["looks"] = (np.array(record["looks"]) + by).tolist()
+        for part, name in ((record["motion"], "times"), (record, "between"), (record, "looks")):
+            part[name] = (np.array(part[name]) + by).tolist()
 
     return forge
 
@@ -147,18 +146,14 @@ def sparse(record: Record) -> None:
     motion = record["motion"]
     for name in ("positions", "velocities", "accelerations", "times"):
         motion[name] = [motion[name][0], motion[name][-1]]
-    record["between"] = []
-    record["looks"] = []
-    record["jerks"] = []
+    record.update(between=[], looks=[], jerks=[])
 
 
 def without_rates(record: Record) -> None:
     """A path: velocities and moving obstacles would go unchecked."""
     for name in ("times", "velocities", "accelerations"):
         del record["motion"][name]
-    record["between"] = []
-    record["looks"] = []
-    record["jerks"] = []
+    record.update(between=[], looks=[], jerks=[])
 
 
 def still_row(record: Record) -> None:
@@ -204,85 +199,34 @@ def no_stretches(record: Record) -> None:
         claim.update(start=[], stop=[], clearance=[], displacement=[], by_planes=[], planes=[])
 
 
-def twice(record: Record) -> None:
-    record["proof"].append(copy.deepcopy(record["proof"][0]))
-
-
-def against_nothing(record: Record) -> None:
-    record["proof"][0]["against"] = "nothing"
-
-
 def exchanged_claims(record: Record) -> None:
     one = record["proof"][0]
     other = record["proof"][-1]
     one["link"], other["link"] = other["link"], one["link"]
 
 
-def no_moving_claim(record: Record) -> None:
-    record["moving"].pop()
+def unknown_ball(record: Record) -> None:
+    [ball] = record["problem"]["moving"]
+    del ball["velocity"]
+    ball["max_speed"] = 1.0
 
 
-def touching(record: Record) -> None:
-    """A contact that the true problem does not allow."""
-    record["problem"]["allowed_contacts"] = {"table": "all"}
+def without(name: str, **rest: Any) -> Callable[[Record], None]:
+    """A problem that lacks a field, and a certificate that says nothing about it."""
 
-
-def held(record: Record) -> None:
-    record["problem"]["locked"] = {"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0}
-
-
-def moved_table(record: Record) -> None:
-    record["problem"]["scene"][0]["box"]["center"][2] -= 0.2
-
-
-def no_fields(*names: str) -> Callable[[Record], None]:
     def forge(record: Record) -> None:
-        for name in names:
-            record["problem"].pop(name, None)
-            empty: dict[str, Any] = {"moving": None, "constraints": [], "payload": None}
-            if name in empty:
-                record["moving" if name == "moving" else "constraints"] = empty[name] or []
-        if "moving" in names:
-            record["moving"] = None
-        if "payload" in names:
-            record["torques"] = []
+        del record["problem"][name]
+        record.update(rest)
 
     return forge
 
 
-def in_problem(name: str, change: Callable[[Any], Any]) -> Callable[[Record], None]:
-    def forge(record: Record) -> None:
-        record["problem"][name] = change(record["problem"][name])
-
-    return forge
+def first_claim_twice(record: Record) -> None:
+    record["proof"].append(copy.deepcopy(record["proof"][0]))
 
 
-def wider_cone(constraints: list[Any]) -> list[Any]:
-    constraints[0]["axis_cone"]["angle"] = 3.0
-    return constraints
-
-
-def lighter(payload: dict[str, Any]) -> dict[str, Any]:
-    return payload | {"mass": 0.01}
-
-
-def slower_ball(moving: list[Any]) -> list[Any]:
-    moving[0]["velocity"] = [0.0, 0.0, 0.0]
-    return moving
-
-
-def faster_ball(moving: list[Any]) -> list[Any]:
-    moving[0]["velocity"] = [0.0, -1.0, 0.0]
-    return moving
-
-
-def unknown_ball(moving: list[Any]) -> list[Any]:
-    del moving[0]["velocity"]
-    moving[0]["max_speed"] = 1.0
-    return moving
-
-
-FORGED: dict[str, tuple[Callable[[Record], None], str]] = {
+CLOSED = {"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0}
+FORGED: dict[str, tuple[Callable[[Record], object], str]] = {
     # planes
     "normals of denormal length": (normals(1e-310), "has a normal of length"),
     "normals of small length": (normals(1e-160), "has a normal of length"),
@@ -304,8 +248,8 @@ FORGED: dict[str, tuple[Callable[[Record], None], str]] = {
     "stretches beyond the motion": (of_widest("stop", lambda x: [*x[:-1], x[-1] + 9]), "is missing from row"),
     "stretches backwards": (reversed_proof, "is missing from row"),
     "no stretches": (no_stretches, "is missing from row"),
-    "a claim twice": (twice, "contains a claim twice"),
-    "a claim against nothing": (against_nothing, "needs no proof"),
+    "a claim twice": (first_claim_twice, "contains a claim twice"),
+    "a claim against nothing": (set_to("proof", 0, "against", to="nothing"), "needs no proof"),
     "claims of other links": (exchanged_claims, "proof: "),
     "no claims": (set_to("proof", to=[]), "is missing"),
     "more clearance": (of_widest("clearance", lambda x: [v + 1e-3 for v in x]), "proof: clearance of"),
@@ -313,7 +257,7 @@ FORGED: dict[str, tuple[Callable[[Record], None], str]] = {
     "endless clearance": (of_widest("clearance", lambda x: [1e308 for _ in x]), "clearance"),
     "clearance of 5 m": (set_to("scene_clearance", to=5.0), "more than the 1 m that are measured"),
     "clearance below 0": (set_to("self_clearance", to=-1.0), "not positive"),
-    "no moving claim": (no_moving_claim, "is missing"),
+    "no moving claim": (lambda record: record["moving"].pop(), "is missing"),
     "nothing about what moves": (set_to("moving", to=None), "none among moving obstacles"),
     # tolerances
     "a negative tolerance": (set_to("tolerances", "limit_slack", to=-1.0), "must not be negative"),
@@ -354,17 +298,17 @@ FORGED: dict[str, tuple[Callable[[Record], None], str]] = {
     "spheres of before": (set_to("robot_parts", "spheres of panda_link5", to="0" * 16), "has changed"),
     "an unknown field": (set_to("holds", to=True), "holds is unknown"),
     # the problem, judged by the true one
-    "a lower table": (moved_table, "scene: table has changed"),
-    "an allowed contact": (touching, "links that may touch table is missing"),
-    "a wider cone": (in_problem("constraints", wider_cone), r"requests: constraints\[0\] has changed"),
-    "a lighter load": (in_problem("payload", lighter), "requests: payload has changed"),
-    "a ball at rest": (in_problem("moving", slower_ball), "requests: moving ball has changed"),
-    "no ball": (no_fields("moving"), "moving ball was added"),
-    "no load": (no_fields("payload"), "payload was added"),
+    "a lower table": (set_to("problem", "scene", 0, "box", "center", 2, to=-0.006), "table has changed"),
+    "an allowed contact": (set_to("problem", "allowed_contacts", to={"table": "all"}), "may touch table is"),
+    "a wider cone": (set_to("problem", "constraints", 0, "axis_cone", "angle", to=3.0), r"constraints\[0\]"),
+    "a lighter load": (set_to("problem", "payload", "mass", to=0.01), "requests: payload has changed"),
+    "a ball at rest": (set_to("problem", "moving", 0, "velocity", to=[0.0] * 3), "moving ball has changed"),
+    "no ball": (without("moving", moving=None), "moving ball was added"),
+    "no load": (without("payload", torques=[]), "payload was added"),
     # the problem, judged by itself
-    "closed fingers": (held, "robot: joint panda_finger_joint1 has changed"),
-    "a faster ball": (in_problem("moving", faster_ball), "is not shown to be free|proof: (clear|displ)"),
-    "a ball of unknown motion": (in_problem("moving", unknown_ball), "proof: "),
+    "closed fingers": (set_to("problem", "locked", to=CLOSED), "joint panda_finger_joint1 has changed"),
+    "a faster ball": (set_to("problem", "moving", 0, "velocity", to=[0, -1, 0]), "shown to be free|proof: "),
+    "a ball of unknown motion": (unknown_ball, "proof: "),
 }
 
 

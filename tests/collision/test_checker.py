@@ -227,16 +227,8 @@ def test_a_huge_floor_is_as_exact_as_a_small_one(size: float) -> None:
     robot = with_spheres("panda")
     q = rows(robot, 400)
     scene = rd.Scene([rd.Box((0.3, 0.1, -size / 2 - 0.05), (size + 4, size + 4, size))])
-    right = (
-        np.stack(
-            [
-                c[..., 2].min(axis=1) * 0 + (c[..., 2] - r).min(axis=1)
-                for c, r in zip(*sphere_centers(robot, q), strict=True)
-            ],
-            axis=1,
-        )[:, 1:]
-        + 0.05
-    )
+    lowest = [(c[..., 2] - r).min(axis=1) for c, r in zip(*sphere_centers(robot, q), strict=True)]
+    right = np.stack(lowest[1:], axis=1) + 0.05
     found = CollisionChecker(robot, scene).link_clearances(q)
     np.testing.assert_allclose(found, np.minimum(right, 1), atol=3e-5)
 
@@ -266,18 +258,13 @@ def test_a_robot_without_spheres_is_free() -> None:
     assert not gradients.any()
 
 
-def test_links_with_an_empty_list_of_spheres_are_left_out() -> None:
-    robot = box_arm()
-    robot = replace(robot, spheres={"l1": robot.spheres["l1"], "l3": np.zeros((0, 4))})
+def test_links_without_spheres_are_left_out_and_fixed_ones_do_not_count_against_the_scene() -> None:
+    arm = box_arm()
+    robot = replace(arm, spheres={"l1": arm.spheres["l1"], "l3": np.zeros((0, 4))})
     checker = CollisionChecker(robot, rd.Scene())
-    assert checker.links == ("l1",)
-    assert checker.pairs == ()
+    assert checker.links == ("l1",) and checker.pairs == ()
     assert checker.free(np.zeros((1, 3)))[0]
-
-
-def test_fixed_links_do_not_count_against_the_scene() -> None:
-    robot = box_arm().with_locked({"j0": 0.0})
-    checker = CollisionChecker(robot, rd.Scene([rd.Sphere((0.2, 0, 0), 0.1)]))
+    checker = CollisionChecker(arm.with_locked({"j0": 0.0}), rd.Scene([rd.Sphere((0.2, 0, 0), 0.1)]))
     assert checker.links == ("l2", "l3")
     assert checker.free(np.zeros((1, 2)))[0]
 

@@ -67,21 +67,6 @@ def test_the_nearest_of_a_dense_cloud() -> None:
     np.testing.assert_allclose(found.link_clearances(q)[near], right.link_clearances(q)[near], atol=TOLERANCE)
 
 
-def test_a_hundred_thousand_points() -> None:
-    robot = with_spheres("panda")
-    rng = np.random.default_rng(0)
-    points = np.column_stack(
-        [rng.uniform(0.3, 0.9, (100_000, 1)), rng.uniform(-0.5, 0.5, (100_000, 1)), np.zeros(100_000) + 0.3]
-    )
-    checker = CollisionChecker(robot, Scene([PointCloud(points, 0.01)]))
-    table = CollisionChecker(robot, Scene([Box((0.6, 0, 0.3), (0.6, 1.0, 0.02))]))
-    q = rows(robot, 1000)
-    free = checker.free(q)
-    # the box has sharp edges where the cloud is round, and the cloud's spheres are joined
-    assert (free == table.free(q)).mean() > 0.97
-    assert checker.link_clearances(q).min(axis=1).max() > 0.1
-
-
 def test_empty_and_distant_clouds_are_empty_scenes() -> None:
     robot = with_spheres("panda")
     q = rows(robot, 200)

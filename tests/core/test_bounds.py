@@ -19,10 +19,7 @@ FAR = [1e20, 0, 0]
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (
-            lambda: rd.Sphere([0, 0, 0], 1e7),
-            "sphere.radius is 10000000.0; it must be a number from 1e-09 to",
-        ),
+        (lambda: rd.Sphere([0, 0, 0], 1e7), "sphere.radius is 10000000.0; it must be a number from 1e-09"),
         (lambda: rd.Sphere([0, 0, 0], 1e-300), "sphere.radius is 1e-300"),
         (lambda: rd.Sphere(FAR, 1), r"sphere.center is \[1e\+20, 0, 0\]; its numbers must be within ±10000"),
         (lambda: rd.Box([0, 0, 0], [1, 1e5, 1]), "box.size"),
@@ -30,10 +27,7 @@ FAR = [1e20, 0, 0]
         (lambda: rd.Box([0, 0, 0], [1, 1, 1], [1e200, 1e200, 0, 0]), "box.wxyz .* within ±10000"),
         (lambda: rd.Cylinder([0, 0, 0], 1, 1e9), "cylinder.height"),
         (lambda: rd.Capsule([0, 0, 0], 1e39, 1), "capsule.radius"),
-        (
-            lambda: rd.Mesh([*TRIANGLE, [5e37, 0, 0]], [[0, 1, 2]]),
-            r"mesh.vertices\[3\] is .* within ±10000 m",
-        ),
+        (lambda: rd.Mesh([*TRIANGLE, [5e37, 0, 0]], [[0, 1, 2]]), r"mesh.vertices\[3\] is .* within ±10000"),
         (lambda: rd.Mesh(TRIANGLE, [[0, 1, np.nan]]), "mesh.faces"),
         (lambda: rd.Mesh(TRIANGLE, [[0, 1, 2]], FAR), "mesh.xyz"),
         (lambda: rd.PointCloud([[0, 0, 0], [1e39, 0, 0], [0, 1e39, 0]]), r"points\[1\] and 1 more is"),

@@ -20,7 +20,7 @@ from trimesh.exchange.obj import export_obj
 from trimesh.exchange.ply import export_ply
 
 from robotdiffuse import InputError
-from robotdiffuse.core.errors import joined, shown, unknown_name
+from robotdiffuse.core.errors import distinct, joined, shown, unknown_name
 from robotdiffuse.core.input_files import (
     MAX_SHOWN_NAME,
     input_file,
@@ -186,9 +186,12 @@ def test_files_that_are_none(tmp_path: Path) -> None:
 
 def test_a_broken_mesh_is_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     broken = {"a.stl": b"solid", "b.obj": b"f 1 2 3", "c.ply": b"ply\nformat", "d.glb": b"x"}
+    broken |= {"empty.stl": b"", "points.obj": b"v 0 0 0\n"}
     for name, content in broken.items():
         (tmp_path / name).write_bytes(content)
         assert "mesh file" in one_line(lambda name=name: read_triangles(tmp_path / name))
+    (tmp_path / "a.txt").touch()
+    assert "mesh format" in one_line(lambda: read_triangles(tmp_path / "a.txt"))
     assert capfd.readouterr().err == ""
 
 
@@ -238,16 +241,11 @@ def test_xml_bombs_are_refused_in_one_line(text: str) -> None:
         parse_xml(text.encode(), "it")
 
 
-@pytest.mark.parametrize("ending", [".npy", ".npz"])
-def test_arrays_of_python_objects_are_refused(ending: str, tmp_path: Path) -> None:
-    file = tmp_path / f"points{ending}"
-    objects = np.array([{"a": 1}], object)
-    if ending == ".npy":
-        np.save(file, objects, allow_pickle=True)
-    else:
-        np.savez(file, points=objects)
-    with pytest.raises(InputError, match="is damaged"):
-        read_arrays(file)
+def test_arrays_of_python_objects_are_refused(tmp_path: Path) -> None:
+    for name, save in (("points.npy", np.save), ("points.npz", np.savez)):
+        save(tmp_path / name, np.array([{"a": 1}], object))
+        with pytest.raises(InputError, match="is damaged"):
+            read_arrays(tmp_path / name)
 
 
 def test_an_archive_called_npy_is_refused(tmp_path: Path) -> None:
@@ -289,3 +287,14 @@ def test_nothing_unpickles_files() -> None:
             if call in ("np.load", "numpy.load"):
                 allowed = [key.value for key in node.keywords if key.arg == "allow_pickle"]  # type: ignore[attr-defined]
                 assert all(isinstance(one, ast.Constant) and one.value is False for one in allowed), file
+
+
+@given(st.lists(st.floats(allow_nan=False), min_size=1, max_size=3), st.integers(2, 6))
+def test_different_numbers_are_told_apart(values: list[float], digits: int) -> None:
+    texts = distinct(*values, digits=digits)
+    assert len(set(texts)) >= len(set(values))
+
+
+def test_as_few_digits_as_needed() -> None:
+    assert distinct(3.14, 9.0) == ["3.14", "9"]
+    assert distinct(3.1400001049, 3.14) == ["3.1400001", "3.14"]

@@ -49,11 +49,3 @@ def test_links_that_may_touch_an_obstacle_are_compared_a_few_times_each(names: l
     assert scene.allowed_contacts == (("box", tuple(few)),)
     with pytest.raises(InputError, match=f"'box' has over {MAX_CONTACT_LINKS} links; write all"):
         Scene(scene.shapes, [("box", names)])
-
-
-def test_contacts_of_a_name_and_of_one_of_its_shapes_are_joined() -> None:
-    boxes = [Box([1, 0, 0], [0.1, 0.1, 0.1])] * 3
-    scene = Scene(boxes, [("box", ["a"]), ("box_2", ["b", "a"]), ("box_3", "all")])
-    assert scene.allowed_contacts == (("box", ("a",)), ("box_2", ("a", "b")), ("box_3", "all"))
-    assert scene.may_touch("b", "box_2") and scene.may_touch("x", "box_3")
-    assert not scene.may_touch("b", "box") and not scene.may_touch("a", "wall")

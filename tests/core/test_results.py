@@ -166,11 +166,7 @@ def test_damaged_result_is_refused(
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [
-        ("{", "is not valid JSON"),
-        ("[]", "must hold one JSON object"),
-        ("{}", "status, reason, planner"),
-    ],
+    [("{", "is not valid JSON"), ("[]", "must hold one JSON object"), ("{}", "status, reason, planner")],
 )
 def test_not_a_result_file(text: str, message: str, tmp_path: FilePath) -> None:
     file = tmp_path / "r.json"

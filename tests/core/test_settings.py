@@ -125,10 +125,7 @@ def test_assignments() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (
-            "reach=1",
-            "search has no setting 'reach'; it has step=1.0, .*range=none, .*inner.cells=3, greedy=false",
-        ),
+        ("reach=1", "search has no setting 'reach'; it has step=1.0, .*range=none, .*inner.cells=3"),
         ("step", "'step' is not NAME=VALUE"),
         ("step=big", "search.step is 'big'; it takes float positive"),
         ("step=-1", "search.step is -1.0; it must be positive"),

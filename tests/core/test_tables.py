@@ -8,16 +8,8 @@ from rich.console import Console
 from robotdiffuse.core import tables
 from robotdiffuse.core.tables import Column, Figure, Table
 
-COLUMNS = (
-    "planner",
-    Column("success", "%", ".1f", "more", scale=100.0),
-    Column("a & b", "s", better="less"),
-)
-ROWS = (
-    ("rrt_star*", 0.25, Figure("0.0010", 0.001)),
-    ("b|c [x]", 0.75, 2.0),
-    ("<d>", float("nan"), None),
-)
+COLUMNS = ("planner", Column("success", "%", ".1f", "more", scale=100.0), Column("a & b", "s", better="less"))
+ROWS = (("rrt_star*", 0.25, Figure("0.0010", 0.001)), ("b|c [x]", 0.75, 2.0), ("<d>", float("nan"), None))
 TABLE = Table.of("Title [of] it", COLUMNS, ROWS, ("note_1 < 2",))
 
 

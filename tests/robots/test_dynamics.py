@@ -68,7 +68,7 @@ def test_bundles_keep_inertias_and_effort_limits(tmp_path: Path) -> None:
 
 def test_motions_with_a_payload_are_slower_and_keep_the_limits() -> None:
     durations = []
-    for mass in (0.0, 2.0, 3.0):
+    for mass in (0.0, 3.0):
         problem = rd.Problem(PANDA, rd.Scene(), LOW, FAR, payload=Payload(mass, [0.0, 0.0, 0.1]))
         for jerk in (None, 300.0):
             motion = rd.plan(problem, time_limit=10.0, jerk=jerk).trajectory
@@ -78,7 +78,7 @@ def test_motions_with_a_payload_are_slower_and_keep_the_limits() -> None:
             assert (np.abs(torques) <= 1.01 * dynamics.limits).all()
             if jerk is None:
                 durations.append(motion.duration)
-    assert durations[0] < durations[2]
+    assert durations[0] < durations[1]
 
 
 def test_the_validator_names_joint_torque_and_limit() -> None:

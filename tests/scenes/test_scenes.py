@@ -161,10 +161,7 @@ def test_region_refuses_a_floor_above_the_reach() -> None:
         (lambda: Mesh([[0, 0, 0]], [[0, 0, 1]]), "indices of the 1 vertices"),
         (lambda: Mesh([[0, 0, 0]], []), "mesh.faces"),
         (lambda: PointCloud([[0, 0]]), "an array of 1 x 2; it must be n x 3"),
-        (
-            lambda: PointCloud([[0, 0, np.inf]]),
-            r"points\[0\] is \[0.0, 0.0, inf\]; it must be finite numbers",
-        ),
+        (lambda: PointCloud([[0, 0, np.inf]]), r"points\[0\] is \[0.0, 0.0, inf\]; it must be finite"),
         (lambda: PointCloud([[0, 0, 0], [1]]), "not numbers"),
         (lambda: Scene(["ball"]), r"scene\[0\] is a str"),  # type: ignore[list-item]
     ],
@@ -342,15 +339,6 @@ def test_files_of_no_points(form: str, tmp_path: Path) -> None:
         assert points.shape == (0, 3) and "holds no points" in notes[0]
 
 
-@pytest.mark.parametrize("form", ["ply ascii", "ply binary", *PCD_FORMS, "npy", "npz"])
-def test_damaged_point_files(form: str, tmp_path: Path) -> None:
-    file = write_points(tmp_path, form, POINTS)
-    file.write_bytes(file.read_bytes()[: 100 if form.startswith("np") else 240])
-    with pytest.raises(InputError, match=r"is damaged|cannot be read|holds") as raised:
-        read_points(file)
-    assert "\n" not in str(raised.value)
-
-
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
@@ -386,24 +374,6 @@ def test_mesh_files(ending: str, tmp_path: Path) -> None:
     assert len(faces) == 12
     extents = [0.5, 1.5, 1] if ending == "glb" else [0.5, 1, 1.5]  # glTF has y up
     assert np.abs(vertices).max(axis=0) == pytest.approx(extents)
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("a.stl", None, "does not exist"),
-        ("a.stl", b"", "is empty"),
-        ("a.stl", b"nonsense", "cannot be read|no triangles"),
-        ("a.obj", b"v 0 0 0\n", "cannot be read|no triangles"),
-        ("a.txt", b"", "mesh format"),
-    ],
-)
-def test_wrong_mesh_files(name: str, content: bytes | None, message: str, tmp_path: Path) -> None:
-    if content is not None:
-        (tmp_path / name).write_bytes(content)
-    with pytest.raises(InputError, match=message) as raised:
-        read_triangles(tmp_path / name)
-    assert "\n" not in str(raised.value)
 
 
 def assert_equal(a: Scene, b: Scene) -> None:

@@ -120,19 +120,6 @@ def test_a_wide_reversal_keeps_its_velocity_limit() -> None:
     check(arm(), p, time_parameterize(arm(), p, always, always, settings), settings)
 
 
-@given(seed=st.integers(0, 2**32 - 1))
-def test_velocities_and_accelerations_are_the_derivatives(seed: int) -> None:
-    robot = arm()
-    p = path(robot, np.cumsum(np.random.default_rng(seed).normal(0, 0.5, (6, 7)), axis=0))
-    t = time_parameterize(robot, p, always, always, TimingSettings(sample_time=0.001))
-    dt = np.diff(t.times)[:-1]
-    middle = 0.5 * (t.velocities[:-2] + t.velocities[1:-1])
-    assert np.abs(np.diff(t.positions[:-1], axis=0) / dt[:, None] - middle).max() < 0.01
-    # Acceleration jumps at the switching points, so that the integral is compared, not the slope.
-    gained = np.cumsum(0.5 * (t.accelerations[:-2] + t.accelerations[1:-1]) * dt[:, None], axis=0)
-    assert np.abs(gained - t.velocities[1:-1]).max() < 0.15
-
-
 def test_one_joint_against_the_closed_form() -> None:
     """Bang-bang: 2 sqrt(d / a) below the velocity limit, d / v + v / a above it."""
     robot = arm((2.0,), (8.0,))
@@ -215,14 +202,6 @@ def test_blend_reaches_the_deviation_and_is_twice_differentiable() -> None:
         assert np.abs(slope - line(s, order + 1)[1:-1]).max() < 2e-3
 
 
-def test_refusals() -> None:
-    robot = arm((2.0, 0.0), (8.0, 8.0))
-    with pytest.raises(InputError, match=r"velocity limit of j1 is 0\.0"):
-        time_parameterize(robot, path(robot, [[0.0, 0.0], [1.0, 1.0]]), always, always)
-    with pytest.raises(InputError, match="corner_deviation"):
-        TimingSettings(corner_deviation=-0.1)
-
-
 @given(
     seed=st.integers(0, 2**32 - 1),
     count=st.integers(2, 8),
@@ -264,7 +243,7 @@ def test_a_limit_of_jerk_is_kept_with_the_others(
 def test_a_motion_from_a_start_velocity_keeps_all_limits_and_need_not_stop(
     seed: int, jerk: float, scale: float, ratio: float
 ) -> None:
-    """Velocities, accelerations and jerks every 0.5 ms, on the way straight on and then around a corner."""
+    """Velocities, accelerations and jerks every ms, on the way straight on and then around a corner."""
     robot = arm()
     rng = np.random.default_rng(seed)
     settings = TimingSettings(jerk=jerk, velocity_scale=scale, acceleration_scale=scale)
@@ -279,22 +258,23 @@ def test_a_motion_from_a_start_velocity_keeps_all_limits_and_need_not_stop(
         assert np.allclose(t.velocities[0], velocity, rtol=1e-12) and not t.accelerations[0].any()
         assert not t.velocities[-1].any() and not t.accelerations[-1].any()
         assert len(t.stops) == 0
-        states = t.at(np.arange(0.0, t.duration, 5e-4))
+        states = t.at(np.arange(0.0, t.duration, 1e-3))
         assert (np.abs(states.velocities) <= scale * robot.velocity * (1 + 2e-6)).all()
         assert (np.abs(states.accelerations) <= scale * robot.acceleration * (1 + 2e-6)).all()
         assert (np.abs(states.jerks) <= jerk * (1 + 1e-6)).all()
 
 
 def test_a_limit_of_jerk_costs_what_it_must() -> None:
-    """One joint over a distance d takes no less than (32 d / j)^(1/3); a high limit costs a row at most."""
+    """One joint over a distance d takes no less than (32 d / j)^(1/3); it took 20 times that with
+    accelerations of seven fixed shares of the limits. A high limit costs a row at most."""
     robot = arm((20.0,), (80.0,))
     p = path(robot, [[0.0], [1.0]])
-    free, gentle, slight = (
+    free, slight, *gentle = (
         time_parameterize(robot, p, always, always, TimingSettings(jerk=jerk)).duration
-        for jerk in (np.inf, 50.0, 1e5)
+        for jerk in (np.inf, 1e5, 50.0, MIN_JERK)
     )
-    least = (32 / 50.0) ** (1 / 3)
-    assert least <= gentle < 1.4 * least
+    least = (32 / np.array([50.0, MIN_JERK])) ** (1 / 3)
+    assert (least <= gentle).all() and (1.4 * least > gentle).all()
     assert slight == pytest.approx(free, abs=0.004)
 
 
@@ -440,7 +420,7 @@ def test_settings_that_make_a_motion_endless_are_refused(field: str, value: floa
         TimingSettings(**{field: value})  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("limit", [1e-300, 1e-7, float("nan")])
+@pytest.mark.parametrize("limit", [0.0, 1e-300, 1e-7, float("nan")])
 def test_limits_that_make_a_motion_endless_are_refused(limit: float) -> None:
     for robot in (arm((1.0, limit), (1.0, 1.0)), arm((1.0, 1.0), (1.0, limit))):
         with pytest.raises(InputError, match=rf"limit of j1 is {limit}; it must be at least 1e-06"):
@@ -464,14 +444,6 @@ def test_rows_tell_the_acceleration_under_a_high_limit_of_jerk(jerk: float) -> N
     q = np.cumsum(np.random.default_rng(0).normal(0, 0.5, (5, 7)), axis=0)
     t = time_parameterize(robot, path(robot, q), always, always, TimingSettings(jerk=jerk))
     assert rate_violations(robot, t, VALIDATOR) == []
-
-
-def test_the_least_limit_of_jerk_costs_little_more_than_it_must() -> None:
-    """With the accelerations of seven fixed shares of the limits it was 20 times the least."""
-    robot = arm((20.0,), (80.0,))
-    t = time_parameterize(robot, path(robot, [[0.0], [1.0]]), always, always, TimingSettings(jerk=MIN_JERK))
-    least = (32 / MIN_JERK) ** (1 / 3)
-    assert least <= t.duration < 1.4 * least
 
 
 def test_a_dense_path_is_driven_without_stops() -> None:

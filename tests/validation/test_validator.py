@@ -62,9 +62,7 @@ def test_a_free_motion_is_accepted_with_a_certified_clearance() -> None:
     report = validator(SWING, *shapes)
     assert report.valid
     assert report.violation is None
-    exact = ExactCollision(
-        box_arm(), rd.Scene([rd.Sphere(vector(1.3, 0.3, 0), 0.1), rd.Sphere(vector(0, -1, 0), 0.2)])
-    )
+    exact = ExactCollision(box_arm(), rd.Scene(shapes))
     for found, distances in (
         (report.scene_clearance, exact.link_distances),
         (report.self_clearance, exact.pair_distances),
@@ -242,6 +240,11 @@ def test_limits_start_and_goal() -> None:
     assert found.time == 1
     assert found.excess == pytest.approx(2e-4)
     assert rd.verify(*problem_and_path(SWING + np.array([[0, 0, 0], [0, 5e-5, 0]]))).valid
+    problem, path = problem_and_path(SWING)
+    several = rd.JointGoal(np.stack([SWING[0], SWING[1], -SWING[1]]))
+    assert rd.verify(replace(problem, goal=several), path).valid
+    unknown = np.array([[0, 0, 0], [0, 0, np.nan]])
+    assert refused(rd.verify(*problem_and_path(SWING + unknown)), "not_finite").time == 1
 
 
 def test_the_earliest_of_different_violations_is_reported() -> None:
@@ -253,25 +256,10 @@ def test_the_earliest_of_different_violations_is_reported() -> None:
     assert rd.verify(problem, rd.Path(box_arm().joint_names, rows)).violation.kind == "limits"  # type: ignore[union-attr]
 
 
-def test_any_of_a_goal_set_will_do() -> None:
-    robot = box_arm()
-    problem = rd.Problem(robot, rd.Scene(), SWING[0], rd.JointGoal(np.stack([SWING[0], SWING[1], -SWING[1]])))
-    assert rd.verify(problem, rd.Path(robot.joint_names, SWING)).valid
-
-
-def test_values_that_are_not_finite() -> None:
-    rows = SWING.copy()
-    rows[1, 2] = np.nan
-    assert refused(rd.verify(*problem_and_path(rows)), "not_finite").time == 1
-
-
-@pytest.mark.parametrize("rows", [np.zeros((0, 3)), np.zeros((2, 4))])
-def test_wrong_shapes_raise(rows: np.ndarray) -> None:
-    with pytest.raises(rd.InputError, match=r"path.positions has shape .* it must be n x 3 with n >= 1"):
-        rd.verify(*problem_and_path(rows))
-
-
-def test_wrong_joint_names_raise() -> None:
+def test_paths_of_another_shape_or_other_joints_raise() -> None:
+    for rows in (np.zeros((0, 3)), np.zeros((2, 4))):
+        with pytest.raises(rd.InputError, match=r"path.positions has shape .* it must be n x 3 with n >= 1"):
+            rd.verify(*problem_and_path(rows))
     problem, path = problem_and_path(SWING)
     with pytest.raises(rd.InputError, match=r"path.joint_names is j2, j1, j0; .* are j0, j1, j2"):
         rd.verify(problem, rd.Path(path.joint_names[::-1], SWING))
@@ -303,8 +291,10 @@ def trajectory(duration: float) -> rd.Trajectory:
 
 
 def test_trajectories() -> None:
+    """`rd.verify` took a trajectory for a path and called it valid at any speed."""
     problem, _ = problem_and_path(SWING)
-    assert verify_trajectory(problem, trajectory(2.0)).valid
+    assert rd.verify(problem, trajectory(2.0)).valid
+    refused(rd.verify(problem, trajectory(0.5)), "acceleration")
     # The peak speed is 1.5 * 1.2 / duration, the peak acceleration 6 * 1.2 / duration^2.
     assert refused(verify_trajectory(problem, trajectory(0.94)), "acceleration").time == 0
     strong = replace(box_arm(), joints=tuple(replace(j, acceleration=20.0) for j in box_arm().joints))
@@ -314,13 +304,6 @@ def test_trajectories() -> None:
     late = rd.Scene([rd.Sphere(1.1 * vector(np.cos(0.8), np.sin(0.8), 0), 0.05)])
     found = refused(verify_trajectory(replace(problem, scene=late), trajectory(2.0)), "scene_collision")
     assert 1.0 < found.time < 2.0
-
-
-def test_verify_validates_the_times_of_a_trajectory() -> None:
-    """`verify` took a trajectory for a path and called it valid at any speed."""
-    problem, path = problem_and_path(SWING)
-    assert rd.verify(problem, path).valid and rd.verify(problem, trajectory(2.0)).valid
-    refused(rd.verify(problem, trajectory(0.5)), "acceleration")
 
 
 def test_trajectories_that_jump_or_run_backwards() -> None:
@@ -362,23 +345,17 @@ def test_wrong_shapes_of_a_trajectory_raise(name: str, cut: Callable[[np.ndarray
         verify_trajectory(problem_and_path(SWING)[0], good)
 
 
-def at_the_limit() -> rd.Trajectory:
-    """The swing as fast as the velocity limit of 2 rad/s allows."""
-    return trajectory(1.5 * 1.2 / 2.0 * 1.0001)
-
-
 @pytest.mark.parametrize(("factor", "kind"), [(1.0, ""), (1.02, ""), (1.49, ""), (1.6, "jump")])
 def test_times_compressed_under_rates_of_zero(factor: float, kind: str) -> None:
     """Rates are recomputed where a trajectory conceals them; with its velocities it stops at each row."""
     robot = replace(box_arm(), joints=tuple(replace(joint, acceleration=1e3) for joint in box_arm().joints))
-    problem = rd.Problem(robot, rd.Scene(), SWING[0], rd.JointGoal(SWING[1:]))
-    good = at_the_limit()
-    assert verify_trajectory(problem, good).valid
+    good = trajectory(1.5 * 1.2 / 2.0 * 1.0001)  # as fast as the limit of 2 rad/s allows
+    assert verified(good, robot=robot).valid
     still = np.zeros_like(good.velocities)
     quick = replace(good, times=good.times / factor, velocities=still, accelerations=still)
     kinds = {wrong.kind for wrong in rate_violations(robot, quick, RATES)}
     assert kinds == {"velocity", "acceleration", "rates"} | ({kind} if kind else set())
-    assert not verify_trajectory(problem, quick).valid
+    assert not verified(quick, robot=robot).valid
 
 
 @pytest.mark.parametrize(
@@ -449,10 +426,9 @@ def in_micro_steps(step: float, time: float, way: float) -> rd.Trajectory:
 def test_micro_steps_hide_no_velocity(step: float, time: float) -> None:
     """Each of them within the resolution of positions, all of them 1.9 to 95 times as fast as the arm."""
     quick = in_micro_steps(step, time, max(step, 0.01))
-    problem = rd.Problem(box_arm(), rd.Scene(), quick.positions[0], rd.JointGoal(quick.positions[-1:]))
-    found = {wrong.kind: wrong.message for wrong in rate_violations(problem.robot, quick, RATES)}
+    found = {wrong.kind: wrong.message for wrong in rate_violations(box_arm(), quick, RATES)}
     assert "j0 at" in found["velocity"]
-    assert not verify_trajectory(problem, quick).valid
+    assert not verified(quick).valid
 
 
 @pytest.mark.parametrize("back", [False, True])
@@ -462,11 +438,10 @@ def test_micro_steps_hide_no_acceleration(back: bool) -> None:
     if back:
         place = 1e-3 * np.abs((quick.times / 1e-3 + 0.5) % 1 - 0.5)
         quick = replace(quick, positions=np.outer(place, [1.9, 0, 0]))
-    problem = rd.Problem(box_arm(), rd.Scene(), quick.positions[0], rd.JointGoal(quick.positions[-1:]))
-    found = {wrong.kind: wrong.message for wrong in rate_violations(problem.robot, quick, RATES)}
+    found = {wrong.kind: wrong.message for wrong in rate_violations(box_arm(), quick, RATES)}
     assert set(found) == {"rates", "acceleration"}
     assert "by its positions over 1 ms and more" in found["acceleration"]
-    assert not verify_trajectory(problem, quick).valid
+    assert not verified(quick).valid
 
 
 def test_rows_far_apart_are_validated_as_controllers_move_between_them() -> None:
@@ -479,10 +454,9 @@ def test_rows_far_apart_are_validated_as_controllers_move_between_them() -> None
     rates = np.zeros((4, 3))
     rates[:, 0] = 1.0, 0.0, -2.0, 2.0
     out = rd.Trajectory(robot.joint_names, np.array([0.0, 1.0, 2.0, 3.0]), rows, speed, rates)
-    problem = rd.Problem(robot, rd.Scene(), rows[0], rd.JointGoal(rows[:1]))
-    assert verify_trajectory(problem, out).valid
+    assert verified(out).valid
     ball = rd.Sphere(1.1 * vector(np.cos(0.73), np.sin(0.73), 0), 0.02)
-    found = refused(verify_trajectory(replace(problem, scene=rd.Scene([ball])), out), "scene_collision")
+    found = refused(verified(out, ball), "scene_collision")
     assert 1.0 < found.time < 1.5
     times, positions = Cubics(out).sampled(1e-3)[:2]
     assert np.isin(out.times, times).all()
@@ -586,7 +560,7 @@ def test_clearance_is_that_of_the_cubic(bulge: float, gap: float) -> None:
     wall = rd.Box(vector(1.1, 0.03 + 0.1 + gap, 0), vector(0.5, 0.2, 1.0))
     report = verified(motion, wall)
     exact = ExactCollision(box_arm(), rd.Scene([wall]))
-    dense = motion.at(np.linspace(1.9, 3.1, 200)).positions
+    dense = motion.at(np.linspace(1.9, 3.1, 41)).positions
     least = min(d.distance for q in dense for d in exact.link_distances(q))
     if report.valid:
         assert report.scene_clearance is not None and 0 < report.scene_clearance <= least + 1e-9
@@ -625,3 +599,18 @@ def test_resampled_motions_keep_the_accelerations() -> None:
         assert rd.verify(problem, fewer).valid
         assert np.allclose(fewer.times[:-1] * rate, np.arange(len(fewer.times) - 1))
         assert fewer.duration <= motion.duration + 3 / rate
+
+
+@pytest.mark.parametrize(
+    ("message", "line"),
+    [
+        ("link1 is 2.0 mm inside ball", "link1 is 2.0 mm inside ball (at 0.500)"),
+        ("joint1 at 0.500 s: its velocity is 3", "joint1 at 0.500 s: its velocity is 3"),
+        (
+            "joint1 is 3 at waypoint 1; its limits are -2 to 2",
+            "joint1 is 3 at waypoint 1; its limits are -2 to 2",
+        ),
+    ],
+)
+def test_the_line_of_a_violation_names_the_place_once(message: str, line: str) -> None:
+    assert Violation("limits", 0.5, message).line == line

@@ -138,11 +138,7 @@ def test_planes_part_as_far_as_coal_says(name: str, seed: int) -> None:
     robot = clad_arm(name)
     scene = scene_of(rng, False)
     q = rng.uniform(robot.lower, robot.upper)
-    exact, arrays, (arm, parts) = (
-        ExactCollision(robot, scene),
-        solid_arrays(robot, scene),
-        hulls_of(robot),
-    )
+    exact, arrays, (arm, parts) = (ExactCollision(robot, scene), solid_arrays(robot, scene), hulls_of(robot))
     posture = convex_bounds.make_posture(arm, arrays, robot.dof)
     slides = np.array(robot.prismatic, np.bool_)
     offsets = robot.frame_offsets.copy()

@@ -64,6 +64,7 @@ def test_xacro_is_compiled_with_what_it_includes(tmp_path: Path) -> None:
     file = xacro(tmp_path / "top", content)
     robot = read_urdf(file)
     assert robot.joint_names == ("j1", "j2", "j3", "j4") and "end" in robot.meshes
+    assert "runs the code" in robot.notes[0]
     digest = UrdfTree(file, {}, compile_xacro=True).digest
     xacro(part / "urdf", macro.replace("0.04", "0.05"), "solid.xacro")
     assert UrdfTree(file, {}, compile_xacro=True).digest != digest  # of the compiled URDF, not of the file
@@ -128,11 +129,6 @@ def test_a_urdf_that_xacro_wrote_is_no_xacro(tmp_path: Path) -> None:
     mesh(tmp_path)
     file = xacro(tmp_path, link("base") + PARTS, "made.urdf")
     assert UrdfTree(file, {}).robot().dof == 4
-
-
-def test_compiled_xacro_is_noted(tmp_path: Path) -> None:
-    pytest.importorskip("xacrodoc")
-    assert "runs the code" in read_urdf(xacro(tmp_path, link("base") + chain("base", row("j", 3)))).notes[0]
 
 
 def test_blanks_of_file_names_may_be_escaped(tmp_path: Path) -> None:

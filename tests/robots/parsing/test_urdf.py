@@ -118,12 +118,11 @@ BAD = {
     "floating": (ARM.replace('type="continuous"', 'type="floating"'), "joint bend has type 'floating'"),
     "no limits": (ARM.replace('lower="-2" upper="1" ', ""), "joint turn is revolute and has no <limit"),
     "limits swapped": (ARM.replace('lower="-2"', 'lower="2"'), "joint turn: lower limit 2"),
+    "endless": (ARM.replace('velocity="1.5"', 'velocity="1e-300"'), "is 1e-300; it must be at least 1e-06"),
     "not a number": (ARM.replace('upper="1"', 'upper="one"'), "joint turn: upper limit is 'one'"),
     "zero axis": (ARM.replace("0 1 0", "0 0 0"), "joint bend: its axis is zero"),
     "short vector": (ARM.replace("0 0 0.05", "0 0"), "origin xyz is '0 0'"),
-    "negative size": (ARM.replace("0.06 0.06 0.3", "0.06 -0.06 0.3"), "must be positive"),
     "missing mesh": (ARM.replace(BOX, MESH), "b.stl"),
-    "unknown shape": (ARM.replace('box size="0.06 0.06 0.3"', 'torus size="1"'), "<torus>"),
 }
 
 
@@ -187,7 +186,6 @@ def test_bundled_robots_are_complete(name: str) -> None:
     robot = load_robot(name)
     assert robot.dof > 0 and robot.spheres.keys() == robot.meshes.keys()
     assert (robot.velocity > 0).all() and (robot.acceleration > 0).all() and (robot.jerk > 0).all()
-    assert read_source(robots.DATA / name)["licence"]
     assert load_robot(name) is robot
 
 
@@ -249,10 +247,7 @@ def test_limits_file(tmp_path: Path) -> None:
         ("limits: {}", "no joint_limits"),
         ("joint_limits: {turn: {max_speed: 1}}", "'max_speed'"),
         ("joint_limits: {turn: {max_velocity: -1}}", "max_velocity of turn is -1"),
-        (
-            "joint_limits: {turn: {max_velocity: 1.0e-300}}",
-            "is 1e-300; it must be a number from 1e-06 to 1e+06",
-        ),
+        ("joint_limits: {turn: {max_velocity: 1.0e-300}}", "is 1e-300; it must be a number from 1e-06"),
         ("joint_limits: {wrist: {max_velocity: 1}}", "'wrist'"),
         ("joint_limits: {turn: {min_position: 5}}", "turn: min_position"),
     ):
@@ -260,12 +255,6 @@ def test_limits_file(tmp_path: Path) -> None:
         with pytest.raises(InputError) as error:
             with_limits(read_urdf(urdf(tmp_path)), read_limits(file)[0])
         assert message in str(error.value)
-
-
-def test_velocity_limits_that_make_motions_endless_are_refused(tmp_path: Path) -> None:
-    file = urdf(tmp_path, ARM.replace('velocity="1.5"', 'velocity="1e-300"'))
-    with pytest.raises(InputError, match="joint turn: velocity limit is 1e-300; it must be at least 1e-06"):
-        read_urdf(file)
 
 
 def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
