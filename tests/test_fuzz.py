@@ -48,23 +48,16 @@ def test_damaged_inputs(kind: str, every: int, tmp_path: Path) -> None:
     assert not faults
 
 
-@pytest.mark.parametrize(
-    ("kind", "seed"),
-    [
-        ("weights", 50009884),
-        ("depth", 50020386),
-        ("settings", 50036692),
-        ("result", 50057525),
-        ("weights", 50164958),
-    ],
-    ids=[
-        "brackets in weights",
-        "a lens of 1e-300 pixels",
-        "1e25 levels",
-        "a long joint name",
-        "a long link name",
-    ],
-)
+ONCE_FAILED = {
+    "brackets in weights": ("weights", 50009884),
+    "a lens of 1e-300 pixels": ("depth", 50020386),
+    "1e25 levels": ("settings", 50036692),
+    "a long joint name": ("result", 50057525),
+    "a long link name": ("weights", 50164958),
+}
+
+
+@pytest.mark.parametrize(("kind", "seed"), ONCE_FAILED.values(), ids=ONCE_FAILED)
 def test_inputs_that_once_failed(kind: str, seed: int, tmp_path: Path) -> None:
     outcome, said = outcome_of(kind, seed, tmp_path)
     assert outcome == "error", said

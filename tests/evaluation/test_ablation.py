@@ -52,11 +52,6 @@ def test_what_is_given_beside_a_config_wins() -> None:
         planner_training("compact", {"data": "d"})
 
 
-def test_every_row_has_its_config() -> None:
-    assert len(ablation.ROWS) == 10
-    assert {row.config for row in ablation.ROWS.values()} == {c for c in CONFIGS if c.startswith("table2_")}
-
-
 def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     base = ["reproduce", "table2", "--data", str(tmp_path), "--out", str(tmp_path / "out")]
     assert main([*base, "--rows", "Ourz"]) == 2

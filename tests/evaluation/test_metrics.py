@@ -342,11 +342,9 @@ def test_paired_without_common_solutions() -> None:
 
 
 PAPER = [row.indicators for row in PAPER_TABLE_1]
-PRINTED = np.array([row.comscore for row in PAPER_TABLE_1])
 
 
 def test_comscore_of_the_papers_table() -> None:
-    """Every printed score is missed; by how much, and what rounding explains, as comscore.py says."""
     scores = comscores(PAPER)
     by_hand = [
         (0 + 1 + (18.492 - 15.037) / 4.35 + 0) / 4,
@@ -356,20 +354,7 @@ def test_comscore_of_the_papers_table() -> None:
         (11.6 / 14.1 + 4.5 / 14.3 + 4.274 / 4.35 + 585 / 591) / 4,
     ]
     np.testing.assert_allclose(scores, by_hand, rtol=1e-12)
-    off = dict(zip([row.name for row in PAPER_TABLE_1], scores - PRINTED, strict=True))
-    assert abs(off["MPiNets"]) < 0.0025 and abs(off["MPD"]) < 0.0025
-    assert off["MPNet"] == pytest.approx(0.0086, abs=1e-4)
-    assert off["RobotDiffuse"] == pytest.approx(0.0124, abs=1e-4)
-    assert off["RRT*"] == pytest.approx(0.0311, abs=1e-4)  # not 0.4175, which print has for MPiNets too
-    rounded = np.round(normalized(PAPER), 2).mean(axis=1)
-    np.testing.assert_allclose(rounded, [0.4475, 0.1975, 0.4150, 0.6450, 0.7750])
     assert list(np.argsort(scores)) == [1, 2, 0, 3, 4]
-
-
-def test_two_other_figures_would_give_the_printed_scores() -> None:
-    other = list(PAPER)
-    other[0], other[2] = replace(other[0], length=15.6), replace(other[2], success=88.0)
-    assert np.abs(comscores(other) - PRINTED).max() < 0.0041
 
 
 def test_where_all_are_equal_all_are_best() -> None:

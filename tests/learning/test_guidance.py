@@ -15,8 +15,6 @@ from robotdiffuse.learning.guidance import OFF, CollisionGuidance, GuidanceSetti
 from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.problems.constraint_kernel import DISTANCE
 from robotdiffuse.problems.constraints import Constraint
-from robotdiffuse.problems.families.rop import ROP_DENSE
-from robotdiffuse.problems.problem import JointGoal
 from robotdiffuse.problems.projection_kernel import ANGLE_WEIGHT
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
@@ -56,63 +54,17 @@ def test_steps_take_a_motion_out_of_collision() -> None:
     assert not checker.free(lines[0].astype(float)).all()
     costs = [guidance(lines, steps)[1][0] for steps in (1, 5, 40)]
     assert costs[0] > costs[1] > costs[2]
+    np.testing.assert_array_equal(guidance(lines, 0)[0], lines)
     moved, _ = guidance(lines, 40)
     assert checker.free(moved[0].astype(float)).all()
 
 
-def test_no_steps_change_nothing() -> None:
-    checker, lines = swing()
-    moved, costs = CollisionGuidance(checker)(lines, 0)
-    np.testing.assert_array_equal(moved, lines)
-    assert (costs == 0).all()
-
-
-@pytest.mark.parametrize("waypoints", [1, 2, 3])
+@pytest.mark.parametrize("waypoints", [1, 3])
 def test_short_trajectories(waypoints: int) -> None:
     checker, lines = swing()
     moved, _ = CollisionGuidance(checker)(lines[:, WAYPOINTS // 2 - 1 :][:, :waypoints], 3)
     assert moved.shape == (2, waypoints, 3)
     assert np.isfinite(moved).all()
-
-
-def test_limits_are_kept() -> None:
-    checker, lines = swing()
-    limits = {"j0": (-0.9, 0.9), "j1": (0.59, 0.61), "j2": (0.59, 0.61)}
-    joints = [
-        replace(joint, lower=limits[joint.name][0], upper=limits[joint.name][1])
-        if joint.name in limits
-        else joint
-        for joint in checker.robot.joints
-    ]
-    tight = replace(checker.robot, joints=tuple(joints))
-    moved, _ = CollisionGuidance(CollisionChecker(tight, checker.scene), GuidanceSettings(margin=0.1))(
-        lines[:1], 20
-    )
-    assert (moved <= tight.upper + 1e-6).all()
-    assert (moved >= tight.lower - 1e-6).all()
-    assert (moved != lines[:1]).any()
-
-
-def test_random_motions_of_the_panda_get_better() -> None:
-    robot = load_robot("panda")
-    before = 0.0
-    after = 0.0
-    solved = 0
-    for seed in range(20):
-        problem = ROP_DENSE.draw(robot, np.random.default_rng(seed)).problem(robot)
-        assert isinstance(problem.goal, JointGoal)
-        checker = CollisionChecker(robot, problem.scene)
-        line = straight(problem.start, problem.goal.positions[0])[None]
-        moved, _ = CollisionGuidance(checker)(line, 30)
-        before += float(checker.cost_gradients(line[0].astype(float), 0.04)[0].sum())
-        after += float(checker.cost_gradients(moved[0].astype(float), 0.04)[0].sum())
-        solved += int(checker.free(moved[0].astype(float)).all()) - int(
-            checker.free(line[0].astype(float)).all()
-        )
-        np.testing.assert_array_equal(moved[0, [0, -1]], line[0, [0, -1]])
-        assert ((moved >= robot.lower.astype(np.float32)) & (moved <= robot.upper.astype(np.float32))).all()
-    assert after < 0.5 * before
-    assert solved > 0
 
 
 def test_point_clouds_guide_too() -> None:
@@ -228,15 +180,6 @@ def test_without_cost_nothing_moves(name: str) -> None:
         assert formulas(guidance, line)[name][0] < 1e-10
     np.testing.assert_allclose(moved, line, atol=1e-6 if name == "length" else 0)
     assert costs[0] == 0
-
-
-def test_formula_by_hand() -> None:
-    upper = PANDA.upper
-    costs = formulas(
-        CollisionGuidance(CROWDED, NOTHING), np.stack([upper - 1.0, upper - 0.2, upper - 0.6])[None]
-    )
-    assert costs.keys() == {"length"}, "no margin, no collision"
-    assert costs["length"][0] == pytest.approx(0.5 * PANDA.dof * (0.8**2 + 0.4**2))
 
 
 def test_together_they_reach_a_free_and_short_path_that_none_reaches_alone() -> None:

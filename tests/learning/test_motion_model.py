@@ -7,11 +7,10 @@ import pytest
 import torch
 
 from helpers.box_arm import box_arm
-from helpers.small_model import SMALL_ENCODER, cloud, small_model
+from helpers.small_model import cloud, small_model
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.diffusion import SAMPLERS, noise_factor
 from robotdiffuse.learning.encoders.networks import (
-    PointAutoencoder,
     chamfer,
     nearest,
 )
@@ -20,15 +19,16 @@ from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.robots.kinematic_tree import JointNormalizer
 
+START = np.array([-1.0, 0.5, 2.0])
+GOAL = np.array([1.5, -0.5, 0.1])
 
-def test_standardized_codes():
-    encoder = PointAutoencoder(SMALL_ENCODER)
-    clouds = torch.cat([cloud(30, seed) for seed in range(40)])
-    with torch.no_grad():
-        encoder.standardize(encoder.encode(clouds))
-        z = encoder(clouds)
-    torch.testing.assert_close(z.mean(0), torch.zeros(8), atol=1e-3, rtol=0)
-    torch.testing.assert_close(z.std(0), torch.ones(8), atol=1e-3, rtol=0)
+
+def sample_with(model: MotionNetwork, settings: SamplingSettings, guide: GuideFn | None = None) -> np.ndarray:
+    def far(q: np.ndarray) -> np.ndarray:
+        return np.full((*q.shape[:2], 3), 0.4, np.float32)
+
+    code = np.zeros(8, np.float32)
+    return model.sample(START, GOAL, code, far, np.random.default_rng(0), settings, guide)
 
 
 def test_nearest_and_chamfer_against_all_pairs():
@@ -65,39 +65,17 @@ def test_noise_is_zero_at_the_ends_and_has_the_data_s_covariance(smooth):
     np.testing.assert_allclose(covariance[1:-1, 1:-1], wanted, atol=2e-3)
 
 
-@pytest.mark.parametrize("guided", [False, True])
-def test_samples_hold_start_and_goal(guided):
+def test_samples_hold_start_and_goal():
     model = small_model().requires_grad_(False).eval()
     model.residual_scale.fill_(0.3)
-    start = np.array([-1.0, 0.5, 2.0])
-    goal = np.array([1.5, -0.5, 0.1])
-    levels = []
-
-    def guide(q, level):
-        levels.append(level)
-        return q + 0.1
-
-    def sample(seed):
-        return model.sample(
-            start,
-            goal,
-            np.zeros(8, np.float32),
-            clearances=lambda q: np.full((*q.shape[:2], 3), 0.2, np.float32),
-            rng=np.random.default_rng(seed),
-            settings=SamplingSettings(samples=5, sampling_steps=6, eta=0.5),
-            guide=guide if guided else None,
-        )
-
-    q = sample(0)
-    assert q.shape == (5, 16, 3)
-    assert (q[:, 0] == start).all()
-    assert (q[:, -1] == goal).all()
-    assert (q >= box_arm().lower).all()
-    assert (q <= box_arm().upper).all()
-    assert np.abs(q[0] - q[1]).max() > 1e-3
-    assert len(levels) == (3 if guided else 0)
-    assert sorted(levels, reverse=True) == levels
-    np.testing.assert_array_equal(sample(0), q)
+    settings = SamplingSettings(samples=5, sampling_steps=6, eta=0.5)
+    for guide in (None, lambda q, level: q + 0.1):
+        q = sample_with(model, settings, guide)
+        assert q.shape == (5, 16, 3)
+        assert (q[:, 0] == START).all() and (q[:, -1] == GOAL).all()
+        assert (q >= box_arm().lower).all() and (q <= box_arm().upper).all()
+        assert np.abs(q[0] - q[1]).max() > 1e-3
+        np.testing.assert_array_equal(sample_with(model, settings, guide), q)
 
 
 def test_clearances_are_inputs_of_the_denoiser():
@@ -122,17 +100,7 @@ def test_residual_and_joints_are_inverse():
 
 
 @pytest.mark.parametrize(
-    ("steps", "share", "guided"),
-    [
-        (6, 0.5, 3),
-        (5, 0.5, 3),
-        (1, 0.5, 1),
-        (6, 0.0, 0),
-        (6, 1.0, 6),
-        (10, 0.3, 3),
-        (30, 0.1, 3),
-        (50, 0.02, 1),
-    ],
+    ("steps", "share", "guided"), [(5, 0.5, 3), (1, 0.5, 1), (6, 0.0, 0), (6, 1.0, 6), (50, 0.02, 1)]
 )
 def test_the_last_share_of_the_steps_is_guided(steps: int, share: float, guided: int) -> None:
     model = small_model()
@@ -163,16 +131,6 @@ def test_sampling_settings_are_checked() -> None:
         SamplingSettings(guided_share=1.5)
     with pytest.raises(InputError, match="sampling steps is 201; it must be between 1 and 200"):
         sample_with(small_model(), SamplingSettings(sampling_steps=201))
-
-
-def sample_with(model: MotionNetwork, settings: SamplingSettings, guide: GuideFn | None = None) -> np.ndarray:
-    def far(q: np.ndarray) -> np.ndarray:
-        return np.full((*q.shape[:2], 3), 0.4, np.float32)
-
-    start = np.array([-1.0, 0.5, 2.0])
-    goal = np.array([1.5, -0.5, 0.1])
-    code = np.zeros(8, np.float32)
-    return model.sample(start, goal, code, far, np.random.default_rng(0), settings, guide)
 
 
 def test_numbers_of_waypoints_are_bounded():

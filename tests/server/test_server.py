@@ -90,12 +90,6 @@ def test_a_motion_through_the_wall_is_not_valid(server: httpx.Client) -> None:
     assert verdict["path"]["violation"]["other"] == "wall"
 
 
-def test_no_plan_is_an_answer(server: httpx.Client) -> None:
-    buried = problem(scene=[{"sphere": {"center": [0, 0, 0.3], "radius": 0.5}}])
-    answer = server.post("/plan", json={"problem": buried})
-    assert answer.status_code == 200 and answer.json()["status"] == "invalid_start"
-
-
 def test_every_field_of_the_schema_may_be_sent_with_its_default(server: httpx.Client) -> None:
     """`objective`, and null for `clearance` and `jerk`, were refused."""
     buried = problem(scene=[{"sphere": {"center": [0, 0, 0.3], "radius": 0.5}}])
