@@ -405,6 +405,10 @@ def test_what_is_shown_is_hard_or_failed(small: Path) -> None:
 
 
 def test_bad_input_is_one_clear_line(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (small / "new" / "records").mkdir(parents=True)
+    (small / "new" / "records" / "mpnet.jsonl").touch()
+    with pytest.raises(InputError, match="no records yet"):
+        read_bench(small / "new")
     with pytest.raises(InputError, match="no records of a bench"):
         read_bench(small / "nowhere")
     with pytest.raises(InputError, match=r"no records of foo; it has .*mpnet, "):
@@ -421,10 +425,3 @@ def test_bad_input_is_one_clear_line(small: Path, capsys: pytest.CaptureFixture[
         stream.write("{broken\n")
     assert main(["bench", "report", str(small)]) == 2
     assert re.search(r"mpnet\.jsonl, line 5 is not a JSON object", capsys.readouterr().err)
-
-
-def test_an_empty_folder_says_how_to_go_on(tmp_path: Path) -> None:
-    (tmp_path / "records").mkdir()
-    (tmp_path / "records" / "mpnet.jsonl").touch()
-    with pytest.raises(InputError, match="no records yet"):
-        read_bench(tmp_path)

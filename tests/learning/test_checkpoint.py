@@ -9,16 +9,13 @@ import torch
 
 from helpers.box_arm import box_arm
 from helpers.example_robots import planar_arm
-from helpers.small_model import SMALL_ENCODER, cloud, save_small_model, small_model
+from helpers.small_model import cloud, save_small_model, small_model
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.checkpoint import (
     fingerprint,
     load_encoder,
     load_model,
     save_network,
-)
-from robotdiffuse.learning.encoders.networks import (
-    PointAutoencoder,
 )
 
 pytestmark = pytest.mark.usefixtures("no_export")
@@ -39,6 +36,8 @@ def test_checkpoint_round_trip(tmp_path):
     np.testing.assert_allclose(z[1], z[0], atol=5e-3)
     assert fingerprint(load_model(tmp_path)) == fingerprint(loaded)
     assert fingerprint(loaded) != fingerprint(small_model(1))
+    with pytest.raises(InputError, match=r"no trained model: encoder\.json"):
+        load_encoder(tmp_path / "nothing")
 
 
 def test_wrong_robot_is_refused(tmp_path):
@@ -113,12 +112,3 @@ def test_damaged_weights_give_one_line(tmp_path, case, file):
     with pytest.raises(InputError, match=file) as caught:
         load_model(tmp_path)
     assert "\n" not in str(caught.value)
-
-
-def test_encoder_files(tmp_path):
-    encoder = PointAutoencoder(SMALL_ENCODER)
-    save_network("encoder", encoder, tmp_path, {})
-    loaded = load_encoder(tmp_path)
-    torch.testing.assert_close(loaded(cloud(9)), encoder(cloud(9)), atol=5e-3, rtol=0)
-    with pytest.raises(InputError, match=r"no trained model: encoder\.json"):
-        load_encoder(tmp_path / "nothing")

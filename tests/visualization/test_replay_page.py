@@ -115,17 +115,11 @@ def test_bad_output_is_one_line(arm, motion, write, ending, name, tmp_path):
     assert [entry.name for entry in tmp_path.iterdir()] == [f"folder.{ending}"], "nothing is left behind"
 
 
-def test_names_of_obstacles_stay_text_in_a_replay(tmp_path) -> None:
-    panda = rd.load_robot("panda")
+def test_names_of_obstacles_stay_text_in_a_replay(arm, motion, tmp_path) -> None:
     name = "</script><script>alert(1)</script>"
-    q = np.zeros((2, panda.dof))
-    motion = rd.Trajectory(panda.joint_names, np.array([0.0, 1.0]), q, 0 * q, 0 * q)
-    file = tmp_path / "replay.html"
-    write_replay(panda, rd.Scene([rd.Sphere([1, 1, 1], 0.1, name=name)]), motion, file)
-    text = file.read_text("utf-8")
-    assert "<script>alert" not in text
-    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
-    assert found is not None and name in json.dumps(json.loads(found.group(1)), ensure_ascii=False)
+    write_replay(arm, Scene([rd.Sphere([1, 1, 1], 0.1, name=name)]), motion, tmp_path / "replay.html")
+    text = (tmp_path / "replay.html").read_text("utf-8")
+    assert "<script>alert" not in text and page_data(text)["scene"][0]["name"] == name
 
 
 def test_moving_obstacles_are_on_the_page_and_in_the_picture(arm, motion, tmp_path):

@@ -320,15 +320,10 @@ def test_planner_learns_which_side(tmp_path, data, arm):
 
 
 @pytest.mark.usefixtures("no_export")
-def test_other_settings_need_another_folder(tmp_path, data):
+def test_other_settings_and_a_damaged_checkpoint_are_refused(tmp_path, data):
     train_planner(planner_settings(data, samples=16), str(tmp_path / "out"))
     with pytest.raises(InputError, match=r"learning_rate = 0\.003, now it is 0\.1"):
         train_planner(planner_settings(data, learning_rate=0.1), str(tmp_path / "out"))
-
-
-@pytest.mark.usefixtures("no_export")
-def test_damaged_checkpoint_is_named(tmp_path, data):
-    train_planner(planner_settings(data, samples=16), str(tmp_path / "out"))
     file = tmp_path / "out" / "training.safetensors"
     file.write_bytes(file.read_bytes()[:1000])
     with pytest.raises(InputError, match=r"training\.safetensors is (damaged|no checkpoint)"):

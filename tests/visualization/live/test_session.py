@@ -156,10 +156,14 @@ def test_the_start_is_dragged_by_its_tip_and_stays_near(session: Session) -> Non
     assert validity(until(session, settled)).kind == VALID
 
 
-def test_a_start_out_of_limits_leaves_the_session_as_it_was(session: Session) -> None:
+def test_what_is_wrong_leaves_the_session_as_it_was(session: Session) -> None:
     before = session.state
     with pytest.raises(InputError, match="limits"):
         session.set_start(START + 10)
+    with pytest.raises(InputError, match="unknown planner 'best'"):
+        session.set_options(planner="best")
+    with pytest.raises(InputError, match="time_limit"):
+        session.set_options(time_limit=0.0)
     after = session.state
     assert after.problem is before.problem and after.version == before.version
 
@@ -176,13 +180,6 @@ def test_obstacles_are_added_resized_and_deleted(session: Session) -> None:
         session.change_obstacle(name, lambda _: None)
     with pytest.raises(InputError, match="known: box, capsule, cylinder, sphere"):
         session.add_obstacle("torus", np.zeros(3))
-
-
-def test_an_unknown_planner_and_a_wrong_limit_are_refused(session: Session) -> None:
-    with pytest.raises(InputError, match="unknown planner 'best'"):
-        session.set_options(planner="best")
-    with pytest.raises(InputError, match="time_limit"):
-        session.set_options(time_limit=0.0)
 
 
 def test_another_robot_takes_the_motion_away(session: Session) -> None:
