@@ -46,6 +46,26 @@ def test_free_voxels_hold_no_obstacle_and_most_of_the_space_is_seen(noisy: bool)
     assert (known.occupied & far).sum() <= 0.02 * known.occupied.sum(), "neither speckles nor the arm"
 
 
+def test_what_obstacles_may_reach_is_free_only_by_a_margin_of_the_own_error() -> None:
+    """Regression: points enlarged by the error of a far camera closed gaps, however near one looked."""
+    known = OccupancyMap(PANDA)
+    far = replace(view_from(0.3), pose_deviation=(0.005, 0.0175))
+    known.add(far)
+    before = known.free
+    points = MAP.centers(np.argwhere(known.occupied))
+    errors = np.full(len(points), 0.03)
+    known.doubt(points, errors)
+    reached = MAP.within(np.column_stack([points, errors]))
+    doubted = before & ~known.free
+    assert 0 < doubted.sum() < 0.2 * before.sum()
+    assert (doubted <= MAP.within(np.column_stack([points, errors + 0.03]))).all()
+    narrow = carve_view(far, PANDA, HOME, 0.015, MAP, narrowed=1.0)[0] == FREE
+    assert (known.free & reached <= narrow).all() and known.unknown[doubted].all()
+    known.add(view_from(0.3))
+    known.doubt(points, errors)
+    assert (known.free[doubted & ~known.occupied]).mean() > 0.9, "an exact view leaves no doubt"
+
+
 def test_a_view_counts_once_and_the_order_does_not_matter() -> None:
     ahead = OccupancyMap(PANDA)
     back = OccupancyMap(PANDA)

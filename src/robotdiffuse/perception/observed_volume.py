@@ -554,15 +554,17 @@ def carve_view(
     q: Configuration,
     arm_margin: float,
     grid: VoxelGrid,
+    narrowed: float = NARROWED_SHARE,
 ) -> tuple[UInt8[ndarray, "nx ny nz"], Float32[ndarray, "nx ny nz"], Int32[ndarray, "nx ny nz"]]:
     """The state of each voxel in the filtered image of one view, its depth behind a surface [m], and its
     number of points; see `carve`.
 
     q: the arm's configuration in the view. arm_margin: points within this distance of its covering spheres
-    are points of the arm; more with noise [m].
+    are points of the arm; more with noise [m]. narrowed: free space is narrowed by this part of what the
+    camera's pose may be off.
     """
     depth, spread, spheres = usable_image(view, robot, q, arm_margin)
-    position, angle = NARROWED_SHARE * np.array(view.pose_deviation)
+    position, angle = narrowed * np.array(view.pose_deviation)
     state = np.empty(grid.shape, np.uint8)
     depth_behind = np.empty(grid.shape, np.float32)
     counts = np.empty(grid.shape, np.int32)

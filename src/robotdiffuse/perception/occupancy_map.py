@@ -24,7 +24,7 @@ from robotdiffuse.perception.observed_volume import (
     merged,
     observe,
 )
-from robotdiffuse.perception.seen_points import CELL, seen_points
+from robotdiffuse.perception.seen_points import CELL, POINT_RADIUS, seen_points
 from robotdiffuse.perception.voxel_grid import MAP, Voxels
 from robotdiffuse.robots.robot import Robot
 
@@ -55,6 +55,10 @@ class OccupancyMap:
         self.max_age = max_age
         self._evidence = np.zeros(MAP.shape, np.float32)
         """Above 0 occupied, below free, 0 unknown."""
+        self._surely_free = np.zeros(MAP.shape, np.bool_)
+        """Seen free even if the camera's pose is off by all that it may be, and without points since."""
+        self._doubted = np.zeros(MAP.shape, np.bool_)
+        """See `doubt`."""
         self._seen_at = np.full(MAP.shape, -np.inf, np.float64)
         self._declared = np.zeros(MAP.shape, np.bool_)
         self._now = -np.inf
@@ -74,7 +78,11 @@ class OccupancyMap:
                 f" {self.robot.name} when the view was taken"
             )
         state, _, counts = carve_view(view, self.robot, q, ARM_MARGIN, MAP)
-        return self._update(state, counts, stamp)
+        new_voxels = self._update(state, counts, stamp)
+        if any(view.pose_deviation):
+            state, _, _ = carve_view(view, self.robot, q, ARM_MARGIN, MAP, narrowed=1.0)
+        self._surely_free |= state == FREE
+        return new_voxels
 
     @locked
     def add_points(self, points: Points, stamp: float = 0.0) -> None:
@@ -95,6 +103,18 @@ class OccupancyMap:
         first = np.maximum(np.ceil((low - MAP.low) / MAP.edge - 1e-6), 0).astype(int)
         end = np.maximum(np.floor((high - MAP.low) / MAP.edge + 1e-6), 0).astype(int)
         self._declared[tuple(slice(a, b) for a, b in zip(first, end, strict=True))] = True
+        self._known = None
+
+    @locked
+    def doubt(self, points: Points, errors: Values) -> None:
+        """Until the next view, voxels that obstacles may reach count as unknown: those within
+        the errors of points, unless a view saw them free by a margin of all of its own error.
+
+        points: observed points [m]; errors: how far off each may be [m].
+        """
+        spheres = np.column_stack([points, POINT_RADIUS + errors])[errors > 0]
+        reached = MAP.within(spheres, MAP.edge * 3**0.5 / 2)
+        self._doubted = reached & ~self._surely_free
         self._known = None
 
     @property
@@ -125,7 +145,7 @@ class OccupancyMap:
             if self.max_age is not None:
                 occupied = occupied & self._fresh
                 free = free & self._fresh
-            free |= self._declared & ~occupied
+            free = (free | self._declared & ~occupied) & ~self._doubted
             self._known = occupied, free, ~(free | occupied)
             for voxels in self._known:
                 voxels.flags.writeable = False
@@ -143,8 +163,11 @@ class OccupancyMap:
         known of before."""
         self._now = max(self._now, stamp)
         self._known = None
+        self._doubted[:] = False
+        self._surely_free[counts > 0] = False
         if self.max_age is not None:
             self._evidence[~self._fresh] = 0.0
+            self._surely_free[~self._fresh] = False
             self._seen_at[(counts > 0) | (state == FREE)] = stamp
         return add_evidence(state, counts, self._evidence, HIT, MISS, MOST_EVIDENCE)
 

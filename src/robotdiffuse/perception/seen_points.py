@@ -316,6 +316,7 @@ def point_shapes(
     start: Configuration,
     goals: Configurations,
     errors: Values,
+    enlarged: bool = True,
 ) -> tuple[SeenPoints, ...]:
     """Observed points as obstacles, without those of known shapes.
 
@@ -324,7 +325,7 @@ def point_shapes(
     Points that are no deeper than their error within the arm there, and those within KNOWN_DISTANCE and their
     error of a known shape, are left out.
 
-    errors: how far off each point may be [m], see `points_error`.
+    errors: how far off each point may be [m], see `points_error`. enlarged: whether points get their error.
     """
     points = points.astype(np.float32)
     errors = ERROR_STEP * np.ceil(errors / ERROR_STEP)
@@ -339,7 +340,7 @@ def point_shapes(
         outside = np.ones(len(alike), np.bool_)
         if error:
             outside = (distances >= MIN_POINT_RADIUS) | (distances < -error)
-        padded = POINT_RADIUS + error * np.array((1.0, 2 / 3, 1 / 3, 0.0))
+        padded = POINT_RADIUS + enlarged * error * np.array((1.0, 2 / 3, 1 / 3, 0.0))
         name = "seen"
         for radius in (*dict.fromkeys(padded.tolist()), MIN_POINT_RADIUS):
             distance = (JOINED if radius > POINT_RADIUS else 1.0) * radius + MIN_POINT_RADIUS

@@ -5,7 +5,8 @@ that cover all other space (`seen_free.py`). Exempt are the voxels with centers 
 motion begins, and the space within 2 cm of it where it ends; seen points count there too. With `see_goal` the
 arm's surface at the goal must have been seen free as well (`seen_free.GoalSeen`). So the promise is as good
 as the map: in a scene that does not change, with a camera whose poses and errors are as stated, such a motion
-meets nothing.
+meets nothing. Where poses are inexact, what obstacles may reach within their error is free only to a view
+that sees it so by a margin of all of its own error, such as one from nearby.
 
 **Probabilistic.** The arm goes if the motion's stated `confidence` is high enough, and otherwise looks first.
 The confidence follows from the predicted probability of all voxels that the map does not know and the motion
@@ -169,16 +170,14 @@ class Explorer:
             raise InputError("there is no goal; call set_goal first")
         q = vector("explorer", "configuration", configuration, self.robot.dof)
         self._news = []
-        self._free = self.map.free
         if goal_error(self.robot, self._goal, q, ARRIVED) is None:
             return Step(DONE, "the arm is at the goal")
         if not len(self._views):
             return Step(LOOK, "nothing was seen yet: observe a view from here")
         goals = self._goal.positions if isinstance(self._goal, JointGoal) else q[None]
         points, errors = self._views.points(self.map.free)
-        seen = point_shapes(points, self.robot, self.scene, q, goals, errors)
-        scene = self.scene.with_shapes([*self.scene.shapes, *seen])
-        problem = Problem(self.robot, scene, q, self._goal)
+        self.map.doubt(points, errors)
+        self._free = self.map.free
         self._seed += TENTATIVE_MOTIONS  # what one step's searches did not find, those of the next one may
         policies = (
             (STRICT, PROBABILISTIC)
@@ -187,13 +186,19 @@ class Explorer:
         )
         step = Step(STUCK, "")
         for policy in policies:
-            step = self._step(problem, policy)
+            # under the strict policy, space that obstacles may reach is not seen free
+            enlarged = policy != STRICT
+            shapes = point_shapes(points, self.robot, self.scene, q, goals, errors, enlarged)
+            problem = Problem(
+                self.robot, self.scene.with_shapes([*self.scene.shapes, *shapes]), q, self._goal
+            )
+            step = replace(self._step(problem, policy), seen=problem.scene)
             if step.kind != STUCK:
                 break
         self._looks += step.kind == LOOK
         if step.motion is not None and step.motion.path is not None:
             self._way_in = step.motion.path.positions
-        return replace(step, seen=problem.scene)
+        return step
 
     @locked
     def wanted(self, path: Path) -> Voxels:
