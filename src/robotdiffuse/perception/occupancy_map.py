@@ -107,8 +107,8 @@ class OccupancyMap:
 
     @locked
     def doubt(self, points: Points, errors: Values) -> None:
-        """Until the next view, voxels that obstacles may reach count as unknown: those within
-        the errors of points, unless a view saw them free by a margin of all of its own error.
+        """Until the next view, voxels that obstacles may reach count as unknown: those within the errors of
+        points, unless a view saw them free by a margin of all of its own error.
 
         points: observed points [m]; errors: how far off each may be [m].
         """
