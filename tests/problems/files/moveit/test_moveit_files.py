@@ -432,7 +432,7 @@ def pose_request(path: list[Any], value: object) -> dict[str, Any]:
 
 def test_scaling_factors_and_the_velocity_of_a_start_state_are_noted() -> None:
     asked = {"max_velocity_scaling_factor": 0.1, "max_acceleration_scaling_factor": 1.0}
-    data = request_data() | asked
+    data: dict[str, Any] = request_data() | asked
     data["start_state"]["joint_state"]["velocity"] = [0.0, 0.3]
     assert {*moveit_request(data, moveit_frames({}, load_robot("panda"))).notes} == {
         "the request's max_velocity_scaling_factor 0.1 is ignored: plan with velocity_scaling=0.1",
