@@ -14,14 +14,14 @@ from helpers.explorations import FLOOR, HOME, WALL, ZONE, recorded
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.perception.depth_view import DepthNoise
-from robotdiffuse.perception.occupancy_map import OccupancyMap, ViewMemory
+from robotdiffuse.perception.occupancy_map import COVER_RADIUS, OccupancyMap, ViewMemory
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
 from robotdiffuse.perception.unknown_space import CARVING_MARGIN
 from robotdiffuse.perception.visibility import surface_balls
 from robotdiffuse.perception.voxel_grid import FINE_SHAPE, LAYERS_BELOW, MAP, sweep
 from robotdiffuse.planning.exploration.explorer import PROBABILITY_BELOW
 from robotdiffuse.planning.exploration.looks import ReachableTree, best_looks
-from robotdiffuse.planning.exploration.seen_free import COVER_RADIUS, GoalSeen, hardly_seen, not_seen_free
+from robotdiffuse.planning.exploration.seen_free import GoalSeen, hardly_seen, not_seen_free
 from robotdiffuse.planning.exploration.simulated import (
     camera_beside,
     explore,

@@ -37,6 +37,8 @@ HIT, MISS = np.float32(3.0), np.float32(2.0)
 of it."""
 MOST_EVIDENCE = np.float32(8.0)
 """Evidence stays within this, so that a voxel can change."""
+COVER_RADIUS = MAP.edge * 3**0.5 / 2
+"""Radius of the ball around a voxel's center that covers the voxel [m]."""
 
 
 class OccupancyMap:
@@ -113,7 +115,7 @@ class OccupancyMap:
         points: observed points [m]; errors: how far off each may be [m].
         """
         spheres = np.column_stack([points, POINT_RADIUS + errors])[errors > 0]
-        reached = MAP.within(spheres, MAP.edge * 3**0.5 / 2)
+        reached = MAP.within(spheres, COVER_RADIUS)
         self._doubted = reached & ~self._surely_free
         self._known = None
 

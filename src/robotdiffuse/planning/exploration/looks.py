@@ -17,12 +17,12 @@ from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Configuration, Configurations, Path, Pose
 from robotdiffuse.perception.observed_volume import observe
-from robotdiffuse.perception.occupancy_map import OccupancyMap
+from robotdiffuse.perception.occupancy_map import COVER_RADIUS, OccupancyMap
 from robotdiffuse.perception.ray_caster import looking_at
 from robotdiffuse.perception.unknown_space import CARVING_MARGIN
 from robotdiffuse.perception.visibility import seen_weights
 from robotdiffuse.perception.voxel_grid import FINE, MAP, Probabilities, Voxels, refined
-from robotdiffuse.planning.exploration.seen_free import COVER_RADIUS, near_ends
+from robotdiffuse.planning.exploration.seen_free import near_ends
 from robotdiffuse.planning.exploration.steps import ArmCamera
 from robotdiffuse.planning.pipeline.unknown_space import policy_for, unknown_space_of
 from robotdiffuse.planning.search.rrt_kernel import extend, make_trees

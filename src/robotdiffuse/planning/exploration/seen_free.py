@@ -21,7 +21,7 @@ from robotdiffuse.core.types import Configuration, Configurations, Path, Points
 from robotdiffuse.perception.depth_filter import MARGIN_SPREADS
 from robotdiffuse.perception.depth_view import AssumedPoints, DepthView
 from robotdiffuse.perception.observed_volume import usable_image
-from robotdiffuse.perception.occupancy_map import OccupancyMap, ViewMemory
+from robotdiffuse.perception.occupancy_map import COVER_RADIUS, OccupancyMap, ViewMemory
 from robotdiffuse.perception.seen_points import sphere_distances
 from robotdiffuse.perception.unknown_space import CARVING_MARGIN, without_known
 from robotdiffuse.perception.visibility import BALL_RADIUS, see_through, surface_balls, within_voxels
@@ -31,8 +31,6 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Shape
 
-COVER_RADIUS = MAP.edge * 3**0.5 / 2
-"""Radius of the ball around a voxel's center that covers the voxel [m]."""
 PARTS = 4
 """Parts of a voxel's edge where voxels are split."""
 NOT_SEEN_FREE = "not seen free"
