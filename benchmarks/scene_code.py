@@ -48,10 +48,9 @@ from robotdiffuse.learning.denoisers import (
     DenoiserSettings,
     TransformerSettings,
 )
-from robotdiffuse.learning.denoisers.networks import two_layers
 from robotdiffuse.learning.diffusion import ddim
 from robotdiffuse.learning.encoders import EncoderSettings, PointNetSettings, PointsSettings, make_encoder
-from robotdiffuse.learning.encoders.networks import Encoder, fp32, wave_angles
+from robotdiffuse.learning.encoders.networks import Encoder, fp32, perceptron, wave_angles
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.training.batches import Batch, scene_clouds
 from robotdiffuse.learning.training.config import JOINT_POINT_COLLISION, EncoderTraining, PlannerTraining
@@ -117,8 +116,8 @@ class ObstacleCode(Encoder):
 
     def __init__(self, settings: EncoderSettings) -> None:
         super().__init__(settings)
-        self.each = nn.Sequential(two_layers(9 + 6 * self.OCTAVES, 192, 192), nn.GELU("tanh"))
-        self.all = two_layers(192, 192, settings.code)
+        self.each = nn.Sequential(perceptron(9 + 6 * self.OCTAVES, 192, 192), nn.GELU("tanh"))
+        self.all = perceptron(192, 192, settings.code)
 
     def forward(self, cloud: Float[Tensor, "batch slots 9"]) -> Float[Tensor, "batch code"]:
         with fp32(cloud):

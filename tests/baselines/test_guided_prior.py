@@ -16,6 +16,7 @@ from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from robotdiffuse import InputError, JointGoal, Problem, Scene, Sphere, Status, load_robot, verify
+from robotdiffuse.baselines import guided_prior
 from robotdiffuse.baselines.guided_prior import (
     EDMP,
     ENSEMBLE,
@@ -334,7 +335,7 @@ def test_solved_means_verified(planner: MPD | EDMP) -> None:
 def test_failure_says_what_was_wrong(planner: MPD | EDMP, monkeypatch: pytest.MonkeyPatch) -> None:
     """Samples that all go through the ball."""
     drawn = lines(planner.settings.samples)
-    monkeypatch.setattr(planner, "draw", lambda *_arguments: drawn)
+    monkeypatch.setattr(guided_prior, "sample", lambda *_arguments: drawn)
     planner.plan(PROBLEM, time_limit=0.1)  # compiles and loads
     result = planner.plan(PROBLEM, time_limit=2.0)
     assert result.status is Status.TIMEOUT and result.path is None

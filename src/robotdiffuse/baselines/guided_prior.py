@@ -137,28 +137,6 @@ class GuidedPrior(ExportedPlanner[GuidedPriorSettings]):
     def guided(self, checker: CollisionChecker, q: Trajectories, left: int) -> Trajectories:
         """The means of a denoising step after the gradient steps of its guides; see `Guide`."""
 
-    def draw(
-        self,
-        prior: MotionModel,
-        checker: CollisionChecker,
-        starts: Configurations,
-        goals: Configurations,
-        rng: np.random.Generator,
-        stop: Callable[[], bool] = lambda: False,
-    ) -> Trajectories | None:
-        """A batch of guided samples, float32; None if `stop` returns True before they are complete."""
-        return sample(
-            prior,
-            starts,
-            goals,
-            self.levels(prior.schedule, self.settings.sampling_steps),
-            rng,
-            partial(self.guided, checker),
-            self.noise_scale,
-            self.quiet_steps,
-            stop,
-        )
-
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
         prior = self.network(context.problem.robot)
@@ -169,8 +147,16 @@ class GuidedPrior(ExportedPlanner[GuidedPriorSettings]):
         """The best sample so far that collides: its segments in collision, length [rad] and waypoints."""
         batches = 0
         while context.remaining > 0:
-            trajectories = self.draw(
-                prior, start_goal.checker, start, goals, context.rng, lambda: context.remaining <= 0
+            trajectories = sample(
+                prior,
+                start,
+                goals,
+                self.levels(prior.schedule, self.settings.sampling_steps),
+                context.rng,
+                partial(self.guided, start_goal.checker),
+                self.noise_scale,
+                self.quiet_steps,
+                lambda: context.remaining <= 0,
             )
             if trajectories is None:
                 break
@@ -187,12 +173,9 @@ class GuidedPrior(ExportedPlanner[GuidedPriorSettings]):
                 result = context.finish(start_goal.complete(attempt[2]), self.name)
                 if result is not None:
                     return result
-        if closest is not None:
-            # so that the result says what is wrong with it; by the exact meshes it may even be free
-            result = context.finish(start_goal.complete(closest[2]), self.name)
-            if result is not None:
-                return result
-        return context.unsolved(
+        # so that the result says what is wrong with it; by the exact meshes it may even be free
+        result = None if closest is None else context.finish(start_goal.complete(closest[2]), self.name)
+        return result or context.unsolved(
             f"none of {batches * samples} samples of the network is free of collision"
             if batches
             else f"time ran out before the first {samples} samples were complete; use a longer time limit"

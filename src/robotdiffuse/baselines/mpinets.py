@@ -79,11 +79,10 @@ class MPiNets(LearnedPlanner[MPiNetsSettings]):
             roll_outs += count
         # the validator checks the meshes, which are smaller than the covering spheres: it may be valid after
         # all
-        result = context.finish(best.path(start_goal), "policy")
-        if result is not None:
-            return result
         outcome = "reached the goal, but not free of collision" if best.arrived else "did not reach the goal"
-        return context.unsolved(f"{roll_outs} roll-outs of the policy, the best of which {outcome}")
+        return context.finish(best.path(start_goal), "policy") or context.unsolved(
+            f"{roll_outs} roll-outs of the policy, the best of which {outcome}"
+        )
 
     def _roll_outs(
         self,
@@ -106,24 +105,20 @@ class MPiNets(LearnedPlanner[MPiNetsSettings]):
         goal = goals[order[np.arange(tried, tried + count) % len(order)]]
         cloud = network.settings.region, network.settings.scene_points
         clouds = scene_clouds(start_goal.checker, *cloud, count, rng)
-        roll_outs = network.roll_outs(clouds, np.repeat(start[None], count, 0), goal)
         motions = [_Motion(start, end) for end in goal]
         for step in range(settings.steps + 1):
-            near = roll_outs.running & (roll_outs.distances() < settings.near)
-            for i in np.flatnonzero(near).tolist():
-                motions[i].try_to_arrive(space)
+            for motion in motions:
+                motion.try_to_arrive(space, settings.near)
             if any(motion.free for motion in motions):
                 break
-            roll_outs.stop(
-                np.array([motion.arrived or (motion.collided and not first) for motion in motions])
-            )
-            if step == settings.steps or not roll_outs.running.any() or context.remaining <= 0:
+            rows = [i for i, one in enumerate(motions) if one.moving and (first or not one.collided)]
+            if step == settings.steps or not rows or context.remaining <= 0:
                 break
+            q = np.stack([motions[i].waypoints[-1] for i in rows])
             noise = settings.noise * rng.standard_normal(goal.shape, dtype=np.float32)
-            roll_outs.advance(None if first else noise)
-            for i in np.flatnonzero(roll_outs.running).tolist():
-                motions[i].go(space, roll_outs.waypoints[-1][i])
-            roll_outs.stop(np.abs(roll_outs.waypoints[-1] - roll_outs.waypoints[-2]).max(1) < STANDSTILL)
+            moved = network.moved(clouds[rows], q if first else q + noise[rows], goal[rows])
+            for i, state in zip(rows, moved, strict=True):
+                motions[i].go(space, state)
         return motions
 
 
@@ -134,6 +129,8 @@ class _Motion:
         self.waypoints = [start]
         self.goal = goal
         self.collided = self.arrived = False
+        self.moving = True
+        """Whether it has neither arrived nor come to a standstill."""
 
     @property
     def free(self) -> bool:
@@ -141,14 +138,19 @@ class _Motion:
         return self.arrived and not self.collided
 
     def go(self, space: Space, q: Float32[ndarray, "dof"]) -> None:
-        self.collided |= not motions_free(space, np.stack([self.waypoints[-1], q]))[0]
+        step = np.stack([self.waypoints[-1], q])
+        self.collided |= not motions_free(space, step)[0]
+        self.moving = np.ptp(step, axis=0).max() >= STANDSTILL
         self.waypoints.append(q)
 
-    def try_to_arrive(self, space: Space) -> None:
-        """Add the straight edge to the goal if it is free."""
-        if motions_free(space, np.stack([self.waypoints[-1], self.goal]))[0]:
+    def try_to_arrive(self, space: Space, near: float) -> None:
+        """Add the straight edge to the goal if no joint is farther from it than `near` [rad] and it is
+        free."""
+        edge = np.stack([self.waypoints[-1], self.goal])
+        if self.moving and np.ptp(edge, axis=0).max() < near and motions_free(space, edge)[0]:
             self.waypoints.append(self.goal)
             self.arrived = True
+            self.moving = False
 
     def path(self, start_goal: StartGoal) -> Configurations:
         """Its waypoints, with the exact start, and the exact goal if it was reached."""

@@ -89,11 +89,8 @@ class MPNet(LearnedPlanner[MPNetPlannerSettings]):
                 settings = replace(settings, resolution=finer_resolution(settings.resolution))
             elif candidate.broken < best.broken:
                 best = candidate
-        if len(best.path):
-            result = context.finish(start_goal.complete(best.path), self.name)
-            if result is not None:
-                return result
-        return context.unsolved(
+        result = context.finish(start_goal.complete(best.path), self.name) if len(best.path) else None
+        return result or context.unsolved(
             f"no path of the network was free in {context.elapsed:.2f} s and {rounds} rounds of "
             f"{settings.attempts} attempts; a longer time limit or hybrid replanning may find one"
         )

@@ -46,8 +46,7 @@ class StraightLine(Planner[StraightLineSettings]):
         order = np.argsort(np.linalg.norm(goals - start, axis=1))
         selected = order[:1] if self.settings.goals == NEAREST else order
         paths = (start_goal.complete(np.stack([start, goal])) for goal in goals[selected])
-        result = first_accepted(context, paths, "straight_line", "solved by the straight line")
-        if result is not None:
-            return result
         plural = "line is" if len(selected) == 1 else f"lines to {len(selected)} goal configurations are"
-        return context.unsolved(f"the straight {plural} refused")
+        return first_accepted(
+            context, paths, "straight_line", "solved by the straight line"
+        ) or context.unsolved(f"the straight {plural} refused")

@@ -36,13 +36,14 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int64
+from jaxtyping import Float, Float32, Int64
 from numpy import ndarray
 from torch import Tensor, nn
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Count, NotNegative, Settings, Sizes
 from robotdiffuse.datasets.surface_clouds import surface_clouds
+from robotdiffuse.learning.encoders.networks import perceptron
 from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16
 from robotdiffuse.learning.training.losses import ArmDistance, ForwardKinematics, SurfacePoints, hinge
 from robotdiffuse.learning.training.tasks import BaselineNetwork
@@ -105,18 +106,14 @@ class MPiNetsNetworkSettings(Settings, name="mpinets"):
                 f"mpinets.target_points is {self.target_points}; it must be at most robot_points, "
                 f"{self.robot_points}"
             )
-        for name in ("centers", "neighbors"):
-            if len(getattr(self, name)) != 2:
-                raise InputError(f"mpinets.{name} is {getattr(self, name)}; it must be two numbers")
         if self.centers[0] > self.scene_points or self.centers[1] > self.centers[0]:
             raise InputError(
                 f"mpinets.centers is {self.centers}; it must fall, from at most scene_points, "
                 f"{self.scene_points}"
             )
-        if len(self.cloud_widths) != 2 or self.cloud_widths[0] % GROUPS:
+        if self.cloud_widths[0] % GROUPS:
             raise InputError(
-                f"mpinets.cloud_widths is {self.cloud_widths}; it must be two numbers, the first a multiple "
-                f"of {GROUPS}"
+                f"mpinets.cloud_widths is {self.cloud_widths}; the first must be a multiple of {GROUPS}"
             )
 
 
@@ -245,9 +242,10 @@ class MPiNetsNetwork(BaselineNetwork):
             nn.LeakyReLU(),
             nn.Linear(cloud_width, code),
         )
-        self.joint_code = _leaky(2 * self.dof, JOINT_WIDTHS)
+        self.joint_code = perceptron(2 * self.dof, *JOINT_WIDTHS, activation=nn.LeakyReLU)
         last = nn.Linear(DECODER_WIDTHS[-1], self.dof)
-        self.decoder = nn.Sequential(_leaky(code + JOINT_WIDTHS[-1], DECODER_WIDTHS), nn.LeakyReLU(), last)
+        hidden = perceptron(code + JOINT_WIDTHS[-1], *DECODER_WIDTHS, activation=nn.LeakyReLU)
+        self.decoder = nn.Sequential(hidden, nn.LeakyReLU(), last)
         for layer in self.modules():
             if isinstance(layer, nn.Linear):
                 nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
@@ -283,14 +281,11 @@ class MPiNetsNetwork(BaselineNetwork):
         code = torch.cat([cloud_code.float(), self.joint_code(torch.cat([x, direction], -1))], -1)
         return self.from_unit((x + self.step * self.decoder(code)).clamp(-1, 1))
 
-    def roll_outs(
-        self,
-        clouds: Float32[ndarray, "n points 3"],
-        start: Joints,
-        goal: Joints,
-    ) -> "RollOuts":
-        """Roll-outs of the policy, in planning."""
-        return RollOuts(self, torch.from_numpy(clouds), start, goal)
+    def moved(self, clouds: Float32[ndarray, "n points 3"], q: Joints, goal: Joints) -> Joints:
+        """The next configurations of arrays, in planning; q is clipped to the limits [rad]."""
+        within = self.normalizer.from_unit(self.normalizer.to_unit(q).clip(-1, 1))
+        with torch.inference_mode():
+            return self(*map(torch.from_numpy, (clouds, within, goal))).numpy()
 
     def loss(
         self, data: TrajectoryData, count: int, fraction: float, rng: np.random.Generator
@@ -322,54 +317,3 @@ class MPiNetsNetwork(BaselineNetwork):
         """Random clouds of scenes for the network's input [m]; zeros where nothing is in reach."""
         generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
         return surface_clouds(scenes, self.settings.scene_points, generator, region=self.settings.region)
-
-
-class RollOuts:
-    """Rolls out the policy step by step on several problems at once."""
-
-    def __init__(
-        self,
-        network: MPiNetsNetwork,
-        clouds: Clouds,
-        start: Joints,
-        goal: Joints,
-    ) -> None:
-        """clouds of the scenes [m]; start and goal in [rad]."""
-        self.network = network
-        self._clouds = clouds
-        self._goal = goal
-        self.waypoints = [start]
-        """[n, dof] before the first and after each step [rad]; stopped roll-outs stay where they are."""
-        self.running = np.ones(len(start), bool)
-
-    def distances(self) -> Float[ndarray, "n"]:
-        """Largest distance of a joint to its goal [rad]."""
-        return np.abs(self.waypoints[-1] - self._goal).max(1)
-
-    def stop(self, which: Bool[ndarray, "n"]) -> None:
-        """Stop these roll-outs."""
-        self.running &= ~which
-
-    def advance(self, noise: Joints | None = None) -> None:
-        """Advance the running roll-outs by one step; noise [rad] is added to the policy's input
-        configuration."""
-        rows = np.flatnonzero(self.running)
-        input_q = self.waypoints[-1] if noise is None else self.waypoints[-1] + noise
-        normalizer = self.network.normalizer
-        q = normalizer.from_unit(normalizer.to_unit(input_q[rows]).clip(-1, 1))
-        with torch.inference_mode():
-            at = torch.from_numpy(q)
-            goal = torch.from_numpy(self._goal[rows])
-            moved = self.network(self._clouds[torch.from_numpy(rows)], at, goal).numpy()
-        after = self.waypoints[-1].copy()
-        after[rows] = moved
-        self.waypoints.append(after)
-
-
-def _leaky(channels: int, widths: tuple[int, ...]) -> nn.Sequential:
-    """Linear layers with a LeakyReLU between them."""
-    layers: list[nn.Module] = []
-    for width in widths:
-        layers += [nn.Linear(channels, width), nn.LeakyReLU()]
-        channels = width
-    return nn.Sequential(*layers[:-1])

@@ -14,6 +14,7 @@ from robotdiffuse.core.types import Configuration, Configurations, Path
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.simulation.world import World
+from robotdiffuse.validation.tolerances import sample_path
 
 MAX_DISTANCE = 10.0
 """Distances are measured up to this [m]."""
@@ -105,16 +106,8 @@ class PyBulletOracle:
 
         step: distance between configurations [rad, joint-space L2]. The default tolerance is Bullet's own.
         """
-        q = path.positions
-        at = [np.arange(1.0)]
-        for i, length in enumerate(np.linalg.norm(np.diff(q, axis=0), axis=1)):
-            count = max(1, int(np.ceil(length / step)))
-            at.append(i + np.arange(1, count + 1) / count)
-        places = np.concatenate(at)
-        first = np.minimum(places.astype(np.int64), max(len(q) - 2, 0))
-        last = np.minimum(first + 1, len(q) - 1)
-        frames = q[first] + (places - first)[:, None] * (q[last] - q[first])
-        contact = self.check_frames(frames, tolerance)
+        places, q = sample_path(path.positions, step)
+        contact = self.check_frames(q, tolerance)
         return None if contact is None else replace(contact, at=float(places[int(contact.at)]))
 
     def _closer(

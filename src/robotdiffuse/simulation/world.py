@@ -9,6 +9,7 @@ from xml.etree import ElementTree as Xml
 
 import numpy as np
 import pybullet
+import trimesh
 
 from robotdiffuse.core.transforms import quaternion_from_rotation, rpy_from_rotation
 from robotdiffuse.core.types import Configuration, Pose, Vector
@@ -187,7 +188,7 @@ class World:
         key = mesh.vertices.tobytes(), mesh.faces.tobytes()
         if key not in self.mesh_shapes:
             file = Path(self._folder.name) / "obstacle.obj"
-            write_obj(file, mesh)
+            _solid(mesh).export(file)
             self.mesh_shapes[key] = self.bullet.createCollisionShape(
                 pybullet.GEOM_MESH, fileName=str(file), flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH
             )
@@ -213,7 +214,7 @@ def write_urdf(robot: Robot, folder: Path) -> Path:
         _add_inertia(element, meshes)
         for i, mesh in enumerate(meshes):
             file = folder / f"{link}_{i}.obj"
-            write_obj(file, mesh)
+            _solid(mesh).export(file)
             _add_geometry(element, "mesh", filename=str(file))
     for joint in robot.joints:
         _add_joint(root, joint, joint.name in robot.joint_names)
@@ -231,11 +232,8 @@ def write_points_urdf(cloud: PointCloud, folder: Path) -> Path:
     return _write_tree(root, folder / "points.urdf")
 
 
-def write_obj(file: Path, mesh: ConvexMesh | Mesh) -> None:
-    """Write triangles as a Wavefront file."""
-    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices.tolist()]
-    lines += [f"f {a} {b} {c}" for a, b, c in (mesh.faces + 1).tolist()]
-    file.write_text("\n".join(lines) + "\n")
+def _solid(mesh: ConvexMesh | Mesh) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
 
 
 def mass_and_center(meshes: tuple[ConvexMesh, ...], density: float) -> tuple[float, Vector]:
@@ -243,9 +241,7 @@ def mass_and_center(meshes: tuple[ConvexMesh, ...], density: float) -> tuple[flo
 
     Overlapping solids count twice where they overlap.
     """
-    import trimesh
-
-    solids = [trimesh.Trimesh(mesh.vertices, mesh.faces, process=False) for mesh in meshes]
+    solids = list(map(_solid, meshes))
     masses = [density * abs(solid.volume) for solid in solids]  # negative if the faces point inwards
     total = float(sum(masses))
     if total < MIN_MASS:

@@ -19,7 +19,7 @@ from robotdiffuse.learning.denoisers import (
     TransformerSettings,
     UNetSettings,
 )
-from robotdiffuse.learning.encoders.networks import OCTAVES, wave_angles
+from robotdiffuse.learning.encoders.networks import OCTAVES, perceptron, wave_angles
 
 MAX_UNFUSED_TOKENS = 96
 """Up to this number of tokens, attention in fp32 on a CPU does without the fused kernel; in bf16 always.
@@ -35,18 +35,13 @@ Trajectories = Float[Tensor, "batch waypoints dof"]
 Tokens = Float[Tensor, "batch tokens width"]
 
 
-def two_layers(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
-    """A feed-forward network with one hidden layer."""
-    return nn.Sequential(nn.Linear(inputs, hidden), nn.GELU("tanh"), nn.Linear(hidden, outputs))
-
-
 class LevelEmbedding(nn.Sequential):
     """The noise level t / T as `width` numbers: sines and cosines, then a feed-forward network."""
 
     frequencies: Tensor
 
     def __init__(self, width: int) -> None:
-        super().__init__(*two_layers(width, width, width))
+        super().__init__(*perceptron(width, width, width))
         self.register_buffer(
             "frequencies", torch.exp(torch.linspace(0.0, np.log(1_000.0), width // 2)), persistent=False
         )
@@ -202,15 +197,15 @@ class TrajectoryTransformer(Denoiser):
         self.adds_z_tk = settings.points or (isinstance(settings, TransformerSettings) and settings.add_z_tk)
         self.embed = nn.Linear(settings.patch * features, width)
         if isinstance(settings, EncoderDecoderSettings):
-            self.condition = nn.ModuleList(two_layers(size, width, width) for size in self.sizes)
+            self.condition = nn.ModuleList(perceptron(size, width, width) for size in self.sizes)
             self.encoder = self._blocks(settings.encoder_layers)
             self.norm_encoded = nn.LayerNorm(width)
         elif settings.points:
-            self.ends = two_layers(2 * dof, 2 * width, width)
-            self.points = two_layers(3 + 6 * OCTAVES, width, width)
+            self.ends = perceptron(2 * dof, 2 * width, width)
+            self.points = perceptron(3 + 6 * OCTAVES, width, width)
             self.norm_points = nn.LayerNorm(width)
         else:
-            self.condition = two_layers(condition, 2 * width, width)
+            self.condition = perceptron(condition, 2 * width, width)
         self.level = LevelEmbedding(width)
         self.blocks = self._blocks(settings.layers, settings.causal, self.encoded or settings.points)
         self.norm = nn.LayerNorm(width)
@@ -323,7 +318,7 @@ class UNet(Denoiser):
             first = ResidualBlock(inputs, outputs, settings.kernel, token, count)
             return nn.ModuleList([first, ResidualBlock(outputs, outputs, settings.kernel, token, count)])
 
-        self.condition = two_layers(condition, 2 * token, token)
+        self.condition = perceptron(condition, 2 * token, token)
         self.level = LevelEmbedding(token)
         self.embed = nn.Linear(features, widths[0])
         self.down = nn.ModuleList(blocks(width, width) for width in widths[:-1])

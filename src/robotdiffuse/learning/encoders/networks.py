@@ -6,7 +6,8 @@ averaged weights have no averaged batch statistics.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -122,6 +123,13 @@ def wave_angles(points: Float[Tensor, "*batch 3"], octaves: int = OCTAVES) -> li
     return [points * (torch.pi / 2 * 2**octave) for octave in range(octaves)]
 
 
+def perceptron(*sizes: int, activation: Callable[[], nn.Module] | None = None) -> nn.Sequential:
+    """Linear layers from each size to the next, with activations between them; None: GELU."""
+    make = activation or partial(nn.GELU, "tanh")
+    parts = [part for a, b in pairwise(sizes) for part in (nn.Linear(a, b), make())]
+    return nn.Sequential(*parts[:-1])
+
+
 def pool_max(features: Features, near: Near) -> Pooled:
     """Maximum feature over the points that count; zeros for clouds without any."""
     low = torch.finfo(features.dtype).min
@@ -149,7 +157,8 @@ class CompressionAutoencoder(Autoencoder):
     def __init__(self, settings: CompressionAutoencoderSettings) -> None:
         super().__init__(settings)
         sizes = (3 * settings.cloud, *settings.hidden, settings.code)
-        self.encoder, self.decoder = _perceptron(sizes), _perceptron(sizes[::-1])
+        self.encoder = perceptron(*sizes, activation=nn.PReLU)
+        self.decoder = perceptron(*sizes[::-1], activation=nn.PReLU)
 
     def encode(self, cloud: Cloud) -> Codes:
         with fp32(cloud):
@@ -183,11 +192,6 @@ class CompressionAutoencoder(Autoencoder):
         return (layer.weight for layer in self.encoder if isinstance(layer, nn.Linear))
 
 
-def _perceptron(sizes: tuple[int, ...]) -> nn.Sequential:
-    parts = [part for a, b in pairwise(sizes) for part in (nn.Linear(a, b), nn.PReLU())]
-    return nn.Sequential(*parts[:-1])
-
-
 DISTANCE_QUERIES = 96
 """Positions per cloud at which the distance field is reconstructed."""
 DISTANCE_WEIGHT = 4.0
@@ -210,23 +214,16 @@ class PointAutoencoder(Autoencoder):
         super().__init__(settings)
         sizes = (3 + 6 * OCTAVES, *settings.points)
         self.points = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(sizes))
-        self.empty = nn.Parameter(torch.zeros(2 * sizes[-1]))
+        pooled = 2 * sizes[-1]
+        self.empty = nn.Parameter(torch.zeros(pooled))
         hidden = settings.hidden
         code = settings.code
-        self.head = nn.Sequential(
-            nn.LayerNorm(2 * sizes[-1]), nn.Linear(2 * sizes[-1], hidden), nn.GELU("tanh"),
-            nn.Linear(hidden, code),
-        )  # fmt: skip
-        self.decoder = nn.Sequential(
-            nn.Linear(code, hidden), nn.GELU("tanh"), nn.Linear(hidden, hidden), nn.GELU("tanh"),
-            nn.Linear(hidden, 3 * settings.decoded),
-        )  # fmt: skip
+        pooled = 2 * sizes[-1]
+        self.head = nn.Sequential(nn.LayerNorm(pooled), *perceptron(pooled, hidden, code))
+        self.decoder = perceptron(code, hidden, hidden, 3 * settings.decoded)
         self.query_code = nn.Linear(code, 192)
         self.query_point = nn.Linear(sizes[0], 192)
-        self.query = nn.Sequential(
-            nn.GELU("tanh"), nn.Linear(192, 192), nn.GELU("tanh"), nn.Linear(192, 192), nn.GELU("tanh"),
-            nn.Linear(192, 1),
-        )  # fmt: skip
+        self.query = nn.Sequential(nn.GELU("tanh"), *perceptron(192, 192, 192, 1))
 
     def encode(self, cloud: Cloud) -> Codes:
         """z before standardization."""

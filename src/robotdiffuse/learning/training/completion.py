@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path as FilePath
 from typing import Annotated, Any
 
@@ -60,7 +61,7 @@ class SamplePrefetcher:
         self._families = tuple(families)
         self._robot = robot
         self._batch = batch
-        self._count, self._workers = workers, Workers(workers, _give_way)
+        self._count, self._workers = workers, Workers(workers, partial(os.nice, NICENESS))
         self._pending: deque[tuple[tuple[int, ...], Future[Samples]]] = deque()
 
     def next(self, rng: np.random.Generator) -> Samples:
@@ -88,10 +89,6 @@ class SamplePrefetcher:
     def _submit(self, seeds: tuple[int, ...]) -> None:
         job = self._workers.submit(draw_samples, self._families, self._robot, seeds)
         self._pending.append((seeds, job))
-
-
-def _give_way() -> None:
-    os.nice(NICENESS)
 
 
 BUNDLED_WEIGHTS = "bundled"

@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_, parameters_to_vector, vector_to_parameters
 from torch.optim.swa_utils import AveragedModel
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, needs
 from robotdiffuse.core.output_files import lock_folder, write_atomically
 from robotdiffuse.learning import need_packages
 from robotdiffuse.learning.checkpoint import read_tensors, versions, write_tensors
@@ -53,10 +53,8 @@ class Processes:
         cuda = torch.cuda.is_available()
         if device == "cuda" and not cuda:
             raise InputError("device is cuda, but PyTorch finds no CUDA device here; use cpu")
-        try:
+        with needs("accelerate", "train"):
             from accelerate import Accelerator, PartialState
-        except ImportError:
-            raise InputError('training needs accelerate: pip install "robotdiffuse[train]"') from None
         cpu = device == "cpu" or not cuda
         bf16 = fast_bf16() if cpu else torch.cuda.is_bf16_supported(including_emulation=False)
         device_type = "cpu" if cpu else "cuda"
@@ -103,12 +101,10 @@ class Processes:
         """Means of the values over the processes."""
         return tuple(self._mean(torch.tensor(values, dtype=torch.float32, device=self.device)).tolist())
 
-    def _mean(self, values: Tensor) -> Tensor:
-        # Accelerate's types allow more than tensors
-        mean: Any = self._accelerator.reduce(values, "mean")
-        return mean
+    def _mean(self, values: Tensor) -> Any:  # Accelerate's types allow more than tensors
+        return self._accelerator.reduce(values, "mean")
 
-    def gather(self, value: Value) -> list[Value]:
+    def gather(self, value: object) -> list[Any]:
         """The values of all processes, in their order."""
         from accelerate.utils import gather_object
 
@@ -116,8 +112,7 @@ class Processes:
 
     def share(self, value: Value | None) -> Value:
         """The first process's value; the values of the others are ignored."""
-        found: Any = self.gather(value)[0]
-        return found
+        return self.gather(value)[0]
 
     def first_goes_first(self) -> AbstractContextManager[None]:
         """A context that the first process of each machine passes before the others, which read what it
@@ -144,7 +139,6 @@ BAR_WIDTH = 24
 wraps is printed again."""
 LOG_EVERY = 50
 """Steps per row of log.csv."""
-LOG_COLUMNS = ("step", "samples", "minutes", "learning_rate", "loss", "validation", "success", "skipped")
 MAX_ROLLBACKS = 5
 """After so many returns to a checkpoint a run has diverged."""
 
@@ -357,17 +351,17 @@ class TrainingRun:
         )
         self._losses.clear()
         held_out, success = validation or (None, None)
-        row = (
-            self.at.step,
-            self.at.samples,
-            round(self.at.seconds / 60, 3),
-            f"{self.settings.learning_rate * self._lr():.3g}",
-            float(f"{loss:.5g}"),
-            "" if held_out is None else f"{held_out:.5g}",
-            "" if success is None else f"{success:.4g}",
-            self.at.skipped,
-        )
-        self.rows.append(dict(zip(LOG_COLUMNS, row, strict=True)))
+        row = {
+            "step": self.at.step,
+            "samples": self.at.samples,
+            "minutes": round(self.at.seconds / 60, 3),
+            "learning_rate": f"{self.settings.learning_rate * self._lr():.3g}",
+            "loss": float(f"{loss:.5g}"),
+            "validation": "" if held_out is None else f"{held_out:.5g}",
+            "success": "" if success is None else f"{success:.4g}",
+            "skipped": self.at.skipped,
+        }
+        self.rows.append(row)
 
     def _checkpoint(self, console: Console) -> None:
         validation = None
@@ -415,7 +409,7 @@ class TrainingRun:
             tensors |= {f"optimizer.{place}.{name}": tensor for name, tensor in moments.items()}
         write_tensors(self._file, tensors, notes)
         text = io.StringIO()
-        writer: csv.DictWriter[str] = csv.DictWriter(text, LOG_COLUMNS)
+        writer: csv.DictWriter[str] = csv.DictWriter(text, self.rows[0] if self.rows else ())
         writer.writeheader()
         writer.writerows(self.rows)
         write_atomically(self.out / "log.csv", text.getvalue(), make_folder=True)
@@ -489,15 +483,12 @@ def _stop_requested() -> Iterator[threading.Event]:
             signal.signal(s, handler)
 
 
-@contextmanager
-def _progress(shown: bool) -> Iterator[Progress]:
+def _progress(shown: bool) -> Progress:
     columns = (
         TextColumn("{task.description}"), BarColumn(BAR_WIDTH), TextColumn("{task.percentage:.1f} %"),
         TextColumn("{task.fields[rate]}"), TextColumn("loss {task.fields[loss]}"), TimeRemainingColumn(),
     )  # fmt: skip
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not shown) as progress:
-        yield progress
+    return Progress(*columns, console=Console(stderr=True), disable=not shown)
 
 
 def train(task: TrainingTask, out: str) -> dict[str, float]:

@@ -216,7 +216,7 @@ def free_in_scene(checker: CollisionChecker, q: Float[ndarray, "n waypoints dof"
     dense = q[:, :-1, None] + share * np.diff(q, axis=1)[:, :, None]
     every = np.concatenate([dense.reshape(len(q), -1, q.shape[-1]), q[:, -1:]], 1)
     free = checker.free(every.reshape(-1, q.shape[-1])).reshape(len(q), -1)
-    return np.all(free, axis=1, keepdims=True)[:, 0]
+    return free.min(axis=1)
 
 
 VALIDATION_SAMPLES = 4
