@@ -30,6 +30,7 @@ from robotdiffuse.robots import DATA, ROBOTS
 pytest.importorskip("fastapi")
 
 from robotdiffuse.server import worker
+from robotdiffuse.trajectories.speed_limits import MIN_SCALING
 
 LEFT = [0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785]
 RIGHT = [-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785]
@@ -182,8 +183,12 @@ def test_lists_health_metrics_and_a_page_without_scripts(server: httpx.Client) -
     schemas = description["components"]["schemas"]
     for name in re.findall(r'"#/components/schemas/(\w+)"', json.dumps(description)):
         assert name in schemas
-    assert tuple(schemas["PlanRequest"]["properties"]["until"]["enum"]) == UNTIL
-    assert set(schemas["PlanRequest"]["properties"]) == {"problem", *worker.ARGUMENTS}
+    arguments = schemas["PlanRequest"]["properties"]
+    assert set(arguments) == {"problem", *worker.ARGUMENTS}
+    assert all("description" in field for field in arguments.values())
+    assert tuple(arguments["until"]["enum"]) == UNTIL
+    assert arguments["velocity_scaling"]["minimum"] == MIN_SCALING, "it was said to be anything above 0"
+    assert "robot" in schemas["Problem"]["required"]
     assert schemas["Error"]["required"] == ["error"] and "HTTPValidationError" not in schemas
 
 

@@ -53,6 +53,15 @@ class Bound:
             return self.rule
         return "finite" if math.isinf(value) and not self.infinite else None
 
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
+        keywords = {
+            "exclusiveMinimum": self.above,
+            "minimum": self.least,
+            "exclusiveMaximum": self.below,
+            "maximum": self.most,
+        }
+        return handler(schema) | {word: bound for word, bound in keywords.items() if bound is not None}
+
     @property
     def rule(self) -> str:
         low = f"at least {self.least:g}" if self.least is not None else ""
@@ -71,6 +80,9 @@ class OneOf:
     """The value must be one of these names."""
 
     names: Iterable[str]
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
+        return handler(schema) | {"enum": list(self.names)}
 
 
 @dataclass(frozen=True)

@@ -1,19 +1,23 @@
 """The HTTP application: endpoints, limits of requests, and errors as one line of JSON."""
 
 import asyncio
+import inspect
+import json
+import re
 import secrets
 import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import fields
 from ipaddress import ip_address
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_type_hints
 from urllib.parse import urlsplit
 
 from fastapi import FastAPI, Header, Request, Response
 from fastapi.openapi.constants import REF_TEMPLATE
 from fastapi.responses import JSONResponse, PlainTextResponse
 from prometheus_client import CONTENT_TYPE_LATEST
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, create_model
 from pydantic.json_schema import models_json_schema
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
@@ -21,8 +25,10 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import shown
-from robotdiffuse.core.types import CONVERGED, MAX_SAMPLE_RATE, TIME, Status
-from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS
+from robotdiffuse.core.types import MAX_SAMPLE_RATE, Status
+from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, plan
+from robotdiffuse.planning.context import PlanRequest
+from robotdiffuse.problems.fields import problem_schema
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.server.connection import REFUSED, log_access
 from robotdiffuse.server.settings import MAX_ARRIVING, ServeSettings
@@ -40,7 +46,6 @@ JOINT_NAMES = [f"panda_joint{i}" for i in range(1, 8)]
 VERIFY_EXAMPLE: Any = {"problem": PROBLEM, "path": {"joint_names": JOINT_NAMES, "positions": WAYPOINTS}}
 
 Rows = list[list[float]]
-Scaling = Annotated[float, Field(gt=0, le=1)]
 ProblemField = Annotated[dict[str, Any], Field(description="as in a problem file", examples=[PROBLEM])]
 
 
@@ -54,27 +59,36 @@ class _Request(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
 
-class PlanRequest(_Request):
-    """A problem, and the arguments of `plan`."""
+def _documented() -> dict[str, str]:
+    """The arguments of `rd.plan`, as its docstring describes them."""
+    _, _, arguments = (inspect.getdoc(plan) or "").partition("Args:\n")
+    texts = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", arguments, re.MULTILINE)
+    return {name: " ".join(text.split()) for name, text in texts}
 
-    problem: ProblemField
-    planner: str = Field(DEFAULT_PLANNER, description="a name of /planners")
-    time_limit: float = Field(1.0, gt=0, description="[s]")
-    seed: int = Field(0, ge=0)
-    until: Literal["first", "converged", "time_limit"] = CONVERGED
-    clearance: float | None = Field(None, ge=0, le=0.5, description="distance to keep where possible [m]")
-    velocity_scaling: Scaling = 1.0
-    acceleration_scaling: Scaling = 1.0
-    objective: Literal["length", "time"] = TIME
-    jerk: float | None = Field(
-        None, gt=0, description="largest jerk of any joint [rad/s³]; null: the robot's limits"
-    )
-    rate: float | None = Field(
-        None,
-        gt=0,
-        le=MAX_SAMPLE_RATE,
-        description="rows per second of the answer's motion, which is validated so [Hz]; null: its own rows",
-    )
+
+_DESCRIPTIONS = _documented()
+_TYPES = get_type_hints(PlanRequest, include_extras=True)
+PlanBody = create_model(
+    "PlanRequest",
+    __base__=_Request,
+    __doc__="A problem, and arguments of `rd.plan`.",
+    problem=(ProblemField, ...),
+    planner=(str, Field(DEFAULT_PLANNER, description="a name of /planners")),
+    rate=(
+        float | None,
+        Field(
+            None,
+            gt=0,
+            le=MAX_SAMPLE_RATE,
+            description="rows per second of the answer's motion, which is validated so [Hz]; null: its own "
+            "rows",
+        ),
+    ),
+    **{
+        field.name: (_TYPES[field.name], Field(field.default, description=_DESCRIPTIONS.get(field.name)))
+        for field in fields(PlanRequest)
+    },
+)
 
 
 class PathMotion(_Request):
@@ -303,11 +317,15 @@ def _describe_bodies(app: FastAPI) -> None:
     """Complete the OpenAPI description: add the models of bodies that endpoints read themselves, and remove
     the answer 422 of FastAPI's own validation, which they do not use."""
     _, models = models_json_schema(
-        [(PlanRequest, "validation"), (VerifyRequest, "validation")], ref_template=REF_TEMPLATE
+        [(PlanBody, "validation"), (VerifyRequest, "validation")], ref_template=REF_TEMPLATE
     )
     description = app.openapi()
     schemas = description["components"]["schemas"]
     schemas |= models["$defs"]
+    problem = json.loads(json.dumps(problem_schema()).replace("#/$defs/", REF_TEMPLATE.format(model="")))
+    schemas |= problem.pop("$defs") | {"Problem": problem}
+    for body in (PlanBody, VerifyRequest):
+        schemas[body.__name__]["properties"]["problem"]["$ref"] = REF_TEMPLATE.format(model="Problem")
     for name in ("HTTPValidationError", "ValidationError"):
         schemas.pop(name, None)
     for methods in description["paths"].values():
@@ -320,7 +338,7 @@ def _errors(*codes: int) -> dict[int | str, dict[str, Any]]:
 
 
 def _body(model: type[BaseModel] | None, description: str) -> dict[str, Any]:
-    """`openapi_extra` of an endpoint that reads its body itself; None: one PlanRequest a line."""
+    """`openapi_extra` of an endpoint that reads its body itself; None: one PlanBody a line."""
     schema = {"type": "string"} if model is None else {"$ref": REF_TEMPLATE.format(model=model.__name__)}
     content = {LINES if model is None else JSON: {"schema": schema}}
     return {"requestBody": {"required": True, "description": description, "content": content}}
@@ -342,7 +360,7 @@ def _add_requests(app: FastAPI, pool: WorkerPool, settings: ServeSettings) -> No
         summary="Plan a motion",
         response_model=PlanAnswer,
         responses=_errors(*REQUEST_ERRORS),
-        openapi_extra=_body(PlanRequest, "a problem, and arguments of plan"),
+        openapi_extra=_body(PlanBody, "a problem, and arguments of plan"),
     )
     async def plan(request: Request, name: RequestID = "") -> Response:
         """Any status of a result is answered with code 200, also if there is no plan."""
