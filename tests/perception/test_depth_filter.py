@@ -19,6 +19,7 @@ from robotdiffuse.perception.observed_volume import ARM_MARGIN, FREE, carve_view
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
 from robotdiffuse.perception.seen_points import seen_points
 from robotdiffuse.perception.voxel_grid import FINE
+from robotdiffuse.planning.exploration.simulated import wrist_camera
 
 PANDA = load_robot("panda")
 HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
@@ -110,6 +111,31 @@ def test_rays_through_the_arm_are_not_empty() -> None:
     assert freed.free.any() and not (freed.free & behind_arm).any()
 
 
+def test_the_arm_beside_its_own_camera_leaves_open_space_open() -> None:
+    """Regression: nearness of the arm made regions beside it surfaces too near to be measured, and the
+    gripper, 9 mm beside the camera and widened by 15 mm, hid half of the image: looks showed nothing."""
+    camera = wrist_camera(PANDA)
+    q = np.array([-0.9, -1.6, -1.4, -2.3, 0.1, 1.1, -1.1])
+    T = camera.poses(PANDA, q[None])[0]
+    view = ray_cast(Scene([FLOOR]), T, camera.intrinsics, camera.size, PANDA, q)
+    ideal = replace(view, depth=np.where(view.depth < 0.15, 0.0, view.depth), range=4.0)
+    zeros = replace(ideal, depth=np.where(np.isinf(ideal.depth), 0.0, ideal.depth))
+    free, with_zeros = (observe([one], PANDA, q).free for one in (ideal, zeros))
+    assert with_zeros.sum() > 0.9 * free.sum() > 10_000
+    off = observe([replace(zeros, pose_deviation=(0.005, 0.0175))], PANDA, q).free
+    assert off.sum() > 0.7 * free.sum()
+
+
+def test_a_straight_edge_is_not_the_end_of_the_image() -> None:
+    """Regression: a board's edge along a row counted as a crop though there is something beyond it."""
+    depth = np.zeros((240, 320))
+    depth[100:] = 1.0
+    assert empty_regions(depth, 2.0) is None, "cropped, perhaps"
+    depth[40:60, 20:50] = 1.2
+    found = empty_regions(depth, 2.0)
+    assert found is not None and found[:36].all()
+
+
 def test_a_covered_lens_measures_nothing() -> None:
     for value in (0.0, np.nan, 0.02, -1.0):
         view = DepthView(np.full((240, 320), value), (FOCAL, FOCAL, 159.5, 119.5), np.eye(4), range=3.0)
@@ -119,7 +145,7 @@ def test_a_covered_lens_measures_nothing() -> None:
 
 def test_images_without_noise_are_taken_as_they_are() -> None:
     view = view_from(1.5)
-    depth, spread, _ = filtered(view)
+    depth, spread = filtered(view)
     assert spread == 0.0
     np.testing.assert_array_equal(depth, view.depth)
     assert patch_noise(np.zeros((240, 320), np.float32))[0] == 0.0, "without returns"

@@ -15,7 +15,7 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import Configuration
-from robotdiffuse.perception.depth_filter import filtered, grown_for_errors, open_depth
+from robotdiffuse.perception.depth_filter import empty_regions, filtered, grown_for_errors, open_depth
 from robotdiffuse.perception.depth_view import NEAREST, DepthView
 from robotdiffuse.perception.ray_caster import in_camera, rectangle
 from robotdiffuse.perception.voxel_grid import COARSE, SHAPE, VoxelGrid
@@ -110,8 +110,8 @@ def _arm_pixels(depth, intrinsics, spheres):
 
 @kernel(fastmath=FASTMATH)
 def _hide_arm(depth, empty, intrinsics, spheres):
-    """Set empty pixels whose rays meet one of the spheres to NO_RETURN. Spheres that contain the camera are
-    ignored."""
+    """Set empty pixels whose rays meet one of the spheres to -NEAREST: they see nothing beyond. Spheres that
+    contain the camera are ignored."""
     h, w = depth.shape
     fx, fy, cx, cy = intrinsics
     for s in range(len(spheres)):
@@ -126,7 +126,7 @@ def _hide_arm(depth, empty, intrinsics, spheres):
                 a = (np.float32(u) - cx) / fx
                 along = a * x + b * y + z
                 if empty[v, u] and along > _ZERO and square * (a * a + b * b + _ONE) < along * along:
-                    depth[v, u] = NO_RETURN
+                    depth[v, u] = -_NEAREST
 
 
 def usable_image(
@@ -136,21 +136,24 @@ def usable_image(
     margin [m], by noise and by the error of the camera's pose.
 
     Where nothing seems to be in range, the image is infinite if the view states its range, else EMPTY. Pixels
-    on the arm are excepted: they have no return. Beside surfaces, nothing is before them.
+    on the arm are excepted. Beside surfaces, nothing is before them.
     """
-    T, (depth, spread, empty) = view.T_base_camera, filtered(view)
+    T, (depth, spread) = view.T_base_camera, filtered(view)
     arm = placed_spheres(robot, q)
     spheres = grown_for_errors(arm, view, spread)
     spheres[:, :3] = (spheres[:, :3] - T[:3, 3]) @ T[:3, :3]
     spheres[:, 3] += margin
     spheres = spheres.astype(np.float32)
+    if view.cloud is not None:
+        return depth, spread, spheres
+    intrinsics = np.array(view.intrinsics, np.float32)
+    arm_pixels = _arm_pixels(depth, intrinsics, spheres)
+    empty = empty_regions(view.depth, view.range, arm_pixels)
     if empty is not None:
-        intrinsics = np.array(view.intrinsics, np.float32)
-        arm_pixels = _arm_pixels(depth, intrinsics, spheres)
         opening = EMPTY if view.range is None else open_depth(depth, arm_pixels, view.intrinsics[0])
         depth = np.where(empty, opening, depth)
-        # not enlarged by errors: the rectangles that must be seen through are
-        outline = np.column_stack([spheres[:, :3], arm[:, 3] + margin]).astype(np.float32)
+        # the rectangles that must be seen through are larger by the error of the angle
+        outline = np.column_stack([spheres[:, :3], arm[:, 3] + view.pose_deviation[0]]).astype(np.float32)
         _hide_arm(depth, empty, intrinsics, outline)
     return depth, spread, spheres
 

@@ -268,7 +268,7 @@ def seen_points(
         count = 0
         for view in views:
             spheres = placed_spheres(robot, start if view.configuration is None else view.configuration)
-            depth, spread, _ = filtered(view)
+            depth, spread = filtered(view)
             spheres = grown_for_errors(spheres, view, spread)
             spheres = (spheres + np.array([0, 0, 0, ARM_DISTANCE])).astype(np.float32)
             if view.cloud is not None:

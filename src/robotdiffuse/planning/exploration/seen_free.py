@@ -153,9 +153,10 @@ class GoalSeen:
         self.taken.clear()
 
     def observe(self, view: DepthView) -> None:
-        """Take a new view with a configuration into account."""
-        if self._required and view.configuration is not None:
-            self.taken.append(view.configuration)
+        """Take a new view into account."""
+        assert view.configuration is not None  # the map takes no other views
+        self.taken.append(view.configuration)
+        if self._required:
             self._unseen = {q: self._not_shown(balls, [view]) for q, balls in self._unseen.items()}
 
     def best(self, start: Configuration, goals: Configurations) -> Configuration:
