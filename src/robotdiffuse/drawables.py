@@ -224,7 +224,7 @@ def _point_surface(cloud: PointCloud, color: Color) -> Surface:
     return Surface(vertices, np.tile(axes, (len(points), 1)), painted(color, len(vertices)), many)
 
 
-def thinned(points: Points) -> Float[ndarray, "m 3"]:
+def thinned(points: Points) -> Points:
     """At most MAX_SIZE of the points: every k-th one."""
     return points[:: -(-len(points) // MAX_SIZE)] if len(points) else points
 

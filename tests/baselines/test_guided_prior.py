@@ -191,12 +191,6 @@ def test_the_guide_gets_the_number_of_steps_to_come(gaussian: Gaussian) -> None:
     assert stopped is None and len(told) == 5
 
 
-@pytest.mark.parametrize("levels", [[], [3, 3], [1, 2], [256, 1], [5, 0]])
-def test_levels_must_fall(gaussian: Gaussian, levels: list[int]) -> None:
-    with pytest.raises(InputError, match="must fall from at most 255 to 1"):
-        sample(gaussian, LEFT[None], RIGHT[None], np.array(levels, np.int64), np.random.default_rng(0), stay)
-
-
 @pytest.mark.parametrize("spaced", [exponential_levels, quadratic_levels])
 @pytest.mark.parametrize("steps", [2, 25, 30, 254, 255])
 def test_spaced_levels(spaced, steps: int) -> None:

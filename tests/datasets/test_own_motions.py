@@ -51,7 +51,7 @@ def test_what_is_wrong_is_named(tmp_path: Path, motions: list[np.ndarray], scene
     for paths, around, message in (
         ([], scenes[0], "paths is empty"),
         ([[0.0] * 7], scenes[0], r"paths\[0\] is .* it must be n x 7 numbers"),
-        (far, scenes[:3], r"paths\[2\]: panda_joint7 is 9.785 in row 0; its limits are -2.8973"),
+        (far, scenes[:3], r"paths\[2\], row 0: panda_joint1 is 9 rad; its limits are -2.8973"),
         (motions, scenes[:3], "scenes are 3; they must be one rd.Scene, or one for each of 24 paths"),
         (motions[:1], rd.Scene([rd.Cylinder([1, 1, 1], 0.1, 0.1)]), "only spheres and boxes can be packed"),
     ):

@@ -112,5 +112,5 @@ def test_a_motion_that_stands_still_is_not_planned_again() -> None:
     problem = Problem(PANDA, Scene(), START, JointGoal(START[None]))
     found = RRTConnect().plan(problem, time_limit=2.0, seed=0)
     first = replace(found, path=Motion(PANDA.joint_names, START[None]))
-    again, best = restarted(RRTConnect(), problem, 0, 2.0, first)
+    again, best = restarted(RRTConnect(), problem, 0, 2.0, first, {})
     assert (again, best.path_length) == (0, 0.0)

@@ -41,7 +41,7 @@ def two(settings: PlannerTraining, out: Path) -> None:
     def first_step_kept(self):
         original(self)
         if self.at.step == 1 and self.processes.first:
-            gradients = {name: p.grad for name, p in self.parameters.items() if p.grad is not None}
+            gradients = {str(i): p.grad for i, p in enumerate(self.parameters) if p.grad is not None}
             write_tensors(out / "first_step.safetensors", gradients, {})
 
     def cut(self):

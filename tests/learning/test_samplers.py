@@ -9,7 +9,7 @@ import torch
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.checkpoint import load_model
-from robotdiffuse.learning.diffusion import OBJECTIVES, SAMPLERS, NoiseSchedule, ScheduleSettings, ddim
+from robotdiffuse.learning.diffusion import OBJECTIVES, SAMPLERS, NoiseSchedule, ScheduleSettings
 
 MEAN = np.array([0.7, -0.3])
 MIX = np.array([[1.2, 0.3], [0.4, 0.6]])
@@ -134,15 +134,12 @@ def test_calls_of_the_predictor(name, steps):
 
 
 @pytest.mark.parametrize("name", SAMPLERS)
-def test_refused_steps_and_shares(name):
+def test_refused_steps(name):
     schedule = cosine_schedule()
     predict = best_predictor(cosine_schedule())
     for steps in (-1, 0, 201):
         with pytest.raises(InputError, match=f"sampling steps is {steps}; it must be between 1 and 200"):
             SAMPLERS.load(name)(predict, schedule, lambda: np.zeros((1, 2)), steps, 0.0)
-    for eta in (-0.1, 1.5, float("nan")):
-        with pytest.raises(InputError, match=f"eta is {eta}; it must be between 0 and 1"):
-            ddim(predict, schedule, lambda: np.zeros((1, 2)), 5, eta)
 
 
 def network(x: np.ndarray, level: int) -> np.ndarray:

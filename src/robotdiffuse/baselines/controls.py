@@ -159,7 +159,7 @@ def library(data: str, robot: Robot) -> Trajectories:
 
 def bent(
     motions: Float[ndarray, "n waypoints dof"], start: Configuration, goal: Configuration, count: int
-) -> Float[ndarray, "count waypoints dof"]:
+) -> Trajectories:
     """The motions, forwards or backwards, whose ends are nearest to start and goal, the nearest first; the
     difference of the ends is spread evenly along each."""
     both = np.concatenate([motions, motions[:, ::-1]])

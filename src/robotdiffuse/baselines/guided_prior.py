@@ -76,7 +76,7 @@ from math import ceil
 from typing import Annotated, ClassVar, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
@@ -85,8 +85,8 @@ from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Filled, Natural, NotNegative, Positive, Settings, Share
-from robotdiffuse.core.types import Configuration, Configurations
-from robotdiffuse.learning.diffusion import NoiseSchedule, reverse_process
+from robotdiffuse.core.types import Configuration, Configurations, Values
+from robotdiffuse.learning.diffusion import NoiseLevels, NoiseSchedule, reverse_process
 from robotdiffuse.learning.guidance import Trajectories
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.planning.context import PlanningContext
@@ -130,7 +130,7 @@ class GuidedPrior(ExportedPlanner[GuidedPriorSettings]):
 
     @staticmethod
     @abstractmethod
-    def levels(schedule: NoiseSchedule, steps: int) -> Int[ndarray, "steps"]:
+    def levels(schedule: NoiseSchedule, steps: int) -> NoiseLevels:
         """The noise levels of the denoising steps, falling."""
 
     @abstractmethod
@@ -190,7 +190,7 @@ def sample(
     prior: MotionModel,
     starts: Configurations,
     goals: Configurations,
-    levels: Int[ndarray, "steps"],
+    levels: NoiseLevels,
     rng: np.random.Generator,
     guide: Guide,
     noise_scale: float = 1.0,
@@ -230,7 +230,7 @@ def sample(
     return q
 
 
-def falling(rising: Int[ndarray, "steps"], most: int) -> Int[ndarray, "steps"]:
+def falling(rising: NoiseLevels, most: int) -> NoiseLevels:
     """Rising levels in reverse order, with equal ones moved apart, up to `most`."""
     at = np.arange(len(rising))
     spaced = np.maximum.accumulate(rising - at) + at
@@ -251,7 +251,7 @@ def collision_gradient(
     margin: float,
     self_margin: float,
     between: int,
-) -> tuple[Float[ndarray, "count"], Trajectories]:
+) -> tuple[Values, Trajectories]:
     """Collision cost of trajectories [m] and its gradient by their waypoints [m/rad], of the ends too.
 
     The cost of a configuration is the root of the sum of h² over the covering spheres and pairs of links,
@@ -311,7 +311,7 @@ class MPDSettings(PriorSettings, name="mpd"):
     """Places between two waypoints at which the collision cost is evaluated."""
 
 
-def exponential_levels(schedule: NoiseSchedule, steps: int) -> Int[ndarray, "steps"]:
+def exponential_levels(schedule: NoiseSchedule, steps: int) -> NoiseLevels:
     """The levels nearest to those of MPD's exponential schedule in log signal-to-noise ratio, falling from T.
 
     Its betas grow by a constant factor; levels that would fall together are moved apart. Raises InputError
@@ -461,7 +461,7 @@ class EDMPSettings(PriorSettings, name="edmp"):
         return [slice(a, b) for a, b in pairwise(cuts)]
 
 
-def quadratic_levels(schedule: NoiseSchedule, steps: int) -> Int[ndarray, "steps"]:
+def quadratic_levels(schedule: NoiseSchedule, steps: int) -> NoiseLevels:
     """`steps` of the levels, falling from T, closer together where there is little noise (Song et al. 2021,
     D.2).
 

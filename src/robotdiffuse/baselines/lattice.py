@@ -30,7 +30,7 @@ from math import comb, sqrt
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
@@ -41,7 +41,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.kernels import allocation_free, kernel
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive, Settings
-from robotdiffuse.core.types import Configuration, Configurations, Status
+from robotdiffuse.core.types import Configuration, Configurations, Status, Values
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.planner import Planner, ever_finer
 from robotdiffuse.planning.start_goal import StartGoal
@@ -587,7 +587,7 @@ class LatticeSearch:
         self._search = self._search._replace(space=space, work=work)
         update(self._search, distances, self._reach)
 
-    def _distances_to_changes(self, checker: CollisionChecker) -> Float[ndarray, "capacity"]:
+    def _distances_to_changes(self, checker: CollisionChecker) -> Values:
         """A lower bound of the distance of the arm at each node from shapes that were added, removed or moved
         [m]."""
         distances = np.full(len(self._search.keys), np.inf, np.float32)

@@ -30,7 +30,7 @@ import numpy as np
 from robotdiffuse.collision.kernels import lane_collision
 from robotdiffuse.collision.kernels.motions import Space, motions_free
 from robotdiffuse.collision.motions import finer_resolution, search_space
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, needs
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import NotNegative, Positive, Settings
 from robotdiffuse.core.types import Configuration, Configurations, Path
@@ -39,14 +39,10 @@ from robotdiffuse.planning.planner import Planner, ever_finer
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.robots.robot import Robot
 
-try:
+with needs("OMPL's Python bindings", "baselines"):
     from ompl import base as ob
     from ompl import geometric as og
     from ompl import util as ou
-except ImportError:
-    raise InputError(
-        'planners of OMPL need its Python bindings, not installed: pip install "robotdiffuse[baselines]"'
-    ) from None
 
 IMPROVEMENT = 0.01
 """An anytime planner stops to have a path validated when it is shorter than the last by this part."""
@@ -174,7 +170,7 @@ class OmplPlanner(Planner[OmplSettings]):
 
     settings_class = OmplSettings
     algorithm: ClassVar[type[ob.Planner]]
-    anytime: ClassVar[bool]
+    anytime: ClassVar[bool] = False
     """Whether it improves its first path."""
     backwards: ClassVar[bool] = False
     """Whether OMPL searches from the goals to the start."""
@@ -245,7 +241,6 @@ class OmplRRT(OmplPlanner):
 
     name = "ompl_rrt"
     algorithm = og.RRT
-    anytime = False
 
 
 class OmplRRTConnect(OmplPlanner):
@@ -254,7 +249,6 @@ class OmplRRTConnect(OmplPlanner):
 
     name = "ompl_rrt_connect"
     algorithm = og.RRTConnect
-    anytime = False
 
 
 class OmplPRM(OmplPlanner):
@@ -263,7 +257,6 @@ class OmplPRM(OmplPlanner):
 
     name = "ompl_prm"
     algorithm = og.PRM
-    anytime = False
     # a second thread adds all goals but the first, and holds the roadmap's lock while it waits for Python's,
     # which the first thread holds while it waits for the roadmap's; with a single goal it adds none
     backwards = True

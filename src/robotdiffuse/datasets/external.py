@@ -20,7 +20,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.bounds import numbers
-from robotdiffuse.core.errors import InputError, distinct, shortened, shown
+from robotdiffuse.core.errors import InputError, shortened, shown
 from robotdiffuse.core.input_files import input_file
 from robotdiffuse.core.output_files import lock_folder, write_atomically
 from robotdiffuse.core.types import Path, Trajectory
@@ -38,7 +38,7 @@ from robotdiffuse.datasets.shards import (
     write_shard,
 )
 from robotdiffuse.problems.families import load_family
-from robotdiffuse.problems.problem import LIMIT_SLACK
+from robotdiffuse.problems.problem import LIMIT_SLACK, checked_configuration
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
@@ -187,13 +187,11 @@ def _positions(robot: Robot, i: int, path: object) -> ndarray:
         raise InputError(
             f"paths[{i}] is {shown(positions)}; it must be n x {robot.dof} numbers, n at least 2: {names}"
         )
-    beyond = np.maximum(robot.lower - q, q - robot.upper)
-    beyond[:, robot.continuous] = 0
-    if not np.isfinite(q).all() or beyond.max() > LIMIT_SLACK:
-        row, j = np.unravel_index(int(np.nanargmax(np.where(np.isfinite(q), beyond, np.inf))), q.shape)
-        value, lower, upper = distinct(q[row, j], robot.lower[j], robot.upper[j])
-        limits = f"its limits are {lower} to {upper} [rad]"
-        raise InputError(f"paths[{i}]: {robot.joint_names[j]} is {value} in row {row}; {limits}")
+    within = np.maximum(robot.lower - q, q - robot.upper) <= LIMIT_SLACK
+    within[:, robot.continuous] = np.isfinite(q[:, robot.continuous])
+    if not within.all():
+        row = int(within.min(axis=1).argmin())
+        checked_configuration(robot, f"paths[{i}], row {row}", q[row], [])
     return q
 
 

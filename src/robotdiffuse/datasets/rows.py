@@ -11,14 +11,16 @@ from dataclasses import dataclass
 from pathlib import Path as FilePath
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int8
+from jaxtyping import Float, Float32, Int8
 from numpy import ndarray
+from numpy.typing import ArrayLike
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import quaternion_from_rotation
-from robotdiffuse.core.types import Configurations, Path, Pose, Trajectory, Values
+from robotdiffuse.core.types import Configurations, Mask, Path, Pose, Trajectory, Values
 from robotdiffuse.datasets.shards import (
+    ARRAYS,
     SPLITS,
     Manifest,
     Shard,
@@ -34,7 +36,7 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import PackedScenes, floor_row
 
-Row = dict[str, ndarray | np.generic]
+Row = dict[str, ndarray]
 """A row of a shard: the row of each array, by its name in `shards.ARRAYS`."""
 
 
@@ -65,27 +67,27 @@ def row_of(
     padding = [(0, most_goals - len(goals)), (0, 0)]
     straight = float(np.linalg.norm(q[-1].astype(np.float64) - q[0]))
     wxyz = quaternion_from_rotation(T_base_tip[:3, :3])
-    row: Row = {
+    row: dict[str, ArrayLike] = {
         "trajectories": q,
         "start": q[0],
-        "goals": np.pad(goals.astype(np.float32), padding, constant_values=np.nan),
-        "goal_costs": np.pad(goal_costs.astype(np.float32), padding[0], constant_values=np.nan),
-        "goal_index": np.int8(goal_index),
-        "target_pose": np.concatenate([wxyz, T_base_tip[:3, 3]]).astype(np.float32),
+        "goals": np.pad(goals, padding, constant_values=np.nan),
+        "goal_costs": np.pad(goal_costs, padding[0], constant_values=np.nan),
+        "goal_index": goal_index,
+        "target_pose": np.concatenate([wxyz, T_base_tip[:3, 3]]),
         "obstacle_kinds": scene.kinds[0],
         "obstacle_params": scene.params[0],
-        "family": np.int8(family),
-        "cost": np.float32(cost),
-        "clearance": np.float32(clearances.min()),
-        "end_clearance": clearances[[0, -1]].astype(np.float32),
-        "safety_distance": np.float32(safety_distance),
-        "line_free": np.bool_(line_free),
-        "detour": np.float32(cost / max(straight, 1e-9)),
-        "seed": np.uint64(seed),
+        "family": family,
+        "cost": cost,
+        "clearance": clearances.min(),
+        "end_clearance": clearances[[0, -1]],
+        "safety_distance": safety_distance,
+        "line_free": line_free,
+        "detour": cost / max(straight, 1e-9),
+        "seed": seed,
     }
     if times is not None:
-        row["times"] = times.astype(np.float32)
-    return row
+        row["times"] = times
+    return {name: np.asarray(value, ARRAYS[name][0]) for name, value in row.items()}
 
 
 def scenes_of(manifest: Manifest, shard: Shard, rows: slice = slice(None)) -> PackedScenes:
@@ -225,7 +227,7 @@ def turned(
     q: Float32[ndarray, "n waypoints dof"],
     scenes: PackedScenes,
     rng: np.random.Generator,
-) -> tuple[Float32[ndarray, "n waypoints dof"], PackedScenes, Bool[ndarray, "n"]]:
+) -> tuple[Float32[ndarray, "n waypoints dof"], PackedScenes, Mask]:
     """Turn each motion and its scene by a random angle, uniform within the limits of the first joint.
 
     Returns the motions, the scenes and which motions are free of collision with the base.

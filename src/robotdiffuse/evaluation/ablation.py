@@ -7,7 +7,7 @@ without guidance.
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path as FilePath
 from typing import Annotated, Any, NamedTuple
@@ -319,11 +319,9 @@ def table2(settings: AblationSettings, results: list[RowResult]) -> Report:
 
 def table(settings: AblationSettings, results: list[RowResult]) -> Table:
     """The rows of Table 2, with the paper's figures beside ours."""
-    settings_by_name = asdict(settings)
-    budget = ("samples", "encoder_samples", "problems", "candidates")
-    title = (
-        f"Table 2 on {settings.family}: {', '.join(f'{name} {settings_by_name[name]:,}' for name in budget)}"
-    )
+    names = ("samples", "encoder_samples", "problems", "candidates")
+    budget = ", ".join(f"{name} {getattr(settings, name):,}" for name in names)
+    title = f"Table 2 on {settings.family}: {budget}"
     several = settings.seeds > 1
     columns = (
         *("row", "guided"),

@@ -472,8 +472,9 @@ def _note_session(settings: BenchSettings, sessions: JsonLines) -> str:
 
 # Presets
 
-BY_LENGTH = ":objective=length"
-"""Suffix for planners that shall minimize path length."""
+# For the shortest paths.
+AORRTC = "aorrtc:objective=length"
+RRT_CONNECT = "rrt_connect:objective=length"
 ROP = ("rop_nontrivial", "rop_dense_nontrivial")
 
 
@@ -492,17 +493,12 @@ class Preset:
     """See `BenchSettings`."""
 
 
-def by_length(*planners: str) -> tuple[str, ...]:
-    """The planners, for the shortest paths."""
-    return tuple(name + BY_LENGTH for name in planners)
-
-
 PRESETS: dict[str, Preset] = {
     "equal_time": Preset(
         "path lengths at one second: search, diffusion, learned baselines",
         (
-            *by_length("aorrtc", "rrt_connect"),
-            *("shared_tree_rrt_star", "diffusion", "mpd", "edmp", "mpnet", "mpinets"),
+            *(AORRTC, RRT_CONNECT, "shared_tree_rrt_star"),
+            *("diffusion", "mpd", "edmp", "mpnet", "mpinets"),
         ),
         (*ROP, "shelf_nontrivial"),
         (1.0,),
@@ -510,7 +506,7 @@ PRESETS: dict[str, Preset] = {
     ),
     "learning": Preset(
         "the network alone beside search, with 0.1 and 0.3 s",
-        ("diffusion", *by_length("aorrtc"), "shared_tree_rrt_star"),
+        ("diffusion", AORRTC, "shared_tree_rrt_star"),
         (*ROP, "shelf_nontrivial"),
         (0.1, 0.3),
         150,
@@ -518,9 +514,11 @@ PRESETS: dict[str, Preset] = {
     "durations": Preset(
         "durations of motions with 0.1 and 1 s: by time, by length, and the timed paths of OMPL",
         (
-            *("aorrtc", "diffusion"),
-            *by_length("aorrtc"),
-            *("ompl_rrt_connect", "ompl_aorrtc"),
+            "aorrtc",
+            "diffusion",
+            AORRTC,
+            "ompl_rrt_connect",
+            "ompl_aorrtc",
         ),
         ("shelf_nontrivial", "crate_nontrivial", "table_nontrivial", "kitchen_nontrivial", "rop_nontrivial"),
         (0.1, 1.0),
@@ -529,14 +527,14 @@ PRESETS: dict[str, Preset] = {
     ),
     "anytime": Preset(
         "anytime search beside OMPL's: Shared-Tree Informed RRT*, AORRTC, Informed RRT*",
-        ("shared_tree_rrt_star", *by_length("aorrtc"), "ompl_aorrtc", "ompl_informed_rrt_star"),
+        ("shared_tree_rrt_star", AORRTC, "ompl_aorrtc", "ompl_informed_rrt_star"),
         ROP,
         (1.0,),
         100,
     ),
     "restarts": Preset(
         "AORRTC beside restarts of RRT-Connect until the same limit",
-        by_length("aorrtc", "rrt_connect"),
+        (AORRTC, RRT_CONNECT),
         (*ROP, "shelf_nontrivial"),
         (1.0,),
         100,

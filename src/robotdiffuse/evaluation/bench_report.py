@@ -13,13 +13,12 @@ from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import JsonLines
 from robotdiffuse.core.tables import Cell, Column, Figure, Table, plain
-from robotdiffuse.core.types import Status, Values
+from robotdiffuse.core.types import Configurations, Status, Values
 from robotdiffuse.evaluation.metrics import METRICS, Metric
 from robotdiffuse.evaluation.problem_sets import read_cases
 from robotdiffuse.evaluation.report import Report, draw_plot, interval, share_cell
@@ -497,39 +496,36 @@ UNEQUAL_NOTE = (
     "† not at equal time: this planner or the reference ended before the limit. `bench run --equal-time` "
     "repeats such calls until the limit."
 )
-NOTES = (
-    "A call counts for a limit if its own limit was at least as long, or if it ended by itself before: "
-    "more time would change nothing. A table compares the problems on which all its planners have such a "
-    "call.",
-    "success: verified motions found by the limit, with the 95 % interval over problems (Wilson). A "
-    "motion that a call returned up to 10 % or 50 ms after its own limit counts: planners stop in time, "
-    "and validation follows.",
-    "collision: share of problems on which the validator refused the planner's last path because it "
-    "collides.",
-    "link length: the paper's, the path lengths of the links that joints move together, mean over the "
-    "problems that the planner itself solved; planners that solve only easy problems seem short. If a call "
-    "continued and returned a shorter path, its length by the limit is that of the returned path, scaled by "
-    "the lengths in joint space.",
-    "ratio: median of the length in joint space over that of the reference, on problems that both solve, "
-    "with its 95 % interval (bootstrap over problems), at equal time: for planners that use up the limit. "
-    "restarted: a planner that ends earlier is called again with other seeds until its calls have used up "
-    "the limit together, and the shortest path counts; the time for timing the other motions does not.",
-    "first: median time to the first path of solved problems. returns: mean time until the planner "
-    "returns; anytime planners use up the limit, and unsolved problems count with it.",
-    "ComScore: as in the paper, from success, collision, length and time until the planner returns, each "
-    "from 0 for the worst row of the table to 1 for the best. It depends on the rows of the table; those "
-    "with restarts are left out. `robotdiffuse reproduce table1` computes it among the paper's rows.",
-    "Quality: means with 95 % intervals of the returned motions, over the solved problems. clearance: a lower"
-    " bound, to obstacles (scene), of the arm to itself (self), and the smaller of the two. over straight "
-    "line: duration over the least time along the straight line, obstacles and limits of jerk aside. stops: "
-    "times that the whole arm rests on the way. peak and mean jerk: of the joint where it is largest. "
-    "bending: the integral of the squared second derivative of the path, over its squared length. jerk: "
-    "logarithm of the dimensionless jerk, lower is smoother; sparc: spectral arc length of the joints' and "
-    "the tip's speed, closer to 0 is smoother.",
-    "p of success: McNemar's exact test; p of joint length: Wilcoxon's signed ranks; neither is corrected "
-    "for the number of comparisons. With several seeds, a problem counts as solved if more than half of them "
-    "are.",
-)
+NOTES = """\
+- A call counts for a limit if its own limit was at least as long, or if it ended by itself before: more
+  time would change nothing. A table compares the problems on which all its planners have such a call.
+- success: verified motions found by the limit, with the 95 % interval over problems (Wilson). A motion that
+  a call returned up to 10 % or 50 ms after its own limit counts: planners stop in time, and validation
+  follows.
+- collision: share of problems on which the validator refused the planner's last path because it collides.
+- link length: the paper's, the path lengths of the links that joints move together, mean over the problems
+  that the planner itself solved; planners that solve only easy problems seem short. If a call continued and
+  returned a shorter path, its length by the limit is that of the returned path, scaled by the lengths in
+  joint space.
+- ratio: median of the length in joint space over that of the reference, on problems that both solve, with
+  its 95 % interval (bootstrap over problems), at equal time: for planners that use up the limit. restarted:
+  a planner that ends earlier is called again with other seeds until its calls have used up the limit
+  together, and the shortest path counts; the time for timing the other motions does not.
+- first: median time to the first path of solved problems. returns: mean time until the planner returns;
+  anytime planners use up the limit, and unsolved problems count with it.
+- ComScore: as in the paper, from success, collision, length and time until the planner returns, each from 0
+  for the worst row of the table to 1 for the best. It depends on the rows of the table; those with restarts
+  are left out. `robotdiffuse reproduce table1` computes it among the paper's rows.
+- Quality: means with 95 % intervals of the returned motions, over the solved problems. clearance: a lower
+  bound, to obstacles (scene), of the arm to itself (self), and the smaller of the two. over straight line:
+  duration over the least time along the straight line, obstacles and limits of jerk aside. stops: times
+  that the whole arm rests on the way. peak and mean jerk: of the joint where it is largest. bending: the
+  integral of the squared second derivative of the path, over its squared length. jerk: logarithm of the
+  dimensionless jerk, lower is smoother; sparc: spectral arc length of the joints' and the tip's speed,
+  closer to 0 is smoother.
+- p of success: McNemar's exact test; p of joint length: Wilcoxon's signed ranks; neither is corrected for
+  the number of comparisons. With several seeds, a problem counts as solved if more than half of them are."""
+"""Markdown."""
 
 
 def named(planner: str) -> str:
@@ -744,15 +740,15 @@ def bench_report(bench: Bench, parts: Sequence[Section], replays: str | None = N
         for comparison in section.comparisons:
             main, *further_tables = tables(section, comparison, bench.reference)
             report.table(main)
-            if comparison.missing:
-                report.add(plain(missing_line(comparison)))
+            if line := missing_line(comparison):
+                report.add(plain(line))
             for table in further_tables:
                 report.table(table, level=4)
     if broken := crashes(bench):
         report.add("## Crashes and exceptions")
         report.items(map(plain, broken))
     report.add("## How to read the tables")
-    report.items(NOTES)
+    report.add(NOTES)
     return report
 
 
@@ -815,7 +811,7 @@ class Replay(NamedTuple):
     title: str
     caption: str
     case: Case
-    positions: Float[ndarray, "n dof"]
+    positions: Configurations
 
 
 def motions_to_replay(bench: Bench, parts: Sequence[Section]) -> list[Replay]:

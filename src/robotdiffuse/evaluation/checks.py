@@ -121,14 +121,13 @@ class DataCheck:
         """A table of the result, and one of the first examples of each kind."""
         planned = f" of {self.planned:,} planned" if self.motions < self.planned else ""
         rate = self.checked / max(self.seconds, 1e-9)
+        found = {kind: f"{self.counts[kind]:,}" for kind in KINDS if self.pybullet or kind != "pybullet"}
         rows = [
             ("shards, motions", f"{self.shards:,}, {self.motions:,}{planned}"),
             ("validated", f"{self.checked:,} in {self.seconds:.1f} s ({rate:.0f}/s)"),
-            *((name, f"{self.counts[kind]:,}") for kind, name in KINDS.items()),
+            *((name, found.get(kind, "not checked")) for kind, name in KINDS.items()),
             ("least clearance recorded", f"{1e3 * self.least_clearance + 0.0:.3f} mm"),
         ]
-        if not self.pybullet:
-            rows = [(name, "not checked" if name == KINDS["pybullet"] else text) for name, text in rows]
         tables = [Table.pairs(f"{self.robot}: {'violations found' if self.findings else 'clean'}", rows)]
         if self.findings:
             examples = [

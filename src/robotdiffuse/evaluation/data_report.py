@@ -6,12 +6,12 @@ from functools import cached_property
 from pathlib import Path as FilePath
 
 import numpy as np
-from jaxtyping import Bool
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.tables import NO_VALUE, Column, Table, plain
+from robotdiffuse.core.types import Mask
 from robotdiffuse.datasets.rows import scenes_of
 from robotdiffuse.datasets.shards import (
     SPLITS,
@@ -86,7 +86,7 @@ class DataFigures:
         return len(self.all["cost"])
 
     @cached_property
-    def families(self) -> dict[str, Bool[ndarray, "n"]]:
+    def families(self) -> dict[str, Mask]:
         """The motions of each family that occurs."""
         of = {name: self.all["family"] == i for i, name in enumerate(self.manifest.families)}
         return {name: chosen for name, chosen in of.items() if chosen.any()}
@@ -147,7 +147,7 @@ def facts(data: DataFigures) -> list[tuple[str, str]]:
             f"waypoints, evenly spaced in {'length' if manifest.timing == 'arc' else 'time'}",
             f"{data.trajectories * manifest.waypoints:,}",
         ),
-        (f"in {data.shards:,} shards", size_in_words(data.bytes)),
+        (f"in {data.shards:,} shards", f"{data.bytes / 1e6:,.1f} MB"),
         ("splits", ", ".join(f"{count:,} {name}" for name, count in data.splits.items())),
         ("problems solved", f"{_share(solved)}; of {counts['tried']:,} tried {lost}"),
         (f"come no closer than {distance} or than their ends", _share(keeps_distance)),
@@ -193,11 +193,6 @@ def tables(data: DataFigures) -> list[Table]:
         Table.of("", (*columns, *of_shares), families),
         Table.of("", ("", "mean", *SPREAD), spreads),
     ]
-
-
-def size_in_words(size: int) -> str:
-    """A size on disk with its unit."""
-    return f"{size / 1e9:.2f} GB" if size >= 1e9 else f"{size / 1e6:.1f} MB"
 
 
 # The page

@@ -11,17 +11,15 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path as FilePath
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.baselines.controls import Control, ControlSettings
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Path, Status, Values
+from robotdiffuse.core.types import Mask, Path, Status, Values
 from robotdiffuse.evaluation.metrics import measured
 from robotdiffuse.evaluation.runs import (
     ENDED_EARLY,
@@ -34,6 +32,7 @@ from robotdiffuse.evaluation.runs import (
     Method,
     Run,
 )
+from robotdiffuse.learning.guidance import Trajectories
 from robotdiffuse.planning.diffusion import Diffusion, DiffusionSettings, encode
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.held_out import goal_of
@@ -68,7 +67,7 @@ def planner_calls(
     seed: int,
     limit: float,
     restarts: bool,
-    request: Mapping[str, Any] = MappingProxyType({}),
+    request: Mapping[str, Any],
 ) -> Iterator[Fields]:
     """Yield the fields of a call's record; with `restarts`, if the call ended early, also those of
     `restarted`. An exception is a record too."""
@@ -92,7 +91,7 @@ def restarted(
     seed: int,
     limit: float,
     first: PlanResult,
-    request: Mapping[str, Any] = MappingProxyType({}),
+    request: Mapping[str, Any],
 ) -> tuple[int, PlanResult]:
     """Call a planner again with fresh seeds until its calls have used up the time limit together.
 
@@ -152,15 +151,15 @@ Draw = Callable[[Run, CollisionChecker], ndarray]
 class Validated(NamedTuple):
     """The validator's verdict on a batch."""
 
-    passed: Bool[ndarray, "n"]
-    hit: Bool[ndarray, "n"]
+    passed: Mask
+    hit: Mask
     """Which trajectories are in collision."""
     reports: list[Report]
-    waypoints: Float[ndarray, "n waypoints dof"]
+    waypoints: Trajectories
     """The trajectories with exact ends."""
 
 
-def validated(problem: Problem, q: Float[ndarray, "n waypoints dof"]) -> Validated:
+def validated(problem: Problem, q: Trajectories) -> Validated:
     """Validate trajectories as they are, except that their ends are made exact."""
     validator = verifier(problem, VerifySettings())
     exact = q.astype(np.float64)
@@ -172,7 +171,7 @@ def validated(problem: Problem, q: Float[ndarray, "n waypoints dof"]) -> Validat
     return Validated(np.array(passed), np.array(hit), reports, exact)
 
 
-def path_lengths(q: Float[ndarray, "n waypoints dof"]) -> Values:
+def path_lengths(q: Trajectories) -> Values:
     """Joint-space lengths [rad]."""
     return np.linalg.norm(np.diff(q, axis=1), axis=2).sum(axis=1)
 

@@ -111,11 +111,6 @@ def problem_file(out: FilePath, problem_set: str) -> FilePath:
     return out / "problems" / f"{problem_set}.jsonl"
 
 
-def case_name(problem_set: str, number: int) -> str:
-    """The name of a problem in its set."""
-    return f"{problem_set}/{number}"
-
-
 def write_problems(out: FilePath, count: int, report: Say) -> None:
     """Draw the first `count` problems of both sets that are not trivial into the folder of a bench, unless it
     has them."""
@@ -125,7 +120,7 @@ def write_problems(out: FilePath, count: int, report: Say) -> None:
         for number in itertools.count():
             for name, problem in draw_problem(number).items():
                 if len(cases[name]) < count and not any(free_lines(problem, goal_configurations(problem))):
-                    cases[name].append(Case(case_name(name, number), "rop", problem, False, None, name))
+                    cases[name].append(Case(f"{name}/{number}", "rop", problem, False, None, name))
             if all(len(found) == count for found in cases.values()):
                 break
         for name, file in files.items():
@@ -479,10 +474,10 @@ class Noisy(NamedTuple):
     path: Path
 
 
-def denoising(problem: Problem, seed: int = 0) -> list[Noisy]:
+def denoising(problem: Problem) -> list[Noisy]:
     """One motion of the bundled network at several noise levels, without guidance, the noisiest first."""
     planner = Diffusion()
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     robot = problem.robot
     model = planner.network(robot)
     checker = CollisionChecker(robot, problem.scene)
@@ -559,14 +554,14 @@ class Compared(NamedTuple):
     """By planner."""
 
 
-def compared_motions(bench: Bench, planners: Sequence[str] = COMPARED) -> Compared | None:
-    """The problem that is not trivial and solved by all of these planners on which their lengths differ
+def compared_motions(bench: Bench) -> Compared | None:
+    """The problem that is not trivial and solved by all planners of figure 3b on which their lengths differ
     most; None without one."""
     solved = {
         planner: {
             (r.problem_set, r.name): r for r in bench.records.get(planner, ()) if r.solved and not r.trivial
         }
-        for planner in planners
+        for planner in COMPARED
     }
     keys = sorted(set.intersection(*map(set, solved.values())))
     if not keys:

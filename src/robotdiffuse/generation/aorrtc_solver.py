@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings
-from robotdiffuse.core.types import Configurations
+from robotdiffuse.core.types import Configuration, Configurations, Values
 from robotdiffuse.planning.search.rrt import AnytimeSearch, SearchSettings
 from robotdiffuse.planning.start_goal import StartGoal, falling_clearances
 from robotdiffuse.robots.kinematic_tree import TURN
@@ -47,7 +46,7 @@ class AORRTCSearch:
     def __init__(
         self,
         checker: CollisionChecker,
-        start: Float[ndarray, "dof"],
+        start: Configuration,
         goals: Configurations,
         settings: AORRTCSearchSettings,
         state: ndarray,
@@ -83,17 +82,12 @@ class AORRTCSearch:
                 break
             search.improve(ITERATIONS_PER_STEP)
         if search.best is not None:
-            self._arrive(search.best)
-
-    def _arrive(self, path: Configurations) -> None:
-        """Set `best_goal`; a continuous joint may end whole turns from its given value."""
-        end = self._ends.complete(path)[-1]
-        turns = np.abs(self.goals - end) / TURN
-        max_joint_distance = np.where(self._robot.continuous, np.abs(turns - np.round(turns)), turns).max(
-            axis=1
-        )
-        self.best_goal = int(max_joint_distance.argmin())
-        self.goals[self.best_goal] = end
+            # a continuous joint may end whole turns from its given value
+            end = self._ends.complete(search.best)[-1]
+            turns = np.abs(self.goals - end) / TURN
+            distances = np.where(self._robot.continuous, np.abs(turns - np.round(turns)), turns)
+            self.best_goal = int(distances.max(axis=1).argmin())
+            self.goals[self.best_goal] = end
 
     @property
     def cost(self) -> float:
@@ -101,7 +95,7 @@ class AORRTCSearch:
         return float(self._search.length)
 
     @property
-    def goal_costs(self) -> Float[ndarray, "k"]:
+    def goal_costs(self) -> Values:
         """Length of the best path for its goal [rad]; infinite for the others."""
         costs = np.full(len(self.goals), np.inf)
         if self.best_goal >= 0:

@@ -308,9 +308,10 @@ def _fill(
     if cluster is None:
         shards = on_this_machine(make_shard, [(settings, index) for index in missing], workers)
     else:
-        absolute = _as_absolute(settings)
-        local_record = _reproducibility_record(absolute)
-        shards = CLUSTERS[cluster](_make_on_node, [(absolute, index, local_record) for index in missing])
+        if names_a_file(settings.robot):  # nodes have other working folders
+            settings = replace(settings, robot=str(FilePath(settings.robot).resolve()))
+        local_record = _reproducibility_record(settings)
+        shards = CLUSTERS[cluster](_make_on_node, [(settings, index, local_record) for index in missing])
     # close it at once, so that workers stop when this is interrupted
     with closing(shards):
         for number, (arrays, counts) in shards:
@@ -321,12 +322,6 @@ def _fill(
             finished += settings.rows(index)
             progress(finished, settings.trajectories)
     return settings.trajectories
-
-
-def _as_absolute(settings: GenerationSettings) -> GenerationSettings:
-    """The settings with an absolute path of the robot, for nodes with other working folders."""
-    file = FilePath(settings.robot)
-    return replace(settings, robot=str(file.resolve())) if names_a_file(settings.robot) else settings
 
 
 def _make_on_node(settings: GenerationSettings, index: int, wanted: dict[str, str]) -> tuple[Arrays, Counts]:

@@ -9,7 +9,6 @@ import copy
 import hashlib
 import json
 import struct
-from datetime import UTC, datetime
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -18,7 +17,6 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError, shortened
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.learning.completion import CompletionSettings
@@ -39,12 +37,6 @@ from robotdiffuse.learning.weight_files import (
     weights_folder,
 )
 from robotdiffuse.robots.robot import Robot
-
-
-def versions() -> dict[str, str]:
-    """Versions of this package and of PyTorch, and the date, for the description of a checkpoint."""
-    date = datetime.now(UTC).strftime("%Y-%m-%d")
-    return {"robotdiffuse": __version__, "torch": torch.__version__, "made": date}
 
 
 def write_tensors(file: FilePath, tensors: dict[str, Tensor], notes: dict[str, Any]) -> str:
@@ -76,13 +68,6 @@ def fingerprint(module: nn.Module) -> str:
     return digest.hexdigest()[:16]
 
 
-def _pack(module: nn.Module) -> dict[str, Tensor]:
-    """The weights to store: matrices of layers in fp16, others unchanged."""
-    kinds = (nn.Linear, nn.Conv3d)
-    half = {f"{name}.weight" for name, part in module.named_modules() if isinstance(part, kinds)}
-    return {name: t.half() if name in half else t for name, t in module.state_dict().items()}
-
-
 def save_network(name: str, network: Any, folder: str | FilePath, training: dict[str, Any]) -> None:
     """Write NAME.safetensors and NAME.json; `name` as in NETWORKS, or encoder or completion.
 
@@ -97,7 +82,10 @@ def save_network(name: str, network: Any, folder: str | FilePath, training: dict
 
 def _save(module: SavedModule, folder: FilePath, stem: str, about: dict[str, Any]) -> None:
     """Write STEM.safetensors, the exported parts, and last STEM.json with the SHA-256 of all."""
-    packed = _pack(module)
+    # matrices of layers in fp16, others unchanged
+    kinds = (nn.Linear, nn.Conv3d)
+    half = {f"{name}.weight" for name, part in module.named_modules() if isinstance(part, kinds)}
+    packed = {name: t.half() if name in half else t for name, t in module.state_dict().items()}
     digest = write_tensors(folder / f"{stem}.safetensors", packed, {})
     stored = copy.deepcopy(module).cpu()
     stored.load_state_dict(packed)  # exported as it will be read
@@ -135,8 +123,7 @@ def _load(name: str, folder: FilePath) -> Any:
     try:
         network.load_state_dict(read_tensors(weights)[0])
     except RuntimeError as error:
-        reason = " ".join(str(error).split())[:200]
-        raise InputError(f"{weights} does not fit its description: {reason}") from None
+        raise InputError(f"{weights} does not fit its description: {str(error)[:200]}") from None
     return network.requires_grad_(False).eval()
 
 

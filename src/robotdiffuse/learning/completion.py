@@ -20,6 +20,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Count, Settings
+from robotdiffuse.core.types import Configuration
 from robotdiffuse.learning.weight_files import (
     completion_folder,
     exported_files,
@@ -97,7 +98,7 @@ FREE = 2
 SHADOW = 4
 OUT_OF_VIEW = 8
 BITS = (OCCUPIED, FREE, SHADOW, OUT_OF_VIEW)
-"""The bits of `Sample.seen`."""
+"""The bits of `Samples.seen`."""
 
 
 @dataclass(frozen=True)
@@ -153,30 +154,21 @@ NO_FLOOR_SHARE = 0.1
 """Share of the samples without a floor: the arm stands on a pedestal."""
 
 
-class Sample(NamedTuple):
-    """An observed volume and the true occupancy, packed."""
+class Samples(NamedTuple):
+    """Observed volumes and the true occupancies, packed."""
 
-    seen: Packed
+    seen: UInt8[ndarray, "n 56 56 32"]
     """The bits of `BITS`."""
-    behind: Packed
+    behind: UInt8[ndarray, "n 56 56 32"]
     """Depth behind the nearest surface, in units of DEPTH_STEP."""
-    truth: Packed
+    truth: UInt8[ndarray, "n 56 56 32"]
     """Whether each of a voxel's eight voxels of 2 cm holds an obstacle: bit 4 x + 2 y + z."""
 
 
-class Samples(NamedTuple):
-    """Many samples: the arrays of `Sample` with a leading axis."""
-
-    seen: UInt8[ndarray, "n 56 56 32"]
-    behind: UInt8[ndarray, "n 56 56 32"]
-    truth: UInt8[ndarray, "n 56 56 32"]
-
-
 def pack(volume: ObservedVolume) -> tuple[Packed, Packed]:
-    """`Sample.seen` and `Sample.behind` of an observed volume."""
-    seen = np.zeros(SHAPE, np.uint8)
-    for bit, of in zip(BITS, (volume.occupied, volume.free, volume.shadow, volume.out_of_view), strict=True):
-        seen |= of * np.uint8(bit)
+    """`Samples.seen` and `Samples.behind` of an observed volume."""
+    kinds = np.stack([volume.occupied, volume.free, volume.shadow, volume.out_of_view], axis=-1)
+    seen = np.packbits(kinds, axis=-1, bitorder="little")[..., 0]
     return seen, np.minimum(np.rint(volume.behind / DEPTH_STEP), 255).astype(np.uint8)
 
 
@@ -186,7 +178,7 @@ def true_voxels(scene: Scene) -> Bool[ndarray, "112 112 64"]:
 
 
 def pack_fine(fine: Bool[ndarray, "112 112 64"]) -> Packed:
-    """`Sample.truth` of an occupancy."""
+    """`Samples.truth` of an occupancy."""
     out = np.zeros(SHAPE, np.uint8)
     for bit in range(8):
         out |= fine[bit >> 2 :: 2, bit >> 1 & 1 :: 2, bit & 1 :: 2] * np.uint8(1 << bit)
@@ -198,7 +190,7 @@ def unpack_fine(truth: UInt8[ndarray, "*b"]) -> Bool[ndarray, "*b 8"]:
     return (truth[..., None] >> np.arange(8, dtype=np.uint8) & 1).astype(np.bool_)
 
 
-def camera_view(scene: Scene, robot: Robot, q: Float[ndarray, "dof"], rng: Generator) -> DepthView:
+def camera_view(scene: Scene, robot: Robot, q: Configuration, rng: Generator) -> DepthView:
     """A depth view of the scene from a random pose, without noise."""
     obstacles = compile_scene_for(robot, scene)
     for _ in range(CAMERA_DRAWS):
@@ -211,20 +203,15 @@ def camera_view(scene: Scene, robot: Robot, q: Float[ndarray, "dof"], rng: Gener
     return ray_cast(scene, T, intrinsics, IMAGE_SIZE, robot, q)
 
 
-def random_configuration(checker: CollisionChecker, robot: Robot, rng: Generator) -> Float[ndarray, "dof"]:
-    """A uniform configuration without collision; with collision if 64 draws find none without."""
-    q = rng.uniform(robot.lower, robot.upper, (64, robot.dof))
-    free = np.flatnonzero(checker.free(q))
-    return q[free[0]] if len(free) else q[0]
-
-
-def draw_sample(families: Sequence[str], robot: Robot, rng: Generator) -> Sample:
-    """A random scene of one of the families, as cameras observe it."""
+def draw_sample(families: Sequence[str], robot: Robot, rng: Generator) -> tuple[Packed, Packed, Packed]:
+    """A random scene of one of the families, as cameras observe it: a row of `Samples`."""
     family = load_family(families[int(rng.integers(len(families)))])
     scene = family.scene(rng, base_spheres(robot))
     if rng.random() < NO_FLOOR_SHARE:
         scene = Scene([shape for shape in scene.shapes if shape is not family.floor])
-    q = random_configuration(CollisionChecker(robot, scene), robot, rng)
+    # the first of 64 configurations without collision; with collision if there is none
+    q = rng.uniform(robot.lower, robot.upper, (64, robot.dof))
+    q = q[CollisionChecker(robot, scene).free(q).argmax()]
     views = [camera_view(scene, robot, q, rng) for _ in range(rng.choice(VIEW_COUNTS))]
     if rng.random() < NOISE_SHARE:
         strength = 2 * rng.random()
@@ -232,8 +219,7 @@ def draw_sample(families: Sequence[str], robot: Robot, rng: Generator) -> Sample
         usual = replace(DepthNoise(), missing=MISSING_SHARE)
         noise = replace(usual, **{name: strength * getattr(usual, name) for name in NOISE_FIELDS})
         views = [noise.applied(_without_infinity(view) if hide_far else view, rng) for view in views]
-    seen, depth_behind = pack(observe(views, robot, q))
-    return Sample(seen, depth_behind, pack_fine(true_voxels(scene)))
+    return *pack(observe(views, robot, q)), pack_fine(true_voxels(scene))
 
 
 def _without_infinity(view: DepthView) -> DepthView:

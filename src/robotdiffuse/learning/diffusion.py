@@ -173,6 +173,7 @@ OBJECTIVES = Registry(
 """By the name in settings. A new one is a class and a line here."""
 
 Samples = Float[ndarray, "count ..."]
+NoiseLevels = Int[ndarray, "steps"]
 Predict = Callable[[ndarray, int], ndarray]
 """From (x_t [count, ...], t) to the predicted clean x_0. It converts the network's output by the objective,
 holds the ends and applies guidance."""
@@ -193,10 +194,8 @@ def ddim(
     steps: calls of the predictor, 1 to T.
     eta: share of the noise that is drawn afresh at every step: 0 is the deterministic probability flow, 1 the
         full stochastic process (ancestral sampling).
-    Raises InputError for steps or eta out of range.
+    Raises InputError for steps out of range.
     """
-    if not 0 <= eta <= 1:
-        raise InputError(f"eta is {eta}; it must be between 0 and 1")
     return reverse_process(predict, schedule, draw_noise, schedule.sampling_levels(steps)[:-1], eta=eta)
 
 
@@ -212,7 +211,7 @@ def reverse_process(
     predict: Predict,
     schedule: NoiseSchedule,
     draw_noise: DrawNoise,
-    levels: Int[ndarray, "steps"],
+    levels: NoiseLevels,
     move: MoveMean | None = None,
     noise_scale: float = 1.0,
     eta: float = 1.0,
@@ -229,11 +228,7 @@ def reverse_process(
     move: replaces the mean of a step, for example by one further down the costs of a guide (MPD, algorithm
         1).
     noise_scale: factor of the standard deviation of the noise that is added to the means (MPD: 0.5).
-
-    Raises InputError for levels that do not fall, or that the schedule lacks.
     """
-    if not len(levels) or np.any(np.diff(levels) >= 0) or not 1 <= levels[-1] <= levels[0] <= schedule.steps:
-        raise InputError(f"levels is {levels.tolist()}; they must fall from at most {schedule.steps} to 1")
     x = draw_noise()
     remaining = len(levels)
     for level, lower in pairwise([*levels.tolist(), 0]):

@@ -49,8 +49,7 @@ class OnnxNetwork:
         try:
             self._session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # ONNX Runtime's own classes of errors have no common base
-            reason = " ".join(str(error).split())[:200]
-            raise InputError(f"{name} is no network that ONNX Runtime can run: {reason}") from None
+            raise InputError(f"{name} is no network that ONNX Runtime can run: {str(error)[:200]}") from None
         self.inputs = tuple(node.name for node in self._session.get_inputs())
         """Names of the inputs."""
 
@@ -80,11 +79,7 @@ class ExportedModel(MotionModel):
         self._denoiser, self._encoder = networks[".onnx"], networks.get(".encoder.onnx")
         initial = Statistics.without_data(self.waypoints, self.dof)
         self._statistics = initial._replace(**read_arrays(folder, name, about, Statistics._fields))
-        self._check_sizes(location)
-
-    def _check_sizes(self, where: str) -> None:
-        """Raises InputError unless networks and statistics fit the description."""
-        initial = Statistics.without_data(self.waypoints, self.dof)
+        # networks and statistics must fit the description
         fits = [a.shape == b.shape for a, b in zip(self._statistics, initial, strict=True)]
         features = np.zeros((1, self.waypoints, self.feature_count), np.float32)
         condition = np.zeros((1, self.condition_count), np.float32)
@@ -94,10 +89,9 @@ class ExportedModel(MotionModel):
             if self._encoder is not None:
                 fits.append(self.encode(np.zeros((0, 3))).shape == (self.settings.code,))
         except Exception as error:  # ONNX Runtime's own classes of errors have no common base
-            reason = " ".join(str(error).split())[:200]
-            raise InputError(f"{where} does not fit its ONNX files: {reason}") from None
+            raise InputError(f"{location} does not fit its ONNX files: {str(error)[:200]}") from None
         if not all(fits):
-            raise InputError(f"{where} does not fit its weights: they are for other sizes")
+            raise InputError(f"{location} does not fit its weights: they are for other sizes")
 
     @property
     def statistics(self) -> Statistics:

@@ -31,6 +31,7 @@ from robotdiffuse.collision.kernels.collision_cost import CLEARANCE_CAP, cost_gr
 from robotdiffuse.collision.kernels.lane_clearance import make_clearance_workspace, pair_clearances_into
 from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
 from robotdiffuse.core.settings import NotNegative, Positive, Settings, Share
+from robotdiffuse.core.types import Values
 from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.problems.constraint_kernel import make_work
 from robotdiffuse.problems.projection_kernel import step
@@ -182,7 +183,7 @@ class CollisionGuidance:
         if constraints is not None:
             self._constraints = constraints.rows, constraints.limits(tolerance_share)
 
-    def __call__(self, q: Trajectories, steps: int) -> tuple[Trajectories, Float[ndarray, "count"]]:
+    def __call__(self, q: Trajectories, steps: int) -> tuple[Trajectories, Values]:
         """The trajectories [rad] after some steps, and the costs of the margins that the last step found.
 
         The first and the last waypoint stay where they are, and have no cost. A cost of zero: no waypoint

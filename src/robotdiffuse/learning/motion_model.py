@@ -13,13 +13,14 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray
+from numpy.random import Generator
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.batched_clearances import packed_clearances_and_gradients, packed_link_clearances
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Bound, Count, OneOf, Settings, SettingsOf, Share
-from robotdiffuse.core.types import Configuration
+from robotdiffuse.core.types import Configuration, Points
 from robotdiffuse.learning.denoisers import DENOISERS, DenoiserSettings, TransformerSettings
 from robotdiffuse.learning.diffusion import (
     OBJECTIVES,
@@ -261,7 +262,7 @@ class MotionModel(ABC):
         x[..., -1:, :] = reference.goal
         return x
 
-    def draw_noise(self, count: int, rng: np.random.Generator) -> Float[ndarray, "count waypoints dof"]:
+    def draw_noise(self, count: int, rng: Generator) -> Float[ndarray, "count waypoints dof"]:
         """Standard noise of the forward process; zero at both ends."""
         white = rng.standard_normal((count, self.waypoints, self.dof), dtype=np.float32)
         return self.statistics.noise_factor @ white
@@ -298,9 +299,7 @@ class MotionModel(ABC):
     def code_of(self, cloud: Cloud) -> Code:
         """z of a cloud from `EncoderSettings.prepared`. The model must have an encoder."""
 
-    def encode(
-        self, points: Float[ndarray, "n 3"], rng: np.random.Generator | None = None
-    ) -> Float[ndarray, "code"]:
+    def encode(self, points: Points, rng: Generator | None = None) -> Code:
         """z of a point cloud of the obstacles' surfaces (base frame, [m]); an empty cloud is allowed.
 
         Without an encoder, z is empty.
@@ -375,7 +374,7 @@ class MotionModel(ABC):
         goal: Configuration,
         code: Float[ndarray, "code"],
         clearances: ClearanceFn,
-        rng: np.random.Generator,
+        rng: Generator,
         settings: SamplingSettings | None = None,
         guide: GuideFn | None = None,
     ) -> Float[ndarray, "samples waypoints dof"]:
@@ -477,12 +476,9 @@ def _carriers(checker: CollisionChecker) -> tuple[int, list[int]]:
     def carrier(link: str) -> int:
         while link in fixed_to:
             link = fixed_to[link]
-        order = [
-            (link == arm_link, min(robot.link_frame(arm_link) - robot.link_frame(link), 0))
-            for arm_link in arm
-        ]
-        before = [i for i, arm_link in enumerate(arm) if robot.link_frame(arm_link) <= robot.link_frame(link)]
-        return max(before or range(len(arm)), key=lambda i: (*order[i], i))
+        frames = [robot.link_frame(one) for one in arm]
+        before = [i for i, frame in enumerate(frames) if frame <= robot.link_frame(link)]
+        return max(before, key=lambda i: (arm[i] == link, frames[i], i), default=len(arm) - 1)
 
     return len(arm), [carrier(link) for link in checker.links[len(arm) :]]
 

@@ -38,13 +38,15 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32, Int64
 from numpy import ndarray
+from numpy.random import Generator
 from torch import Tensor, nn
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Count, NotNegative, Settings, Sizes
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.encoders.networks import perceptron
-from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16
+from robotdiffuse.learning.network import Scalar
+from robotdiffuse.learning.training.batches import TrajectoryData, fast_autocast, torch_generator
 from robotdiffuse.learning.training.losses import ArmDistance, ForwardKinematics, SurfacePoints, hinge
 from robotdiffuse.learning.training.tasks import BaselineNetwork
 from robotdiffuse.learning.weight_files import RobotIdentity
@@ -270,7 +272,7 @@ class MPiNetsNetwork(BaselineNetwork):
     ) -> Configurations:
         """The next configurations, within limits [rad]; clouds of the scenes [m], q and goal in [rad]."""
         points = torch.cat([clouds, self._surface(q), self._surface(goal)[:, self._target]], 1).detach()
-        with torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
+        with fast_autocast():
             layer = self.first(points, self._labels.expand(len(q), -1, -1))
             together = self.together["layers"](torch.cat(self.second(*layer), -1))
             cloud_code = self.cloud_code(together)
@@ -287,9 +289,7 @@ class MPiNetsNetwork(BaselineNetwork):
         with torch.inference_mode():
             return self(*map(torch.from_numpy, (clouds, within, goal))).numpy()
 
-    def loss(
-        self, data: TrajectoryData, count: int, fraction: float, rng: np.random.Generator
-    ) -> Float[Tensor, ""]:
+    def loss(self, data: TrajectoryData, count: int, fraction: float, rng: Generator) -> Scalar:
         """Point match and collision of one step each of `count` motions, in units of `LOSS_UNIT`."""
         steps = self.draw(data, count, rng)
         q = self(steps.clouds, steps.q, steps.goal)
@@ -298,7 +298,7 @@ class MPiNetsNetwork(BaselineNetwork):
         close = hinge(self._distance(q[:, None], steps.scenes), MARGIN).mean()
         return (match + COLLISION_WEIGHT * close) / LOSS_UNIT
 
-    def draw(self, data: TrajectoryData, count: int, rng: np.random.Generator) -> Steps:
+    def draw(self, data: TrajectoryData, count: int, rng: Generator) -> Steps:
         """Random waypoints of random motions, forwards or backwards, and the waypoints that follow them."""
         rows = data.draw(count, TRIVIAL_SHARE, rng)
         last = data.q.shape[1] - 1
@@ -313,7 +313,7 @@ class MPiNetsNetwork(BaselineNetwork):
         current, after, end = (torch.from_numpy(part) for part in (q, expert, goal))
         return Steps(current, after, end, clouds, scenes)
 
-    def clouds(self, scenes: PackedScenes, rng: np.random.Generator) -> Clouds:
+    def clouds(self, scenes: PackedScenes, rng: Generator) -> Clouds:
         """Random clouds of scenes for the network's input [m]; zeros where nothing is in reach."""
-        generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
-        return surface_clouds(scenes, self.settings.scene_points, generator, region=self.settings.region)
+        settings = self.settings
+        return surface_clouds(scenes, settings.scene_points, torch_generator(rng), region=settings.region)

@@ -36,7 +36,7 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 from torch import Generator, Tensor, nn
 
@@ -44,7 +44,8 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings, Sizes
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.encoders import curve_keys
-from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16
+from robotdiffuse.learning.network import Scalar
+from robotdiffuse.learning.training.batches import TrajectoryData, fast_autocast, torch_generator
 from robotdiffuse.learning.training.tasks import BaselineNetwork
 from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.scenes.surface_points import PANDA_REGION, VisibleRegion
@@ -165,9 +166,7 @@ class MPNetNetwork(BaselineNetwork):
             ends = torch.from_numpy(q), torch.from_numpy(goal)
             return self.next_states(z.expand(len(q), -1), *ends, generator).numpy()
 
-    def loss(
-        self, data: TrajectoryData, count: int, fraction: float, rng: np.random.Generator
-    ) -> Float[Tensor, ""]:
+    def loss(self, data: TrajectoryData, count: int, fraction: float, rng: np.random.Generator) -> Scalar:
         """The auto-encoder's loss [m^2] in the first part of the training, then Pnet's, end to end through
         Enet.
 
@@ -175,10 +174,10 @@ class MPNetNetwork(BaselineNetwork):
         the data's steps.
         """
         of = self.settings
-        generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
+        generator = torch_generator(rng)
         rows = data.draw(max(1, count // of.waypoints), TRIVIAL_SHARE, rng)
-        cloud = self.clouds(data, rows, generator)
-        with torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
+        cloud = surface_clouds(data.scenes[rows], of.points, generator, region=self.region)
+        with fast_autocast():
             if fraction < PRETRAINING:
                 return self.autoencoder_loss(cloud, generator)
             z = self.encode(cloud).repeat_interleave(of.waypoints, 0)
@@ -190,7 +189,7 @@ class MPNetNetwork(BaselineNetwork):
         return (step.float() - target_step).square().mean()
 
     @torch.enable_grad()
-    def autoencoder_loss(self, cloud: Clouds, generator: Generator) -> Float[Tensor, ""]:
+    def autoencoder_loss(self, cloud: Clouds, generator: Generator) -> Scalar:
         """The mean squared distance of points to their reconstructions plus lambda |dz / d cloud|^2 [m^2]."""
         flat = sorted_along_curve(cloud, self.region).flatten(1)
         flat.requires_grad_()
@@ -200,12 +199,6 @@ class MPNetNetwork(BaselineNetwork):
         signs = torch.empty_like(z).bernoulli_(0.5, generator=generator) * 2 - 1
         (slope,) = torch.autograd.grad(z, flat, signs, create_graph=True)
         return error + self.settings.contraction * slope.square().sum(1).mean()
-
-    def clouds(
-        self, data: TrajectoryData, rows: Int[ndarray, "scenes"], generator: Generator
-    ) -> Float[Tensor, "scenes points 3"]:
-        """A random cloud [m] of the obstacles of each of these trajectories."""
-        return surface_clouds(data.scenes[rows], self.settings.points, generator, region=self.region)
 
     def training_samples(
         self, q: Float[ndarray, "scenes waypoints dof"], rng: np.random.Generator

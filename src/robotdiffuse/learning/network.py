@@ -21,6 +21,7 @@ from robotdiffuse.robots.kinematic_tree import JointNormalizer
 if TYPE_CHECKING:
     from onnx import GraphProto
 
+Scalar = Float[Tensor, ""]
 EXPORT_PACKAGES = ("onnx", "onnxscript")
 """What PyTorch's exporter needs."""
 LEAST_STORED_IN_HALF = 1024
@@ -137,8 +138,7 @@ def _quietly() -> Iterator[None]:
     level = logger.level
     logger.setLevel(logging.ERROR)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             yield
     finally:
         logger.setLevel(level)

@@ -230,12 +230,8 @@ def weights_for(name: str, robot: Robot) -> FilePath | None:
 
 @kept_by_stamp
 def _identity(name: str, folder: FilePath) -> RobotIdentity:
-    file = folder / f"{name}.json"
-    try:
-        about = read_json(file)["robot"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{file} is damaged: {type(error).__name__}: {error}") from None
-    return RobotIdentity.from_json(about, f"{file}: robot")
+    about = read_description(folder, name)
+    return RobotIdentity.from_json(about.get("robot"), f"{folder / name}.json: robot")
 
 
 def folder_of(folder: str | FilePath) -> FilePath:
@@ -260,14 +256,12 @@ def weights_folder(name: str, folder: str | FilePath | None, robot: Robot) -> Fi
     check_weights(name, folder)
     if folder is not None:
         return folder_of(folder)
-    folder_found = weights_for(name, robot)
-    if folder_found is None and (BUNDLED / robot.name / f"{name}.json").is_file():
-        return BUNDLED / robot.name  # made for another arm of the same name; the caller reports that
-    if folder_found is None:
-        raise no_weights_error(
-            name, f"no weights of the network {name} come with the package for {robot.name}"
-        )
-    return folder_found
+    if fitting := weights_for(name, robot):
+        return fitting
+    bundled = BUNDLED / robot.name
+    if (bundled / f"{name}.json").is_file():
+        return bundled  # made for another arm of the same name; the caller reports that
+    raise no_weights_error(name, f"no weights of the network {name} come with the package for {robot.name}")
 
 
 def completion_folder(folder: str | FilePath | None) -> FilePath:

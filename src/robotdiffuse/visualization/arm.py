@@ -6,7 +6,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision.exact_meshes import forward_frames
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Configuration, Path, Trajectory
+from robotdiffuse.core.types import Configuration, Configurations, Path, Points, Trajectory, Values
 from robotdiffuse.drawables import Surface, join, link_surfaces
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.visual_meshes import has_visual
@@ -47,29 +47,27 @@ class DrawnArm:
         poses = zip(self.surfaces[begin:], self.frames(q)[begin:], strict=True)
         return join([surface.moved(T) for surface, T in poses])
 
-    def tool_points(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n 3"]:
+    def tool_points(self, q: Configurations) -> Points:
         """Positions of the tool [m]."""
         return self.frames(q)[:, self.tool_frame, :3] @ np.append(self.tool_point, 1.0)
 
-    def trace(self, q: Float[ndarray, "n dof"], count: int = TRACE_POINTS) -> Float[ndarray, "m 3"]:
+    def trace(self, q: Configurations, count: int = TRACE_POINTS) -> Points:
         """Positions of the tool at equal steps in joint space along a polyline [m]."""
         return self.tool_points(dense(q, count))
 
 
-def dense(q: Float[ndarray, "n dof"], count: int) -> Float[ndarray, "m dof"]:
+def dense(q: Configurations, count: int) -> Configurations:
     """`count` configurations equally spaced along a polyline in joint space; one if it does not move."""
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(q, axis=0), axis=1))])
     return q[:1] if s[-1] == 0 else interpolated(np.linspace(0, s[-1], count), s, q)
 
 
-def interpolated(
-    at: Float[ndarray, "m"], times: Float[ndarray, "n"], rows: Float[ndarray, "n dof"]
-) -> Float[ndarray, "m dof"]:
+def interpolated(at: Values, times: Values, rows: Configurations) -> Configurations:
     """Rows between given ones, linearly."""
     return np.stack([np.interp(at, times, column) for column in rows.T], axis=1)
 
 
-def timed(motion: Path | Trajectory) -> tuple[Float[ndarray, "n"], Float[ndarray, "n dof"]]:
+def timed(motion: Path | Trajectory) -> tuple[Values, Configurations]:
     """Times [s] and positions of a motion; a path without times gets a constant speed in joint space."""
     if isinstance(motion, Trajectory):
         return motion.times, motion.positions

@@ -14,7 +14,7 @@ from PIL import Image
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.transforms import placed
-from robotdiffuse.core.types import Path, Points, Trajectory
+from robotdiffuse.core.types import Mask, Path, Points, Trajectory
 from robotdiffuse.drawables import ASSUMED, OBSERVED, Color, Surface, drawables, painted
 from robotdiffuse.perception.seen_points import near_scene
 from robotdiffuse.perception.voxel_grid import MAP
@@ -148,7 +148,7 @@ def frustum(explorer: RecordedExplorer, act: RecordedAct) -> list[Points]:
     return [np.stack([T[:3, 3], corner]) for corner in rim] + [np.concatenate([rim, rim[:1]])]
 
 
-def faces_between(inside: Voxels, outside: Voxels) -> tuple[Int[ndarray, "n"], Bool[ndarray, "n"]]:
+def faces_between(inside: Voxels, outside: Voxels) -> tuple[Int[ndarray, "n"], Mask]:
     """The faces between a voxel of one set and one of another, in order, and whether the one inside comes
     first along the axis.
 
@@ -279,7 +279,15 @@ def write_exploration(explorer: RecordedExplorer, scene: Scene, file: str | File
         "true_scene": data["scene"],
     }
     data["scene"] = page_shapes(explorer.scene)
-    data["facts"] = _facts(explorer)
+    last = explorer.acts[-1].step
+    kinds = Counter(act.step.kind for act in explorer.acts)
+    data["facts"] = [
+        ("status", "solved" if last.kind == DONE else last.kind),
+        ("policy", explorer.settings.policy.replace("_", " ")),
+        ("looks", str(kinds[LOOK])),
+        ("views", str(len(explorer.views))),
+        ("time in motion", f"{explorer.duration:.1f} s"),
+    ]
     write_atomically(target, page_text(f"{robot.name} · exploration", data, "exploration.js"))
 
 
@@ -342,15 +350,3 @@ def _act(explorer: RecordedExplorer, moment: Moment) -> dict[str, Any]:
         "look": [np.round(edge, 4).tolist() for edge in frustum(explorer, act)],
         "end": None if end is None else np.round(end, 5).tolist(),
     }
-
-
-def _facts(explorer: RecordedExplorer) -> list[tuple[str, str]]:
-    last = explorer.acts[-1].step
-    kinds = Counter(act.step.kind for act in explorer.acts)
-    return [
-        ("status", "solved" if last.kind == DONE else last.kind),
-        ("policy", explorer.settings.policy.replace("_", " ")),
-        ("looks", str(kinds[LOOK])),
-        ("views", str(len(explorer.views))),
-        ("time in motion", f"{explorer.duration:.1f} s"),
-    ]

@@ -5,6 +5,7 @@ import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -15,8 +16,10 @@ from scipy.spatial import ConvexHull
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.settings import Bound, Natural, NotNegative, Settings
 from robotdiffuse.core.types import Configuration, Configurations, Path, Points, Rotation, Trajectory, Vector
 from robotdiffuse.drawables import GOAL, START, Color, Drawable, Surface, drawables, join, painted
+from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
@@ -130,17 +133,14 @@ def best_view(
     points = np.concatenate([moving, obstacles.vertices[near]])
     points = points[ConvexHull(points, qhull_options="QJ").vertices]
     thumbnail_size = (160, max(1, 160 * size[1] // size[0]))
-    best = _direction(0.0, ELEVATIONS[0])
-    best_score = -1.0
     around = np.arange(AZIMUTHS) * (2 * np.pi / AZIMUTHS) if azimuth is None else np.array([azimuth])
-    for elevation in ELEVATIONS:
-        for angle in around:
-            camera = framed(points, _direction(angle, elevation), thumbnail_size, free)
-            score = _score(camera, arm, ghosts, trace, obstacles)
-            if score > best_score:
-                best = _direction(angle, elevation)
-                best_score = score
-    return framed(points, best, size, free)
+
+    def score(toward: Vector) -> float:
+        camera = framed(points, toward, thumbnail_size, free)
+        return _score(camera, arm, ghosts, trace, obstacles)
+
+    directions = (_direction(angle, elevation) for elevation in ELEVATIONS for angle in around)
+    return framed(points, max(directions, key=score), size, free)
 
 
 def view_of_motion(
@@ -215,28 +215,22 @@ class ClearSurface:
     alpha: float
 
 
+Pixels = Annotated[int, Bound(least=16.0)]
+
+
 @dataclass(frozen=True)
-class PictureSettings:
+class PictureSettings(Settings, name="picture"):
     """Size and contents of the picture."""
 
-    width: int = 1280
-    """[pixels]"""
-    height: int = 800
-    """[pixels]"""
-    ghosts: int = 5
+    width: Pixels = 1280
+    height: Pixels = 800
+    ghosts: Natural = 5
     """Number of see-through arms from the start towards the goal."""
     azimuth: float | None = None
     """Azimuth of the camera, from the x axis of the base [rad]; None: from where most of the motion can be
     seen."""
-    shell: float = 0.0
+    shell: NotNegative = 0.0
     """Thickness of the see-through safety shell about the arm [m]; 0: none."""
-
-    def __post_init__(self) -> None:
-        if self.width < 16 or self.height < 16:
-            raise InputError(f"picture of {self.width} x {self.height} pixels; each side must be at least 16")
-        for name in ("ghosts", "shell"):
-            if getattr(self, name) < 0:
-                raise InputError(f"{name} is {getattr(self, name)}; it must be 0 or more")
 
 
 def write_picture(
@@ -362,15 +356,8 @@ def render(
 
 def _shell(arm: DrawnArm, q: Configuration, thickness: float) -> Surface:
     """The covering spheres of the arm, enlarged by the thickness of the shell [m]."""
-    robot = arm.robot
-    T_base_frame = arm.frames(q)
-    balls = []
-    for link, spheres in robot.spheres.items():
-        T = T_base_frame[robot.link_frame(link)] @ robot.T_frame_link(link)
-        balls += [
-            _ball((T @ [x, y, z, 1.0])[:3], radius + thickness, WHITE, 3) for x, y, z, radius in spheres
-        ]
-    return join(balls)
+    spheres = placed_spheres(arm.robot, q)
+    return join([_ball(one[:3], one[3] + thickness, WHITE, 3) for one in spheres])
 
 
 def _ball(center: Vector, radius: float, color: Color, subdivisions: int) -> Surface:

@@ -15,8 +15,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 from PIL import Image
 
 from robotdiffuse.core.errors import InputError, check_type, shortened
@@ -37,7 +35,7 @@ from robotdiffuse.drawables import (
 )
 from robotdiffuse.planning.pose_goals import pose_configurations
 from robotdiffuse.problems.files import problem_from_record
-from robotdiffuse.problems.goals import AnyGoal, JointGoal, poses_of
+from robotdiffuse.problems.goals import AnyGoal, JointGoal, OneGoal, poses_of
 from robotdiffuse.problems.problem import Problem, StateValidity, check_problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
@@ -158,7 +156,7 @@ def page_data(
     }
 
 
-def _thinned(times: Values, positions: Configurations) -> tuple[Float[ndarray, "m"], Float[ndarray, "m dof"]]:
+def _thinned(times: Values, positions: Configurations) -> tuple[Values, Configurations]:
     """At most MAX_ROW_RATE rows per second and MAX_ROWS in all; shorter motions stay unchanged."""
     max_rows = int(min(MAX_ROWS, max(2, np.ceil(MAX_ROW_RATE * times[-1]) + 1)))
     if len(times) <= max_rows:
@@ -279,7 +277,9 @@ def write_problem(problem: Problem, file: str | FilePath, result: PlanResult | N
     states = np.stack([problem.start] if goal is None else [problem.start, goal])
     scene = problem.scene.with_shapes([*problem.scene.shapes, *(moving.shape for moving in problem.moving)])
     robot, scene = replace(problem, scene=scene, moving=()).standing()
-    T_world_poses = _goal_poses(problem)
+    T_world_base = IDENTITY if problem.T_world_base is None else problem.T_world_base
+    poses = (pose for goal in _goals(problem) for pose in poses_of(goal))
+    T_world_poses = [T_world_base @ pose.T_base_frame for pose in poses]
     near_poses = [Sphere(T[:3, 3], AXIS_LENGTH) for T in T_world_poses]
     framed = scene.with_shapes([*scene.shapes, *near_poses])  # what the camera shows
     arm = DrawnArm(robot)
@@ -306,12 +306,16 @@ def write_problem(problem: Problem, file: str | FilePath, result: PlanResult | N
     return write_atomically(target, page_text(title, data))
 
 
+def _goals(problem: Problem) -> Sequence[OneGoal]:
+    """The goals of which one must be reached."""
+    return problem.goal.goals if isinstance(problem.goal, AnyGoal) else (problem.goal,)
+
+
 def _goal_state(problem: Problem) -> tuple[Configuration | None, StateValidity]:
     """The first free configuration of the goal, or else the first one; None if none reaches it."""
-    goals = problem.goal.goals if isinstance(problem.goal, AnyGoal) else (problem.goal,)
     rng = np.random.default_rng(0)
     first = None
-    for goal in goals:
+    for goal in _goals(problem):
         joints = isinstance(goal, JointGoal)
         for q in goal.positions if joints else pose_configurations(problem, goal, rng):
             validity = problem.is_free(q)
@@ -344,13 +348,6 @@ def _raised(surface: Surface) -> Surface:
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
     vertices = surface.vertices + OFFSET * normals[corner]
     return replace(surface, vertices=vertices, colors=painted(COLLIDING, len(vertices)))
-
-
-def _goal_poses(problem: Problem) -> list[Pose]:
-    """All goal poses in the world's frame."""
-    goals = problem.goal.goals if isinstance(problem.goal, AnyGoal) else (problem.goal,)
-    T_world_base = IDENTITY if problem.T_world_base is None else problem.T_world_base
-    return [T_world_base @ pose.T_base_frame for goal in goals for pose in poses_of(goal)]
 
 
 def _axes(poses: list[Pose]) -> list[tuple[Surface, Color]]:
@@ -522,6 +519,11 @@ def show(result: PlanResult | ResultFile, problem: Problem | None = None, height
             "rd.show is for notebooks; elsewhere save the result and use `robotdiffuse view`, or "
             "robotdiffuse.visualization.write_replay"
         )
+    return Replay(result_page(problem, result), height)
+
+
+def result_page(problem: Problem, result: PlanResult) -> str:
+    """The page of a result: its replay, or without a motion the problem."""
     motion = result.trajectory or result.path
     with TemporaryDirectory() as folder:
         file = FilePath(folder) / "replay.html"
@@ -529,7 +531,7 @@ def show(result: PlanResult | ResultFile, problem: Problem | None = None, height
             write_problem(problem, file, result)
         else:
             write_replay(*problem.standing(), motion, file, result=result, moving=problem.moving_in_world)
-        return Replay(file.read_text("utf-8"), height)
+        return file.read_text("utf-8")
 
 
 def _in_notebook() -> bool:

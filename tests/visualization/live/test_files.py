@@ -14,9 +14,9 @@ from robotdiffuse.visualization.live.session import (
     first_problem,
     problem_for,
     problem_text,
-    replay_page,
     uploaded_problem,
 )
+from robotdiffuse.visualization.replay_page import result_page
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def test_problems_go_out_and_come_back(demo: Problem) -> None:
 
 def test_a_replay_holds_the_motion(demo: Problem) -> None:
     result = load_planner("aorrtc").plan(demo, 20.0)
-    page = replay_page(demo, result).decode()
+    page = result_page(demo, result)
     assert page.startswith("<!doctype html>") and "bottle" in page and "src=" not in page
 
 

@@ -25,7 +25,7 @@ from robotdiffuse.learning.encoders import (
     PointNetSettings,
     PointsSettings,
 )
-from robotdiffuse.learning.network import SavedModule
+from robotdiffuse.learning.network import SavedModule, Scalar
 
 Cloud = Float[Tensor, "batch points 3"]
 Codes = Float[Tensor, "batch code"]
@@ -33,7 +33,7 @@ Near = Bool[Tensor, "batch points"]
 Features = Float[Tensor, "batch points channels"]
 Pooled = Float[Tensor, "batch channels"]
 Ordered = Float[Tensor, "batch cloud 3"]
-Loss = tuple[Float[Tensor, ""], dict[str, float]]
+Loss = tuple[Scalar, dict[str, float]]
 
 
 class Encoder(SavedModule, ABC):
@@ -319,9 +319,7 @@ def pick(points: Float[Tensor, "batch n 3"], index: Tensor) -> Float[Tensor, "ba
     return points.gather(1, index[..., None].expand(-1, -1, 3))
 
 
-def chamfer(
-    decoded: Float[Tensor, "batch n 3"], cloud: Float[Tensor, "batch m 3"], near: Tensor
-) -> Float[Tensor, ""]:
+def chamfer(decoded: Float[Tensor, "batch n 3"], cloud: Float[Tensor, "batch m 3"], near: Tensor) -> Scalar:
     """Chamfer distance [m]: root mean square distance to the nearest point of the other set, both ways.
 
     near: which points of the cloud count [batch m]; clouds without any are left out.

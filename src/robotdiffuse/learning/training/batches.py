@@ -10,13 +10,14 @@ from pathlib import Path as FilePath
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Float32, Int
 from numpy import ndarray
+from numpy.random import Generator
 from torch import Tensor
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import write_atomically
-from robotdiffuse.core.types import Values
+from robotdiffuse.core.types import Mask, Values
 from robotdiffuse.datasets.rows import read_rows, turns_about_vertical
 from robotdiffuse.datasets.shards import SPLITS, shard_indices
 from robotdiffuse.datasets.surface_clouds import surface_clouds
@@ -30,9 +31,7 @@ from robotdiffuse.scenes.scene_arrays import BOX, NONE, SPHERE, PackedScenes
 Trajectories = Float[ndarray, "n waypoints dof"]
 
 
-def random_scenes(
-    count: int, max_obstacles: int, rng: np.random.Generator, rop: bool = False
-) -> PackedScenes:
+def random_scenes(count: int, max_obstacles: int, rng: Generator, rop: bool = False) -> PackedScenes:
     """Random scenes for training an encoder, of three kinds in equal parts: two large obstacles as in ROP;
     several obstacles with the sizes of dense ROP; any number of boxes and spheres of any size and
     orientation. rop: only scenes of the first kind."""
@@ -64,7 +63,7 @@ class TrajectoryData:
     q: Trajectories
     """[rad], float32, evenly spaced along the path."""
     scenes: PackedScenes
-    trivial: Bool[ndarray, "n"]
+    trivial: Mask
     """Whether the straight line from start to goal is free too."""
     codes: Float[ndarray, "n code"] | None
     """z of each scene, float16; None if there is no frozen encoder."""
@@ -86,7 +85,7 @@ class TrajectoryData:
         """Indices of the trivial rows, and of the others."""
         return np.flatnonzero(self.trivial), np.flatnonzero(~self.trivial)
 
-    def draw(self, count: int, trivial_share: float, rng: np.random.Generator) -> Int[ndarray, "count"]:
+    def draw(self, count: int, trivial_share: float, rng: Generator) -> Int[ndarray, "count"]:
         """Indices of random rows, with this share of trivial ones if the data have both kinds."""
         share = trivial_share if all(map(len, self.pools)) else float(len(self.pools[0]) > 0)
         easy = rng.random(count) < share
@@ -185,30 +184,37 @@ def _codes(
     return codes
 
 
-def encode_scenes(
-    encoder: Encoder, scenes: PackedScenes, rng: np.random.Generator
-) -> Float[ndarray, "n code"]:
+def encode_scenes(encoder: Encoder, scenes: PackedScenes, rng: Generator) -> Float[ndarray, "n code"]:
     """z of each scene from a random cloud, float16."""
     codes = [np.zeros((0, encoder.settings.code), np.float16)]
     for i in range(0, len(scenes), 256):
         clouds = scene_clouds(encoder, scenes[i : i + 256], rng)
-        with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
+        with torch.inference_mode(), fast_autocast():
             codes.append(encoder(clouds).numpy().astype(np.float16))
     return np.concatenate(codes)
 
 
 def scene_clouds(
-    encoder: Encoder, scenes: PackedScenes, rng: np.random.Generator, points: int | None = None
+    encoder: Encoder, scenes: PackedScenes, rng: Generator, points: int | None = None
 ) -> Float32[Tensor, "n points 3"]:
     """A random cloud of each scene [m], of `points` points; None: of the encoder's number."""
     settings = encoder.settings
-    generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
-    return surface_clouds(scenes, points or settings.cloud, generator, region=settings.region)
+    return surface_clouds(scenes, points or settings.cloud, torch_generator(rng), region=settings.region)
+
+
+def torch_generator(rng: Generator) -> torch.Generator:
+    """Random numbers for PyTorch, from the next number of NumPy's."""
+    return torch.Generator().manual_seed(int(rng.integers(2**63)))
 
 
 def fast_bf16() -> bool:
     """Whether this CPU multiplies bf16 matrices fast."""
     return bool(torch.cpu._is_avx512_bf16_supported())
+
+
+def fast_autocast() -> torch.autocast:
+    """A context in which this CPU multiplies matrices in bf16, if it does so fast."""
+    return torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16())
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +254,7 @@ class Batches:
     trivial_share: float
     weight_limit: float | None
 
-    def draw(self, count: int, rng: np.random.Generator) -> Batch:
+    def draw(self, count: int, rng: Generator) -> Batch:
         """A random batch."""
         rows = self.data.draw(count, self.trivial_share, rng)
         # one level from each of `count` equal parts of the range: less variance than independent draws
@@ -256,7 +262,7 @@ class Batches:
         levels = 1 + (parts * self.model.schedule.steps).astype(np.int64)
         return self.at(rows, np.minimum(levels, self.model.schedule.steps), rng)
 
-    def at(self, rows: ndarray, levels: ndarray, rng: np.random.Generator) -> Batch:
+    def at(self, rows: ndarray, levels: ndarray, rng: Generator) -> Batch:
         """The batch of these rows at these noise levels."""
         data = self.data
         model = self.model

@@ -12,8 +12,9 @@ from typing import Annotated, Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float32
 from numpy import ndarray
+from numpy.random import Generator
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
@@ -31,6 +32,7 @@ from robotdiffuse.learning.completion import (
     voxel_centers,
 )
 from robotdiffuse.learning.completion_network import CompletionNetwork, folded
+from robotdiffuse.learning.network import Scalar
 from robotdiffuse.learning.training.config import ShareBelowOne, TrainingSettings
 from robotdiffuse.learning.training.loop import Processes, TrainingTask, Validation, on_cpu, train
 from robotdiffuse.perception.voxel_grid import VOXEL
@@ -64,7 +66,7 @@ class SamplePrefetcher:
         self._count, self._workers = workers, Workers(workers, partial(os.nice, NICENESS))
         self._pending: deque[tuple[tuple[int, ...], Future[Samples]]] = deque()
 
-    def next(self, rng: np.random.Generator) -> Samples:
+    def next(self, rng: Generator) -> Samples:
         """The batch of samples with the seeds that `rng` draws."""
         seeds = self._seeds(rng)
         if not self._count:
@@ -83,7 +85,7 @@ class SamplePrefetcher:
         """Stop the workers."""
         self._workers.close()
 
-    def _seeds(self, rng: np.random.Generator) -> tuple[int, ...]:
+    def _seeds(self, rng: Generator) -> tuple[int, ...]:
         return tuple(rng.integers(SEED_LIMIT, size=self._batch).tolist())
 
     def _submit(self, seeds: tuple[int, ...]) -> None:
@@ -176,7 +178,7 @@ class CompletionTask(TrainingTask):
             network.load_state_dict(pretrained.state_dict())
         return network
 
-    def loss(self, fraction: float, rng: np.random.Generator) -> Float[Tensor, ""]:
+    def loss(self, fraction: float, rng: Generator) -> Scalar:
         return self._loss(self.prefetcher.next(rng))
 
     def validate(self, fraction: float) -> Validation:
@@ -235,15 +237,11 @@ class CompletionTask(TrainingTask):
             parts.append(draw_samples((name,), self.robot, seeds.tolist()))
         return Samples(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
-    def _predicted_voxels(self, samples: Samples) -> Bool[ndarray, "n 56 56 32"]:
-        """The voxels that the network predicts: those within the arm's reach that no view observed free."""
-        return ((samples.seen & FREE) == 0) & self._reachable
-
-    def _logits_and_truth(
-        self, samples: Samples, selected: Bool[ndarray, "n 56 56 32"]
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Logits [m 8] and truth [m 8] of the selected voxels, and their indices [m]."""
-        indices = folded(torch.from_numpy(selected)).reshape(-1).nonzero()[:, 0]
+    def _logits_and_truth(self, samples: Samples) -> tuple[Tensor, Tensor, Tensor]:
+        """Logits [m 8] and truth [m 8] of the voxels that the network predicts, and their indices [m]: the
+        voxels within the arm's reach that no view observed free."""
+        predicted = ((samples.seen & FREE) == 0) & self._reachable
+        indices = folded(torch.from_numpy(predicted)).reshape(-1).nonzero()[:, 0]
         truth = folded(torch.from_numpy(samples.truth)).reshape(-1)[indices].numpy()
         device = self.processes.device
         with self.processes.autocast():
@@ -252,8 +250,8 @@ class CompletionTask(TrainingTask):
         rows = logits.reshape(-1, 8).index_select(0, indices.to(device))
         return rows.float(), torch.from_numpy(unpack_fine(truth)).to(device), indices
 
-    def _loss(self, samples: Samples) -> Float[Tensor, ""]:
-        logits, truth, _ = self._logits_and_truth(samples, self._predicted_voxels(samples))
+    def _loss(self, samples: Samples) -> Scalar:
+        logits, truth, _ = self._logits_and_truth(samples)
         return binary_cross_entropy_with_logits(logits, truth.float())
 
     def _predictions(self, samples: Samples) -> tuple[Probabilities, Truth, Truth]:
@@ -262,15 +260,16 @@ class CompletionTask(TrainingTask):
         for part in _split(samples):
             hidden = ((part.seen & OCCUPIED) == 0) & self._above
             with torch.no_grad():
-                logits, truth, counted = self._logits_and_truth(part, self._predicted_voxels(part))
+                logits, truth, counted = self._logits_and_truth(part)
             unknown = folded(torch.from_numpy(hidden)).reshape(-1)[counted].numpy().repeat(8)
             predictions.append((logits.cpu().numpy().ravel(), truth.cpu().numpy().ravel(), unknown))
         logits, truth, unknown = (np.concatenate(parts) for parts in zip(*predictions, strict=True))
         return logits, truth, unknown
 
 
-def _split(samples: Samples, size: int = 4) -> list[Samples]:
-    return [Samples(*(array[i : i + size] for array in samples)) for i in range(0, len(samples.seen), size)]
+def _split(samples: Samples) -> list[Samples]:
+    """Batches of at most four."""
+    return [Samples(*(array[i : i + 4] for array in samples)) for i in range(0, len(samples.seen), 4)]
 
 
 def fitted_temperature(logits: Probabilities, truth: Truth) -> float:

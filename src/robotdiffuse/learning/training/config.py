@@ -43,7 +43,6 @@ def block_at(fraction: float) -> int:
 
 
 ShareBelowOne = Annotated[float, Bound(least=0.0, below=1.0)]
-DEVICES = ("cpu", "cuda")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +71,7 @@ class TrainingSettings(Settings):
     checkpoint."""
     threads: Count = 1
     """Threads of PyTorch. While other processes keep the cores busy, one is several times faster than two."""
-    device: Annotated[str, OneOf(DEVICES)] | None = None
+    device: Annotated[str, OneOf(("cpu", "cuda"))] | None = None
     """cpu or cuda; None: cuda if there is one."""
     checkpoint_seconds: NotNegative = 120.0
     """Time between checkpoints [s]."""
@@ -175,13 +174,11 @@ class PlannerTraining(MotionTraining, ModelParts):
         super().__post_init__()
         if self.target == "limits" and self.smooth_noise:
             raise InputError("target is limits and smooth_noise is True; in units of the limits it is white")
-        if self.progressive:
-            self._check_progressive()
         if self.encoder_settings is not None:
             ENCODERS.entry(self.encoder)  # a folder holds a trained encoder with its own settings
         check_points("encoder", self.encoder, self.denoiser)
-
-    def _check_progressive(self) -> None:
+        if not self.progressive:
+            return
         patch = getattr(self.denoiser_settings, "patch", TransformerSettings.patch)
         if self.smooth_noise or self.denoiser != "transformer" or self.objective != "clean" or patch != 1:
             raise InputError(

@@ -15,24 +15,26 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from numpy.random import Generator
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_, parameters_to_vector, vector_to_parameters
 from torch.optim.swa_utils import AveragedModel
 
+from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError, needs
 from robotdiffuse.core.output_files import lock_folder, write_atomically
 from robotdiffuse.learning import need_packages
-from robotdiffuse.learning.checkpoint import read_tensors, versions, write_tensors
+from robotdiffuse.learning.checkpoint import read_tensors, write_tensors
 from robotdiffuse.learning.encoders.networks import Encoder
-from robotdiffuse.learning.network import EXPORT_PACKAGES
+from robotdiffuse.learning.network import EXPORT_PACKAGES, Scalar
 from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16, load_data
 from robotdiffuse.learning.training.config import MotionTraining
 from robotdiffuse.robots.robot import Robot
@@ -166,7 +168,7 @@ class TrainingTask(ABC):
     """What must be the same when a run is resumed besides the settings, for example the robot."""
 
     @abstractmethod
-    def loss(self, fraction: float, rng: np.random.Generator) -> Float[Tensor, ""]:
+    def loss(self, fraction: float, rng: Generator) -> Scalar:
         """The loss of a random batch; `fraction` of the training is done, 0 to 1."""
 
     @abstractmethod
@@ -215,14 +217,11 @@ class TrainingRun:
         self.settings = settings = task.settings
         self.processes = processes = task.processes
         self.out = FilePath(out)
-        self.parameters: dict[str, nn.Parameter] = {
-            n: p for n, p in task.module.named_parameters() if p.requires_grad
-        }
-        self._trained = nn.ParameterList(self.parameters.values())
-        self.average = AveragedModel(self._trained, avg_fn=self._averaged)
+        self.parameters = nn.ParameterList(p for p in task.module.parameters() if p.requires_grad)
+        self.average = AveragedModel(self.parameters, avg_fn=self._averaged)
         """The moving average of the parameters."""
         self.optimizer = torch.optim.AdamW(
-            self.parameters.values(),
+            self.parameters,
             lr=0.0,
             betas=(0.9, 0.99),
             weight_decay=settings.weight_decay,
@@ -288,8 +287,8 @@ class TrainingRun:
         self.optimizer.zero_grad(set_to_none=True)
         value = self.task.loss(self.fraction, self.rng)
         value.backward()
-        mean = self.processes.average(self.parameters.values(), value.item())
-        norm = clip_grad_norm_(self.parameters.values(), self.settings.gradient_norm)
+        mean = self.processes.average(self.parameters, value.item())
+        norm = clip_grad_norm_(self.parameters, self.settings.gradient_norm)
         self.at.step += 1
         self.at.samples += self._samples_per_step
         if not (math.isfinite(mean) and math.isfinite(norm.item())):
@@ -298,7 +297,7 @@ class TrainingRun:
         self._bad = 0
         self.optimizer.step()
         self._losses.append(mean)
-        self.average.update_parameters(self._trained)
+        self.average.update_parameters(self.parameters)
 
     def _averaged(self, average: Tensor, parameter: Tensor, _count: Tensor | int) -> Tensor:
         decay = min(self.settings.average, self.at.step / (self.at.step + 10))
@@ -333,7 +332,7 @@ class TrainingRun:
     @contextmanager
     def averaged(self) -> Iterator[None]:
         """A context in which the module has the moving average of its weights."""
-        now = [p.detach().clone() for p in self._trained]
+        now = [p.detach().clone() for p in self.parameters]
         self._set(self.average.parameters())
         try:
             yield
@@ -342,7 +341,7 @@ class TrainingRun:
 
     @torch.no_grad()
     def _set(self, values: Iterable[Tensor]) -> None:
-        for p, value in zip(self._trained, values, strict=True):
+        for p, value in zip(self.parameters, values, strict=True):
             p.copy_(value)
 
     def _log(self, validation: Validation | None) -> None:
@@ -451,8 +450,7 @@ class TrainingRun:
             self._losses = notes["losses"]
             self.rows = notes["rows"]
         except (LookupError, TypeError, ValueError, RuntimeError) as error:
-            reason = " ".join(str(error).split())[:200]
-            raise InputError(f"{self._file} is no checkpoint of this run: {reason}") from None
+            raise InputError(f"{self._file} is no checkpoint of this run: {str(error)[:200]}") from None
 
     def _check_same(self, notes: dict) -> None:
         now = json.loads(json.dumps(self.settings.to_json()))
@@ -506,7 +504,9 @@ def train(task: TrainingTask, out: str) -> dict[str, float]:
     with run.averaged():
         report = task.finish() | {"samples": float(run.at.samples)}
         minutes = round(run.at.seconds / 60, 2)
-        about = task.about() | {"minutes": minutes} | report | versions()
+        about = task.about() | {"minutes": minutes} | report
+        about |= {"robotdiffuse": __version__, "torch": torch.__version__}
+        about["made"] = f"{datetime.now(UTC):%Y-%m-%d}"
         task.save(FilePath(out), {"settings": task.settings.to_json(), **about})
     return task.processes.share(report)
 
@@ -544,16 +544,14 @@ class MotionTask(TrainingTask):
             print(text, file=sys.stderr)
 
     @abstractmethod
-    def loss_of(
-        self, data: TrajectoryData, fraction: float, rng: np.random.Generator, validating: bool
-    ) -> Float[Tensor, ""]:
+    def loss_of(self, data: TrajectoryData, fraction: float, rng: Generator, validating: bool) -> Scalar:
         """The loss of a random batch of these data."""
 
-    def success(self, rng: np.random.Generator) -> float | None:
+    def success(self, rng: Generator) -> float | None:
         """Share of some held-out problems that the network solves by itself; None: not measured."""
         return None
 
-    def loss(self, fraction: float, rng: np.random.Generator) -> Float[Tensor, ""]:
+    def loss(self, fraction: float, rng: Generator) -> Scalar:
         return self.loss_of(self.train_data, fraction, rng, validating=False)
 
     def validate(self, fraction: float) -> Validation:

@@ -11,15 +11,17 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from numpy import ndarray
+from numpy.random import Generator
 from torch import Tensor
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Mask
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, save_network
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.encoders import encoder_name, make_encoder
-from robotdiffuse.learning.encoders.networks import Autoencoder, Encoder
-from robotdiffuse.learning.guidance import CollisionGuidance
+from robotdiffuse.learning.encoders.networks import Autoencoder, Encoder, Loss
+from robotdiffuse.learning.guidance import CollisionGuidance, Trajectories
 from robotdiffuse.learning.motion_model import (
     ModelParts,
     MotionModelSettings,
@@ -28,13 +30,13 @@ from robotdiffuse.learning.motion_model import (
     packed_clearances,
 )
 from robotdiffuse.learning.motion_network import MotionNetwork
-from robotdiffuse.learning.network import Network
+from robotdiffuse.learning.network import Network, Scalar
 from robotdiffuse.learning.training.batches import (
     Batch,
     Batches,
     TrajectoryData,
     encode_scenes,
-    fast_bf16,
+    fast_autocast,
     random_scenes,
     scene_clouds,
 )
@@ -91,7 +93,7 @@ class _EncoderTask(TrainingTask):
         self.module = self._trained = module.to(processes.device)
         self._most = settings.points if module.settings.any_size else module.settings.cloud
 
-    def loss(self, fraction: float, rng: np.random.Generator) -> Float[Tensor, ""]:
+    def loss(self, fraction: float, rng: Generator) -> Scalar:
         settings = self.settings
         module = self.module
         max_points = self._most
@@ -121,24 +123,22 @@ class _EncoderTask(TrainingTask):
     def save(self, folder: FilePath, training: dict[str, Any]) -> None:
         save_network("encoder", self._trained, folder, training)
 
-    def _scenes(self, count: int, rng: np.random.Generator) -> PackedScenes:
+    def _scenes(self, count: int, rng: Generator) -> PackedScenes:
         settings = self.settings
         return random_scenes(count, settings.max_obstacles, rng, rop=settings.scenes == "rop")
 
-    def _validation(self, count: int, seed: int) -> tuple[Float[Tensor, ""], dict[str, float]]:
+    def _validation(self, count: int, seed: int) -> Loss:
         with torch.no_grad():
             return self._reconstruction(count, self._most, np.random.default_rng(seed))
 
-    def _reconstruction(
-        self, count: int, points: int, rng: np.random.Generator
-    ) -> tuple[Float[Tensor, ""], dict[str, float]]:
+    def _reconstruction(self, count: int, points: int, rng: Generator) -> Loss:
         scenes = self._scenes(count, rng)
         cloud = scene_clouds(self.module, scenes, rng, points).to(self.processes.device)
         with self.processes.autocast():
             return self.module.loss(cloud, rng)
 
 
-def linear_readout(encoder: Encoder, scenes: PackedScenes, rng: np.random.Generator) -> dict[str, float]:
+def linear_readout(encoder: Encoder, scenes: PackedScenes, rng: Generator) -> dict[str, float]:
     """Errors of a linear read-out of z, the same measure for all encoders.
 
     A linear map from z to the signed distances of fixed positions around the arm to the obstacles is fitted
@@ -153,17 +153,16 @@ def linear_readout(encoder: Encoder, scenes: PackedScenes, rng: np.random.Genera
         .clip(-MAX_READOUT_DISTANCE, MAX_READOUT_DISTANCE)
         .astype(np.float64)
     )
-    z -= z[:READOUT_SCENES].mean(0)
-    mean = targets[:READOUT_SCENES].mean(0)
-    gram = z[:READOUT_SCENES].T @ z[:READOUT_SCENES]
-    ridge = max(RELATIVE_RIDGE * np.trace(gram) / len(gram), np.finfo(np.float64).tiny)
-    weights = np.linalg.solve(
-        gram + ridge * np.eye(len(gram)), z[:READOUT_SCENES].T @ (targets[:READOUT_SCENES] - mean)
+    # both relative to their means over the scenes of the fit
+    (z, z_tested), (of_z, tested) = (
+        np.split(values - values[:READOUT_SCENES].mean(0), [READOUT_SCENES]) for values in (z, targets)
     )
-    error = targets[READOUT_SCENES:] - mean
+    gram = z.T @ z
+    ridge = max(RELATIVE_RIDGE * np.trace(gram) / len(gram), np.finfo(np.float64).tiny)
+    weights = np.linalg.solve(gram + ridge * np.eye(len(gram)), z.T @ of_z)
     return {
-        "readout": float(np.abs(error - z[READOUT_SCENES:] @ weights).mean()),
-        "readout_of_constant": float(np.abs(error).mean()),
+        "readout": float(np.abs(tested - z_tested @ weights).mean()),
+        "readout_of_constant": float(np.abs(tested).mean()),
     }
 
 
@@ -181,7 +180,7 @@ def planning_success(
     data: TrajectoryData,
     problems: int,
     candidates: int,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> float:
     """Share of free trajectories among `candidates` samples for each of the first non-trivial problems.
 
@@ -210,7 +209,7 @@ def _guided(guidance: CollisionGuidance, q: ndarray, _level: float) -> ndarray:
     return guidance(q, PRIOR_GUIDANCE_STEPS)[0]
 
 
-def free_in_scene(checker: CollisionChecker, q: Float[ndarray, "n waypoints dof"]) -> Bool[ndarray, "n"]:
+def free_in_scene(checker: CollisionChecker, q: Trajectories) -> Mask:
     """Which motions are free in the checker's scene, at their waypoints and between them."""
     share = np.linspace(0, 1, CHECKS_PER_SEGMENT, endpoint=False)[:, None]
     dense = q[:, :-1, None] + share * np.diff(q, axis=1)[:, :, None]
@@ -262,9 +261,7 @@ class PlannerTask(MotionTask):
         self.clearances = packed_clearances(robot, model.settings)
         self._loss = PlannerLoss(model, robot, settings, processes)
 
-    def loss_of(
-        self, data: TrajectoryData, fraction: float, rng: np.random.Generator, validating: bool
-    ) -> Float[Tensor, ""]:
+    def loss_of(self, data: TrajectoryData, fraction: float, rng: Generator, validating: bool) -> Scalar:
         settings = self.settings
         if settings.progressive:
             self.model.coarsen(block_at(fraction))
@@ -275,12 +272,12 @@ class PlannerTask(MotionTask):
             dropped = torch.from_numpy(rng.random(settings.batch) < settings.condition_drop)
         return self._loss(batch, fraction, rng, dropped)
 
-    def success(self, rng: np.random.Generator) -> float:
+    def success(self, rng: Generator) -> float:
         if self._on_cpu is not self.model:
             self._on_cpu.load_state_dict(self.model.state_dict())
             self._on_cpu.coarsen(self.model.block)
         problems = self.settings.validation_problems
-        with torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
+        with fast_autocast():
             return planning_success(
                 self._on_cpu, self.robot, self.validation_data, problems, VALIDATION_SAMPLES, rng
             )
@@ -325,9 +322,9 @@ class PlannerLoss:
         self,
         batch: Batch,
         fraction: float,
-        rng: np.random.Generator,
+        rng: Generator,
         dropped: Bool[Tensor, "n"] | None = None,
-    ) -> Float[Tensor, ""]:
+    ) -> Scalar:
         """The loss. fraction: of the training that is done; dropped: samples whose condition is hidden."""
         model = self.model
         losses = self.settings
@@ -354,7 +351,7 @@ class PlannerLoss:
         batch: Batch,
         output: Float[Tensor, "n waypoints dof"],
         collision_weight: float,
-        rng: np.random.Generator,
+        rng: Generator,
     ) -> Float[Tensor, "n"]:
         """L_point and L_collision of each sample, at some of the waypoints."""
         model = self.model
@@ -397,9 +394,7 @@ class BaselineNetwork(Network, ABC):
         """Fill buffers with statistics of the training trajectories; called before a run."""
 
     @abstractmethod
-    def loss(
-        self, data: TrajectoryData, count: int, fraction: float, rng: np.random.Generator
-    ) -> Float[Tensor, ""]:
+    def loss(self, data: TrajectoryData, count: int, fraction: float, rng: Generator) -> Scalar:
         """The loss of `count` samples drawn from the data; `fraction` of the training is done, 0 to 1."""
 
 
@@ -439,9 +434,7 @@ class _BaselineTask(MotionTask):
         self.module.fit_statistics(self.train_data)
         self.identity = {"robot": robot.name, "network": repr(default_settings)}
 
-    def loss_of(
-        self, data: TrajectoryData, fraction: float, rng: np.random.Generator, validating: bool
-    ) -> Float[Tensor, ""]:
+    def loss_of(self, data: TrajectoryData, fraction: float, rng: Generator, validating: bool) -> Scalar:
         return self.module.loss(data, self.settings.batch, fraction, rng)
 
     def validate(self, fraction: float) -> Validation:

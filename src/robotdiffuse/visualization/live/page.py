@@ -46,11 +46,11 @@ from robotdiffuse.visualization.live.session import (
     dimensions,
     moved_to,
     problem_text,
-    replay_page,
     resized,
     uploaded_problem,
     validity,
 )
+from robotdiffuse.visualization.replay_page import result_page
 
 # Sizes of gizmos, as fractions of the arm's reach.
 GIZMO_SIZE = 0.23
@@ -200,7 +200,10 @@ class Page(LivePage):
 
     def _new_motion(self, state: State) -> None:
         motion = None if state.motion is None else state.motion.trajectory
-        frames = None if motion is None else sampled_frames(self._drawn, motion)
+        frames = None
+        if motion is not None:
+            at = np.append(np.arange(0.0, motion.duration, 1 / POSE_RATE), motion.duration)
+            frames = self._drawn.frames(interpolated(at, motion.times, motion.positions))
         with self._lock:
             self._frames = frames
         draw_trace(self.server, self._drawn, motion)
@@ -265,8 +268,7 @@ class _Gizmo:
         """Move to a pose, unless it is being dragged; hide for None."""
         if T is not None and not self._held:
             place(self.handle, T)
-        if self.handle.visible is not (T is not None):
-            self.handle.visible = T is not None
+        self.handle.visible = T is not None
 
 
 class Panel:
@@ -357,10 +359,10 @@ class Panel:
                 event, lambda: self._session.change_obstacle(self._selected.value, lambda _: None)
             )
         )
-        self._add.on_click(lambda event: self._guarded(event, self._add_obstacle))
-
-    def _add_obstacle(self) -> None:
-        self._page.select(self._session.add_obstacle(self._new.value))
+        add = self._session.add_obstacle
+        self._add.on_click(
+            lambda event: self._guarded(event, lambda: self._page.select(add(self._new.value)))
+        )
 
     def _files_tab(self) -> None:
         gui = self._server.gui
@@ -388,7 +390,7 @@ class Panel:
         state = self._session.state
         if state.motion is None:
             raise InputError("there is no motion to save yet")
-        return replay_page(state.problem, state.motion)
+        return result_page(state.problem, state.motion).encode()
 
     # display
 
@@ -479,13 +481,13 @@ class Panel:
         if motion is None or motion.trajectory is None:
             return
         data = plotted(robot, motion.trajectory, self._kind.value)
-        names = tuple(robot.joint_names)
-        if self._plot is not None and not self._changes.new("joints of the plot", names):
+        names = robot.joint_names
+        other_joints = self._changes.new("joints of the plot", names)
+        if self._plot is not None and not other_joints:
             self._plot.data = data
             return
         if self._plot is not None:
             self._plot.remove()
-        self._changes.new("joints of the plot", names)
         joints = [
             uplot.Series(label=name, stroke=JOINT_COLORS[i % len(JOINT_COLORS)], width=1.5)
             for i, name in enumerate(names)
@@ -551,7 +553,7 @@ def _stages_html(seconds: tuple[tuple[str, float], ...]) -> str:
 
 
 POSE_RATE = 30.0
-"""Poses of a motion that are precomputed per second."""
+"""Poses of a motion that are precomputed per second, beside the last one."""
 RED = (0xD6, 0x3B, 0x3B)
 GAMMA = 2.2
 # Points of the tool's trace along an edge of a tree; most edges drawn per tree, the first ones.
@@ -622,22 +624,13 @@ class Arm:
                 for frame, T, wxyz in zip(self._frames, T_base_frame, turns, strict=True):
                     frame.position = T[:3, 3]
                     frame.wxyz = wxyz
-        if self.root.visible is not (T_base_frame is not None):
-            self.root.visible = T_base_frame is not None
-
-
-def sampled_frames(arm: DrawnArm, motion: Trajectory) -> Float[ndarray, "n frames 4 4"]:
-    """Poses of the frames along a motion, POSE_RATE per second, and the last one."""
-    at = np.append(np.arange(0.0, motion.duration, 1 / POSE_RATE), motion.duration)
-    return arm.frames(interpolated(at, motion.times, motion.positions))
+        self.root.visible = T_base_frame is not None
 
 
 def place(node: Any, T: Pose) -> None:
-    """Move a node, without a message to browsers if it is there."""
-    wxyz = quaternion_from_rotation(T[:3, :3])
-    if not (np.allclose(node.position, T[:3, 3]) and np.allclose(node.wxyz, wxyz)):
-        node.position = T[:3, 3]
-        node.wxyz = wxyz
+    """Move a node; viser sends no message to browsers if it is there."""
+    node.position = T[:3, 3]
+    node.wxyz = quaternion_from_rotation(T[:3, :3])
 
 
 class Obstacles:

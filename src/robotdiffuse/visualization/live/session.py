@@ -11,8 +11,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from importlib.resources import as_file, files
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Generic, TypeVar
 
 import numpy as np
@@ -29,7 +27,7 @@ from robotdiffuse.drawables import own_frame
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, load_planner
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.families import load_family
-from robotdiffuse.problems.files import load_problem, problem_from_record, save_problem
+from robotdiffuse.problems.files import WRITERS, load_problem, problem_from_record, problem_record
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal, poses_of
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import known_robots, load_robot
@@ -40,7 +38,6 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
 from robotdiffuse.validation.report import Report
 from robotdiffuse.validation.validator import verify, verify_trajectory
-from robotdiffuse.visualization.replay_page import write_replay
 
 NEW_OBSTACLES: dict[str, Callable[[Vector, float], Shape]] = {
     "sphere": lambda center, size: Sphere(center, size),
@@ -548,22 +545,7 @@ def _check_contained(data: object, robot: Robot) -> None:
 
 def problem_text(problem: Problem) -> bytes:
     """The problem as a YAML file."""
-    return _written("problem.yaml", lambda file: save_problem(problem, file))
-
-
-def replay_page(problem: Problem, result: PlanResult) -> bytes:
-    """The replay of a solved result as a self-contained HTML page."""
-    motion = result.trajectory or result.path
-    assert motion is not None
-    given = *problem.standing(), motion
-    return _written("replay.html", lambda file: write_replay(*given, file, result=result))
-
-
-def _written(name: str, write: Callable[[Path], object]) -> bytes:
-    with TemporaryDirectory() as folder:
-        file = Path(folder) / name
-        write(file)
-        return file.read_bytes()
+    return WRITERS[".yaml"](problem_record(problem)).encode()
 
 
 FRAME_RATE = 30.0
