@@ -35,7 +35,8 @@ from robotdiffuse.validation.tolerances import DEFAULT
 SUCCESS = "Success"
 CLOUD = "point_cloud"
 HELD = "attached"
-DEFAULT_ACCELERATION = 3.5  # with more, controllers of simulators lag behind [rad/s²]
+RAMP_TIME = 0.01  # in which accelerations build up [s]; MPlib has no limits of jerk
+SETTLING_TIME = 0.24  # of controllers that are given positions alone: so long the last one is repeated [s]
 TILT_WEIGHT = 0.01  # of rotation beside position, where poses are out of reach [m/rad]
 TILT_MARGIN = 1.25  # of the least tilt with which a position is in reach: there the arm is stretched
 HELD_JOINT_STEP = 0.002  # grippers are held at multiples of this [rad] or [m]
@@ -52,7 +53,7 @@ class Planner:
         user_link_names: Ignored: links have the names of the URDF.
         user_joint_names: Joints in the order of `qpos`; none: the planned joints.
         joint_vel_limits: Velocity limits of the planned joints [rad/s]; none: 1, as in MPlib.
-        joint_acc_limits: Their acceleration limits [rad/s²]; none: 3.5 (MPlib: 1).
+        joint_acc_limits: Their acceleration limits [rad/s²]; none: those of the robot (MPlib: 1).
 
     Raises:
         InputError: For files that cannot be read, unknown links and joints, and limits of the wrong number.
@@ -76,13 +77,12 @@ class Planner:
         if missing:
             raise InputError(f"user_joint_names lacks {', '.join(missing)}, which move {move_group}")
         self._places = [self.joint_names.index(name) for name in robot.joint_names]
-        ones = np.ones(robot.dof)
         velocity = np.ravel(joint_vel_limits)
         acceleration = np.ravel(joint_acc_limits)
         self.robot = _limited(
             robot,
-            velocity if len(velocity) else ones,
-            acceleration if len(acceleration) else DEFAULT_ACCELERATION * ones,
+            velocity if len(velocity) else np.ones(robot.dof),
+            acceleration if len(acceleration) else robot.acceleration,
         )
         self.workspace = Workspace(self.robot, move_group)
         """Robot and obstacles; other obstacles than a point cloud are added here."""
@@ -249,7 +249,9 @@ class Planner:
     def _planned(
         self, failed: str, plan: Callable[..., PlanResult], qpos: ArrayLike, options: dict[str, Any]
     ) -> dict[str, Any]:
-        """A planned motion as MPlib returns it: a row every `time_step`, and the last one."""
+        """A planned motion as MPlib returns it: a row every `time_step`. The first is one step after the
+        start, and the last is repeated until controllers have settled, since scripts grasp and release
+        right after it."""
         start = self._start(qpos)
         try:
             result = plan(start, time_limit=options.get("planning_time", 1.0))
@@ -259,8 +261,8 @@ class Planner:
         if trajectory is None:
             return {"status": f"{failed}: {result.reason}"}
         step = options.get("time_step", 0.1)
-        times = np.append(np.arange(0.0, trajectory.duration, step), trajectory.duration)
-        state = trajectory.at(times)
+        times = step * np.arange(1, np.ceil((trajectory.duration + SETTLING_TIME) / step) + 1)
+        state = trajectory.at(np.minimum(times, trajectory.duration))
         return {
             "status": SUCCESS,
             "time": times,
@@ -352,7 +354,8 @@ def _robot(urdf: str | Path, tip: str, srdf: str | Path, package: str) -> Robot:
 def _limited(robot: Robot, velocity: ndarray, acceleration: ndarray) -> Robot:
     """The robot with other limits of its planned joints."""
     limits = dict[str, dict[str, float]]()
-    for field, values in (("velocity", velocity), ("acceleration", acceleration)):
+    jerk = acceleration / RAMP_TIME
+    for field, values in (("velocity", velocity), ("acceleration", acceleration), ("jerk", jerk)):
         if len(values) != robot.dof:
             raise InputError(f"there are {len(values)} {field} limits; {robot.name} plans {robot.dof} joints")
         for name, value in zip(robot.joint_names, values.tolist(), strict=True):

@@ -225,9 +225,10 @@ PLACED = """
 """
 
 
-def test_a_base_on_slides_without_range_and_actuator_is_held(tmp_path: Path) -> None:
-    """As Fetch stands in Gymnasium-Robotics: the slides only place it."""
-    (tmp_path / "m.xml").write_text(PLACED)
+@pytest.mark.parametrize("actuator", ["", "<actuator><position joint='x'/></actuator></mujoco>"])
+def test_a_base_on_slides_without_range_is_held(actuator: str, tmp_path: Path) -> None:
+    """As Fetch stands in Gymnasium-Robotics, where nothing moves them, and TidyBot, which drives on them."""
+    (tmp_path / "m.xml").write_text(PLACED.replace("</mujoco>", actuator or "</mujoco>"))
     tree = UrdfTree(tmp_path / "m.xml", {})
     robot = tree.robot(srdf=tree.semantics)
     assert robot.joint_names == ("j",)

@@ -77,7 +77,11 @@ def robot_bodies(model: Any) -> list[int]:
         root: {kind_of("Joint", model.jnt_type[joint]) for joint in tree_joints}
         for root, tree_joints in joints.items()
     }
-    driven = driven_joints(model)
+    driven = {
+        int(model.actuator_trnid[k, 0])
+        for k in range(model.nu)
+        if kind_of("Trn", model.actuator_trntype[k]) in ("joint", "jointinparent")
+    }
     chosen = [root for root, tree_joints in joints.items() if driven & set(tree_joints)]
     if not chosen:
         chosen = [
@@ -88,25 +92,15 @@ def robot_bodies(model: Any) -> list[int]:
     return [body for root in chosen for body in trees[root]]
 
 
-def driven_joints(model: Any) -> set[int]:
-    """The joints that an actuator moves."""
-    return {
-        int(model.actuator_trnid[k, 0])
-        for k in range(model.nu)
-        if kind_of("Trn", model.actuator_trntype[k]) in ("joint", "jointinparent")
-    }
-
-
 def placing_joints(model: Any, bodies: list[int]) -> set[int]:
-    """The joints that only place the base: slides without range and actuator, if the robot has other
-    joints."""
+    """The joints that only place the base: slides without range, if the robot has other joints."""
     joints = _joints_of(model, bodies)
     unlimited = {
         joint
         for joint in joints
         if kind_of("Joint", model.jnt_type[joint]) == "slide" and not model.jnt_limited[joint]
     }
-    return unlimited - driven_joints(model) if len(unlimited) < len(joints) else set()
+    return unlimited if len(unlimited) < len(joints) else set()
 
 
 def kind_of(enumeration: str, value: Any) -> str:
@@ -194,7 +188,7 @@ class ConvertedModel:
             if kind == "free" or joint in self.held:
                 what = f"the free joint of {name}"
                 if kind == "slide":
-                    what = f"slide joint {label}, which has no range and no actuator,"
+                    what = f"slide joint {label}, which has no range,"
                 self.notes.append(f"{what} is held where the model places it")
                 continue
             if kind == "ball":

@@ -99,6 +99,8 @@ class UrdfTree:
     notes: list[str] = field(default_factory=list)
     semantics: Srdf | None = None
     """Named poses and allowed pairs of a MuJoCo model."""
+    unlimited: set[str] = field(default_factory=set)
+    """Joints without a velocity limit."""
     _surfaces: dict[str, tuple[Surface, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -205,9 +207,12 @@ class UrdfTree:
         planned, ends = planned_joints(self.path, base, joints, tip, group, srdf)
         meshes = self.geometry(names)
         inertias = self.inertias(names)
-        passive = [
+        notes = [
             f"joint {joint.name} is passive; it is held" for joint in joints if joint.name in srdf.passive
         ]
+        unlimited = [joint.name for joint in joints if joint.name in planned and joint.name in self.unlimited]
+        if unlimited:
+            notes.append(f"no velocity limit for {joined(unlimited)}; {DEFAULT_VELOCITY:g} assumed")
         robot = Robot(
             name=self.name,
             base=base,
@@ -215,7 +220,7 @@ class UrdfTree:
             other_tips=tuple(ends[1:]),
             joints=tuple(joints),
             meshes={link: parts for link, parts in meshes.items() if parts},
-            notes=tuple(dict.fromkeys((*self.notes, *passive))),
+            notes=tuple(dict.fromkeys((*self.notes, *notes))),
             root=self.carried(base),
             above=self.above(base),
             poses=dict(srdf.poses),
@@ -423,7 +428,7 @@ class UrdfTree:
             )
         if velocity <= 0:
             velocity = DEFAULT_VELOCITY
-            self.notes.append(f"joint {joint.name} has no velocity limit; {velocity:g} assumed")
+            self.unlimited.add(joint.name)
         effort = 0.0
         with suppress(InputError):  # most planning needs none
             effort = max(float(self._numbers(of.get("effort", ""), 1, "effort")[0]), 0.0)
