@@ -8,7 +8,7 @@ capsules and spheres: a disagreement is a configuration in which one of the two 
 and the other none. Then problems are drawn in such scenes, between free configurations that the straight line
 does not join, and planned; MuJoCo executes each motion with position actuators, one for each joint, and
 gravity compensated. An unexpected contact is any of the robot's during a motion, except between links that
-may touch.
+may touch or do not move relative to each other.
 """
 
 # MuJoCo has no types for type checkers:
@@ -67,13 +67,12 @@ class World(NamedTuple):
         mujoco.mj_forward(self.model, self.data)
 
     def contacts(self, robot: Robot) -> Iterator[tuple[str, str, float]]:
-        """Contacts of links that may not touch, with their distances [m]."""
+        """Contacts of links that may not touch and move relative to each other, with their distances [m]."""
         model = self.model
         for contact in self.data.contact:
             names = [self.links[int(model.geom_bodyid[geom])] for geom in contact.geom]
-            own = [name for name in names if name in robot.link_names]
-            moved = any(robot.link_frame(name) for name in own)
-            if moved and frozenset(names) not in robot.allowed_collisions:
+            frames = {robot.link_frame(name) if name in robot.link_names else 0 for name in names}
+            if len(frames) > 1 and frozenset(names) not in robot.allowed_collisions:
                 yield names[0], names[1], float(contact.dist)
 
 
@@ -88,6 +87,8 @@ def world_of(file: Path, robot: Robot, rng: np.random.Generator) -> World:
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     for body in spec.bodies:
         body.gravcomp = 1.0
+    for first, second in map(sorted, robot.allowed_collisions):
+        spec.add_exclude(bodyname1=first, bodyname2=second)  # geoms that always overlap would rub
     for joint in spec.joints:
         joint.armature = ARMATURE
         if joint.name in robot.joint_names or joint.name in robot.locked:

@@ -1,5 +1,6 @@
 """MPlib's methods, arguments and results: motions end at the requested goal, and failures have a reason."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 import robotdiffuse as rd
 from robotdiffuse.adapters.mplib import Planner, matrix
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.robots.kinematic_tree import Mimic
 
 JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
@@ -46,6 +48,17 @@ def test_rows_begin_after_the_start_and_last_until_controllers_have_settled() ->
     assert off[0] < 0.2 and off[-7] > 1e-6
     assert off[-5:].max() < 1e-9 and not result["velocity"][-5:].any()
     assert result["time"][-1] >= result["duration"] + 0.24 - 1e-9
+
+
+def test_fingers_need_not_be_equally_far_open() -> None:
+    """The second one follows the first; in a grasp they differ by a millimeter, and the plan was refused."""
+    made = planner()
+    first, second = FINGERS
+    follows = Mimic(first, 1.0, 0.0)
+    joints = [replace(joint, mimic=follows if joint.name == second else None) for joint in made.robot.joints]
+    made.workspace.robot = replace(made.robot, joints=tuple(joints))
+    assert made.check_for_self_collision([*QPOS[:7], 0.0205, 0.0213]) == []
+    assert made.workspace.robot.locked == {first: 0.02, second: 0.02}
 
 
 def test_limits_can_be_set_later() -> None:

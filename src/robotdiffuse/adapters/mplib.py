@@ -107,10 +107,7 @@ class Planner:
 
     def _limit(self, velocity: ndarray, acceleration: ndarray) -> None:
         self.robot = _limited(self.robot, velocity, acceleration)
-        bodies = self.workspace.robot.attached
-        self.workspace.robot = self.robot
-        for body in bodies:
-            self.workspace.robot = self.workspace.robot.with_body(body)
+        self.workspace.robot = _limited(self.workspace.robot, velocity, acceleration)
 
     def set_base_pose(self, pose: Any) -> None:
         """Place the base in the world. Obstacles stay where they are in the world.
@@ -301,12 +298,13 @@ class Planner:
             names = ", ".join(self.joint_names)
             raise InputError(f"qpos has {len(q)} values; it must have {len(self.joint_names)}: {names}")
         values = dict(zip(self.joint_names, q.tolist(), strict=True))
+        robot = self.workspace.robot
         locked = {
-            name: round(values[name] / HELD_JOINT_STEP) * HELD_JOINT_STEP
-            for name in self.workspace.robot.locked
-            if name in values
+            joint.name: round(values[joint.name] / HELD_JOINT_STEP) * HELD_JOINT_STEP
+            for joint in robot.joints
+            if joint.name in robot.locked and joint.name in values and joint.mimic is None
         }
-        self.workspace.robot = self.workspace.robot.with_locked(locked)
+        self.workspace.robot = robot.with_locked(locked)
         return q[self._places]
 
     def _qpos(self, q: ndarray, like: ArrayLike) -> ndarray:
