@@ -237,6 +237,9 @@ def _mujoco_shapes(model: Any, data: Any, base: str) -> list[Shape]:
     from robotdiffuse.robots.parsing import mjcf
 
     mujoco = mjcf.imported_mujoco()
+    if model.nflex:
+        flex = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, 0)
+        raise InputError(f"flex {flex} is soft; obstacles must be rigid: use geoms in its place")
     placed = mujoco.MjData(model)
     if data is not None:
         placed.qpos[:] = data.qpos
@@ -254,7 +257,7 @@ def _mujoco_shapes(model: Any, data: Any, base: str) -> list[Shape]:
         body = int(model.geom_bodyid[geom])
         if body in robot or not colliding[geom]:
             continue
-        name = model.geom(geom).name or model.body(body).name
+        name = model.geom(geom).name or model.body(body).name or f"geom{geom}"
         T = T_base_world @ transform(placed.geom_xpos[geom], placed.geom_xmat[geom].reshape(3, 3))
         center = T[:3, 3]
         wxyz = quaternion_from_rotation(T[:3, :3])
