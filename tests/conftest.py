@@ -92,6 +92,7 @@ def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Light and ghosts take seconds to draw; a small picture tells as much to a test."""
     from robotdiffuse.visualization import picture, replay_page
 
-    small = picture.PictureSettings(width=480, height=300, ghosts=1)
+    small = picture.PictureSettings(width=240, height=150, ghosts=1)
     for module in (picture, replay_page):
         monkeypatch.setattr(module, "PictureSettings", lambda **_: small)
+    monkeypatch.setattr(replay_page, "THUMBNAIL", small)

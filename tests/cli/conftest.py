@@ -1,4 +1,4 @@
-"""Commands run in an empty folder."""
+"""Commands run in an empty folder, and draw small pictures."""
 
 from pathlib import Path
 
@@ -6,5 +6,5 @@ import pytest
 
 
 @pytest.fixture(autouse=True)
-def in_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def in_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_pictures: None) -> None:
     monkeypatch.chdir(tmp_path)

@@ -13,8 +13,6 @@ from helpers.motion_stores import line, random_motions, record, write_motions
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere
-from robotdiffuse.visualization import replay_page
-from robotdiffuse.visualization.picture import PictureSettings
 
 PANDA = load_robot("panda")
 START = np.array([-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
@@ -60,8 +58,7 @@ def test_check_finds_a_collision(folder, capsys):
     assert re.search(r"found by PyBullet +1\b", printed) and "inside sphere" in printed
 
 
-def test_view_shows_samples_in_one_page(folder, capsys, monkeypatch):
-    monkeypatch.setattr(replay_page, "THUMBNAIL", PictureSettings(64, 40, ghosts=1))
+def test_view_shows_samples_in_one_page(folder, capsys):
     out = folder.parent / "samples.html"
     assert run("data", "view", folder, "--count", 2, "--seed", 3, "--out", out) == 0
     assert f"wrote {out}" in capsys.readouterr().out.replace("\n", "")

@@ -5,11 +5,15 @@ import signal
 import subprocess
 import sys
 import urllib.request
+from functools import partial
 from pathlib import Path
 
 import pytest
 
+import robotdiffuse as rd
 from helpers.commands import START, run, write_problem
+from robotdiffuse.visualization.exploration import write_exploration_picture
+from robotdiffuse.visualization.picture import PictureSettings
 
 NEAR = {"joints": [-0.95, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]}
 
@@ -17,8 +21,8 @@ NEAR = {"joints": [-0.95, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]}
 def test_explore_writes_a_replay_a_strip_and_a_recording(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import robotdiffuse as rd
-
+    small = partial(write_exploration_picture, settings=PictureSettings(width=240, height=150, ghosts=1))
+    monkeypatch.setattr("robotdiffuse.cli.explore.write_exploration_picture", small)
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     problem = write_problem(tmp_path, goal=NEAR)

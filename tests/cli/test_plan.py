@@ -186,7 +186,6 @@ def test_wrong_settings_are_told(
     assert message in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("small_pictures")
 def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("demo") == 0
     printed = capsys.readouterr().out

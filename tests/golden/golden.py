@@ -37,7 +37,7 @@ from robotdiffuse.problems.problem import Problem
 GOLDEN = Path(__file__).with_name("golden.json")
 TOLERANCE = 1e-4
 """Of projections, relative to what numbers of this size and count have by chance."""
-PROBLEMS = 20
+PROBLEMS = 8
 MIX = ("rop", "rop_dense", "shelf", "crate", "table")
 Entry = dict[str, Any]
 
@@ -88,7 +88,7 @@ def command(*arguments: str) -> None:
 
 def make_data(folder: Path) -> None:
     mix = ",".join(f"{name}=1" for name in MIX)
-    sizes = ("--trajectories", "60", "--shard", "60", "--goals", "3", "--seed", "5", "--workers", "1")
+    sizes = ("--trajectories", "24", "--shard", "24", "--goals", "3", "--seed", "5", "--workers", "1")
     with patch.object(
         factory, "on_this_machine", lambda call, calls, _: (one for one in enumerate(starmap(call, calls)))
     ):

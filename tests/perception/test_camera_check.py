@@ -1,6 +1,7 @@
 """A camera checked against the arm in its image, which is drawn by balls on the surfaces of its meshes."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -36,14 +37,16 @@ def seen(q: ndarray, seed: int = 0, T: ndarray = T) -> rd.DepthView:
     return DepthNoise(0.003, correlation=1.5, zeros=True).applied(clean, np.random.default_rng(seed))
 
 
-VIEW = seen(HOME)
+@cache
+def at_home() -> rd.DepthView:
+    return seen(HOME)
 
 
 def test_nothing_is_said_of_a_camera_as_stated() -> None:
-    share, _, cells = agreement(VIEW, PANDA, HOME)
-    assert share > 0.7 and cells > 100 and camera_note(VIEW, PANDA, HOME) == ""
-    away = replace(VIEW, T_base_camera=looking_at(np.array([1.2, 0.0, 0.5]), np.array([3.0, 0.0, 0.5])))
-    empty = replace(away, depth=np.full_like(VIEW.depth, 3.0))
+    share, _, cells = agreement(at_home(), PANDA, HOME)
+    assert share > 0.7 and cells > 100 and camera_note(at_home(), PANDA, HOME) == ""
+    away = replace(at_home(), T_base_camera=looking_at(np.array([1.2, 0.0, 0.5]), np.array([3.0, 0.0, 0.5])))
+    empty = replace(away, depth=np.full_like(at_home().depth, 3.0))
     assert camera_note(empty, PANDA, HOME) == "", "the arm is not in the image"
 
 
@@ -58,7 +61,7 @@ MISTAKES = {
 @pytest.mark.parametrize("name", MISTAKES)
 def test_mistakes_in_poses_are_named(name: str) -> None:
     """Planned on without a note, with points of walls and arm anywhere."""
-    wrong = replace(VIEW, T_base_camera=MISTAKES[name](T))
+    wrong = replace(at_home(), T_base_camera=MISTAKES[name](T))
     assert name in camera_note(wrong, PANDA, HOME)
     result = rd.load_planner("aorrtc").plan(rd.Problem(PANDA, rd.Scene([]), HOME, HOME + 0.1, views=[wrong]))
     assert any(name in note for note in result.notes)
@@ -89,14 +92,14 @@ def test_mistakes_in_poses_are_named_where_the_arm_is_seen() -> None:
 
 def test_intrinsics_of_another_image_are_named() -> None:
     fx, fy, cx, cy = K
-    wrong = replace(VIEW, intrinsics=(1.5 * fx, 1.5 * fy, 1.5 * cx, 1.5 * cy))
+    wrong = replace(at_home(), intrinsics=(1.5 * fx, 1.5 * fy, 1.5 * cx, 1.5 * cy))
     assert "intrinsics are those of an image 1.5 times as wide" in camera_note(wrong, PANDA, HOME)
 
 
 def test_a_calibration_that_is_off_is_named() -> None:
     off = T.copy()
     off[:3, :3] = T[:3, :3] @ Rotation.from_rotvec([0.0, 0.1, 0.0]).as_matrix()
-    assert "sees through" in camera_note(replace(VIEW, T_base_camera=off), PANDA, HOME)
+    assert "sees through" in camera_note(replace(at_home(), T_base_camera=off), PANDA, HOME)
 
 
 def test_the_pose_is_estimated_from_views_of_the_arm() -> None:
@@ -113,10 +116,10 @@ def test_the_pose_is_estimated_from_views_of_the_arm() -> None:
     stated = found.pose_deviation
     assert position < 2 * stated[0] and angle < 2 * stated[1] and stated[0] < 0.04
     with pytest.raises(rd.InputError, match="configuration"):
-        rd.calibrate_camera([replace(VIEW, configuration=None)], PANDA)
+        rd.calibrate_camera([replace(at_home(), configuration=None)], PANDA)
     moved = replace(views[0], T_base_camera=T)
     with pytest.raises(rd.InputError, match="views differ in T_base_camera"):
         rd.calibrate_camera([*views, moved], PANDA)
-    elsewhere = replace(VIEW, depth=np.full_like(VIEW.depth, 3.0))
+    elsewhere = replace(at_home(), depth=np.full_like(at_home().depth, 3.0))
     with pytest.raises(rd.InputError, match=r"hardly seen|agrees with the images"):
         rd.calibrate_camera([elsewhere], PANDA)
