@@ -167,7 +167,9 @@ def test_geoms_without_a_solid_are_refused() -> None:
 
 CLOTH = """
 <mujoco>
-  <worldbody><flexcomp name="cloth" type="grid" count="3 3 1" spacing="1 1 1" radius="0.1" dim="2"/></worldbody>
+  <worldbody>
+    <flexcomp name="cloth" type="grid" count="3 3 1" spacing="1 1 1" radius="0.1" dim="2"/>
+  </worldbody>
 </mujoco>
 """
 
