@@ -95,7 +95,7 @@ def test_a_frame_stays_open() -> None:
 
 def test_parts_stick_out_little_about_tight_places() -> None:
     """A wide hole is filled within the tolerance, but not near a tight place."""
-    coarse = PartSettings(concavity=0.2, voxels=50_000)
+    coarse = PartSettings(concavity=0.2, voxels=20_000)
     tight = np.array([[0.06, 0.05, 0.06]])
     whole = convex_parts((surface(FRAME),), coarse)
     parts = convex_parts((surface(FRAME),), coarse, tight)

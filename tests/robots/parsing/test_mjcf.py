@@ -74,7 +74,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def arm(file: Path, tmp_path_factory: pytest.TempPathFactory) -> Robot:
-    settings = replace(QUICK, sampling=SamplingSettings(samples=1000, descents=3))
+    settings = replace(QUICK, sampling=SamplingSettings(samples=300, descents=3))
     with coarse_grids():
         return add_robot(file, out=tmp_path_factory.mktemp("robots") / "arm", settings=settings).robot
 

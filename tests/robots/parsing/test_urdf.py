@@ -17,6 +17,7 @@ from helpers.urdfs import read_urdf
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_rpy
 from robotdiffuse.robots import ROBOTS, load_robot
+from robotdiffuse.robots.fitting import preparation
 from robotdiffuse.robots.fitting.convex_parts import MIN_THICKNESS, convex_hull
 from robotdiffuse.robots.fitting.preparation import PreparationSettings, add_robot
 from robotdiffuse.robots.fitting.self_collisions import SamplingSettings
@@ -263,12 +264,10 @@ def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.Mo
     balls = ARM.replace(BOX, '<sphere radius="0.15"/>').replace(TUBE, '<sphere radius="0.1"/>')
     file = urdf(tmp_path, balls)
     steps = []
+    quick = PreparationSettings(sampling=SamplingSettings(samples=200), samples=200, rounds=0)
+    monkeypatch.setattr(preparation, "PreparationSettings", lambda: quick)
     with coarse_grids():
-        report = add_robot(
-            file,
-            settings=PreparationSettings(sampling=SamplingSettings(samples=200), samples=200, rounds=0),
-            progress=lambda what, step, count: steps.append((step, count)),
-        )
+        report = add_robot(file, progress=lambda what, step, count: steps.append((step, count)))
     assert report.folder == tmp_path / "robots" / "tiny"
     assert steps[0] == (0, 7) and steps[-1] == (7, 7)
     for fitted in report.links:
