@@ -109,11 +109,10 @@ def problem_of(manifest: Manifest, robot: Robot, shard: Shard, row: int) -> Prob
 
     Raises InputError if the row is not a valid problem, for example if its start is outside the limits.
     """
-    goals = np.asarray(shard["goals"][row], np.float64)
+    goals = shard["goals"][row]
     goals = goals[~np.isnan(goals).any(axis=1)]
-    start = np.asarray(shard["start"][row], np.float64)
     scene = scenes_of(manifest, shard, slice(row, row + 1)).scene(0)
-    return Problem(robot, scene, start, JointGoal(goals))
+    return Problem(robot, scene, shard["start"][row], JointGoal(goals))
 
 
 def path_of(robot: Robot, shard: Shard, row: int) -> Path:

@@ -14,11 +14,11 @@ import os
 import re
 import shutil
 import sys
-import tempfile
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path as FilePath
+from tempfile import TemporaryDirectory
 from types import ModuleType
 from typing import Any
 
@@ -269,33 +269,28 @@ def write_shard(
         "fingerprint": _fingerprint(converted),
         "counts": {name: int(counts[name]) for name in sorted(counts)},
     }
-    scratch_folder: str | None = None
     try:
         FilePath(folder).mkdir(parents=True, exist_ok=True)
-        scratch_folder = tempfile.mkdtemp(prefix=f".{target.name}.", dir=folder)
-        new_folder = FilePath(scratch_folder, "new")
-        old_folder = FilePath(scratch_folder, "old")
-        group = zarr.open_group(new_folder, mode="w", zarr_format=3, attributes=attributes)
-        for name, array in converted.items():
-            group.create_array(
-                name,
-                data=array,
-                chunks=tuple(max(1, size) for size in array.shape),
-                compressors=None
-                if name == "trajectories"
-                else zarr.codecs.ZstdCodec(level=COMPRESSION_LEVEL),
-                filters=None,
-                # write chunks of zeros too, so that a missing file means damage
-                config={"write_empty_chunks": True},
-            )
-        if target.exists():
-            target.rename(old_folder)
-        new_folder.rename(target)
+        with TemporaryDirectory(prefix=f".{target.name}.", dir=folder, ignore_cleanup_errors=True) as scratch:
+            new_folder = FilePath(scratch, "new")
+            group = zarr.open_group(new_folder, mode="w", zarr_format=3, attributes=attributes)
+            for name, array in converted.items():
+                group.create_array(
+                    name,
+                    data=array,
+                    chunks=tuple(max(1, size) for size in array.shape),
+                    compressors=None
+                    if name == "trajectories"
+                    else zarr.codecs.ZstdCodec(level=COMPRESSION_LEVEL),
+                    filters=None,
+                    # write chunks of zeros too, so that a missing file means damage
+                    config={"write_empty_chunks": True},
+                )
+            if target.exists():
+                target.rename(FilePath(scratch, "old"))
+            new_folder.rename(target)
     except OSError as error:
         raise write_error(target, error) from None
-    finally:
-        if scratch_folder is not None:
-            shutil.rmtree(scratch_folder, ignore_errors=True)
 
 
 def _fingerprint(arrays: dict[str, ndarray]) -> str:

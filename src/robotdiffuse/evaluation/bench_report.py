@@ -536,8 +536,9 @@ def named(planner: str) -> str:
 
 # Tables
 
-Spec = Sequence[tuple[Column, Callable[[Row], Cell]]]
-"""Columns of a table of planners, with the functions for their cells."""
+PlannerColumn = tuple[Column, Callable[[Row], Cell]]
+"""A column of a table of planners, and the function for its cells."""
+Spec = Sequence[PlannerColumn]
 
 
 def seconds(value: float) -> Cell:
@@ -632,7 +633,7 @@ def _table(heading: str, rows: Sequence[Row], spec: Spec) -> Table:
     return Table.of(heading, ["planner", *(column for column, _ in spec)], cells)
 
 
-def _ratio(comparison: Comparison, reference: str) -> tuple[Column, Callable[[Row], Cell]]:
+def _ratio(comparison: Comparison, reference: str) -> PlannerColumn:
     """A column with the ratio of lengths to those of the reference and its interval; empty for a planner
     whose restarts have this ratio."""
     full = {row.planner: row.full for row in comparison.rows}
@@ -650,13 +651,13 @@ def _ratio(comparison: Comparison, reference: str) -> tuple[Column, Callable[[Ro
     return Column(f"joint length / {named(reference)}"), ratio
 
 
-def _metric(metric: Metric) -> tuple[Column, Callable[[Row], Cell]]:
+def _metric(metric: Metric) -> PlannerColumn:
     """A column with the mean of a metric over the solved problems."""
     column = Column(metric.heading, metric.unit, better=metric.better)
     return column, lambda row: row.mean(metric)
 
 
-def _of_pair(heading: str, of: Callable[[Paired], Cell]) -> tuple[Column, Callable[[Row], Cell]]:
+def _of_pair(heading: str, of: Callable[[Paired], Cell]) -> PlannerColumn:
     """A column of comparisons with the reference on the same problems."""
     return Column(heading), lambda row: row.paired and of(row.paired)
 

@@ -73,6 +73,10 @@ MOTIONS_PER_TASK = 100
 """Motions of a shard that a process checks in one task."""
 
 
+Defects = Iterator[tuple[str, str]]
+"""Kind and message of each."""
+
+
 @dataclass(frozen=True)
 class Finding:
     """A defect."""
@@ -251,7 +255,7 @@ class _Task:
                     yield Finding("pybullet", shard.index, row, text)
 
 
-def _defects(task: _Task, shard: Shard, row: int) -> Iterator[tuple[str, str]]:
+def _defects(task: _Task, shard: Shard, row: int) -> Defects:
     """Kind and message of each defect of a motion, without PyBullet."""
     robot = task.robot
     path = path_of(robot, shard, row)
@@ -280,7 +284,7 @@ def _defects(task: _Task, shard: Shard, row: int) -> Iterator[tuple[str, str]]:
             yield "clearance", f"{name} is {1e3 * stated:.2f} mm; measured: {1e3 * value:.2f} mm"
 
 
-def _ends(shard: Shard, row: int) -> Iterator[tuple[str, str]]:
+def _ends(shard: Shard, row: int) -> Defects:
     q = shard["trajectories"][row]
     goals = shard["goals"][row]
     goal = int(shard["goal_index"][row])
@@ -295,7 +299,7 @@ def _ends(shard: Shard, row: int) -> Iterator[tuple[str, str]]:
         yield "ends", f"the last waypoint differs from goal {goal} by {off:.3g}"
 
 
-def _limits(robot: Robot, q: Configurations) -> Iterator[tuple[str, str]]:
+def _limits(robot: Robot, q: Configurations) -> Defects:
     excess = np.maximum(robot.lower - q, q - robot.upper)
     excess[:, robot.continuous] = 0.0
     if excess.max() > LIMIT_SLACK:
@@ -305,7 +309,7 @@ def _limits(robot: Robot, q: Configurations) -> Iterator[tuple[str, str]]:
         yield "limits", f"{name} is {value} at waypoint {i}; its limits are {low} to {high}"
 
 
-def _lengths(shard: Shard, row: int, path: Path) -> Iterator[tuple[str, str]]:
+def _lengths(shard: Shard, row: int, path: Path) -> Defects:
     cost = float(shard["cost"][row])
     detour = float(shard["detour"][row])
     if not cost * (1 - COST_TOLERANCE) - ROUNDING <= path.length <= cost * (1 + ROUNDING) + ROUNDING:

@@ -48,7 +48,7 @@ def link_length(robot: Robot, q: Float[ndarray, "n waypoints dof"]) -> Values:
     Links that are fixed to these, such as hand and fingers, are left out: they would count the last link
     several times. The paper's arm has no hand.
     """
-    at = forward_frames(robot, np.asarray(q, np.float64).reshape(-1, q.shape[-1]))[:, 1:, :3, 3]
+    at = forward_frames(robot, q.reshape(-1, q.shape[-1]))[:, 1:, :3, 3]
     at = at.reshape(*q.shape[:2], *at.shape[1:])
     return np.linalg.norm(np.diff(at, axis=1), axis=-1).sum(axis=(1, 2))
 
@@ -68,6 +68,10 @@ class Motion:
         return sample_path(self.path.positions, STEP)[1]
 
 
+Measure = Callable[[Motion], float | None]
+"""Returns the value in SI units, as in records; None if the motion has none."""
+
+
 @dataclass(frozen=True)
 class Metric:
     """A figure of motions."""
@@ -79,8 +83,7 @@ class Metric:
     better: Literal["more", "less", ""]
     format: str
     """Format of numbers, such as `.2f`."""
-    of: Callable[[Motion], float | None]
-    """Returns the value in SI units, as in records; None if the motion has none."""
+    of: Measure
     scale: float = 1.0
     """Units of tables per SI unit."""
 
@@ -89,12 +92,12 @@ class Metric:
         return self.name.replace("_", " ")
 
 
-def _clearance(name: str) -> Callable[[Motion], float | None]:
+def _clearance(name: str) -> Measure:
     """A metric that reads a field of the verdict: a lower bound of distances along the motion [m]."""
     return lambda motion: getattr(motion.verdict, name, None)
 
 
-def _timed(of: Callable[[Trajectory, Robot], float | None]) -> Callable[[Motion], float | None]:
+def _timed(of: Callable[[Trajectory, Robot], float | None]) -> Measure:
     """A metric of timed motions."""
     return lambda motion: None if motion.trajectory is None else of(motion.trajectory, motion.robot)
 
@@ -109,7 +112,7 @@ def _over_straight_line(trajectory: Trajectory, robot: Robot) -> float | None:
     return trajectory.duration / straight_time if straight_time > 0 else None
 
 
-def _joint_jerk(of: Callable[[ndarray, ndarray], float]) -> Callable[[Motion], float | None]:
+def _joint_jerk(of: Callable[[ndarray, ndarray], float]) -> Measure:
     """A metric of the jerks between rows, of the joint where each is largest, and of the steps' times."""
 
     def value(trajectory: Trajectory, _: Robot) -> float | None:
@@ -122,7 +125,7 @@ def _joint_jerk(of: Callable[[ndarray, ndarray], float]) -> Callable[[Motion], f
     return _timed(value)
 
 
-def _sparc(tip: bool) -> Callable[[Motion], float | None]:
+def _sparc(tip: bool) -> Measure:
     """A metric of the spectral arc length of the speed of the joints, or of the tip."""
 
     def value(trajectory: Trajectory, robot: Robot) -> float:

@@ -75,11 +75,10 @@ REACH_SAMPLES = 256
 @once_per_robot
 def covers(robot: Robot) -> bool:
     """Whether the network predicts wherever the arm can reach, as random configurations show."""
-    lower, upper = (np.clip(limit, -np.pi, np.pi) for limit in (robot.lower, robot.upper))
-    if any(robot.prismatic):
-        lower, upper = (
-            np.where(robot.prismatic, *pair) for pair in ((robot.lower, lower), (robot.upper, upper))
-        )
+    lower, upper = (
+        np.where(robot.prismatic, limit, np.clip(limit, -np.pi, np.pi))
+        for limit in (robot.lower, robot.upper)
+    )
     q = np.random.default_rng(0).uniform(lower, upper, (REACH_SAMPLES, robot.dof))
     for link, spheres in robot.spheres.items():
         if robot.link_frame(link) == 0:

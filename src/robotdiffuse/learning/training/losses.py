@@ -45,8 +45,8 @@ class ForwardKinematics:
         self._steps = []
         """By joint, [12, 4]: C, A and B transposed, stacked; [8, 4]: C and the slide of a prismatic joint."""
         for offset, prismatic in zip(robot.frame_offsets, robot.prismatic, strict=True):
-            self._steps.append(self._tensor(np.hstack(list(offset @ (slides if prismatic else turns))).T))
-        self._last_row = self._tensor(np.array([[0.0], [0.0], [0.0], [1.0]]))
+            self._steps.append(self.tensor(np.hstack(list(offset @ (slides if prismatic else turns))).T))
+        self._last_row = self.tensor(np.array([[0.0], [0.0], [0.0], [1.0]]))
 
     def __call__(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch frames 4 4"]:
         """T_base_frame of all dof + 1 frames, the base (identity) first."""
@@ -70,7 +70,8 @@ class ForwardKinematics:
         bottom = self._last_row.expand(len(frames), 1, 4, q.shape[1])
         return torch.cat([top, bottom], dim=1).permute(3, 0, 1, 2).reshape(*batch, len(frames), 4, 4)
 
-    def _tensor(self, array: ndarray) -> Tensor:
+    def tensor(self, array: ndarray) -> Tensor:
+        """The array, with this dtype and on this device."""
         return torch.as_tensor(array, dtype=self.dtype, device=self.device)
 
 
@@ -128,7 +129,7 @@ class SurfacePoints:
         if not points:
             raise InputError(f"robot {robot.name} has no meshes on its moving links, which L_point needs")
         self._frame = torch.from_numpy(np.concatenate(frames)).to(kinematics.device)
-        local = torch.from_numpy(np.concatenate(points)).to(kinematics.device, kinematics.dtype)
+        local = kinematics.tensor(np.concatenate(points))
         self._local = torch.nn.functional.pad(local, (0, 1), value=1.0)
 
     def __call__(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch points 3"]:
@@ -152,9 +153,7 @@ class ArmDistance:
     def __init__(self, kinematics: ForwardKinematics) -> None:
         arrays = compile_robot(kinematics.robot)
         groups = np.repeat(arrays.frame, np.diff(arrays.first))
-        spheres = torch.as_tensor(
-            arrays.spheres[groups > 0], dtype=kinematics.dtype, device=kinematics.device
-        )
+        spheres = kinematics.tensor(arrays.spheres[groups > 0])
         self._kinematics = kinematics
         self._frame = torch.as_tensor(groups[groups > 0], device=kinematics.device).long()
         self._centers = spheres[:, :3]

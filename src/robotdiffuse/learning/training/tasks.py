@@ -94,16 +94,11 @@ class _EncoderTask(TrainingTask):
         self._most = settings.points if module.settings.any_size else module.settings.cloud
 
     def loss(self, fraction: float, rng: Generator) -> Scalar:
-        settings = self.settings
-        module = self.module
-        max_points = self._most
-        points = (
-            int(rng.integers(max(1, max_points // 8), max_points + 1))
-            if module.settings.any_size
-            else max_points
-        )
-        error, _ = self._reconstruction(settings.batch, points, rng)
-        theta = torch.stack([p.square().sum() for p in module.penalized()]).sum()
+        points = self._most
+        if self.module.settings.any_size:
+            points = int(rng.integers(max(1, points // 8), points + 1))
+        error, _ = self._reconstruction(self.settings.batch, points, rng)
+        theta = torch.stack([p.square().sum() for p in self.module.penalized()]).sum()
         return error + REGULARIZATION * theta
 
     def validate(self, fraction: float) -> Validation:

@@ -8,6 +8,7 @@ import html
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -138,13 +139,9 @@ class ExplorationSession:
         self.on_change: Callable[[], None] = lambda: None
         self._changed = threading.Condition()
         self._run = 0
-        self._state = ExplorationState(settings, noise, problem.start, speed=speed)
-        self._task = LatestTask(self._explore, "explore")
-
-    @property
-    def state(self) -> ExplorationState:
+        self.state = ExplorationState(settings, noise, problem.start, speed=speed)
         """The current state."""
-        return self._state
+        self._task = LatestTask(self._explore, "explore")
 
     def set_mode(self, mode: str) -> None:
         """Pause, take one step (the one under way, if there is one), or run."""
@@ -156,7 +153,7 @@ class ExplorationSession:
 
     def restart(self, policy: str | None = None, noise: bool | None = None) -> None:
         """Begin anew, with another policy or noise if given. Raises InputError for an unknown policy."""
-        old = self._state
+        old = self.state
         settings = old.settings if policy is None else replace(old.settings, policy=policy)
         noise = old.noise if noise is None else noise
         new = ExplorationState(settings, noise, self.problem.start, old.mode, speed=old.speed)
@@ -165,7 +162,7 @@ class ExplorationSession:
     def _change(self, begin: bool, **changes: Any) -> None:
         """Change the state; `begin` starts the exploration with it, from the beginning."""
         with self._changed:
-            self._state = replace(self._state, **changes)
+            self.state = replace(self.state, **changes)
             if begin:
                 self._run += 1
                 self._task.submit(self._run)
@@ -182,17 +179,14 @@ class ExplorationSession:
     # Work of the thread
 
     def _explore(self, run: int) -> None:
-        try:
-            self._take_steps(run)
-        except _OutdatedError:
-            pass
-        except Exception as error:  # the page survives any error
-            kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
-            with self._changed:
-                if run == self._run:
-                    failure = kind + shortened(str(error))
-                    self._state = replace(self._state, phase=ENDED, failure=failure)
-            self.on_change()
+        with suppress(_OutdatedError):
+            try:
+                self._take_steps(run)
+            except _OutdatedError:
+                raise
+            except Exception as error:  # the page survives any error
+                kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+                self._update(run, phase=ENDED, failure=kind + shortened(str(error)))
 
     def _take_steps(self, run: int) -> None:
         state = self._update(run, phase=CHOOSING)
@@ -202,7 +196,7 @@ class ExplorationSession:
         events = explore(self.problem, explorer, noise, self._seed)
         ended = False
         while not ended:
-            if self._state.mode == PAUSED:
+            if self.state.mode == PAUSED:
                 self._update(run, phase=WAITING)
             self._wait_while_paused(run)
             self._update(run, phase=CHOOSING)
@@ -210,7 +204,7 @@ class ExplorationSession:
             self._execute(run, explorer)
             ended = event.step.motion is None or not event.free
             with self._changed:
-                mode = PAUSED if self._state.mode == STEPPING else self._state.mode
+                mode = PAUSED if self.state.mode == STEPPING else self.state.mode
                 self._update(
                     run,
                     mode=mode,
@@ -231,7 +225,7 @@ class ExplorationSession:
                 last = time.perf_counter()
             time.sleep(1 / FRAME_RATE)
             now = time.perf_counter()
-            speed = self._state.speed if at >= 0 else max(self._state.speed, 1.0)
+            speed = self.state.speed if at >= 0 else max(self.state.speed, 1.0)
             at = min(at + speed * (now - last), act.duration)
             last = now
             if at > 0:
@@ -243,15 +237,15 @@ class ExplorationSession:
         with self._changed:
             if run != self._run:
                 raise _OutdatedError
-            self._state = state = replace(self._state, **changes)
+            self.state = state = replace(self.state, **changes)
         self.on_change()
         return state
 
     def _wait_while_paused(self, run: int) -> bool:
         """Whether it was paused."""
         with self._changed:
-            paused = self._state.mode == PAUSED
-            self._changed.wait_for(lambda: run != self._run or self._state.mode != PAUSED)
+            paused = self.state.mode == PAUSED
+            self._changed.wait_for(lambda: run != self._run or self.state.mode != PAUSED)
             if run != self._run:
                 raise _OutdatedError
         return paused

@@ -142,7 +142,8 @@ class Session:
     def __init__(self, problem: Problem, options: PageOptions = PageOptions()) -> None:
         self.on_change: Callable[[], None] = lambda: None
         self._lock = threading.RLock()
-        self._state = _opened(problem, options)
+        self.state = _opened(problem, options)
+        """The current state."""
         self._planners: dict[str, Planner] = {}
         self._planning_task = LatestTask(self._plan, "plan")
         self._validation_task = LatestTask(self._validate, "validate")
@@ -151,39 +152,35 @@ class Session:
 
     def start(self) -> None:
         """Plan for the first time."""
-        self._goal_task.submit(self._state.goal_pose)
+        self._goal_task.submit(self.state.goal_pose)
         self._changed()
-
-    @property
-    def state(self) -> State:
-        """The current state."""
-        return self._state
 
     def close(self) -> None:
         """Start no more work; running calls end in their own time."""
         for thread in (self._planning_task, self._validation_task, self._goal_task, self._start_task):
             thread.close()
 
+    def _set(self, **changes: Any) -> None:
+        self.state = replace(self.state, **changes)
+
     # Changes by the user
 
     def open(self, problem: Problem) -> None:
         """Replace the problem; it may have another robot."""
         with self._lock:
-            old = self._state
-            new = _opened(problem, self._state.options)
+            old = self.state
+            new = _opened(problem, self.state.options)
             same_robot = old.problem.robot is new.problem.robot
-            self._state = replace(new, version=old.version, motion=old.motion if same_robot else None)
+            self.state = replace(new, version=old.version, motion=old.motion if same_robot else None)
             self._goal_task.submit(new.goal_pose)
             self._changed()
 
     def set_options(self, **changes: Any) -> None:
         """Change fields of `PageOptions`. Raises InputError for bad values."""
         with self._lock:
-            if "planner" in changes:
-                PLANNERS.entry(changes["planner"])
-            before = self._state.options
-            options = replace(self._state.options, **changes)
-            self._state = replace(self._state, options=options)
+            before = self.state.options
+            options = replace(self.state.options, **changes)
+            self._set(options=options)
             if replace(before, trees=options.trees) != options:
                 self._changed()
             elif before != options:
@@ -192,24 +189,24 @@ class Session:
     def plan_now(self) -> None:
         """Plan now, even if automatic planning is off."""
         with self._lock:
-            self._state = replace(self._state, planning=True)
-            self._planning_task.submit(self._state.version)
+            self._set(planning=True)
+            self._planning_task.submit(self.state.version)
         self.on_change()
 
     def move_goal(self, T_base_frame: Pose) -> None:
         """Set the goal to a pose of the goal's link, or of the tip."""
         with self._lock:
-            state = self._state
+            state = self.state
             goal = _posed(state.problem.goal, state.goal_frame, T_base_frame)
             problem = replace(state.problem, goal=goal)
-            self._state = replace(state, problem=problem, goal_pose=T_base_frame)
+            self._set(problem=problem, goal_pose=T_base_frame)
             self._goal_task.submit(T_base_frame)
             self._changed()
 
     def set_start(self, q: Configuration) -> None:
         """Set the start configuration."""
         with self._lock:
-            self._state = replace(self._state, problem=replace(self._state.problem, start=q))
+            self._set(problem=replace(self.state.problem, start=q))
             self._changed()
 
     def move_start(self, T_base_tip: Pose) -> None:
@@ -221,34 +218,34 @@ class Session:
         with self._lock:
             if kind not in NEW_OBSTACLES:
                 raise unknown_name("kind of obstacle", kind, NEW_OBSTACLES)
-            length = reach(self._state.problem.robot)
+            length = reach(self.state.problem.robot)
             center = length * NEW_POSITION if center is None else center
             obstacle = NEW_OBSTACLES[kind](center, round(NEW_RADIUS * length, 2))
-            self._set_scene([*self._state.obstacles.values(), obstacle])
-            return [*self._state.obstacles][-1]
+            self._set_scene([*self.state.obstacles.values(), obstacle])
+            return [*self.state.obstacles][-1]
 
     def change_obstacle(self, name: str, change: Callable[[Shape], Shape | None]) -> None:
         """Replace an obstacle, or delete it for None. Raises InputError for an unknown name."""
         with self._lock:
-            obstacles = self._state.obstacles
+            obstacles = self.state.obstacles
             if name not in obstacles:
                 raise unknown_name("obstacle", name, obstacles)
             changed = {**obstacles, name: change(obstacles[name])}
             self._set_scene([shape for shape in changed.values() if shape is not None])
 
     def _set_scene(self, shapes: list[Shape]) -> None:
-        problem = self._state.problem
+        problem = self.state.problem
         scene = problem.scene.with_shapes(shapes)
-        self._state = replace(self._state, problem=replace(problem, scene=scene))
+        self._set(problem=replace(problem, scene=scene))
         self._changed()
 
     def _changed(self) -> None:
         """Validate the motion shown again, and plan again if `follow` is on."""
         with self._lock:
-            state = self._state
+            state = self.state
             version = state.version + 1
             follow = state.options.follow
-            self._state = replace(state, version=version, planning=follow, answer=None, failure="")
+            self._set(version=version, planning=follow, answer=None, failure="")
             if state.motion is not None:
                 self._validation_task.submit(version)
             if follow:
@@ -260,13 +257,13 @@ class Session:
     def _publish(self, fits: Callable[[State], bool], **changes: Any) -> None:
         """Change the state if what was computed still fits it."""
         with self._lock:
-            if not fits(self._state):
+            if not fits(self.state):
                 return
-            self._state = replace(self._state, **changes)
+            self._set(**changes)
         self.on_change()
 
     def _validate(self, _version: int) -> None:
-        state = self._state
+        state = self.state
         if state.motion is None:
             return
         validation = _validated(state.problem, state.motion, state.version)
@@ -279,7 +276,7 @@ class Session:
 
     def _find_goal_configuration(self, T_base_frame: Pose) -> None:
         """Find a configuration at the goal, close to the previous one."""
-        state = self._state
+        state = self.state
         previous = state.goal_configuration
         robot = state.problem.robot
         near = state.problem.start if previous is None else previous
@@ -287,37 +284,35 @@ class Session:
         self._publish(lambda now: now.problem.robot is robot, goal_configuration=q)
 
     def _move_start(self, T_base_tip: Pose) -> None:
-        problem = self._state.problem
+        problem = self.state.problem
         q = _configuration_at(problem.robot, problem.robot.tip, T_base_tip, problem.start)
-        if q is not None and self._state.problem.robot is problem.robot:
+        if q is not None and self.state.problem.robot is problem.robot:
             self.set_start(q)
 
     def _plan(self, version: int) -> None:
-        state = self._state
+        state = self.state
         if state.version != version:
             return
         result, failure, seconds = self._solve(state)
         validation = None
-        now = self._state
+        now = self.state
         same_robot = now.problem.robot is state.problem.robot
         if same_robot and result is not None and result.trajectory is not None:
             validation = _validated(now.problem, result, now.version)
             seconds = (*seconds, ("validating again", validation.seconds))
         with self._lock:
-            current = self._state.version == version
+            current = self.state.version == version
             if current:
-                self._state = replace(
-                    self._state, planning=False, answer=result, failure=failure, seconds=seconds
-                )
+                self._set(planning=False, answer=result, failure=failure, seconds=seconds)
             # an outdated motion is still shown if it is free in the current scene
-            same_robot = self._state.problem.robot is state.problem.robot
+            same_robot = self.state.problem.robot is state.problem.robot
             violation = None if validation is None else validation.report.violation
             # the goal moves while the target is dragged
             free = violation is None or violation.kind == "goal"
             if same_robot and validation is not None and (current or free):
-                self._state = replace(self._state, motion=result, validation=validation)
-                if validation.version != self._state.version:
-                    self._validation_task.submit(self._state.version)
+                self._set(motion=result, validation=validation)
+                if validation.version != self.state.version:
+                    self._validation_task.submit(self.state.version)
         self.on_change()
 
     def _solve(self, state: State) -> tuple[PlanResult | None, str, tuple[tuple[str, float], ...]]:
