@@ -266,6 +266,20 @@ def test_a_line_that_is_always_refused_does_not_end_the_search(monkeypatch: pyte
     assert result.solved and len(result.path.positions) > 2
 
 
+def test_half_of_the_first_samples_lie_about_the_line_to_a_goal():
+    space = search_space(CollisionChecker(PANDA, WALL), 0.04)
+    start = LEFT.astype(np.float32)
+    goals = np.stack([RIGHT, READY]).astype(np.float32)
+    q = np.empty((4_000, 7), np.float32)
+    state = random_state(2)
+    for row in q:
+        rrt_kernel.sample_about_line(space, start, goals, row, state)
+    assert (q >= space.lower).all() and (q <= space.upper).all()
+    middle = (start + goals.mean(axis=0)) / 2
+    spread = rrt_kernel.LINE_SPREAD * (space.upper - space.lower)
+    assert (np.abs(np.median(q, axis=0) - middle) < 0.1 * spread).all()
+
+
 def test_search_can_be_continued():
     space = search_space(CollisionChecker(PANDA, WALL), 0.04)
     trees = rrt_kernel.make_trees(*ends(), 5000)

@@ -105,7 +105,7 @@ def test_rounds_reach_the_optimum_quickly(planar) -> None:
     checker, start, goal, optimum = planar
     settings = replace(TOUCHING, resolution=0.01)
     search = SharedTreeSearch(checker, start, goal[None], settings, random_state(1))
-    for _ in range(20):
+    for _ in range(40):
         search.round()
     assert 0.985 < search.cost / optimum < 1.01
     assert all(a >= b for a, b in pairwise(search.costs))

@@ -57,6 +57,9 @@ OPTIMALITY_TOLERANCE = 1e-4
 """A path that exceeds the straight line by no more than this part is optimal."""
 NEAR_FACTOR = 1.3
 """Paths up to this factor of the best length may become the fastest motion."""
+LONG_ROUND_FACTOR = 5
+"""If the first round finds no path, rounds have this many times as many iterations until there is one: larger
+trees find a narrow passage sooner than new ones."""
 VALIDATION_INTERVAL = 4_000
 """Iterations between two validations of shorter paths. Validating only at the end could lose everything found
 since the last valid path."""
@@ -101,7 +104,8 @@ class SearchSettings(Settings):
     tightenings: Natural = 200
     """Attempts to shorten each path but the first by small moves of its waypoints."""
     iterations: Count = 20_000
-    """Most iterations of a round; its trees hold at most as many nodes."""
+    """Most iterations of a round; its trees hold at most as many nodes. Five times as many where the first
+    round finds no path."""
     keep_trees: bool = False
     """Whether results hold the trees of the search, for drawing."""
 
@@ -311,6 +315,8 @@ class AnytimeSearch:
     def _iterate(self) -> None:
         """Run some iterations of a round, and offer the path that they find."""
         iterations = self.settings.iterations
+        if self.best is None and self.work >= iterations:
+            iterations *= LONG_ROUND_FACTOR
         trees = self._trees
         capacity = iterations + len(self.goals) + 2 * self.spare_nodes
         if trees is None or self.work >= self._round_end or trees.sizes.max() + self.spare_nodes >= capacity:

@@ -27,6 +27,10 @@ _NOWHERE = np.float32(1e15)
 """A coordinate far from all nodes, with a finite square [rad]."""
 _FAR = np.float32(1e29)
 """Less than the square of a distance to _NOWHERE, and more than any other."""
+LINE_SHARE = np.float32(0.5)
+"""Share of the samples about the straight line while there is no path; the others are uniform."""
+LINE_SPREAD = np.float32(0.3)
+"""Their standard deviation, as a fraction of a joint's range."""
 
 
 class Trees(NamedTuple):
@@ -160,6 +164,8 @@ def search(space, limits, trees, bound, longest, iterations, state):
             g_hat = _to_roots(trees, tree, sample)
             h_hat = _to_roots(trees, other_tree, sample)
             c_rand = g_hat + random(state) * (bound - h_hat - g_hat)
+        elif limits is None and random(state) < LINE_SHARE:
+            sample_about_line(space, start, goals, sample, state)
         else:
             sample_box(space, sample, state)
         # EXTEND(T_a, x_rand): x_near and x_new
@@ -387,6 +393,18 @@ def sample_box(space, q, state):
     """Sample q uniformly within the joint limits."""
     for j in range(len(q)):
         q[j] = space.lower[j] + random(state) * (space.upper[j] - space.lower[j])
+
+
+@allocation_free(inner=False)
+def sample_about_line(space, start, goals, q, state):
+    """Sample q about the straight line from the start to one of the goals: normally distributed, clamped to
+    the limits."""
+    g = min(int(random(state) * len(goals)), len(goals) - 1)
+    share = random(state)
+    for j in range(len(q)):
+        center = start[j] + share * (goals[g, j] - start[j])
+        spread = LINE_SPREAD * (space.upper[j] - space.lower[j])
+        q[j] = min(max(center + spread * _normal(state), space.lower[j]), space.upper[j])
 
 
 @kernel()
