@@ -61,6 +61,10 @@ def test_what_obstacles_may_reach_is_free_only_by_a_margin_of_the_own_error() ->
     assert (doubted <= MAP.within(np.column_stack([points, errors + 0.03]))).all()
     narrow = carve_view(far, PANDA, HOME, 0.015, MAP, narrowed=1.0)[0] == FREE
     assert (known.free & reached <= narrow).all() and known.unknown[doubted].all()
+    declared = OccupancyMap(PANDA)
+    declared.declare_free(((-1.0, -1.0, -0.4), (1.0, 1.0, 1.1)))
+    declared.doubt(points, errors)
+    assert declared.free.sum() == declared._declared.sum(), "declared free until a view finds it occupied"
     known.add(view_from(0.3))
     known.doubt(points, errors)
     assert (known.free[doubted & ~known.occupied]).mean() > 0.9, "an exact view leaves no doubt"

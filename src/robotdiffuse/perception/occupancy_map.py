@@ -110,7 +110,7 @@ class OccupancyMap:
     @locked
     def doubt(self, points: Points, errors: Values) -> None:
         """Until the next view, voxels that obstacles may reach count as unknown: those within the errors of
-        points, unless a view saw them free by a margin of all of its own error.
+        points, unless they are declared free or a view saw them so by a margin of all of its own error.
 
         points: observed points [m]; errors: how far off each may be [m].
         """
@@ -147,7 +147,7 @@ class OccupancyMap:
             if self.max_age is not None:
                 occupied = occupied & self._fresh
                 free = free & self._fresh
-            free = (free | self._declared & ~occupied) & ~self._doubted
+            free = free & ~self._doubted | self._declared & ~occupied
             self._known = occupied, free, ~(free | occupied)
             for voxels in self._known:
                 voxels.flags.writeable = False
