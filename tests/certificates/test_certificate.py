@@ -15,8 +15,8 @@ import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from robotdiffuse.certificates.bounds import Prover, Stretches
 from robotdiffuse.certificates.certificate import Certificate, load_certificate
-from robotdiffuse.certificates.checker import describe_claim, hash_of
-from robotdiffuse.certificates.proof import StretchProof, Tolerances, robot_parts, scene_parts
+from robotdiffuse.certificates.checker import describe_claim
+from robotdiffuse.certificates.proof import StretchProof, Tolerances, hash_of, robot_parts, scene_parts
 from robotdiffuse.certificates.search import NotValidError, certify
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError

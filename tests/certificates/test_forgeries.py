@@ -13,8 +13,7 @@ import pytest
 
 import robotdiffuse as rd
 from robotdiffuse.certificates.certificate import load_certificate
-from robotdiffuse.certificates.checker import hash_of
-from robotdiffuse.certificates.proof import request_parts, scene_parts
+from robotdiffuse.certificates.proof import hash_of, request_parts, scene_parts
 from robotdiffuse.certificates.requirements import not_checked
 from robotdiffuse.certificates.search import certify
 from robotdiffuse.cli.verify import described

@@ -14,8 +14,7 @@ import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from robotdiffuse.certificates.bounds import MovingProver, Stretches
 from robotdiffuse.certificates.certificate import Certificate, load_certificate
-from robotdiffuse.certificates.checker import hash_of
-from robotdiffuse.certificates.proof import request_parts
+from robotdiffuse.certificates.proof import hash_of, request_parts
 from robotdiffuse.certificates.requirements import constraint_bounds
 from robotdiffuse.certificates.search import certify
 from robotdiffuse.core.errors import InputError

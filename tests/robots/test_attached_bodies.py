@@ -144,7 +144,7 @@ def test_a_tool_is_the_tip_and_its_shapes_are_in_the_frame_of_its_link() -> None
     ("wrong", "message"),
     [
         (lambda r: r.attach(SHAPES[0], "hand"), "unknown link in attached.link: 'hand'; known: l1, l2, l3"),
-        (lambda r: r.attach(SHAPES[0], r.base), "no planned joint moves; these are moved: l1"),
+        (lambda r: r.attach(SHAPES[0], r.base), "no planned joint moves .*; they move l1"),
         (lambda r: r.attach(rd.Sphere([0, 0, 0], 0.1, name="l2"), "l3"), "is a link of"),
         (lambda r: r.attach(SHAPES[0], "l3", ["l9"]), "unknown link in attached.touch_links: 'l9'"),
         (lambda r: r.attach(rd.PointCloud([[0, 0, 0]]), "l3"), "'point_cloud' is a point_cloud; it must be"),

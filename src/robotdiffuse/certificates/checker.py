@@ -19,7 +19,7 @@ from robotdiffuse.certificates.proof import (
     StretchProof,
     Tolerances,
     differences,
-    motion_hash,
+    hash_of,
     request_parts,
     robot_parts,
     scene_parts,
@@ -31,7 +31,7 @@ from robotdiffuse.certificates.requirements import (
     requirement_errors,
 )
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.core.types import Trajectory
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 
@@ -108,12 +108,6 @@ def _cover_errors(robot: Robot) -> Iterator[str]:
         beyond = float(gaps.min(axis=1).max())
         if not beyond <= COVER_TOLERANCE:
             yield f"robot: the meshes of {link} stick out of its spheres by {beyond:.2g} m"
-
-
-def hash_of(motion: Path | Trajectory) -> str:
-    """Hash of a motion, without any rounding."""
-    rates = (motion.times, motion.velocities, motion.accelerations) if isinstance(motion, Trajectory) else ()
-    return motion_hash(motion.joint_names, motion.positions, *rates)
 
 
 def _proof_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:

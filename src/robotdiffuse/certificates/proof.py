@@ -3,7 +3,7 @@ scenes and motions, part by part, so that the checker can name what differs."""
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -15,7 +15,7 @@ from robotdiffuse.certificates.bounds import Claim, Plane, Stretches
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path, Trajectory, Values
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot import Robot, hashed_content
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud, Shape, Triangulated
 
@@ -103,8 +103,6 @@ class MotionProof:
     [m/s³]; empty for a path, and where accelerations jump at the ends."""
 
 
-HASH_DECIMALS = 9
-"""Decimals that are hashed: rotations from quaternions differ in the last bits between machines."""
 HASH_LENGTH = 16
 """Hexadecimal digits of the hash of a part."""
 LIMITS = ("lower", "upper", "velocity", "acceleration")
@@ -161,12 +159,12 @@ def request_parts(problem: Problem) -> dict[str, str]:
     return parts
 
 
-def motion_hash(names: Iterable[str], *rows: np.ndarray | None) -> str:
-    """Hash of joint names and arrays, without any rounding."""
-    digest = hashlib.sha256(json.dumps(list(names)).encode())
-    for array in rows:
-        if array is not None:
-            digest.update(str(array.shape).encode() + np.ascontiguousarray(array, np.float64).tobytes())
+def hash_of(motion: Path | Trajectory) -> str:
+    """Hash of a motion, without any rounding."""
+    rates = (motion.times, motion.velocities, motion.accelerations) if isinstance(motion, Trajectory) else ()
+    digest = hashlib.sha256(json.dumps(list(motion.joint_names)).encode())
+    for array in (motion.positions, *rates):
+        digest.update(str(array.shape).encode() + np.ascontiguousarray(array, np.float64).tobytes())
     return digest.hexdigest()
 
 
@@ -191,8 +189,4 @@ def _numbers(shape: Shape) -> list[object]:
 
 
 def _hash(names: object, *numbers: object) -> str:
-    digest = hashlib.sha256(json.dumps(names).encode())
-    for values in numbers:
-        rounded = np.round(np.asarray(values, np.float64), HASH_DECIMALS) + 0.0  # no negative zeros
-        digest.update(str(rounded.shape).encode() + rounded.tobytes())
-    return digest.hexdigest()[:HASH_LENGTH]
+    return hashlib.sha256(hashed_content(names, *numbers)).hexdigest()[:HASH_LENGTH]

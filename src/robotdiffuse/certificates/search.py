@@ -33,12 +33,12 @@ from robotdiffuse.certificates.bounds import (
     placed,
 )
 from robotdiffuse.certificates.certificate import Certificate
-from robotdiffuse.certificates.checker import hash_of
 from robotdiffuse.certificates.kinematics import cubics_of, places_of
 from robotdiffuse.certificates.proof import (
     DECIMALS,
     StretchProof,
     Tolerances,
+    hash_of,
     request_parts,
     robot_parts,
     scene_parts,
@@ -55,7 +55,7 @@ from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.core.types import Path, Pose, Trajectory, Values
 from robotdiffuse.problems.problem import Problem, check_problem
-from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose
+from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose, coal_rounded
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.validation.validator import DEFAULT, VerifySettings, check_motion, verify
 
@@ -80,7 +80,10 @@ class PlaneFinder:
         self.prover = prover
         self._parts = {link: tuple(map(_hull, parts)) for link, parts in prover.parts.items()}
         self._obstacles = tuple(
-            _rounded(body) if isinstance(body, Rounded) else None for body in prover.obstacles.bodies
+            _Body(coal_rounded(*body[2:]), transform(body.center, body.R))
+            if isinstance(body, Rounded)
+            else None
+            for body in prover.obstacles.bodies
         )
 
     def planes(self, todo: Stretches, rows: ndarray, needed: Values) -> list[Plane]:
@@ -164,17 +167,6 @@ def _hull(part: Part) -> _Body:
     if len(part.vertices) == 1:
         return _Body(coal.Sphere(part.rounding), transform(part.vertices[0]))
     return _Body(coal_convex(part.vertices, part.faces), np.eye(4))
-
-
-def _rounded(body: Rounded) -> _Body:
-    x, y, z = (2 * body.half).tolist()
-    if body.disc > 0:
-        geometry = coal.Cylinder(body.disc, z)
-    elif body.rounding > 0:
-        geometry = coal.Capsule(body.rounding, z) if z > 0 else coal.Sphere(body.rounding)
-    else:
-        geometry = coal.Box(x, y, z)
-    return _Body(geometry, transform(body.center, body.R))
 
 
 CLEARANCE_SHARE = 0.5

@@ -4,15 +4,16 @@ It does not use the covering spheres, so they can be tested against it. Only a l
 represented by its spheres.
 """
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from robotdiffuse.collision.kernels.convex_bounds import Hulls, Solids
-from robotdiffuse.core.transforms import placed, transform
+from robotdiffuse.core.transforms import ball_around, placed, transform
 from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -68,9 +69,7 @@ def parts_of(robot: Robot) -> dict[str, tuple[Part, ...]]:
         convex_parts: list[Part] = []
         for mesh in robot.meshes.get(link, ()):
             vertices = placed(T, mesh.vertices)
-            center = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-            radius = float(np.linalg.norm(vertices - center, axis=1).max())
-            convex_parts.append(Part(frame, vertices, mesh.faces, 0.0, center, radius))
+            convex_parts.append(Part(frame, vertices, mesh.faces, 0.0, *ball_around(vertices)))
         if not convex_parts:
             for x, y, z, radius in robot.spheres.get(link, np.zeros((0, 4))).tolist():
                 center = T[:3, :3] @ np.array([x, y, z]) + T[:3, 3]
@@ -124,13 +123,19 @@ def solids_of(scene: Scene) -> tuple[Solid, ...]:
     return tuple(solid for solid in map(_solid, scene.shapes) if solid is not None)
 
 
+def allowed_contacts(scene: Scene, links: Sequence[str], solids: Sequence[Solid]) -> Bool[ndarray, "l s"]:
+    """Whether each link may touch each solid; without rows and columns if the scene allows no contact."""
+    if not scene.allowed_contacts:
+        return np.zeros((0, 0), np.bool_)
+    names = [solid.shape.name for solid in solids]
+    allowed = {name: [scene.may_touch(link, name) for link in links] for name in dict.fromkeys(names)}
+    return np.array([allowed[name] for name in names], np.bool_).reshape(len(names), len(links)).T.copy()
+
+
 def solid_arrays(robot: Robot, scene: Scene) -> Solids:
     """The arrays of the obstacles for compiled code."""
     solids = solids_of(scene)
-    may_touch = np.zeros((0, 0), np.bool_)
-    if scene.allowed_contacts:
-        rows = [[scene.may_touch(check.link, s.shape.name) for s in solids] for check in checks_of(robot)]
-        may_touch = np.array(rows, np.bool_).reshape(-1, len(solids))
+
     T = np.array([solid.T_base_box for solid in solids]).reshape(-1, 4, 4)
     return Solids(
         np.ascontiguousarray(np.swapaxes(T[:, :3, :3], 1, 2)),
@@ -139,7 +144,7 @@ def solid_arrays(robot: Robot, scene: Scene) -> Solids:
         np.array([solid.disc for solid in solids], np.float64),
         np.array([solid.rounding for solid in solids], np.float64),
         np.array([solid.bounds for solid in solids], np.bool_),
-        may_touch,
+        allowed_contacts(scene, [check.link for check in checks_of(robot)], solids),
     )
 
 

@@ -33,11 +33,11 @@ from robotdiffuse.collision.surface_pairs import MAX_OVERLAP, SurfacePair, surfa
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.deadline import check_time
 from robotdiffuse.core.transforms import transform
-from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose, coal_surface
+from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose, coal_rounded, coal_surface
 from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere, Triangulated
+from robotdiffuse.scenes.shapes import PointCloud, Sphere, Triangulated
 
 CHUNK_SIZE = 8192
 """Configurations that `collides` processes at once; bounds its memory."""
@@ -112,23 +112,10 @@ def _balls(robot: Robot) -> dict[str, tuple[int, ndarray, ndarray]]:
 def _obstacle(solid: Solid) -> _Obstacle:
     """The Coal object of a shape."""
     shape = solid.shape
-    match shape:
-        case Sphere():
-            geometry = coal.Sphere(shape.radius)
-        case Box():
-            geometry = coal.Box(*shape.size)
-        case Cylinder():
-            geometry = coal.Cylinder(shape.radius, shape.height)
-        case Capsule():
-            geometry = coal.Capsule(shape.radius, shape.height)
-        case Triangulated() | PointCloud():
-            geometry = _tree(shape)
-        case _:
-            raise TypeError(f"no collision geometry for a {type(shape).__name__}")
-    # surfaces are given in the base frame
-    T = coal.Transform3s.Identity() if solid.bounds else coal_pose(solid.T_base_box)
-    inflation = solid.rounding if solid.bounds else 0.0
-    return _Obstacle(shape.name, geometry, T, solid.bounds, inflation)
+    if isinstance(shape, Triangulated | PointCloud):  # given in the base frame
+        return _Obstacle(shape.name, _tree(shape), coal.Transform3s.Identity(), True, solid.rounding)
+    geometry = coal_rounded(solid.half, solid.disc, solid.rounding)
+    return _Obstacle(shape.name, geometry, coal_pose(solid.T_base_box), False, 0.0)
 
 
 @lru_cache(maxsize=16)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy import ndarray
 
-from robotdiffuse.collision.convex_geometry import Solid, solids_of
+from robotdiffuse.collision.convex_geometry import Solid, allowed_contacts, solids_of
 from robotdiffuse.collision.kernels.simd import W, by_sixteen
 from robotdiffuse.collision.point_cloud_grid import (
     NO_SPHERES,
@@ -23,9 +23,9 @@ from robotdiffuse.collision.point_cloud_grid import (
 )
 from robotdiffuse.collision.sphere_pair_tables import build_pair_tables, no_tables
 from robotdiffuse.core.deadline import check_time
-from robotdiffuse.core.transforms import placed, transform
+from robotdiffuse.core.transforms import moved_spheres, transform
 from robotdiffuse.robots.kinematic_tree import once_per_robot
-from robotdiffuse.robots.motion_bounds import motion_radii
+from robotdiffuse.robots.motion_bounds import radii_of
 from robotdiffuse.robots.robot import LinkPairTable, Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud, Triangulated
@@ -136,11 +136,8 @@ def compile_robot(robot: Robot) -> RobotArrays:
     )
     if not pairs:
         return arrays
-    rows = [link for link in robot.link_names if link in robot.spheres]
-    group_radii = motion_radii(robot)[[rows.index(link) for link in groups]]
-    pair_indices, tables = build_pair_tables(
-        arrays, robot.lower, robot.upper, group_radii, _known_tables(robot, pairs, groups)
-    )
+    known = _known_tables(robot, pairs, groups)
+    pair_indices, tables = build_pair_tables(arrays, robot.lower, robot.upper, radii_of(robot, groups), known)
     return arrays._replace(pairs=pair_indices, pair_tables=tables)
 
 
@@ -175,9 +172,7 @@ def _placed_groups(robot: Robot) -> dict[str, _Group]:
     link_spheres = []
     parts = []
     for link in links:
-        local = np.asarray(robot.spheres[link], np.float64)
-        centers = placed(robot.T_frame_link(link), local[:, :3])
-        link_spheres.append(np.column_stack([centers, local[:, 3]]))
+        link_spheres.append(moved_spheres(robot.T_frame_link(link), robot.spheres[link]))
         parts.append(_clusters(link_spheres[-1]))
     bounds = _bounding_spheres([*link_spheres, *(part for group in parts for part in group)])
     of_parts = iter(bounds[len(link_spheres) :])
@@ -274,16 +269,8 @@ def compile_scene(
         rows,
         _boxes_around(rows),
         *_grid_around(tuple(points), reach, radius),
-        _may_touch(scene, groups, [solid.shape.name for solid in solids]),
+        allowed_contacts(scene, groups, solids),
     )
-
-
-def _may_touch(scene: Scene, groups: tuple[str, ...], names: list[str]) -> ndarray:
-    """`SceneArrays.may_touch` for solids with these names."""
-    if not scene.allowed_contacts:
-        return np.zeros((0, 0), np.bool_)
-    allowed = {name: [scene.may_touch(link, name) for link in groups] for name in dict.fromkeys(names)}
-    return np.array([allowed[name] for name in names], np.bool_).reshape(len(names), len(groups)).T.copy()
 
 
 def _rows(solids: Sequence[Solid], reach: float) -> ndarray:

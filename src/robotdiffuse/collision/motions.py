@@ -43,6 +43,7 @@ from robotdiffuse.collision.kernels.motion_pieces import Motion, Pieces
 from robotdiffuse.collision.kernels.motions import Space
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.loading import loading
+from robotdiffuse.core.transforms import ball_around
 from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot
@@ -299,7 +300,6 @@ def with_covering_spheres(robot: Robot) -> Robot:
     for link, meshes in robot.meshes.items():
         if len(meshes) and not len(robot.spheres.get(link, ())):
             vertices = np.concatenate([mesh.vertices for mesh in meshes])
-            center = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-            radius = np.linalg.norm(vertices - center, axis=1).max()
+            center, radius = ball_around(vertices)
             added[link] = np.array([[*center, radius]])
     return replace(robot, spheres=robot.spheres | added) if added else robot

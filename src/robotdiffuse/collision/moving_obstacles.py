@@ -24,9 +24,9 @@ from robotdiffuse.collision.kernels.moving_obstacles import CLEARANCE_CAP, Links
 from robotdiffuse.collision.motions import with_covering_spheres
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.loading import loading
-from robotdiffuse.core.transforms import inverse, placed, quaternion_from_rotation
+from robotdiffuse.core.transforms import inverse, moved_spheres, quaternion_from_rotation
 from robotdiffuse.robots.kinematic_tree import once_per_robot
-from robotdiffuse.robots.motion_bounds import motion_radii
+from robotdiffuse.robots.motion_bounds import radii_of
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle, track_speeds
 from robotdiffuse.scenes.scene import Scene
@@ -182,11 +182,7 @@ class MovingCollision:
 
 def _at(times: ndarray, rows: ndarray, time: float) -> Float[ndarray, "dof"]:
     """Rows, interpolated at a time; constant before and after them."""
-    if len(times) == 1:
-        return rows[0]
-    i = int(np.clip(np.searchsorted(times, time, side="right") - 1, 0, len(times) - 2))
-    share = float(np.clip((time - times[i]) / (times[i + 1] - times[i]), 0.0, 1.0))
-    return rows[i] + share * (rows[i + 1] - rows[i])
+    return np.array([np.interp(time, times, column) for column in rows.T])
 
 
 @once_per_robot
@@ -194,12 +190,9 @@ def compile_links(robot: Robot) -> tuple[tuple[str, ...], Links]:
     """Names of the moving links with geometry, and their arrays for compiled code."""
     covered = with_covering_spheres(robot)
     names = tuple(link for link in robot_groups(covered) if covered.link_frame(link) > 0)
-    rows = [link for link in covered.link_names if link in covered.spheres]
     spheres = []
     for link in names:
-        T = covered.T_frame_link(link)
-        local = np.asarray(covered.spheres[link], np.float64)
-        spheres.append(np.column_stack([placed(T, local[:, :3]), local[:, 3]]))
+        spheres.append(moved_spheres(covered.T_frame_link(link), covered.spheres[link]))
     bounds = np.zeros((len(names), 4))
     for i, of_link in enumerate(spheres):
         low = (of_link[:, :3] - of_link[:, 3:]).min(axis=0)
@@ -215,7 +208,7 @@ def compile_links(robot: Robot) -> tuple[tuple[str, ...], Links]:
         bounds,
         np.cumsum([0] + [len(of_link) for of_link in spheres]),
         np.concatenate(spheres) if spheres else np.zeros((0, 4)),
-        np.ascontiguousarray(motion_radii(covered)[[rows.index(link) for link in names]]),
+        radii_of(covered, names),
     )
     return names, links
 

@@ -4,6 +4,8 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
+from types import UnionType
+from typing import Any
 
 import numpy as np
 
@@ -75,6 +77,16 @@ def check_type(what: str, value: object, kind: type | tuple[type, ...], wanted: 
     """Raises InputError unless the value is of one of these types; `wanted` says what it must be."""
     if not isinstance(value, kind):
         raise InputError(f"{what} is {shown(value)}; it must be {wanted}")
+
+
+def check_list(
+    what: str, value: Any, kinds: type | tuple[type, ...] | UnionType, wanted: str, least: int = 0
+) -> None:
+    """Raises InputError unless the value is a list of at least `least` instances of these types; `wanted`
+    names them."""
+    of_kind = isinstance(value, list | tuple) and all(isinstance(one, kinds) for one in value)
+    if not of_kind or len(value) < least:
+        raise InputError(f"{what} is {shown(value)}; it must be a list of {wanted}")
 
 
 def distinct(*values: float | int, digits: int = 6) -> list[str]:

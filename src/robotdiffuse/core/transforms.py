@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import unit_quaternion, vector
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Points, Pose, Rotation, Vector
+from robotdiffuse.core.types import Points, Pose, Rotation, Spheres, Vector
 
 IDENTITY = np.eye(4)
 
@@ -133,6 +133,17 @@ def inverse(T: Pose) -> Pose:
 def placed(T: Pose, points: Points) -> Points:
     """Points of a frame in the frame in which its pose is T."""
     return points @ T[:3, :3].T + T[:3, 3]
+
+
+def moved_spheres(T: Pose, spheres: Spheres) -> Spheres:
+    """Spheres x y z radius of a frame in the frame in which its pose is T."""
+    return np.column_stack([placed(T, spheres[:, :3]), spheres[:, 3]])
+
+
+def ball_around(points: Points) -> tuple[Vector, float]:
+    """Center and radius of a ball around points: about the middle of their box."""
+    center = (points.min(axis=0) + points.max(axis=0)) / 2
+    return center, float(np.linalg.norm(points - center, axis=1).max())
 
 
 def rotation_angle(rotation: Rotation) -> float:

@@ -25,7 +25,7 @@ payload: {mass: 1.5, com: [0, 0, 0.12], link: panda_hand}
 """
 
 from collections.abc import Callable
-from dataclasses import MISSING, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -49,6 +49,7 @@ from robotdiffuse.scenes.files import (
     check_fields,
     contacts_entry,
     read_scene,
+    required_fields,
     scene_entries,
 )
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
@@ -114,7 +115,7 @@ def _fields_of(kind: type) -> tuple[dict[str, Schema], list[str]]:
         schemas |= (
             POSE if field.name in ("wxyz", "T_base_box") else {field.name: VALUES.get(field.name, NUMBER)}
         )
-    return schemas, [field.name for field in fields(kind) if field.default is MISSING]
+    return schemas, required_fields(kind)
 
 
 def _entry_schema(kind: type[Shape] | type[Constraint]) -> Schema:

@@ -273,20 +273,14 @@ def _requested(
         implied = f"planned at {locked:g}, which {joint.mimic.joint} implies"
         notes.append(f"start_state: {joint.name} is {start_value:g}; {implied}")
 
-    def values(where: str, positions: dict[str, float]) -> list[float]:
-        missing = [name for name in robot.joint_names if name not in positions]
-        if missing:
-            raise InputError(f"{where} has no value for {', '.join(missing)}")
-        return [positions[name] for name in robot.joint_names]
-
-    start = values("start_state", request.start)
+    start = robot.planned_values("start_state", request.start)
     for attached in request.attached:
         robot = attached.held_by(robot, start)
     if request.pose_goal is not None:
         goal: Goal = PoseGoal(*request.pose_goal)
     else:
-        rows = [values(f"goal_constraints[{i}]", goal) for i, goal in enumerate(request.joint_goals)]
-        goal = JointGoal(rows)
+        goals = enumerate(request.joint_goals)
+        goal = JointGoal([robot.planned_values(f"goal_constraints[{i}]", values) for i, values in goals])
     return Problem(robot, scene, start, goal, notes=tuple(notes), **options)
 
 

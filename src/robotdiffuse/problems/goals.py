@@ -10,7 +10,7 @@ from typing import no_type_check
 import numpy as np
 
 from robotdiffuse.core.bounds import Value, numbers, rigid_transform
-from robotdiffuse.core.errors import InputError, repeated, shown
+from robotdiffuse.core.errors import InputError, check_list, repeated, shown
 from robotdiffuse.core.types import GivenConfigurations, GivenPose, Pose, VectorOrNone
 
 
@@ -97,13 +97,11 @@ class PosesGoal(Value):
     poses: Sequence[PoseGoal]
 
     def __post_init__(self) -> None:
-        poses = self.poses if isinstance(self.poses, list | tuple) else ()
-        if not poses or not all(isinstance(pose, PoseGoal) for pose in poses):
-            raise InputError(f"goal.poses is {shown(self.poses)}; it must be a list of rd.PoseGoal")
-        twice = repeated(pose.frame for pose in poses)
+        check_list("goal.poses", self.poses, PoseGoal, "rd.PoseGoal", least=1)
+        twice = repeated(pose.frame for pose in self.poses)
         if twice:
             raise InputError(f"goal.poses names {twice[0]!r} twice; each link has one pose")
-        object.__setattr__(self, "poses", tuple(poses))
+        object.__setattr__(self, "poses", tuple(self.poses))
 
     def moved(self, T: Pose) -> "PosesGoal":
         """The goal after a rigid motion.
@@ -127,13 +125,9 @@ class AnyGoal(Value):
     goals: "tuple[OneGoal, ...]"
 
     def __post_init__(self) -> None:
-        goals = self.goals if isinstance(self.goals, list | tuple) else ()
-        if not goals or not all(isinstance(goal, OneGoal) for goal in goals):
-            raise InputError(
-                f"goal.goals is {shown(self.goals)}; it must be a list of rd.JointGoal, rd.PoseGoal and "
-                "rd.PosesGoal"
-            )
-        object.__setattr__(self, "goals", tuple(goals))
+        wanted = "rd.JointGoal, rd.PoseGoal and rd.PosesGoal"
+        check_list("goal.goals", self.goals, OneGoal, wanted, least=1)
+        object.__setattr__(self, "goals", tuple(self.goals))
 
     def moved(self, T: Pose) -> "AnyGoal":
         """The goals after a rigid motion.

@@ -26,7 +26,7 @@ from robotdiffuse.core.transforms import (
     transform,
 )
 from robotdiffuse.core.types import Pose, Vector
-from robotdiffuse.robots.bodies import AttachedBody
+from robotdiffuse.robots.bodies import AttachedBody, polygon_around_circle
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import MIMIC_SLACK, MOVING_KINDS, Robot
 from robotdiffuse.scenes.point_cloud import cover_radius, occupied_voxels
@@ -38,8 +38,7 @@ REQUEST = "a motion plan request"
 # Names in planning scenes: of the matrix, and in it of the octomap.
 MATRIX = "allowed_collision_matrix"
 OCTOMAP = "<octomap>"
-CONE_SIDES = 32
-"""Sides of the pyramid around a cone, which is 0.5 % wider than the cone."""
+
 # Edge and thickness of the box below a plane [m].
 PLANE_EXTENT = 20.0
 PLANE_THICKNESS = 0.01
@@ -319,18 +318,14 @@ def _triangles(where: str, part: dict[str, Any], folder: Path) -> tuple[ndarray,
 
 def _cone(size: Float[ndarray, "2"], xyz: Vector, wxyz: Float[ndarray, "4"], name: str) -> Mesh:
     """A pyramid around a cone of height and radius [m] about its z axis, with the tip at half the height."""
+    from robotdiffuse.robots.fitting.convex_parts import convex_hull  # SciPy, which few problems need
+
     height, radius = size
     if not (size > 0).all():
         raise InputError(f"dimensions of a cone are {shown(size)}; they must be positive")
-    angles = 2 * np.pi * np.arange(CONE_SIDES) / CONE_SIDES
-    ring = radius / np.cos(np.pi / CONE_SIDES) * np.column_stack([np.cos(angles), np.sin(angles)])
-    bottom = np.column_stack([ring, np.full(CONE_SIDES, -height / 2)])
-    vertices = np.concatenate([bottom, [[0, 0, -height / 2], [0, 0, height / 2]]])
-    one = np.arange(CONE_SIDES)
-    following = np.roll(np.arange(CONE_SIDES), -1)
-    base = np.column_stack([following, one, np.full(CONE_SIDES, CONE_SIDES)])
-    side = np.column_stack([one, following, np.full(CONE_SIDES, CONE_SIDES + 1)])
-    return Mesh(vertices, np.concatenate([base, side]), xyz, wxyz, name=name)
+    bottom = np.insert(polygon_around_circle(radius), 2, -height / 2, axis=1)
+    hull = convex_hull(np.concatenate([bottom, [[0, 0, height / 2]]]))
+    return Mesh(hull.vertices, hull.faces, xyz, wxyz, name=name)
 
 
 PRIMITIVES: dict[str, tuple[int, Callable[[ndarray, ndarray, ndarray, str], Shape]]] = {

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import MAX_COORDINATE, MIN_RATE, Value, numbers, rigid_transform, short
-from robotdiffuse.core.errors import InputError, check_type, distinct, shown, unknown_name
+from robotdiffuse.core.errors import InputError, check_list, check_type, distinct, shown, unknown_name
 from robotdiffuse.core.transforms import inverse
 from robotdiffuse.core.types import AnyConfiguration, Configuration, JointValues, Pose, Values
 from robotdiffuse.perception.depth_view import DepthView, SeenPoints
@@ -43,15 +43,13 @@ def base_pose(T_world_base: object) -> Pose | None:
     return None if T_world_base is None else rigid_transform("T_world_base", T_world_base)
 
 
-def waypoint_goals(robot: Robot, waypoints: object, notes: list[str]) -> tuple[Goal, ...]:
-    if not isinstance(waypoints, list | tuple):
-        raise InputError(f"waypoints is {shown(waypoints)}; it must be a list of goals")
+def waypoint_goals(robot: Robot, waypoints: Any, notes: list[str]) -> tuple[Goal, ...]:
+    check_list("waypoints", waypoints, object, "goals")
     return tuple(checked_goal(robot, f"waypoints[{i}]", goal, notes) for i, goal in enumerate(waypoints))
 
 
-def depth_views(robot: Robot, views: object) -> tuple[DepthView, ...]:
-    if not isinstance(views, list | tuple) or not all(isinstance(view, DepthView) for view in views):
-        raise InputError(f"views is {shown(views)}; it must be a list of rd.DepthView")
+def depth_views(robot: Robot, views: Any) -> tuple[DepthView, ...]:
+    check_list("views", views, DepthView, "rd.DepthView")
     for i, view in enumerate(views):
         if view.configuration is not None and len(view.configuration) != robot.dof:
             raise InputError(
@@ -61,23 +59,20 @@ def depth_views(robot: Robot, views: object) -> tuple[DepthView, ...]:
     return tuple(views)
 
 
-def path_constraints(robot: Robot, constraints: object) -> tuple[Constraint, ...]:
+def path_constraints(robot: Robot, constraints: Any) -> tuple[Constraint, ...]:
     kinds = tuple(CONSTRAINTS.values())
-    if not isinstance(constraints, list | tuple) or not all(isinstance(one, kinds) for one in constraints):
-        constructors = ", ".join(f"rd.{kind.__name__}" for kind in kinds)
-        raise InputError(f"constraints is {shown(constraints)}; it must be a list of {constructors}")
+    check_list("constraints", constraints, kinds, ", ".join(f"rd.{kind.__name__}" for kind in kinds))
     for i, one in enumerate(constraints):
-        _check_planned_joint_moves(robot, f"constraints[{i}].frame", one.frame)
+        robot.check_moved(f"constraints[{i}].frame", one.frame)
     return tuple(constraints)
 
 
-def checked_payload(robot: Robot, payload: object) -> Payload | None:
+def checked_payload(robot: Robot, payload: Any) -> Payload | None:
     if payload is None:
         return None
-    if not isinstance(payload, Payload):
-        raise InputError(f"payload is {shown(payload)}; it must be a rd.Payload")
+    check_type("payload", payload, Payload, "a rd.Payload")
     check_dynamics(robot)
-    _check_planned_joint_moves(robot, "payload.link", robot.tip if payload.link is None else payload.link)
+    robot.check_moved("payload.link", robot.tip if payload.link is None else payload.link)
     return payload
 
 
@@ -101,15 +96,6 @@ def blend_radii(value: object, count: int) -> tuple[float, ...]:
     return tuple(blends.tolist()) if has_blends else (0.0,) * count
 
 
-def _check_planned_joint_moves(robot: Robot, field: str, frame: str) -> None:
-    """Raises InputError unless a planned joint moves the link."""
-    moved = [link for link in robot.link_names if robot.link_frame(link) > 0]
-    if frame not in robot.link_names:
-        raise unknown_name(f"link in {field}:", frame, moved)
-    if frame not in moved:
-        raise InputError(f"{field}: no planned joint moves {frame!r}; they move {', '.join(moved)}")
-
-
 def check_contacts(robot: Robot, scene: Scene) -> None:
     """Raises InputError for allowed contacts of links that the robot lacks."""
     link_names = {*robot.link_names}
@@ -119,10 +105,9 @@ def check_contacts(robot: Robot, scene: Scene) -> None:
                 raise unknown_name(f"link in allowed_contacts of {obstacle}:", link, robot.link_names)
 
 
-def moving_obstacles(moving: object, scene: Scene) -> tuple[MovingObstacle, ...]:
+def moving_obstacles(moving: Any, scene: Scene) -> tuple[MovingObstacle, ...]:
     """The obstacles, renamed where a shape of the scene has the same name."""
-    if not isinstance(moving, list | tuple) or not all(isinstance(one, MovingObstacle) for one in moving):
-        raise InputError(f"moving is {shown(moving)}; it must be a list of rd.MovingObstacle")
+    check_list("moving", moving, MovingObstacle, "rd.MovingObstacle")
     shapes = Scene([*scene.shapes, *(one.shape for one in moving)]).shapes[len(scene.shapes) :]
     return tuple(
         one if one.shape is shape else replace(one, shape=shape)
@@ -164,7 +149,7 @@ def checked_goal(robot: Robot, field: str, goal: object, notes: list[str]) -> Go
         each = [checked_goal(robot, *of, notes) for of in zip(fields, goal.goals, strict=True)]
         return AnyGoal(tuple(each))  # type: ignore[arg-type]
     if isinstance(goal, PoseGoal):
-        _check_planned_joint_moves(robot, f"{field}.frame", goal.frame)
+        robot.check_moved(f"{field}.frame", goal.frame)
         return goal
     goal = _values(robot, field, goal)
     if isinstance(goal, PosesGoal):
@@ -181,7 +166,7 @@ def _check_independent_links(robot: Robot, field: str, goal: PosesGoal) -> None:
     """Raises InputError unless planned joints move each link, and any two relative to each other."""
     parts = dict[int, str]()
     for pose in goal.poses:
-        _check_planned_joint_moves(robot, f"{field}.poses", pose.frame)
+        robot.check_moved(f"{field}.poses", pose.frame)
         linked = parts.setdefault(robot.link_frame(pose.frame), pose.frame)
         if linked != pose.frame:
             raise InputError(
@@ -199,10 +184,7 @@ def _values(robot: Robot, field: str, value: Any) -> Any:
     for name in value:
         if name not in joint_names:
             raise unknown_name(f"joint in {field}:", str(name), joint_names)
-    missing = [name for name in robot.joint_names if name not in value]
-    if missing:
-        raise InputError(f"{field} has no {', '.join(missing)}")
-    return [value[name] for name in robot.joint_names]
+    return robot.planned_values(field, value)
 
 
 def configuration(robot: Robot, field: str, value: object) -> Configuration:
@@ -351,10 +333,8 @@ class Problem(Value):
             check_clearance(self.clearance)
         if self.unknown is not None:
             check_unknown("unknown", self.unknown)
-        if not isinstance(self.robot, Robot):
-            raise InputError(f"robot is {shown(self.robot)}; it must be a Robot, e.g. rd.load_robot('panda')")
-        if not isinstance(self.scene, Scene):
-            raise InputError(f"scene is {shown(self.scene)}; it must be a Scene, e.g. rd.Scene([shape, ...])")
+        check_type("robot", self.robot, Robot, "a Robot, e.g. rd.load_robot('panda')")
+        check_type("scene", self.scene, Scene, "a Scene, e.g. rd.Scene([shape, ...])")
         check_contacts(self.robot, self.scene)
         notes = list(self.notes)
         checked: dict[str, Any] = {
@@ -541,7 +521,11 @@ def check_unknown(field: str, value: object) -> str:
 
 def _check_combinations(checked: dict[str, Any]) -> None:
     """Raises InputError for fields that cannot be combined."""
-    given_fields = {name for name, value in checked.items() if value is not None and not _is_empty(value)}
+    given_fields = {
+        name
+        for name, value in checked.items()
+        if not (value is None or (isinstance(value, tuple) and not value))
+    }
     if not any(checked["blend"]):
         given_fields.discard("blend")
     if any(isinstance(constraint, CartesianLine) for constraint in checked["constraints"]):
@@ -549,10 +533,6 @@ def _check_combinations(checked: dict[str, Any]) -> None:
     for one, excluded, advice in EXCLUSIVE_FIELDS:
         if one in given_fields and excluded in given_fields:
             raise InputError(f"{one} cannot be combined with {excluded}{advice}")
-
-
-def _is_empty(value: object) -> bool:
-    return isinstance(value, tuple) and not value
 
 
 def moved(value: Any, T: Pose) -> Any:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, fields
 from typing import Any, NamedTuple, Protocol, no_type_check, runtime_checkable
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
@@ -14,6 +14,8 @@ from robotdiffuse.core.types import GivenVector, Points, Pose, Rotation, Vector
 
 TOOL = "tool"
 """Default name of a tool."""
+POLYGON_SIDES = 32
+"""Sides of the polygons that stand for circles."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +28,12 @@ class Surface(Value):
 
 class ConvexMesh(Surface):
     """A convex polyhedron in the frame of its link [m]."""
+
+
+def polygon_around_circle(radius: float) -> Float[ndarray, "32 2"]:
+    """Corners of a regular polygon, 0.5 % wider than the circle about the origin that it contains."""
+    angles = 2 * np.pi * np.arange(POLYGON_SIDES) / POLYGON_SIDES
+    return radius / np.cos(np.pi / POLYGON_SIDES) * np.column_stack([np.cos(angles), np.sin(angles)])
 
 
 @runtime_checkable

@@ -8,12 +8,22 @@ import numpy as np
 from jaxtyping import Integer
 from numpy import ndarray
 
-from robotdiffuse.core.types import Points, Pose
+from robotdiffuse.core.types import Points, Pose, Vector
 
 
 def coal_pose(T: Pose) -> coal.Transform3s:
     """A pose as a Coal transform."""
     return coal.Transform3s(T[:3, :3], T[:3, 3])
+
+
+def coal_rounded(half: Vector, disc: float, rounding: float) -> coal.CollisionGeometry:
+    """A sphere, box, cylinder or capsule: the Minkowski sum of a box, a disc about its z axis and a ball."""
+    x, y, z = (2 * half).tolist()
+    if disc > 0:
+        return coal.Cylinder(disc, z)
+    if rounding > 0:
+        return coal.Capsule(rounding, z) if z > 0 else coal.Sphere(rounding)
+    return coal.Box(x, y, z)
 
 
 def coal_convex(vertices: Points, faces: Integer[ndarray, "f 3"]) -> coal.Convex:

@@ -1,6 +1,6 @@
 """Joints and links of a robot, and what follows from them: limits, frames, chains."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, wraps
 from typing import Any, NamedTuple, TypeVar
@@ -180,6 +180,12 @@ class KinematicTree(Value):
     effort = _limit("effort")
     """Largest torques [N m] or forces [N]; 0 where the URDF gives none."""
 
+    def limit_excess(self, q: JointArray) -> JointArray:
+        """By how much joint values are beyond the limits, negative within; 0 for continuous joints."""
+        excess = np.maximum(self.lower - q, q - self.upper)
+        excess[..., self.continuous] = 0.0
+        return excess
+
     @cached_property
     def prismatic(self) -> tuple[bool, ...]:
         return tuple(joint.kind == "prismatic" for joint in self.planned_joints)
@@ -318,6 +324,22 @@ class KinematicTree(Value):
     def T_frame_link(self, link: str) -> Pose:
         """Constant pose of the link in its frame (see `link_frame`); InputError for an unknown link."""
         return self._link(link)[1]
+
+    def check_moved(self, field: str, link: str) -> None:
+        """Raises InputError, naming the field, unless a planned joint moves the link."""
+        moved = [name for name in self.link_names if self.link_frame(name) > 0]
+        if link not in self.link_names:
+            raise unknown_name(f"link in {field}:", link, moved)
+        if link not in moved:
+            raise InputError(f"{field}: no planned joint moves {link!r}; they move {', '.join(moved)}")
+
+    def planned_values(self, where: str, values: Mapping[str, Any], advice: str = "") -> list[Any]:
+        """The values of the planned joints in order. Raises InputError, with the advice at its end, for those
+        that are missing."""
+        missing = [name for name in self.joint_names if name not in values]
+        if missing:
+            raise InputError(f"{where} has no {', '.join(missing)}{advice}")
+        return [values[name] for name in self.joint_names]
 
     def _link(self, link: str) -> tuple[int, ndarray]:
         if link not in self._frames[0]:

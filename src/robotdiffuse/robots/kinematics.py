@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.transforms import placed
+from robotdiffuse.core.transforms import moved_spheres
 from robotdiffuse.core.types import Configuration, Configurations, Points, Pose, Poses, Spheres
 from robotdiffuse.robots.kinematic_tree import KinematicTree, once_per_robot
 
@@ -74,7 +74,7 @@ def placed_spheres(robot: KinematicTree, q: Configuration) -> Spheres:
     parts = [np.zeros((0, 4))]
     for link, spheres in robot.spheres.items():
         T = frames[robot.link_frame(link)] @ robot.T_frame_link(link)
-        parts.append(np.column_stack([placed(T, spheres[:, :3]), spheres[:, 3]]))
+        parts.append(moved_spheres(T, spheres))
     return np.concatenate(parts)
 
 

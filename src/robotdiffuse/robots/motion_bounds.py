@@ -1,5 +1,6 @@
 """Bounds on the motion of links: how far a link can be from the axis of a joint."""
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -50,8 +51,7 @@ def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
     for j in reversed(range(robot.dof)):
         for i in np.flatnonzero(frames == j + 1):
             spheres = robot.spheres[links[i]]
-            T = robot.T_frame_link(links[i])
-            centers = placed(T, spheres[:, :3])
+            centers = placed(robot.T_frame_link(links[i]), spheres[:, :3])
             support[i] = (centers @ by_row + spheres[:, 3, None]).max(axis=1)
             farthest[i] = (np.linalg.norm(centers, axis=1) + spheres[:, 3]).max()
         moved = np.flatnonzero(robot.moved_by[frames, j])
@@ -84,6 +84,12 @@ def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
     radii = np.concatenate([bare_radii, radii])
     radii.setflags(write=False)
     return radii
+
+
+def radii_of(robot: Robot, links: Sequence[str]) -> Float[ndarray, "links dof"]:
+    """The rows of `motion_radii` of some links, as a new array."""
+    rows = [link for link in robot.link_names if link in robot.spheres]
+    return motion_radii(robot)[[rows.index(link) for link in links]]
 
 
 def _directions() -> Float[ndarray, "rows columns 3"]:

@@ -354,14 +354,7 @@ class Robot(KinematicTree):
                 shapes that cannot be held.
         """
         field = TOOL if body.tool else "attached"
-        moved = [link for link in self.link_names if self.link_frame(link) > 0]
-        if body.link not in self.link_names:
-            raise unknown_name(f"link in {field}.link:", str(body.link), moved)
-        if body.link not in moved:
-            raise InputError(
-                f"{field}.link is {body.link}, which no planned joint moves; these are moved: "
-                f"{', '.join(moved)}"
-            )
+        self.check_moved(f"{field}.link", body.link)
         if body.name in self.link_names:
             raise InputError(
                 f"{field}.name is {body.name!r}, which is a link of {self.name}; give it another name"
@@ -536,18 +529,22 @@ def named_pose(robot: Robot, field: str, name: str) -> list[float]:
         raise InputError(f"{field} is {shown(name)}; it must be {values} ({robot.name} has no named poses)")
     if name not in robot.poses:
         raise unknown_name(f"pose in {field}:", name, complete)
-    values = robot.poses[name]
-    missing = [joint for joint in robot.joint_names if joint not in values]
-    if missing:
-        raise InputError(
-            f"{field}: the pose {name!r} has no {', '.join(missing)}; whole poses: {', '.join(complete)}"
-        )
-    return [values[joint] for joint in robot.joint_names]
+    advice = f"; whole poses: {', '.join(complete)}"
+    return robot.planned_values(f"{field}: the pose {name!r}", robot.poses[name], advice)
 
 
 DIGITS = 9
 """Numbers are rounded to this many decimals, since rotations from quaternions differ by machine in the last
 bits."""
+
+
+def hashed_content(names: object, *numbers: object) -> bytes:
+    """Names and rounded arrays as bytes, which hashes of robots, scenes and requests are made of."""
+    content = json.dumps(names).encode()
+    for values in numbers:
+        rounded = np.round(np.asarray(values, np.float64), DIGITS) + 0.0  # no negative zeros
+        content += str(rounded.shape).encode() + rounded.tobytes()
+    return content
 
 
 def robot_fingerprint(robot: Robot) -> str:
@@ -558,10 +555,7 @@ def robot_fingerprint(robot: Robot) -> str:
     digest = hashlib.sha256()
 
     def add(names: object, *numbers: object) -> None:
-        digest.update(json.dumps(names).encode())
-        for values in numbers:
-            rounded = np.round(np.asarray(values, np.float64), DIGITS) + 0.0  # no negative zeros
-            digest.update(str(rounded.shape).encode() + rounded.tobytes())
+        digest.update(hashed_content(names, *numbers))
 
     add([robot.base, *robot.tips])
     for joint in robot.joints:

@@ -5,14 +5,10 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
-from robotdiffuse.robots.bodies import ConvexMesh
+from robotdiffuse.robots.bodies import ConvexMesh, polygon_around_circle
 from robotdiffuse.robots.fitting.convex_parts import Surface, convex_hull, convex_parts
 
-PRISM_SIDES = 32
-"""Sides of the prism around a cylinder, which is 0.5 % wider than the cylinder."""
 SPHERE_RINGS = 7
 """Rings of vertices around a sphere, and around the caps of a capsule."""
 
@@ -20,9 +16,7 @@ SPHERE_RINGS = 7
 def capsule_polyhedron(radius: float, height: float) -> ConvexMesh:
     """A polyhedron around a capsule about the z axis, or around a sphere if the height is 0 [m]."""
     angles = np.pi * np.arange(1, SPHERE_RINGS + 1) / (SPHERE_RINGS + 1) - np.pi / 2
-    rings = [
-        np.column_stack([_polygon_around_circle(np.cos(a)), np.full(PRISM_SIDES, np.sin(a))]) for a in angles
-    ]
+    rings = [np.insert(polygon_around_circle(np.cos(a)), 2, np.sin(a), axis=1) for a in angles]
     corners = np.concatenate([*rings, [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]])
     hull = convex_hull(corners)
     # scaled up until the sphere is inside all faces
@@ -34,11 +28,6 @@ def capsule_polyhedron(radius: float, height: float) -> ConvexMesh:
         return convex_hull(corners)
     half = np.array([0.0, 0.0, height / 2])
     return convex_hull(np.concatenate([corners - half, corners + half]))
-
-
-def _polygon_around_circle(radius: float) -> Float[ndarray, "k 2"]:
-    angles = 2 * np.pi * np.arange(PRISM_SIDES) / PRISM_SIDES
-    return radius / np.cos(np.pi / PRISM_SIDES) * np.column_stack([np.cos(angles), np.sin(angles)])
 
 
 @lru_cache(maxsize=64)
@@ -58,8 +47,8 @@ def _box(shape: Any) -> ConvexMesh:
 
 def _prism(shape: Any) -> ConvexMesh:
     """A prism around a cylinder."""
-    ring = _polygon_around_circle(shape.radius)
-    ends = [np.column_stack([ring, np.full(PRISM_SIDES, z * shape.height)]) for z in (-0.5, 0.5)]
+    ring = polygon_around_circle(shape.radius)
+    ends = [np.insert(ring, 2, z * shape.height, axis=1) for z in (-0.5, 0.5)]
     return convex_hull(np.concatenate(ends))
 
 

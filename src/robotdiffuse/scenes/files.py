@@ -91,8 +91,13 @@ def read_scene(
     return Scene(shapes, contacts), tuple(notes)  # type: ignore[arg-type]
 
 
+def required_fields(kind: Any) -> list[str]:
+    """The names of a dataclass's fields without a default."""
+    return [field.name for field in fields(kind) if field.default is MISSING]
+
+
 def _shape(where: str, kind: type[Shape], values: object, folder: Path, notes: list[str]) -> Shape:
-    required = [f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING]  # type: ignore[arg-type]
+    required = required_fields(kind)
     optional = [f.name for f in fields(kind) if f.name not in required]  # type: ignore[arg-type]
     if isinstance(values, dict) and "file" in values:
         content = FILE_CONTENT.get(kind.kind, ())

@@ -12,7 +12,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.bounds import MIN_RATE
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Configurations, JointRows, JointValues, Path, Trajectory, Values
+from robotdiffuse.core.types import Configurations, JointValues, Path, Trajectory, Values
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.corner_rounding import BlendedPolyline, half_widths
 from robotdiffuse.trajectories.speed_limits import (
@@ -78,13 +78,13 @@ def time_parameterize(
     Raises InputError if a velocity or acceleration limit of a joint is below MIN_RATE, and OutOfTimeError if
     the deadline leaves no time.
     """
-    _check_limits(robot)
-    rows = _distinct(path.positions)
-    if len(rows) == 1:
-        return _resting_trajectory(path, settings)
-    max_deviations = _largest_deviations(rows, settings, deviations)
-    corners = path.positions[rows], max_deviations[1:-1]
-    return _round_and_time(robot, path, *corners, valid, free, settings, keeps, start_speed, extra)[1]
+    if len(_distinct(path.positions)) == 1:
+        _check_limits(robot)
+        still = np.zeros((2, robot.dof))
+        times = np.array([0.0, settings.sample_time])
+        return Trajectory(path.joint_names, times, path.positions[[0, -1]], still, still)
+    rounding = valid, free, settings, keeps, extra, deviations
+    return rounded_corners(robot, path, *rounding, start_speed=start_speed)[2]
 
 
 def rounded_corners(
@@ -97,39 +97,16 @@ def rounded_corners(
     extra: ExtraLimits = NO_EXTRA_LIMITS,
     deviations: Values | None = None,
     stops: Sequence[int] = (),
-) -> tuple[JointRows, Values]:
-    """The distinct waypoints of a path, at least two, and by how much `time_parameterize` would round each
-    corner [rad]. Corners at the path's rows `stops` are not rounded."""
+    start_speed: float = 0.0,
+) -> tuple[Configurations, Values, Trajectory]:
+    """The distinct waypoints of a path, at least two, by how much each corner is rounded [rad], and the
+    resulting motion; see `time_parameterize`. Corners at the path's rows `stops` are not rounded."""
     _check_limits(robot)
     rows = _distinct(path.positions)
-    max_deviations = _largest_deviations(rows, settings, deviations)
-    max_deviations[np.searchsorted(rows, stops, side="right") - 1] = 0.0
-    corners = path.positions[rows], max_deviations[1:-1]
-    return corners[0], _round_and_time(robot, path, *corners, valid, free, settings, keeps, 0.0, extra)[0]
-
-
-def _largest_deviations(
-    rows: Int[ndarray, "m"], settings: TimingSettings, deviations: Values | None
-) -> Values:
-    """How far the motion may leave each of these rows of a path [rad]; a new array."""
-    return np.full(len(rows), settings.corner_deviation) if deviations is None else deviations[rows]
-
-
-def _round_and_time(
-    robot: Robot,
-    path: Path,
-    waypoints: Configurations,
-    deviations: Values,
-    valid: Callable[[Trajectory], bool],
-    free: Callable[[Path], bool],
-    settings: TimingSettings,
-    keeps: Callable[[ndarray], bool],
-    start_speed: float,
-    extra: ExtraLimits = NO_EXTRA_LIMITS,
-) -> tuple[Values, Trajectory]:
-    """How far each corner is rounded, at most by the deviations, and the resulting motion; see
-    `time_parameterize`."""
-    deviations = _shrunk(waypoints, deviations, keeps, MIN_DEVIATION)
+    waypoints = path.positions[rows]
+    allowed = np.full(len(rows), settings.corner_deviation) if deviations is None else deviations[rows]
+    allowed[np.searchsorted(rows, stops, side="right") - 1] = 0.0
+    deviations = _shrunk(waypoints, allowed[1:-1], keeps, MIN_DEVIATION)
     while start_speed and deviations[:1].any():
         stop = np.append(np.flatnonzero(deviations == 0), len(deviations))[0]
         try:  # whether a motion with this start speed can pass the corners up to its first stop
@@ -141,7 +118,7 @@ def _round_and_time(
     for attempt in range(MAX_TIMINGS):
         trajectory = _time_segments(robot, path, waypoints, deviations, slower, start_speed, extra)
         if not deviations.any() or valid(trajectory):
-            return deviations, trajectory
+            return waypoints, deviations, trajectory
         less = _shrunk(waypoints, deviations, lambda corner: free(replace(path, positions=corner)))
         if (less < deviations).any():
             deviations = less
@@ -153,7 +130,8 @@ def _round_and_time(
             deviations = _smaller(deviations)
             slower = settings
     deviations = np.zeros(len(waypoints) - 2)
-    return deviations, _time_segments(robot, path, waypoints, deviations, settings, start_speed, extra)
+    trajectory = _time_segments(robot, path, waypoints, deviations, settings, start_speed, extra)
+    return waypoints, deviations, trajectory
 
 
 def _smaller(deviations: Values) -> Values:
@@ -210,13 +188,6 @@ def _distinct(positions: Configurations) -> Int[ndarray, "m"]:
     if len(distinct) > 1:
         distinct[-1] = len(positions) - 1
     return np.array(distinct)
-
-
-def _resting_trajectory(path: Path, settings: TimingSettings) -> Trajectory:
-    """Two rows at rest."""
-    still = np.zeros((2, path.positions.shape[1]))
-    positions = np.stack([path.positions[0], path.positions[-1]])
-    return Trajectory(path.joint_names, np.array([0.0, settings.sample_time]), positions, still, still)
 
 
 def _time_segments(
@@ -293,7 +264,7 @@ class StopGraph:
         self.joint_names = path.joint_names
         self.step = step
         self._extra = extra
-        waypoints, rounded = rounded_corners(
+        waypoints, rounded, _ = rounded_corners(
             robot, path, valid, free, settings, keeps, extra, deviations, required_stops
         )
         self.line = BlendedPolyline(waypoints, half_widths(waypoints, rounded))

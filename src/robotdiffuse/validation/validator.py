@@ -110,7 +110,7 @@ class Verifier:
 
     def path(self, path: Path) -> Report:
         """See `verify`."""
-        check_motion("path", path, (Path,))
+
         self._check_shape("path", path)
         known_violations = []
         if self.dynamics is not None and within(path.positions):
@@ -120,7 +120,6 @@ class Verifier:
 
     def trajectory(self, trajectory: Trajectory) -> Report:
         """See `verify_trajectory`."""
-        check_motion("trajectory", trajectory, (Trajectory,))
         self._check_shape("trajectory", trajectory)
         rows = (trajectory.times, trajectory.velocities, trajectory.accelerations)
         if not all(np.isfinite(values).all() for values in rows):
@@ -296,8 +295,7 @@ class Verifier:
         return Violation("jump", float(clock[i]), message, name, None, abs(step))
 
     def _limits(self, q: ndarray, clock: ndarray, place: str) -> Violation | None:
-        excess = np.maximum(self.robot.lower - q, q - self.robot.upper)
-        excess[:, self.robot.continuous] = 0.0
+        excess = self.robot.limit_excess(q)
         bad = np.flatnonzero((excess > self.settings.limit_slack).any(axis=1))
         if not len(bad):
             return None
@@ -524,8 +522,7 @@ def _limit_violations(
 ) -> list[Violation]:
     robot = problem.robot
     limit_violations = []
-    beyond = np.maximum(robot.lower - q, q - robot.upper)
-    beyond[:, robot.continuous] = 0.0
+    beyond = robot.limit_excess(q)
     for j in np.flatnonzero((beyond > settings.limit_slack).any(axis=0)).tolist():
         over = np.flatnonzero(beyond[:, j] > settings.limit_slack)
         i = int(over[clock[over].argmin()])

@@ -176,7 +176,7 @@ WRONG = {
         {"attached": [{"link": "panda_hand", "sphere": {"center": [0, 0, 0], "radius": -1}}]},
         r"attached\[0\].sphere.radius is -1; it must be a positive number",
     ),
-    "fixed link": ({"attached": [CUP | {"link": "panda_link0"}]}, r"attached\[0\]: attached.link is panda"),
+    "fixed link": ({"attached": [CUP | {"link": "panda_link0"}]}, r"attached\[0\]: attached.link: no"),
     "twice": ({"attached": [CUP, CUP]}, r"attached\[1\]: attached.name is 'cup'"),
 }  # fmt: skip
 

@@ -102,7 +102,7 @@ class TimedPath:
             return distant.collision_free(Path(robot.joint_names, q))
 
         distant = verifier(validator.problem, replace(DEFAULT, contact=max(displacement, DEFAULT.contact)))
-        rows, deviations = rounded_corners(robot, path, free, validator.collision_free, keeps=free_around)
+        rows, deviations, _ = rounded_corners(robot, path, free, validator.collision_free, keeps=free_around)
         line = BlendedPolyline(rows, half_widths(rows, deviations))
         for i in np.flatnonzero(deviations):
             width = line.half_widths[i]

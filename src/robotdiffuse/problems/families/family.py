@@ -12,7 +12,7 @@ from numpy.random import Generator
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Positive, Settings
-from robotdiffuse.core.transforms import placed
+from robotdiffuse.core.transforms import moved_spheres
 from robotdiffuse.core.types import Configuration, Configurations, JointRows, Pose
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
@@ -173,12 +173,9 @@ def reaching_configurations(
 
 def base_spheres(robot: Robot) -> Spheres:
     """Collision spheres (x, y, z, radius) of the links that no planned joint moves, in the base frame [m]."""
-    parts = [np.zeros((0, 4))]
-    for link, spheres in robot.spheres.items():
-        if robot.link_frame(link) == 0:
-            T = robot.T_frame_link(link)
-            parts.append(np.column_stack([placed(T, spheres[:, :3]), spheres[:, 3]]))
-    return np.concatenate(parts)
+    fixed = [link for link in robot.spheres if robot.link_frame(link) == 0]
+    parts = [moved_spheres(robot.T_frame_link(link), robot.spheres[link]) for link in fixed]
+    return np.concatenate([np.zeros((0, 4)), *parts])
 
 
 def is_clear_of(shape: Sphere | Box, keep_out: Spheres | None) -> bool:

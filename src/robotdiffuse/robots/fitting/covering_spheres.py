@@ -14,7 +14,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial import ConvexHull, QhullError
 
-from robotdiffuse.core.transforms import inverse, placed
+from robotdiffuse.core.transforms import inverse, moved_spheres, placed
 from robotdiffuse.core.types import Points, Rotation, Spheres, Values, Vector
 from robotdiffuse.robots.bodies import AttachedBody, ConvexMesh
 from robotdiffuse.robots.fitting.sphere_fitting import MARGIN, SphereSettings
@@ -124,6 +124,5 @@ def body_geometry(body: AttachedBody) -> tuple[tuple[ConvexMesh, ...], Spheres]:
         T = T_body_link @ T_link_shape
         for part in parts:
             meshes.append(ConvexMesh(placed(T, part.vertices), part.faces))
-            around = cover(part)
-            spheres.append(np.column_stack([placed(T, around[:, :3]), around[:, 3]]))
+            spheres.append(moved_spheres(T, cover(part)))
     return tuple(meshes), np.concatenate(spheres)

@@ -629,13 +629,14 @@ def add_robot(
     write_robot_folder(replace(prepared.robot, notes=(*robot.notes, note)), folder, source | shares)
     seconds = time.process_time() - begin
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * BYTES_PER_UNIT
-    summary = (
+    return AddReport(
+        read_robot_folder(folder),
+        folder,
         prepared.links,
         prepared.pairs,
-        prepared.false_collisions,
+        measured,
         seconds,
         memory,
         srdf_file,
         differences,
     )
-    return AddReport(read_robot_folder(folder), folder, *summary)

@@ -19,12 +19,12 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import for_kernels
+from robotdiffuse.core.transforms import ball_around
 from robotdiffuse.core.types import Configurations, Mask, Points, Poses, Spheres, Values
-from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import ball_distances, deepest_touches
 from robotdiffuse.robots.kinematic_tree import MOVING_KINDS, TURN, Joint, with_mimics
-from robotdiffuse.robots.motion_bounds import motion_radii
+from robotdiffuse.robots.motion_bounds import radii_of
 from robotdiffuse.robots.robot import LinkPairTable, Robot
 
 BINS = 24
@@ -63,7 +63,8 @@ class Links:
     @cached_property
     def balls(self) -> dict[str, Spheres]:
         """Balls [x y z radius] around each part, by link [m]."""
-        return {link: np.stack([_ball(mesh) for mesh in parts]) for link, parts in self.robot.meshes.items()}
+        around = {link: [ball_around(m.vertices) for m in parts] for link, parts in self.robot.meshes.items()}
+        return {link: np.array([[*c, r + BALL_MARGIN] for c, r in balls]) for link, balls in around.items()}
 
     def random(self, count: int, rng: np.random.Generator) -> Configurations:
         """Uniform values of all joints within their limits."""
@@ -190,12 +191,6 @@ class Links:
         return part_gaps
 
 
-def _ball(mesh: ConvexMesh) -> Float[ndarray, "4"]:
-    """Center and radius of a ball that contains a mesh [m]."""
-    center = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
-    return np.append(center, np.linalg.norm(mesh.vertices - center, axis=1).max() + BALL_MARGIN)
-
-
 CELLS = 128
 """Cells of a table along each joint; a power of two."""
 ROUNDING = 1e-5
@@ -210,8 +205,7 @@ def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float
     """
     joints = robot.joints_between(*pair)
     far = max(pair, key=robot.link_frame)
-    with_spheres = [link for link in robot.link_names if link in robot.spheres]
-    lever = motion_radii(robot)[with_spheres.index(far), list(joints)]
+    lever = radii_of(robot, [far])[0, list(joints)]
     slides = np.array(robot.prismatic)[list(joints)]
     lower = robot.lower[list(joints)]
     upper = robot.upper[list(joints)]

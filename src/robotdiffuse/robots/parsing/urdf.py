@@ -32,7 +32,7 @@ from robotdiffuse.core.transforms import (
     transform,
 )
 from robotdiffuse.core.types import Points, Pose, Values
-from robotdiffuse.robots.bodies import ConvexMesh, Inertia, inertia_of
+from robotdiffuse.robots.bodies import ConvexMesh, Inertia, inertia_of, polygon_around_circle
 from robotdiffuse.robots.fitting.convex_parts import MIN_THICKNESS, Surface, convex_hull, thickened
 from robotdiffuse.robots.kinematic_tree import CONTINUOUS_LIMIT, MOVING_KINDS, Joint, Mimic, with_mimics
 from robotdiffuse.robots.kinematics import reach
@@ -380,7 +380,6 @@ class UrdfTree:
             return None
         leaders = [name]
         leader = followed
-        last = followed
         while leader is not None:
             leaders.append(leader.get("joint", ""))
             if leaders[-1] not in self.elements or leaders[-1] in leaders[:-1]:
@@ -388,9 +387,8 @@ class UrdfTree:
                     f"{self.path}: joint {leaders[-2]} mimics {shown(leaders[-1])}; it must be another "
                     f"joint of the file that does not mimic it"
                 )
-            last = leader
             leader = self.elements[leaders[-1]].find("mimic")
-        if self.elements[leaders[-1]].get("type") == "fixed" or last is None:
+        if self.elements[leaders[-1]].get("type") == "fixed":
             self.notes.append(f"joint {name} mimics the fixed joint {leaders[-1]}; treated as independent")
             return None
         location = f"joint {name}: mimic"
@@ -534,9 +532,7 @@ class UrdfTree:
         if shape.tag == "capsule":
             end = _ball() * radius
         else:
-            angle = np.arange(32) * np.pi / 16
-            ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(32)], axis=1)
-            end = ring * radius / np.cos(np.pi / 32)
+            end = np.insert(polygon_around_circle(float(radius[0])), 2, 0.0, axis=1)
         half = float(positive("length", 1)[0]) / 2
         return np.concatenate([end + np.array([0, 0, z]) for z in (-half, half)])
 
