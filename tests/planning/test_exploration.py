@@ -175,8 +175,9 @@ def test_looks_see_what_is_wanted() -> None:
         x, y, z = T[:3, :3].T @ (target - T[:3, 3])
         fx, fy, cx, cy = camera.intrinsics
         assert z > 0 and 0 <= fx * x / z + cx <= camera.size[0] and 0 <= fy * y / z + cy <= camera.size[1]
-    one.observe(rd.DepthView(np.zeros((2, 2)), (1.0, 1.0, 0.5, 0.5), np.eye(4), best[0][-1]))
-    taken = one._goal_seen.taken[-1]
+    goal_seen = GoalSeen(PANDA, one.map, ViewMemory(PANDA), False)
+    goal_seen.observe(rd.DepthView(np.zeros((2, 2)), (1.0, 1.0, 0.5, 0.5), np.eye(4), best[0][-1]))
+    [taken] = goal_seen.taken
     other = next(best_looks(one.map, tree, camera, wanted, None, np.random.default_rng(0), [taken]))
     assert np.abs(other[-1] - taken).max() > 0.05, "not from where an image did not show it"
 
