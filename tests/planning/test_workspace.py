@@ -103,6 +103,19 @@ def test_the_nearest_goal_that_a_line_leads_to() -> None:
     assert not result.solved and result.reason.startswith("goal 0: ")
 
 
+@pytest.mark.parametrize("time_limit", [1e-5, -1.0])
+def test_a_limit_that_has_run_out_before_the_line_is_planned(time_limit: float) -> None:
+    """It was refused as negative: "time_limit is -0.00085"."""
+    space = panda(T_world_base=T_WORLD_BASE)
+    end = space.pose(READY) @ rd.pose([0.0, 0.0, 0.05])
+    for corners in ((), (end,)):
+        if time_limit < 0:
+            with pytest.raises(rd.InputError, match="time_limit is -1"):
+                space.plan_line(end, READY, time_limit=time_limit, waypoints=corners)
+        else:
+            assert space.plan_line(end, READY, time_limit=time_limit, waypoints=corners).reason
+
+
 def test_lines_through_waypoints_are_one_motion() -> None:
     space = panda(T_world_base=T_WORLD_BASE)
     T = space.pose(READY)

@@ -56,6 +56,8 @@ RESERVED_FACTOR = 2.0
 """Time that is reserved for validating and timing a path, by the longest that the call has taken for one."""
 EXPECTED_VALIDATION_TIME = 0.003
 """Time that is reserved for validating and timing a path before the call has done so once [s]."""
+MIN_TIME_LIMIT = 1e-3
+"""Time limit of what remains to be done once time has run out [s]."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,12 @@ class PlanRequest(Settings):
 def clock() -> float:
     """The time of a clock that stands still while this thread loads code [s]."""
     return time.perf_counter() - loading_seconds()
+
+
+def time_left(time_limit: float, began: float) -> float:
+    """What is left of the time limit of a call that began at a time of `clock`; at least MIN_TIME_LIMIT, or
+    the limit itself if that is less [s]."""
+    return min(time_limit, max(time_limit - (clock() - began), MIN_TIME_LIMIT))
 
 
 def requested_clearance(problem: Problem, clearance: float | None) -> float:

@@ -15,8 +15,8 @@ from robotdiffuse.core.errors import InputError, check_type, located, shown
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.transforms import pose
 from robotdiffuse.core.types import AnyConfiguration, Configuration, Trajectory
-from robotdiffuse.planning.context import clock
-from robotdiffuse.planning.pipeline.waypoints import MIN_TIME_LIMIT, one_after_another
+from robotdiffuse.planning.context import clock, time_left
+from robotdiffuse.planning.pipeline.waypoints import one_after_another
 from robotdiffuse.problems.constraints import Constraint
 from robotdiffuse.problems.goals import AnyGoal, JointGoal, PoseGoal
 from robotdiffuse.problems.problem import Problem
@@ -177,7 +177,7 @@ def plan_steps(
         assert isinstance(step, MoveTo | MoveRelative)
         space = copy(space)
         space.scene = Scene(space.scene.shapes, [*space.scene.allowed_contacts, *step.contacts.items()])
-        left = max(time_limit - (clock() - began), MIN_TIME_LIMIT)
+        left = time_left(time_limit, began)
         left /= sum(isinstance(one, MoveTo | MoveRelative) for one in steps[k:])
         if isinstance(step, MoveRelative):
             T = space.pose(q)

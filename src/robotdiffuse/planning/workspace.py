@@ -15,8 +15,8 @@ from robotdiffuse.core.transforms import inverse, rpy_from_rotation
 from robotdiffuse.core.transforms import pose as pose_matrix
 from robotdiffuse.core.types import AnyConfiguration
 from robotdiffuse.planning import plan
-from robotdiffuse.planning.context import clock
-from robotdiffuse.planning.pipeline.waypoints import MIN_TIME_LIMIT, join
+from robotdiffuse.planning.context import clock, time_left
+from robotdiffuse.planning.pipeline.waypoints import join
 from robotdiffuse.planning.steps import Step, StepsResult, plan_steps
 from robotdiffuse.problems.constraints import CartesianLine, Constraint
 from robotdiffuse.problems.goals import AnyGoal, PoseGoal
@@ -227,8 +227,7 @@ class Workspace:
         """
         began = clock()
         problem = Problem(self.robot, self.scene, start, self._goal(goal), constraints=constraints)
-        left = min(time_limit, max(time_limit - (clock() - began), MIN_TIME_LIMIT))
-        return plan(problem, left, **request)
+        return plan(problem, time_left(time_limit, began), **request)
 
     def plan_steps(
         self, steps: Sequence[Step], start: AnyConfiguration, time_limit: float = 10.0, **request: Any
@@ -299,14 +298,14 @@ class Workspace:
             q = start
             ends = [*waypoints, pose]
             for k, end in enumerate(ends):
-                left = max(time_limit - (clock() - began), MIN_TIME_LIMIT) / (len(ends) - k)
+                left = time_left(time_limit, began) / (len(ends) - k)
                 result = self.plan_line(end, q, tolerance, angle, speed, left, **request)
                 if not result.solved:
                     reason = f"line {k + 1} of {len(ends)}: {result.reason}"
                     return replace(result, reason=reason, fraction=(k + (result.fraction or 0.0)) / len(ends))
                 q = result.path.positions[-1]
                 lines.append(result)
-            whole = join(lines, time_limit=max(time_limit, MIN_TIME_LIMIT))
+            whole = join(lines, time_limit=time_limit)
             return replace(whole, fraction=1.0, goal_index=lines[-1].goal_index) if whole.solved else whole
         several = isinstance(pose, AnyGoal)
         matrices = numbers(pose)
@@ -325,10 +324,10 @@ class Workspace:
         off = [np.linalg.norm((line_end(problem, line) - T_start)[:3, 3]) for problem in problems]
         best = None
         for tried, i in enumerate(np.argsort(off, kind="stable")):
-            left = time_limit - (clock() - began)
-            if best is not None and left <= 0.0:
+            if best is not None and clock() - began >= time_limit:
                 break
-            result = plan(problems[i], left / (len(goals) - tried), **request)
+            left = time_left(time_limit, began) / (len(goals) - tried)
+            result = plan(problems[i], left, **request)
             if result.solved:
                 return replace(result, goal_index=int(i)) if several else result
             if several:

@@ -26,7 +26,7 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path, Status, Trajectory
-from robotdiffuse.planning.context import PlanningContext, PlanRequest
+from robotdiffuse.planning.context import MIN_TIME_LIMIT, PlanningContext, PlanRequest
 from robotdiffuse.planning.pipeline import Solver, attempt
 from robotdiffuse.problems.constraints import CartesianLine
 from robotdiffuse.problems.goals import Goal, JointGoal
@@ -44,8 +44,6 @@ little."""
 # Each corner deviation that is tried is this factor of the last, up to this many times.
 DEVIATION_FACTOR = 0.9
 MAX_DEVIATIONS = 80
-MIN_TIME_LIMIT = 1e-3
-"""Time limit of what remains to be done once time has run out [s]."""
 
 
 def plan_through_waypoints(solver: Solver, problem: Problem, request: PlanRequest) -> PlanResult:
