@@ -15,7 +15,7 @@ from robotdiffuse.core.transforms import inverse, rpy_from_rotation
 from robotdiffuse.core.transforms import pose as pose_matrix
 from robotdiffuse.core.types import AnyConfiguration
 from robotdiffuse.planning import plan
-from robotdiffuse.planning.context import clock, time_left
+from robotdiffuse.planning.context import PlanRequest, clock, time_left
 from robotdiffuse.planning.pipeline.waypoints import join
 from robotdiffuse.planning.steps import Step, StepsResult, plan_steps
 from robotdiffuse.problems.constraints import CartesianLine, Constraint
@@ -292,6 +292,7 @@ class Workspace:
         from robotdiffuse.problems.compiled_constraints import line_end  # compiled code
 
         line = CartesianLine(self.tip, tolerance, angle, speed)
+        PlanRequest(time_limit)  # a wrong limit is refused before it is divided
         began = clock()
         if len(waypoints):
             lines = list[PlanResult]()
