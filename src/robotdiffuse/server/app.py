@@ -68,6 +68,10 @@ def _documented() -> dict[str, str]:
 
 _DESCRIPTIONS = _documented()
 _TYPES = get_type_hints(PlanRequest, include_extras=True)
+_ARGUMENTS: dict[str, Any] = {
+    field.name: (_TYPES[field.name], Field(field.default, description=_DESCRIPTIONS.get(field.name)))
+    for field in fields(PlanRequest)
+}
 PlanBody = create_model(
     "PlanRequest",
     __base__=_Request,
@@ -84,10 +88,7 @@ PlanBody = create_model(
             "rows",
         ),
     ),
-    **{
-        field.name: (_TYPES[field.name], Field(field.default, description=_DESCRIPTIONS.get(field.name)))
-        for field in fields(PlanRequest)
-    },
+    **_ARGUMENTS,
 )
 
 
