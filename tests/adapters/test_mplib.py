@@ -154,6 +154,18 @@ def test_a_moved_base_keeps_obstacles_held_objects_and_allowed_contacts() -> Non
     assert len(made.workspace.robot.attached) == 1
 
 
+def test_where_no_motion_turns_evenly_one_that_turns_otherwise_has_a_note() -> None:
+    """A turn in place by 35 degrees with the arm nearly stretched, from ManiSkill's LiftPegUpright."""
+    made = Planner("panda", "panda_hand_tcp", user_joint_names=JOINTS + FINGERS, srdf="")
+    arm = [-0.1748361, 1.1052635, 0.3719087, -0.3689424, -0.3424939, 1.4765055, 0.748881]
+    q = np.array([*arm, 0.0237, 0.0236])
+    pose = [0.7810504, -0.0747778, 0.325, 0.0, 0.9510565, 0.0, 0.309017]
+    result = made.plan_screw(pose, q, planning_time=0.5)
+    assert result["status"] == "Success" and "this one turns otherwise" in result["note"]
+    line = [tip(made, q)[:3, 3] for q in result["position"]]
+    assert np.allclose(line, pose[:3], atol=8e-3) and np.allclose(line[-1], pose[:3], atol=1e-3)
+
+
 def test_a_line_to_the_edge_of_reach_ends_tilted_with_a_note() -> None:
     made = planner()
     q = np.array([-0.23, 0.58, 0.0, -1.27, 0.0, 1.84, 0.56])

@@ -37,6 +37,7 @@ CLOUD = "point_cloud"
 HELD = "attached"
 RAMP_TIME = 0.01  # in which accelerations build up [s]; MPlib has no limits of jerk
 SETTLING_TIME = 0.24  # of controllers that are given positions alone: so long the last one is repeated [s]
+LOOSE_TOLERANCE = 0.002  # of lines that are followed without turning evenly [m]
 TILT_WEIGHT = 0.01  # of rotation beside position, where poses are out of reach [m/rad]
 TILT_MARGIN = 1.25  # of the least tilt with which a position is in reach: there the arm is stretched
 HELD_JOINT_STEP = 0.002  # grippers are held at multiples of this [rad] or [m]
@@ -208,15 +209,19 @@ class Planner:
     def plan_screw(self, target_pose: Any, qpos: ArrayLike, *_: Any, **options: Any) -> dict[str, Any]:
         """Move along a straight line, turning evenly; see `plan_pose`.
 
-        Where the arm reaches the position only with a tilt of less than 15 degrees, it moves there so, and
-        `note` says how far it is tilted.
+        Where no motion does so, one along the line that turns otherwise is tried. Where the arm reaches the
+        position only with a tilt of less than 15 degrees, it moves there so. `note` says which.
         """
         T = self._in_world(target_pose, options)
 
         def plan(start: ndarray, **request: Any) -> PlanResult:
             result = self.workspace.plan_line(T, start, **request)
-            if result.solved or len(self.workspace.ik(T, near=start, count=1)):
+            if result.solved:
                 return result
+            if len(self.workspace.ik(T, near=start, count=1)):
+                uneven = self.workspace.plan_line(T, start, LOOSE_TOLERANCE, None, **request)
+                note = "no motion turns evenly along the line; this one turns otherwise"
+                return replace(uneven, notes=(*uneven.notes, note)) if uneven.solved else result
             tilt = self._tilt(T, start)
             angle = np.linalg.norm(tilt)
             if angle > DEFAULT.goal_angle:
