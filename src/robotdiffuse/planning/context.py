@@ -52,7 +52,7 @@ TOLERANCE_FRACTION = 0.95
 """Planners keep this part of each tolerance of path constraints."""
 MAX_RESERVED_FRACTION = 0.5
 """Largest part of the time limit that is reserved for validation and timing."""
-RESERVED_FACTOR = 2.0
+RESERVED_FACTOR = 3.0
 """Time that is reserved for validating and timing a path, by the longest that the call has taken for one."""
 EXPECTED_VALIDATION_TIME = 0.003
 """Time that is reserved for validating and timing a path before the call has done so once [s]."""
