@@ -31,7 +31,9 @@ def serving(
         assert process.stdout is not None
         found = re.search(r"http://[^;]+", process.stdout.readline())
         assert found is not None and "ready" in process.stdout.readline()
-        with httpx.Client(base_url=found.group(), timeout=500.0) as client:
+        # a kept connection may be closed by the server in the moment in which it is used again
+        limits = httpx.Limits(max_keepalive_connections=0)
+        with httpx.Client(base_url=found.group(), timeout=500.0, limits=limits) as client:
             yield client, process
     finally:
         process.send_signal(signal.SIGKILL)
