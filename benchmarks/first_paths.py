@@ -32,7 +32,7 @@ from robotdiffuse.robots import load_robot
 FAMILIES = ("rop", "rop_dense", "shelf", "crate", "table", "clutter", "kitchen", "cabinet")
 OTHER_ARMS = ("ur5e:shelf", "so101:shelf", "baxter_left:shelf", "baxter:shelf", "baxter:table")
 SEED = 5
-"""Of the problems; no setting was chosen on them."""
+"""Of the problems."""
 LIMIT = 1.0
 """CPU time after which a search ends [s]."""
 

@@ -135,7 +135,6 @@ def allowed_contacts(scene: Scene, links: Sequence[str], solids: Sequence[Solid]
 def solid_arrays(robot: Robot, scene: Scene) -> Solids:
     """The arrays of the obstacles for compiled code."""
     solids = solids_of(scene)
-
     T = np.array([solid.T_base_box for solid in solids]).reshape(-1, 4, 4)
     return Solids(
         np.ascontiguousarray(np.swapaxes(T[:, :3, :3], 1, 2)),

@@ -25,6 +25,7 @@ from robotdiffuse.collision.motions import with_covering_spheres
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.loading import loading
 from robotdiffuse.core.transforms import inverse, moved_spheres, quaternion_from_rotation
+from robotdiffuse.core.types import interpolated
 from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.motion_bounds import radii_of
 from robotdiffuse.robots.robot import Robot
@@ -147,7 +148,7 @@ class MovingCollision:
         obstacle = self.moving[o]
         T_stands_moved = obstacle.shape.T_base_shape @ inverse(obstacle.pose(time))
         distance = self._exact[o].distance_from_moved_base(
-            self.link_names[link], _at(times, q, time), T_stands_moved
+            self.link_names[link], interpolated(time, times, q), T_stands_moved
         )
         return distance - self.tracks.growth[o] * max(time, 0.0)
 
@@ -155,7 +156,7 @@ class MovingCollision:
         """Upper bound on how far the link's and the obstacle's points move from the middle of an interval to
         its ends, in sum [m]."""
         ways = kernel.cumulative_motion(q)
-        a, m, b = (_at(times, ways, time) for time in (start, (start + stop) / 2, stop))
+        a, m, b = (interpolated(time, times, ways) for time in (start, (start + stop) / 2, stop))
         speed = kernel.speed_between(self.tracks, o, start, stop) + self.tracks.growth[o]
         return float(self.links.motion_radii[link] @ np.maximum(m - a, b - m)) + speed * (stop - start) / 2
 
@@ -178,11 +179,6 @@ class MovingCollision:
                 break
             depth = max(depth, -distance)
         return TimedContact(self.link_names[link], self.moving[o].name, time, float(depth))
-
-
-def _at(times: ndarray, rows: ndarray, time: float) -> Float[ndarray, "dof"]:
-    """Rows, interpolated at a time; constant before and after them."""
-    return np.array([np.interp(time, times, column) for column in rows.T])
 
 
 @once_per_robot

@@ -332,6 +332,13 @@ Rows = tuple[Float[ndarray, "n"], Float[ndarray, "n dof"], Float[ndarray, "n dof
 """Times, positions, velocities and accelerations."""
 
 
+def interpolated(
+    at: Float[ndarray, "*at"] | float, times: Values, rows: JointRows
+) -> Float[ndarray, "*at dof"]:
+    """Rows between those of these times, linearly; the first and the last before and after them."""
+    return np.stack([np.interp(at, times, column) for column in rows.T], axis=-1)
+
+
 def spline_rows(
     controls: Float[ndarray, "m dof"],
     step: float,

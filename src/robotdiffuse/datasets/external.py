@@ -187,8 +187,7 @@ def _positions(robot: Robot, i: int, path: object) -> ndarray:
         raise InputError(
             f"paths[{i}] is {shown(positions)}; it must be n x {robot.dof} numbers, n at least 2: {names}"
         )
-    within = np.maximum(robot.lower - q, q - robot.upper) <= LIMIT_SLACK
-    within[:, robot.continuous] = np.isfinite(q[:, robot.continuous])
+    within = np.isfinite(q) & (robot.limit_excess(q) <= LIMIT_SLACK)
     if not within.all():
         row = int(within.min(axis=1).argmin())
         checked_configuration(robot, f"paths[{i}], row {row}", q[row], [])

@@ -300,8 +300,7 @@ def _ends(shard: Shard, row: int) -> Defects:
 
 
 def _limits(robot: Robot, q: Configurations) -> Defects:
-    excess = np.maximum(robot.lower - q, q - robot.upper)
-    excess[:, robot.continuous] = 0.0
+    excess = robot.limit_excess(q)
     if excess.max() > LIMIT_SLACK:
         i, j = np.unravel_index(excess.argmax(), excess.shape)
         value, low, high = distinct(q[i, j], robot.lower[j], robot.upper[j])

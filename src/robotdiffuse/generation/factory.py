@@ -26,7 +26,7 @@ from robotdiffuse.core.interrupts import delay_interrupts
 from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.core.registry import Entry, Registry
 from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Settings, SettingsOf, Share
-from robotdiffuse.core.types import Path
+from robotdiffuse.core.types import Path, interpolated
 from robotdiffuse.datasets.rows import Row, resample, row_of
 from robotdiffuse.datasets.shards import (
     MANIFEST,
@@ -254,8 +254,7 @@ def _resampled(
     if not validator.trajectory(timed).valid:
         return None
     times = np.linspace(0.0, timed.duration, settings.waypoints)
-    rows = [np.interp(times, timed.times, timed.positions[:, j]) for j in range(robot.dof)]
-    return times, np.stack(rows, axis=1).astype(np.float32)
+    return times, interpolated(times, timed.times, timed.positions).astype(np.float32)
 
 
 # The folder

@@ -26,6 +26,7 @@ from robotdiffuse.core.types import (
     Rotation,
     Values,
     Vector,
+    interpolated,
 )
 from robotdiffuse.problems import constraint_kernel as kernel
 from robotdiffuse.problems.constraint_kernel import CONE, DISTANCE, ROLL_PITCH_YAW, TURN, Rows
@@ -231,7 +232,7 @@ class PathConstraints:
         near = np.geomspace(MIN_SEGMENT_FRACTION, VIOLATION_STEP, 64)
         s = np.unique(np.concatenate([near, VIOLATION_STEP * np.arange(VIOLATION_STEPS), knots]))
         s = s[s <= min(knots[-1], VIOLATION_STEP * VIOLATION_STEPS)]
-        places = np.stack([np.interp(s, knots, column) for column in way.T], axis=1)
+        places = interpolated(s, knots, way)
         values = self.values(places)[:, row]
         over = values > self.rows.limit[row]
         start = int(over.argmax())

@@ -12,7 +12,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.bounds import MIN_RATE
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Configurations, JointValues, Path, Trajectory, Values
+from robotdiffuse.core.types import Configurations, JointValues, Path, Trajectory, Values, interpolated
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.corner_rounding import BlendedPolyline, half_widths
 from robotdiffuse.trajectories.speed_limits import (
@@ -78,11 +78,6 @@ def time_parameterize(
     Raises InputError if a velocity or acceleration limit of a joint is below MIN_RATE, and OutOfTimeError if
     the deadline leaves no time.
     """
-    if len(_distinct(path.positions)) == 1:
-        _check_limits(robot)
-        still = np.zeros((2, robot.dof))
-        times = np.array([0.0, settings.sample_time])
-        return Trajectory(path.joint_names, times, path.positions[[0, -1]], still, still)
     rounding = valid, free, settings, keeps, extra, deviations
     return rounded_corners(robot, path, *rounding, start_speed=start_speed)[2]
 
@@ -99,11 +94,16 @@ def rounded_corners(
     stops: Sequence[int] = (),
     start_speed: float = 0.0,
 ) -> tuple[Configurations, Values, Trajectory]:
-    """The distinct waypoints of a path, at least two, by how much each corner is rounded [rad], and the
-    resulting motion; see `time_parameterize`. Corners at the path's rows `stops` are not rounded."""
+    """The distinct waypoints of a path, by how much each corner is rounded [rad], and the resulting motion;
+    see `time_parameterize`. Corners at the path's rows `stops` are not rounded."""
     _check_limits(robot)
     rows = _distinct(path.positions)
     waypoints = path.positions[rows]
+    if len(rows) == 1:
+        still = np.zeros((2, robot.dof))
+        times = np.array([0.0, settings.sample_time])
+        resting = Trajectory(path.joint_names, times, path.positions[[0, -1]], still, still)
+        return waypoints, np.zeros(0), resting
     allowed = np.full(len(rows), settings.corner_deviation) if deviations is None else deviations[rows]
     allowed[np.searchsorted(rows, stops, side="right") - 1] = 0.0
     deviations = _shrunk(waypoints, allowed[1:-1], keeps, MIN_DEVIATION)
@@ -326,7 +326,7 @@ class StopGraph:
         """Index of the nearest of some configurations at each tick of a motion, from its start to its end."""
         times, q = motion.rows[:2]
         ticks = self.step * np.arange(motion.ticks + 1)
-        at = np.column_stack([np.interp(ticks, times, column) for column in q.T])
+        at = interpolated(ticks, times, q)
         return ((configurations**2).sum(axis=1) - 2 * at @ configurations.T).argmin(axis=1)
 
     def trajectory(self, way: list[Motion | int]) -> Trajectory:

@@ -10,7 +10,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.settings import Bound, Natural, NotNegative, Positive, Settings
 from robotdiffuse.core.transforms import inverse, rotation_angle, rpy_from_rotation
-from robotdiffuse.core.types import Configuration, Configurations, JointRows, Pose, Values
+from robotdiffuse.core.types import Configuration, Configurations, JointRows, Pose, Values, interpolated
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PosesGoal
 from robotdiffuse.robots.kinematics import link_origins, link_pose
 from robotdiffuse.robots.robot import Robot
@@ -182,8 +182,8 @@ def sample_path(q: Configurations, step: float, after: float = 0.0) -> tuple[Val
     shares = [np.arange(count) / count for count in counts]
     places = np.append(np.repeat(np.arange(len(counts)), counts) + np.concatenate([[], *shares]), len(counts))
     places = places[places >= after]
-    rows = np.arange(len(q))
-    return places, np.column_stack([np.interp(places, rows, joint) for joint in q.T])
+    rows = np.arange(float(len(q)))
+    return places, interpolated(places, rows, q)
 
 
 def _near(

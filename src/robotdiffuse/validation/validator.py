@@ -110,7 +110,6 @@ class Verifier:
 
     def path(self, path: Path) -> Report:
         """See `verify`."""
-
         self._check_shape("path", path)
         known_violations = []
         if self.dynamics is not None and within(path.positions):

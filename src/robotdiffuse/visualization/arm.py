@@ -6,7 +6,15 @@ from numpy import ndarray
 
 from robotdiffuse.collision.exact_meshes import forward_frames
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Configuration, Configurations, Path, Points, Trajectory, Values
+from robotdiffuse.core.types import (
+    Configuration,
+    Configurations,
+    Path,
+    Points,
+    Trajectory,
+    Values,
+    interpolated,
+)
 from robotdiffuse.drawables import Surface, join, link_surfaces
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.visual_meshes import has_visual
@@ -60,11 +68,6 @@ def dense(q: Configurations, count: int) -> Configurations:
     """`count` configurations equally spaced along a polyline in joint space; one if it does not move."""
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(q, axis=0), axis=1))])
     return q[:1] if s[-1] == 0 else interpolated(np.linspace(0, s[-1], count), s, q)
-
-
-def interpolated(at: Values, times: Values, rows: Configurations) -> Configurations:
-    """Rows between given ones, linearly."""
-    return np.stack([np.interp(at, times, column) for column in rows.T], axis=1)
 
 
 def timed(motion: Path | Trajectory) -> tuple[Values, Configurations]:

@@ -21,7 +21,16 @@ from robotdiffuse.core.errors import InputError, check_type, shortened
 from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.results import PlanResult, ResultFile
 from robotdiffuse.core.transforms import IDENTITY, inverse, quaternion_from_rotation
-from robotdiffuse.core.types import Configuration, Configurations, Path, Points, Pose, Trajectory, Values
+from robotdiffuse.core.types import (
+    Configuration,
+    Configurations,
+    Path,
+    Points,
+    Pose,
+    Trajectory,
+    Values,
+    interpolated,
+)
 from robotdiffuse.drawables import (
     GOAL,
     START,
@@ -41,7 +50,7 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud, Sphere, Triangulated
-from robotdiffuse.visualization.arm import DrawnArm, facts, interpolated, timed
+from robotdiffuse.visualization.arm import DrawnArm, facts, timed
 from robotdiffuse.visualization.picture import (
     MARGINS,
     VERTICAL_FIELD,

@@ -218,7 +218,6 @@ class PointAutoencoder(Autoencoder):
         self.empty = nn.Parameter(torch.zeros(pooled))
         hidden = settings.hidden
         code = settings.code
-        pooled = 2 * sizes[-1]
         self.head = nn.Sequential(nn.LayerNorm(pooled), *perceptron(pooled, hidden, code))
         self.decoder = perceptron(code, hidden, hidden, 3 * settings.decoded)
         self.query_code = nn.Linear(code, 192)

@@ -15,7 +15,7 @@ from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.bounds import Value, rigid_transform
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Configuration, Configurations, Path, Pose
+from robotdiffuse.core.types import Configuration, Configurations, Path, Pose, interpolated
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.occupancy_map import COVER_RADIUS, OccupancyMap
 from robotdiffuse.perception.ray_caster import looking_at
@@ -84,7 +84,7 @@ def first_parts(waypoints: Configurations) -> Iterator[Configurations]:
     at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1))])
     for part in PARTS:
         end = part * at[-1]
-        last = np.array([np.interp(end, at, joint) for joint in waypoints.T])
+        last = interpolated(end, at, waypoints)
         yield np.concatenate([waypoints[at < end], last[None]])
 
 

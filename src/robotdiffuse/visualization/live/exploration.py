@@ -179,13 +179,13 @@ class ExplorationSession:
     # Work of the thread
 
     def _explore(self, run: int) -> None:
-        with suppress(_OutdatedError):
-            try:
-                self._take_steps(run)
-            except _OutdatedError:
-                raise
-            except Exception as error:  # the page survives any error
-                kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+        try:
+            self._take_steps(run)
+        except _OutdatedError:
+            return
+        except Exception as error:  # the page survives any error
+            kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+            with suppress(_OutdatedError):
                 self._update(run, phase=ENDED, failure=kind + shortened(str(error)))
 
     def _take_steps(self, run: int) -> None:

@@ -18,14 +18,14 @@ from viser import uplot
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
-from robotdiffuse.core.types import Configuration, Pose, Trajectory, Tree
+from robotdiffuse.core.types import Configuration, Pose, Trajectory, Tree, interpolated
 from robotdiffuse.drawables import GOAL, START, Color, Drawable, Surface, drawables, own_frame, thinned
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.robots.kinematics import link_pose, reach
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape
-from robotdiffuse.visualization.arm import DrawnArm, interpolated
+from robotdiffuse.visualization.arm import DrawnArm
 from robotdiffuse.visualization.live.server import PageServer
 from robotdiffuse.visualization.live.session import (
     COLLISIONS,
