@@ -16,39 +16,29 @@ def turned(angle: float) -> np.ndarray:
     return START + np.array([angle, 0, 0, 0, 0, 0, 0])
 
 
-def problem(scene: Scene) -> Problem:
-    return Problem(load_robot("panda"), scene, START, turned(1.2))
+BLOCKED = Scene([Sphere((0.4, 0.3, 0.6), 0.15)])
 
 
-def blocked() -> Problem:
-    return problem(Scene([Sphere((0.4, 0.3, 0.6), 0.15)]))
+def context_for(scene: Scene, time_limit: float = 10.0) -> PlanningContext:
+    problem = Problem(load_robot("panda"), scene, START, turned(1.2))
+    return PlanningContext("test", problem, PlanRequest(time_limit=time_limit))
 
 
-def context_for(scene: Scene) -> PlanningContext:
-    return PlanningContext("test", problem(scene), PlanRequest(time_limit=10.0))
-
-
-def test_progress_falls_and_ends_with_the_returned_path() -> None:
-    context = context_for(Scene([]))
-    for length in (5.0, 3.0, 4.0, 0.9):  # 4 is no improvement; 0.9 is shorter than the returned path
-        context.improved(length)
-    result = context.finish(np.stack([START, turned(1.2)]), "test")
-    assert result is not None and result.path is not None
-    lengths = [length for _, length in result.progress]
-    np.testing.assert_allclose(lengths, [5.0, 3.0, 1.2])
-    assert result.progress[-1] == (result.planning_time, result.path.length)
-
-
-def test_returned_path_keeps_the_time_at_which_it_was_found() -> None:
-    context = context_for(Scene([]))
-    context.improved(1.2)
-    result = context.finish(np.stack([START, turned(1.2)]), "test")
-    assert result is not None
-    assert len(result.progress) == 1 and result.progress[0][0] < result.planning_time
+def test_progress_falls_and_ends_with_the_returned_path_when_it_was_found() -> None:
+    # 4 is no improvement; 0.9 is shorter than the returned path
+    for found, kept in (((5.0, 3.0, 4.0, 0.9), [5.0, 3.0, 1.2]), ((1.2,), [1.2])):
+        context = context_for(Scene([]))
+        for length in found:
+            context.improved(length)
+        result = context.finish(np.stack([START, turned(1.2)]), "test")
+        assert result is not None
+        np.testing.assert_allclose([length for _, length in result.progress], kept)
+        assert result.progress[-1][1] == result.path.length
+        assert (result.progress[-1][0] < result.planning_time) == (len(found) == 1)
 
 
 def test_failures_name_what_the_validator_refused() -> None:
-    context = PlanningContext("test", blocked(), PlanRequest(time_limit=10.0))
+    context = context_for(BLOCKED)
     assert context.unsolved().refused == ""
     assert context.finish(np.stack([START, turned(1.2)]), "test") is None
     assert context.unsolved().refused == "scene_collision"
@@ -57,16 +47,16 @@ def test_failures_name_what_the_validator_refused() -> None:
 
 
 def test_a_search_that_ended_differs_from_one_that_ran_out_of_time() -> None:
-    ended = PlanningContext("test", blocked(), PlanRequest(time_limit=10.0)).unsolved()
+    ended = context_for(BLOCKED).unsolved()
     assert ended.status is Status.NO_PATH and "the search ended" in ended.reason
-    late = PlanningContext("test", blocked(), PlanRequest(time_limit=1e-9)).unsolved()
+    late = context_for(BLOCKED, 1e-9).unsolved()
     assert late.status is Status.TIMEOUT and "longer time limit" in late.reason
 
 
 def test_a_result_notes_the_compile_time_once() -> None:
     njit(lambda x: x + 1)(1)
     planner = load_planner("rrt_connect")
-    first, second = (planner.plan(blocked(), time_limit=20.0) for _ in range(2))
+    first, second = (planner.plan(context_for(BLOCKED).problem, time_limit=20.0) for _ in range(2))
     assert sum("compiled for" in note and "does not count" in note for note in first.notes) == 1
     assert not any("compiled for" in note for note in second.notes)
 

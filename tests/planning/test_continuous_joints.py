@@ -18,7 +18,6 @@ from robotdiffuse.validation.validator import verify_trajectory
 
 
 def turning_arm() -> rd.Robot:
-    """The arm of boxes, whose first and last joints turn without end."""
     arm = box_arm()
     joints = tuple(
         replace(joint, kind="continuous", lower=-CONTINUOUS_LIMIT, upper=CONTINUOUS_LIMIT)
@@ -39,7 +38,7 @@ def planned(
 ) -> rd.Path:
     problem = rd.Problem(ARM, scene or rd.Scene(), start, goal)  # type: ignore[arg-type]
     result = rd.load_planner(planner).plan(problem, time_limit=60.0, **more)  # type: ignore[arg-type]
-    assert result.solved and result.path is not None and result.trajectory is not None, result.reason
+    assert result.solved, result.reason
     assert rd.verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
     assert np.array_equal(result.path.positions[0], problem.start)
     steps = np.abs(np.diff(result.trajectory.positions, axis=0)).max()
@@ -75,12 +74,11 @@ def test_values_wrapped_to_half_a_turn_are_no_motion_but_those_of_a_file_are_unw
     """A path was valid, the long way round; the same rows with times turned at 1571 rad/s."""
     problem = rd.Problem(ARM, rd.Scene(), [3.0, 0.0, 0.0], [-3.0, 0.0, 0.0])
     motion = rd.load_planner("aorrtc").plan(problem).trajectory
-    assert motion is not None
     wrapped = (motion.positions + np.pi) % (2 * np.pi) - np.pi
     timed = replace(motion, positions=wrapped)
     for rows in (rd.Path(ARM.joint_names, wrapped), timed):
         violation = rd.verify(problem, rows).violation
-        assert violation is not None and violation.kind == "jump" and violation.subject == "j0"
+        assert violation.kind == "jump" and violation.subject == "j0"
         assert "unwrap" in violation.message
     for times in (None, motion.times):
         velocities = None if times is None else motion.velocities

@@ -19,7 +19,6 @@ T_START = link_pose(PANDA, START, HAND)
 
 
 def moved(xyz: list[float], axis: list[float] | None = None, angle: float = 0.0) -> np.ndarray:
-    """The hand's pose at the start, moved and turned about its own origin, in the base's frame."""
     T = T_START.copy()
     T[:3, 3] += xyz
     T[:3, :3] = rotation_about(np.array(axis or [0.0, 0.0, 1.0]), angle) @ T[:3, :3]
@@ -123,10 +122,3 @@ def test_line_into_a_box_ends_at_the_box() -> None:
     # fingertips are 0.112 m below the hand's origin; the table's top is at 0.1 m
     gap = T_START[2, 3] - 0.112 - 0.1
     assert result.fraction == pytest.approx(gap / 0.3, abs=0.05)
-
-
-def test_link_that_is_at_the_end_already_stays() -> None:
-    """The spline through equal configurations was a traceback."""
-    result = planned(T_START)
-    assert result.solved, result.reason
-    assert result.path_length is not None and result.path_length < 1e-3

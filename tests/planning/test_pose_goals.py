@@ -35,7 +35,6 @@ def baxter() -> rd.Robot:
 
 @cache
 def free() -> ndarray:
-    """Configurations that are free over the table."""
     robot = baxter()
     rng = np.random.default_rng(4)
     drawn = rng.uniform(robot.lower, robot.upper, (400, robot.dof))
@@ -47,7 +46,6 @@ def poses_at(robot: rd.Robot, q: ndarray, links: Sequence[str], *tolerances: Any
 
 
 def off(robot: rd.Robot, goal: rd.PosesGoal, q: ndarray) -> float:
-    """The most that any link is off its pose [m], [rad]."""
     between = [np.linalg.inv(pose.T_base_frame) @ link_pose(robot, q, pose.frame) for pose in goal.poses]
     return max(max(float(np.linalg.norm(T[:3, 3])), rotation_angle(T[:3, :3])) for T in between)
 
@@ -63,12 +61,14 @@ def test_both_hands_are_brought_to_their_poses() -> None:
     found = pose_configurations(problem, goal, np.random.default_rng(0))
     assert len(found) == 10
     assert max(off(baxter(), goal, q) for q in found) < 1e-5
-    apart = np.abs(found[:, None] - found).max(axis=2)
-    assert apart[~np.eye(10, dtype=bool)].min() > 0.1
+    between = np.abs(found[:, None] - found).max(axis=2)
+    assert between[~np.eye(10, dtype=bool)].min() > 0.1
     result = rd.plan(problem, time_limit=20.0)
-    assert result.path is not None, result.reason
+    assert result.solved, result.reason
     assert off(baxter(), goal, result.path.positions[-1]) < 1e-5
     assert check(rd.certify(problem, result.path), problem).valid
+    here = replace(problem, goal=poses_at(baxter(), problem.start, HANDS))
+    assert rd.plan(here, time_limit=10.0).path_length < 1e-4
 
 
 def test_links_that_share_a_joint_are_brought_there_together(tmp_path: Path) -> None:
@@ -99,8 +99,7 @@ def test_tolerances_of_each_pose_are_used_and_validated() -> None:
 def test_the_validator_names_the_hand_that_is_elsewhere() -> None:
     (problem, goal), (start, there) = both_hands(), free()[:2]
     left_only = np.where([name.startswith("left") for name in baxter().joint_names], there, start)
-    found = rd.verify(problem, rd.Path(baxter().joint_names, np.stack([start, left_only]))).violation
-    assert found is not None
+    assert not rd.verify(problem, rd.Path(baxter().joint_names, np.stack([start, left_only]))).valid
     error = goal_error(baxter(), goal, left_only)
     assert error is not None and error.subject == "right_gripper"
     assert goal_error(baxter(), goal, there) is None
@@ -133,18 +132,17 @@ def test_a_pose_out_of_reach_is_named_alone() -> None:
 def test_files_keep_them(tmp_path: Path) -> None:
     pose = {"xyz": [0.7, 0.25, 0.3], "wxyz": [0.0, 1.0, 0.0, 0.0]}
     goal = {"poses": {"left_gripper": pose | {"rpy_tolerance": [0.0, 0.0, 3.1]}, "right_gripper": pose}}
-    for field in ("goal", "any"):
-        record = problem_record(both_hands()[0]) | {"goal": goal if field == "goal" else {"any": [goal]}}
-        record["base"] = {"xyz": [0.1, 0.2, 0.3], "wxyz": [0.6, 0.0, 0.0, 0.8]}
-        file = tmp_path / "problem.yaml"
-        file.write_text(yaml.safe_dump(record))
+    file = tmp_path / "problem.yaml"
+    base = {"xyz": [0.1, 0.2, 0.3], "wxyz": [0.6, 0.0, 0.0, 0.8]}
+    for asked in (goal, {"any": [goal]}):
+        file.write_text(yaml.safe_dump(problem_record(both_hands()[0]) | {"goal": asked, "base": base}))
         problem = rd.load_problem(file)
         kept = problem_record(problem)
         assert problem_record(problem_from_record(kept)) == kept
         each = problem.goal.goals[0] if isinstance(problem.goal, rd.AnyGoal) else problem.goal
         assert isinstance(each, rd.PosesGoal) and [one.frame for one in each.poses] == [*goal["poses"]]
-        T_world_base = problem.T_world_base
-        np.testing.assert_allclose((T_world_base @ each.poses[0].T_base_frame)[:3, 3], pose["xyz"])
+        T_world_frame = problem.T_world_base @ each.poses[0].T_base_frame
+        np.testing.assert_allclose(T_world_frame[:3, 3], pose["xyz"])
 
 
 T = np.eye(4)
@@ -175,20 +173,11 @@ def test_what_makes_no_sense_is_one_line(case: str) -> None:
     assert "\n" not in str(refused.value)
 
 
-def test_a_link_twice_in_a_file_is_one_line(tmp_path: Path) -> None:
-    file = tmp_path / "problem.yaml"
-    pose = "{xyz: [0, 0, 0], wxyz: [1, 0, 0, 0]}"
-    file.write_text(f"robot: baxter\ngoal: {{poses: {{left_gripper: {pose}, left_gripper: {pose}}}}}\n")
-    with pytest.raises(rd.InputError, match="left_gripper appears twice in line 2"):
-        rd.load_problem(file)
-
-
-ARMS = ("iiwa14", "gen3", "xarm7", "panda", "ur5e", "fr3")
+ARMS = ("iiwa14", "gen3", "panda", "ur5e")
 FREE = rd.Scene()
 
 
 def apart(robot: rd.Robot, count: int, seed: int = 5) -> ndarray:
-    """Configurations without a collision, away from the limits and anywhere within them."""
     rng = np.random.default_rng(seed)
     middle = 0.5 * (robot.lower + robot.upper)
     half = 0.5 * (robot.upper - robot.lower)
@@ -227,7 +216,7 @@ def test_a_pose_where_the_hand_is_costs_no_motion(arm: str) -> None:
         here = rd.PoseGoal(robot.tip, link_pose(robot, start, robot.tip))
         for goal in (here, rd.PoseGoal(robot.tip, here.T_base_frame, [0.01] * 3, [0.1, 0.1, np.pi])):
             result = rd.plan(rd.Problem(robot, FREE, start, goal), 5.0)
-            assert result.path is not None and result.path.length < 1e-4
+            assert result.path.length < 0.0001
 
 
 @pytest.mark.parametrize("arm", ARMS)
@@ -255,18 +244,12 @@ def test_a_pose_nearby_is_reached_by_the_nearest_configuration(arm: str) -> None
             rd.Problem(robot, FREE, start, goal, constraints=[rd.CartesianLine(robot.tip)]),
         ):
             result = rd.plan(problem, 10.0)
-            assert result.path is not None, result.reason
+            assert result.solved, result.reason
             assert result.path.length <= longest
             assert result.goal_index == (1 if isinstance(problem.goal, rd.AnyGoal) else 0)
         if tested == 2:
             return
     raise AssertionError("no starts")
-
-
-def test_hands_where_they_are_stay_there() -> None:
-    start = free()[0]
-    result = rd.plan(rd.Problem(baxter(), rd.Scene([TABLE]), start, poses_at(baxter(), start, HANDS)), 10.0)
-    assert result.path is not None and result.path.length < 1e-4
 
 
 def four_joints(folder: Path) -> rd.Robot:
@@ -310,7 +293,6 @@ def test_a_pose_out_of_reach_by_more_than_the_validator_accepts_stays_so() -> No
 
 
 def many_grasps() -> tuple[rd.Problem, ndarray]:
-    """Ten poses inside obstacles, then ten that are free."""
     robot = rd.load_robot("panda")
     q = apart(robot, 40)
     balls = [rd.Sphere(link_pose(robot, row, robot.tip)[:3, 3], 0.05) for row in q[1:11]]
@@ -334,12 +316,12 @@ def test_of_several_goals_each_is_tried_once(monkeypatch: pytest.MonkeyPatch) ->
     problem, q_free = many_grasps()
     assert isinstance(problem.goal, rd.AnyGoal) and len(problem.goal.goals) == 20 and len(q_free) == 10
     result = rd.plan(problem, 20.0)
-    assert result.path is not None and result.goal_index is not None and result.goal_index >= 10
+    assert result.goal_index is not None and result.goal_index >= 10
     reached = problem.goal.goals[result.goal_index]
     assert goal_error(problem.robot, reached, result.path.positions[-1]) is None
     assert len(tried) == 20
     again = rd.plan(problem, 20.0)
-    assert again.path is not None and np.array_equal(again.path.positions, result.path.positions)
+    assert np.array_equal(again.path.positions, result.path.positions)
 
 
 def test_of_several_goals_no_more_are_tried_late(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -361,11 +343,7 @@ def test_of_several_goals_no_more_are_tried_late(monkeypatch: pytest.MonkeyPatch
     goals = rd.AnyGoal(problem.goal.goals[::-1])
     result = rd.plan(replace(problem, goal=goals), 1.0, until="first")
     assert result.solved and 5 <= len(tried) <= 7
-
-
-def test_if_none_of_several_goals_is_free_the_reason_is_that_of_the_first() -> None:
-    problem, _ = many_grasps()
-    assert isinstance(problem.goal, rd.AnyGoal)
+    monkeypatch.undo()
     result = rd.plan(replace(problem, goal=rd.AnyGoal(problem.goal.goals[:2])), 20.0)
     assert result.status is rd.Status.INVALID_GOAL
     assert result.reason.startswith("none of 2 goals can be reached, the first: all ")
@@ -385,7 +363,7 @@ def test_the_goal_index_names_the_goal_that_is_reached() -> None:
     T_beside = transform(T[:3, 3] + [0.002, 0, 0], T[:3, :3])
     goals = rd.AnyGoal((rd.PoseGoal(robot.tip, T_beside), rd.PoseGoal(robot.tip, T)))
     result = rd.plan(rd.Problem(robot, FREE, start, goals))
-    assert result.path is not None and result.goal_index is not None
+    assert result.goal_index is not None
     reached = goals.goals[result.goal_index]
     assert isinstance(reached, rd.PoseGoal)
     error = link_pose(robot, result.path.positions[-1], robot.tip) - reached.T_base_frame

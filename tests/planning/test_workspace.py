@@ -21,9 +21,8 @@ def test_motions_are_for_the_obstacles_as_they_are_then() -> None:
     space = panda()
     free = space.plan(RIGHT, LEFT, time_limit=10.0)
     assert free.stage == "straight_line"
-    space.add(
-        rd.Sphere([0.5, 0.0, 0.6], 0.2, name="ball"), rd.Box([0.5, 0.0, -0.2], [1.0, 1.0, 0.1], name="table")
-    )
+    table = rd.Box([0.5, 0.0, -0.2], [1.0, 1.0, 0.1], name="table")
+    space.add(rd.Sphere([0.5, 0.0, 0.6], 0.2, name="ball"), table)
     assert space.obstacles == ("ball", "table")
     around = space.plan(RIGHT, LEFT, time_limit=10.0)
     assert around.solved and around.path_length > free.path_length + 0.1
@@ -57,31 +56,6 @@ def test_poses_are_in_the_world() -> None:
     assert np.allclose(there.scene.shapes[0].bounds, ball.bounds)
 
 
-def test_a_grasped_obstacle_moves_with_the_arm_until_it_is_put_down() -> None:
-    space = panda()
-    can = rd.Cylinder([0.5, -0.3, 0.06], radius=0.03, height=0.12, name="can")
-    space.add(rd.Box([0.5, 0.0, -0.05], [0.8, 1.2, 0.1], name="table"), can)
-    fingers = ("panda_hand", "panda_leftfinger", "panda_rightfinger")
-    above = rd.pose([0.5, -0.3, 0.30], rpy=[np.pi, 0.0, 0.0])
-    grasp = rd.pose([0.5, -0.3, 0.18], rpy=[np.pi, 0.0, 0.0])
-    space.tip = "panda_hand"
-    first = space.plan(above, "ready", time_limit=10.0)
-    space.allow("can", fingers)
-    down = space.plan_line(grasp, first.path.positions[-1], time_limit=10.0)
-    assert down.solved and down.fraction == 1.0, down.reason
-    q = down.path.positions[-1]
-    space.attach("can", q, touch_links=fingers)
-    assert space.obstacles == ("table",)
-    assert "if it stands there, allowed_contacts of table may name it" in space.is_free(q).reason
-    space.allow("table", ["can"])
-    up = space.plan_line(above, q, time_limit=10.0)
-    assert up.solved, up.reason
-    space.detach("can", up.path.positions[-1])
-    held = next(shape for shape in space.scene.shapes if shape.name == "can")
-    lifted = held.bounds.mean(axis=0) - can.bounds.mean(axis=0)
-    assert np.allclose(lifted, [0.0, 0.0, 0.12], atol=2e-3)
-
-
 def test_the_nearest_goal_that_a_line_leads_to() -> None:
     space = panda(T_world_base=T_WORLD_BASE)
     T = space.robot.fk(READY, space.tip)
@@ -103,17 +77,14 @@ def test_the_nearest_goal_that_a_line_leads_to() -> None:
     assert not result.solved and result.reason.startswith("goal 0: ")
 
 
-@pytest.mark.parametrize("time_limit", [1e-5, -1.0])
-def test_a_limit_that_has_run_out_before_the_line_is_planned(time_limit: float) -> None:
+def test_a_limit_that_has_run_out_before_the_line_is_planned() -> None:
     """It was refused as negative: "time_limit is -0.00085"."""
     space = panda(T_world_base=T_WORLD_BASE)
     end = space.pose(READY) @ rd.pose([0.0, 0.0, 0.05])
     for corners in ((), (end,)):
-        if time_limit < 0:
-            with pytest.raises(rd.InputError, match="time_limit is -1"):
-                space.plan_line(end, READY, time_limit=time_limit, waypoints=corners)
-        else:
-            assert space.plan_line(end, READY, time_limit=time_limit, waypoints=corners).reason
+        assert space.plan_line(end, READY, time_limit=1e-5, waypoints=corners).reason
+        with pytest.raises(rd.InputError, match="time_limit is -1"):
+            space.plan_line(end, READY, time_limit=-1.0, waypoints=corners)
 
 
 def test_lines_through_waypoints_are_one_motion() -> None:
@@ -148,8 +119,9 @@ def test_a_line_to_a_goal_with_tolerances_turns_no_more_than_it_must() -> None:
     assert rd.verify(problem, less.trajectory).valid
 
 
-@pytest.mark.parametrize("angle", [0.05, None])
-@pytest.mark.parametrize(("way", "turn"), [(0.0, 0.0), (0.0, 0.5), (0.0005, 0.0)])
+@pytest.mark.parametrize(
+    ("way", "turn", "angle"), [(0.0, 0.0, None), (0.0, 0.5, 0.05), (0.0, 0.5, None), (0.0005, 0.0, 0.05)]
+)
 def test_short_lines_and_turns_about_the_tool_point(way: float, turn: float, angle: float | None) -> None:
     space = panda()
     end = space.pose(READY) @ rd.pose([0.0, 0.0, way], rpy=[0.0, 0.0, turn])
@@ -164,13 +136,10 @@ def test_short_lines_and_turns_about_the_tool_point(way: float, turn: float, ang
     ("call", "message"),
     [
         (
-            lambda space: space.plan_line([np.eye(4), np.eye(4)], "ready"),
-            "pose is 2 poses; a line has one end: give those before the last as waypoints",
+            lambda space: space.plan_line([np.eye(4)] * 2, "ready"),
+            "pose is 2 poses; a line has one end",
         ),
-        (
-            lambda space: space.move("bal", np.eye(4)),
-            "unknown obstacle 'bal'; known: ball",
-        ),
+        (lambda space: space.move("bal", np.eye(4)), "unknown obstacle 'bal'; known: ball"),
         (lambda space: space.move("ball", np.eye(3)), "T_world_shape is .*; it must be 4 x 4"),
         (lambda space: space.attach("cup", READY), "unknown obstacle 'cup'"),
         (lambda space: space.add(*[rd.Sphere([1, 0, 0], 0.1, name="a")] * 2), "names must differ"),
@@ -276,6 +245,7 @@ def test_contacts_hold_for_their_step_only() -> None:
     steps = pick(GRASP @ rd.pose([0.0, 0.0, -0.12]))
     result = space.plan_steps([*steps[:3], rd.MoveRelative([0, 0, 0.15], "world", name="lift")], "ready")  # type: ignore[list-item]
     assert result.failed == "lift" and "can touches table" in result.reason
+    assert "if it stands there, allowed_contacts of table may name it" in result.reason
     assert space.scene.allowed_contacts == ()
 
 

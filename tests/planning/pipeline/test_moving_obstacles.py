@@ -27,7 +27,6 @@ def problem(*moving: rd.MovingObstacle, **more: object) -> rd.Problem:
 
 
 def clearances(motion: rd.Trajectory, obstacle: rd.MovingObstacle) -> list[float]:
-    """The least distances at times 20 ms apart."""
     found = list[float]()
     for t in np.arange(0.0, motion.duration, 0.02):
         exact = ExactCollision(PANDA, rd.Scene([obstacle.at(t)]))
@@ -64,8 +63,6 @@ def test_a_wall_that_comes_cannot_be_passed() -> None:
 
 
 def test_the_earliest_schedule_waits_for_a_passing_obstacle() -> None:
-    """Three configurations in a row; the middle one is occupied at ticks 1 to 3; both ends of a step are
-    checked."""
     clear = np.ones((3, 10), bool)
     clear[1, 1:4] = False
     args = np.array([0, 2]), np.array([0]), np.array([1]), np.array([0, 3]), np.array([0, 1, 2])
@@ -74,12 +71,8 @@ def test_the_earliest_schedule_waits_for_a_passing_obstacle() -> None:
     assert way == [WAITED] * 4 + [0]
     clear[0, 2] = False  # and it comes by the start before
     assert not earliest(clear, *args)[1]
-
-
-def test_the_grid_of_times_ends_with_the_time() -> None:
-    args = np.array([0, 2]), np.array([0]), np.array([1]), np.array([0, 3]), np.array([0, 1, 2])
     with deadline(lambda: -1.0), pytest.raises(OutOfTimeError, match="the grid of times"):
-        earliest(np.ones((3, 10), bool), *args)
+        earliest(clear, *args)
 
 
 UPRIGHT = rd.AxisCone("panda_hand", [0, 0, 1], [0, 0, -1], 0.2)
@@ -121,10 +114,10 @@ def test_a_stop_at_a_waypoint_is_not_gone_through() -> None:
     ball = rd.MovingObstacle(rd.Sphere(at, 0.08, name="ball"), velocity=[0.3, 0, 0.3])
     task = problem(ball, waypoints=[middle])
     found = rd.load_planner("rrt_connect").plan(task, 20.0)
-    assert found.trajectory is not None, found.reason
+    assert found.solved, found.reason
     assert verify_trajectory(task, found.trajectory).valid
     alone = rd.load_planner("rrt_connect").plan(replace(task, moving=()), 20.0).trajectory
-    assert alone is not None and found.trajectory.duration > alone.duration
+    assert found.trajectory.duration > alone.duration
 
 
 def test_corners_are_rounded_as_far_as_the_planner_certified() -> None:
@@ -132,41 +125,34 @@ def test_corners_are_rounded_as_far_as_the_planner_certified() -> None:
     default."""
     middle = np.array([0.0, 0.9, 0, -1.8, 0, 2.1, 0.8])
     path = rd.Path(PANDA.joint_names, np.stack([START, middle, END]))
-    shortest = {}
-    for deviation in (None, 0.0, 0.02):
-        deviations = None if deviation is None else np.full(3, deviation)
+    shortest = []
+    for deviations in (None, np.zeros(3), np.full(3, 0.02)):
         graph = StopGraph(
             PANDA, path, lambda _: True, lambda _: True, TimingSettings(), GRID_STEP, deviations=deviations
         )
-        last = len(graph.stops) - 1
-        whole = [m.ticks for m in graph.motions if (m.source, m.target) == (0, last)]
-        shortest[deviation] = min(whole, default=None)
-    assert shortest[0.0] is None
-    assert shortest[0.02] > shortest[None]
+        ends = 0, len(graph.stops) - 1
+        shortest.append(min((m.ticks for m in graph.motions if (m.source, m.target) == ends), default=0))
+    assert shortest[1] == 0 < shortest[0] < shortest[2]
 
 
 def test_each_row_of_a_path_through_waypoints_has_its_corner_deviation() -> None:
     """They were those of the last segment alone."""
     tight = rd.Problem(PANDA, rd.Scene([rd.Sphere([0.55, 0.0, 0.5], 0.15)]), START, END)
     mid = rd.load_planner("aorrtc").plan(tight, 10.0)
-    assert mid.path is not None and mid.trajectory is not None
+    assert mid.path is not None
     task = replace(tight, waypoints=[mid.trajectory.positions[len(mid.trajectory.times) // 3]])
     found = rd.load_planner("aorrtc").plan(task, 10.0)
-    assert found.path is not None and found.corner_deviations is not None
+    assert found.corner_deviations is not None
     assert len(found.corner_deviations) == len(found.path.positions)
     there = np.abs(found.path.positions - task.waypoints[0].positions[0]).max(axis=1) < 1e-6  # type: ignore[union-attr]
     assert there.any() and not np.array(found.corner_deviations)[there].any()
 
 
-VELOCITIES = [np.eye(7)[0] * 2.0, np.array([0.5, 0.1, 0.3, -0.4, 0.1, 0, 0.6]), -np.eye(7)[0]]
-
-
-@pytest.mark.parametrize("velocity", VELOCITIES)
+@pytest.mark.parametrize("velocity", [np.eye(7)[0] * 2.0, np.array([-0.5, 0.1, 0.3, -0.4, 0.1, 0, 0.6])])
 def test_motions_begin_with_the_start_velocity(velocity: np.ndarray) -> None:
     task = rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=velocity)
     found = rd.load_planner("rrt_connect").plan(task, 60.0)
-    assert found.status is rd.Status.SOLVED, found.reason
-    assert found.trajectory is not None
+    assert found.solved, found.reason
     assert np.allclose(found.trajectory.velocities[0], velocity, atol=1e-9)
     assert (np.abs(found.trajectory.velocities) <= PANDA.velocity * (1 + 1e-6)).all()
     assert (np.abs(found.trajectory.accelerations) <= PANDA.acceleration * (1 + 1e-3)).all()
@@ -176,14 +162,12 @@ def test_motions_begin_with_the_start_velocity(velocity: np.ndarray) -> None:
     assert not found.trajectory.accelerations[0].any()
     assert verify_trajectory(task, found.trajectory).valid
     at_rest = verify_trajectory(replace(task, start_velocity=None), found.trajectory).violation
-    assert at_rest is not None
     assert at_rest.kind in ("rest", "acceleration")
 
 
 @pytest.mark.parametrize(
     ("velocity", "message"),
     [
-        ([0.1] * 6, "start_velocity is .*; it must be 7 finite numbers"),
         ([np.nan] * 7, "start_velocity is .*; it must be 7 finite numbers"),
         ([9.0, 0, 0, 0, 0, 0, 0], "start_velocity: panda_joint1 is 9; its velocity limit is 2.17"),
         ((1.00001 * PANDA.velocity).tolist(), r"panda_joint1 is 2\.17502; its velocity limit is 2\.175$"),
@@ -194,7 +178,7 @@ def test_invalid_start_velocities_are_refused(velocity: list[float], message: st
         rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=velocity)
 
 
-def test_a_start_velocity_in_float32_at_the_limit_is_clamped() -> None:
+def test_start_velocities_at_the_limit_in_float32_are_clamped_and_those_of_nearly_nothing_are_rest() -> None:
     limit = np.nextafter(PANDA.velocity.astype(np.float32), np.float32(np.inf))
     assert (limit > PANDA.velocity).all()
     for sign in (1, -1):
@@ -202,11 +186,13 @@ def test_a_start_velocity_in_float32_at_the_limit_is_clamped() -> None:
         assert task.start_velocity is not None and task.notes
         assert (np.abs(task.start_velocity) <= PANDA.velocity).all()
         assert all("clamped from" in note for note in task.notes)
+    # 1e-300 rad/s divided by its square's root, which is 0
+    assert rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=[1e-300] * 7).start_velocity is None
+    assert rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=[1e-5] * 7).start_velocity is not None
 
 
 @pytest.mark.parametrize(("first", "jerk"), [(PANDA.upper[0] - 0.01, None), (START[0], 0.1)])
 def test_a_start_velocity_that_cannot_stop_is_invalid(first: float, jerk: float | None) -> None:
-    """Before a limit, and with little jerk."""
     start = np.array([first, *START[1:]])
     task = rd.Problem(PANDA, rd.Scene(), start, END, start_velocity=np.eye(7)[0] * 2.0)
     found = rd.load_planner("rrt_connect").plan(task, jerk=jerk)
@@ -214,9 +200,3 @@ def test_a_start_velocity_that_cannot_stop_is_invalid(first: float, jerk: float 
     assert "panda_joint1 cannot stop" in found.reason
     with pytest.raises(rd.InputError, match=r"velocity_scaling leaves it 1\.08"):
         rd.load_planner("rrt_connect").plan(task, velocity_scaling=0.5)
-
-
-def test_start_velocities_of_nearly_nothing_are_rest() -> None:
-    """1e-300 rad/s divided by its square's root, which is 0."""
-    assert rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=[1e-300] * 7).start_velocity is None
-    assert rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=[1e-5] * 7).start_velocity is not None

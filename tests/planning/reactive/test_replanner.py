@@ -2,6 +2,7 @@
 
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from itertools import count as counted
 from itertools import pairwise
 from threading import Lock
@@ -23,10 +24,10 @@ START, END = np.array([-1.0, 0.3, 0, -1.8, 0, 2.1, 0.8]), np.array([1.0, 0.3, 0,
 SPEED = 0.4
 PERIOD = 0.02
 FLOOR = rd.Box([0, 0, -0.06], [2, 2, 0.1], name="floor")
+UPRIGHT = rd.AxisCone("panda_hand", [0, 0, 1], [0, 0, -1], 0.2)
 
 
 def balls(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and velocities of balls that cross the arm's workspace after 1 to 2 s."""
     rng = np.random.default_rng(seed)
     through = np.column_stack([rng.uniform(0.4, 0.7, count), rng.uniform(-0.3, 0.3, count), [0.5] * count])
     ways = np.column_stack([rng.choice([-1.0, 1.0], count), rng.normal(size=(count, 2)) * [0.3, 0.2]])
@@ -142,17 +143,13 @@ def test_steps_of_two_threads_follow_each_other() -> None:
 
 
 def test_unseen_obstacles_grow_with_time() -> None:
-    """A ball that is not seen again may be anywhere after a while, which keeps the arm at rest."""
     replanner = loop(np.array([[0.5, 1.6, 0.5]]))
     replanner.step({"sphere": [0.5, 1.6, 0.5]}, 0.0)
-    late = replanner.step({}, 10.0)
-    assert not late.renewed
+    assert not replanner.step({}, 10.0).renewed
 
 
 def test_the_arm_waits_for_an_obstacle_at_the_goal() -> None:
-    from robotdiffuse.robots.kinematics import link_pose
-
-    place = link_pose(PANDA, END, "panda_hand")[:3, 3]
+    place = PANDA.fk(END)[:3, 3]
     replanner = loop(place[None])
     for k in range(100):
         command = replanner.step({"sphere": place}, k * PERIOD)
@@ -168,7 +165,6 @@ def test_the_arm_waits_for_an_obstacle_at_the_goal() -> None:
     ("observation", "now", "message"),
     [
         ({"sphere": [0.5, 1.6, 0.5]}, 0.0, "now is 0 s after 0 s; time must go on"),
-        ({"sphere": [0.5, 1.6, 0.5]}, -1.0, "now is -1 s after 0 s; time must go on"),
         ({"sphere": [0.5, 1.6, 0.5]}, np.nan, "now is nan; it must be a finite number of seconds"),
         ({"ball": [0.5, 1.6, 0.5]}, 0.1, "unknown obstacle in observation: 'ball'"),
         ({"sphere": [0.5, np.nan, 0.5]}, 0.1, r"observation\['sphere'\] is"),
@@ -182,34 +178,21 @@ def test_invalid_steps_are_refused(observation: object, now: float, message: str
         replanner.step(observation, now)  # type: ignore[arg-type]
 
 
-def test_replanners_that_cannot_begin() -> None:
-    with pytest.raises(rd.InputError, match=r"problem\.moving is empty"):
-        rd.Replanner(rd.Problem(PANDA, rd.Scene(), START, END))
-    inside = rd.Problem(
-        PANDA,
-        rd.Scene([rd.Sphere([0.35, -0.5, 0.4], 0.3)]),
-        START,
-        END,
-        moving=[rd.MovingObstacle(rd.Sphere([3, 3, 3], 0.1), max_speed=1.0)],
-    )
-    with pytest.raises(rd.InputError, match="the replanner cannot begin: the start is in collision"):
-        rd.Replanner(inside)
-
-
-UPRIGHT = rd.AxisCone("panda_hand", [0, 0, 1], [0, 0, -1], 0.2)
-UNSUPPORTED: dict[str, dict[str, Any]] = {
-    "waypoints": {"waypoints": [rd.JointGoal((START + END) / 2)]},
-    "constraints": {"constraints": [UPRIGHT]},
-    "payload": {"payload": rd.Payload(0.5, link="panda_hand")},
-}
-
-
-@pytest.mark.parametrize("what", UNSUPPORTED)
-def test_the_replanner_refuses_what_it_does_not_support(what: str) -> None:
-    ball = rd.MovingObstacle(rd.Sphere([3, 0, 0], 0.1, name="ball"), max_speed=0.1)
-    problem = rd.Problem(PANDA, rd.Scene(), START, END, moving=[ball], **UNSUPPORTED[what])
-    with pytest.raises(rd.InputError, match=rf"problem\.{what}: the replanner does not support it"):
-        rd.Replanner(problem)
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"moving": []}, r"problem\.moving is empty"),
+        ({"start": [0, 1.5, 0, -0.5, 0, 2.1, 0.8]}, "the replanner cannot begin: the start is in collision"),
+        ({"waypoints": [END]}, r"problem\.waypoints: the replanner does not support it"),
+        ({"constraints": [UPRIGHT]}, r"problem\.constraints: the replanner does not support it"),
+        ({"payload": rd.Payload(0.5, link="panda_hand")}, r"problem\.payload: the replanner does not"),
+    ],
+)
+def test_replanners_that_cannot_begin(fields: dict[str, Any], message: str) -> None:
+    moving = [rd.MovingObstacle(rd.Sphere([3, 0, 0], 0.1), max_speed=0.1)]
+    problem = rd.Problem(PANDA, rd.Scene([FLOOR]), START, END, moving=moving)
+    with pytest.raises(rd.InputError, match=message):
+        rd.Replanner(replace(problem, **fields))
 
 
 @pytest.mark.parametrize("goal", ["start", "pose", "here"])
@@ -244,7 +227,7 @@ def test_a_goal_in_collision_leaves_the_old_one() -> None:
     assert np.allclose(replanner.problem.goal.positions, END)  # type: ignore[union-attr]
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_limits_hold_at_every_time_however_often_the_arm_brakes(seed: int) -> None:
     """Random paths, jerk limits, steps and periods; each motion goes on exactly as the last one."""
     rng = np.random.default_rng(seed)

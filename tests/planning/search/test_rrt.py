@@ -9,18 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robotdiffuse import (
-    Box,
-    InputError,
-    JointGoal,
-    Problem,
-    Scene,
-    Sphere,
-    Status,
-    Trajectory,
-    load_robot,
-    verify,
-)
+import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import explain_collision
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
@@ -35,19 +24,12 @@ from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.trajectories.simplification import shortcut, simplify, tighten
 from robotdiffuse.trajectories.timing import time_parameterize
 
-PANDA = load_robot("panda")
-WALL = Scene([Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.8], name="wall")])
+PANDA = rd.load_robot("panda")
+WALL = rd.Scene([rd.Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.8], name="wall")])
 LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
-AROUND = Problem(PANDA, WALL, LEFT, RIGHT)
+AROUND = rd.Problem(PANDA, WALL, LEFT, RIGHT)
 
-SEALED = Scene(
-    [
-        Box([0.65, 0.0, 0.5], [1.0, 0.02, 3.0]),
-        Box([-0.65, 0.0, 0.5], [1.0, 0.02, 3.0]),
-        Box([0.0, 0.0, 1.35], [3.0, 0.02, 1.3]),
-    ]
-)
 READY = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 
 
@@ -85,10 +67,8 @@ def test_paths_are_below_the_bound_and_join_the_ends() -> None:
 
 @pytest.mark.parametrize("limit", [2.0, 0.05])
 def test_trees_that_are_kept_hold_free_edges_and_change_no_path(limit: float) -> None:
-    """With a search that finds a path, and one that hardly can in its time: walls on both sides and one
-    above."""
-    walls = [Box([x, 0.0, 0.6], [1.4, 0.05, 2.4], name=f"wall{x}") for x in (-0.95, 0.95)]
-    scene = WALL if limit > 1 else Scene([*walls, Box([0.0, 0.0, 1.2], [0.6, 0.05, 0.6], name="above")])
+    walls = [rd.Box([x, 0.0, 0.6], [1.4, 0.05, 2.4], name=f"wall{x}") for x in (-0.95, 0.95)]
+    scene = WALL if limit > 1 else rd.Scene([*walls, rd.Box([0.0, 0.0, 1.2], [0.6, 0.05, 0.6], name="above")])
     problem = replace(AROUND, scene=scene)
     kept = AORRTC(AORRTCSettings(keep_trees=True)).plan(problem, limit, until="first")
     plain = AORRTC().plan(problem, limit, until="first")
@@ -117,16 +97,16 @@ def test_more_time_gives_no_longer_paths(planner: AORRTC | RRTConnect) -> None:
     assert first.path_length is not None and short.path_length is not None and limit.path_length is not None
     assert limit.path_length <= short.path_length <= first.path_length
     for result in (first, short, limit):
-        assert result.path is not None and verify(AROUND, result.path).valid
+        assert result.path is not None and rd.verify(AROUND, result.path).valid
         lengths = [length for _, length in result.progress]
         assert lengths == sorted(lengths, reverse=True) and lengths[-1] == result.path_length
 
 
 def test_a_free_straight_line_is_the_answer() -> None:
     result = AORRTC().plan(
-        Problem(PANDA, Scene(), LEFT, JointGoal(np.stack([-LEFT * [1, 0, 0, -1, 0, -1, 1], RIGHT])))
+        rd.Problem(PANDA, rd.Scene(), LEFT, rd.JointGoal(np.stack([-LEFT * [1, 0, 0, -1, 0, -1, 1], RIGHT])))
     )
-    assert result.path is not None and result.stage == "straight_line"
+    assert result.stage == "straight_line"
     assert len(result.path.positions) == 2
 
 
@@ -135,30 +115,21 @@ def test_the_clearance_is_kept_or_a_note_says_otherwise() -> None:
         result = AORRTC().plan(AROUND, 5.0, clearance=asked)
         assert result.scene_clearance is not None
         least = CollisionChecker(PANDA, WALL)
-        assert result.trajectory is not None
         segments = pairwise(result.trajectory.positions)  # rounded corners keep it too
         dense = np.concatenate([np.linspace(a, b, 5) for a, b in segments])
         assert least.link_clearances(dense).min() >= asked - 0.002 and not result.notes
+    wide = AORRTC().plan(replace(AROUND, clearance=0.05), 5.0)
+    less = AORRTC().plan(replace(AROUND, clearance=0.05), 5.0, clearance=0.0)
+    assert wide.duration > less.duration, "the clearance of a call overrides that of the problem"
     # between the plates the arm cannot keep 20 cm
     narrow = AORRTC().plan(AROUND, 5.0, clearance=0.3)
     assert narrow.solved and any("not 30 cm" in note for note in narrow.notes)
-
-
-def test_the_clearance_of_a_call_overrides_that_of_the_problem() -> None:
-    wide = Problem(PANDA, WALL, LEFT, RIGHT, clearance=0.05)
-    kept = AORRTC().plan(wide, 5.0)
-    less = AORRTC().plan(wide, 5.0, clearance=0.0)
-    assert kept.trajectory is not None and less.trajectory is not None
-    assert kept.trajectory.duration > less.trajectory.duration
-    with pytest.raises(InputError, match=r"clearance is -0\.1; it must be a distance from 0 to 0.5 m"):
-        Problem(PANDA, WALL, LEFT, RIGHT, clearance=-0.1)
 
 
 def test_scaled_motions_are_slower() -> None:
     full, half = (
         AORRTC().plan(AROUND, 20.0, velocity_scaling=v, acceleration_scaling=v * v) for v in (1.0, 0.5)
     )
-    assert full.trajectory is not None and half.trajectory is not None
     assert half.trajectory.duration == pytest.approx(2 * full.trajectory.duration, rel=0.01)
 
 
@@ -166,7 +137,6 @@ def test_a_limit_of_jerk_is_kept_by_a_certified_motion() -> None:
     free, gentle = (
         AORRTC().plan(AROUND, 20.0, until="first", jerk=jerk).trajectory for jerk in (None, 100.0)
     )
-    assert free is not None and gentle is not None
     rates = np.diff(gentle.accelerations, axis=0) / np.diff(gentle.times)[:, None]
     assert np.abs(rates).max() <= 100.0 * (1 + 1e-6)
     assert free.duration < gentle.duration < 2 * free.duration
@@ -181,23 +151,17 @@ def test_gain_zero_does_not_end_the_search() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"until": "soon"}, r"until"),
+        ({"objective": "energy"}, "length, time"),
         ({"clearance": float("nan")}, "clearance is nan"),
         ({"clearance": 5.0}, r"clearance is 5\.0; it must be between 0 and 0\.5"),
         ({"velocity_scaling": 0.0}, r"velocity_scaling is 0\.0; it must be between 0.001 and 1"),
         ({"acceleration_scaling": 1.5}, r"acceleration_scaling is 1\.5"),
-        ({"acceleration_scaling": 1e-6}, r"acceleration_scaling is 1e-06; it must be between 0.001 and 1"),
         ({"jerk": 1e-5}, r"jerk is 1e-05; it must be at least 0\.01"),
     ],
 )
 def test_arguments_are_checked(arguments: dict, message: str) -> None:
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(rd.InputError, match=message):
         AORRTC().plan(AROUND, **arguments)
-
-
-def test_a_short_limit_is_a_time_out() -> None:
-    result = AORRTC().plan(AROUND, 1e-6)
-    assert result.status is Status.TIMEOUT and result.path is None
 
 
 def test_one_slow_validation_does_not_use_up_later_calls(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -206,7 +170,7 @@ def test_one_slow_validation_does_not_use_up_later_calls(monkeypatch: pytest.Mon
 
     late = [0.0]
 
-    def slow(*arguments: Any, **others: Any) -> Trajectory:
+    def slow(*arguments: Any, **others: Any) -> rd.Trajectory:
         late[0] += 1.0
         return time_parameterize(*arguments, **others)
 
@@ -241,18 +205,18 @@ def test_a_long_detour_is_replaced() -> None:
     """Regression: bounded rounds found nothing shorter than a first path around a shelf; restarts did."""
     problem = replace(held_out_problem("shelf", 3), clearance=0.0)
     result = AORRTC(AORRTCSettings(patience=40_000)).plan(problem, time_limit=60.0)
-    assert result.path is not None and result.path.length < 8.0
+    assert result.path.length < 8.0
 
 
 def test_a_step_of_nearly_a_whole_turn_is_two_steps() -> None:
     """The way that is free turns a continuous joint by 5.84 rad, which the validator refuses as one step."""
-    gen3 = load_robot("gen3")
+    gen3 = rd.load_robot("gen3")
     start = np.array([0.22, 1.4, 0.0, 0.3, 0.0, 0.0, 0.0])
     goal = np.array([-0.22, 1.4, 0.0, 0.3, 0.0, 0.0, 0.0])
-    problem = Problem(gen3, Scene([Box([0.9, 0.0, 0.5], [0.8, 0.02, 1.6])]), start, goal)
+    problem = rd.Problem(gen3, rd.Scene([rd.Box([0.9, 0.0, 0.5], [0.8, 0.02, 1.6])]), start, goal)
     result = AORRTC().plan(problem, until="first")
     assert result.solved and result.stage == "straight_line"
-    assert verify(problem, result.path).valid and verify(problem, result.trajectory).valid
+    assert rd.verify(problem, result.path).valid and rd.verify(problem, result.trajectory).valid
 
 
 def test_a_line_that_is_always_refused_does_not_end_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -262,34 +226,8 @@ def test_a_line_that_is_always_refused_does_not_end_the_search(monkeypatch: pyte
         return finish(self, waypoints, *rest, **options) if len(waypoints) > 2 else None
 
     monkeypatch.setattr(context.PlanningContext, "finish", refusing)
-    result = AORRTC().plan(Problem(PANDA, Scene(), LEFT, RIGHT), time_limit=20.0, until="first")
+    result = AORRTC().plan(rd.Problem(PANDA, rd.Scene(), LEFT, RIGHT), time_limit=20.0, until="first")
     assert result.solved and len(result.path.positions) > 2
-
-
-def test_half_of_the_first_samples_lie_about_the_line_to_a_goal():
-    space = search_space(CollisionChecker(PANDA, WALL), 0.04)
-    start = LEFT.astype(np.float32)
-    goals = np.stack([RIGHT, READY]).astype(np.float32)
-    q = np.empty((4_000, 7), np.float32)
-    state = random_state(2)
-    for row in q:
-        rrt_kernel.sample_about_line(space, start, goals, row, state)
-    assert (q >= space.lower).all() and (q <= space.upper).all()
-    middle = (start + goals.mean(axis=0)) / 2
-    spread = rrt_kernel.LINE_SPREAD * (space.upper - space.lower)
-    assert (np.abs(np.median(q, axis=0) - middle) < 0.1 * spread).all()
-
-
-def test_search_can_be_continued():
-    space = search_space(CollisionChecker(PANDA, WALL), 0.04)
-    trees = rrt_kernel.make_trees(*ends(), 5000)
-    state = random_state(1)
-    sizes = []
-    for _ in range(1000):
-        if len(rrt_kernel.search(space, None, trees, rrt_kernel.INFINITE, np.float32(0.3), 1, state)):
-            break
-        sizes.append(trees.sizes.sum())
-    assert len(sizes) > 1 and (np.diff(sizes) >= 0).all() and sizes[-1] > sizes[0]
 
 
 @pytest.mark.parametrize("end", ["start", "goal"])
@@ -297,7 +235,7 @@ def test_ends_free_by_the_meshes_but_not_by_the_spheres_are_left_or_named(end, m
     """Regression: one without a way out was an immediate timeout."""
     ahead = link_pose(PANDA, READY, "panda_hand")[:3, 3] - [0.0, 0.0, 0.2]
     radii = np.arange(0.1, 0.05, -0.0002)
-    scenes = (Scene([Sphere(ahead, radius, name="ball")]) for radius in radii)
+    scenes = (rd.Scene([rd.Sphere(ahead, radius, name="ball")]) for radius in radii)
     scene = next(scene for scene in scenes if explain_collision(PANDA, scene, READY) is None)
     checker = CollisionChecker(PANDA, scene)
     lead = retreat(checker, READY)
@@ -305,23 +243,8 @@ def test_ends_free_by_the_meshes_but_not_by_the_spheres_are_left_or_named(end, m
     assert np.abs(lead - READY).max() < 0.3
     monkeypatch.setattr(start_goal, "RETREAT_STEPS", 1)
     rows = (READY, LEFT) if end == "start" else (LEFT, READY)
-    result = RRTConnect().plan(Problem(PANDA, scene, rows[0], rows[1]))
-    assert result.status is (Status.INVALID_START if end == "start" else Status.INVALID_GOAL)
+    result = RRTConnect().plan(rd.Problem(PANDA, scene, rows[0], rows[1]))
+    assert result.status is (rd.Status.INVALID_START if end == "start" else rd.Status.INVALID_GOAL)
     told = re.search(r"spheres of (\w+) reach ([\d.]+) mm into ball, .* are ([\d.]+) mm apart", result.reason)
     assert told and told[1].startswith("panda_") and result.reason.startswith(f"the {end} is too close")
     assert float(told[2]) > 0 and float(told[3]) >= 0
-
-
-def test_start_in_collision_names_link_and_obstacle():
-    scene = Scene([Sphere(link_pose(PANDA, READY, "panda_link5")[:3, 3], 0.1, name="ball")])
-    result = RRTConnect().plan(Problem(PANDA, scene, READY, JointGoal(LEFT[None])))
-    assert result.status is Status.INVALID_START and result.path is None
-    assert "ball" in result.reason and "panda_link" in result.reason
-
-
-def test_no_way_through_times_out():
-    """A wall between start and goal, with a gap only for the base: the search ends with the time limit."""
-    checker = CollisionChecker(PANDA, SEALED)
-    assert checker.free(np.stack([LEFT, RIGHT])).all()
-    result = RRTConnect().plan(Problem(PANDA, SEALED, LEFT, JointGoal(RIGHT[None])), time_limit=0.3)
-    assert result.status is Status.TIMEOUT and result.path is None and "no path was found in" in result.reason

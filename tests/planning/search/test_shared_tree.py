@@ -34,8 +34,6 @@ TOUCHING = replace(ENDLESS, safety_distance=0.0)
 
 
 def two_joints():
-    """The planar arm with its last joint locked: the configuration space is a plane, and a grid gives the
-    optimum."""
     pairs = (("l1", "l2"), ("l1", "l3"), ("l2", "l3"))
     arm = box_arm().with_locked({box_arm().joint_names[2]: 0.0})
     return replace(arm, allowed_collisions=frozenset(map(frozenset, pairs)))
@@ -47,10 +45,8 @@ def grid_optimum(checker: CollisionChecker, start: np.ndarray, goal: np.ndarray,
     h = axis[1] - axis[0]
     free = checker.free(np.array(list(product(axis, axis)))).reshape(cells, cells)
     steps = [(i, j) for i, j in product(range(-5, 6), repeat=2) if gcd(i, j) == 1]
-    rows = []
-    columns = []
-    lengths = []
     number = np.arange(cells * cells).reshape(cells, cells)
+    edges = []
     for i, j in steps:
         here = np.s_[max(0, -i) : cells - max(0, i), max(0, -j) : cells - max(0, j)]
         there = np.s_[max(0, i) : cells - max(0, -i), max(0, j) : cells - max(0, -j)]
@@ -61,19 +57,16 @@ def grid_optimum(checker: CollisionChecker, start: np.ndarray, goal: np.ndarray,
             b = round(t * j)
             middle = np.s_[max(0, -i) + a : cells - max(0, i) + a, max(0, -j) + b : cells - max(0, j) + b]
             open_ = open_ & free[middle]
-        rows.append(number[here][open_])
-        columns.append(number[there][open_])
-        lengths.append(np.full(int(open_.sum()), h * np.hypot(i, j)))
-    graph = coo_array(
-        (np.concatenate(lengths), (np.concatenate(rows), np.concatenate(columns))), (cells**2, cells**2)
-    )
+        a, b = number[here][open_], number[there][open_]
+        edges.append((np.full(len(a), h * np.hypot(i, j)), a, b))
+    lengths, rows, columns = map(np.concatenate, zip(*edges, strict=True))
+    graph = coo_array((lengths, (rows, columns)), (cells**2, cells**2))
     a, b = (number[tuple(np.abs(axis - x).argmin() for x in q)] for q in (start, goal))
     return float(dijkstra(graph.tocsr(), indices=a)[b])
 
 
 @pytest.fixture(scope="module")
 def planar():
-    """A planar problem with a detour: its checker, start, goals and optimum."""
     robot = two_joints()
     scene = rd.Scene([rd.Sphere([0.75, 0.0, 0.0], 0.2), rd.Sphere([-0.3, 0.7, 0.0], 0.15)])
     checker = CollisionChecker(robot, scene)
@@ -112,7 +105,6 @@ def test_rounds_reach_the_optimum_quickly(planar) -> None:
 
 
 def consistent(trees: rrt_kernel.Trees) -> None:
-    """Parents, children and costs agree."""
     for node in range(1, int(trees.sizes[0])):
         parent = int(trees.parents[0, node])
         gap = np.linalg.norm(trees.nodes[0, node].astype(float) - trees.nodes[0, parent])
@@ -127,7 +119,6 @@ def consistent(trees: rrt_kernel.Trees) -> None:
 
 @pytest.mark.parametrize("capacity", [1_000, 200])
 def test_the_tree_stays_a_tree(capacity: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With goals reached, rewired and grafted; also where the tree is full."""
     monkeypatch.setattr(shared_tree, "CAPACITY", capacity)
     checker = CollisionChecker(PANDA, WALL)
     goals = RIGHT + np.pad([[0.0, 0.0, 0.0], [0.2, 0.2, 0.0], [0.1, -0.3, 0.3]], ((0, 0), (0, 4)))
@@ -202,35 +193,37 @@ def test_the_cheapest_goal_wins_and_every_goal_has_its_cost() -> None:
     assert search.cost < 1.02 * min(other.cost for other in single)
 
 
+def searched(
+    checker: CollisionChecker, start: np.ndarray, distance: float
+) -> tuple[SharedTreeSearch, np.ndarray]:
+    settings = replace(ENDLESS, safety_distance=distance, resolution=0.01)
+    search = SharedTreeSearch(checker, start, RIGHT[None], settings, random_state(0))
+    for _ in range(10):
+        search.round()
+    path = search.path()
+    assert path is not None
+    fine = [a + np.linspace(0, 1, 60)[:, None] * (b - a) for a, b in pairwise(path)]
+    return search, np.concatenate(fine)
+
+
 def test_the_safety_distance_is_kept() -> None:
     checker = CollisionChecker(PANDA, WALL)
     ends = checker.link_clearances(np.stack([LEFT, RIGHT])).min(axis=1)
     assert (ends > 0.06).all()
     for distance in (0.0, 0.05):
-        settings = replace(ENDLESS, safety_distance=distance, resolution=0.01)
-        search = SharedTreeSearch(checker, LEFT, RIGHT[None], settings, random_state(0))
-        for _ in range(10):
-            search.round()
-        path = search.path()
-        assert path is not None and search.safety_distance == distance
-        fine = np.concatenate([a + np.linspace(0, 1, 60)[:, None] * (b - a) for a, b in pairwise(path)])
+        search, fine = searched(checker, LEFT, distance)
+        assert search.safety_distance == distance
         least = checker.link_clearances(fine).min()
         assert distance - 0.002 < least < distance + 0.02, "the shortest way passes at this distance"
 
 
 def test_near_a_close_end_the_distance_is_relaxed() -> None:
-    """Away from an end that is closer than the safety distance the rest of the way still keeps it."""
     checker = CollisionChecker(PANDA, WALL)
     close = LEFT.copy()
     while checker.link_clearances(close[None]).min() > 0.01:
         close[0] -= 0.002
-    settings = replace(ENDLESS, resolution=0.01)
-    search = SharedTreeSearch(checker, close, RIGHT[None], settings, random_state(0))
-    for _ in range(10):
-        search.round()
-    path = search.path()
-    assert path is not None and search.safety_distance == 0.05
-    fine = np.concatenate([a + np.linspace(0, 1, 60)[:, None] * (b - a) for a, b in pairwise(path)])
+    search, fine = searched(checker, close, 0.05)
+    assert search.safety_distance == 0.05
     clearance = checker.link_clearances(fine).min(axis=1)
     away = np.linalg.norm(fine - close, axis=1)
     allowed = np.minimum(0.05, clearance[0] + 0.1 * (away + 0.1))
@@ -251,13 +244,6 @@ def test_a_gap_too_narrow_for_the_distance_lowers_it() -> None:
     search = SharedTreeSearch(checker, start, goal[None], ENDLESS, random_state(0))
     search.run(lambda: search.cost < np.inf)
     assert search.safety_distance == pytest.approx(0.01) and search.cost == pytest.approx(1.8)
-
-
-def test_the_same_seed_gives_the_same_path() -> None:
-    problem = rd.Problem(PANDA, WALL, LEFT, rd.JointGoal(RIGHT[None]))
-    first, second = (rd.load_planner("shared_tree_rrt_star").plan(problem, 120.0, seed=4) for _ in range(2))
-    assert first.path is not None and second.path is not None
-    assert np.array_equal(first.path.positions, second.path.positions)
 
 
 def test_no_way_ends_at_the_time_limit_or_when_it_was_searched_for_at_every_distance() -> None:
