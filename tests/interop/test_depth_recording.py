@@ -15,6 +15,7 @@ import robotdiffuse as rd
 from helpers.explorations import FLOOR, HOME, WALL
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import transform
+from robotdiffuse.interop import ros2
 from robotdiffuse.interop.depth_recording import (
     CAMERA_INFO,
     IMAGE,
@@ -57,9 +58,6 @@ def test_a_recorded_exploration_is_read_again_and_gives_the_same_voxels(tmp_path
     assert len(alone) == len(views["beside"])
 
 
-TURN = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
-
-
 KINDS = {
     "/joint_states": JOINT_STATE,
     "/tf": TRANSFORMS,
@@ -69,35 +67,46 @@ KINDS = {
 }
 
 
-def recording(file: Path, change: Callable[[dict[str, Any]], None] = lambda messages: None) -> Path:
+def stamp(seconds: float) -> dict[str, int]:
+    return {"sec": int(seconds), "nanosec": round(1e9 * (seconds % 1))}
+
+
+def pose(parent: str, child: str, at: float, turn: float = 0.0, x: float = 0.0) -> dict[str, Any]:
+    """A transform with a turn about z."""
+    rotation = {"x": 0.0, "y": 0.0, "z": np.sin(turn / 2), "w": np.cos(turn / 2)}
+    place = {"translation": {"x": x, "y": 0.0, "z": 0.0}, "rotation": rotation}
+    return {
+        "header": {"stamp": stamp(at), "frame_id": parent},
+        "child_frame_id": child,
+        "transform": place,
+    }
+
+
+def camera(frame: str, at: float, encoding: str, unit: float, zeros: int = 0) -> tuple[Any, Any]:
+    """CameraInfo and an image of two rows, in multiples of `unit` [m]."""
+    size = {"header": {"stamp": stamp(at), "frame_id": frame}, "height": 2, "width": 2}
+    pixels = np.round(np.array([[0.5, 0.0], [1.5, 2.0]]) / unit).astype("<u2")
+    data = np.frombuffer(pixels.tobytes() + bytes(zeros), np.uint8)
+    k = [300.0, 0.0, 0.5, 0.0, 310.0, 0.4, 0.0, 0.0, 1.0]
+    info = size | {"k": k, "r": np.zeros(9), "p": np.zeros(12)}
+    info |= {name.upper(): info[name] for name in "krp"}  # as ROS 1 has them
+    return info, size | {"encoding": encoding, "step": 4, "data": data}
+
+
+def recording(file: Path, change: Callable[[dict[str, Any]], object] = lambda messages: None) -> Path:
     """One image of 16 bits at 1.05 s, joint states and transforms every 0.1 s, and a camera on a link whose
     pose on it is static. `change` changes the messages by topic."""
-
-    def stamp(seconds: float) -> dict[str, int]:
-        return {"sec": int(seconds), "nanosec": round(1e9 * (seconds % 1))}
-
-    def pose(parent: str, child: str, x: float, at: float) -> dict[str, Any]:
-        place = {"translation": {"x": x, "y": 0.0, "z": 0.0}, "rotation": TURN}
-        header = {"stamp": stamp(at), "frame_id": parent}
-        return {"transforms": [{"header": header, "child_frame_id": child, "transform": place}]}
-
-    header = {"stamp": stamp(1.05), "frame_id": "camera_optical"}
-    pixels = np.array([[500, 0], [1500, 2000]], "<u2")
-    k = [300.0, 0.0, 0.5, 0.0, 310.0, 0.4, 0.0, 0.0, 1.0]
-    image = {"header": header, "height": 2, "width": 2, "encoding": "16UC1", "step": 4}
+    info, image = camera("camera_optical", 1.05, "16UC1", 1e-3)
     names = list(reversed(PANDA.joint_names))
-    rows = (1.0, 1.1)
     messages: dict[str, Any] = {
         "/joint_states": [
             {"header": {"stamp": stamp(at)}, "name": names, "position": (HOME[::-1] + at).tolist()}
-            for at in rows
+            for at in (1.0, 1.1)
         ],
-        "/tf": [pose("panda_link0", "panda_hand", at, at) for at in rows],
-        "/tf_static": [pose("panda_hand", "camera_optical", 0.5, 0.0)],
-        "/camera/camera_info": [
-            {"header": header, "height": 2, "width": 2, "k": k, "r": np.eye(3).ravel(), "p": np.zeros(12)}
-        ],
-        "/camera/image_rect": [image | {"data": np.frombuffer(pixels.tobytes(), np.uint8)}],
+        "/tf": [{"transforms": [pose("panda_link0", "panda_hand", at, x=at)]} for at in (1.0, 1.1)],
+        "/tf_static": [{"transforms": [pose("panda_hand", "camera_optical", 0.0, x=0.5)]}],
+        "/camera/camera_info": [info | {"r": np.eye(3).ravel()}],
+        "/camera/image_rect": [image],
     }
     change(messages)
     each = [(topic, KINDS[topic], content) for topic, contents in messages.items() for content in contents]
@@ -107,60 +116,25 @@ def recording(file: Path, change: Callable[[dict[str, Any]], None] = lambda mess
             for topic, kind, content in each:
                 out.ros(topic, kind, content, 10**9)
             out.writer.finish()
-    elif file.suffix == ".bag":
-        ros1_bag(file, each)
     else:
-        with Writer2(file, version=9) as writer:
-            connections = {
-                topic: writer.add_connection(topic, kind, typestore=typestore())
-                for topic, kind in KINDS.items()
-            }
-            for topic, kind, content in each:
-                data = typestore().serialize_cdr(to_message(kind, content), kind)
-                writer.write(connections[topic], 10**9, data)
+        write_bag(Writer1(file) if file.suffix == ".bag" else Writer2(file, version=9), each)
     return file
 
 
-ROS1 = get_typestore(Stores.ROS1_NOETIC)
-ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
-
-
-def ros1_message(kind: str, value: Any) -> Any:
-    """A message of ROS 1 from plain data; missing fields are empty or zero."""
-
-    def field(definition: Any, given: Any) -> Any:
-        node, of = int(definition[0]), definition[1]
-        if node == 1:
-            empty: Any = "" if of[0] == "string" else 0
-            return empty if given is None else given
-        if node == 2:
-            return ros1_message(of, given or {})
-        element = of[0]
-        items = [] if given is None else given
-        if int(element[0]) == 1 and element[1][0] != "string":
-            return np.asarray(items, dtype=element[1][0])
-        return [field(element, item) for item in items]
-
-    fields = ROS1.fielddefs[kind][1]
-    return ROS1.types[kind](
-        **{name: field(of, value.get(name, value.get(name.lower()))) for name, of in fields}
-    )
-
-
-def ros1_bag(
-    file: Path, messages: list[tuple[str, str, Any]], compression: Writer1.CompressionFormat | None = None
-) -> None:
-    bag = Writer1(file)
-    if compression is not None:
-        bag.set_compression(compression)
-    with bag as writer:
+def write_bag(bag: Writer1 | Writer2, messages: list[tuple[str, str, Any]]) -> None:
+    store = typestore()
+    if isinstance(bag, Writer1):
+        store = get_typestore(Stores.ROS1_NOETIC)
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
+    with bag as writer, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ros2, "typestore", lambda: store)
         connections = {
-            topic: writer.add_connection(topic, kind, typestore=ROS1)
+            topic: writer.add_connection(topic, kind, typestore=store)
             for topic, kind in dict.fromkeys((topic, kind) for topic, kind, _ in messages)
         }
+        serialized = store.serialize_ros1 if isinstance(bag, Writer1) else store.serialize_cdr
         for topic, kind, content in messages:
-            data = ROS1.serialize_ros1(ros1_message(kind, content), kind)
-            writer.write(connections[topic], 10**9, data)
+            writer.write(connections[topic], 10**9, serialized(to_message(kind, content), kind))
 
 
 def test_poses_and_configurations_are_interpolated_and_millimeters_read(tmp_path: Path) -> None:
@@ -189,18 +163,16 @@ def test_bags_hold_what_mcap_files_do(name: str, tmp_path: Path) -> None:
 
 def realsense(file: Path, compression: Writer1.CompressionFormat | None = None, zeros: int = 0) -> Path:
     """A bag as librealsense writes it: depth in units of 0.1 mm, no joint states and no transforms."""
-    header = {"stamp": {"sec": 3, "nanosec": 0}, "frame_id": "0"}
-    pixels = np.array([[5000, 0], [15000, 20000]], "<u2")
-    data = np.frombuffer(pixels.tobytes() + bytes(zeros), np.uint8)
-    image = {"header": header, "height": 2, "width": 2, "encoding": "mono16", "step": 4, "data": data}
-    k = [300.0, 0.0, 0.5, 0.0, 310.0, 0.4, 0.0, 0.0, 1.0]
-    info = {"header": header, "height": 2, "width": 2, "k": k, "r": np.zeros(9), "p": np.zeros(12)}
+    info, image = camera("0", 3.0, "mono16", 1e-4, zeros)
+    bag = Writer1(file)
+    if compression is not None:
+        bag.set_compression(compression)
     messages = [
         ("/device_0/sensor_0/option/Depth_Units/value", "std_msgs/msg/Float32", {"data": 1e-4}),
         ("/device_0/sensor_0/Depth_0/info/camera_info", CAMERA_INFO, info),
         ("/device_0/sensor_0/Depth_0/image/data", IMAGE, image),
     ]
-    ros1_bag(file, messages, compression)
+    write_bag(bag, messages)
     return file
 
 
@@ -235,28 +207,20 @@ def test_damaged_bags_are_refused(size: int, tmp_path: Path) -> None:
         list(read_depth_views(file, PANDA, T_base_camera=np.eye(4)))
 
 
-def remove(topic: str) -> Callable[[dict[str, Any]], None]:
-    return lambda messages: messages.__setitem__(topic, [])
-
-
-def late(messages: dict[str, Any]) -> None:
-    messages["/joint_states"] = messages["/joint_states"][:1]
-    messages["/joint_states"][0]["header"]["stamp"]["sec"] = 3
-
-
-def far_apart(messages: dict[str, Any]) -> None:
-    messages["/joint_states"][1]["header"]["stamp"]["sec"] = 100
-
-
 def with_velocities_alone(messages: dict[str, Any]) -> None:
-    header = {"stamp": {"sec": 1, "nanosec": 5 * 10**7}}
-    rates = {"header": header, "name": list(PANDA.joint_names), "velocity": [0.0] * 7}
+    rates = {"header": {"stamp": stamp(1.05)}, "name": list(PANDA.joint_names), "velocity": [0.0] * 7}
     messages["/joint_states"].append(rates)
 
 
-@pytest.mark.parametrize(("change", "at"), [(far_apart, 1.0), (with_velocities_alone, 1.05)])
+@pytest.mark.parametrize(
+    ("change", "at"),
+    [
+        (lambda messages: messages["/joint_states"][1]["header"]["stamp"].update(sec=100), 1.0),
+        (with_velocities_alone, 1.05),
+    ],
+)
 def test_only_joint_states_near_in_time_and_with_positions_count(
-    change: Callable[[dict[str, Any]], None], at: float, tmp_path: Path
+    change: Callable[[dict[str, Any]], object], at: float, tmp_path: Path
 ) -> None:
     """One far away was interpolated with, and one without positions was reported as damage."""
     [(_, view)] = read_depth_views(recording(tmp_path / "r.mcap", change), PANDA)
@@ -279,41 +243,35 @@ def test_continuous_joints_are_interpolated_the_short_way(tmp_path: Path) -> Non
     np.testing.assert_allclose(np.cos(view.configuration), halfway, atol=1e-9)
 
 
-def in_color(messages: dict[str, Any]) -> None:
-    messages["/camera/image_rect"][0]["encoding"] = "rgb8"
-
-
-def of_another_size(messages: dict[str, Any]) -> None:
-    messages["/camera/camera_info"][0]["width"] = 3
-
-
 def test_an_image_without_a_joint_state_leaves_the_rest(tmp_path: Path) -> None:
     """It ended the reading for good."""
 
     def early_too(messages: dict[str, Any]) -> None:
         [image] = messages["/camera/image_rect"]
-        early = image | {"header": image["header"] | {"stamp": {"sec": 0, "nanosec": 0}}}
-        early["header"]["stamp"]["nanosec"] = 5 * 10**8
+        early = image | {"header": image["header"] | {"stamp": stamp(0.5)}}
         messages["/camera/image_rect"] = [early, image | {"encoding": "mono16"}]
 
-    [(stamp, view)] = read_depth_views(recording(tmp_path / "r.mcap", early_too), PANDA)
-    assert stamp == pytest.approx(1.05)
+    [(at, view)] = read_depth_views(recording(tmp_path / "r.mcap", early_too), PANDA)
+    assert at == pytest.approx(1.05)
     np.testing.assert_allclose(view.depth, [[0.5, 0.0], [1.5, 2.0]], rtol=1e-6)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (remove("/camera/camera_info"), "no CameraInfo on /camera/camera_info"),
-        (remove("/camera/image_rect"), "holds no depth images"),
-        (remove("/tf"), "no transforms lead from panda_link0 to camera_optical.*panda_hand"),
-        (late, "no joint state of panda_joint1.* within 0.1 s of the image"),
-        (in_color, "holds no depth images"),
-        (of_another_size, "2 x 2 pixels; their CameraInfo has 3 x 2"),
+        (lambda of: of["/camera/camera_info"].clear(), "no CameraInfo on /camera/camera_info"),
+        (lambda of: of["/camera/image_rect"].clear(), "holds no depth images"),
+        (lambda of: of["/tf"].clear(), "no transforms lead from panda_link0 to camera_optical.*panda_hand"),
+        (
+            lambda of: [state["header"]["stamp"].update(sec=3) for state in of["/joint_states"]],
+            "no joint state of panda_joint1.* within 0.1 s of the image",
+        ),
+        (lambda of: of["/camera/image_rect"][0].update(encoding="rgb8"), "holds no depth images"),
+        (lambda of: of["/camera/camera_info"][0].update(width=3), "2 x 2 pixels; their CameraInfo has 3 x 2"),
     ],
 )
 def test_what_is_missing_is_said(
-    change: Callable[[dict[str, Any]], None], message: str, tmp_path: Path
+    change: Callable[[dict[str, Any]], object], message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(InputError, match=message) as error:
         list(read_depth_views(recording(tmp_path / "r.mcap", change), PANDA))
@@ -331,33 +289,22 @@ def test_other_files_and_topics_are_refused(tmp_path: Path) -> None:
         write_depth_views(PANDA, {"wrist": [StampedView(0.0, view)]}, tmp_path / "w.mcap")
 
 
-def message(parent: str, child: str, at: float, turn: float = 0.0, x: float = 0.0) -> dict[str, Any]:
-    """A transform with a turn about z."""
-    stamp = {"sec": int(at), "nanosec": round(1e9 * (at % 1))}
-    rotation = {"x": 0.0, "y": 0.0, "z": np.sin(turn / 2), "w": np.cos(turn / 2)}
-    place = {"translation": {"x": x, "y": 0.0, "z": 0.0}, "rotation": rotation}
-    return {"header": {"stamp": stamp, "frame_id": parent}, "child_frame_id": child, "transform": place}
-
-
 def history() -> TransformHistory:
     """A link that turns by 1 rad in 0.1 s, logged in the wrong order, and a camera fixed to it."""
     out = TransformHistory()
-    out.add(message("base", "link", 5.1, 1.0), static=False)
-    out.add(message("base", "link", 5.0, 0.0), static=False)
-    out.add(message("/link", "/camera", 0.0, x=2.0), static=True)
+    out.add(pose("base", "link", 5.1, 1.0), static=False)
+    out.add(pose("base", "link", 5.0, 0.0), static=False)
+    out.add(pose("/link", "/camera", 0.0, x=2.0), static=True)
     return out
 
 
-@pytest.mark.parametrize("share", (0.0, 0.25, 1.0))
-def test_chains_are_followed_and_interpolated(share: float) -> None:
-    T = history().at("base", "camera", 5.0 + 0.1 * share, 0.1, "the image")
+@pytest.mark.parametrize(("at", "share"), [(5.0, 0.0), (5.025, 0.25), (5.1, 1.0), (5.15, 1.0)])
+def test_chains_are_followed_and_interpolated_and_at_the_ends_the_nearest_counts(
+    at: float, share: float
+) -> None:
+    T = history().at("base", "camera", at, 0.1, "the image")
     np.testing.assert_allclose(T[:3, :3], Rotation.from_rotvec([0, 0, share]).as_matrix(), atol=1e-6)
     np.testing.assert_allclose(T[:3, 3], [2 * np.cos(share), 2 * np.sin(share), 0.0], atol=1e-6)
-
-
-def test_the_nearest_transform_counts_at_the_ends() -> None:
-    T = history().at("base", "link", 5.15, 0.1, "the image")
-    np.testing.assert_allclose(T[:3, :3], Rotation.from_rotvec([0, 0, 1.0]).as_matrix(), atol=1e-6)
 
 
 def test_missing_transforms_are_said() -> None:
@@ -366,10 +313,10 @@ def test_missing_transforms_are_said() -> None:
     with pytest.raises(InputError, match=r"no transforms lead from world to camera.*lead to link, base"):
         history().at("world", "camera", 5.0, 0.1, "the image")
     circle = history()
-    circle.add(message("camera", "base", 5.0), static=True)
+    circle.add(pose("camera", "base", 5.0), static=True)
     with pytest.raises(InputError, match="no transforms lead from world"):
         circle.at("world", "camera", 5.0, 0.1, "the image")
-    bad = message("base", "link", 5.0)
+    bad = pose("base", "link", 5.0)
     bad["transform"]["rotation"] = dict.fromkeys("xyzw", 0.0)
     with pytest.raises(InputError, match="the transform of link has the rotation"):
         circle.add(bad, static=False)
