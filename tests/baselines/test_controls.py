@@ -8,19 +8,8 @@ import pytest
 import robotdiffuse as rd
 from helpers.example_robots import planar_arm
 from robotdiffuse.baselines import controls, straight_line
-from robotdiffuse.baselines.controls import (
-    MAX_HALF_RANGE,
-    NEAREST,
-    NOISE,
-    SPREAD,
-    VIAS,
-    Control,
-    ControlSettings,
-    smooth_noise,
-)
 from robotdiffuse.baselines.straight_line import StraightLine, StraightLineSettings
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.exported_model import exported_model
 
 PANDA = rd.load_robot("panda")
@@ -30,10 +19,12 @@ WALL = rd.Scene([rd.Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.4], name="wall")])
 
 
 @pytest.mark.parametrize(
-    "settings", [ControlSettings(), ControlSettings(source=VIAS, guidance_steps=0)], ids=[NOISE, VIAS]
+    "settings",
+    [controls.ControlSettings(), controls.ControlSettings(source=controls.VIAS, guidance_steps=0)],
+    ids=[controls.NOISE, controls.VIAS],
 )
-def test_a_wall_that_blocks_the_line_is_passed_by_candidates(settings: ControlSettings) -> None:
-    found = Control(settings).plan(rd.Problem(PANDA, WALL, START, rd.JointGoal([GOAL])), 20.0)
+def test_a_wall_that_blocks_the_line_is_passed_by_candidates(settings: controls.ControlSettings) -> None:
+    found = controls.Control(settings).plan(rd.Problem(PANDA, WALL, START, rd.JointGoal([GOAL])), 20.0)
     assert found.solved and found.stage == settings.source
 
 
@@ -42,11 +33,11 @@ def test_vias_are_free_and_on_the_candidates() -> None:
     assert vias.shape == (16, 7)
     checker = CollisionChecker(PANDA, rd.Scene())
     assert checker.free(vias).all()
-    control = Control(ControlSettings(source=VIAS, samples=3, guidance_steps=0))
+    control = controls.Control(controls.ControlSettings(source=controls.VIAS, samples=3, guidance_steps=0))
     q = control.candidates(START, GOAL[None], checker, np.random.default_rng(0))
     assert (q[:, 0] == START).all() and (q[:, -1] == GOAL).all()
     np.testing.assert_array_equal(q[:, q.shape[1] // 2], vias[:3])
-    with pytest.raises(InputError, match="only the panda"):
+    with pytest.raises(rd.InputError, match="only the panda"):
         controls.fixed_vias(planar_arm(0.5, 0.4))
 
 
@@ -59,16 +50,18 @@ def test_the_nearest_motions_are_bent_to_start_and_goal(monkeypatch: pytest.Monk
     np.testing.assert_allclose(first, np.stack([start, [1.5, 0.55], goal]))
     np.testing.assert_allclose(second[[0, -1]], [start, goal])
     monkeypatch.setattr(controls, "library", lambda data, robot: np.stack([[START, GOAL]] * 2))
-    control = Control(ControlSettings(source=NEAREST, data="data", samples=1, guidance_steps=0))
+    control = controls.Control(
+        controls.ControlSettings(source=controls.NEAREST, data="data", samples=1, guidance_steps=0)
+    )
     q = control.candidates(START, GOAL[None], CollisionChecker(PANDA, WALL), np.random.default_rng(0))
     np.testing.assert_allclose(q, [[START, GOAL]])
 
 
 def test_data_are_for_the_nearest_motions_alone(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="needs data"):
-        ControlSettings(source=NEAREST)
-    with pytest.raises(InputError, match="needs data"):
-        ControlSettings(data=str(tmp_path))
+    with pytest.raises(rd.InputError, match="needs data"):
+        controls.ControlSettings(source=controls.NEAREST)
+    with pytest.raises(rd.InputError, match="needs data"):
+        controls.ControlSettings(data=str(tmp_path))
 
 
 MIDDLE = 0.5 * (PANDA.lower + PANDA.upper)
@@ -76,7 +69,7 @@ GOALS = np.stack([MIDDLE, MIDDLE + 0.1])
 
 
 def test_smooth_noise_keeps_ends_and_limits() -> None:
-    q = smooth_noise(PANDA.lower, GOALS, 5, 48, PANDA, np.random.default_rng(0))
+    q = controls.smooth_noise(PANDA.lower, GOALS, 5, 48, PANDA, np.random.default_rng(0))
     assert q.shape == (5, 48, 7) and q.dtype == np.float32
     assert np.array_equal(q[:, 0], np.repeat(PANDA.lower[None], 5, 0).astype(np.float32))
     assert np.array_equal(q[:, -1], GOALS[[0, 1, 0, 1, 0]].astype(np.float32))
@@ -84,11 +77,10 @@ def test_smooth_noise_keeps_ends_and_limits() -> None:
 
 
 def test_the_covariance_of_smooth_noise_is_about_that_of_the_pandas_weights() -> None:
-    """Eigenvalues agree to a hundredth of their sum, and the standard deviation on average."""
-    q = smooth_noise(MIDDLE, MIDDLE[None], 4000, 48, PANDA, np.random.default_rng(1)) - MIDDLE
-    half = np.minimum(0.5 * (PANDA.upper - PANDA.lower), MAX_HALF_RANGE)
+    q = controls.smooth_noise(MIDDLE, MIDDLE[None], 4000, 48, PANDA, np.random.default_rng(1)) - MIDDLE
+    half = np.minimum(0.5 * (PANDA.upper - PANDA.lower), controls.MAX_HALF_RANGE)
     rows = np.moveaxis(q / half, 1, 2).reshape(-1, 48)
-    assert abs(rows.std() - SPREAD) < 0.005
+    assert abs(rows.std() - controls.SPREAD) < 0.005
     model = exported_model("model", None, PANDA)
     factor = model.statistics.noise_factor.astype(np.float64)
     shares = [np.linalg.eigvalsh(c)[::-1] / np.trace(c) for c in (rows.T @ rows, factor @ factor.T)]
@@ -99,7 +91,7 @@ def test_any_goal_is_tried_where_the_nearest_is_blocked() -> None:
     free = np.append(2.8, GOAL[1:])
     problem = rd.Problem(PANDA, WALL, START, rd.JointGoal([GOAL, free]))
     found = StraightLine().plan(problem, 5.0)
-    assert found.solved and found.path is not None
+    assert found.solved
     np.testing.assert_array_equal(found.path.positions, [START, free])
     alone = StraightLine(StraightLineSettings(goals=straight_line.NEAREST)).plan(problem, 5.0)
     assert not alone.solved and alone.refused == "scene_collision"

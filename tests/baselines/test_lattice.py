@@ -16,7 +16,6 @@ from robotdiffuse.baselines.lattice import (
     DStarLite,
     DStarLiteSettings,
     LatticeSearch,
-    LatticeSettings,
     Outcome,
     lattice_moves,
 )
@@ -40,7 +39,6 @@ def scene_of_spheres(rng: np.random.Generator, count: int = 5) -> Scene:
 
 
 def arm_problem(seed: int) -> tuple[CollisionChecker, np.ndarray, np.ndarray, np.random.Generator]:
-    """A scene, and a start and two goals that are free in it."""
     rng = np.random.default_rng([5, seed])
     checker = CollisionChecker(ARM, scene_of_spheres(rng))
     q = rng.uniform(-2.5, 2.5, (300, 3))
@@ -48,55 +46,40 @@ def arm_problem(seed: int) -> tuple[CollisionChecker, np.ndarray, np.ndarray, np
     return checker, q[0].astype(np.float32), q[1:3].astype(np.float32), rng
 
 
-def least_cost(
-    checker: CollisionChecker, start: np.ndarray, goals: np.ndarray, settings: LatticeSettings
-) -> float:
-    """The least cost by Dijkstra's algorithm over the whole graph."""
-    lower = ARM.lower
-    upper = ARM.upper
+def least_cost(checker: CollisionChecker, start: np.ndarray, goals: np.ndarray, most_joints: int) -> float:
+    """By Dijkstra's algorithm over the whole graph."""
     origin = start.astype(float)
-    low = np.ceil((lower - origin) / SPACING).astype(int)
-    high = np.floor((upper - origin) / SPACING).astype(int)
+    low = np.ceil((ARM.lower - origin) / SPACING).astype(int)
+    high = np.floor((ARM.upper - origin) / SPACING).astype(int)
     nodes = list(product(*(range(a, b + 1) for a, b in zip(low, high, strict=True))))
     number = {node: i for i, node in enumerate(nodes)}
     q = (origin + SPACING * np.array(nodes)).astype(np.float32)
     free = checker.free(q)
-    pairs = []
-    ends = []
-    costs = []
+    space = search_space(checker, 0.01)
+    graph: dict[tuple[int, int], float] = {}
+
+    def join(i: int, k: int, there: np.ndarray, cost: float) -> None:
+        # several goals in one cell would add up, so the least is kept
+        if motions_free(space, np.stack([q[i], there]))[0]:
+            graph[i, k] = min(cost, graph.get((i, k), np.inf))
+
     for move in product((-1, 0, 1), repeat=3):
-        joints = np.abs(move).sum()
-        if not 0 < joints <= settings.joints_per_move or next(step for step in move if step) < 0:
-            continue
-        for node, i in number.items():
-            k = number.get(tuple(np.add(node, move)))
-            if k is not None and free[i] and free[k]:
-                pairs.append((q[i], q[k]))
-                ends.append((i, k))
-                costs.append(SPACING * np.sqrt(joints))
+        joints = sum(map(abs, move))
+        if 0 < joints <= most_joints and next(step for step in move if step) > 0:
+            for node, i in number.items():
+                k = number.get(tuple(np.add(node, move)))
+                if k is not None and free[i] and free[k]:
+                    join(i, k, q[k], SPACING * np.sqrt(joints))
     for goal in goals:
         for node, i in number.items():
-            corner = origin + SPACING * np.array(node)
-            cell = np.floor((goal - origin) / SPACING)
-            if free[i] and set(np.array(node) - cell) <= {0, 1}:
-                pairs.append((q[i], goal))
-                ends.append((i, len(nodes)))
-                costs.append(np.linalg.norm(corner - goal))
-    space = search_space(checker, settings.resolution)
-    valid = np.array([motions_free(space, np.array(pair, np.float32))[0] for pair in pairs])
-    i, k = np.array(ends)[valid].T
-    # several goals in one cell would add up, so the least is kept
-    graph = {}
-    for a, b, cost in zip(i, k, np.array(costs)[valid], strict=True):
-        graph[a, b] = min(cost, graph.get((a, b), np.inf))
-    rows, columns = np.array(list(graph)).T
+            if free[i] and set(np.array(node) - np.floor((goal - origin) / SPACING)) <= {0, 1}:
+                join(i, len(nodes), goal, float(np.linalg.norm(origin + SPACING * np.array(node) - goal)))
     size = len(nodes) + 1
-    matrix = coo_array((list(graph.values()), (rows, columns)), (size, size)).tocsr()
+    matrix = coo_array((list(graph.values()), np.array(list(graph)).T), (size, size)).tocsr()
     return float(dijkstra(matrix, directed=False, indices=number[0, 0, 0])[-1])
 
 
 def cost_of(search: LatticeSearch) -> float:
-    """The cost that the search found, after checking its path."""
     outcome = search.run()
     assert outcome in (Outcome.FOUND, Outcome.EXHAUSTED)
     path = search.path()
@@ -112,11 +95,11 @@ def cost_of(search: LatticeSearch) -> float:
 
 
 @pytest.mark.parametrize("joints", [1, 2, 3])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 def test_both_find_the_least_cost(seed, joints):
     checker, start, goals, _ = arm_problem(seed)
     settings = {"spacing": SPACING, "joints_per_move": joints, "resolution": 0.01}
-    expected = least_cost(checker, start, goals, LatticeSettings(**settings))
+    expected = least_cost(checker, start, goals, joints)
     a_star = LatticeSearch(checker, start, goals, AStarSettings(inflation=1.0, **settings))
     d_star = LatticeSearch(checker, start, goals, DStarLiteSettings(**settings))
     assert cost_of(a_star) == pytest.approx(expected, rel=1e-5)
@@ -134,7 +117,7 @@ def test_inflation_bounds_the_cost(seed):
 
 
 @pytest.mark.parametrize("joints", [1, 2])
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_repairs_cost_what_a_new_search_costs(seed, joints):
     """Obstacles move, appear and disappear, while the arm moves along its path."""
     checker, start, goals, rng = arm_problem(seed)
@@ -167,18 +150,15 @@ def test_repairs_cost_what_a_new_search_costs(seed, joints):
 
 
 def test_repairs_of_small_changes_expand_less():
-    repaired = 0
-    fresh = 0
-    for seed in range(10):
+    repaired = fresh = 0
+    for seed in range(6):
         checker, start, goals, rng = arm_problem(seed)
         settings = DStarLiteSettings(spacing=0.15, resolution=0.02)
         search = LatticeSearch(checker, start, goals[:1], settings)
         cost_of(search)
         before = search.expansions
         shapes = list(checker.scene.shapes)
-        ball = shapes[0]
-        assert isinstance(ball, Sphere)
-        shapes[0] = Sphere(ball.center + rng.normal(0, 0.02, 3) * [1, 1, 0], ball.radius)
+        shapes[0] = Sphere(shapes[0].center + rng.normal(0, 0.02, 3) * [1, 1, 0], shapes[0].radius)  # type: ignore[union-attr]
         checker = CollisionChecker(ARM, Scene(shapes))
         search.update(checker)
         new = LatticeSearch(checker, start, goals[:1], settings)
@@ -200,21 +180,17 @@ def test_start_buried_and_freed_again():
     assert cost_of(search) == cost
 
 
-@pytest.mark.parametrize("planner", [AStar, DStarLite])
-@pytest.mark.parametrize("goal", [LEFT, LEFT + 0.05], ids=["the start", "within a cell"])
-def test_trivial(planner, goal):
-    result = planner().plan(Problem(PANDA, WALL, LEFT, JointGoal(goal[None])), time_limit=5.0)
-    assert result.path_length == pytest.approx(np.linalg.norm(goal - LEFT), abs=1e-6)
-
-
 @pytest.mark.parametrize(
     ("planner", "settings"),
     [(AStar, AStarSettings(spacing=0.1, max_nodes=300)), (DStarLite, DStarLiteSettings(max_nodes=300))],
 )
-def test_full_memory_is_reported(planner, settings):
-    result = planner(settings).plan(Problem(PANDA, WALL, LEFT, JointGoal(RIGHT[None])), time_limit=5.0)
+def test_full_memory_and_the_time_limit_are_reported(planner, settings):
+    problem = Problem(PANDA, WALL, LEFT, JointGoal(RIGHT[None]))
+    result = planner(settings).plan(problem, time_limit=5.0)
     assert result.status is Status.NO_PATH
     assert "memory is full" in result.reason and "coarser" in result.reason
+    result = planner(replace(settings, spacing=0.08, max_nodes=10**7)).plan(problem, time_limit=0.1)
+    assert result.status is Status.TIMEOUT and "expansions" in result.reason
 
 
 @pytest.mark.parametrize("planner", [AStar, DStarLite])
@@ -224,23 +200,6 @@ def test_no_path_on_the_lattice(planner):
     problem = Problem(ARM, walls, np.zeros(3), JointGoal(np.array([[2.79, 0.0, 0.0]])))
     result = planner().plan(problem, time_limit=5.0)
     assert result.status in (Status.NO_PATH, Status.INVALID_GOAL) and not result.solved
-
-
-@pytest.mark.parametrize(
-    "planner",
-    [AStar(AStarSettings(spacing=0.05, inflation=1.0)), DStarLite(DStarLiteSettings(spacing=0.1))],
-)
-def test_time_limit(planner):
-    problem = Problem(PANDA, WALL, LEFT, JointGoal(RIGHT[None]))
-    planner.plan(problem, 0.1)
-    result = planner.plan(problem, time_limit=0.3)
-    assert result.status is Status.TIMEOUT and "expansions" in result.reason
-
-
-def test_spacing_with_too_many_nodes():
-    problem = Problem(PANDA, WALL, LEFT, JointGoal(RIGHT[None]))
-    with pytest.raises(InputError, match=r"a_star.spacing is 0.001.*a spacing of 0.0"):
-        AStar(AStarSettings(spacing=0.001)).plan(problem)
 
 
 def test_updates_refuse_another_robot_and_places_off_the_lattice():
@@ -282,7 +241,10 @@ def test_moves_of_several_joints_are_all_once_few_joints_first() -> None:
         assert (np.diff(np.abs(half).sum(axis=1)) >= 0).all()
 
 
-def test_too_many_edges_per_node_are_refused() -> None:
+def test_too_many_nodes_or_edges_are_refused() -> None:
+    problem = Problem(PANDA, WALL, LEFT, JointGoal(RIGHT[None]))
+    with pytest.raises(InputError, match=r"a_star.spacing is 0.001.*a spacing of 0.0"):
+        AStar(AStarSettings(spacing=0.001)).plan(problem)
     baxter = load_robot("baxter")
     ends = np.zeros((2, 14), np.float32)
     with pytest.raises(InputError, match=r"joints_per_move is 14; on baxter .* 4782968 edges.* at most 5"):

@@ -13,20 +13,15 @@ pytest.importorskip("ompl")
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from robotdiffuse.baselines import ompl
-from robotdiffuse.baselines import ompl as planners
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.exact_meshes import explain_collision
-from robotdiffuse.robots.kinematics import link_pose
 
 PANDA = rd.load_robot("panda")
 LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
-READY = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 WALL = rd.Scene([rd.Box([0.45, 0.0, 0.25], [0.3, 0.05, 0.5], name="wall")])
-FIRST = (planners.OmplRRT, planners.OmplRRTConnect, planners.OmplPRM)
-ANYTIME = (planners.OmplRRTStar, planners.OmplInformedRRTStar, planners.OmplBITStar, planners.OmplAORRTC)
+FIRST = (ompl.OmplRRT, ompl.OmplRRTConnect, ompl.OmplPRM)
+ANYTIME = (ompl.OmplRRTStar, ompl.OmplInformedRRTStar, ompl.OmplBITStar, ompl.OmplAORRTC)
 every = pytest.mark.parametrize("planner", FIRST + ANYTIME, ids=lambda planner: planner.name)
-anytime = pytest.mark.parametrize("planner", ANYTIME, ids=lambda planner: planner.name)
 
 
 def problem(*goals: np.ndarray, scene: rd.Scene = WALL) -> rd.Problem:
@@ -34,7 +29,7 @@ def problem(*goals: np.ndarray, scene: rd.Scene = WALL) -> rd.Problem:
 
 
 def plan(
-    planner: type[planners.OmplPlanner], problem: rd.Problem, seed: int = 1, limit: float = 0.5
+    planner: type[ompl.OmplPlanner], problem: rd.Problem, seed: int = 1, limit: float = 0.5
 ) -> rd.PlanResult:
     """Plan with a short time limit for anytime planners, which use all of it, and a longer one where a busy
     machine finds no path in it."""
@@ -49,44 +44,16 @@ def plan(
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled() -> None:
-    """Compile and load the kernels before the planners are timed."""
-    planners.OmplRRTConnect().plan(problem(RIGHT), time_limit=120.0)
-
-
-def test_an_anytime_planner_improves():
-    for limit in (1.5, 15.0):
-        result = plan(planners.OmplInformedRRTStar, problem(RIGHT), limit=limit)
-        if len(result.progress) > 2 and result.progress[-1][1] < 0.9 * result.progress[0][1]:
-            return
-    pytest.fail(f"no better path after the first: {result.progress}")
-
-
-@anytime
-def test_an_anytime_planner_ends_when_no_path_can_be_shorter(planner):
-    limit = 20.0
-    result = planner().plan(problem(RIGHT, scene=rd.Scene([])), time_limit=limit)
-    assert result.path is not None
-    assert result.path.length <= 1.0002 * np.linalg.norm(RIGHT - LEFT)
-    assert result.planning_time < limit
+    ompl.OmplRRTConnect().plan(problem(RIGHT), time_limit=120.0)
 
 
 @every
-def test_a_goal_where_the_arm_stands(planner):
-    result = planner().plan(problem(LEFT), time_limit=120.0)
-    assert result.solved and result.path is not None
-    assert result.path.length < 1e-5
-
-
-@every
-def test_one_of_several_goals(planner):
-    blocked = np.append(0.0, LEFT[1:])
-    near = LEFT + 0.05
-    several = problem(blocked, RIGHT, near)
-    assert explain_collision(PANDA, WALL, blocked) is not None
-    result = plan(planner, several)
-    assert result.path is not None and rd.verify(several, result.path).valid
+def test_a_goal_where_the_arm_stands_and_an_end_when_no_path_can_be_shorter(planner):
+    assert planner().plan(problem(LEFT), time_limit=120.0).path.length < 1e-5
     if planner.anytime:
-        np.testing.assert_allclose(result.path.positions[-1], near, atol=1e-6)
+        result = planner().plan(problem(RIGHT, scene=rd.Scene([])), time_limit=20.0)
+        assert result.path.length <= 1.0002 * np.linalg.norm(RIGHT - LEFT)
+        assert result.planning_time < 20.0
 
 
 @pytest.mark.timeout(300)
@@ -95,12 +62,11 @@ def test_prm_with_many_goals_ends():
     rng = np.random.default_rng(0)
     many = problem(*(RIGHT + 0.1 * rng.standard_normal((20, 7))))
     for seed in range(5):
-        result = planners.OmplPRM().plan(many, time_limit=120.0, seed=seed)
+        result = ompl.OmplPRM().plan(many, time_limit=120.0, seed=seed)
         assert result.path is not None and rd.verify(many, result.path).valid
 
 
 def corridor() -> rd.Problem:
-    """A planar arm with its goal between two walls, so long that the arm can neither leave nor enter."""
     walls = [rd.Box([0.8, side * 0.12, 0.0], [1.2, 0.08, 0.2]) for side in (-1, 1)]
     return rd.Problem(box_arm(), rd.Scene(walls), np.array([2.0, 0.0, 0.0]), rd.JointGoal(np.zeros((1, 3))))
 
@@ -113,43 +79,22 @@ def test_no_way_to_the_goal_times_out(planner, monkeypatch):
     assert "no path was found" in result.reason
 
 
-@pytest.mark.parametrize("planner", [planners.OmplRRTConnect, planners.OmplAORRTC])
-def test_start_that_only_the_spheres_call_in_collision(planner):
-    ahead = link_pose(PANDA, READY, "panda_hand")[:3, 3] - [0.0, 0.0, 0.2]
-    radii = np.arange(0.1, 0.05, -0.0002)
-    balls = (rd.Sphere(ahead, float(radius)) for radius in radii)
-    ball = next(ball for ball in balls if explain_collision(PANDA, rd.Scene([ball]), READY) is None)
-    scene = rd.Scene([rd.Sphere(ahead, ball.radius - 0.002)])
-    assert not CollisionChecker(PANDA, scene).free(READY[None])[0]
-    close = rd.Problem(PANDA, scene, READY, rd.JointGoal(LEFT[None]))
-    result = plan(planner, close)
-    assert result.path is not None and rd.verify(close, result.path).valid
-    np.testing.assert_array_equal(result.path.positions[0], READY)
-
-
-@pytest.mark.parametrize("planner", [planners.OmplRRT, planners.OmplRRTConnect])
+@pytest.mark.parametrize("planner", [ompl.OmplRRT, ompl.OmplRRTConnect])
 def test_same_seed_same_path(planner):
     once, again, other = (plan(planner, problem(RIGHT), seed).path for seed in (3, 3, 4))
-    assert once is not None and again is not None and other is not None
     np.testing.assert_array_equal(once.positions, again.positions)
     assert once.length != other.length
 
 
-def test_simplifying_shortens():
-    raw = planners.OmplRRT(planners.OmplSettings(simplify=False)).plan(problem(RIGHT), 120.0, seed=1)
-    short = planners.OmplRRT().plan(problem(RIGHT), 120.0, seed=1)
-    assert raw.path is not None and short.path is not None
-    assert short.path.length < raw.path.length
-
-
-def test_range_bounds_the_extensions():
-    settings = planners.OmplSettings(range=0.3, simplify=False)
-    result = planners.OmplRRT(settings).plan(problem(RIGHT), 120.0)
-    assert result.path is not None
+def test_range_bounds_the_extensions_which_simplifying_shortens():
+    settings = ompl.OmplSettings(range=0.3, simplify=False)
+    result = ompl.OmplRRT(settings).plan(problem(RIGHT), 120.0, seed=1)
     assert np.linalg.norm(np.diff(result.path.positions, axis=0), axis=1).max() < 0.3 + 1e-6
+    simplified = ompl.OmplRRT(ompl.OmplSettings(range=0.3)).plan(problem(RIGHT), 120.0, seed=1)
+    assert simplified.path.length < result.path.length
 
 
-@pytest.mark.parametrize("planner", [planners.OmplRRTConnect, planners.OmplAORRTC])
+@pytest.mark.parametrize("planner", [ompl.OmplRRTConnect, ompl.OmplAORRTC])
 def test_a_refused_path_is_searched_again_more_closely(planner, monkeypatch):
     resolutions = []
 
@@ -158,11 +103,11 @@ def test_a_refused_path_is_searched_again_more_closely(planner, monkeypatch):
         seen = checker if len(resolutions) > 1 else CollisionChecker(PANDA, rd.Scene([]))
         return search_space(seen, resolution, *rest)
 
-    search_space = planners.search_space
-    monkeypatch.setattr(planners, "search_space", first_without_the_wall)
+    search_space = ompl.search_space
+    monkeypatch.setattr(ompl, "search_space", first_without_the_wall)
     result = plan(planner, problem(RIGHT))
     assert resolutions[:2] == [0.05, 0.025]
-    assert result.path is not None and rd.verify(problem(RIGHT), result.path).valid
+    assert rd.verify(problem(RIGHT), result.path).valid
 
 
 @every
@@ -180,9 +125,7 @@ def test_an_error_below_ompl_comes_out(planner, monkeypatch):
     assert plan(planner, problem(RIGHT)).solved
 
 
-class UncheckedStartGoal(planners.StartGoal):
-    """A start and a goal without collision checks."""
-
+class UncheckedStartGoal(ompl.StartGoal):
     def __init__(self, *_):
         self.checker = CollisionChecker(PANDA, WALL)
         self.start = LEFT
@@ -191,7 +134,7 @@ class UncheckedStartGoal(planners.StartGoal):
         self.goal_leads = [RIGHT]
 
 
-OMPL_CHECKS = planners.ob.MotionValidator, planners.ob.StateValidityChecker
+OMPL_CHECKS = ompl.ob.MotionValidator, ompl.ob.StateValidityChecker
 
 
 def test_nothing_stays_in_memory():
@@ -202,14 +145,14 @@ def test_nothing_stays_in_memory():
     assert not kept
 
 
-@pytest.mark.parametrize("planner", [planners.OmplPRM, planners.OmplBITStar])
+@pytest.mark.parametrize("planner", [ompl.OmplPRM, ompl.OmplBITStar])
 def test_a_planner_without_a_range_refuses_one(planner):
     with pytest.raises(rd.InputError, match=f"{planner.name} has no range"):
-        planner(planners.OmplSettings(range=1.0))
+        planner(ompl.OmplSettings(range=1.0))
 
 
 def test_without_ompl_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "ompl", None)
     monkeypatch.delitem(sys.modules, ompl.__name__)
     with pytest.raises(rd.InputError, match=r"pip install \"robotdiffuse\[baselines\]\""):
-        runpy.run_path(planners.__file__)
+        runpy.run_path(ompl.__file__)

@@ -3,17 +3,16 @@
 import numpy as np
 import pytest
 
+import robotdiffuse as rd
 from helpers.example_robots import example_robot
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.datasets.rows import turned, turns_about_vertical
 from robotdiffuse.problems.families.rop import ROP_DENSE
-from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 
 
 def test_turned_motions_have_the_same_clearances():
-    robot = load_robot("panda")
+    robot = rd.load_robot("panda")
     rng = np.random.default_rng(3)
     scenes = [ROP_DENSE.scene(rng) for _ in range(6)]
     packed = PackedScenes.pack(scenes, ROP_DENSE.max_obstacles, floor=True)
@@ -30,14 +29,14 @@ def test_turned_motions_have_the_same_clearances():
         before = CollisionChecker(robot, packed.scene(i)).link_clearances(q[i])
         after = CollisionChecker(robot, packed_turned.scene(i)).link_clearances(q_turned[i])
         np.testing.assert_allclose(after, before, atol=2e-5)
-        alone = CollisionChecker(robot, Scene([])).free(q_turned[i])
+        alone = CollisionChecker(robot, rd.Scene([])).free(q_turned[i])
         assert clear[i] == alone.all()
 
 
 def test_a_motion_that_uses_the_whole_range_of_the_first_joint_stays():
-    robot = load_robot("panda")
+    robot = rd.load_robot("panda")
     q = np.linspace(robot.lower, robot.upper, 5)[None].astype(np.float32)
-    same, _, _ = turned(robot, q, PackedScenes.pack([Scene([])], 1), np.random.default_rng(0))
+    same, _, _ = turned(robot, q, PackedScenes.pack([rd.Scene([])], 1), np.random.default_rng(0))
     np.testing.assert_allclose(same, q, atol=1e-6)
 
 

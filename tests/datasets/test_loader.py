@@ -39,27 +39,23 @@ def stored(store, name):
 
 def test_every_row_of_a_split_once(store):
     split = split_of(PackedScenes(stored(store, "obstacle_kinds"), stored(store, "obstacle_params")))
-    q = stored(store, "trajectories")
-    pose = stored(store, "target_pose")
-    scaled = (q - (ARM.upper + ARM.lower) / 2) / ((ARM.upper - ARM.lower) / 2)
+    goals = stored(store, "goals")
+    goals = goals[np.arange(len(goals)), stored(store, "goal_index")]
     for i, name in enumerate(SPLITS):
         data = RopDataset(store, name, points=8)
         batch = joined(data.batches(32, shuffle=False))
         assert len(data) == (split == i).sum() == len(batch) > 0
+        scaled = (stored(store, "trajectories") - (ARM.upper + ARM.lower) / 2) / ((ARM.upper - ARM.lower) / 2)
         np.testing.assert_allclose(batch.trajectories, scaled[split == i], atol=1e-6)
-        np.testing.assert_array_equal(batch.target_pose, pose[split == i])
+        np.testing.assert_array_equal(batch.target_pose, stored(store, "target_pose")[split == i])
         torch.testing.assert_close(batch.start, batch.trajectories[:, 0], atol=0, rtol=0)
-        goals = stored(store, "goals")[split == i]
-        index = stored(store, "goal_index")[split == i]
-        goal = data.normalizer.to_unit(goals[np.arange(len(goals)), index])
-        np.testing.assert_allclose(batch.goal, goal, atol=1e-6)
+        np.testing.assert_allclose(batch.goal, data.normalizer.to_unit(goals[split == i]), atol=1e-6)
         shuffled = joined(data.batches(32))
         assert not torch.equal(shuffled.target_pose, batch.target_pose)
         ours, theirs = (np.lexsort(part.target_pose.numpy().T) for part in (shuffled, batch))
         for field in fields(RopBatch)[:-1]:
-            a = getattr(shuffled, field.name)[ours]
-            b = getattr(batch, field.name)[theirs]
-            torch.testing.assert_close(a, b, atol=0, rtol=0)
+            pair = getattr(shuffled, field.name)[ours], getattr(batch, field.name)[theirs]
+            torch.testing.assert_close(*pair, atol=0, rtol=0)
 
 
 @pytest.mark.parametrize("sort_points", [False, True])
@@ -81,24 +77,18 @@ def test_clouds_lie_on_the_obstacles(store, sort_points):
 def test_the_same_epoch_from_the_same_generator(store):
     data = RopDataset(store, points=16)
     threads = torch.get_num_threads()
-
-    def epoch(seed):
-        return joined(data.batches(50, generator=torch.Generator().manual_seed(seed)))
-
-    first = epoch(0)
+    generators = [torch.Generator().manual_seed(seed) for seed in (0, 0, 1)]
+    first = joined(data.batches(50, generator=generators[0]))
     torch.set_num_threads(3)
     try:
-        second = epoch(0)
+        second, other = (joined(data.batches(50, generator=one)) for one in generators[1:])
         assert torch.get_num_threads() == 3, "the threads that make batches have numbers of their own"
     finally:
         torch.set_num_threads(threads)
     for field in fields(RopBatch):
         torch.testing.assert_close(getattr(first, field.name), getattr(second, field.name), atol=0, rtol=0)
-    other = epoch(1)
     assert not torch.equal(first.target_pose, other.target_pose)
-    generator = torch.Generator().manual_seed(0)
-    epochs = [joined(data.batches(50, generator=generator)) for _ in range(2)]
-    assert not torch.equal(epochs[0].points, epochs[1].points)
+    assert not torch.equal(joined(data.batches(50, generator=generators[0])).points, first.points)
     stopped = data.batches(10)
     next(stopped)
     stopped.close()  # type: ignore[attr-defined]
@@ -153,16 +143,21 @@ def test_bad_input(store, tmp_path):
     assert len(RopDataset(store, robot=ARM)) > 0
     with pytest.raises(InputError, match="batch_size is 0"):
         RopDataset(store).batches(0)
-    with pytest.raises(InputError, match="no data set"):
-        RopDataset(tmp_path)
-    write_manifest(tmp_path, manifest_of(ARM, WAYPOINTS))
-    with pytest.raises(InputError, match="holds no shard"):
-        RopDataset(tmp_path)
-    write_shard(tmp_path, 0, random_arrays(ARM, 5, np.random.default_rng(0), WAYPOINTS + 1), {})
-    with pytest.raises(InputError, match=r"shard_00000\.zarr, array trajectories has rows of shape"):
-        RopDataset(tmp_path)
-    write_shard(tmp_path, 0, random_arrays(ARM, 5, np.random.default_rng(0), WAYPOINTS), {})
-    file = next(p for p in (shard_path(tmp_path, 0) / "trajectories" / "c").rglob("*") if p.is_file())
-    file.write_bytes(b"")
-    with pytest.raises(InputError, match=r"shard_00000\.zarr, array trajectories is damaged"):
-        RopDataset(tmp_path)
+
+    def shard(waypoints):
+        write_shard(tmp_path, 0, random_arrays(ARM, 5, np.random.default_rng(0), waypoints), {})
+
+    def damaged():
+        shard(WAYPOINTS)
+        chunks = (shard_path(tmp_path, 0) / "trajectories" / "c").rglob("*")
+        next(p for p in chunks if p.is_file()).write_bytes(b"")
+
+    for change, message in [
+        (lambda: None, "no data set"),
+        (lambda: write_manifest(tmp_path, manifest_of(ARM, WAYPOINTS)), "holds no shard"),
+        (lambda: shard(WAYPOINTS + 1), r"shard_00000\.zarr, array trajectories has rows of shape"),
+        (damaged, r"shard_00000\.zarr, array trajectories is damaged"),
+    ]:
+        change()
+        with pytest.raises(InputError, match=message):
+            RopDataset(tmp_path)

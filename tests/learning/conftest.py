@@ -6,7 +6,6 @@ from robotdiffuse.learning.motion_network import MotionNetwork
 
 
 def nothing(_: MotionNetwork) -> dict[str, bytes]:
-    """In place of `MotionNetwork.exports`."""
     return {}
 
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from robotdiffuse.core.errors import InputError
+import robotdiffuse as rd
+from helpers.short_training import trained
 from robotdiffuse.learning.checkpoint import load_completion, save_network
 from robotdiffuse.learning.completion import (
     FREE,
@@ -25,27 +26,17 @@ from robotdiffuse.learning.completion import (
     voxel_centers,
 )
 from robotdiffuse.learning.completion_network import CompletionNetwork, folded, unfolded
+from robotdiffuse.learning.training import completion
 from robotdiffuse.learning.training import completion as training
-from robotdiffuse.learning.training.completion import (
-    CompletionTraining,
-    SamplePrefetcher,
-    average_precision,
-    calibration_error,
-    fitted_temperature,
-    train_completion,
-)
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.perception.voxel_grid import SHAPE
 from robotdiffuse.problems.families import FAMILIES, load_family
-from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box
 
-PANDA = load_robot("panda")
+PANDA = rd.load_robot("panda")
 HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 SMALL = CompletionSettings(channels=(8, 8, 8), blocks=(1, 1, 1))
-TINY = CompletionTraining(samples=8, batch=2, workers=0, network=SMALL, families=("rop", "table"))
+TINY = completion.CompletionTraining(samples=8, batch=2, workers=0, network=SMALL, families=("rop", "table"))
 
 
 @pytest.fixture(autouse=True)
@@ -56,7 +47,6 @@ def few_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_samples_agree_with_the_scene(family: str) -> None:
-    """Almost none of the voxels seen free are occupied, and most of those seen occupied are."""
     samples = draw_samples((family,), PANDA, range(4))
     truth = unpack_fine(samples.truth)
     free = (samples.seen & FREE) > 0
@@ -71,8 +61,10 @@ def test_training_begins_with_the_weights_that_it_is_given() -> None:
     task = training.CompletionTask(settings, training.Processes("cpu"))
     given = load_completion().state_dict()
     assert all(torch.equal(value, given[name]) for name, value in task.module.state_dict().items())
-    with pytest.raises(InputError, match="weights bundled are of a network of"):
+    with pytest.raises(rd.InputError, match="weights bundled are of a network of"):
         training.CompletionTask(replace(TINY, weights="bundled"), training.Processes("cpu"))
+    with pytest.raises(rd.InputError, match=r"families.*rap.*crate"):
+        replace(TINY, families=("rap",))
 
 
 def test_voxels_pack_and_unpack() -> None:
@@ -93,7 +85,7 @@ def test_folding_and_unfolding_are_inverse() -> None:
 
 
 def test_the_network_s_inputs() -> None:
-    scene = Scene([Box((0.5, 0.0, 0.3), (0.1, 0.6, 0.6))])
+    scene = rd.Scene([rd.Box((0.5, 0.0, 0.3), (0.1, 0.6, 0.6))])
     T = looking_at(np.array([-1.0, 0.3, 1.0]), np.array([0.5, 0.0, 0.3]))
     view = ray_cast(scene, T, (130.0, 130.0, 79.5, 59.5), (160, 120), PANDA, HOME)
     volume = observe([view], PANDA, HOME)
@@ -112,7 +104,6 @@ def test_the_network_s_inputs() -> None:
 
 @pytest.mark.slow
 def test_voxels_of_predictions_and_samples_agree(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """A small network that has memorised one sample predicts the true voxels."""
     settings = replace(TINY, learning_rate=1e-2)
     task = training.CompletionTask(settings, training.Processes("cpu"))
     rng = np.random.default_rng(1)
@@ -124,14 +115,7 @@ def test_voxels_of_predictions_and_samples_agree(monkeypatch: pytest.MonkeyPatch
     seen, behind = pack(volume)
     sample = Samples(seen[None], behind[None], pack_fine(fine)[None])
     monkeypatch.setattr(task.prefetcher, "next", lambda rng: sample)
-    optimizer = torch.optim.Adam(task.module.parameters(), lr=5e-3)
-    losses = []
-    for _ in range(60):
-        optimizer.zero_grad()
-        loss = task.loss(0.0, rng)
-        loss.backward()
-        optimizer.step()
-        losses.append(loss.item())
+    losses = trained(task.module, lambda _: task.loss(0.0, rng), 60, 5e-3)
     assert losses[-1] < 0.3 * losses[0]
     save_network("completion", task.module, tmp_path, {})
     p = predict(volume, exported_completion(tmp_path))
@@ -140,26 +124,30 @@ def test_voxels_of_predictions_and_samples_agree(monkeypatch: pytest.MonkeyPatch
     assert (p[free] == 0).all()
     reach = reachable().repeat(2, 0).repeat(2, 1).repeat(2, 2)
     counted = ~free & reach
-    assert average_precision(p[counted], fine[counted]) > 2 * fine[counted].mean()
+    assert completion.average_precision(p[counted], fine[counted]) > 2 * fine[counted].mean()
 
 
 def test_training_writes_weights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(CompletionNetwork, "exports", lambda _: {})  # it takes seconds
-    report = train_completion(replace(TINY, samples=2), str(tmp_path))
-    assert report["samples"] == 2 and load_completion(tmp_path).settings == SMALL
+    report = completion.train_completion(replace(TINY, samples=2), str(tmp_path))
+    loaded = load_completion(tmp_path)
+    assert report["samples"] == 2 and loaded.settings == SMALL
+    assert loaded.temperature == pytest.approx(report["temperature"])
+    with pytest.raises(rd.InputError, match="robotdiffuse train completion"):
+        load_completion(tmp_path / "nothing")
 
 
 @pytest.mark.slow
 def test_training_is_resumed_exactly_with_and_without_prefetching(tmp_path: Path) -> None:
-    report = train_completion(TINY, str(tmp_path / "whole"))
-    train_completion(replace(TINY, samples=4), str(tmp_path / "parts"))
-    again = train_completion(TINY, str(tmp_path / "parts"))
+    report = completion.train_completion(TINY, str(tmp_path / "whole"))
+    completion.train_completion(replace(TINY, samples=4), str(tmp_path / "parts"))
+    again = completion.train_completion(TINY, str(tmp_path / "parts"))
     assert again.keys() == report.keys() and report["samples"] == 8
     whole = load_completion(tmp_path / "whole")
     assert whole.temperature > 0 and not any(p.requires_grad for p in whole.parameters())
     rng = np.random.default_rng(2)
     other = np.random.default_rng(2)
-    ahead, alone = (SamplePrefetcher(("rop",), PANDA, 2, workers) for workers in (1, 0))
+    ahead, alone = (completion.SamplePrefetcher(("rop",), PANDA, 2, workers) for workers in (1, 0))
     for _ in range(3):
         a = ahead.next(rng)
         b = alone.next(other)
@@ -169,37 +157,17 @@ def test_training_is_resumed_exactly_with_and_without_prefetching(tmp_path: Path
     ahead.close()
 
 
-def test_unknown_families_are_refused() -> None:
-    with pytest.raises(InputError, match=r"families.*rap.*crate"):
-        replace(TINY, families=("rap",))
-
-
-def test_weights_in_files(tmp_path: Path) -> None:
-    network = CompletionNetwork(SMALL)
-    network.temperature.fill_(1.25)
-    save_network("completion", network, tmp_path, {})
-    loaded = load_completion(tmp_path)
-    assert loaded.settings == SMALL and loaded.temperature == 1.25
-    seen = torch.zeros(1, *SHAPE, dtype=torch.uint8)
-    with torch.no_grad():
-        np.testing.assert_allclose(
-            loaded.probabilities(seen, seen).numpy(), network.probabilities(seen, seen).numpy(), atol=2e-3
-        )
-    with pytest.raises(InputError, match="robotdiffuse train completion"):
-        load_completion(tmp_path / "nothing")
-
-
 def test_temperature_and_calibration() -> None:
     rng = np.random.default_rng(4)
     logits = rng.normal(size=200_000).astype(np.float32) * 2
     truth = rng.random(len(logits)) < 1 / (1 + np.exp(-logits))
-    assert fitted_temperature(3 * logits, truth) == pytest.approx(3, rel=0.03)
+    assert completion.fitted_temperature(3 * logits, truth) == pytest.approx(3, rel=0.03)
     p = 1 / (1 + np.exp(-logits))
-    assert calibration_error(p, truth) < 0.01 < 0.1 < calibration_error(p**3, truth)
-    assert average_precision(p, truth) == pytest.approx(average_precision(p**3, truth))
-    assert average_precision(np.array([0.9, 0.8, 0.1], np.float32), np.array([True, False, True])) == (
-        pytest.approx((1 + 2 / 3) / 2)
-    )
+    assert completion.calibration_error(p, truth) < 0.01 < 0.1 < completion.calibration_error(p**3, truth)
+    assert completion.average_precision(p, truth) == pytest.approx(completion.average_precision(p**3, truth))
+    assert completion.average_precision(
+        np.array([0.9, 0.8, 0.1], np.float32), np.array([True, False, True])
+    ) == (pytest.approx((1 + 2 / 3) / 2))
 
 
 def test_nothing_is_predicted_beyond_reach() -> None:

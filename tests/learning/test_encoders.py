@@ -16,28 +16,13 @@ from robotdiffuse.cli import main
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.datasets.shards import write_manifest, write_shard
 from robotdiffuse.datasets.surface_clouds import surface_clouds
+from robotdiffuse.learning import encoders
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, load_model, save_network
 from robotdiffuse.learning.denoisers import CrossAttentionSettings, TransformerSettings
-from robotdiffuse.learning.encoders import (
-    ENCODERS,
-    CompressionAutoencoderSettings,
-    DGCNNSettings,
-    PointAutoencoderSettings,
-    PointNetSettings,
-    PointsSettings,
-    encoder_name,
-    make_encoder,
-)
-from robotdiffuse.learning.encoders.networks import (
-    Autoencoder,
-    CompressionAutoencoder,
-    EdgeConvolution,
-    neighbors,
-)
+from robotdiffuse.learning.encoders import networks
 from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.learning.motion_model import MotionModelSettings
 from robotdiffuse.learning.motion_network import MotionNetwork
-from robotdiffuse.learning.training import tasks as encoder_training
 from robotdiffuse.learning.training import tasks as training
 from robotdiffuse.learning.training.batches import Batches, load_data, random_scenes, scene_clouds
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
@@ -46,29 +31,27 @@ from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.scenes.scene_arrays import SPHERE
 from robotdiffuse.scenes.surface_points import PANDA_REGION
 
-SMALL_CAE = CompressionAutoencoderSettings(code=8, cloud=40, hidden=(32, 16))
+SMALL_CAE = encoders.CompressionAutoencoderSettings(code=8, cloud=40, hidden=(32, 16))
 SMALL = {
     "compression_autoencoder": SMALL_CAE,
-    "point_autoencoder": PointAutoencoderSettings(code=8, points=(16, 24), hidden=16, decoded=12),
-    "pointnet": PointNetSettings(
+    "point_autoencoder": encoders.PointAutoencoderSettings(code=8, points=(16, 24), hidden=16, decoded=12),
+    "pointnet": encoders.PointNetSettings(
         code=8, cloud=32, first=(8, 12), second=(12, 24), transform=(8, 8), transform_head=(8,), head=(16,)
     ),
-    "dgcnn": DGCNNSettings(code=8, cloud=32, neighbors=4, edges=(8, 12), embedding=16, head=(16,)),
-    "points": PointsSettings(code=24, cloud=8),
+    "dgcnn": encoders.DGCNNSettings(code=8, cloud=32, neighbors=4, edges=(8, 12), embedding=16, head=(16,)),
+    "points": encoders.PointsSettings(code=24, cloud=8),
 }
-ALONE = [name for name, entry in ENCODERS.items() if entry.kind == "alone"]
-JOINTLY = [name for name, entry in ENCODERS.items() if entry.kind == "jointly"]
-every_encoder = pytest.mark.parametrize("name", ENCODERS)
-with_weights = pytest.mark.parametrize("name", [name for name in ENCODERS if name != "points"])
+ALONE = [name for name, entry in encoders.ENCODERS.items() if entry.kind == "alone"]
+every_encoder = pytest.mark.parametrize("name", encoders.ENCODERS)
+with_weights = pytest.mark.parametrize("name", [name for name in encoders.ENCODERS if name != "points"])
 
 
 def small(name, seed=0):
     torch.manual_seed(seed)
-    return make_encoder(name, SMALL[name])
+    return encoders.make_encoder(name, SMALL[name])
 
 
 def cloud(n, batch=1, seed=0):
-    """Points in the region."""
     generator = torch.Generator().manual_seed(seed)
     low = torch.tensor([-0.5, -0.5, 0.1])
     high = torch.tensor([0.5, 0.5, 0.9])
@@ -82,19 +65,8 @@ def denoiser_for(encoder: str) -> dict[str, Any]:
 
 
 def test_every_encoder_is_tested():
-    assert set(SMALL) == set(ENCODERS)
-    assert {encoder_name(small(name)) for name in ENCODERS} == set(ENCODERS)
-
-
-@every_encoder
-@pytest.mark.parametrize("n", [1, 2, 31, 40, 300])
-def test_any_number_of_points(name, n):
-    encoder = small(name)
-    z = encoder(cloud(n, 3))
-    assert z.shape == (3, SMALL[name].code)
-    assert z.dtype == torch.float32
-    assert z.isfinite().all()
-    assert torch.equal(encoder(cloud(n, 3)), z), "the same cloud has the same code"
+    assert set(SMALL) == set(encoders.ENCODERS)
+    assert {encoders.encoder_name(small(name)) for name in encoders.ENCODERS} == set(encoders.ENCODERS)
 
 
 @every_encoder
@@ -116,15 +88,18 @@ def test_any_number_of_obstacles(name):
 
 @every_encoder
 @settings(max_examples=10, deadline=None)
-@given(n=st.integers(1, 90), seed=st.integers(0, 1000))
-def test_order_does_not_matter(name, n, seed):
+@given(n=st.integers(1, 300), seed=st.integers(0, 1000))
+def test_any_number_of_points_in_any_order(name, n, seed):
     encoder = small(name)
     points = cloud(n, 2, seed)
+    z = encoder(points)
+    assert z.shape == (2, SMALL[name].code) and z.dtype == torch.float32 and z.isfinite().all()
+    assert torch.equal(encoder(points), z), "the same cloud has the same code"
     order = torch.randperm(n, generator=torch.Generator().manual_seed(seed))
-    torch.testing.assert_close(encoder(points[:, order]), encoder(points), atol=2e-5, rtol=1e-5)
+    torch.testing.assert_close(encoder(points[:, order]), z, atol=2e-5, rtol=1e-5)
 
 
-@pytest.mark.parametrize("name", [name for name in ENCODERS if name != "dgcnn"])
+@pytest.mark.parametrize("name", [name for name in encoders.ENCODERS if name != "dgcnn"])
 @pytest.mark.parametrize("n", [1, 2, 20])
 def test_repetition_does_not_matter(name, n):
     """DGCNN is left out: repeated points are each other's nearest neighbors."""
@@ -152,7 +127,7 @@ def test_gradients_reach_every_parameter(name):
     clouds = torch.cat([cloud(40, 6), torch.zeros(2, 40, 3)])
     clouds[5, 2:] = 0.0
     loss = encoder(clouds).square().sum() + encoder(0 * clouds[:, :1]).square().sum()
-    if isinstance(encoder, Autoencoder):
+    if isinstance(encoder, networks.Autoencoder):
         loss = loss + encoder.loss(clouds, np.random.default_rng(0))[0]
     loss.backward()
     for parameter, p in encoder.named_parameters():
@@ -163,12 +138,12 @@ def test_gradients_reach_every_parameter(name):
 @every_encoder
 def test_files(name, tmp_path):
     encoder = small(name)
-    if isinstance(encoder, Autoencoder):
+    if isinstance(encoder, networks.Autoencoder):
         with torch.no_grad():
             encoder.standardize(encoder.encode(cloud(40, 30)))
     save_network("encoder", encoder, tmp_path, {})
     loaded = load_encoder(tmp_path)
-    assert type(loaded) is ENCODERS.load(name)
+    assert type(loaded) is encoders.ENCODERS.load(name)
     assert loaded.settings == encoder.settings
     assert not any(p.requires_grad for p in loaded.parameters())
     points = cloud(40)
@@ -188,49 +163,24 @@ def test_settings_are_read_by_name(name):
         replace(settings, encoder_settings=other)
 
 
-@pytest.mark.parametrize(("name", "least", "most"), [("pointnet", 3.0e6, 3.6e6), ("dgcnn", 1.2e6, 1.9e6)])
-def test_sizes_of_the_papers(name, least, most):
-    """Built at the sizes that the authors of each encoder give, with z of this paper's size: PointNet has 3.5
-    million weights, of which the head to 40 classes is small, DGCNN 1.8 million."""
-    wide = {"first": (64, 64), "second": (64, 128, 1024), "transform": (64, 128, 1024)}
-    sizes: dict[str, Any] = {
-        "pointnet": wide | {"transform_head": (512, 256)},
-        "dgcnn": {"neighbors": 20, "edges": (64, 64, 128, 256), "embedding": 1024},
-    }
-    of_paper = replace(ENCODERS.defaults(name), code=60, cloud=1024, head=(512, 256), **sizes[name])
-    assert least < sum(p.numel() for p in make_encoder(name, of_paper).parameters()) < most
-
-
 @pytest.mark.parametrize(
     ("kind", "changes", "message"),
     [
-        (PointAutoencoderSettings, {"points": ()}, "encoder.points is ()"),
-        (PointNetSettings, {"second": (8, 0)}, "encoder.second is"),
-        (DGCNNSettings, {"neighbors": 0}, "encoder.neighbors is 0"),
-        (CompressionAutoencoderSettings, {"code": 0}, "encoder.code is 0"),
-        (PointsSettings, {"cloud": 20}, "points.code is 96; it must be three times cloud, 60"),
+        (encoders.PointAutoencoderSettings, {"points": ()}, r"encoder.points is \(\)"),
+        (encoders.PointNetSettings, {"second": (8, 0)}, "encoder.second is"),
+        (encoders.DGCNNSettings, {"neighbors": 0}, "encoder.neighbors is 0"),
+        (encoders.PointsSettings, {"cloud": 20}, "points.code is 96; it must be three times cloud, 60"),
     ],
 )
 def test_bad_settings(kind, changes, message):
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match=message):
         kind(**changes)
-    assert message in str(caught.value)
-
-
-def test_compression_autoencoder_has_the_papers_layers():
-    encoder = make_encoder("compression_autoencoder")
-    assert isinstance(encoder, CompressionAutoencoder)
-    sizes = [4200, 786, 512, 256, 60]
-    for network, wanted in ((encoder.encoder, sizes), (encoder.decoder, sizes[::-1])):
-        linear = [layer for layer in network if isinstance(layer, torch.nn.Linear)]
-        assert [linear[0].in_features, *(layer.out_features for layer in linear)] == wanted
-    assert [tuple(w.shape) for w in encoder.penalized()] == [(786, 4200), (512, 786), (256, 512), (60, 256)]
 
 
 def test_arranged_clouds():
     """Points are sorted like the ordered clouds of `surface_clouds`, and thinned or repeated evenly.
     Both round coordinates to a millionth of the largest."""
-    encoder = make_encoder("points", PointsSettings(code=120, cloud=40))
+    encoder = encoders.make_encoder("points", encoders.PointsSettings(code=120, cloud=40))
     scenes = random_scenes(20, 12, np.random.default_rng(0))
     clouds = partial(surface_clouds, scenes, region=encoder.settings.region)
     ordered = clouds(40, torch.Generator().manual_seed(0), ordered=True)
@@ -238,15 +188,14 @@ def test_arranged_clouds():
     torch.testing.assert_close(encoder.arrange(ordered), ordered, atol=2e-6, rtol=0)
     torch.testing.assert_close(encoder.arrange(loose), ordered, atol=2e-6, rtol=0)
     every = ordered[:, 1::4]  # of 40 for 10, the middle one of each four
-    few = make_encoder("points", PointsSettings(code=30, cloud=10))
+    few = encoders.make_encoder("points", encoders.PointsSettings(code=30, cloud=10))
     torch.testing.assert_close(few.arrange(loose)[:, :, 0], ordered[:, 2::4, 0], atol=2e-6, rtol=0)
     repeated = encoder.arrange(every)
     torch.testing.assert_close(repeated, every.repeat_interleave(4, 1), atol=2e-6, rtol=0)
 
 
 def test_clouds_along_a_curve():
-    """The order does not depend on that of the input, and neighbors are close to each other."""
-    encoder = CompressionAutoencoder(replace(SMALL_CAE, cloud=400))
+    encoder = networks.CompressionAutoencoder(replace(SMALL_CAE, cloud=400))
     loose = cloud(400, 5)
     arranged = encoder.arrange(loose)
     assert torch.equal(encoder.arrange(loose.flip(1)), arranged)
@@ -255,34 +204,15 @@ def test_clouds_along_a_curve():
     assert steps[0] < 0.4 * steps[1]
 
 
-def test_compression_autoencoder_reconstructs_a_small_set():
-    torch.manual_seed(0)
-    encoder = CompressionAutoencoder(SMALL_CAE)
-    clouds = cloud(40, 6)
-    rng = np.random.default_rng(0)
-    optimizer = torch.optim.Adam(encoder.parameters(), lr=3e-3)
-    reached = []
-    for _ in range(400):
-        optimizer.zero_grad()
-        loss, errors = encoder.loss(clouds, rng)
-        loss.backward()
-        optimizer.step()
-        reached.append(errors["reconstruction"])
-    assert reached[0] > 0.5
-    assert reached[-1] < 0.02
-    difference = encoder.decode(encoder.encode(clouds)) - encoder.arrange(clouds)
-    assert abs(difference.square().sum(-1).mean().sqrt().item() - reached[-1]) < 0.01
-
-
 def test_edge_convolution_is_the_maximum_over_edges():
     """Against the layer as in the paper, edge by edge."""
     torch.manual_seed(0)
-    layer = EdgeConvolution(5, 7, 4)
-    few = neighbors(torch.tensor([[[0.0], [1.0], [3.0], [1.1]]]), torch.arange(4)[None] < 3, 4)[0]
+    layer = networks.EdgeConvolution(5, 7, 4)
+    few = networks.neighbors(torch.tensor([[[0.0], [1.0], [3.0], [1.1]]]), torch.arange(4)[None] < 3, 4)[0]
     assert [set(row.tolist()) for row in few] == [{0, 1, 2}] * 3 + [{0, 1, 2, 3}]
     x = torch.randn(2, 12, 5)
     near = torch.ones(2, 12, dtype=torch.bool)
-    index = neighbors(x, near, 4)
+    index = networks.neighbors(x, near, 4)
     for b in range(2):
         apart = torch.cdist(x[b], x[b])
         for i in range(12):
@@ -296,7 +226,7 @@ def test_edge_convolution_is_the_maximum_over_edges():
 
 @pytest.mark.parametrize("name", ALONE)
 def test_training_alone(name, tmp_path, monkeypatch):
-    monkeypatch.setattr(encoder_training, "READOUT_SCENES", 256)
+    monkeypatch.setattr(training, "READOUT_SCENES", 256)
     training_settings = EncoderTraining(
         name=name, minutes=None, samples=1600, batch=16, points=64, warmup_steps=10, encoder=SMALL[name]
     )
@@ -306,7 +236,7 @@ def test_training_alone(name, tmp_path, monkeypatch):
         drawn.add(given[3] if len(given) > 3 else None)
         return scene_clouds(*given)
 
-    monkeypatch.setattr(encoder_training, "scene_clouds", clouds)
+    monkeypatch.setattr(training, "scene_clouds", clouds)
     before = train_encoder(replace(training_settings, samples=16), str(tmp_path / "short"))
     report = train_encoder(training_settings, str(tmp_path / "long"))
     error = "chamfer" if name == "point_autoencoder" else "reconstruction"
@@ -317,39 +247,37 @@ def test_training_alone(name, tmp_path, monkeypatch):
     else:
         assert sizes == {40}
     encoder = load_encoder(tmp_path / "long")
-    assert encoder_name(encoder) == name
+    assert encoders.encoder_name(encoder) == name
     scenes = random_scenes(300, 12, np.random.default_rng(5))
     z = encoder(scene_clouds(encoder, scenes, np.random.default_rng(6)))
     torch.testing.assert_close(z.std(0), torch.ones(8), atol=0.35, rtol=0)
 
 
 def test_training_from_the_command_line(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(encoder_training, "READOUT_SCENES", 32)
+    monkeypatch.setattr(training, "READOUT_SCENES", 32)
     out = str(tmp_path / "out")
     command = ["train", "encoder", "--samples", "4", "--batch", "2", "--out", out, "--encoder"]
     assert main([*command, "compression_autoencoder"]) == 0
     assert "reconstruction: " in capsys.readouterr().out
-    assert load_encoder(out).settings == CompressionAutoencoderSettings()
+    assert load_encoder(out).settings == encoders.CompressionAutoencoderSettings()
     assert main([*command, "pointnett"]) == 2
     assert "known: compression_autoencoder, dgcnn" in capsys.readouterr().err
 
 
 def test_readout_of_constant_codes(monkeypatch):
-    monkeypatch.setattr(encoder_training, "READOUT_SCENES", 256)
+    monkeypatch.setattr(training, "READOUT_SCENES", 256)
     encoder = small("pointnet")
-    rng = np.random.default_rng(0)
-    report = linear_readout(encoder, random_scenes(768, 4, rng), rng)
-    assert report["readout"] < report["readout_of_constant"]
-    last = list(encoder.parameters())[-2]  # the matrix of the last layer
-    torch.nn.init.zeros_(last)
-    rng = np.random.default_rng(0)
-    report = linear_readout(encoder, random_scenes(768, 4, rng), rng)
-    assert report["readout"] == pytest.approx(report["readout_of_constant"])
+    reports = []
+    for _ in range(2):
+        rng = np.random.default_rng(0)
+        reports.append(linear_readout(encoder, random_scenes(768, 4, rng), rng))
+        torch.nn.init.zeros_(list(encoder.parameters())[-2])  # the matrix of the last layer
+    assert reports[0]["readout"] < reports[0]["readout_of_constant"]
+    assert reports[1]["readout"] == pytest.approx(reports[1]["readout_of_constant"])
 
 
 @pytest.fixture
 def data(tmp_path, monkeypatch):
-    """One shard of random motions."""
     arm = box_arm()
     monkeypatch.setattr(training, "load_robot", lambda name: arm)
     folder = tmp_path / "data"
@@ -369,12 +297,12 @@ def planner(data, encoder, **changes) -> PlannerTraining:
 @pytest.mark.slow
 @every_encoder
 def test_joint_training_changes_the_encoder(name, data, tmp_path):
-    """The planner's file holds the trained encoder."""
     planned = planner(data, name, encoder_settings=SMALL[name], learning_rate=1e-2)
     fresh = small(name)
     train_planner(planned, str(tmp_path / "out"))
     model = load_model(tmp_path / "out", box_arm())
-    assert model.encoder is not None and type(model.encoder) is ENCODERS.load(name)
+    assert type(model.encoder) is encoders.ENCODERS.load(name)
+    assert model.encoder is not None
     trained = dict(model.encoder.named_parameters())
     moved = {key for key, p in fresh.named_parameters() if (trained[key] - p).abs().max() > 3e-4}
     own = ("decoder", "query") if name in ALONE else ()  # what only reconstructs takes no part
@@ -418,11 +346,10 @@ def test_batches_with_clouds_instead_of_codes(data):
     [
         (PlannerTraining, {"encoder": "points"}, "encoder is points and denoiser is .* need each other"),
         (PlannerTraining, {"encoder": "e", "denoiser": "cross_attention"}, "encoder is e .* need each other"),
-        (PlannerTraining, {"encoder": None, "denoiser": "cross_attention"}, "is None .* need each other"),
         (PlannerTraining, {"encoder": "e", "encoder_settings": SMALL["pointnet"]}, "unknown encoder 'e'"),
-        *((EncoderTraining, {"name": name}, f"name is {name}.*jointly") for name in JOINTLY),
+        (EncoderTraining, {"minutes": 3.0, "samples": 4}, "exactly one"),
+        (EncoderTraining, {"name": "pointnet"}, "name is pointnet.*jointly"),
         (MotionModelSettings, {"encoder": "points", "encoder_settings": SMALL["points"]}, "need each other"),
-        (MotionModelSettings, denoiser_for("points"), "need each other"),
     ],
 )
 def test_parts_that_do_not_fit_are_refused(kind, parts, message):

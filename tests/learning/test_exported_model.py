@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
+import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.small_model import save_small_model, small_model
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.checkpoint import fingerprint, load_completion, load_network, save_network
 from robotdiffuse.learning.completion import BITS, exported_completion
 from robotdiffuse.learning.encoders import CompressionAutoencoderSettings
@@ -18,9 +18,8 @@ from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.weight_files import BUNDLED
 from robotdiffuse.perception.voxel_grid import SHAPE
-from robotdiffuse.robots import load_robot
 
-PANDA = load_robot("panda")
+PANDA = rd.load_robot("panda")
 RELATIVE_TOLERANCE = 1e-5
 """Of the largest number: fp32 rounds to 6e-8, and a network has some hundred roundings in a row."""
 MAX_FILE_SIZE = 16e6
@@ -82,14 +81,6 @@ def test_a_cloud_in_order_is_that_of_the_compression_autoencoder() -> None:
         np.testing.assert_allclose(encoder.settings.prepared(cloud), ours, atol=1e-6)
 
 
-def test_units_of_joints_agree_for_arrays_and_tensors() -> None:
-    network = small_model()
-    q = np.random.default_rng(0).uniform(-2, 2, (5, 3)).astype(np.float32)
-    unit = network.normalizer.to_unit(q)
-    np.testing.assert_allclose(network.to_unit(torch.from_numpy(q)).numpy(), unit, atol=1e-6)
-    np.testing.assert_allclose(network.from_unit(torch.from_numpy(unit)).numpy(), q, atol=1e-6)
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("weights")
@@ -140,6 +131,6 @@ def test_damaged_files_give_one_line(folder: Path, tmp_path: Path, case: str, me
         _described(tmp_path, {"settings": about["settings"] | {"waypoints": 20}})
     else:
         (tmp_path / "model.safetensors").unlink()
-    with pytest.raises(InputError, match=message) as caught:
+    with pytest.raises(rd.InputError, match=message) as caught:
         exported_model("model", tmp_path, box_arm())
     assert "\n" not in str(caught.value)

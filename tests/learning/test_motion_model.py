@@ -1,22 +1,33 @@
 """The diffusion model and its parts: encoder, noise, samplers."""
 
+import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.small_model import cloud, small_model
+from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.learning.diffusion import SAMPLERS, noise_factor
-from robotdiffuse.learning.encoders.networks import (
-    chamfer,
-    nearest,
+from robotdiffuse.core.transforms import transform
+from robotdiffuse.learning.denoisers import TransformerSettings
+from robotdiffuse.learning.denoisers.networks import MAX_UNFUSED_TOKENS, attend
+from robotdiffuse.learning.diffusion import SAMPLERS, NoiseSchedule, ScheduleSettings, noise_factor
+from robotdiffuse.learning.encoders.networks import chamfer, nearest
+from robotdiffuse.learning.motion_model import (
+    MAX_CLEARANCE,
+    GuideFn,
+    MotionModelSettings,
+    SamplingSettings,
+    link_clearances,
 )
-from robotdiffuse.learning.motion_model import GuideFn, MotionModelSettings, SamplingSettings
-from robotdiffuse.learning.motion_network import MotionNetwork
-from robotdiffuse.learning.training.config import PlannerTraining
+from robotdiffuse.learning.motion_network import MotionNetwork, block_means
+from robotdiffuse.learning.training.config import STAGES, PlannerTraining
+from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.robots.kinematic_tree import JointNormalizer
 
 START = np.array([-1.0, 0.5, 2.0])
@@ -43,11 +54,7 @@ def test_nearest_and_chamfer_against_all_pairs():
     torch.testing.assert_close(chamfer(a, b, allowed), sum(rms), atol=1e-4, rtol=1e-4)
 
 
-def test_normalizer():
-    normalizer = JointNormalizer(np.array([-1.0, 0.0]), np.array([3.0, 0.5]))
-    q = np.array([[-1.0, 0.0], [3.0, 0.5], [1.0, 0.25]])
-    np.testing.assert_allclose(normalizer.to_unit(q), [[-1, -1], [1, 1], [0, 0]], atol=1e-7)
-    np.testing.assert_allclose(normalizer.from_unit(normalizer.to_unit(q)), q, atol=1e-7)
+def test_a_joint_without_a_range_is_refused():
     with pytest.raises(InputError, match="joint 1"):
         JointNormalizer(np.array([0.0, 1.0]), np.array([1.0, 1.0]))
 
@@ -99,9 +106,7 @@ def test_residual_and_joints_are_inverse():
     assert np.sqrt((x[:, 1:-1] ** 2).mean((0, 1))) == pytest.approx([1, 1, 1], abs=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("steps", "share", "guided"), [(5, 0.5, 3), (1, 0.5, 1), (6, 0.0, 0), (6, 1.0, 6), (50, 0.02, 1)]
-)
+@pytest.mark.parametrize(("steps", "share", "guided"), [(5, 0.5, 3), (1, 0.5, 1), (6, 0.0, 0), (50, 0.02, 1)])
 def test_the_last_share_of_the_steps_is_guided(steps: int, share: float, guided: int) -> None:
     model = small_model()
     levels = []
@@ -135,7 +140,118 @@ def test_sampling_settings_are_checked() -> None:
 
 def test_numbers_of_waypoints_are_bounded():
     """Matrices of 10**25 rows were asked for; found by fuzzing."""
-    with pytest.raises(InputError, match=r"waypoints is 1000+; it must be between 3 and 4096"):
-        MotionModelSettings.from_json({"waypoints": 10**25}, "model")
-    with pytest.raises(InputError, match=r"waypoints is 1000+; it must be between 3 and 4096"):
-        PlannerTraining.from_json({"data": "d", "encoder": "e", "waypoints": 10**25}, "training")
+    for kind, values in ((MotionModelSettings, {}), (PlannerTraining, {"data": "d", "encoder": "e"})):
+        with pytest.raises(InputError, match=r"waypoints is 1000+; it must be between 3 and 4096"):
+            kind.from_json(values | {"waypoints": 10**25}, "x")
+
+
+PANDA = rd.load_robot("panda")
+ROD = rd.Box([0, 0, 0.3], [0.05, 0.05, 0.4], name="rod")
+HELD = {
+    "panda_hand": PANDA.attach(ROD, "panda_hand"),
+    "panda_rightfinger": PANDA.with_tool("panda_link8", transform(np.zeros(3))).attach(ROD, "tool"),
+    "panda_link4": PANDA.attach(ROD, "panda_link4"),
+}
+"""By the link that counts as carrying it: without geometry of its own, the last that moves as it does."""
+
+
+@pytest.mark.parametrize("carrier", HELD)
+@pytest.mark.parametrize("clearance_gradients", [False, True])
+def test_a_held_object_counts_as_a_part_of_what_carries_it(carrier: str, clearance_gradients: bool) -> None:
+    held = HELD[carrier]
+    settings = MotionModelSettings(clearance_gradients=clearance_gradients)
+    scene = rd.Scene([rd.Sphere([0.5, 0.0, 0.1], 0.1)])
+    q = np.random.default_rng(0).uniform(PANDA.lower, PANDA.upper, (4, 5, 7)).astype(np.float32)
+    checkers = CollisionChecker(PANDA, scene), CollisionChecker(held, scene)
+    bare, carrying = (link_clearances(checker, settings)(q) for checker in checkers)
+    assert bare.shape == carrying.shape, "the network was trained for the bare arm"
+    links = checkers[0].links
+    own = checkers[1]
+    rod = own.link_clearances(q.reshape(-1, 7), MAX_CLEARANCE)[:, own.links.index("rod")]
+    at = links.index(carrier)
+    expected = bare[..., : len(links)].copy()
+    expected[..., at] = np.minimum(expected[..., at], rod.reshape(4, 5))
+    np.testing.assert_allclose(carrying[..., : len(links)], expected, atol=1e-6)
+    assert (expected[..., at] < bare[..., at]).any(), "the rod is nearer somewhere"
+    assert not RobotIdentity.of(PANDA).difference(held)
+
+
+SMALL = TransformerSettings(32, 2, 2, 64, patch=1)
+
+
+def attention_gradient(dtype: torch.dtype) -> torch.Tensor:
+    tokens = MAX_UNFUSED_TOKENS + 30
+    inputs = torch.randn(3, 2, 4, tokens, 32, generator=torch.Generator().manual_seed(0))
+    target = torch.randn(2, tokens, 128, generator=torch.Generator().manual_seed(1))
+    parts = inputs.to(dtype, copy=True).requires_grad_()
+    q, k, v = parts.unbind(0)
+    (attend(q, k, v).float() - target).square().mean().backward()
+    assert parts.grad is not None
+    return parts.grad.float()
+
+
+def test_gradients_of_attention_in_bf16_are_those_in_fp32():
+    wanted = attention_gradient(torch.float32)
+    error = attention_gradient(torch.bfloat16) - wanted
+    assert error.norm() < 1e-2 * wanted.norm()
+
+
+@pytest.mark.parametrize("block", [1, 4, 9])
+def test_means_of_blocks_keep_the_ends_and_straight_lines(block):
+    means, interpolation, _ = block_means(38, block)
+    line = torch.linspace(-1.0, 2.0, 38)[:, None]
+    blocks = means @ line
+    assert blocks[0] == line[0] and blocks[-1] == line[-1]
+    torch.testing.assert_close(interpolation @ blocks, line)
+
+
+def test_means_of_white_noise_are_white():
+    block = 9
+    means = block_means(254, block)[0]
+    covariance = (means @ means.T)[1:-1, 1:-1]
+    torch.testing.assert_close(covariance, torch.eye(len(covariance)) / block)
+
+
+def test_a_denoiser_on_blocks_learns_all_waypoints():
+    settings = MotionModelSettings(
+        waypoints=38, target="absolute", clearance_features=False, denoiser_settings=SMALL
+    )
+    model = MotionNetwork(RobotIdentity.of(rd.load_robot("panda")), settings)
+    torch.nn.init.normal_(model.denoiser.out.weight, std=0.1)
+    inputs = torch.randn(3, 38, model.feature_count), torch.ones(3), torch.zeros(3, model.condition_count)
+    fine = model.denoise(*inputs)
+    for stage in STAGES:
+        model.coarsen(stage.block)
+        output = model.denoise(*inputs)
+        assert output.shape == fine.shape
+        assert torch.equal(output, fine) == (stage.block == 1)
+
+
+def progressive_training(**changes: Any) -> PlannerTraining:
+    settings: dict[str, Any] = {
+        "data": "",
+        "encoder": "pointnet",
+        "waypoints": 38,
+        "smooth_noise": False,
+        "progressive": True,
+        "target": "absolute",
+        "denoiser_settings": SMALL,
+    }
+    return PlannerTraining(**settings | changes)
+
+
+def test_progressive_training_needs_white_noise_and_blocks_that_fit():
+    assert progressive_training().progressive
+    with pytest.raises(rd.InputError, match="blocks of 9 must divide the 35 waypoints"):
+        progressive_training(waypoints=37)
+    with pytest.raises(rd.InputError, match="smooth_noise False"):
+        progressive_training(smooth_noise=True)
+    with pytest.raises(rd.InputError, match="patch 1"):
+        progressive_training(denoiser_settings=None)
+
+
+def test_shift_of_the_signal_to_noise_ratio():
+    plain = NoiseSchedule(ScheduleSettings(floor=1e-12))
+    shifted = NoiseSchedule(ScheduleSettings(floor=1e-12, log_snr_shift=math.log(25)))
+    difference = 2 * (plain.half_log_snr[1:-1] - shifted.half_log_snr[1:-1])
+    np.testing.assert_allclose(difference, math.log(25), rtol=1e-6)

@@ -1,13 +1,11 @@
 """Schedule, objectives, samplers: on Gaussian data, where closed forms are known, and against diffusers."""
 
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 import pytest
 import torch
 
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.diffusion import OBJECTIVES, SAMPLERS, NoiseSchedule, ScheduleSettings
 
@@ -20,18 +18,7 @@ def cosine_schedule(steps: int = 200) -> NoiseSchedule:
     return NoiseSchedule(ScheduleSettings(steps=steps))
 
 
-def log_snr_schedule() -> NoiseSchedule:
-    """Levels evenly spaced in log-SNR: all steps shrink, except for the last one, which starts from little
-    noise."""
-    half = np.concatenate([[np.inf], np.linspace(8, -4, 4096)])
-    schedule = cosine_schedule(4096)
-    schedule.signal = 1 / np.sqrt(1 + np.exp(-2 * half))
-    schedule.noise = 1 / np.sqrt(1 + np.exp(2 * half))
-    return schedule
-
-
 def best_predictor(schedule: NoiseSchedule) -> Callable[[np.ndarray, int], np.ndarray]:
-    """E[x_0 | x_t] for Gaussian data and white noise."""
 
     def predict(x, level):
         a = schedule.signal[level]
@@ -52,7 +39,6 @@ def exact_flow(schedule: NoiseSchedule, x: np.ndarray) -> np.ndarray:
 
 
 def flow_errors(name: str, schedule: NoiseSchedule, steps: list[int]) -> np.ndarray:
-    """RMS distance of samples to the points where the exact flow takes the same noise."""
     noise = np.random.default_rng(0).standard_normal((64, 2))
     exact = exact_flow(schedule, noise)
     predict = best_predictor(schedule)
@@ -79,21 +65,14 @@ def exact_moments(
 
 
 def slope(steps: list[int], errors: np.ndarray) -> float:
-    """Order of convergence, fitted on logarithms."""
     return -np.polyfit(np.log(steps), np.log(errors), 1)[0]
 
 
-@pytest.mark.parametrize(
-    ("schedule", "least", "most"),
-    [(log_snr_schedule, 0.9, 1.1), (partial(cosine_schedule, 8192), 0.95, np.inf)],
-)
-def test_order_of_ddim(schedule: Callable[[], NoiseSchedule], least: float, most: float) -> None:
-    """Levels of the schedule itself are evenly spaced in t: at its ends the steps in log-SNR do not shrink,
-    which costs a little of the order."""
+def test_order_of_ddim() -> None:
     steps = [32, 64, 128, 256]
-    errors = flow_errors("ddim", schedule(), steps)
+    errors = flow_errors("ddim", cosine_schedule(8192), steps)
     assert (np.diff(errors) < 0).all()
-    assert least < slope(steps, errors) < most
+    assert slope(steps, errors) > 0.95
 
 
 @pytest.mark.parametrize("name", SAMPLERS)
@@ -110,7 +89,7 @@ def test_stochastic_samples_have_the_data_s_moments(name):
 
 
 @pytest.mark.parametrize("name", SAMPLERS)
-@pytest.mark.parametrize("steps", [1, 2, 3, 199, 200])
+@pytest.mark.parametrize("steps", [1, 2, 3, 200])
 def test_calls_of_the_predictor(name, steps):
     """One call per step, from the last level downwards. All values are finite, also between levels of equal
     noise, whatever the predictor returns. The result is the last prediction."""
@@ -133,32 +112,18 @@ def test_calls_of_the_predictor(name, steps):
     assert np.isfinite(x).all()
 
 
-@pytest.mark.parametrize("name", SAMPLERS)
-def test_refused_steps(name):
-    schedule = cosine_schedule()
-    predict = best_predictor(cosine_schedule())
-    for steps in (-1, 0, 201):
-        with pytest.raises(InputError, match=f"sampling steps is {steps}; it must be between 1 and 200"):
-            SAMPLERS.load(name)(predict, schedule, lambda: np.zeros((1, 2)), steps, 0.0)
-
-
 def network(x: np.ndarray, level: int) -> np.ndarray:
-    """A nonlinear function that differs at every level, like a network."""
     return np.tanh(x + np.sin(level)) + 0.1 * x
 
 
 def draws_for(steps: int) -> list[np.ndarray]:
     """The first noise, and that of every step, as a torch.Generator of seed 1 gives them."""
     generator = torch.Generator().manual_seed(1)
-    first = np.random.default_rng(0).standard_normal((4, 3))
-    return [
-        first,
-        *(torch.randn(4, 3, generator=generator, dtype=torch.float64).numpy() for _ in range(steps)),
-    ]
+    later = [torch.randn(4, 3, generator=generator, dtype=torch.float64).numpy() for _ in range(steps)]
+    return [np.random.default_rng(0).standard_normal((4, 3)), *later]
 
 
 def our_steps(name: str, schedule: NoiseSchedule, steps: int, eta: float) -> np.ndarray:
-    """x at each level, from the noise to the sample."""
     found = []
     draws = iter(draws_for(steps))
 
@@ -170,55 +135,45 @@ def our_steps(name: str, schedule: NoiseSchedule, steps: int, eta: float) -> np.
     return np.array([*found, sample])
 
 
-def their_steps(levels: list[int], scheduler, outputs, variance_noise: bool, **settings) -> np.ndarray:
-    """The same by a scheduler of diffusers. `outputs`: of the network, from x, x_0 and the level."""
+def their_steps(levels: list[int], scheduler, variance_noise: bool, **settings) -> np.ndarray:
     draws = [torch.from_numpy(n) for n in draws_for(len(levels) - 1)]
     x = draws[0]
     found = [draws[0].numpy()]
     for timestep, level, noise in zip(scheduler.timesteps, levels[:-1], draws[1:], strict=True):
         if variance_noise:
             settings["variance_noise"] = noise
-        output = outputs(x.numpy(), network(x.numpy(), level), level)
-        x = scheduler.step(torch.from_numpy(output), timestep, x, **settings).prev_sample.double()
+        clean = torch.from_numpy(network(x.numpy(), level))
+        x = scheduler.step(clean, timestep, x, **settings).prev_sample.double()
         found.append(x.numpy())
     return np.array(found)
 
 
-def vp_settings(schedule: NoiseSchedule) -> dict:
+@pytest.mark.parametrize(
+    ("name", "steps", "eta"),
+    [("ddpm", 200, 1.0), ("ddpm", 7, 1.0), ("ddim", 20, 0.0), ("ddim", 20, 1.0), ("ddim", 8, 0.5)],
+)
+def test_against_diffusers(name, steps, eta):
+    diffusers = pytest.importorskip("diffusers")
+    schedule = cosine_schedule()
+    levels = schedule.sampling_levels(steps).tolist()
     alpha_bar = schedule.signal**2
-    return {
+    vp = {
         "num_train_timesteps": schedule.steps,
         "trained_betas": 1 - alpha_bar[1:] / alpha_bar[:-1],
         "prediction_type": "sample",
     }
-
-
-@pytest.mark.parametrize("steps", [200, 20, 7])
-def test_ddpm_against_diffusers(steps):
-    diffusers = pytest.importorskip("diffusers")
-    schedule = cosine_schedule()
-    levels = schedule.sampling_levels(steps).tolist()
-    scheduler = diffusers.DDPMScheduler(**vp_settings(schedule), clip_sample=False)
-    scheduler.set_timesteps(timesteps=[level - 1 for level in levels[:-1]])
-    scheduler.alphas_cumprod = torch.from_numpy(schedule.signal[1:] ** 2)  # theirs is in single precision
-    generator = torch.Generator().manual_seed(1)
-    theirs = their_steps(levels, scheduler, lambda x, clean, level: clean, False, generator=generator)
-    np.testing.assert_allclose(our_steps("ddpm", schedule, steps, 1.0), theirs, atol=1e-5)
-
-
-@pytest.mark.parametrize("steps", [20, 8])
-@pytest.mark.parametrize("eta", [0.0, 0.5, 1.0])
-def test_ddim_against_diffusers(eta, steps):
-    diffusers = pytest.importorskip("diffusers")
-    schedule = cosine_schedule()
-    levels = schedule.sampling_levels(steps).tolist()
-    scheduler = diffusers.DDIMScheduler(
-        **vp_settings(schedule), clip_sample=False, timestep_spacing="trailing", set_alpha_to_one=True
-    )
-    scheduler.set_timesteps(steps)
-    scheduler.alphas_cumprod = torch.from_numpy(schedule.signal[1:] ** 2)  # theirs is in single precision
-    theirs = their_steps(levels, scheduler, lambda x, clean, level: clean, True, eta=eta)
-    np.testing.assert_allclose(our_steps("ddim", schedule, steps, eta), theirs, atol=1e-5)
+    if name == "ddpm":
+        scheduler = diffusers.DDPMScheduler(**vp, clip_sample=False)
+        scheduler.set_timesteps(timesteps=[level - 1 for level in levels[:-1]])
+        settings = {"generator": torch.Generator().manual_seed(1)}
+    else:
+        trailing = {"timestep_spacing": "trailing", "set_alpha_to_one": True}
+        scheduler = diffusers.DDIMScheduler(**vp, clip_sample=False, **trailing)
+        scheduler.set_timesteps(steps)
+        settings = {"eta": eta}
+    scheduler.alphas_cumprod = torch.from_numpy(alpha_bar[1:])  # theirs is in single precision
+    theirs = their_steps(levels, scheduler, name == "ddim", **settings)
+    np.testing.assert_allclose(our_steps(name, schedule, steps, eta), theirs, atol=1e-5)
 
 
 def test_the_schedule_of_the_bundled_model_is_that_of_its_training():
@@ -240,19 +195,14 @@ def test_the_schedule():
     assert schedule.weight(np.arange(1), 5.0)[0] == 5
 
 
-@pytest.mark.parametrize("tensors", [False, True])
+@pytest.mark.parametrize("as_given", [np.asarray, torch.from_numpy])
 @pytest.mark.parametrize("name", OBJECTIVES)
-def test_objective_round_trip(name, tensors):
-    """The clean trajectory follows from x_t and the target at all levels."""
+def test_objective_round_trip(name, as_given):
     schedule = cosine_schedule()
     objective = OBJECTIVES.make(name)
-    clean, noise = np.random.default_rng(0).standard_normal((2, 201, 5, 2))
-    a, s = (v[:, None, None] for v in (schedule.signal, schedule.noise))
-    if tensors:
-        x, n, a, s = (torch.from_numpy(v) for v in (clean, noise, a, s))
-        back = objective.clean(a * x + s * n, objective.target(x, n, a, s), a, s).numpy()
-    else:
-        back = objective.clean(a * clean + s * noise, objective.target(clean, noise, a, s), a, s)
+    clean, noise = map(as_given, np.random.default_rng(0).standard_normal((2, 201, 5, 2)))
+    a, s = (as_given(v[:, None, None]) for v in (schedule.signal, schedule.noise))
+    back = objective.clean(a * clean + s * noise, objective.target(clean, noise, a, s), a, s)
     np.testing.assert_allclose(back, clean, atol=1e-9)
 
 

@@ -52,6 +52,5 @@ def stored(tmp_path_factory):
 
 @pytest.fixture
 def data(tmp_path, arm, stored):
-    """A copy of the data; the encoder is beside the folder."""
     shutil.copytree(stored, tmp_path, dirs_exist_ok=True)
     return tmp_path / "data"

@@ -9,24 +9,9 @@ import pytest
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.datasets.shards import shard_path, split_of
 from robotdiffuse.learning.checkpoint import load_encoder
-from robotdiffuse.learning.training.batches import (
-    load_data,
-    random_scenes,
-)
-from robotdiffuse.scenes.scene_arrays import BOX, SPHERE
+from robotdiffuse.learning.training.batches import load_data
 
 WAYPOINTS = 48
-
-
-def test_random_scenes():
-    scenes = random_scenes(300, 12, np.random.default_rng(0))
-    kinds = scenes.kinds
-    params = scenes.params
-    assert set(np.unique(kinds)) == {0, SPHERE, BOX}
-    assert (params[kinds == 0] == 0).all()
-    assert (params[kinds == SPHERE, 3] > 0).all()
-    np.testing.assert_allclose(np.linalg.norm(params[kinds != 0, 6:], axis=1), 1, atol=1e-5)
-    assert (kinds != 0).sum(1).max() == 12
 
 
 def test_codes_are_cached_beside_the_data(data, arm):
@@ -55,7 +40,6 @@ def test_turned_copies_are_for_training_alone(data, arm):
 
 
 def test_splits_and_waypoints(data, arm):
-    """Training and validation share no scene, the test split is left out, and waypoints are resampled."""
     loaded = load_data(str(data), arm, load_encoder(data.parent / "encoder"), WAYPOINTS, print)
     train, validation = loaded.split(1000)
     assert set(split_of(train.scenes)) == {0}
@@ -65,19 +49,16 @@ def test_splits_and_waypoints(data, arm):
     assert train.q.shape[1:] == (WAYPOINTS, arm.dof)
 
 
-@pytest.mark.parametrize("case", ["none", "damaged", "robot"])
-def test_bad_data_give_one_line(case, data, arm):
-    message = {
-        "none": "holds no shard",
-        "damaged": r"shard_00001\.zarr",
-        "robot": "use the robot of the data",
-    }
-    if case == "none":
-        for i in (0, 1):
-            shutil.rmtree(shard_path(data, i))
-    elif case == "damaged":
-        shutil.rmtree(shard_path(data, 1) / "line_free")
-    robot = replace(arm, spheres={}) if case == "robot" else arm
-    with pytest.raises(InputError, match=message[case]) as caught:
-        load_data(str(data), robot, load_encoder(data.parent / "encoder"), WAYPOINTS, print)
+@pytest.mark.parametrize(
+    ("damage", "change", "message"),
+    [
+        (lambda data: [shutil.rmtree(shard_path(data, i)) for i in (0, 1)], {}, "holds no shard"),
+        (lambda data: shutil.rmtree(shard_path(data, 1) / "line_free"), {}, r"shard_00001\.zarr"),
+        (lambda data: None, {"spheres": {}}, "use the robot of the data"),
+    ],
+)
+def test_bad_data_give_one_line(damage, change, message, data, arm):
+    damage(data)
+    with pytest.raises(InputError, match=message) as caught:
+        load_data(str(data), replace(arm, **change), load_encoder(data.parent / "encoder"), WAYPOINTS, print)
     assert "\n" not in str(caught.value)

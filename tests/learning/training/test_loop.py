@@ -14,7 +14,6 @@ from robotdiffuse.learning.training.loop import TrainingRun
 
 
 def run_of(folder: Path, factor: Callable[[int], float]) -> TrainingRun:
-    """A run of 40 steps, the loss of each with a factor by its number."""
     settings = EncoderTraining(
         minutes=None, samples=40, batch=1, warmup_steps=1, checkpoint_seconds=0.0, average=0.9, bad_steps=3
     )

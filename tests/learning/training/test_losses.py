@@ -5,13 +5,7 @@ import pytest
 import torch
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.learning.training.losses import (
-    ArmDistance,
-    ForwardKinematics,
-    LossSettings,
-    SurfacePoints,
-    hinge,
-)
+from robotdiffuse.learning.training import losses
 from robotdiffuse.problems.families.rop import ROP, ROP_DENSE
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
@@ -20,7 +14,7 @@ from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.shapes import Box
 
 PANDA = load_robot("panda")
-DOUBLE = ForwardKinematics(PANDA, torch.float64)
+DOUBLE = losses.ForwardKinematics(PANDA, torch.float64)
 
 
 def configurations(n: int, waypoints: int, seed: int = 0) -> torch.Tensor:
@@ -30,14 +24,13 @@ def configurations(n: int, waypoints: int, seed: int = 0) -> torch.Tensor:
 
 @pytest.mark.parametrize("floor", [True, False])
 def test_distances_are_those_of_the_kernel(floor: bool) -> None:
-    """In scenes of different size at once, with turned boxes among them."""
     rng = np.random.default_rng(1)
     scenes = [Scene(family.scene(rng).shapes[1:]) for family in (ROP, ROP_DENSE, ROP_DENSE)]
     turned = rng.normal(size=4)
     scenes += [Scene([]), Scene([Box([0.4, 0.1, 0.5], [0.1, 0.3, 0.6], turned / np.linalg.norm(turned))])]
     scenes = [Scene([*([ROP.floor] if floor else []), *scene.shapes]) for scene in scenes]
     q = configurations(len(scenes), 20)
-    distance = ArmDistance(DOUBLE)(q, PackedScenes.pack(scenes, 12, floor)).numpy()
+    distance = losses.ArmDistance(DOUBLE)(q, PackedScenes.pack(scenes, 12, floor)).numpy()
     for i, full in enumerate(scenes):
         expected = CollisionChecker(PANDA, full).link_clearances(q[i].numpy()).min(axis=1)
         # the floor's box is as wide as the arm reaches; deep in it the plane and the box differ
@@ -50,11 +43,11 @@ def test_distances_are_those_of_the_kernel(floor: bool) -> None:
 def test_the_hinge_and_its_gradient() -> None:
     rng = np.random.default_rng(2)
     scenes = PackedScenes.pack([ROP.scene(rng)], 2, floor=True)
-    arm = ArmDistance(DOUBLE)
+    arm = losses.ArmDistance(DOUBLE)
     q = configurations(1, 6, 3).requires_grad_()
 
     def loss(at: torch.Tensor) -> torch.Tensor:
-        return hinge(arm(at, scenes), 0.2).square().mean()
+        return losses.hinge(arm(at, scenes), 0.2).square().mean()
 
     loss(q).backward()
     assert q.grad is not None and q.grad.abs().max() > 0
@@ -62,11 +55,11 @@ def test_the_hinge_and_its_gradient() -> None:
     with torch.no_grad():
         slope = (loss(q + 1e-6 * direction) - loss(q - 1e-6 * direction)) / 2e-6
     np.testing.assert_allclose((q.grad * direction).sum(), slope, rtol=1e-4)
-    assert torch.equal(hinge(torch.tensor([-0.1, 0.05, 0.3]), 0.1), torch.tensor([0.2, 0.05, 0.0]))
+    assert torch.equal(losses.hinge(torch.tensor([-0.1, 0.05, 0.3]), 0.1), torch.tensor([0.2, 0.05, 0.0]))
 
 
 def test_surface_points_move_with_their_links() -> None:
-    points = SurfacePoints(DOUBLE, 3, np.random.default_rng(4))
+    points = losses.SurfacePoints(DOUBLE, 3, np.random.default_rng(4))
     q = configurations(2, 4, 5)
     placed = points(q).numpy()
     links = [link for link, meshes in PANDA.meshes.items() if meshes and PANDA.link_frame(link) > 0]
@@ -83,7 +76,7 @@ def test_surface_points_move_with_their_links() -> None:
 
 
 def test_the_collision_loss_begins_as_scheduled() -> None:
-    settings = LossSettings(collision=2.0, begin=0.5)
+    settings = losses.LossSettings(collision=2.0, begin=0.5)
     assert [settings.collision_weight(f) for f in (0.0, 0.5, 0.55, 0.6, 1.0)] == pytest.approx(
         [0, 0, 1, 2, 2]
     )

@@ -1,0 +1,19 @@
+"""A short training of a network, for the tests of its loss."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+
+def trained(network: nn.Module, loss_at: Callable[[int], Tensor], steps: int, rate: float) -> list[float]:
+    """The loss of each step, by the number of which `loss_at` gives it."""
+    optimizer = torch.optim.AdamW(network.parameters(), rate)
+    losses = []
+    for step in range(steps):
+        loss = loss_at(step)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    return losses
