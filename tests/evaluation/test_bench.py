@@ -8,6 +8,7 @@ import sys
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,16 +20,6 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.registry import Entry
 from robotdiffuse.core.types import Path as Motion
 from robotdiffuse.evaluation import bench
-from robotdiffuse.evaluation.bench import (
-    PRESETS,
-    BenchSettings,
-    PlannerProcess,
-    PlannerSpec,
-    Preset,
-    open_runs,
-    preset_settings,
-    run_bench,
-)
 from robotdiffuse.evaluation.bench_report import LATE_SECONDS
 from robotdiffuse.evaluation.metrics import METRICS
 from robotdiffuse.evaluation.problem_sets import gather_cases, problem_set_name, validator
@@ -50,11 +41,9 @@ def quiet(*_: object) -> None: ...
 
 
 def settings(
-    out: Path, planners: str = "rrt_connect", problems: str = "rop", count: int = 3
-) -> BenchSettings:
-    return BenchSettings(
-        tuple(planners.split(",")), tuple(problems.split(",")), out, time_limit=20.0, count=count
-    )
+    out: Path, planners: str = "rrt_connect", problem: str = "rop", count: int = 3
+) -> bench.BenchSettings:
+    return bench.BenchSettings(tuple(planners.split(",")), (problem,), out, time_limit=20.0, count=count)
 
 
 def keys(records: list[Record]) -> Counter:
@@ -66,8 +55,8 @@ def test_records_hold_what_was_measured_and_are_not_made_twice(tmp_path: Path) -
     plain = "rrt_connect"
     with_settings = "rrt_connect:optimize_time=0.05:tightenings=0"
     asked = replace(settings(tmp_path, f"{plain},{with_settings}", count=2), seeds=2)
-    assert run_bench(asked, quiet, quiet) == 8
-    assert run_bench(asked, quiet, quiet) == 0
+    assert bench.run_bench(asked, quiet, quiet) == 8
+    assert bench.run_bench(asked, quiet, quiet) == 0
     rows = read_records(tmp_path)
     assert list(rows) == [plain, with_settings], "a planner with settings is a row of its own"
     for records in rows.values():
@@ -86,7 +75,7 @@ def test_records_hold_what_was_measured_and_are_not_made_twice(tmp_path: Path) -
         assert (record.workers, record.run) == (1, runs[0]["run"])
         assert record.load is not None and record.cpu is not None
         assert record.trivial == (line_length(problem, validator) is not None)
-    assert run_bench(replace(asked, count=3, planners=(plain,)), quiet, quiet) == 2
+    assert bench.run_bench(replace(asked, count=3, planners=(plain,)), quiet, quiet) == 2
     assert len(runs[0]["versions"]) > 3
 
 
@@ -99,7 +88,7 @@ def faulty(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("faulty")
 def test_failures_of_every_kind_are_records_and_the_run_goes_on(tmp_path: Path) -> None:
     asked = replace(settings(tmp_path, "faulty", count=1), seeds=7, time_limit=0.5)
-    assert run_bench(asked, quiet, quiet) == 7
+    assert bench.run_bench(asked, quiet, quiet) == 7
     found = {record.seed: record for record in read_records(tmp_path)["faulty"]}
     assert found[faulty_planner.SOLVES].solved and found[faulty_planner.TALKS].solved
     assert found[faulty_planner.RAISES].status == "exception"
@@ -109,13 +98,13 @@ def test_failures_of_every_kind_are_records_and_the_run_goes_on(tmp_path: Path) 
     assert found[faulty_planner.HANGS].status == "overran"
     log = (tmp_path / "logs" / "faulty.log").read_text()
     assert "about to die" in log and "this is no answer" in log and "ValueError" in log
-    assert run_bench(asked, quiet, quiet) == 0
+    assert bench.run_bench(asked, quiet, quiet) == 0
 
 
 def test_a_planner_of_the_program_itself_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PLANNERS, "mine", Entry("__main__:Mine", "for tests"))
     with pytest.raises(InputError, match="planner mine is in the program that was started"):
-        run_bench(settings(tmp_path, "mine", count=1), quiet, quiet)
+        bench.run_bench(settings(tmp_path, "mine", count=1), quiet, quiet)
 
 
 def test_a_metric_of_an_imported_module_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -129,7 +118,7 @@ def test_a_metric_of_an_imported_module_is_measured(tmp_path: Path, monkeypatch:
     try:
         registry.import_modules(["counted"])
         asked = replace(settings(tmp_path / "run", "rrt_connect", count=1), time_limit=60.0)
-        assert run_bench(asked, quiet, quiet) == 1
+        assert bench.run_bench(asked, quiet, quiet) == 1
         (record,) = read_records(tmp_path / "run")["rrt_connect"]
         assert record.measures["legs"] == len(record.waypoints) - 1
     finally:
@@ -158,47 +147,37 @@ def test_killed_run_completes_without_repeating_or_losing_a_result(tmp_path: Pat
         assert keys(RecordFile(file).records) == {("rop", f"rop/{i}", 0, 20.0): 1 for i in range(3)}
 
 
-def test_what_ended_by_itself_is_not_asked_again_with_more_time(tmp_path: Path) -> None:
+def test_runs_that_are_left_and_restarts_where_time_is_left(tmp_path: Path) -> None:
+    """What ended by itself is not asked again with more time."""
     cases = gather_cases(["rop"], 3, tmp_path, quiet)
     ran_out = replace(RECORD, name="rop/1", status="timeout", time=1.0, progress=())
     crashed = replace(RECORD, name="rop/2", status="crashed", time=0.0, progress=())
-    records = [RECORD, ran_out, crashed]
+    refused = replace(crashed, status="invalid_goal")
 
-    def left(time_limit: float, seeds: int = 1) -> list[tuple[str, int]]:
-        asked = replace(settings(tmp_path), time_limit=time_limit, seeds=seeds)
-        return [(t.case.name, t.seed) for t in open_runs({"rrt_connect": records}, cases, asked)]
+    def left(records: list[Record], time_limit: float, seeds: int = 1, **more: Any) -> list[tuple[int, int]]:
+        by_planner = {"rrt_connect": [RECORD, ran_out, crashed]}
+        if more:
+            by_planner = {"rrt_connect": [RECORD, ran_out, refused], "rrt_connect+restarts": records}
+        asked = replace(settings(tmp_path), time_limit=time_limit, seeds=seeds, **more)
+        return [(int(run.case.name[-1]), run.seed) for run in bench.open_runs(by_planner, cases, asked)]
 
-    assert left(1.0) == []
-    assert left(10.0) == [("rop/1", 0), ("rop/2", 0)]
-    assert left(0.5) == [("rop/0", 0), ("rop/1", 0), ("rop/2", 0)]
-    assert left(1.0, seeds=2) == [("rop/0", 1), ("rop/1", 1), ("rop/2", 1)]
-
-
-def test_restarts_are_asked_for_where_time_is_left(tmp_path: Path) -> None:
-    cases = gather_cases(["rop"], 3, tmp_path, quiet)
-    ran_out = replace(RECORD, name="rop/1", status="timeout", time=1.0, progress=())
-    refused = replace(RECORD, name="rop/2", status="invalid_goal", time=0.0, progress=())
-    plain = [RECORD, ran_out, refused]
-    asked = replace(settings(tmp_path), equal_time=True)
+    assert left([], 1.0) == []
+    assert left([], 10.0) == [(1, 0), (2, 0)]
+    assert left([], 0.5) == [(0, 0), (1, 0), (2, 0)]
+    assert left([], 1.0, seeds=2) == [(0, 1), (1, 1), (2, 1)]
     again = [replace(RECORD, planner="rrt_connect+restarts", time=0.99, restarts=80)]
-
-    def left(time_limit: float, restarted: list[Record]) -> list[str]:
-        records = {"rrt_connect": plain, "rrt_connect+restarts": restarted}
-        runs = open_runs(records, cases, replace(asked, time_limit=time_limit))
-        return [run.case.name for run in runs]
-
-    assert left(1.0, []) == ["rop/0"]
-    assert left(1.0, again) == []
-    assert left(10.0, again) == ["rop/0", "rop/1"]
+    assert left([], 1.0, equal_time=True) == [(0, 0)]
+    assert left(again, 1.0, equal_time=True) == []
+    assert left(again, 10.0, equal_time=True) == [(0, 0), (1, 0)]
 
 
 @pytest.mark.slow
 def test_a_planner_is_restarted_until_its_time_is_used_up(tmp_path: Path) -> None:
     asked = replace(settings(tmp_path, "rrt_connect", "rop_nontrivial", count=2), time_limit=2.0)
-    assert run_bench(asked, quiet, quiet) == 2
+    assert bench.run_bench(asked, quiet, quiet) == 2
     before = read_records(tmp_path)["rrt_connect"]
-    assert run_bench(replace(asked, equal_time=True), quiet, quiet) == 2
-    assert run_bench(replace(asked, equal_time=True), quiet, quiet) == 0
+    assert bench.run_bench(replace(asked, equal_time=True), quiet, quiet) == 2
+    assert bench.run_bench(replace(asked, equal_time=True), quiet, quiet) == 0
     found = read_records(tmp_path)
     assert found["rrt_connect"] == before
     for once, again in zip(before, found["rrt_connect+restarts"], strict=True):
@@ -219,7 +198,7 @@ def test_planners_take_turns_with_each_problem(tmp_path: Path, monkeypatch: pyte
     most = [0]
     wanted = [1]
 
-    def plan(self: PlannerProcess, run: Run, restarts: bool) -> list[dict]:
+    def plan(self: bench.PlannerProcess, run: Run, restarts: bool) -> list[dict]:
         at_once[0] += 1
         most[0] = max(most[0], at_once[0])
         calls.append((run.case.name, run.method))
@@ -227,40 +206,37 @@ def test_planners_take_turns_with_each_problem(tmp_path: Path, monkeypatch: pyte
         at_once[0] -= 1
         return [{"status": "timeout", "time": 2.0}]
 
-    monkeypatch.setattr(PlannerProcess, "plan", plan)
-    monkeypatch.setattr(PlannerProcess, "warm", quiet)
+    monkeypatch.setattr(bench.PlannerProcess, "plan", plan)
+    monkeypatch.setattr(bench.PlannerProcess, "warm", quiet)
     planners = "rrt_connect,mpnet,a_star"
-    assert run_bench(settings(tmp_path / "a", planners), quiet, quiet) == 9
+    assert bench.run_bench(settings(tmp_path / "a", planners), quiet, quiet) == 9
     assert calls == [(f"rop/{i}", name) for i in range(3) for name in planners.split(",")]
     assert most == [1]
     wanted[0] = 2
-    assert run_bench(replace(settings(tmp_path / "b", planners), workers=2), quiet, quiet) == 9
+    assert bench.run_bench(replace(settings(tmp_path / "b", planners), workers=2), quiet, quiet) == 9
     assert most == [2]
     for name in planners.split(","):
-        assert [name for name, _ in keys_in_order(tmp_path / "b", name)] == [f"rop/{i}" for i in range(3)]
-
-
-def keys_in_order(folder: Path, planner: str) -> list[tuple[str, int]]:
-    return [(record.name, record.seed) for record in read_records(folder)[planner]]
+        records = read_records(tmp_path / "b")[name]
+        assert [record.name for record in records] == [f"rop/{i}" for i in range(3)]
 
 
 def test_a_planner_with_settings() -> None:
-    planner = PlannerSpec.parse("rrt_connect:optimize_time=0.05:tightenings=0").load()
+    planner = bench.PlannerSpec.parse("rrt_connect:optimize_time=0.05:tightenings=0").load()
     assert isinstance(planner, RRTConnect)
     assert (planner.settings.optimize_time, planner.settings.tightenings) == (0.05, 0)
-    calls = PlannerSpec.parse("aorrtc:until=time_limit:gain=0.01:clearance=0")
+    calls = bench.PlannerSpec.parse("aorrtc:until=time_limit:gain=0.01:clearance=0")
     assert calls.request()["until"] == "time_limit" and calls.request()["clearance"] == 0
     assert calls.load().settings == AORRTCSettings(gain=0.01)
     with pytest.raises(InputError, match="until 'soon'; known: converged"):
-        PlannerSpec.parse("aorrtc:until=soon")
-    nested = PlannerSpec.parse("diffusion:guidance.margin=0.02:samples=4").load()
+        bench.PlannerSpec.parse("aorrtc:until=soon")
+    nested = bench.PlannerSpec.parse("diffusion:guidance.margin=0.02:samples=4").load()
     assert isinstance(nested, Diffusion)
     assert (nested.settings.guidance.margin, nested.settings.samples) == (0.02, 4)
 
 
 def test_weights_of_the_package_are_found_by_their_name() -> None:
     """They were sought in the working folder, and the row of Table 1 without clearances could not run."""
-    spec = PlannerSpec.parse("diffusion@panda_points:samples=1")
+    spec = bench.PlannerSpec.parse("diffusion@panda_points:samples=1")
     assert spec.label == "diffusion@panda_points:samples=1" and list(spec.weights_hashes) == ["model"]
     planner = spec.load()
     assert isinstance(planner, Diffusion) and planner.settings.weights == str(BUNDLED / "panda_points")
@@ -279,13 +255,8 @@ def test_line_that_was_cut_off_is_made_again(tmp_path: Path, cut: int) -> None:
     assert file.read_bytes() == cut_off  # another process may be about to end the line
     appended.append(replace(RECORD, seed=2))
     assert RecordFile(file).records == [RECORD, replace(RECORD, seed=2)]
-
-
-def test_damaged_line_is_named(tmp_path: Path) -> None:
-    file = tmp_path / "a.jsonl"
-    line = json.dumps(RECORD.row())
-    file.write_text(line + '\n{"planner": 1}\n' + line + "\n")
-    with pytest.raises(InputError, match="line 2 is no record"):
+    file.write_text(file.read_text() + '{"planner": 1}\n' + json.dumps(RECORD.row()) + "\n")
+    with pytest.raises(InputError, match="line 3 is no record"):
         RecordFile(file)
 
 
@@ -297,9 +268,7 @@ def test_nontrivial_problems_are_not_solved_by_the_line(tmp_path: Path) -> None:
     assert [case.key for case in again] == [case.key for case in cases]
     more = gather_cases(["rop"], 5, tmp_path, quiet)
     assert [case.name for case in more] == [f"rop/{i}" for i in range(5)]
-    kept = cases[2].problem
-    drawn = held_out_problem("rop", 0)
-    np.testing.assert_array_equal(kept.start, drawn.start)
+    np.testing.assert_array_equal(cases[2].problem.start, held_out_problem("rop", 0).start)
 
 
 def test_problems_of_files_and_folders(tmp_path: Path) -> None:
@@ -310,11 +279,7 @@ def test_problems_of_files_and_folders(tmp_path: Path) -> None:
     (folder / "b.json").write_text(lines[2])
     (folder / "readme.txt").write_text("not a problem")
     cases = gather_cases([str(folder)], None, tmp_path / "out", quiet)
-    assert [(case.problem_set, case.family) for case in cases] == [
-        ("mine", "a"),
-        ("mine", "b"),
-        ("mine", "a"),
-    ]
+    assert [(case.problem_set, case.family) for case in cases] == [("mine", family) for family in "aba"]
     assert len(gather_cases([str(folder)], 2, tmp_path / "out", quiet)) == 2
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="holds no usable problem"):
@@ -347,9 +312,9 @@ def test_other_weights_of_the_same_name_are_refused(tmp_path: Path, monkeypatch:
         (tmp_path / parent / "best" / "mpnet.json").write_text(json.dumps(about))
     first, other = (settings(tmp_path / "out", f"mpnet@{tmp_path / at}/best", count=1) for at in "ab")
     for _ in range(2):
-        run_bench(first, quiet, quiet)
+        bench.run_bench(first, quiet, quiet)
     with pytest.raises(InputError, match="has records of mpnet@best with other weights than those in"):
-        run_bench(other, quiet, quiet)
+        bench.run_bench(other, quiet, quiet)
 
 
 @pytest.mark.parametrize(
@@ -359,43 +324,35 @@ def test_other_weights_of_the_same_name_are_refused(tmp_path: Path, monkeypatch:
         ({"planners": ("rrt_connect", "rrt_connect")}, "the same name"),
         ({"planners": ("rrt_connect@.",)}, "rrt_connect has no weights"),
         ({"planners": ("rrt_connect:stp=1",)}, "rrt_connect has no setting 'stp'; it has .*tightenings"),
-        ({"planners": ("rrt_connect:range=-1",)}, "rrt_connect.range is -1.0; it must be positive"),
         ({"planners": ("rrt_connect:range",)}, "'range' is not NAME=VALUE"),
         ({"planners": ("diffusion@nowhere",)}, r"there are no weights \S*nowhere"),
-        ({"planners": ("mpnet@nowhere",)}, r"there are no weights \S*nowhere"),
         ({"problems": ("rop", "rop")}, "named only once"),
         ({"problems": ("ropp",)}, "neither a file or folder nor a family"),
-        ({"time_limit": 0.0}, "time_limit is 0.0"),
         ({"count": 0}, "count is 0"),
         ({"cluster": "slurm"}, "known: ray"),
     ],
 )
 def test_bad_settings_are_told_before_anything_is_made(tmp_path: Path, change: dict, match: str) -> None:
     with pytest.raises(InputError, match=match):
-        run_bench(replace(settings(tmp_path / "out"), **change), quiet, quiet)
+        bench.run_bench(replace(settings(tmp_path / "out"), **change), quiet, quiet)
     assert not (tmp_path / "out" / "records").exists()
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", bench.PRESETS)
 def test_planners_and_problems_of_presets_are_known(name: str, tmp_path: Path) -> None:
     pytest.importorskip("ompl")
-    stages = preset_settings(name, tmp_path)
+    stages = bench.preset_settings(name, tmp_path)
     assert stages
     for settings in stages:
         assert settings.specs and all(problem_set_name(text) for text in settings.problems)
-
-
-def test_a_smaller_count_and_further_problems(tmp_path: Path) -> None:
-    counts = [settings.count for settings in preset_settings("anytime", tmp_path, ("shelf",), count=50)]
-    assert counts == [50]
-    problems = preset_settings("anytime", tmp_path, ("shelf",))[0].problems
-    assert problems == ("rop_nontrivial", "rop_dense_nontrivial", "shelf")
+    [first, *_] = bench.preset_settings(name, tmp_path, ("shelf",), count=20)
+    assert first.problems == (*stages[0].problems, "shelf") and first.count == 20
 
 
 @pytest.mark.slow
 def test_the_command_runs_every_stage_of_a_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    preset = Preset("for tests", ("rrt_connect",), ("rop",), (0.001, 0.5), 5, equal_time=False)
-    monkeypatch.setitem(PRESETS, "small", preset)
+    preset = bench.Preset("for tests", ("rrt_connect",), ("rop",), (0.001, 0.5), 5, equal_time=False)
+    monkeypatch.setitem(bench.PRESETS, "small", preset)
     assert main(["bench", "run", "--preset", "small", "--count", "2", "--out", str(tmp_path)]) == 0
     found = read_records(tmp_path)
     limits = {record.time_limit for record in found["rrt_connect"]}
@@ -404,7 +361,7 @@ def test_the_command_runs_every_stage_of_a_preset(tmp_path: Path, monkeypatch: p
 
 def test_a_preset_in_place_of_planners_and_limits(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(InputError, match="unknown preset 'table2'; known: anytime"):
-        preset_settings("table2", tmp_path)
+        bench.preset_settings("table2", tmp_path)
     asked = ["bench", "run", "--out", str(tmp_path)]
     assert main([*asked, "--planners", "rrt_connect"]) == 2
     assert "name --planners and --problems, or a --preset" in capfd.readouterr().err

@@ -17,11 +17,10 @@ pytestmark = pytest.mark.sim
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """One problem that the line does not solve: a path, and the line."""
     case = gather_cases(["rop_nontrivial"], 1, tmp_path, lambda _: None)[0]
     problem = case.problem
     path = RRTConnect().plan(problem, 10.0).path
-    assert path is not None and isinstance(problem.goal, JointGoal)
+    assert isinstance(problem.goal, JointGoal)
     about = Record("good", *case.key, case.family, case.trivial, 0, 1.0, "solved", "", 0.01)
     line = [problem.start.tolist(), problem.goal.positions[0].tolist()]
     for record in (

@@ -7,18 +7,11 @@ import pytest
 
 pytest.importorskip("matplotlib")
 
+import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.motion_stores import random_motions, write_motions
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.evaluation import data_report
 from robotdiffuse.evaluation import data_report as report
-from robotdiffuse.evaluation.data_report import (
-    SAMPLED_WAYPOINTS,
-    facts,
-    read_figures,
-    tables,
-    write_page,
-)
-from robotdiffuse.robots import load_robot
 
 ARM = box_arm()
 
@@ -28,30 +21,26 @@ def rows():
     return random_motions(ARM, 11)
 
 
-def trivial_shares(rows):
-    free = [[row["line_free"] for row in rows if row["family"] == family] for family in (0, 1)]
-    return [np.mean(each) for each in free]
-
-
 def test_figures(tmp_path, rows):
     write_motions(tmp_path, ARM, rows, shard=4)
-    found = read_figures(tmp_path)
+    found = data_report.read_figures(tmp_path)
     costs = np.array([row["cost"] for row in rows])
     assert (found.trajectories, found.manifest.trajectories, found.shards) == (11, 11, 3)
-    assert facts(found)[:2] == [("motions", "11"), ("waypoints, evenly spaced in length", "220")]
+    assert data_report.facts(found)[:2] == [("motions", "11"), ("waypoints, evenly spaced in length", "220")]
     assert found.counts == {"tried": 17, "solved": 11, "unsolved": 3, "refused": 0, "thinned": 3}
     assert sum(found.splits.values()) == 11 and list(found.splits) == ["train", "validation", "test"]
-    _, families, spreads = tables(found)
+    _, families, spreads = data_report.tables(found)
     assert [row[:2] for row in families.rows] == [("rop", 6), ("rop_dense", 5)]
     lengths = [costs.mean(), *np.quantile(costs, [0, 0.05, 0.5, 0.95, 1])]
     assert spreads.texts[0] == ["length [rad]", *(f"{length:.3f}" for length in lengths)]
     assert spreads.texts[1][1:] == ["1.000"] * 6
     assert families.columns[5].heading == "trivial"
-    assert [row[5] for row in families.rows] == [pytest.approx(x) for x in trivial_shares(rows)]
+    free = [[row["line_free"] for row in rows if row["family"] == family] for family in (0, 1)]
+    assert [row[5] for row in families.rows] == [pytest.approx(np.mean(each)) for each in free]
     shares = np.array([row[5:13] for row in families.rows], float)
     assert np.allclose(shares[:, :4].sum(axis=1), 1) and np.allclose(shares[:, 4:].sum(axis=1), 1)
     assert found.safety_distance == pytest.approx(0.05)
-    assert [text for _, text in facts(found)[4:]] == [
+    assert [text for _, text in data_report.facts(found)[4:]] == [
         "78.6 %; of 17 tried 3 unsolved, 0 refused, 3 thinned",  # 11 of 14
         "100.0 %",
         "100.0 %",
@@ -64,13 +53,13 @@ def test_figures(tmp_path, rows):
 def test_large_sets_are_sampled_evenly(tmp_path, rows, monkeypatch):
     monkeypatch.setattr(report, "SAMPLED_MOTIONS", 4)
     write_motions(tmp_path, ARM, rows, shard=3)
-    found = read_figures(tmp_path)
+    found = data_report.read_figures(tmp_path)
     assert len(found.all["cost"]) == 11
     chosen = [rows[i] for i in (0, 2, 4, 6, 8, 10)]
     costs = [row["goal_costs"] for row in chosen]
     np.testing.assert_allclose(found.sample["goal_costs"], costs, rtol=1e-6)
     kept = found.sample["trajectories"]
-    assert kept.shape == (6, min(SAMPLED_WAYPOINTS, 20), 3)
+    assert kept.shape == (6, min(data_report.SAMPLED_WAYPOINTS, 20), 3)
     assert np.array_equal(kept[:, [0, -1]], [row["trajectories"][[0, -1]] for row in chosen])
 
 
@@ -78,7 +67,7 @@ def test_page(tmp_path, rows):
     data = tmp_path / "arm <1>"
     file = tmp_path / "report.html"
     write_motions(data, ARM, rows)
-    write_page(data, file, ARM)
+    data_report.write_page(data, file, ARM)
     page = file.read_text("utf-8")
     assert page.count("<svg") == 3
     for text in (
@@ -94,24 +83,22 @@ def test_page(tmp_path, rows):
     addresses = set(re.findall(r"""(?:src|href)=["'](.*?)["']""", page))
     assert all(address.startswith(("data:", "#")) for address in addresses), "it must open without network"
     before = file.read_bytes()
-    write_page(data, file, ARM)
+    data_report.write_page(data, file, ARM)
     assert file.read_bytes() == before
 
 
 @pytest.mark.parametrize("n", [1, 2])
 def test_page_of_hardly_any_motions(n, tmp_path, rows):
     write_motions(tmp_path, ARM, rows[:n])
-    write_page(tmp_path, tmp_path / "report.html", ARM)
+    data_report.write_page(tmp_path, tmp_path / "report.html", ARM)
 
 
 def test_bad_input(tmp_path, rows):
-    with pytest.raises(InputError, match="no data set"):
-        read_figures(tmp_path)
     write_motions(tmp_path, ARM, [])
-    with pytest.raises(InputError, match="holds no shards"):
-        read_figures(tmp_path)
+    with pytest.raises(rd.InputError, match="holds no shards"):
+        data_report.read_figures(tmp_path)
     write_motions(tmp_path, ARM, rows)
-    with pytest.raises(InputError, match=r"unknown ending '\.pdf'"):
-        write_page(tmp_path, tmp_path / "report.pdf", ARM)
-    with pytest.raises(InputError, match="fingerprint"):
-        write_page(tmp_path, tmp_path / "report.html", load_robot("panda"))
+    with pytest.raises(rd.InputError, match=r"unknown ending '\.pdf'"):
+        data_report.write_page(tmp_path, tmp_path / "report.pdf", ARM)
+    with pytest.raises(rd.InputError, match="fingerprint"):
+        data_report.write_page(tmp_path, tmp_path / "report.html", rd.load_robot("panda"))

@@ -9,82 +9,58 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
+import robotdiffuse as rd
 from helpers.example_robots import planar_arm
 from robotdiffuse.core.transforms import rotation_about, transform
-from robotdiffuse.core.types import Path, Trajectory
-from robotdiffuse.evaluation.metrics import (
-    bending,
-    log_dimensionless_jerk,
-    measured,
-    spectral_arc_length,
-    turning,
-)
+from robotdiffuse.evaluation import metrics, statistics
 from robotdiffuse.evaluation.paper import PAPER_TABLE_1
-from robotdiffuse.evaluation.statistics import (
-    Indicators,
-    bootstrap_interval,
-    compare,
-    comscores,
-    normalized,
-    wilson_interval,
-)
-from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
-from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Sphere
-from robotdiffuse.validation.validator import VerifySettings, verify
+from robotdiffuse.validation.validator import VerifySettings
 
-PANDA = load_robot("panda")
+PANDA = rd.load_robot("panda")
 ARM = planar_arm(0.5, 0.4)
 MINIMUM_JERK = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
 START = np.array([0, -0.785, 0, -2.356, 0, 1.571, 0.785])
 END = np.array([0.6, -0.4, 0.3, -2.0, 0.2, 1.8, 0.5])
 
 
-def minimum_jerk(duration: float, start: np.ndarray, end: np.ndarray, rows: int = 501) -> Trajectory:
+def minimum_jerk(duration: float, start: np.ndarray, end: np.ndarray, rows: int = 501) -> rd.Trajectory:
     s = np.linspace(0, 1, rows)
     way = np.asarray(end) - start
     p, v, a = (MINIMUM_JERK.deriv(k)(s)[:, None] * way / duration**k for k in range(3))
     names = tuple(f"j{i}" for i in range(len(way)))
-    return Trajectory(names, s * duration, start + p, v, a)
+    return rd.Trajectory(names, s * duration, start + p, v, a)
 
 
-def path_of(trajectory: Trajectory) -> Path:
-    return Path(trajectory.joint_names, trajectory.positions[[0, -1]])
+def path_of(trajectory: rd.Trajectory) -> rd.Path:
+    return rd.Path(trajectory.joint_names, trajectory.positions[[0, -1]])
 
 
 # Figures of one motion
 
 
-def test_lengths_of_an_arm_that_turns_about_its_base() -> None:
-    """Two waypoints: the arcs between them count, not the chord. The origin of l2 moves; the tip is
-    fixed to l2 and does not count as a link."""
+@pytest.mark.parametrize(
+    ("rows", "joint", "link", "tip", "turned"),
+    [
+        # the arcs between waypoints count, not the chord; the tip is fixed to l2 and does not count as a link
+        ([[0, 0], [1.5, 0]], 1.5, 1.5 * 0.5, 1.5 * 0.9, 0),
+        ([[0, 0], [0, 0.7], [0, 0]], 1.4, 0, 1.4 * 0.4, np.pi),  # l2 turns about its own origin
+        ([[0, 0], [0, 0.6], [0, 0.6], [0.6, 0.6], [0.6, 0]], 1.8, 0.3, None, np.pi),
+        ([[0, 0], [1, 1e-7], [2, 0]], 2, 1.0, None, 2e-7),
+    ],
+)
+def test_lengths_of_an_arm_of_two_links(
+    rows: list, joint: float, link: float, tip: float | None, turned: float
+) -> None:
     motion = minimum_jerk(2.0, np.zeros(2), np.array([1.5, 0.0]))
-    found = measured(ARM, path_of(motion), motion)
-    assert found["joint_length"] == pytest.approx(1.5)
-    assert found["link_length"] == pytest.approx(1.5 * 0.5, rel=3e-5)
-    assert found["tip_length"] == pytest.approx(1.5 * 0.9, rel=3e-5)
-    assert found["turning"] == 0
+    found = metrics.measured(ARM, rd.Path(motion.joint_names, np.array(rows, float)), motion)
+    assert found["joint_length"] == pytest.approx(joint)
+    assert found["link_length"] == pytest.approx(link, rel=1e-4, abs=1e-12)
+    assert tip is None or found["tip_length"] == pytest.approx(tip, rel=1e-4)
+    assert found["turning"] == pytest.approx(turned, rel=1e-6)
     assert found["duration"] == 2.0
-    # The tip's speed is 0.9 m times the joint's.
+    # the tip's speed is 0.9 m times the joint's
     assert found["sparc_tip"] == pytest.approx(found["sparc_joint"], rel=1e-9)
-
-
-def test_lengths_of_an_arm_that_turns_at_its_elbow_and_back() -> None:
-    motion = minimum_jerk(2.0, np.zeros(2), np.array([0.0, 0.7]))
-    there_and_back = Path(motion.joint_names, np.array([[0, 0], [0, 0.7], [0, 0]]))
-    found = measured(ARM, there_and_back, motion)
-    assert found["joint_length"] == pytest.approx(1.4)
-    assert found["link_length"] == pytest.approx(0, abs=1e-12)  # l2 turns about its own origin
-    assert found["tip_length"] == pytest.approx(1.4 * 0.4, rel=3e-5)
-    assert found["turning"] == pytest.approx(np.pi)
-
-
-def test_turning_is_the_sum_of_the_angles() -> None:
-    square = np.array([[0, 0], [1, 0], [1, 0], [1, 1], [0, 1], [0, 0.0]])
-    assert turning(square) == pytest.approx(1.5 * np.pi)
-    assert turning(np.array([[0, 0], [1, 1e-7], [2, 0]])) == pytest.approx(2e-7, rel=1e-6)
 
 
 def test_bending_of_a_sine_by_hand() -> None:
@@ -93,16 +69,16 @@ def test_bending_of_a_sine_by_hand() -> None:
     a = 0.003
     k = 3
     q = np.stack([u, a * np.sin(np.pi * k * u)], axis=1)
-    assert bending(q) == pytest.approx((a * (np.pi * k) ** 2) ** 2 / 2, rel=0.01)
-    assert bending(5 * q) == pytest.approx(bending(q))
-    assert bending(q[[0, -1]]) == pytest.approx(0, abs=1e-9)
+    assert metrics.bending(q) == pytest.approx((a * (np.pi * k) ** 2) ** 2 / 2, rel=0.01)
+    assert metrics.bending(5 * q) == pytest.approx(metrics.bending(q))
+    assert metrics.bending(q[[0, -1]]) == pytest.approx(0, abs=1e-9)
 
 
 @given(st.floats(0.3, 8), st.floats(0.05, 6))
 def test_dimensionless_jerk_of_minimum_jerk_is_720(duration: float, amplitude: float) -> None:
     """Whatever its duration and amplitude: the integral of the squared jerk is 720 A^2 / T^5."""
     motion = minimum_jerk(duration, np.zeros(2), np.array([0.6, 0.8]) * amplitude)
-    assert log_dimensionless_jerk(motion) == pytest.approx(np.log(720), abs=0.01)
+    assert metrics.log_dimensionless_jerk(motion) == pytest.approx(np.log(720), abs=0.01)
 
 
 def test_jerk_of_jumps_of_the_acceleration_by_hand() -> None:
@@ -112,44 +88,18 @@ def test_jerk_of_jumps_of_the_acceleration_by_hand() -> None:
     acceleration = np.where(t < 1, a, -a)
     velocity = np.where(t < 1, a * t, a * (2 - t))
     position = np.where(t < 1, a * t**2 / 2, a - a * (2 - t) ** 2 / 2)
-    motion = Trajectory(("j0",), t, position[:, None], velocity[:, None], acceleration[:, None])
+    motion = rd.Trajectory(("j0",), t, position[:, None], velocity[:, None], acceleration[:, None])
     integral = (1 + 4 + 1) * a**2 / 0.01
-    assert log_dimensionless_jerk(motion) == pytest.approx(np.log(2**5 / a**2 * integral), abs=1e-9)
+    assert metrics.log_dimensionless_jerk(motion) == pytest.approx(np.log(2**5 / a**2 * integral), abs=1e-9)
 
 
-def arc_length_by_quadrature(speed: np.polynomial.Polynomial, duration: float) -> float:
-    """Of the spectrum of a speed on [0, duration], by its definition."""
-
-    def spectrum(f: float, power: int) -> complex:
-        turn = 2 * np.pi * f
-        parts = [
-            quad(lambda t, w=w: speed(t) * t**power * w(turn * t), 0, duration, limit=200)[0]
-            for w in (np.cos, np.sin)
-        ]
-        return complex(parts[0], -parts[1])
-
-    whole = spectrum(0.0, 0).real
-    frequencies = np.arange(0.0, 10.0, 0.005 / duration)
-    values = np.array([abs(spectrum(f, 0)) / whole for f in frequencies[frequencies < 6 / duration]])
-    last = frequencies[np.flatnonzero(values >= 0.05)[-1]]
-
-    def curve(f: float) -> float:
-        v = spectrum(f, 0)
-        slope = -2j * np.pi * spectrum(f, 1)
-        return float(np.hypot(1 / last, (v.conjugate() * slope).real / abs(v) / whole))
-
-    return -quad(curve, 0, last, epsrel=1e-6)[0]
-
-
-def test_spectral_arc_length_of_minimum_jerk_by_quadrature() -> None:
-    """Side lobes of its spectrum stay below the threshold, so the duration does not matter."""
-    expected = arc_length_by_quadrature(MINIMUM_JERK.deriv(), 1.0)
-    assert expected == pytest.approx(-1.41, abs=0.01)
+def test_spectral_arc_length_of_minimum_jerk_does_not_depend_on_the_duration() -> None:
+    """Side lobes of its spectrum stay below the threshold."""
     for duration in (0.8, 1.0, 3.0, 7.3):
         motion = minimum_jerk(duration, np.zeros(2), np.array([0.6, 0.3]))
-        found = measured(ARM, path_of(motion), motion)
+        found = metrics.measured(ARM, path_of(motion), motion)
         # The last frequency is a multiple of 1 / (16 to 32 durations).
-        assert found["sparc_joint"] == pytest.approx(expected, abs=0.01)
+        assert found["sparc_joint"] == pytest.approx(-1.41, abs=0.015)
 
 
 @pytest.mark.parametrize("width", [0.1, 0.35, 1.0])
@@ -158,20 +108,20 @@ def test_spectral_arc_length_of_a_gaussian(width: float) -> None:
     speed = np.exp(-((np.arange(-6 * width, 6 * width, 0.01) / width) ** 2) / 2)
     c = np.log(20)
     expected = -quad(lambda x: np.hypot(1, 2 * c * x * np.exp(-c * x**2)), 0, 1)[0]
-    assert spectral_arc_length(speed, 0.01) == pytest.approx(expected, abs=0.01)
+    assert metrics.spectral_arc_length(speed, 0.01) == pytest.approx(expected, abs=0.01)
 
 
 def test_interrupted_and_shaking_motions_are_less_smooth() -> None:
     straight = minimum_jerk(2.0, np.zeros(2), np.array([1.0, 0.5]))
     half = minimum_jerk(1.0, np.zeros(2), np.array([0.5, 0.25]))
-    stopping = Trajectory(
+    stopping = rd.Trajectory(
         half.joint_names,
         np.concatenate([half.times, half.times[1:] + 1.0]),
         np.concatenate([half.positions, half.positions[1:] + half.positions[-1]]),
         np.concatenate([half.velocities, half.velocities[1:]]),
         np.concatenate([half.accelerations, half.accelerations[1:]]),
     )
-    smooth, stops = (measured(ARM, path_of(m), m) for m in (straight, stopping))
+    smooth, stops = (metrics.measured(ARM, path_of(m), m) for m in (straight, stopping))
     assert stops["sparc_joint"] < smooth["sparc_joint"] - 0.1
     assert stops["sparc_tip"] < smooth["sparc_tip"] - 0.1
     # Two motions of half the length in half the time: 2 * (1/2)^2 * 2^5.
@@ -181,44 +131,35 @@ def test_interrupted_and_shaking_motions_are_less_smooth() -> None:
 @pytest.mark.parametrize("rows", [np.zeros((1, 2)), np.zeros((2, 2)), np.ones((5, 2))])
 def test_a_motion_that_stands_still_has_figures(rows: np.ndarray) -> None:
     times = np.linspace(0, 0.01 * (len(rows) - 1), len(rows))
-    motion = Trajectory(("j0", "j1"), times, rows, 0 * rows, 0 * rows)
-    found = measured(ARM, Path(motion.joint_names, rows), motion)
+    motion = rd.Trajectory(("j0", "j1"), times, rows, 0 * rows, 0 * rows)
+    found = metrics.measured(ARM, rd.Path(motion.joint_names, rows), motion)
     assert found.pop("duration") == motion.duration
     assert set(found) >= {"joint_length", "link_length", "turning", "bending", "jerk", "sparc_tip"}
     assert set(found.values()) == {0.0}
 
 
-def test_a_joint_that_does_not_move_the_tip() -> None:
-    """The tip of the Panda's hand lies on the axis of its last joint."""
-    motion = minimum_jerk(1.0, START, START + np.array([0, 0, 0, 0, 0, 0, 0.5]))
-    found = measured(PANDA, path_of(motion), motion)
-    assert found["tip_length"] == pytest.approx(0, abs=1e-9)
-    assert found["sparc_tip"] == 0
-    assert found["sparc_joint"] < -1.3
-    assert found["link_length"] == pytest.approx(0, abs=1e-9)  # link 7 too; hand and fingers do not count
-
-
 def test_clearance_to_the_scene_and_to_itself_apart() -> None:
-    """A ball 5 cm above the hand's way, and the arm nearer to itself than that."""
     rows = np.stack([START, START + 0.01])
     top = link_pose(PANDA, START, "panda_link4")[:3, 3]
-    problem = Problem(PANDA, Scene([Sphere(top + np.array([0, 0, 0.4]), 0.1)]), START, JointGoal(rows[1:]))
-    path = Path(PANDA.joint_names, rows)
-    verdict = verify(problem, path)
-    found = measured(PANDA, path, None, verdict)
+    problem = rd.Problem(
+        PANDA, rd.Scene([rd.Sphere(top + np.array([0, 0, 0.4]), 0.1)]), START, rd.JointGoal(rows[1:])
+    )
+    path = rd.Path(PANDA.joint_names, rows)
+    verdict = rd.verify(problem, path)
+    found = metrics.measured(PANDA, path, None, verdict)
     apart = found["scene_clearance"], found["self_clearance"]
     assert apart == pytest.approx((verdict.scene_clearance, verdict.self_clearance), rel=1e-6)
     assert found["min_clearance"] == min(apart) and 0.05 < apart[0] < 0.3
-    assert "scene_clearance" not in measured(PANDA, path)
+    assert "scene_clearance" not in metrics.measured(PANDA, path)
 
 
 def test_figures_do_not_depend_on_the_rows_of_a_trajectory() -> None:
     coarse, fine = (minimum_jerk(1.234, START, END, rows) for rows in (200, 2000))
-    a, b = (measured(PANDA, path_of(m), m) for m in (coarse, fine))
+    a, b = (metrics.measured(PANDA, path_of(m), m) for m in (coarse, fine))
     assert a["jerk"] == pytest.approx(b["jerk"], abs=0.002)
     assert (a["sparc_joint"], a["sparc_tip"]) == pytest.approx((b["sparc_joint"], b["sparc_tip"]), abs=1e-3)
-    fine_path = Path(fine.joint_names, fine.positions)
-    along = measured(PANDA, fine_path, fine)
+    fine_path = rd.Path(fine.joint_names, fine.positions)
+    along = metrics.measured(PANDA, fine_path, fine)
     assert (a["link_length"], a["tip_length"]) == pytest.approx(
         (along["link_length"], along["tip_length"]), rel=1e-4
     )
@@ -227,10 +168,9 @@ def test_figures_do_not_depend_on_the_rows_of_a_trajectory() -> None:
 # The paper's criteria of success, on the Panda: each alone is what makes the validator refuse
 
 
-def panda_verdict(rows: np.ndarray, goal: PoseGoal | None = None, **settings: float) -> str:
-    """The kind of the violation; empty for a success."""
-    problem = Problem(PANDA, Scene(), rows[0], goal or JointGoal(rows[-1:]))
-    report = verify(problem, Path(PANDA.joint_names, rows), VerifySettings(**settings))  # type: ignore[arg-type]
+def panda_verdict(rows: np.ndarray, goal: rd.PoseGoal | None = None, **settings: float) -> str:
+    problem = rd.Problem(PANDA, rd.Scene(), rows[0], goal or rd.JointGoal(rows[-1:]))
+    report = rd.verify(problem, rd.Path(PANDA.joint_names, rows), VerifySettings(**settings))  # type: ignore[arg-type]
     assert report.valid == (report.violation is None)
     return "" if report.violation is None else report.violation.kind
 
@@ -242,7 +182,7 @@ def test_one_centimeter_and_fifteen_degrees_are_settings(shift: float, angle: fl
     axis = np.array([0.6, 0.0, 0.8])
     T = link_pose(PANDA, END, "panda_hand")
     T = transform(T[:3, 3] + shift * axis, rotation_about(axis, np.radians(angle)) @ T[:3, :3])
-    goal = PoseGoal("panda_hand", T)
+    goal = rd.PoseGoal("panda_hand", T)
     rows = np.stack([START, END])
     assert panda_verdict(rows, goal) == kind
     loose = {"goal_distance": 0.012, "goal_angle": float(np.radians(17))}
@@ -251,20 +191,15 @@ def test_one_centimeter_and_fifteen_degrees_are_settings(shift: float, angle: fl
     assert panda_verdict(rows, goal, **strict) == "goal"
 
 
-@pytest.mark.parametrize("joint", range(7))
-@pytest.mark.parametrize("upper", [False, True])
-def test_exceeded_limits_fail(joint: int, upper: bool) -> None:
-    """A millirad beyond each limit on the way; a motion to the limit itself is a success."""
+@pytest.mark.parametrize(("joint", "sign"), [(0, 1), (1, -1), (6, 1)])
+def test_exceeded_limits_fail(joint: int, sign: int) -> None:
     base = np.array([0, 0, 0, -2.0, 0, 1.571, 0.785])
-    if joint == 3 and not upper:
-        base = START  # bent back, so that closing the elbow does not put the hand into the base
-    at = base.copy()
-    beyond = base.copy()
-    at[joint] = (PANDA.upper if upper else PANDA.lower)[joint]
-    beyond[joint] = at[joint] + (1e-3 if upper else -1e-3)
-    assert panda_verdict(np.stack([base, at, base])) == ""
-    assert panda_verdict(np.stack([base, beyond, base])) == "limits"
-    assert panda_verdict(np.stack([base, beyond, base]), limit_slack=2e-3) == ""
+    rows = np.stack([base, base, base])
+    rows[1, joint] = (PANDA.upper if sign > 0 else PANDA.lower)[joint]
+    assert panda_verdict(rows) == ""
+    rows[1, joint] += 1e-3 * sign
+    assert panda_verdict(rows) == "limits"
+    assert panda_verdict(rows, limit_slack=2e-3) == ""
 
 
 # Statistics
@@ -275,28 +210,21 @@ def test_exceeded_limits_fail(joint: int, upper: bool) -> None:
     [
         # R. G. Newcombe 1998, table 1, method 3
         (81, 263, 0.2553, 0.3662),
-        (15, 148, 0.0624, 0.1605),
         (0, 20, 0.0, 0.1611),
         (1, 29, 0.0061, 0.1718),
+        (0, 0, 0.0, 1.0),
     ],
 )
 def test_wilson_interval(successes: int, n: int, low: float, high: float) -> None:
-    assert wilson_interval(successes, n) == pytest.approx((low, high), abs=5e-5)
-
-
-def test_wilson_interval_solves_its_equation() -> None:
-    """At both ends p the share lies 1.96 standard errors of p away, for 95 %."""
-    for p in wilson_interval(30, 70):
-        assert abs(30 / 70 - p) / np.sqrt(p * (1 - p) / 70) == pytest.approx(1.959964, abs=1e-5)
-    assert wilson_interval(0, 0) == (0.0, 1.0)
+    assert statistics.wilson_interval(successes, n) == pytest.approx((low, high), abs=5e-5)
 
 
 def test_bootstrap_of_the_mean_has_the_normal_width() -> None:
     values = np.random.default_rng(1).normal(3.0, 2.0, 400)
-    low, high = bootstrap_interval(values)
+    low, high = statistics.bootstrap_interval(values)
     half = 1.96 * values.std() / 20
     assert (low, high) == pytest.approx((values.mean() - half, values.mean() + half), abs=0.02)
-    assert bootstrap_interval(values) == (low, high)
+    assert statistics.bootstrap_interval(values) == (low, high)
 
 
 def test_paired_success_is_the_exact_test_of_mcnemar() -> None:
@@ -304,7 +232,7 @@ def test_paired_success_is_the_exact_test_of_mcnemar() -> None:
     b = np.full(100, np.nan)
     a[:80] = b[:80] = 2.0
     b[80:85] = a[85:97] = 2.0
-    found = compare(a, b)
+    found = statistics.compare(a, b)
     assert (found.a_only, found.b_only, found.both, found.neither) == (12, 5, 80, 3)
     assert found.p_success == pytest.approx(2 * sum(comb(17, k) for k in range(6)) / 2**17)
     assert (found.ratio, found.ratio_interval, found.p_length) == (1.0, (1.0, 1.0), 1.0)
@@ -314,24 +242,24 @@ def test_paired_lengths_are_the_signed_ranks_of_wilcoxon() -> None:
     """C. Darwin's maize: ranks 24 against 96, of which 1,352 of the 2^15 signs are as far from even."""
     differences = np.array([6, 8, 14, 16, 23, 24, 28, 29, 41, -48, 49, 56, 60, -67, 75])
     lengths = np.random.default_rng(0).uniform(1, 9, 15)
-    found = compare(lengths * np.exp(differences / 1000), lengths)
+    found = statistics.compare(lengths * np.exp(differences / 1000), lengths)
     assert found.p_length == pytest.approx(0.041259765625)
     assert found.ratio == pytest.approx(np.exp(0.024))
     assert found.ratio is not None and found.ratio_interval is not None
     assert np.exp(0.006) <= found.ratio_interval[0] < found.ratio < found.ratio_interval[1] <= np.exp(0.056)
-    back = compare(lengths, lengths * np.exp(differences / 1000))
+    back = statistics.compare(lengths, lengths * np.exp(differences / 1000))
     assert back.p_length == found.p_length
     assert back.ratio == pytest.approx(np.exp(-0.024))
-    assert compare(np.full(6, 1.1), np.full(6, 1.0)).p_length == pytest.approx(2 / 2**6)
+    assert statistics.compare(np.full(6, 1.1), np.full(6, 1.0)).p_length == pytest.approx(2 / 2**6)
 
 
 def test_paired_without_common_solutions() -> None:
-    found = compare(np.array([1.0, np.nan, np.nan]), np.array([np.nan, 1.0, np.nan]))
+    found = statistics.compare(np.array([1.0, np.nan, np.nan]), np.array([np.nan, 1.0, np.nan]))
     assert (found.a_only, found.b_only, found.both, found.neither) == (1, 1, 0, 1)
     assert (found.p_success, found.ratio, found.ratio_interval, found.p_length) == (1.0, None, None, 1.0)
-    none = compare(np.zeros(0), np.zeros(0))
+    none = statistics.compare(np.zeros(0), np.zeros(0))
     assert (none.neither, none.p_success, none.ratio) == (0, 1.0, None)
-    still = compare(np.zeros(3), np.zeros(3))  # start and goal are the same
+    still = statistics.compare(np.zeros(3), np.zeros(3))  # start and goal are the same
     assert (still.ratio, still.p_length) == (1.0, 1.0)
 
 
@@ -342,7 +270,7 @@ PAPER = [row.indicators for row in PAPER_TABLE_1]
 
 
 def test_comscore_of_the_papers_table() -> None:
-    scores = comscores(PAPER)
+    scores = statistics.comscores(PAPER)
     by_hand = [
         (0 + 1 + (18.492 - 15.037) / 4.35 + 0) / 4,
         (11.2 / 14.1 + 0 + 0 + 0) / 4,
@@ -355,23 +283,14 @@ def test_comscore_of_the_papers_table() -> None:
 
 
 def test_where_all_are_equal_all_are_best() -> None:
-    same = Indicators(90.0, 0.0, 5.0, 1.0)
-    np.testing.assert_array_equal(comscores([same]), [1.0])
-    np.testing.assert_array_equal(comscores([same, same]), [1.0, 1.0])
-    np.testing.assert_array_equal(comscores([same, replace(same, length=6.0)]), [1.0, 0.75])
-    assert comscores([]).shape == (0,)
-
-
-def test_unknown_figures_count_as_the_worst() -> None:
-    nothing = Indicators(0.0, 0.0, np.nan, 10.0)
-    rows = [Indicators(90.0, 2.0, 5.0, 1.0), Indicators(95.0, 1.0, 7.0, 3.0), nothing]
+    same = statistics.Indicators(90.0, 0.0, 5.0, 1.0)
+    np.testing.assert_array_equal(statistics.comscores([same, same]), [1.0, 1.0])
+    np.testing.assert_array_equal(statistics.comscores([same, replace(same, length=6.0)]), [1.0, 0.75])
+    assert statistics.comscores([]).shape == (0,)
+    # unknown figures count as the worst
+    nothing = statistics.Indicators(0.0, 0.0, np.nan, 10.0)
+    rows = [statistics.Indicators(90.0, 2.0, 5.0, 1.0), statistics.Indicators(95.0, 1.0, 7.0, 3.0), nothing]
     np.testing.assert_allclose(
-        normalized(rows), [[90 / 95, 0, 1, 1], [1, 0.5, 0, 7 / 9], [0, 1, 0, 0]], rtol=1e-12
+        statistics.normalized(rows), [[90 / 95, 0, 1, 1], [1, 0.5, 0, 7 / 9], [0, 1, 0, 0]]
     )
-    np.testing.assert_array_equal(normalized([nothing, nothing])[:, 2], [0, 0])
-
-
-@given(st.lists(st.tuples(*[st.floats(0, 1e3)] * 4), min_size=1, max_size=6))
-def test_scores_lie_between_0_and_1(rows: list[tuple[float, float, float, float]]) -> None:
-    scores = comscores([Indicators(*row) for row in rows])
-    assert ((scores >= -1e-12) & (scores <= 1 + 1e-12)).all()
+    np.testing.assert_array_equal(statistics.normalized([nothing, nothing])[:, 2], [0, 0])

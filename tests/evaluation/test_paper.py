@@ -2,100 +2,78 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+import robotdiffuse as rd
 from robotdiffuse.cli import main
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.evaluation import paper
-from robotdiffuse.evaluation.paper import (
-    JOINT,
-    PAPER_TABLE_1,
-    POSE,
-    ROWS,
-    Row,
-    Table1Settings,
-    draw_problem,
-    free_lines,
-    goal_configurations,
-    problem_file,
-    write_problems,
-)
 from robotdiffuse.evaluation.runs import read_records
 from robotdiffuse.evaluation.statistics import Indicators, comscores
-from robotdiffuse.learning.denoisers import CrossAttentionSettings
-from robotdiffuse.learning.encoders import CompressionAutoencoderSettings, PointsSettings
+from robotdiffuse.learning.denoisers import DENOISERS
+from robotdiffuse.learning.encoders import ENCODERS
 from robotdiffuse.learning.motion_model import MotionModelSettings
 from robotdiffuse.learning.weight_files import BUNDLED, FORMAT
-from robotdiffuse.problems.goals import PoseGoal
 from robotdiffuse.problems.held_out import CaseFile
 from robotdiffuse.validation.tolerances import goal_error
 
-ROW_NAMES = {row.paper: row.name for row in ROWS if row.paper}
+ROW_NAMES = {row.paper: row.name for row in paper.ROWS if row.paper}
 
 
 def test_scores_are_the_papers_and_further_rows_replace_its_method() -> None:
-    of = {ROW_NAMES[row.name]: row.indicators for row in PAPER_TABLE_1}
-    printed = comscores([row.indicators for row in PAPER_TABLE_1])
+    of = {ROW_NAMES[row.name]: row.indicators for row in paper.PAPER_TABLE_1}
+    printed = comscores([row.indicators for row in paper.PAPER_TABLE_1])
     further = Indicators(100.0, 0.0, 14.0, 1.0)
-    found = paper.scores(ROWS, of | {"aorrtc": further})
-    for row, score in zip(PAPER_TABLE_1, printed, strict=True):
+    found = paper.scores(paper.ROWS, of | {"aorrtc": further})
+    for row, score in zip(paper.PAPER_TABLE_1, printed, strict=True):
         assert found[ROW_NAMES[row.name]] == pytest.approx(score)
     assert found["aorrtc"] == 1.0  # the best in all four
 
 
 def test_the_papers_method_has_a_row_only_with_weights_that_see_the_code_alone(tmp_path: Path) -> None:
-    assert Table1Settings(tmp_path).rows == ROWS
-    with_weights = Table1Settings(tmp_path, paper_weights=str(BUNDLED / "panda"))
-    with pytest.raises(InputError, match="whose inputs include clearances"):
+    assert paper.Table1Settings(tmp_path).rows == paper.ROWS
+    with_weights = paper.Table1Settings(tmp_path, paper_weights=str(BUNDLED / "panda"))
+    with pytest.raises(rd.InputError, match="whose inputs include clearances"):
         paper.run_table1(with_weights, lambda _: None, lambda *_: None)
-    assert paper.NO_WEIGHTS in paper.notes(Table1Settings(tmp_path))
+    assert paper.NO_WEIGHTS in paper.notes(paper.Table1Settings(tmp_path))
 
 
 @pytest.mark.parametrize(
-    ("settings", "name"),
+    ("parts", "name"),
     [
-        (
-            MotionModelSettings(
-                encoder="points",
-                encoder_settings=PointsSettings(),
-                denoiser="cross_attention",
-                denoiser_settings=CrossAttentionSettings(),
-            ),
-            f"{paper.WITHOUT_CLEARANCES}: points, cross_attention, 50 % of 1.6 M samples",
-        ),
-        (
-            MotionModelSettings(
-                waypoints=254,
-                encoder="compression_autoencoder",
-                encoder_settings=CompressionAutoencoderSettings(),
-            ),
-            f"{paper.AS_IN_PAPER}: compression_autoencoder, transformer, 50 % of 1.6 M samples",
-        ),
+        ({"encoder": "points", "denoiser": "cross_attention"}, paper.WITHOUT_CLEARANCES),
+        ({"waypoints": 254, "encoder": "compression_autoencoder"}, paper.AS_IN_PAPER),
     ],
 )
-def test_the_row_of_weights_says_what_they_are(
-    settings: MotionModelSettings, name: str, tmp_path: Path
-) -> None:
+def test_the_row_of_weights_says_what_they_are(parts: dict[str, Any], name: str, tmp_path: Path) -> None:
+    defaults = {"encoder_settings": ENCODERS.defaults(parts["encoder"])}
+    if "denoiser" in parts:
+        defaults["denoiser_settings"] = DENOISERS.defaults(parts["denoiser"])
+    settings = MotionModelSettings(**parts, **defaults)
     about = {"format": FORMAT, "settings": settings.to_json(), "training": {"samples": 800_000.0}}
     (tmp_path / "model.json").write_text(json.dumps(about))
-    guided, unguided = Table1Settings(tmp_path, paper_weights=str(tmp_path)).rows[5:7]
-    assert guided == Row(name, f"diffusion@{tmp_path}:samples=1:repeat=false")
+    guided, unguided = paper.Table1Settings(tmp_path, paper_weights=str(tmp_path)).rows[5:7]
+    name = f"{name}: {parts['encoder']}, {settings.denoiser}, 50 % of 1.6 M samples"
+    assert guided == paper.Row(name, f"diffusion@{tmp_path}:samples=1:repeat=false")
     unguided_planner = f"diffusion@{tmp_path}:samples=1:guidance_steps=0:repeat=false"
-    assert unguided == Row(f"{name}, no guidance", unguided_planner)
+    assert unguided == paper.Row(f"{name}, no guidance", unguided_planner)
 
 
 def test_a_limit_that_no_sample_keeps_is_refused_before_the_first_call(tmp_path: Path) -> None:
-    settings = Table1Settings(tmp_path, time_limit=1e-4, paper_weights="panda_points")
-    with pytest.raises(InputError, match=r"single sample takes about .* denoising steps"):
+    settings = paper.Table1Settings(tmp_path, time_limit=1e-4, paper_weights="panda_points")
+    with pytest.raises(rd.InputError, match=r"single sample takes about .* denoising steps"):
         paper.run_table1(settings, lambda _: None, lambda *_: None)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
 def test_a_small_page_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    lines = Row(ROWS[4].name, "straight_line", paper.OURS), Row("nearest", "straight_line:goals=nearest")
+    lines = (
+        paper.Row(paper.ROWS[4].name, "straight_line", paper.OURS),
+        paper.Row("nearest", "straight_line:goals=nearest"),
+    )
     monkeypatch.setattr(paper, "ROWS", lines)
     command = ["reproduce", "table1", "--out", str(tmp_path), "--problems", "3", "--time-limit", "2"]
     assert main(command) == 0 and main(command) == 0
@@ -107,30 +85,30 @@ def test_a_small_page_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_both_goals_are_of_one_problem() -> None:
-    drawn = draw_problem(3)
-    pose = drawn[POSE]
-    joint = drawn[JOINT]
-    assert isinstance(pose.goal, PoseGoal)
+    drawn = paper.draw_problem(3)
+    pose = drawn[paper.POSE]
+    joint = drawn[paper.JOINT]
+    assert isinstance(pose.goal, rd.PoseGoal)
     np.testing.assert_array_equal(pose.start, joint.start)
-    configuration = goal_configurations(joint)[0]
+    configuration = paper.goal_configurations(joint)[0]
     assert goal_error(pose.robot, pose.goal, configuration) is None
-    several = goal_configurations(pose)
+    several = paper.goal_configurations(pose)
     assert 2 <= len(several) <= 10
     assert all(goal_error(pose.robot, pose.goal, q) is None for q in several)
-    lengths = [length for length in free_lines(pose, several) if length is not None]
+    lengths = [length for length in paper.free_lines(pose, several) if length is not None]
     assert lengths == sorted(lengths)
 
 
 def test_problems_are_written_once(tmp_path: Path) -> None:
     said: list[str] = []
-    write_problems(tmp_path, 2, said.append)
-    before = problem_file(tmp_path, POSE).read_bytes()
-    write_problems(tmp_path, 2, said.append)
-    assert len(said) == 1 and problem_file(tmp_path, POSE).read_bytes() == before
-    cases = CaseFile(problem_file(tmp_path, POSE)).cases()
+    paper.write_problems(tmp_path, 2, said.append)
+    before = paper.problem_file(tmp_path, paper.POSE).read_bytes()
+    paper.write_problems(tmp_path, 2, said.append)
+    assert len(said) == 1 and paper.problem_file(tmp_path, paper.POSE).read_bytes() == before
+    cases = CaseFile(paper.problem_file(tmp_path, paper.POSE)).cases()
     assert len(cases) == 2 and not any(case.trivial for case in cases)
     for case in cases:
-        assert not any(free_lines(case.problem, goal_configurations(case.problem)))
+        assert not any(paper.free_lines(case.problem, paper.goal_configurations(case.problem)))
     numbers = [int(case.name.removeprefix("rop_pose/")) for case in cases]
     assert numbers == sorted(numbers)
-    assert paper.trivial_share(tmp_path, POSE) == 1 - 2 / (numbers[1] + 1)
+    assert paper.trivial_share(tmp_path, paper.POSE) == 1 - 2 / (numbers[1] + 1)

@@ -7,22 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.types import Path as Motion
 from robotdiffuse.evaluation.methods import planned, restarted, sampled
 from robotdiffuse.evaluation.runs import Fields, Record, Run, run_all
 from robotdiffuse.planning.search.rrt import RRTConnect
 from robotdiffuse.problems.held_out import Case
-from robotdiffuse.problems.problem import JointGoal, Problem
-from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Sphere
 
-PANDA = load_robot("panda")
+PANDA = rd.load_robot("panda")
 START = np.array([-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 GOAL = START * np.array([-1, 1, 1, 1, 1, 1, 1])
-FREE = Problem(PANDA, Scene([]), START, JointGoal(GOAL[None]))
-BLOCKED = Problem(PANDA, Scene([Sphere([0.5, 0.0, 0.5], 0.2)]), START, JointGoal(GOAL[None]))
+FREE = rd.Problem(PANDA, rd.Scene([]), START, rd.JointGoal(GOAL[None]))
+BLOCKED = rd.Problem(PANDA, rd.Scene([rd.Sphere([0.5, 0.0, 0.5], 0.2)]), START, rd.JointGoal(GOAL[None]))
 LENGTH_OF_LINE = float(np.linalg.norm(GOAL - START))
 CASES = [
     Case(name, "free", problem, trivial, LENGTH_OF_LINE, "mine")
@@ -48,14 +45,21 @@ def test_methods_take_turns_on_each_case_with_the_same_random_numbers() -> None:
     assert found["x"][0].reference == LENGTH_OF_LINE and found["x"][0].workers == 1
 
 
-def test_what_is_kept_is_not_made_again(tmp_path: Path) -> None:
+def test_what_is_kept_is_not_made_again_also_after_an_interruption(tmp_path: Path) -> None:
     calls: list[tuple[str, str, int]] = []
-    first = run_all(CASES[:1], quick(1.0, calls), folder=tmp_path, bar=False)
-    again = run_all(CASES, quick(2.0, calls), folder=tmp_path, bar=False)
-    assert calls == [("x", "a", 0), ("y", "a", 0), ("x", "b", 0), ("y", "b", 0)]
-    assert again["x"][0] == first["x"][0]
-    backwards = run_all(CASES[::-1], quick(3.0, calls), folder=tmp_path, bar=False)
-    assert len(calls) == 4 and [record.name for record in backwards["x"]] == ["b", "a"]
+
+    def stopping(run: Run) -> Iterator[Fields]:
+        if run.case.name == "b":
+            raise KeyboardInterrupt
+        return quick(1.0, calls)["x"](run)
+
+    with pytest.raises(KeyboardInterrupt):
+        run_all(CASES, {"x": stopping}, folder=tmp_path, bar=False)
+    again = run_all(CASES, {"x": quick(2.0, calls)["x"]}, folder=tmp_path, bar=False)
+    assert calls == [("x", "a", 0), ("x", "b", 0)]
+    assert [int(record.joint_length or 0) for record in again["x"]] == [1, 2]
+    backwards = run_all(CASES[::-1], {"x": quick(3.0, calls)["x"]}, folder=tmp_path, bar=False)
+    assert len(calls) == 2 and [record.name for record in backwards["x"]] == ["b", "a"]
 
 
 def test_another_time_limit_is_another_run(tmp_path: Path) -> None:
@@ -68,20 +72,6 @@ def test_another_time_limit_is_another_run(tmp_path: Path) -> None:
     assert len(calls) == 4
 
 
-def test_interrupted_runs_continue(tmp_path: Path) -> None:
-    calls: list[tuple[str, str, int]] = []
-
-    def stopping(run: Run) -> Iterator[Fields]:
-        if run.case.name == "b":
-            raise KeyboardInterrupt
-        yield {"status": "solved", "time": 0.1}
-
-    with pytest.raises(KeyboardInterrupt):
-        run_all(CASES, {"x": stopping}, folder=tmp_path, bar=False)
-    run_all(CASES, {"x": quick(1.0, calls)["x"]}, folder=tmp_path, bar=False)
-    assert calls == [("x", "b", 0)]
-
-
 def test_samples_are_validated_as_they_are_and_the_shortest_that_passes_is_measured() -> None:
     def draw(run: Run, checker: CollisionChecker) -> np.ndarray:
         middle = (START + GOAL) / 2
@@ -92,9 +82,8 @@ def test_samples_are_validated_as_they_are_and_the_shortest_that_passes_is_measu
 
     free, blocked = run_all(CASES, {"x": sampled(draw)}, bar=False)["x"]
     assert free.solved and free.passed == pytest.approx(2 / 3)
-    assert free.joint_length == pytest.approx(2 * np.hypot(LENGTH_OF_LINE / 2, 0.2), rel=1e-5), (
-        "with exact ends"
-    )
+    with_exact_ends = 2 * np.hypot(LENGTH_OF_LINE / 2, 0.2)
+    assert free.joint_length == pytest.approx(with_exact_ends, rel=1e-5)
     assert {"scene_clearance", "link_length", "turning"} <= free.measures.keys()
     assert blocked.status == "no_path" and blocked.passed == 0.0 and blocked.collided == 1.0
 
@@ -109,7 +98,7 @@ def test_a_planner_in_this_process_gives_the_bench_records() -> None:
 
 def test_a_motion_that_stands_still_is_not_planned_again() -> None:
     """A length of 0 counted as no path."""
-    problem = Problem(PANDA, Scene(), START, JointGoal(START[None]))
+    problem = rd.Problem(PANDA, rd.Scene(), START, rd.JointGoal(START[None]))
     found = RRTConnect().plan(problem, time_limit=2.0, seed=0)
     first = replace(found, path=Motion(PANDA.joint_names, START[None]))
     again, best = restarted(RRTConnect(), problem, 0, 2.0, first, {})

@@ -16,8 +16,7 @@ from robotdiffuse.processes import workers as module
 from robotdiffuse.processes.workers import EndedError, OverrunError, Worker, Workers, allow, cancelled, renew
 
 ROOT = Path(__file__).parents[2]
-HELD = 60
-"""Longer than a worker may outlive its parent [s]."""
+HELD = 60  # longer than a worker may outlive its parent [s]
 
 
 def test_a_single_worker_is_replaced_when_it_dies_or_is_ended() -> None:
@@ -58,10 +57,6 @@ def renewed() -> int:
     return os.getpid()
 
 
-def no_answer() -> object:
-    return lambda: None
-
-
 class OddError(Exception):
     def __init__(self, one: int, two: int) -> None:
         super().__init__(f"{one} and {two}")
@@ -93,7 +88,7 @@ def test_errors_of_calls_keep_the_process() -> None:
             worker.call(divmod, 1, 0)
         assert "in a worker process" in raised.value.__notes__[0]
         with pytest.raises(Exception, match="pickle"):
-            worker.call(no_answer)
+            worker.call(eval, "lambda: None")
         with pytest.raises(Exception, match="pickle"):
             worker.call(print, lambda: None)
         with pytest.raises(TypeError):
@@ -131,7 +126,6 @@ def test_running_and_waiting_calls_are_cancelled(monkeypatch: pytest.MonkeyPatch
 
 
 def fail_without(file: str) -> bool:
-    """Whether this made the file; a second call has to fail."""
     new = not os.path.exists(file)
     Path(file).write_text("")
     return new
@@ -165,10 +159,7 @@ def test_a_worker_in_compiled_code_does_not_outlive_a_killed_parent() -> None:
         assert parent.stdout.readline() == "begun\n" and worker.exists()
         time.sleep(0.5)  # for the call to begin
         parent.kill()
-        until = time.monotonic() + HELD / 4
-        while worker.exists():
-            assert time.monotonic() < until, "it lives as long as its call"
-            time.sleep(0.02)
+        waiting.until(lambda: not worker.exists(), HELD / 4)
 
 
 CHECKS = """
@@ -181,28 +172,17 @@ except InputError as error:
 """
 
 
-@pytest.mark.parametrize("by", ["file", "stdin", "text"])
-def test_shared_calls_of_a_script_that_processes_cannot_import_say_what_to_do(
-    by: str, tmp_path: Path
-) -> None:
-    script = tmp_path / "script.py"
-    script.write_text(CHECKS)
-    arguments = {"file": [str(script)], "stdin": ["-"], "text": ["-c", CHECKS]}[by]
-    command = [sys.executable, *arguments]
+@pytest.mark.parametrize("by", ["-", "-c"])
+def test_shared_calls_of_a_script_that_processes_cannot_import_say_what_to_do(by: str) -> None:
+    command = [sys.executable, by, *([CHECKS] if by == "-c" else [])]
     ended = subprocess.run(command, input=CHECKS, capture_output=True, text=True, timeout=500, check=True)
-    if by == "text":
-        assert ended.stdout == "[(0, 1), (1, 2)]\n"
-    else:
-        assert ended.stdout.endswith('below the line: if __name__ == "__main__":\n')
-
-
-def slowly(seconds: float) -> None:
-    time.sleep(seconds)
+    expected = 'below the line: if __name__ == "__main__":\n' if by == "-" else "[(0, 1), (1, 2)]\n"
+    assert ended.stdout.endswith(expected)
 
 
 def test_calls_while_the_first_process_starts_wait_for_it() -> None:
     """A call that came meanwhile started the process again: both read the answers of one connection."""
-    with Workers(1, slowly, (0.5,), keep_ready=True) as workers:
+    with Workers(1, time.sleep, (0.5,), keep_ready=True) as workers:
         starting = threading.Thread(target=workers.start)
         starting.start()
         time.sleep(0.1)
