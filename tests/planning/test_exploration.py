@@ -19,7 +19,7 @@ from robotdiffuse.perception.visibility import surface_balls
 from robotdiffuse.perception.voxel_grid import MAP, sweep
 from robotdiffuse.planning.exploration import simulated
 from robotdiffuse.planning.exploration.looks import ReachableTree, best_looks
-from robotdiffuse.planning.exploration.seen_free import GoalSeen, hardly_seen, not_seen_free
+from robotdiffuse.planning.exploration.seen_free import GoalSeen, not_seen_free
 from robotdiffuse.planning.exploration.steps import DONE
 from robotdiffuse.planning.exploration.stopping import braked
 from robotdiffuse.robots.kinematics import link_pose, placed_spheres
@@ -134,14 +134,6 @@ def test_nothing_further_than_the_margin_from_a_goal_is_exempt() -> None:
             way = points[: beyond[0] + 1]
             assert any((tree.query(way)[0] <= size + 1e-6).any() for tree, size in trees)
     assert outside > 100
-
-
-def test_goals_that_were_hardly_seen() -> None:
-    one = explorer(seen=False)
-    assert hardly_seen(one.map, HOME, RIGHT)
-    assert not hardly_seen(one.map, HOME, HOME)
-    one.map.declare_free(((-1.0, -1.0, -0.4), (1.0, 1.0, 1.1)))
-    assert not hardly_seen(one.map, HOME, RIGHT)
 
 
 def test_looks_see_what_is_wanted() -> None:
@@ -336,16 +328,6 @@ def test_steps_and_views_are_kept_with_their_times() -> None:
     assert [view.camera for view in explorer.views[:2]] == [None, 0], "that beside the arm, then its own"
     assert any(act.step.kind == "look" for act in acts)
     assert all((act.T_base_camera is not None) == (act.step.kind == "look") for act in acts)
-
-
-def test_what_was_known_is_the_map_of_the_views_until_then() -> None:
-    problem, explorer = recorded()
-    again = rd.Explorer(problem.robot, explorer.cameras, rd.Scene([FLOOR]), ZONE)
-    for view in explorer.views[:3]:
-        again.observe(view.view)
-        np.testing.assert_array_equal(view.occupied, again.map.occupied)
-        np.testing.assert_array_equal(view.free, again.map.free)
-        np.testing.assert_array_equal(view.unknown, again.map.unknown)
 
 
 FROM, TO = (np.array([turn, *HOME[1:]]) for turn in (1.0, -0.9))

@@ -135,10 +135,7 @@ def test_short_lines_and_turns_about_the_tool_point(way: float, turn: float, ang
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (
-            lambda space: space.plan_line([np.eye(4)] * 2, "ready"),
-            "pose is 2 poses; a line has one end",
-        ),
+        (lambda space: space.plan_line([np.eye(4)] * 2, "ready"), "pose is 2 poses; a line has one end"),
         (lambda space: space.move("bal", np.eye(4)), "unknown obstacle 'bal'; known: ball"),
         (lambda space: space.move("ball", np.eye(3)), "T_world_shape is .*; it must be 4 x 4"),
         (lambda space: space.attach("cup", READY), "unknown obstacle 'cup'"),

@@ -7,7 +7,6 @@ import pytest
 
 import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.learning.diffusion import SAMPLERS
 from robotdiffuse.learning.encoders import DGCNNSettings
 from robotdiffuse.learning.exported_model import ExportedModel
 from robotdiffuse.learning.motion_model import MotionModelSettings
@@ -121,13 +120,6 @@ def test_an_encoder_of_one_size_gets_clouds_of_that_size(monkeypatch: pytest.Mon
     monkeypatch.setattr(model, "encode", z)
     encode(model, CollisionChecker(PANDA, PROBLEM.scene), 320, np.random.default_rng(0))
     assert sizes == [50]
-
-
-@pytest.mark.parametrize("sampler", SAMPLERS)
-def test_any_sampler_plans(sampler: str) -> None:
-    planner = Diffusion(DiffusionSettings(sampler=sampler, guided_share=1.0, sampling_steps=8))
-    result = planner.plan(PROBLEM, time_limit=60.0)
-    assert result.stage == "network" and result.path is not None and rd.verify(PROBLEM, result.path).valid
 
 
 def test_a_point_cloud_in_place_of_shapes() -> None:

@@ -16,13 +16,7 @@ from robotdiffuse.perception import voxel_grid
 from robotdiffuse.perception.depth_view import SeenPoints
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
-from robotdiffuse.perception.unknown_space import (
-    CARVING_MARGIN,
-    PADDINGS,
-    RATES,
-    OccupiedVoxels,
-    Padded,
-)
+from robotdiffuse.perception.unknown_space import CARVING_MARGIN, PADDINGS, RATES, OccupiedVoxels, Padded
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.pipeline import attempt, unknown_space
 from robotdiffuse.planning.planner import Planner
@@ -115,13 +109,6 @@ def test_occupied_crosses_nothing_unknown_but_at_the_ends(planner: Planner) -> N
     assert unknown.any() and not (swept & unknown).any()
 
 
-def test_goals_given_as_a_pose(planner: Planner) -> None:
-    goal = rd.PoseGoal(PANDA.tip, link_pose(PANDA, GOAL, PANDA.tip))
-    problem = replace(partial("padded"), goal=goal)
-    result = planner.plan(problem, time_limit=3.0)
-    assert result.path is not None and rd.verify(problem, result.path).valid
-
-
 def test_an_end_in_what_was_seen_is_named(planner: Planner) -> None:
     blocked = rd.Scene([rd.Box(link_pose(PANDA, GOAL, PANDA.tip)[:3, 3], [0.3, 0.3, 0.3])])
     result = planner.plan(partial("padded", taken(blocked)), time_limit=4.0)
@@ -145,8 +132,7 @@ def test_assumptions_are_carved_free_at_the_ends() -> None:
 
 
 @pytest.mark.parametrize(
-    ("unknown", "depth"),
-    [("optimistic", 0.0), ("padded", np.nan), ("predicted", np.inf), ("padded", -1.0)],
+    ("unknown", "depth"), [("optimistic", 0.0), ("padded", np.nan), ("predicted", np.inf), ("padded", -1.0)]
 )
 def test_images_without_returns_are_refused(planner: Planner, unknown: str, depth: float) -> None:
     """A covered lens got a confidence of 0.995, and no note."""

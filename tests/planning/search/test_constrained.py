@@ -68,10 +68,10 @@ def excess(constraint: Constraint, q: np.ndarray) -> float:
         pytest.param(
             *(*planner, *case),
             id=f"{case[0][0].kind}-{planner[0]}",
-            marks=[pytest.mark.slow] if planner[0] == "diffusion" and LINE in case[0] else [],
+            marks=[pytest.mark.slow] if planner[0] == "diffusion" and i % 2 else [],
         )
         for planner in (("rrt_connect", "constrained_rrt_connect"), ("diffusion", "network"))
-        for case in CASES
+        for i, case in enumerate(CASES)
     ],
 )
 def test_motions_keep_constraints_at_every_millimeter(
@@ -133,7 +133,7 @@ def test_a_goal_pose_with_tolerance_is_turned_until_it_keeps_the_constraint() ->
     assert rd.verify(made, result.path).valid
 
 
-@pytest.mark.parametrize("case", [0, 2, 4])
+@pytest.mark.parametrize("case", [0, 2])
 def test_more_iterations_give_no_slower_motion(case: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """It returned the shortest path, whose motion may be slower than one found before."""
     durations = []

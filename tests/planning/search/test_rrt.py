@@ -102,14 +102,6 @@ def test_more_time_gives_no_longer_paths(planner: AORRTC | RRTConnect) -> None:
         assert lengths == sorted(lengths, reverse=True) and lengths[-1] == result.path_length
 
 
-def test_a_free_straight_line_is_the_answer() -> None:
-    result = AORRTC().plan(
-        rd.Problem(PANDA, rd.Scene(), LEFT, rd.JointGoal(np.stack([-LEFT * [1, 0, 0, -1, 0, -1, 1], RIGHT])))
-    )
-    assert result.stage == "straight_line"
-    assert len(result.path.positions) == 2
-
-
 def test_the_clearance_is_kept_or_a_note_says_otherwise() -> None:
     for asked in (0.0, 0.02, 0.05):
         result = AORRTC().plan(AROUND, 5.0, clearance=asked)

@@ -5,7 +5,7 @@ import pytest
 
 import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.kernels.motions import Space, motions_free
+from robotdiffuse.collision.kernels.motions import Space
 from robotdiffuse.planning.search.time_optimization import TimeOptimization
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.trajectories.speed_limits import TimingSettings
@@ -45,14 +45,6 @@ def test_the_slowest_joint_is_the_bound(path: np.ndarray) -> None:
     assert best is not None and best.time == pytest.approx(alone, rel=0.03)
     assert best.time < 0.94 * straight_line_time(path[0], path[-1], *limits)
     assert np.array_equal(best.path[[0, -1]], path[[0, -1]])
-
-
-def test_the_polyline_stays_free() -> None:
-    way = rd.load_planner("rrt_connect").plan(AROUND, 60.0, until="first").path
-    found = optimized(WALL, way.positions, 100)
-    best = found.best
-    assert best is not None and best.time < 0.99 * found.times[0][1]
-    assert motions_free(space(WALL, way.positions), best.path.astype(np.float32)).all()
 
 
 @pytest.mark.parametrize("planner", ["aorrtc", "rrt_connect", "robotdiffuse"])
