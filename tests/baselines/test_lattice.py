@@ -193,15 +193,6 @@ def test_full_memory_and_the_time_limit_are_reported(planner, settings):
     assert result.status is Status.TIMEOUT and "expansions" in result.reason
 
 
-@pytest.mark.parametrize("planner", [AStar, DStarLite])
-def test_no_path_on_the_lattice(planner):
-    """The wall keeps the three boxes in their half of the plane."""
-    walls = Scene([Box([0.0, side * 0.75, 0.0], [3.0, 1.3, 0.5]) for side in (1, -1)])
-    problem = Problem(ARM, walls, np.zeros(3), JointGoal(np.array([[2.79, 0.0, 0.0]])))
-    result = planner().plan(problem, time_limit=5.0)
-    assert result.status in (Status.NO_PATH, Status.INVALID_GOAL) and not result.solved
-
-
 def test_updates_refuse_another_robot_and_places_off_the_lattice():
     checker, start, goals, _ = arm_problem(0)
     search = LatticeSearch(checker, start, goals, DStarLiteSettings())

@@ -14,7 +14,6 @@ from robotdiffuse.datasets import external as robot_npz
 from robotdiffuse.datasets.external import export_npz, import_npz
 from robotdiffuse.datasets.rows import problem_of
 from robotdiffuse.datasets.shards import SPLITS, check_shard, read_manifest, read_shard, write_shard
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.scene_arrays import SPHERE
 
 PANDA = rd.load_robot("panda")
@@ -89,7 +88,7 @@ def test_what_was_exported_is_a_data_set_again(tmp_path):
     least = before["clearance"].clip(max=shard["clearance"])
     np.testing.assert_allclose(shard["clearance"], least, atol=1e-6)
     assert shard["line_free"].tolist() == [False, True, True]
-    tip = link_pose(PANDA, shard["goals"][0, 0].astype(float), PANDA.tip)
+    tip = PANDA.fk(shard["goals"][0, 0].astype(float), PANDA.tip)
     np.testing.assert_allclose(shard["target_pose"][:, 4:], [tip[:3, 3]] * 3, atol=1e-6)
     floor, *spheres = problem_of(manifest, PANDA, shard, 2).scene.shapes
     assert isinstance(floor, rd.Box) and floor.size.tolist() == [2.0, 2.0, 0.1]

@@ -14,7 +14,6 @@ from helpers.example_robots import planar_arm
 from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.evaluation import metrics, statistics
 from robotdiffuse.evaluation.paper import PAPER_TABLE_1
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.validation.validator import VerifySettings
 
 PANDA = rd.load_robot("panda")
@@ -140,7 +139,7 @@ def test_a_motion_that_stands_still_has_figures(rows: np.ndarray) -> None:
 
 def test_clearance_to_the_scene_and_to_itself_apart() -> None:
     rows = np.stack([START, START + 0.01])
-    top = link_pose(PANDA, START, "panda_link4")[:3, 3]
+    top = PANDA.fk(START, "panda_link4")[:3, 3]
     problem = rd.Problem(
         PANDA, rd.Scene([rd.Sphere(top + np.array([0, 0, 0.4]), 0.1)]), START, rd.JointGoal(rows[1:])
     )
@@ -180,7 +179,7 @@ def panda_verdict(rows: np.ndarray, goal: rd.PoseGoal | None = None, **settings:
 )
 def test_one_centimeter_and_fifteen_degrees_are_settings(shift: float, angle: float, kind: str) -> None:
     axis = np.array([0.6, 0.0, 0.8])
-    T = link_pose(PANDA, END, "panda_hand")
+    T = PANDA.fk(END, "panda_hand")
     T = transform(T[:3, 3] + shift * axis, rotation_about(axis, np.radians(angle)) @ T[:3, :3])
     goal = rd.PoseGoal("panda_hand", T)
     rows = np.stack([START, END])

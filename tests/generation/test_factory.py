@@ -23,9 +23,8 @@ from robotdiffuse.datasets.rows import path_of, problem_of
 from robotdiffuse.datasets.shards import check_shard, read_manifest, read_shard
 from robotdiffuse.generation import GenerationSettings, factory, generate
 from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
-from robotdiffuse.generation.factory import PROBLEMS_PER_SHARD, SEARCHES, draw, make_shard, solve
+from robotdiffuse.generation.factory import PROBLEMS_PER_SHARD, draw, make_shard, solve
 from robotdiffuse.robots import names_a_file
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 
 MIX = {"rop": 0.5, "rop_dense": 0.5}
@@ -152,7 +151,7 @@ def test_the_target_holds_for_all_goals(target: str, folder: Path) -> None:
         rows, _ = make_shard(replace(SETTINGS, trajectories=3, target="pose"), 0)
     several = 0
     for goals, wanted in zip(rows["goals"], rows["target_pose"], strict=True):
-        poses = [link_pose(PANDA, q.astype(float), PANDA.tip) for q in goals if np.isfinite(q).all()]
+        poses = [PANDA.fk(q.astype(float), PANDA.tip) for q in goals if np.isfinite(q).all()]
         np.testing.assert_allclose([T[:3, 3] for T in poses], [wanted[4:]] * len(poses), atol=1e-3)
         rotation = rotation_from_quaternion(wanted[:4].astype(float))
         for T in poses if target == "pose" else poses[:1]:
@@ -195,11 +194,14 @@ def test_frames_in_time_keep_the_velocity_limits() -> None:
         ({"mix": {}}, "mix is empty"),
         ({"mix": {"rop": float("nan")}}, "share of rop is nan"),
         ({"mix": {"pantry": 1.0}}, r"pantry.*rop, rop_dense"),
+        ({"planner": "aorrtc"}, "planner is aorrtc, but its settings are SharedTreeSettings"),
+        ({"planner": "bi_rrt"}, r"planner 'bi_rrt'; known: aorrtc, shared_tree_rrt_star"),
     ],
 )
 def test_bad_settings_are_refused(change: dict[str, Any], message: str) -> None:
     with pytest.raises(rd.InputError, match=message):
         replace(SETTINGS, **change)
+    assert GenerationSettings.from_json(AORRTC.to_json(), "settings") == AORRTC
 
 
 def test_other_settings_are_refused_by_name(folder: Path) -> None:
@@ -239,7 +241,14 @@ def test_data_of_other_versions_and_robots_are_refused(
         generate(SETTINGS, tmp_path)
 
 
-def test_unusable_folders_are_refused(folder: Path, tmp_path: Path) -> None:
+def test_unusable_folders_workers_and_clusters_are_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(rd.InputError, match="workers is 0"):
+        generate(SETTINGS, tmp_path / "data", 0)
+    with pytest.raises(rd.InputError, match=r"cluster.*slurm.*ray"):
+        generate(SETTINGS, tmp_path / "data", cluster="slurm")
+    with lock_folder(tmp_path), pytest.raises(rd.InputError, match="another process is filling"):
+        generate(SETTINGS, tmp_path)
+    assert not list(tmp_path.iterdir())
     (tmp_path / "file").write_text("")
     with pytest.raises(rd.InputError, match=r"cannot use the folder .*file"):
         generate(SETTINGS, tmp_path / "file")
@@ -252,20 +261,6 @@ def test_unusable_folders_are_refused(folder: Path, tmp_path: Path) -> None:
         (tmp_path / "manifest.json").write_text(damaged)
         with pytest.raises(rd.InputError, match=r"manifest\.json is damaged"):
             generate(SETTINGS, tmp_path)
-
-
-def test_two_cannot_fill_one_folder(tmp_path: Path) -> None:
-    with lock_folder(tmp_path), pytest.raises(rd.InputError, match="another process is filling"):
-        generate(SETTINGS, tmp_path)
-    assert not contents(tmp_path)
-
-
-def test_workers_and_clusters_that_are_none_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(rd.InputError, match="workers is 0"):
-        generate(SETTINGS, tmp_path / "data", 0)
-    with pytest.raises(rd.InputError, match=r"cluster.*slurm.*ray"):
-        generate(SETTINGS, tmp_path / "data", cluster="slurm")
-    assert not (tmp_path / "data").exists()
 
 
 def test_furniture_among_the_families(tmp_path: Path) -> None:
@@ -327,12 +322,3 @@ def test_goals_a_turn_away_are_taken_the_short_way() -> None:
         if len(far) == 3:
             return
     pytest.fail(f"only {len(far)} such problems")
-
-
-def test_settings_are_those_of_the_planner() -> None:
-    with pytest.raises(rd.InputError, match="planner is aorrtc, but its settings are SharedTreeSettings"):
-        GenerationSettings(planner="aorrtc")
-    with pytest.raises(rd.InputError, match=r"planner 'bi_rrt'; known: aorrtc, shared_tree_rrt_star"):
-        GenerationSettings(planner="bi_rrt")
-    assert GenerationSettings.from_json(AORRTC.to_json(), "settings") == AORRTC
-    assert SEARCHES.defaults("aorrtc") == AORRTC.search

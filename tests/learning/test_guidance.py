@@ -17,7 +17,6 @@ from robotdiffuse.problems.constraint_kernel import DISTANCE
 from robotdiffuse.problems.constraints import Constraint
 from robotdiffuse.problems.projection_kernel import ANGLE_WEIGHT
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
 
@@ -114,19 +113,6 @@ def test_steps_descend(name: str, seed: int) -> None:
         before = after
 
 
-@pytest.mark.parametrize("name", ALONE)
-def test_steps_go_down_the_slope(name: str) -> None:
-    gentle = replace(ALONE[name], push=1e-3, length=min(ALONE[name].length, 0.01))
-    guidance = CollisionGuidance(CROWDED, gentle)
-    q = random_motions(1, count=8)
-    move = guidance(q, 1)[0].astype(float) - q
-    moving = np.abs(move).max((1, 2)) > 0
-    assert moving.sum() >= 4, "a cost that is met"
-    ahead, behind = (formulas(guidance, q + sign * 0.1 * move)[name] for sign in (1, -1))
-    assert (ahead < behind)[moving].all()
-    np.testing.assert_array_equal(formulas(guidance, q)[name][~moving], 0)
-
-
 def test_a_full_step_is_newton_s() -> None:
     """The formula is smallest in the waypoint that a round moves last."""
     guidance = CollisionGuidance(CROWDED, ALONE["length"])
@@ -164,7 +150,7 @@ def test_together_they_reach_a_free_and_short_path_that_none_reaches_alone() -> 
 HAND = "panda_hand"
 TILTED = np.array([-0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2])
 REACHED = np.array([0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2])
-AT = link_pose(PANDA, TILTED, HAND)[:3, 3]
+AT = PANDA.fk(TILTED, HAND)[:3, 3]
 CONE = rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], 0.2)
 EACH: list[Constraint] = [
     CONE,

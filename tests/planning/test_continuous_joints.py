@@ -11,10 +11,8 @@ from helpers.box_arm import box_arm
 from robotdiffuse.interop.recorded_motion import RecordedMotion, motion_of_robot
 from robotdiffuse.planning.start_goal import images
 from robotdiffuse.robots.kinematic_tree import CONTINUOUS_LIMIT
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.parsing.urdf import with_limits
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
-from robotdiffuse.validation.validator import verify_trajectory
 
 
 def turning_arm() -> rd.Robot:
@@ -39,7 +37,7 @@ def planned(
     problem = rd.Problem(ARM, scene or rd.Scene(), start, goal)  # type: ignore[arg-type]
     result = rd.load_planner(planner).plan(problem, time_limit=60.0, **more)  # type: ignore[arg-type]
     assert result.solved, result.reason
-    assert rd.verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
+    assert rd.verify(problem, result.path).valid and rd.verify(problem, result.trajectory).valid
     assert np.array_equal(result.path.positions[0], problem.start)
     steps = np.abs(np.diff(result.trajectory.positions, axis=0)).max()
     assert steps < 0.05  # no jump: 2 rad/s at rows of 10 ms
@@ -65,7 +63,7 @@ def test_the_long_way_where_something_blocks_the_short_one() -> None:
 
 
 def test_a_pose_is_reached_across_half_a_turn() -> None:
-    goal = rd.PoseGoal("tip", link_pose(ARM, np.array([-2.9, 0.5, 0.2]), "tip"))
+    goal = rd.PoseGoal("tip", ARM.fk(np.array([-2.9, 0.5, 0.2]), "tip"))
     path = planned("aorrtc", [2.9, 0.5, 0.2], goal)
     assert path.length < 0.6
 

@@ -22,7 +22,7 @@ from robotdiffuse.planning.exploration.looks import ReachableTree, best_looks
 from robotdiffuse.planning.exploration.seen_free import GoalSeen, not_seen_free
 from robotdiffuse.planning.exploration.steps import DONE
 from robotdiffuse.planning.exploration.stopping import braked
-from robotdiffuse.robots.kinematics import link_pose, placed_spheres
+from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.trajectories.speed_limits import jerk_limits
 
 PANDA = rd.load_robot("panda")
@@ -76,7 +76,7 @@ def test_an_arm_at_a_goal_pose_is_done() -> None:
     # it went on for ever: only configurations were compared
     one = explorer()
     q = PROBLEM.start
-    one.set_goal(rd.PoseGoal("panda_hand", link_pose(PANDA, q + 0.05, "panda_hand")))
+    one.set_goal(rd.PoseGoal("panda_hand", PANDA.fk(q + 0.05, "panda_hand")))
     step = one.next(q)
     assert step.kind != "done"
     assert one.next(q + 0.05).kind == "done"

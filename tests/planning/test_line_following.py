@@ -9,13 +9,12 @@ import robotdiffuse as rd
 from robotdiffuse.core.transforms import rotation_about, rotation_angle
 from robotdiffuse.planning import line_following
 from robotdiffuse.planning.search.rrt import AORRTC
-from robotdiffuse.robots.kinematics import link_pose, link_poses
 from robotdiffuse.trajectories.speed_limits import jerk_limits
 
 PANDA = rd.load_robot("panda")
 HAND = "panda_hand"
 START = np.array([0.1, 0.2, 0.0, -2.0, 0.0, 2.2, 0.8])
-T_START = link_pose(PANDA, START, HAND)
+T_START = PANDA.fk(START, HAND)
 
 
 def moved(xyz: list[float], axis: list[float] | None = None, angle: float = 0.0) -> np.ndarray:
@@ -52,7 +51,7 @@ def test_motion_is_on_the_line_at_every_millisecond(name: str) -> None:
     if name == "tilt in place":
         assert rd.certify(result.problem, t) is not None
     clock = np.arange(0.0, t.duration, 1e-3)
-    T = link_poses(PANDA, CubicHermiteSpline(t.times, t.positions, t.velocities)(clock), HAND)
+    T = PANDA.fk(CubicHermiteSpline(t.times, t.positions, t.velocities)(clock), HAND)
     way = T_end[:3, 3] - T_START[:3, 3]
     turn = T_end[:3, :3] @ T_START[:3, :3].T
     angle = rotation_angle(turn)

@@ -14,7 +14,6 @@ from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.planning.search import rrt_kernel
 from robotdiffuse.problems.held_out import held_out_problem
-from robotdiffuse.validation.validator import verify_trajectory
 
 START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 GOAL = START + np.array([1.2, 0.3, 0.0, 0.4, 0.0, 0.0, 0.0])
@@ -38,7 +37,7 @@ def test_solved_means_verified(name: str, number: int) -> None:
     if result.path is None or result.trajectory is None:
         assert result.progress == ()
         return
-    assert rd.verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
+    assert rd.verify(problem, result.path).valid and rd.verify(problem, result.trajectory).valid
     times, lengths = np.array(result.progress).T
     assert (np.diff(times) >= 0).all() and (np.diff(lengths) < 0).all()
     assert lengths[-1] == pytest.approx(result.path.length)

@@ -17,8 +17,6 @@ from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS, PLANNERS, planners_that_support
 from robotdiffuse.planning.planner import Planner
-from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.validation.validator import verify_trajectory
 
 PANDA = rd.load_robot("panda")
 START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
@@ -27,7 +25,7 @@ HAND = "panda_hand"
 ELBOW = "panda_link4"
 FAR = rd.Box([0.0, -0.8, 0.3], [0.2, 0.2, 0.6], name="crate")
 SCENE = rd.Scene([FAR])
-T_GOAL = link_pose(PANDA, GOAL, HAND)
+T_GOAL = PANDA.fk(GOAL, HAND)
 T_WORLD_BASE = transform(np.array([1.0, -2.0, 0.5]), rotation_about(np.array([0.0, 0.0, 1.0]), 2.0))
 PLAIN = rd.Problem(PANDA, SCENE, START, GOAL)
 
@@ -70,7 +68,7 @@ ASKED: dict[str, Asked] = {
     "pose": Asked(_goal(rd.PoseGoal(HAND, T_GOAL))),
     "pose with room": Asked(_goal(rd.PoseGoal(HAND, T_GOAL, [0.02] * 3, [0.1, 0.1, np.pi]))),
     "poses of two links": Asked(
-        _goal(rd.PosesGoal([rd.PoseGoal(ELBOW, link_pose(PANDA, GOAL, ELBOW)), rd.PoseGoal(HAND, T_GOAL)]))
+        _goal(rd.PosesGoal([rd.PoseGoal(ELBOW, PANDA.fk(GOAL, ELBOW)), rd.PoseGoal(HAND, T_GOAL)]))
     ),
     "any goal": Asked(_goal([rd.PoseGoal(HAND, T_GOAL), rd.JointGoal(GOAL)])),
     "waypoints": Asked(lambda: replace(PLAIN, waypoints=(rd.JointGoal((START + GOAL) / 2),))),
@@ -96,9 +94,7 @@ ASKED: dict[str, Asked] = {
     "box": Asked(_constrained(rd.PositionBox(HAND, [0, -1, 0], [1, 1, 1])), {}, (PATH_CONSTRAINTS,)),
     "plane": Asked(_constrained(rd.OnPlane(HAND, T_GOAL[:3, 3], [0, 0, 1], 0.05)), {}, (PATH_CONSTRAINTS,)),
     "line": Asked(
-        _constrained(
-            rd.OnLine(HAND, T_GOAL[:3, 3], T_GOAL[:3, 3] - link_pose(PANDA, START, HAND)[:3, 3], 0.01)
-        ),
+        _constrained(rd.OnLine(HAND, T_GOAL[:3, 3], T_GOAL[:3, 3] - PANDA.fk(START, HAND)[:3, 3], 0.01)),
         {},
         (PATH_CONSTRAINTS,),
     ),
@@ -182,4 +178,4 @@ def test_every_request_is_met_or_refused_by_one_line(name: str, asked: str) -> N
         return
     result = planner.plan(problem, time_limit=40.0, **{"until": "first", **request})
     assert result.path is not None and result.trajectory is not None, result.reason
-    assert rd.verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
+    assert rd.verify(problem, result.path).valid and rd.verify(problem, result.trajectory).valid

@@ -265,8 +265,9 @@ def test_bad_steps(steps: list[object], message: str) -> None:
 
 def test_motions_are_joined_with_and_without_a_stop() -> None:
     space = table_with_can()
-    there = space.plan(GRASP @ rd.pose([0.0, 0.0, -0.12]), "ready", time_limit=10.0)
-    back = space.plan("extended", there.path.positions[-1], time_limit=10.0)
+    there = space.plan("extended", "ready", time_limit=10.0)
+    end = there.path.positions[-1]
+    back = space.plan(GRASP @ rd.pose([0.0, 0.0, -0.12]), end, time_limit=10.0)
     stopping = rd.join([there, back], time_limit=20.0)
     assert stopping.stops == 1
     assert stopping.duration == pytest.approx(there.duration + back.duration)
@@ -276,21 +277,15 @@ def test_motions_are_joined_with_and_without_a_stop() -> None:
         assert len(one.problem.waypoints) == 1
         assert rd.verify(one.problem, one.trajectory).valid
         assert rd.certify(one.problem, one.trajectory).check(one.problem).valid
-
-
-def test_motions_that_cannot_be_joined() -> None:
-    space = table_with_can()
-    there = space.plan("extended", "ready", time_limit=10.0)
-    end = there.path.positions[-1]
     line = space.plan_line(space.pose(end) @ rd.pose([0.0, 0.0, -0.05]), end, time_limit=10.0)
     assert rd.join([there, line], time_limit=10.0).solved
-    with pytest.raises(rd.InputError, match="constraints of their own, which a corner would leave"):
-        rd.join([there, line], 0.05)
-    with pytest.raises(rd.InputError, match=r"results\[1\] begins .* rad from the end of results\[0\] in"):
-        rd.join([there, there])
-    with pytest.raises(rd.InputError, match="it takes two to join"):
-        rd.join([there])
     space.remove("can")
-    other = space.plan("ready", end, time_limit=10.0)
-    with pytest.raises(rd.InputError, match=r"results\[1\] is for another robot or scene"):
-        rd.join([there, other])
+    elsewhere = space.plan("ready", end, time_limit=10.0)
+    for motions, blend, message in (
+        ([there, line], 0.05, "constraints of their own, which a corner would leave"),
+        ([there, there], 0.0, r"results\[1\] begins .* rad from the end of results\[0\] in"),
+        ([there], 0.0, "it takes two to join"),
+        ([there, elsewhere], 0.0, r"results\[1\] is for another robot or scene"),
+    ):
+        with pytest.raises(rd.InputError, match=message):
+            rd.join(motions, blend)

@@ -8,7 +8,6 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.learning.training import losses
 from robotdiffuse.problems.families.rop import ROP, ROP_DENSE
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.shapes import Box
@@ -68,7 +67,7 @@ def test_surface_points_move_with_their_links() -> None:
         locals_ = []
         for a in range(2):
             for b in range(4):
-                T = link_pose(PANDA, q[a, b].numpy(), link)
+                T = PANDA.fk(q[a, b].numpy(), link)
                 locals_.append((placed[a, b, 3 * i : 3 * i + 3] - T[:3, 3]) @ T[:3, :3])
         np.testing.assert_allclose(locals_, np.broadcast_to(locals_[0], (8, 3, 3)), atol=1e-9)
         corners = np.concatenate([mesh.vertices for mesh in PANDA.meshes[link]])

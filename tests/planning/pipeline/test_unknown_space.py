@@ -20,7 +20,7 @@ from robotdiffuse.perception.unknown_space import CARVING_MARGIN, PADDINGS, RATE
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.pipeline import attempt, unknown_space
 from robotdiffuse.planning.planner import Planner
-from robotdiffuse.robots.kinematics import link_pose, placed_spheres
+from robotdiffuse.robots.kinematics import placed_spheres
 
 PANDA = rd.load_robot("panda")
 START = np.array([-0.9, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
@@ -110,7 +110,7 @@ def test_occupied_crosses_nothing_unknown_but_at_the_ends(planner: Planner) -> N
 
 
 def test_an_end_in_what_was_seen_is_named(planner: Planner) -> None:
-    blocked = rd.Scene([rd.Box(link_pose(PANDA, GOAL, PANDA.tip)[:3, 3], [0.3, 0.3, 0.3])])
+    blocked = rd.Scene([rd.Box(PANDA.fk(GOAL, PANDA.tip)[:3, 3], [0.3, 0.3, 0.3])])
     result = planner.plan(partial("padded", taken(blocked)), time_limit=4.0)
     assert result.status is rd.Status.INVALID_GOAL and result.assumption == "" and result.confidence is None
 

@@ -11,14 +11,12 @@ import robotdiffuse as rd
 from robotdiffuse.core.transforms import rotation_angle, rotation_from_rpy, transform
 from robotdiffuse.planning.search import rrt
 from robotdiffuse.problems.constraints import Constraint
-from robotdiffuse.robots.kinematics import link_pose, link_poses
-from robotdiffuse.validation.validator import verify_trajectory
 
 PANDA = rd.load_robot("panda")
 START = np.array([-0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2])
 GOAL = np.array([0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2])
 HAND = "panda_hand"
-AT = link_pose(PANDA, START, HAND)[:3, 3]
+AT = PANDA.fk(START, HAND)[:3, 3]
 WALL = rd.Box([0.5, 0.0, 0.2], [0.3, 0.06, 0.4], name="wall")
 UPRIGHT = rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], np.radians(10))
 LINE = rd.CartesianLine(HAND, 1e-3, 0.02, 0.25)
@@ -38,7 +36,7 @@ def problem(constraints: list[Constraint], scene: rd.Scene | None = None) -> rd.
 
 def excess(constraint: Constraint, q: np.ndarray) -> float:
     """The largest violation of a constraint by configurations [n, dof], [m] or [rad], computed by hand."""
-    T = link_poses(PANDA, q, constraint.frame)
+    T = PANDA.fk(q, constraint.frame)
     p = T[:, :3, 3]
     if isinstance(constraint, rd.AxisCone):
         cosines = T[:, :3, :3] @ constraint.axis @ constraint.direction
@@ -50,8 +48,8 @@ def excess(constraint: Constraint, q: np.ndarray) -> float:
     if isinstance(constraint, rd.OnLine):
         off = np.linalg.norm(np.cross(p - constraint.point, constraint.direction), axis=1)
         return float(off.max()) - constraint.tolerance
-    first = link_pose(PANDA, START, HAND)
-    last = link_pose(PANDA, GOAL, HAND)
+    first = PANDA.fk(START, HAND)
+    last = PANDA.fk(GOAL, HAND)
     way = last[:3, 3] - first[:3, 3]
     share = np.clip((p - first[:3, 3]) @ way / (way @ way), 0, 1)
     off = np.linalg.norm(p - first[:3, 3] - share[:, None] * way, axis=1) - constraint.tolerance
@@ -82,7 +80,7 @@ def test_motions_keep_constraints_at_every_millimeter(
     result = rd.load_planner(name).plan(made, time_limit=20.0)
     assert result.solved, result.reason
     assert result.stage == stage
-    assert rd.verify(made, result.path).valid and verify_trajectory(made, result.trajectory).valid
+    assert rd.verify(made, result.path).valid and rd.verify(made, result.trajectory).valid
     for rows in (result.path.positions, result.trajectory.positions):
         for a, b in pairwise(rows):
             steps = int(np.abs(b - a).sum() / 1e-3) + 2  # lever arms are below 1 m
@@ -94,11 +92,11 @@ def test_speed_of_a_line_is_kept_and_used() -> None:
     result = rd.load_planner("aorrtc").plan(problem([LINE]), time_limit=20.0)
     assert result.trajectory is not None, result.reason
     t = result.trajectory
-    at = link_poses(PANDA, t.positions, HAND)[:, :3, 3]
+    at = PANDA.fk(t.positions, HAND)[:, :3, 3]
     speeds = np.linalg.norm(np.diff(at, axis=0), axis=1) / np.diff(t.times)
     assert speeds.max() <= 0.25 * 1.001 and np.median(speeds) >= 0.24
     slower = problem([replace(LINE, speed=0.2)])
-    found = verify_trajectory(slower, t).violation
+    found = rd.verify(slower, t).violation
     assert found.kind == "speed" and "allows 0.2 m/s" in found.message
 
 
@@ -117,7 +115,7 @@ def test_violations_at_start_and_goal_are_reported() -> None:
     for change, status in (
         ({"start": tilted}, rd.Status.INVALID_START),
         ({"goal": tilted}, rd.Status.INVALID_GOAL),
-        ({"goal": rd.PoseGoal(HAND, link_pose(PANDA, tilted, HAND))}, rd.Status.INVALID_GOAL),
+        ({"goal": rd.PoseGoal(HAND, PANDA.fk(tilted, HAND))}, rd.Status.INVALID_GOAL),
     ):
         told = rd.load_planner("aorrtc").plan(replace(problem([UPRIGHT]), **change), 60.0)
         assert told.status is status

@@ -10,7 +10,6 @@ from robotdiffuse.planning.search.time_optimization import TimeOptimization
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.trajectories.speed_limits import TimingSettings
 from robotdiffuse.trajectories.straight_line import straight_line_time
-from robotdiffuse.validation.validator import verify_trajectory
 
 ROBOT = rd.load_robot("panda")
 LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
@@ -54,7 +53,7 @@ def test_motions_take_less_time_and_keep_their_certificate(planner: str) -> None
     result = made.plan(AROUND, 60.0)
     assert result.trajectory is not None and result.stops == 0
     assert result.duration is not None and by_length.duration is not None
-    assert verify_trajectory(AROUND, result.trajectory).valid
+    assert rd.verify(AROUND, result.trajectory).valid
     assert result.duration < 0.99 * by_length.duration
     if planner != "rrt_connect":  # which returns the shorter of two paths, not the shortest
         assert by_length.path.length < result.path.length
