@@ -316,7 +316,7 @@ REFUSED: dict[str, tuple[Callable[..., object], tuple[Any, ...], str]] = {
         ({"joint_trajectory": panda_record(), "multi_dof_joint_trajectory": {"points": [{}]}}, "it"),
         "multi_dof_joint_trajectory has points; only arms on a fixed base can be validated",
     ),
-    "two parts": (motion_from_record, ({"trajectory": [{}, {}]}, "it"), "trajectory holds 2 parts"),
+    "two parts": (motion_from_record, ({"trajectory": [{}, {}]}, "it"), "trajectory has 2 parts"),
     "no plan": (
         motion_from_record,
         ({"status": "timeout"}, "it"),

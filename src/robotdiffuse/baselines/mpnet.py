@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from robotdiffuse.learning.mpnet import MPNetNetwork
 
 SEARCH_ITERATIONS = 500
-"""Iterations of RRT-Connect between two readings of the clock, in hybrid replanning."""
+"""Number of iterations of RRT-Connect between two readings of the clock, in hybrid replanning."""
 SEARCH_CAPACITY = 20_000
 SEARCH_RANGE = np.float32(1.0)
 """Longest extension of a tree of RRT-Connect, in hybrid replanning [rad, joint-space L2]."""
@@ -52,16 +52,16 @@ SEARCH_RANGE = np.float32(1.0)
 @dataclass(frozen=True)
 class MPNetPlannerSettings(LearnedSettings, name="mpnet"):
     attempts: Count = 16
-    """Paths that are planned at once (paper: 1)."""
+    """Number of paths that are planned at once (paper: 1)."""
     steps: Count = 24
-    """Most steps of bidirectional neural planning between two states; a step is 0.7 rad."""
+    """Largest number of steps of bidirectional neural planning between two states; a step is 0.7 rad."""
     replanning: Natural = 10
     """N_r, how often colliding parts are replanned before the attempts are given up."""
     hybrid: bool = False
     """Whether RRT-Connect repairs what the network leaves in collision."""
     resolution: Positive = 0.03
     """No point of the arm moves further than this between two checks of a motion [m]; the validator's
-    certificate covers the rest. It is halved after a path that the validator refuses."""
+    certificate covers the rest. The resolution is halved after each path that the validator refuses."""
     clearance: NotNegative = 0.002
     """Distance to obstacles that paths keep where start and goal allow it [m]."""
 
@@ -79,11 +79,12 @@ class MPNet(LearnedPlanner[MPNetPlannerSettings]):
         best = Attempt(np.inf, np.inf, np.zeros((0, 0)))
         rounds = 0
         while rounds == 0 or context.remaining > 0:
-            one = NeuralPlanning(context, start_goal, network, settings, context.rng)
-            candidate = one.best()
+            planning = NeuralPlanning(context, start_goal, network, settings, context.rng)
+            candidate = planning.best()
             rounds += 1
             if candidate.broken == 0:
-                result = context.finish(start_goal.complete(candidate.path), self.name, one.reason(rounds))
+                reason = planning.reason(rounds)
+                result = context.finish(start_goal.complete(candidate.path), self.name, reason)
                 if result is not None:
                     return result
                 settings = replace(settings, resolution=finer_resolution(settings.resolution))
@@ -98,7 +99,7 @@ class MPNet(LearnedPlanner[MPNetPlannerSettings]):
 
 class Attempt(NamedTuple):
     broken: float
-    """Segments in collision; infinite if there is no path."""
+    """Number of segments in collision; infinite if there is no path."""
     length: float
     """[rad]"""
     path: Configurations
@@ -165,8 +166,8 @@ class NeuralPlanning:
 
         one_will_do: stop as soon as one of them is free.
 
-        Motions whose ends were not connected have a segment in collision; so may others, whose states
-        collide.
+        A motion whose ends were not connected has a segment in collision. Connected motions may have one too,
+        since their states are not checked.
         """
         forth = [[q] for q in starts]
         back = [[q] for q in goals]
@@ -187,8 +188,8 @@ class NeuralPlanning:
         return [_joined(*rows) for rows in zip(forth, back, strict=True)]
 
     def replan(self, paths: list[Configurations]) -> list[Configurations]:
-        """The paths without their states in collision, with new states where the straight line is not
-        free."""
+        """The paths without their states in collision; where the straight line between two remaining states
+        is not free, with new states of the network."""
         free_states = [self.without_collisions(path) for path in paths]
         broken = [
             (a, int(i))
@@ -211,13 +212,13 @@ class NeuralPlanning:
         ]
 
     def search(self, path: Configurations) -> Configurations:
-        """The path without its states in collision, with paths of RRT-Connect where the straight line is not
-        free; as far as time allows."""
+        """The path without its states in collision; where the straight line between two remaining states is
+        not free, with a path of RRT-Connect, as far as time allows."""
         self.searched = True
         path = self.without_collisions(path)
         segments = [path[:1]]
-        for (a, b), seen in zip(pairwise(path), self.segments_free(path), strict=True):
-            segments.append(b[None] if seen else self.searched_between(a, b)[1:])
+        for (a, b), free in zip(pairwise(path), self.segments_free(path), strict=True):
+            segments.append(b[None] if free else self.searched_between(a, b)[1:])
         return np.concatenate(segments)
 
     def searched_between(self, a: Configuration, b: Configuration) -> Configurations:

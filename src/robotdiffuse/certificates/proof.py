@@ -1,5 +1,5 @@
-"""The proof of a motion as values: what was proved, and the bounds that prove it; content hashes of robots,
-scenes and motions, part by part, so that the checker can name what differs."""
+"""Data classes for the proof of a motion: what was proved, and the bounds that prove it. Also hashes of the
+parts of robots, scenes and motions, by which the checker can name the part that differs."""
 
 import hashlib
 import json
@@ -22,7 +22,7 @@ from robotdiffuse.scenes.shapes import PointCloud, Shape, Triangulated
 BOUND_TOLERANCE = 1e-6
 """A recomputed bound may differ from the written one by this [m] or [rad], because files round."""
 DECIMALS = 7
-"""Decimals of bounds in files [m]."""
+"""Number of decimals of bounds [m] in files."""
 
 
 @dataclass(frozen=True)
@@ -44,14 +44,15 @@ class Tolerances:
     rest: float = 1e-6
     """[rad/s]"""
     rate_slack: float = 0.01
-    """Share of the robot's limits."""
+    """Fraction of the robot's limits."""
     chord: float = 1e-3
     """How far the cubics through the rows may leave the straight lines that were certified [rad] or [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class StretchProof:
-    """Stretches of the motion, claim by claim, and the bounds that show each stretch to be free."""
+    """For each claim (a link against the scene, or two links against each other), stretches of the motion and
+    the bounds that show each stretch to be free."""
 
     claims: tuple[Claim, ...]
     stretches: Stretches
@@ -60,7 +61,8 @@ class StretchProof:
     clearance: Values
     """Clearance in the middle of each stretch [m], rounded down."""
     displacement: Values
-    """Upper bound on the displacement of any point of the link from there [m], rounded up."""
+    """Upper bound on how far any point of the link moves from its place in the middle of the stretch [m],
+    rounded up."""
     planes: tuple[Plane, ...]
 
 
@@ -83,7 +85,8 @@ class MotionProof:
     scene_clearance: float
     """Lower bound on the distance of all moving links to all obstacles, all along the motion [m]."""
     self_clearance: float
-    """The same between links that are checked against each other [m]."""
+    """Lower bound on the distance between links that are checked against each other, all along the motion
+    [m]."""
     proof: StretchProof
     problem: dict[str, Any] | None = None
     """The problem as in a problem file; None if the robot cannot be loaded by a name or file."""
@@ -95,12 +98,12 @@ class MotionProof:
     """For each quantity of a path constraint its name and an upper bound all along the motion [m] or
     [rad]."""
     torque_samples: Values = field(default_factory=lambda: np.zeros(0))
-    """Places between the rows at which torques are computed besides the rows, given as `between`."""
+    """Further places at which torques are computed, besides the rows; in the same form as `between`."""
     torques: tuple[tuple[str, float], ...] = ()
     """For each joint its name and an upper bound of its torque with the payload all along [N m] or [N]."""
     jerks: tuple[tuple[str, float], ...] = ()
-    """For each joint its name and its largest jerk, accelerations being linear between rows [rad/s³] or
-    [m/s³]; empty for a path, and where accelerations jump at the ends."""
+    """For each joint its name and its largest jerk [rad/s³] or [m/s³], if accelerations are linear between
+    the rows; empty for a path, and if accelerations jump at the ends of the motion."""
 
 
 HASH_LENGTH = 16
@@ -146,14 +149,16 @@ def request_parts(problem: Problem) -> dict[str, str]:
         rows = [robot.inertias[link].values for link in links]
         payload_numbers = [carried.mass, *carried.com, *carried.moments]
         T_world_base = problem.T_world_base
-        stands = np.eye(4) if T_world_base is None else T_world_base
-        parts["payload"] = _hash([carried.link, *links], payload_numbers, stands, robot.effort, rows)
-    for one in problem.moving:
-        ways = [np.zeros(0) if v is None else v for v in (one.velocity, one.times, one.poses, one.max_speed)]
-        parts[f"moving {one.name}"] = _hash(one.shape.kind, *_numbers(one.shape), *ways)
-    for i, one in enumerate(problem.constraints):
-        values = [getattr(one, f.name) for f in fields(one)]
-        texts = [one.kind, *(value for value in values if isinstance(value, str))]
+        T_base = np.eye(4) if T_world_base is None else T_world_base
+        parts["payload"] = _hash([carried.link, *links], payload_numbers, T_base, robot.effort, rows)
+    for obstacle in problem.moving:
+        optional = (obstacle.velocity, obstacle.times, obstacle.poses, obstacle.max_speed)
+        motion = [np.zeros(0) if value is None else value for value in optional]
+        shape = obstacle.shape
+        parts[f"moving {obstacle.name}"] = _hash(shape.kind, *_numbers(shape), *motion)
+    for i, constraint in enumerate(problem.constraints):
+        values = [getattr(constraint, f.name) for f in fields(constraint)]
+        texts = [constraint.kind, *(value for value in values if isinstance(value, str))]
         rows = [np.zeros(0) if value is None else value for value in values if not isinstance(value, str)]
         parts[f"constraints[{i}]"] = _hash(texts, *rows)
     return parts

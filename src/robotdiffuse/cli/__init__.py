@@ -20,7 +20,8 @@ from robotdiffuse.core.registry import import_modules
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser that reports errors in one line, and each command its own."""
+    """An argument parser that reports an error in one line, under the name of the command in which it
+    occurred."""
 
     def parse_known_args(self, args=None, namespace=None):  # type: ignore[override]
         arguments, unknown = super().parse_known_args(args, namespace)
@@ -102,7 +103,7 @@ def _prepare_streams() -> None:
 def _write_failed(why: str = "") -> int:
     """Report the failure, and redirect standard output to /dev/null so that flushing it at exit cannot fail.
 
-    why: empty where the reader has closed the pipe, as head does, which is no news.
+    why: the reason to report; empty if the reader closed the pipe, as `head` does, which is not reported.
     """
     with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

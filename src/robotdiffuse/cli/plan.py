@@ -35,7 +35,8 @@ def run_plan(arguments: Namespace) -> int:
     request = {field.name: getattr(arguments, field.name) for field in fields(PlanRequest)}
     picture = any(file.suffix.lower() == ".png" for file in outputs)
     result = load_and_plan(problem, name, settings, arguments.weights, picture, **request)
-    written = [file for file in outputs if _write(problem, result, file)]  # first: `| head` ends what prints
+    # files first: printing into `| head` can end the process
+    written = [file for file in outputs if _write(problem, result, file)]
     print_result(result, asked_clearance(problem, name, arguments.clearance))
     if arguments.next_view and result.path is not None:
         print_next_view(problem, result)
@@ -90,8 +91,8 @@ def _write(problem: Problem, result: PlanResult, file: Path) -> bool:
 
 
 def asked_clearance(problem: Problem, planner: str, clearance: float | None = None) -> float | None:
-    """The clearance that a call asks for, the problem's or the default one [m]; None for a planner that keeps
-    none."""
+    """The clearance [m]: that of the call, else the problem's, else the default. None for a planner that
+    keeps none."""
 
     if CLEARANCE not in PLANNERS.entry(planner).supports:
         return None

@@ -1,4 +1,4 @@
-"""Metrics of motions. A new line in METRICS appears in records, tables, plots and pages."""
+"""Metrics of motions. A metric that is added to _METRICS appears in records, tables, plots and pages."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,7 +20,8 @@ from robotdiffuse.validation.report import Report
 from robotdiffuse.validation.tolerances import sample_path
 
 STEP = 0.02
-"""Longest step for link paths [rad, joint-space L2]; arcs are then measured 2e-5 too short."""
+"""Longest step along a path when the lengths of link paths are measured [rad, joint-space L2]. Arcs then come
+out too short by at most 0.002 %."""
 SAMPLE_TIME = 0.01
 """Time between the rows that smoothness is measured at [s]."""
 STANDSTILL = 1e-6
@@ -28,13 +29,13 @@ STANDSTILL = 1e-6
 CUTOFF = 10.0
 THRESHOLD = 0.05
 PADDING = 4
-"""Parameters of the spectral arc length, from its paper: highest frequency [Hz]; least amplitude as a share
-of that at frequency 0; zeros are appended up to 2 to the power PADDING times the length, or up to twice as
-many."""
+"""Parameters of the spectral arc length, from its paper. CUTOFF: highest frequency [Hz]. THRESHOLD: least
+amplitude, as a fraction of the amplitude at frequency 0. PADDING: zeros are appended until the number of
+samples is a power of two and has grown by a factor of 2^PADDING to 2^(PADDING + 1)."""
 BENDING_SAMPLES = 129
-"""Evenly spaced places of a path that bending is measured at."""
+"""Number of evenly spaced places of a path at which bending is measured."""
 DIGITS = 7
-"""Significant digits of values in records."""
+"""Number of significant digits of values in records."""
 
 
 Verdict = Report | PlanResult
@@ -74,7 +75,7 @@ Measure = Callable[[Motion], float | None]
 
 @dataclass(frozen=True)
 class Metric:
-    """A figure of motions."""
+    """A number that is computed for each motion."""
 
     name: str
     """Its name in records; in tables with spaces."""
@@ -103,8 +104,8 @@ def _timed(of: Callable[[Trajectory, Robot], float | None]) -> Measure:
 
 
 def _over_straight_line(trajectory: Trajectory, robot: Robot) -> float | None:
-    """Duration over the least time from the first row to the last along the straight line, obstacles and
-    limits of jerk aside."""
+    """The duration, divided by the least time for the straight line from the first row to the last, without
+    obstacles and limits of jerk."""
     if min(robot.velocity.min(), robot.acceleration.min()) <= 0:
         return None
     q = trajectory.positions
@@ -113,7 +114,8 @@ def _over_straight_line(trajectory: Trajectory, robot: Robot) -> float | None:
 
 
 def _joint_jerk(of: Callable[[ndarray, ndarray], float]) -> Measure:
-    """A metric of the jerks between rows, of the joint where each is largest, and of the steps' times."""
+    """A metric that `of` computes from two arrays: for each step between rows, the largest jerk of any joint
+    and the duration of the step."""
 
     def value(trajectory: Trajectory, _: Robot) -> float | None:
         steps = np.diff(trajectory.times)
@@ -140,7 +142,8 @@ def _sparc(tip: bool) -> Measure:
 
 
 _METRICS = (
-    # Euclidean in joint space; the paper's: path lengths of the origins of all moving links together
+    # joint_length: Euclidean in joint space. link_length: the paper's, summed over the origins of all moving
+    # links
     Metric("joint_length", "rad", "less", ".3f", lambda m: m.path.length),
     Metric("link_length", "m", "less", ".2f", lambda m: link_length(m.robot, m.fine[None])[0]),
     Metric(
@@ -153,7 +156,7 @@ _METRICS = (
     # sum of the angles between successive segments in joint space; 0 for a straight line
     Metric("turning", "rad", "less", ".2f", lambda m: turning(m.path.positions)),
     Metric("bending", "", "less", ".0f", lambda m: bending(m.path.positions)),
-    # the smaller of the two that follow: to obstacles, and of the arm to itself
+    # min_clearance is the smaller of scene_clearance (to obstacles) and self_clearance (of the arm to itself)
     Metric("min_clearance", "mm", "more", ".1f", _clearance("min_clearance"), 1000.0),
     Metric("scene_clearance", "mm", "more", ".1f", _clearance("scene_clearance"), 1000.0),
     Metric("self_clearance", "mm", "more", ".1f", _clearance("self_clearance"), 1000.0),
@@ -174,15 +177,16 @@ METRICS = {metric.name: metric for metric in _METRICS}
 def measured(
     robot: Robot, path: Path, trajectory: Trajectory | None = None, verdict: Verdict | None = None
 ) -> dict[str, float]:
-    """Values of the METRICS that a motion has, by name; lengths are 0 for one that stands still."""
+    """Values of METRICS by name, without those that the motion does not have; lengths are 0 for a motion that
+    stands still."""
     motion = Motion(robot, path, trajectory, verdict)
     values = {name: metric.of(motion) for name, metric in METRICS.items()}
     return {name: float(f"{x:.{DIGITS}g}") for name, x in values.items() if x is not None}
 
 
 def bending(positions: Configurations) -> float:
-    """The integral of |q''(u)|^2 du over u in [0, 1], over the squared length, of a path at BENDING_SAMPLES;
-    0 for a straight line."""
+    """The integral of |q''(u)|^2 du for u in [0, 1], divided by the squared length of the path; 0 for a
+    straight line. The path is sampled at BENDING_SAMPLES places."""
     length = Path((), positions).length
     if length < STANDSTILL:
         return 0.0
@@ -206,9 +210,9 @@ def log_dimensionless_jerk(trajectory: Trajectory) -> float:
     Sternad, "Sensitivity of smoothness measures to movement duration, amplitude, and arrests", 2009).
 
     6.579 = ln 720 for a straight minimum-jerk motion, 0 for one that stands still. Jerk is the difference of
-    accelerations over SAMPLE_TIME; before and after the motion they are zero. If accelerations jump, as in
-    time-optimal motions, the integral is inversely proportional to that time: compare only figures with the
-    same one.
+    successive accelerations, which are zero before and after the motion, divided by the time between them
+    (SAMPLE_TIME). If accelerations jump, as in time-optimal motions, the integral is inversely proportional
+    to SAMPLE_TIME: compare only values computed with the same SAMPLE_TIME.
     """
     length = Path((), trajectory.positions).length
     if length < STANDSTILL:
@@ -223,9 +227,10 @@ def spectral_arc_length(speed: Values, step: float) -> float:
     """SPARC of a speed profile with rows `step` [s] apart (S. Balasubramanian, A. Melendez-Calderon, A.
     Roby-Brami and E. Burdet, "On the analysis of movement smoothness", 2015).
 
-    Minus the length of the curve of the amplitude of its Fourier spectrum, 1 at frequency 0, over the
-    frequency as a share of the last one up to CUTOFF whose amplitude is at least THRESHOLD. -1.4 for a
-    minimum-jerk motion, less for less smooth ones; 0 for one that stands still.
+    The amplitude of the Fourier spectrum of the speed is scaled to 1 at frequency 0. Frequencies count up to
+    the last one, at most CUTOFF, whose amplitude is at least THRESHOLD; they are scaled to [0, 1]. The result
+    is minus the length of the curve of amplitude over frequency: -1.4 for a minimum-jerk motion, less for
+    less smooth ones; 0 for one that stands still.
     """
     if speed.sum() * step < STANDSTILL:
         return 0.0

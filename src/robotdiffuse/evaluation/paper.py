@@ -1,9 +1,9 @@
 """The paper's problems, its Table 1 and its figures, beside ours.
 
-The problems are drawn as its authors draw them, with the pose of the tip or one configuration as the goal:
-start and goal points are uniform in a box; inverse kinematics of the position alone finds a start
-configuration and a first goal configuration, whose pose is the goal. Planners find ten configurations for it,
-and success is within 1 cm and 15 degrees.
+Start and goal points are drawn as the authors draw them: uniformly in a box. Inverse kinematics of the
+position alone finds a start configuration and a goal configuration. The goal of a problem is this goal
+configuration, or the pose of the tip in it; for a pose, planners find up to ten configurations. A motion
+succeeds if it ends within 1 cm and 15 degrees.
 """
 
 import itertools
@@ -47,7 +47,7 @@ from robotdiffuse.problems.families.family import POSITION
 from robotdiffuse.problems.families.rop import ROP, Rop
 from robotdiffuse.problems.goals import JointGoal, PoseGoal
 from robotdiffuse.problems.held_out import SEED, Case, CaseFile, goal_of
-from robotdiffuse.problems.held_out import Report as Say
+from robotdiffuse.problems.held_out import Report as ReportProgress
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
 
@@ -89,8 +89,8 @@ def draw_problem(number: int) -> dict[str, Problem]:
 
 
 def goal_configurations(problem: Problem) -> Configurations:
-    """The configurations of a problem's goal; for a pose at most ten free ones, those of a call with
-    seed 0."""
+    """The configurations of a problem's goal; for a pose, at most ten collision-free ones, the same that a
+    planner finds when it is called with seed 0."""
     if isinstance(problem.goal, JointGoal):
         return problem.goal.positions
     assert isinstance(problem.goal, PoseGoal)
@@ -107,13 +107,14 @@ def free_lines(problem: Problem, goals: Configurations) -> list[float | None]:
 
 
 def problem_file(out: FilePath, problem_set: str) -> FilePath:
-    """The file of a problem set in the folder of a bench, which also names the set for `bench run`."""
+    """The file of a problem set in the folder of a bench; `bench run` takes this path as the name of the
+    set."""
     return out / "problems" / f"{problem_set}.jsonl"
 
 
-def write_problems(out: FilePath, count: int, report: Say) -> None:
-    """Draw the first `count` problems of both sets that are not trivial into the folder of a bench, unless it
-    has them."""
+def write_problems(out: FilePath, count: int, report: ReportProgress) -> None:
+    """Draw the first `count` non-trivial problems of both sets and write them into the folder of a bench,
+    unless it has them."""
     files = {name: CaseFile(problem_file(out, name)) for name in GOALS}
     if min(map(len, files.values())) < count:
         cases: dict[str, list[Case]] = {name: [] for name in GOALS}
@@ -129,14 +130,18 @@ def write_problems(out: FilePath, count: int, report: Say) -> None:
 
 
 def trivial_share(out: FilePath, problem_set: str) -> float:
-    """The share of trivial problems among those that were drawn up to the last one of a set."""
+    """The share of trivial problems among all that were drawn until the set was complete."""
     cases = CaseFile(problem_file(out, problem_set)).cases()
     return 1 - len(cases) / (1 + int(cases[-1].name.partition("/")[2]))
 
 
 def straight_line_shares(count: int, family: Rop = ROP) -> dict[str, int]:
-    """How many of `count` problems have a free straight line to the first, to the nearest and to any of their
-    ten goal configurations, which reach a position, as the authors draw them. family: the obstacles."""
+    """Number of problems, of `count`, in which the straight line is free: to one goal configuration, to the
+    nearest of ten, and to any of ten.
+
+    As in the authors' code, goal configurations reach a position with any orientation. family: the
+    distribution of the obstacles.
+    """
     robot = load_robot("panda")
     names = ("a single goal", "the nearest of ten goals", "any of ten goals")
     shares: dict[str, int] = dict.fromkeys(names, 0)
@@ -160,15 +165,17 @@ PAPER_PARTS = "compression_autoencoder", "transformer", 254
 PAPER_SAMPLES = 1_600_000
 """Samples of the paper's training: 25,000 batches of 64."""
 GUIDED_SAMPLE = ("samples=1", "repeat=false")
-"""One sample, no further batches where the validator refuses it."""
+"""One sample, and no further batches if the validator refuses it."""
 ONE_SAMPLE = ("samples=1", "guidance_steps=0", "repeat=false")
-"""The same without guidance by distances: the paper's JPC of Table 2."""
+"""One sample without guidance by distances: the row JPC of the paper's Table 2 (losses of joints, points and
+collision)."""
 NO_WEIGHTS = (
-    f"{AS_IN_PAPER}: no weights of its size and with its encoder. Train them with `robotdiffuse train "
-    "planner --config paper --data FOLDER --encoder FOLDER --out FOLDER` and name them by --paper-weights."
+    f"The row *{AS_IN_PAPER}* is missing: there are no weights of the paper's size with its encoder. Train "
+    "them with `robotdiffuse train planner --config paper --data FOLDER --encoder FOLDER --out FOLDER` and "
+    "give their folder as --paper-weights."
 )
-OURS = "RobotDiffuse"
-"""The paper's name of its own row."""
+PAPER_METHOD = "RobotDiffuse"
+"""Name of the row of the paper's own method in its Table 1."""
 
 
 @dataclass(frozen=True)
@@ -203,16 +210,18 @@ the differences is unknown. These explanations were tried:
 
 - Rounding: four times each printed score has no more than two decimals (1.67, 0.76, 1.67, 2.58, 3.06), so
   normalized values were probably first rounded to two. Then MPD is 0.645 exactly; MPiNets is 0.4150, and
-  MPNet 0.1975, of which 0.19 is the first two decimals; RRT* (0.4475) and RobotDiffuse (0.7750) are one
-  digit away from print. So slips of the pen in three rows, and one score cut short, would explain it all.
+  MPNet 0.1975, of which 0.19 is the first two decimals; RRT* (0.4475) and RobotDiffuse (0.7750) are one digit
+  away from print. So slips of the pen in RRT*, MPiNets and RobotDiffuse, and a truncated score of MPNet,
+  would explain all differences.
 - Columns normalized otherwise (shares of the maximum, logarithms, ranks; all combinations): the largest
   difference stays at 0.025 or more.
-- Other weights: the best that sum to 1 leave 0.011. (0.24, 0.19, 0.29, 0.22), which sum to 0.94, leave 0.002;
-  four free numbers for five scores prove little, and the paper says that its weights are equal.
-- Other figures than the printed ones, as of an earlier state of the table: no change of a single cell leaves
-  less than 0.012. RRT*'s length 15.6 in place of 15.037, and MPiNets' success 88.0 in place of 87.4, leave
-  0.004. At equal weights RRT*'s score can only mean a normalized length of 0.67 for it: it is worst in
-  success and time and best in collision.
+- Other weights: with the best weights that sum to 1, the largest difference is 0.011. With (0.24, 0.19, 0.29,
+  0.22), which sum to 0.94, it is 0.002; four free numbers for five scores prove little, and the paper says
+  that its weights are equal.
+- Other numbers than the printed ones, as from an earlier state of the table: with any change of a single
+  cell, the largest difference is at least 0.012. With RRT*'s length 15.6 in place of 15.037, and MPiNets'
+  success 88.0 in place of 87.4, it is 0.004. RRT* is worst in success and time (0) and best in collision (1),
+  so with equal weights its score requires a normalized length of 0.67.
 """
 
 
@@ -229,19 +238,28 @@ ROWS = (
     Row("MPNet", "mpnet", "MPNet"),
     Row("MPiNets", "mpinets", "MPiNets"),
     Row("MPD", "mpd", "MPD"),
-    Row("diffusion, as it ships: clearances as inputs", "diffusion", OURS),
+    Row("diffusion, as it ships: clearances as inputs", "diffusion", PAPER_METHOD),
     Row("diffusion, a single sample", "diffusion:samples=1:repeat=false"),
     Row("diffusion, a single sample, no guidance", ":".join(["diffusion", *ONE_SAMPLE])),
-    Row("the same, no clearances: 32 points of the scene", ":".join([f"diffusion@{POINTS}", *ONE_SAMPLE])),
+    Row(
+        "diffusion, a single sample, no guidance, no clearances: 32 points of the scene",
+        ":".join([f"diffusion@{POINTS}", *ONE_SAMPLE]),
+    ),
     Row("robotdiffuse, the default: aorrtc", "robotdiffuse"),
     Row("no planner: line to the nearest goal", "straight_line:goals=nearest"),
     Row("no planner: line to any goal", "straight_line"),
-    Row("no planner: line, else one via", "control:source=vias:samples=1:guidance_steps=0"),
-    Row("no planner: line, else 16 vias", "control:source=vias:guidance_steps=0"),
-    Row("no network: line, else smooth noise under guidance", "control"),
+    Row(
+        "no planner: line, else through one fixed configuration",
+        "control:source=vias:samples=1:guidance_steps=0",
+    ),
+    Row(
+        "no planner: line, else through one of 16 fixed configurations",
+        "control:source=vias:guidance_steps=0",
+    ),
+    Row("no network: line, else smooth noise with guidance", "control"),
 )
 MEASURES = ("link_length", "joint_length", "duration", "jerk", "turning")
-"""Metrics of the solved motions that the table has."""
+"""Metrics of solved motions that are columns of the table."""
 
 
 @dataclass(frozen=True)
@@ -255,8 +273,8 @@ class Table1Settings:
     cpu_time: bool = False
     """See `BenchSettings`."""
     paper_weights: str | None = None
-    """Folder with weights of config `paper`, `points` or another one without clearances as inputs, for two
-    rows of single samples: under guidance, as the paper's own row, and without it."""
+    """Folder with weights of config `paper`, `points` or another one without clearances as inputs. They get
+    two rows of single samples: one with guidance, which stands for the paper's method, and one without."""
     data: str | None = None
     """Folder of a data set, for a row of its nearest motions."""
     workers: int = 1
@@ -265,10 +283,10 @@ class Table1Settings:
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """The rows of the table; those without clearances as inputs only with weights, nearest motions with
-        data."""
+        """The rows of the table: ROWS; if `paper_weights` is given, two rows of these weights; if `data` is
+        given, a row of nearest motions."""
         nearest = Row(
-            "no network: line, else nearest motions under guidance",
+            "no network: line, else nearest motions with guidance",
             f"control:source={NEAREST}:data={self.data}",
         )
         controls = () if self.data is None else (nearest,)
@@ -294,11 +312,11 @@ class Table1Settings:
         )
 
 
-def run_table1(settings: Table1Settings, report: Say, done: Done) -> Bench:
-    """Make the calls that are missing in the folder; the bench with all of them.
+def run_table1(settings: Table1Settings, report: ReportProgress, done: Done) -> Bench:
+    """Make the calls that are missing in the folder; returns the bench with all calls.
 
     Raises InputError for paper weights with clearances as inputs or with more steps than fit into the time
-    limit, and as `run_bench` does.
+    limit, and the errors of `run_bench`.
     """
     if settings.paper_weights is not None:
         _check_paper_weights(settings.paper_weights, settings.time_limit)
@@ -308,24 +326,27 @@ def run_table1(settings: Table1Settings, report: Say, done: Done) -> Bench:
 
 
 def _title(folder: str) -> str:
-    """The name of the row of a folder's weights: what they are. Raises InputError if there are none."""
+    """Name of the row for the weights of a folder: it says their encoder, denoiser and number of training
+    samples. Raises InputError if there are none."""
     about = read_description(folder_of(folder), "model")
-    of = MotionModelSettings.from_json(about.get("settings"), f"{folder}/model.json: settings")
-    title = AS_IN_PAPER if (of.encoder, of.denoiser, of.waypoints) == PAPER_PARTS else WITHOUT_CLEARANCES
-    seen = about.get("training", {}).get("samples", 0.0) / PAPER_SAMPLES
-    return f"{title}: {of.encoder}, {of.denoiser}, {100 * seen:.0f} % of {PAPER_SAMPLES / 1e6:g} M samples"
+    settings = MotionModelSettings.from_json(about.get("settings"), f"{folder}/model.json: settings")
+    parts = settings.encoder, settings.denoiser, settings.waypoints
+    title = AS_IN_PAPER if parts == PAPER_PARTS else WITHOUT_CLEARANCES
+    trained = 100 * about.get("training", {}).get("samples", 0.0) / PAPER_SAMPLES
+    network = f"{settings.encoder}, {settings.denoiser}"
+    return f"{title}: {network}, {trained:.0f} % of {PAPER_SAMPLES / 1e6:g} M samples"
 
 
 def _check_paper_weights(folder: str, time_limit: float) -> None:
-    """Raises InputError for weights that get the clearances of the scene as inputs, and for those of which a
-    single sample takes longer here than the time limit [s]."""
+    """Raises InputError for weights that get the clearances of the scene as inputs, and for weights with
+    which a single sample takes longer on this machine than the time limit [s]."""
     from robotdiffuse.learning.exported_model import exported_model
 
     model = exported_model("model", folder, load_robot("panda"))
     if model.settings.clearance_features:
         raise InputError(
-            f"paper_weights is {folder}, whose inputs include clearances; the paper's method sees the scene "
-            "by its code alone: train with --config paper or points"
+            f"paper_weights is {folder}, whose inputs include clearances; these rows are for weights without "
+            "them: train with --config paper or points"
         )
     steps = model.settings.sampling_steps or model.schedule.steps
     inputs = (1, model.waypoints, model.feature_count), 1, (1, model.condition_count)
@@ -349,7 +370,7 @@ def table1(settings: Table1Settings, bench: Bench) -> Report:
     )
     report = paper_report("Table 1", command)
     rows = dict(zip(settings.bench.specs, settings.rows, strict=True))
-    # the folder may have more
+    # the folder may have more problems
     names = {
         case.name
         for problem_set in GOALS
@@ -365,8 +386,8 @@ def table1(settings: Table1Settings, bench: Bench) -> Report:
         report.table(_table(section, rows), level=2)
     shares = [f"{100 * trivial_share(settings.out, name):.0f} % with {kind}" for name, kind in GOALS.items()]
     trivial = (
-        f"Of the problems drawn, trivial are {' and '.join(shares)} as the goal: the straight line to some "
-        "goal configuration is free. They are left out; the paper's figures are of all."
+        "Trivial problems, in which the straight line to some goal configuration is free, are left out: "
+        f"{' and '.join(shares)} as the goal. The paper's figures include them."
     )
     lines = [trivial, *notes(settings), *about(bench), *crashes(bench)]
     if loads:
@@ -375,17 +396,18 @@ def table1(settings: Table1Settings, bench: Bench) -> Report:
     return report
 
 
-def scores(rows: Sequence[Row], of: dict[str, Indicators]) -> dict[str, float]:
-    """ComScores among the paper's five rows; each further row takes the place of the paper's method."""
-    ours = next(row.name for row in rows if row.paper == OURS)
-    other_rows = [row.name for row in rows if row.paper and row.paper != OURS]
-    among = {
-        name: comscores([of[row_name] for row_name in other_rows] + [of[name]]).tolist()
-        for name in of
+def scores(rows: Sequence[Row], indicators: dict[str, Indicators]) -> dict[str, float]:
+    """ComScores of the rows, normalized over the five rows that the paper has. The score of any further row
+    is computed with that row in place of the paper's method."""
+    ours = next(row.name for row in rows if row.paper == PAPER_METHOD)
+    other_rows = [row.name for row in rows if row.paper and row.paper != PAPER_METHOD]
+    scores_with = {
+        name: comscores([indicators[row_name] for row_name in other_rows] + [indicators[name]]).tolist()
+        for name in indicators
         if name not in other_rows
     }
-    return dict(zip(other_rows, among[ours], strict=False)) | {
-        name: values[-1] for name, values in among.items()
+    return dict(zip(other_rows, scores_with[ours], strict=False)) | {
+        name: values[-1] for name, values in scores_with.items()
     }
 
 
@@ -393,23 +415,23 @@ def _table(section: Section, rows: dict[str, Row]) -> Table:
     """The table of a problem set; `rows` by planner."""
     comparison = section.main
     title = f"Goal: {GOALS[section.problem_set]}; {comparison.problems} problems that are not trivial"
-    indicators = {
-        rows[of.planner].name: replace(of.figures, time=Mean.of(o.record.time for o in of.outcomes).value)
-        for of in comparison.rows
-    }
+    indicators = {}
+    for planner_row in comparison.rows:
+        time = Mean.of(o.record.time for o in planner_row.outcomes).value
+        indicators[rows[planner_row.planner].name] = replace(planner_row.figures, time=time)
     comscore = scores(tuple(rows.values()), indicators)
     printed = {row.name: (*astuple(row.indicators), row.comscore) for row in PAPER_TABLE_1}
     printed_beside = section.problem_set == POSE
     table = []
-    for of in comparison.rows:
-        row = rows[of.planner]
-        collision = of.figures.collision / 100
+    for planner_row in comparison.rows:
+        row = rows[planner_row.planner]
+        collision = planner_row.figures.collision / 100
         collisions = wilson_interval(round(collision * comparison.problems), comparison.problems)
         cells = (
             row.name,
-            of.success,
+            planner_row.success,
             share_cell(collision, collisions),
-            *(of.mean(METRICS[name]) for name in MEASURES),
+            *(planner_row.mean(METRICS[name]) for name in MEASURES),
             indicators[row.name].time,
             comscore[row.name],
         )
@@ -435,8 +457,8 @@ def _table(section: Section, rows: dict[str, Row]) -> Table:
 def notes(settings: Table1Settings) -> list[str]:
     """How to read the tables."""
     texts = [
-        f"Every call has {settings.time_limit:g} s{' of CPU time' * settings.cpu_time}, in the paper up to "
-        "600. RRT* searches until then.",
+        f"Every call has {settings.time_limit:g} s{' of CPU time' * settings.cpu_time}; in the paper up to "
+        "600 s. RRT* always uses the whole limit.",
         "success: the motion passes the validator and ends within 1 cm and 15° of the pose, with the 95 % "
         "interval by Wilson. collision: share of problems on which the validator refused the planner's last "
         "path because it collides. RRT*, MPNet, MPiNets, MPD and diffusion as it ships try again until time "
@@ -446,8 +468,8 @@ def notes(settings: Table1Settings) -> list[str]:
         "problems seem short. length of links 1 to 7: path lengths of the origins of the links that joints "
         "move, which the paper calls path length (its arm has no hand; it names no unit). log jerk: "
         "logarithm of the dimensionless jerk; turning: sum of the angles between segments.",
-        "ComScore: as in the paper, among its "
-        "five rows; each further row takes the place of the paper's method.",
+        "ComScore: normalized as in the paper, over its five rows as measured here. The score of any further "
+        "row is computed with that row in place of the paper's method.",
         "robotdiffuse minimizes the duration, its default. time: mean until the planner returns"
         f"{' (CPU time of its process)' * settings.cpu_time}; the machine may do other work.",
     ]
@@ -457,10 +479,11 @@ def notes(settings: Table1Settings) -> list[str]:
 # Figures
 
 STEPS = (1, 2, 5, 10, 50, 200)
-"""Denoising steps of the plot of success."""
+"""Numbers of denoising steps in the plot of success."""
 SHOWN_STEPS = 20
 SHOWN = (0, 10, 15, 18)
-"""Denoising steps of the motion that is drawn, and those of them, counted from the first, that are."""
+"""SHOWN_STEPS: number of denoising steps of the drawn motion. SHOWN: indices of the steps before which it is
+drawn."""
 COMPARED = ("diffusion", "mpinets")
 """Planners of figure 3b, as in the paper."""
 
@@ -469,7 +492,7 @@ class Noisy(NamedTuple):
     """A motion on its way from noise."""
 
     level: float
-    """Noise level as a part of T; 0 for the motion itself."""
+    """Noise level as a fraction of T; 0 for the motion itself."""
     path: Path
 
 
@@ -517,18 +540,19 @@ def success_by_steps(out: FilePath, count: int) -> dict[str, dict[int, list[Reco
             settings = replace(NETWORK_ALONE, guidance_steps=guidance, sampling_steps=steps)
             method = f"{name}, {steps} steps, {sampling_digest(settings, weights)}"
             methods[method] = sampled(from_network(Diffusion(settings)))
-        of = run_all(cases, methods, seeds=(1,), folder=out / "figures", title=f"figure 1, {name}")
-        records[name] = dict(zip(STEPS, of.values(), strict=True))
+        runs = run_all(cases, methods, seeds=(1,), folder=out / "figures", title=f"figure 1, {name}")
+        records[name] = dict(zip(STEPS, runs.values(), strict=True))
     return records
 
 
 def plot_success_by_steps(records: dict[str, dict[int, list[Record]]]) -> str:
-    """The share of single samples that pass the validator over the number of denoising steps, as SVG."""
+    """Plot of the share of single samples that pass the validator, over the number of denoising steps, as
+    SVG."""
 
     def fill(figure: "PlotFigure") -> None:
         axes = figure.subplots()
         for name, of_steps in records.items():
-            shares = [np.array([r.passed for r in of]) for of in of_steps.values()]
+            shares = [np.array([r.passed for r in values]) for values in of_steps.values()]
             mean = np.array([x.mean() for x in shares])
             bars = np.abs(np.array([bootstrap_interval(x) for x in shares]).T - mean)
             axes.errorbar(list(of_steps), mean, bars, fmt="o-", markersize=4, label=name)
@@ -539,7 +563,8 @@ def plot_success_by_steps(records: dict[str, dict[int, list[Record]]]) -> str:
 
 
 def plot_success_over_time(bench: Bench) -> str:
-    """Figure 3a, with the paper's method in it: success over time on the problems with poses, as SVG."""
+    """Figure 3a: success over time on the problems with poses, as SVG. The lines are the planners with their
+    default settings, among them `diffusion` as it ships."""
     plain_rows = {name: records for name, records in bench.records.items() if ":" not in name}
     parts = sections(replace(bench, records=plain_rows))
     return success_over_time(next(part for part in parts if part.name == POSE), list(plain_rows))
@@ -554,8 +579,8 @@ class Compared(NamedTuple):
 
 
 def compared_motions(bench: Bench) -> Compared | None:
-    """The problem that is not trivial and solved by all planners of figure 3b on which their lengths differ
-    most; None without one."""
+    """Of the non-trivial problems that both planners of figure 3b solve, the one on which the lengths of
+    their paths differ most; None if there is none."""
     solved = {
         planner: {
             (r.problem_set, r.name): r for r in bench.records.get(planner, ()) if r.solved and not r.trivial
@@ -567,10 +592,12 @@ def compared_motions(bench: Bench) -> Compared | None:
         return None
 
     def ratio(key: tuple[str, str]) -> float:
-        lengths = [of[key].joint_length or 1.0 for of in solved.values()]
+        lengths = [by_key[key].joint_length or 1.0 for by_key in solved.values()]
         return max(lengths) / min(lengths)
 
     best = max(keys, key=ratio)
     case = next(case for name in (POSE, JOINT) for case in read_cases(bench.folder, name) if case.key == best)
     names = case.problem.robot.joint_names
-    return Compared(case, {planner: Path(names, of[best].waypoints) for planner, of in solved.items()})
+    return Compared(
+        case, {planner: Path(names, by_key[best].waypoints) for planner, by_key in solved.items()}
+    )

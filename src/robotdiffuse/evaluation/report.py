@@ -1,4 +1,4 @@
-"""A report: texts, tables and plots as Markdown, and the same as an HTML page that needs no network.
+"""A report: texts, tables and plots as Markdown, and the same as an HTML page that works offline.
 
 Plots are SVG. They need matplotlib, which is not part of the core install.
 """
@@ -60,7 +60,7 @@ class Report:
         self.add("\n".join(markdown(table)))
 
     def plot(self, file: str, caption: str, svg: str) -> None:
-        """Add a plot, which is to lie in a file beside the report."""
+        """Add a plot, which `write` writes to a file beside the report."""
         self.plots[file] = svg
         self.picture(file, caption)
 
@@ -79,7 +79,7 @@ class Report:
 
         body = MarkdownIt().enable("table").render(self.markdown)
         for file, svg in self.plots.items():
-            # references into another plot would draw nothing
+            # plots use the same ids, and a reference to one in another plot draws nothing: make them unique
             svg = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{FilePath(file).stem}-", svg)
             body = re.sub(rf'<img src="{re.escape(file)}"[^>]*>', lambda _, svg=svg: svg, body)
         titles = re.findall("<h2>(.*?)</h2>", body)
@@ -98,7 +98,7 @@ class Report:
         """Write the report as Markdown, and its plots beside."""
         write_atomically(file, self.markdown, make_folder=True)
         for name, svg in self.plots.items():
-            # the text is dark
+            # dark text needs a white background, also in a viewer with a dark one
             write_atomically(file.with_name(name), svg.replace("<svg ", '<svg style="background: white" ', 1))
 
 

@@ -33,16 +33,18 @@ from robotdiffuse.robots.robot import MOVING_KINDS, Robot
 from robotdiffuse.scenes.scene import Scene
 
 STATIONARY_TOLERANCE = 1e-6
-"""A joint that moves less than this counts as stationary [rad] or [m]."""
+"""Allowance for the rounding of recorded values: a locked joint may move by this and LOCKED_TOLERANCE
+together [rad] or [m]."""
 LOCKED_TOLERANCE = 1e-4
 """Largest distance of a joint from the value that the problem locks it at [rad] or [m]."""
 MAX_NAMES = 6
-"""Most joint names in a message."""
+"""Largest number of joint names in a message."""
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedMotion:
-    """A checked motion of any joints, in any order; absent rates are None."""
+    """A checked motion of any joints, in any order; velocities and accelerations that the recording lacks are
+    None."""
 
     joint_names: tuple[str, ...]
     positions: Float[ndarray, "n joints"]
@@ -62,8 +64,9 @@ def checked_motion(
 ) -> RecordedMotion:
     """Check the parts of a motion and return it.
 
-    Empty rates count as absent. Times are shifted to begin at 0; times that are all 0 count as absent. Raises
-    InputError as `check_motion_arrays` does, and for times that do not increase.
+    Empty times, velocities and accelerations count as absent. Times are shifted to begin at 0; times that are
+    all 0 count as absent. Raises InputError as `check_motion_arrays` does, and for times that do not
+    increase.
     """
     optional_fields = {"times": times, "velocities": velocities, "accelerations": accelerations}
     arrays = {name: value for name, value in optional_fields.items() if not _empty(value)}
@@ -79,20 +82,20 @@ def checked_motion(
     return RecordedMotion(joints, **checked | {"times": t - t[0]}, notes=notes)
 
 
-def _empty(rates: object) -> bool:
+def _empty(value: object) -> bool:
     """Whether the value is None, or a list of empty rows."""
-    if rates is None:
+    if value is None:
         return True
     try:
-        return all(len(row) == 0 for row in rates)  # type: ignore[attr-defined, arg-type, union-attr]
+        return all(len(row) == 0 for row in value)  # type: ignore[attr-defined, arg-type, union-attr]
     except TypeError:
         return False
 
 
 @dataclass(frozen=True, eq=False)
 class RobotMotion:
-    """A recorded motion as one of a robot's planned joints, and notes on what the conversion changed or left
-    out."""
+    """A recorded motion, converted to the planned joints of a robot, with notes on what the conversion
+    changed or left out."""
 
     motion: Path | Trajectory
     notes: tuple[str, ...]
@@ -101,10 +104,10 @@ class RobotMotion:
 def motion_of_robot(motion: RecordedMotion, robot: Robot) -> RobotMotion:
     """The motion of a robot's planned joints, matched by name.
 
-    The recording may contain other joints of the robot, if they stay at their locked values. Absent
-    velocities become those of the cubic spline from rest to rest through the rows, absent accelerations the
-    means of those of the cubics before and after each row. Raises InputError for missing or unknown joints,
-    and for other joints that leave their locked values.
+    The recording may contain other joints of the robot, if they stay at their locked values. If velocities
+    are absent, they are those of the cubic spline through the rows that starts and ends at rest. If
+    accelerations are absent, each is the mean of the accelerations of the two cubics that meet at its row.
+    Raises InputError for missing or unknown joints, and for other joints that leave their locked values.
     """
     notes = list(motion.notes)
     columns = {name: j for j, name in enumerate(motion.joint_names)}
@@ -178,8 +181,8 @@ def _mean_accelerations(motion: Trajectory) -> JointRows:
 
 
 def problem_of_motion(motion: RecordedMotion, robot: Robot, scene: Scene) -> Problem:
-    """The problem in a scene whose start and goal are those of a motion; its other joints are locked at their
-    first values."""
+    """A problem in the scene, from the first to the last row of the motion. Joints of the recording that are
+    not planned are locked at their values in the first row."""
     movable = {j.name for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None}
     movable -= set(robot.joint_names)
     at = {name: float(motion.positions[0, j]) for j, name in enumerate(motion.joint_names) if name in movable}
@@ -263,8 +266,8 @@ def _only(trajectories: Any) -> RecordedMotion:
     if isinstance(trajectories, Mapping):
         return _motion(trajectories)
     if not isinstance(trajectories, list) or len(trajectories) != 1:
-        count = len(trajectories) if isinstance(trajectories, list) else shown(trajectories)
-        raise InputError(f"trajectory holds {count} parts; one is validated at a time")
+        count = f"has {len(trajectories)} parts" if isinstance(trajectories, list) else "is no list"
+        raise InputError(f"trajectory {count}; it must be a trajectory, or a list of one")
     return _motion(trajectories[0])
 
 

@@ -1,7 +1,7 @@
 """The occupancy completion network, which predicts obstacles where no camera saw.
 
-Its voxels, its use by ONNX Runtime, and the samples that it is trained on: random scenes seen by cameras
-placed as a person would place them.
+This module defines the network's voxels, runs the network with ONNX Runtime, and draws its training samples:
+random scenes seen by cameras that are placed as a person would place them.
 
 Nothing here loads PyTorch. The network itself is in `completion_network`.
 """
@@ -51,10 +51,10 @@ class CompletionSettings(Settings, name="completion"):
     """Sizes of the network."""
 
     channels: tuple[Count, Count, Count] = (32, 64, 128)
-    """Features of cells of 8, 16 and 32 cm."""
+    """Number of features of each cell of 8, 16 and 32 cm."""
     blocks: tuple[Count, Count, Count] = (1, 1, 2)
-    """Residual blocks at each size: as many on the way down as on the way up; those of the last size occur
-    once."""
+    """Number of residual blocks at each cell size of the U-Net: the first two numbers hold on the way down
+    and again on the way up, the last one at the bottom."""
 
 
 def voxel_centers() -> Float[ndarray, "56 56 32 3"]:
@@ -69,7 +69,8 @@ def reachable() -> Bool[ndarray, "56 56 32"]:
 
 
 REACH_SAMPLES = 256
-"""Random configurations: they reach within 1 cm as far as thousands do."""
+"""Number of random configurations that are tried. The farthest point that they reach is within 1 cm of the
+farthest that thousands reach."""
 
 
 @once_per_robot
@@ -109,9 +110,11 @@ class CameraPlaces(Settings, name="cameras"):
     height: Range = (0.4, 1.6)
     """Above the base."""
     front_share: float = 0.75
-    """Share of the cameras that stand in front, on the arm's side of the obstacles."""
+    """Share of the cameras whose bearing from the base is drawn about the direction away from the obstacles;
+    the bearings of the others are drawn from the whole circle."""
     front: float = 2.0
-    """Largest angle about the base between such a camera and the direction opposite the obstacles."""
+    """Largest difference between such a bearing and the direction that, seen from the base, is opposite to
+    the obstacles."""
     target_spread: float = 0.2
     """Standard deviation of the point that a camera looks at, about a point in front of the arm."""
     field_of_view: Range = (0.75, 1.1)
@@ -135,22 +138,22 @@ class CameraPlaces(Settings, name="cameras"):
 
 
 VIEW_COUNTS = (1, 1, 1, 2)
-"""Numbers of views of a sample, drawn evenly."""
+"""The number of views of a sample is one of these, each with the same probability."""
 IMAGE_SIZE = (160, 120)
 """Width and height of images [pixels]."""
 NOISE_SHARE = 0.5
-"""Share of the samples with noise, of up to twice the usual strength."""
+"""Share of the samples that have noise, of up to twice the usual strength."""
 CAMERA_CLEARANCE = 0.05
 """Cameras stand at least this far from obstacles, where a few draws find such a place [m]."""
 CAMERA_DRAWS = 8
 OUT_OF_RANGE_SHARE = 0.5
 """Share of the noisy samples in which surfaces out of range return no depth, as with most real cameras."""
 MISSING_SHARE = 0.02
-"""Share of the pixels without a return, anywhere, with noise of the usual strength."""
+"""Share of the pixels, anywhere in the image, that return no depth if noise has its usual strength."""
 NOISE_FIELDS = ("spread", "missing", "stray", "flying", "edge_missing", "grazing")
 """Fields of the noise that its strength multiplies."""
 NO_FLOOR_SHARE = 0.1
-"""Share of the samples without a floor: the arm stands on a pedestal."""
+"""Share of the samples without a floor, as for an arm on a pedestal (the pedestal itself is not modeled)."""
 
 
 class Samples(NamedTuple):
@@ -208,7 +211,7 @@ def draw_sample(families: Sequence[str], robot: Robot, rng: Generator) -> tuple[
     scene = family.scene(rng, base_spheres(robot))
     if rng.random() < NO_FLOOR_SHARE:
         scene = Scene([shape for shape in scene.shapes if shape is not family.floor])
-    # the first of 64 configurations without collision; with collision if there is none
+    # the first of 64 random configurations that is free of collision, or the first one if none is
     q = rng.uniform(robot.lower, robot.upper, (64, robot.dof))
     q = q[CollisionChecker(robot, scene).free(q).argmax()]
     views = [camera_view(scene, robot, q, rng) for _ in range(rng.choice(VIEW_COUNTS))]
@@ -240,8 +243,9 @@ Completion = Callable[[ndarray, ndarray], ndarray]
 def predict(volume: ObservedVolume, network: Completion | None = None) -> Float32[ndarray, "112 112 64"]:
     """The probability that each voxel of 2 cm holds an obstacle.
 
-    It is 0 in voxels that were seen free, and farther than 1 m from a Panda's shoulder, which training did
-    not cover. The grid begins at the volume's LOW. network: None for the one that comes with the package.
+    It is 0 in voxels that were seen free. It is also 0 farther than 1 m from a Panda's shoulder, since
+    training did not cover these voxels. The grid begins at the volume's LOW. network: None for the one that
+    comes with the package.
     """
     return (network or exported_completion())(*pack(volume))
 

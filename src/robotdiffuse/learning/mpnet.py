@@ -9,22 +9,22 @@ randomness comes from. The planner around it is `baselines.mpnet`.
 Differences from the paper:
 
 - Enet and Pnet are smaller, so that they train in an hour of one core; the settings name the paper's sizes.
-- The paper trains Enet either as an auto-encoder or end to end with Pnet. Here one run does both in turn: z
-  of an auto-encoder alone loses what decides about collisions, and training end to end is cheap, as
-  the waypoints of a trajectory share their z.
+- The paper trains Enet either as an auto-encoder or end to end with Pnet. Here one run does both in turn: a
+  code z that is trained only for reconstruction loses details that decide whether the arm collides, and
+  training end to end is cheap, as the waypoints of a trajectory share their z.
 - The paper's clouds list the obstacles in a fixed order, which a sensed cloud lacks. So points are sorted
   along a space-filling curve: neighbors in the list are neighbors in space, and a perceptron can average
   them.
-- The contractive penalty is that of S. Rifai et al., "Contractive auto-encoders", ICML 2011, which the paper
-  names; its equation has the squared weights in that place.
+- The contractive penalty is that of S. Rifai et al., "Contractive auto-encoders", ICML 2011, as the text of
+  MPNet's paper says; the equation in MPNet's paper has a sum of squared weights in place of it.
 - Pnet outputs the step to the next waypoint, in units of the data's steps, in place of the waypoint: so
   dropout disturbs the step alone, not the arm's current configuration.
-- A quarter of Pnet's outputs is dropped, not half: its narrower layers then keep about as many as in the
-  paper. With half, Pnet learns far less in this shorter training.
-- Waypoints are 0.7 rad apart on our demonstrations, from a random waypoint on; those of the paper are the
-  vertices of optimized RRT* paths. A step is a sixth of a path on average, and the chords are 0.3 % shorter
-  than the paths. All steps have this length, so that the target is unambiguous; steps of a share of the
-  path's length would not be.
+- Dropout drops a quarter of the outputs of Pnet's hidden layers, not half: so these narrower layers keep
+  about as many outputs as in the paper. With half, Pnet learns far less in this shorter training.
+- A training sample is a random row of one of our demonstrations and the row 0.7 rad further along the path
+  (the paper: neighboring vertices of optimized RRT* paths). On average that is a sixth of a path, and the
+  chords are 0.3 % shorter than the path. The step has the same length everywhere; if it were a fraction of
+  the path's length, the same inputs could have different targets.
 - Half of the samples have as their goal a later waypoint other than the last one: bidirectional planning and
   replanning ask for such pairs.
 """
@@ -58,22 +58,23 @@ then fills the region."""
 PRETRAINING = 0.1
 """Share of the training, at its beginning, in which Enet is trained as an auto-encoder."""
 SUB_GOALS = 0.5
-"""Share of the samples whose goal is a later waypoint of the trajectory than its last one."""
+"""Share of the samples whose goal is a random later waypoint of the trajectory, in place of its last one."""
 TRIVIAL_SHARE = 0.15
-"""Share of the training trajectories between ends whose straight line is free too."""
+"""Share of the training trajectories that are trivial: a free straight line also joins their start and
+goal."""
 
 
 @dataclass(frozen=True)
 class MPNetSettings(Settings, name="mpnet"):
     points: Count = 320
-    """Points of Enet's input cloud (paper: 1,400, of a plane)."""
+    """Points of Enet's input cloud (paper: 1,400, for scenes in two dimensions)."""
     encoder_layers: Sizes = (384, 256, 128)
     """Layers of Enet between the cloud and z (paper: 512, 256, 128)."""
     decoder_layer: Count = 128
     """The one layer between z and the reconstruction, used in training only (paper: the mirror image of
     Enet)."""
     code: Count = 60
-    """Size of z (paper: 28, for a plane)."""
+    """Size of z (paper: 28, for scenes in two dimensions)."""
     contraction: NotNegative = 1e-3
     """lambda, the weight of the contractive penalty [m^2]."""
     layers: Sizes = (768, 640, 512, 384, 320, 256, 192, 128, 128, 64, 32)
@@ -86,7 +87,7 @@ class MPNetSettings(Settings, name="mpnet"):
     step: Positive = 0.7
     """Distance along the path from one waypoint to the next [rad, joint-space L2]."""
     waypoints: Count = 8
-    """Samples drawn of each trajectory; they share z."""
+    """Number of training samples from each trajectory; they share z."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -106,12 +107,14 @@ class MPNetNetwork(BaselineNetwork):
 
     def __init__(self, robot: RobotIdentity, settings: MPNetSettings | None = None) -> None:
         super().__init__(robot, settings or MPNetSettings())
-        of = self.settings
-        sizes = (3 * of.points, *of.encoder_layers, of.code)
+        settings = self.settings
+        sizes = (3 * settings.points, *settings.encoder_layers, settings.code)
         self.encoder = Perceptron(sizes)
-        self.decoder = Perceptron((of.code, of.decoder_layer, sizes[0]))
+        self.decoder = Perceptron((settings.code, settings.decoder_layer, sizes[0]))
         self.policy = Perceptron(
-            (of.code + 2 * self.dof, *of.layers, self.dof), of.dropout, len(of.layers) - of.steady_layers
+            (settings.code + 2 * self.dof, *settings.layers, self.dof),
+            settings.dropout,
+            len(settings.layers) - settings.steady_layers,
         )
         self.register_buffer("step_scale", torch.tensor(0.1))
         self.step_scale: Tensor
@@ -170,17 +173,17 @@ class MPNetNetwork(BaselineNetwork):
         """The auto-encoder's loss [m^2] in the first part of the training, then Pnet's, end to end through
         Enet.
 
-        Each scene has `waypoints` samples. Pnet's loss is the mean squared error of the steps, in units of
+        Each scene gives `waypoints` samples. Pnet's loss is the mean squared error of the steps, in units of
         the data's steps.
         """
-        of = self.settings
+        settings = self.settings
         generator = torch_generator(rng)
-        rows = data.draw(max(1, count // of.waypoints), TRIVIAL_SHARE, rng)
-        cloud = surface_clouds(data.scenes[rows], of.points, generator, region=self.region)
+        rows = data.draw(max(1, count // settings.waypoints), TRIVIAL_SHARE, rng)
+        cloud = surface_clouds(data.scenes[rows], settings.points, generator, region=self.region)
         with fast_autocast():
             if fraction < PRETRAINING:
                 return self.autoencoder_loss(cloud, generator)
-            z = self.encode(cloud).repeat_interleave(of.waypoints, 0)
+            z = self.encode(cloud).repeat_interleave(settings.waypoints, 0)
             q, following, goal = (torch.from_numpy(a) for a in self.training_samples(data.q[rows], rng))
             x = self.to_unit(q)
             target = self.to_unit(goal)
@@ -205,11 +208,11 @@ class MPNetNetwork(BaselineNetwork):
     ) -> tuple[Float[ndarray, "n dof"], Float[ndarray, "n dof"], Float[ndarray, "n dof"]]:
         """Configurations, the waypoints after them, and goals [rad], along trajectories in a random
         direction."""
-        of = self.settings
+        settings = self.settings
         last = q.shape[1] - 1
         spacing = np.linalg.norm(np.diff(q, axis=1), axis=2).mean(1)
-        stride = np.clip(np.rint(of.step / np.maximum(spacing, 1e-6)), 1, last).astype(np.int64)
-        rows = np.repeat(np.arange(len(q)), of.waypoints)
+        stride = np.clip(np.rint(settings.step / np.maximum(spacing, 1e-6)), 1, last).astype(np.int64)
+        rows = np.repeat(np.arange(len(q)), settings.waypoints)
         n = len(rows)
         goal = np.full(n, last)
         near = rng.random(n) < SUB_GOALS

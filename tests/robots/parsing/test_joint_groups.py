@@ -159,7 +159,7 @@ def test_mimic_of_nothing_or_in_a_circle(followed: str, tmp_path: Path) -> None:
         + link("end")
         + joint("other", "base", "end", more='<mimic joint="rod"/>')
     )
-    with pytest.raises(InputError, match="joint of the file that does not mimic it"):
+    with pytest.raises(InputError, match="another joint of the file and must not mimic"):
         read_urdf(written(tmp_path, ARM, parts))
 
 

@@ -55,7 +55,7 @@ from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 
-# Scenes that a linear read-out is fitted to, and further ones that it is tested on.
+# Number of scenes to which a linear read-out is fitted, and number of further scenes on which it is tested.
 READOUT_SCENES = 2048
 TEST_SCENES = 512
 READOUT_POSITIONS = np.stack(
@@ -74,7 +74,8 @@ def train_encoder(settings: EncoderTraining, out: str) -> dict[str, float]:
     """Train an auto-encoder; write encoder.safetensors and encoder.json into the folder `out`.
 
     The same call continues a run that was interrupted. Returns errors on fresh clouds [m], those of the
-    reconstruction (see the encoder's `loss`) and of `linear_readout`, and `samples`. Raises as `task.train`.
+    reconstruction (see the encoder's `loss`) and of `linear_readout`, and `samples`. Raises the errors of
+    `loop.train`.
     """
     return train(_EncoderTask(settings, Processes(settings.device)), out)
 
@@ -91,10 +92,10 @@ class _EncoderTask(TrainingTask):
         module = make_encoder(settings.name, settings.encoder)
         assert isinstance(module, Autoencoder)  # by EncoderTraining
         self.module = self._trained = module.to(processes.device)
-        self._most = settings.points if module.settings.any_size else module.settings.cloud
+        self._max_points = settings.points if module.settings.any_size else module.settings.cloud
 
     def loss(self, fraction: float, rng: Generator) -> Scalar:
-        points = self._most
+        points = self._max_points
         if self.module.settings.any_size:
             points = int(rng.integers(max(1, points // 8), points + 1))
         error, _ = self._reconstruction(self.settings.batch, points, rng)
@@ -124,7 +125,7 @@ class _EncoderTask(TrainingTask):
 
     def _validation(self, count: int, seed: int) -> Loss:
         with torch.no_grad():
-            return self._reconstruction(count, self._most, np.random.default_rng(seed))
+            return self._reconstruction(count, self._max_points, np.random.default_rng(seed))
 
     def _reconstruction(self, count: int, points: int, rng: Generator) -> Loss:
         scenes = self._scenes(count, rng)
@@ -137,8 +138,8 @@ def linear_readout(encoder: Encoder, scenes: PackedScenes, rng: Generator) -> di
     """Errors of a linear read-out of z, the same measure for all encoders.
 
     A linear map from z to the signed distances of fixed positions around the arm to the obstacles is fitted
-    to the first READOUT_SCENES and tested on the others. `readout`: its mean error [m];
-    `readout_of_constant`: the error of the mean distances, without z.
+    to the first READOUT_SCENES and tested on the others. `readout`: mean error of this map [m];
+    `readout_of_constant`: mean error if the mean distances are predicted, without z [m].
     """
     with torch.no_grad():
         clouds = scene_clouds(encoder, scenes, rng).split(256)
@@ -149,24 +150,26 @@ def linear_readout(encoder: Encoder, scenes: PackedScenes, rng: Generator) -> di
         .astype(np.float64)
     )
     # both relative to their means over the scenes of the fit
-    (z, z_tested), (of_z, tested) = (
+    (z, z_test), (target_fit, target_test) = (
         np.split(values - values[:READOUT_SCENES].mean(0), [READOUT_SCENES]) for values in (z, targets)
     )
     gram = z.T @ z
     ridge = max(RELATIVE_RIDGE * np.trace(gram) / len(gram), np.finfo(np.float64).tiny)
-    weights = np.linalg.solve(gram + ridge * np.eye(len(gram)), z.T @ of_z)
+    weights = np.linalg.solve(gram + ridge * np.eye(len(gram)), z.T @ target_fit)
     return {
-        "readout": float(np.abs(tested - z_tested @ weights).mean()),
-        "readout_of_constant": float(np.abs(tested).mean()),
+        "readout": float(np.abs(target_test - z_test @ weights).mean()),
+        "readout_of_constant": float(np.abs(target_test).mean()),
     }
 
 
 SAMPLING_STEPS = 6
-"""Sampling steps of every network, so that validation takes less time than the training."""
+"""Number of sampling steps in validations, the same for all networks: few, so that a validation takes less
+time than the training between two validations."""
 PRIOR_GUIDANCE_STEPS = 4
-"""Guidance of a prior, whose inputs do not include the scene: gradient steps in each guided sampling step."""
+"""Number of gradient steps of the guidance in each sampling step of a prior: a motion model without the scene
+as input."""
 CHECKS_PER_SEGMENT = 6
-"""Configurations that are checked in each segment from waypoint to waypoint."""
+"""Number of configurations that are checked in each segment from waypoint to waypoint."""
 
 
 def planning_success(
@@ -214,18 +217,19 @@ def free_in_scene(checker: CollisionChecker, q: Trajectories) -> Mask:
 
 
 VALIDATION_SAMPLES = 4
-"""Trajectories sampled for each problem of a validation."""
+"""Number of trajectories that are sampled for each problem of a validation."""
 MAX_STATISTICS_TRAJECTORIES = 20_000
-"""Largest number of trajectories for scale, mean and covariance."""
+"""Largest number of trajectories from which the scale, mean and covariance of the motions are estimated."""
 
 
 def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
-    """Train the diffusion model; write model.safetensors and model.json, all that planning needs; for a prior
-    trajectory_prior.safetensors and .json.
+    """Train the diffusion model. Write model.safetensors, from which training continues, the ONNX files that
+    planning runs, and model.json. For a prior (a model without the scene as input) the files are named
+    trajectory_prior.
 
     The same call continues a run that was interrupted. Returns `validation`, the loss on held-out
     trajectories, `success`, the share of free motions among those sampled for their problems, and `samples`.
-    Raises as `task.train`, and InputError if the data or the encoder do not fit.
+    Raises the errors of `loop.train`, and InputError if the data or the encoder do not fit.
     """
     return train(PlannerTask(settings, Processes(settings.device)), out)
 
@@ -320,7 +324,8 @@ class PlannerLoss:
         rng: Generator,
         dropped: Bool[Tensor, "n"] | None = None,
     ) -> Scalar:
-        """The loss. fraction: of the training that is done; dropped: samples whose condition is hidden."""
+        """The loss. fraction: fraction of the training that is done. dropped: samples whose condition is
+        hidden."""
         model = self.model
         losses = self.settings
         device = self.processes.device
@@ -410,8 +415,7 @@ def train_baseline(settings: BaselineTraining, out: str) -> dict[str, float]:
     """Train a network with its default settings; write NAME.safetensors and NAME.json into the folder `out`.
 
     The same call continues a run that was interrupted. Returns `validation`, the loss on held-out
-    trajectories, and `samples`.
-    Raises as `task.train`, and InputError if the data do not fit.
+    trajectories, and `samples`. Raises the errors of `loop.train`, and InputError if the data do not fit.
     """
     return train(_BaselineTask(settings, Processes(settings.device)), out)
 

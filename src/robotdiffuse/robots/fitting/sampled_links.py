@@ -28,12 +28,12 @@ from robotdiffuse.robots.motion_bounds import radii_of
 from robotdiffuse.robots.robot import LinkPairTable, Robot
 
 BINS = 24
-"""Bins of a joint's range, to test whether the joint alone determines when two links collide."""
+"""Number of bins of a joint's range, to test whether the joint alone determines when two links collide."""
 MAX_STOPPED_RANGE = 5.2
 """A joint with a narrower range has mechanical stops [rad]; limits of wider ranges may be arbitrary."""
 MAX_UNEXPLAINED = 0.25
-"""For the reason `limits`: largest fraction of the variance of "the links collide" that the joint's value may
-leave unexplained."""
+"""A pair of links is allowed for the reason `limits` (see `self_collisions`) if the joint's value leaves at
+most this fraction of the variance of the indicator "the links collide" unexplained."""
 BALL_MARGIN = 1e-9
 """Margin of bounding and inscribed balls of meshes [m], larger than rounding errors."""
 NEAR_DISTANCE = 0.1
@@ -50,7 +50,7 @@ class Links:
         self.lower = np.array([joint.lower for joint in self.joints])
         self.upper = np.array([joint.upper for joint in self.joints])
         self.distance_request, self.distance_result = coal.DistanceRequest(), coal.DistanceResult()
-        self._leading: dict[frozenset[str], tuple[str, list[Joint]]] = {}
+        self._joints_between: dict[frozenset[str], tuple[str, list[Joint]]] = {}
         self.request, self.result = coal.CollisionRequest(), coal.CollisionResult()
 
     @cached_property
@@ -77,8 +77,8 @@ class Links:
         return np.array([rest.get(j.name, min(max(0.0, j.lower), j.upper)) for j in self.joints])
 
     def stop_explains(self, joint: Joint, q: Configurations, colliding: Mask) -> bool:
-        """Whether a joint alone determines in which configurations two links collide, up to one of its
-        stops."""
+        """Whether the value of a joint alone determines if two links collide, and they collide from some
+        value on up to one of the joint's stops."""
         if joint not in self.joints or joint.upper - joint.lower > MAX_STOPPED_RANGE:
             return False
         share = (q[:, self.joints.index(joint)] - joint.lower) / (joint.upper - joint.lower)
@@ -90,8 +90,8 @@ class Links:
         return bool(max(often[0], often[-1]) > 0.99 and unexplained < MAX_UNEXPLAINED * variance)
 
     def poses(self, q: Configurations, wanted: frozenset[str] | None = None) -> dict[str, Poses]:
-        """T_base_link by link. With `wanted` links, only their relative poses, in the frame of some common
-        link."""
+        """T_base_link by link. With `wanted` links, only their poses relative to each other, in the frame of
+        their last common ancestor."""
         start, joints = (self.robot.base, self.robot.joints) if wanted is None else self._between(wanted)
         poses = {start: np.broadcast_to(np.eye(4), (len(q), 4, 4))}
         values = with_mimics(self.robot.joints, {joint.name: q[:, i] for i, joint in enumerate(self.joints)})
@@ -104,16 +104,17 @@ class Links:
 
     def _between(self, links: frozenset[str]) -> tuple[str, list[Joint]]:
         """The last common ancestor of links, and the joints from there to them."""
-        if links not in self._leading:
+        if links not in self._joints_between:
             chains = [self.robot.joints_above(link) for link in links]
-            common = [one for one, *rest_of_chain in zip(*chains, strict=False) if {*rest_of_chain} <= {one}]
+            common = [first for first, *others in zip(*chains, strict=False) if {*others} <= {first}]
             needed = {joint.child for chain in chains for joint in chain[len(common) :]}
             joints = [joint for joint in self.robot.joints if joint.child in needed]
-            self._leading[links] = common[-1].child if common else self.robot.base, joints
-        return self._leading[links]
+            self._joints_between[links] = common[-1].child if common else self.robot.base, joints
+        return self._joints_between[links]
 
     def sphere_distance(self, poses: dict[str, ndarray], a: str, b: str) -> Values:
-        """Signed distances between the covering spheres of two links [m], a lower bound for their meshes."""
+        """Signed distances between the covering spheres of two links [m], a lower bound of the distances of
+        their meshes."""
         first, second = (for_kernels(self.robot.spheres[link]) for link in (a, b))
         return -deepest_touches(poses[a], poses[b], first, second, NEAR_DISTANCE, -np.inf)[0]
 
@@ -123,7 +124,7 @@ class Links:
         return coal_pose(poses[a][i]), coal_pose(poses[b][i]), ball_gaps
 
     def collide(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> bool:
-        """Whether the meshes of two links collide in configuration i."""
+        """Whether convex parts of two links collide in configuration i."""
         T_a, T_b, ball_gaps = self._placed(poses, a, b, i)
         for m, n in zip(*np.nonzero(ball_gaps <= 0), strict=True):
             self.result.clear()
@@ -144,7 +145,8 @@ class Links:
         return np.reshape(contact_points, (-1, 3))
 
     def mesh_distance(self, poses: dict[str, ndarray], a: str, b: str, i: int = 0) -> float:
-        """Distance between the meshes of two links in configuration i [m]; zero or less if they collide."""
+        """Distance between the convex parts of two links in configuration i [m]; zero or less if they
+        collide."""
         T_a, T_b, ball_gaps = self._placed(poses, a, b, i)
         min_distance = np.inf
         for k in ball_gaps.argsort(axis=None):
@@ -192,7 +194,7 @@ class Links:
 
 
 CELLS = 128
-"""Cells of a table along each joint; a power of two."""
+"""Number of cells of a table along each joint; a power of two."""
 ROUNDING = 1e-5
 """Upper bound on the rounding error of a distance [m]."""
 
@@ -218,14 +220,14 @@ def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float
     parts = np.indices([len(robot.meshes[link]) for link in pair]).reshape(2, -1)
     low = np.zeros(
         (parts.shape[1], len(joints))
-    )  # a row for each cell and pair of parts that may touch there
+    )  # one row for each pair of parts and cell in which the parts may touch
     while len(low):
-        cells, cell = np.unique(low, axis=0, return_inverse=True)
+        cells, cell_of_row = np.unique(low, axis=0, return_inverse=True)
         q = np.tile(nominal, (len(cells), 1))
         q[:, columns] = lower + edge * (cells + size / 2)
         travel = float(lever @ (edge * size) / 2) + ROUNDING
         poses = links.poses(q, frozenset(pair))
-        distance = links.part_distances(poses, *pair, cell.ravel(), parts, travel)
+        distance = links.part_distances(poses, *pair, cell_of_row.ravel(), parts, travel)
         touch = distance <= travel
         given_up = touch & ((size <= 1).all() & (distance <= 0) | (distance < -travel) | (travel < finest))
         for first, last in zip(*_cells(np.unique(low[given_up], axis=0), size), strict=True):

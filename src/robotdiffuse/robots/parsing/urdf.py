@@ -153,7 +153,7 @@ class UrdfTree:
             if child in self.parents:
                 raise InputError(
                     f"{self.path}: link {child} has two parent joints ({self.parents[child]}, {name}); a "
-                    f"URDF is a tree: remove one, and let the joints that close the loop mimic others"
+                    f"URDF is a tree: remove one of them, and make the joints that it determined mimic others"
                 )
             self.parents[child] = name
             self.children.setdefault(parent, []).append(name)
@@ -161,7 +161,11 @@ class UrdfTree:
         if len(roots) != 1:
             raise InputError(
                 f"{self.path}: a URDF must have one root link; this one has {len(roots)}"
-                + (f" ({', '.join(roots[:5])}); connect them with fixed joints" if roots else ": a loop")
+                + (
+                    f" ({', '.join(roots[:5])}); connect them with fixed joints"
+                    if roots
+                    else ": the joints form a loop; remove one"
+                )
             )
         self.root = roots[0]
 
@@ -185,14 +189,14 @@ class UrdfTree:
         elements, visual elements are used, with a note.
 
         Args:
-            base: First link of the robot; by default the root. Links above it are left out, but its pose in
-                the root's frame is kept, for scenes given in that frame.
+            base: First link of the robot; by default the root. Links between the root and the base are left
+                out, but the pose of the base in the root's frame is kept, for scenes given in that frame.
             tip: Last link. By default the link where a gripper or a hand begins (see `robots.parsing.srdf`),
                 such as panda_hand for a Panda with fingers, or else the deepest link.
             locked: Values of locked joints by name [rad] or [m].
-            group: A group of the SRDF, the common prefix of an arm's joint names, or "both" or "all". A group
-                of several chains, such as two arms, is one robot with several tips. Without group and tip,
-                the robot must have one arm.
+            group: A group of the SRDF, the common prefix of an arm's joint names, or all arms: "both" (of
+                two) or "all". A group of several chains, such as two arms, is one robot with several tips.
+                Without group and tip, the robot must have one arm.
             srdf: Groups, named poses and passive joints.
 
         Raises:
@@ -221,7 +225,7 @@ class UrdfTree:
             joints=tuple(joints),
             meshes={link: parts for link, parts in meshes.items() if parts},
             notes=tuple(dict.fromkeys((*self.notes, *notes))),
-            root=self.carried(base),
+            root=self.pose_link(base),
             above=self.above(base),
             poses=dict(srdf.poses),
             inertias=inertias,
@@ -274,7 +278,9 @@ class UrdfTree:
                 file = self.packages.file(mesh.get("filename", ""))
                 digest.update(read_bytes(file, "mesh file"))
                 if file.suffix.lower() in (".dae", ".glb", ".gltf"):
-                    digest.update(b"in metres, z up")  # robots made before these were converted differ
+                    # these formats are now converted to meters and z up; robots prepared before that need
+                    # another digest
+                    digest.update(b"in metres, z up")
         return digest.hexdigest()
 
     def _named(self, root: ET.Element, what: str) -> dict[str, ET.Element]:
@@ -320,10 +326,11 @@ class UrdfTree:
             transforms[link] = T_link_ancestor
         return transforms
 
-    def carried(self, link: str) -> str:
-        """The link that a robot pose in a scene refers to, on the way to `link`.
+    def pose_link(self, link: str) -> str:
+        """The link whose pose a scene gives as the robot's pose: a link between the root and `link`.
 
-        This is the link that a mobile base without geometry (one joint, or three) carries, or else the root.
+        If the URDF begins with a mobile base without geometry (a planar or floating joint, or three joints
+        that move in a plane), it is the link after these joints, otherwise the root.
         """
         way: list[str] = []
         end = link
@@ -384,8 +391,8 @@ class UrdfTree:
             leaders.append(leader.get("joint", ""))
             if leaders[-1] not in self.elements or leaders[-1] in leaders[:-1]:
                 raise InputError(
-                    f"{self.path}: joint {leaders[-2]} mimics {shown(leaders[-1])}; it must be another "
-                    f"joint of the file that does not mimic it"
+                    f"{self.path}: joint {leaders[-2]} mimics {shown(leaders[-1])}, which must be "
+                    f"another joint of the file and must not mimic {leaders[-2]}"
                 )
             leader = self.elements[leaders[-1]].find("mimic")
         if self.elements[leaders[-1]].get("type") == "fixed":
@@ -397,13 +404,13 @@ class UrdfTree:
         return Mimic(leaders[1], float(multiplier[0]), float(offset[0]))
 
     def _with_limits(self, joint: Joint, limit: ET.Element | None) -> Joint:
-        of = {} if limit is None else limit.attrib
+        attributes = {} if limit is None else limit.attrib
         limits: dict[str, float] = {}
         for limit_name in ("lower", "upper", "velocity"):
-            if limit_name in of:
+            if limit_name in attributes:
                 max_value = MAX_RATE if limit_name == "velocity" else MAX_COORDINATE
                 numbers = self._numbers(
-                    of[limit_name], 1, f"joint {joint.name}: {limit_name} limit", max_value
+                    attributes[limit_name], 1, f"joint {joint.name}: {limit_name} limit", max_value
                 )
                 limits[limit_name] = float(numbers[0])
         if joint.kind == "continuous":
@@ -429,7 +436,7 @@ class UrdfTree:
             self.unlimited.add(joint.name)
         effort = 0.0
         with suppress(InputError):  # most planning needs none
-            effort = max(float(self._numbers(of.get("effort", ""), 1, "effort")[0]), 0.0)
+            effort = max(float(self._numbers(attributes.get("effort", ""), 1, "effort")[0]), 0.0)
         acceleration = ACCELERATION_PER_VELOCITY * velocity
         jerk = JERK_PER_ACCELERATION * acceleration
         return replace(
@@ -574,13 +581,13 @@ class UrdfTree:
         if origin is None:
             return np.eye(4)
         xyz = self._numbers(origin.get("xyz", "0 0 0"), 3, f"{what}: origin xyz")
-        turned = origin.get("quat_xyzw")
-        if turned is None:
+        quaternion = origin.get("quat_xyzw")
+        if quaternion is None:
             rpy = self._numbers(origin.get("rpy", "0 0 0"), 3, f"{what}: origin rpy")
             return transform(xyz, rotation_from_rpy(*map(float, rpy)))
         if "rpy" in origin.attrib:
             raise InputError(f"{self.path}: {what}: origin has rpy and quat_xyzw; it must have one of them")
-        numbers = self._numbers(turned, 4, f"{what}: origin quat_xyzw")
+        numbers = self._numbers(quaternion, 4, f"{what}: origin quat_xyzw")
         x, y, z, w = unit_quaternion(f"{self.path}: {what}", numbers, "origin quat_xyzw")
         return transform(xyz, rotation_from_quaternion(np.array([w, x, y, z])))
 

@@ -1,8 +1,9 @@
 """The server of a page: viser with access control, lights, a floor and a first view.
 
-viser by itself accepts every connection. Here it checks each browser before any data is sent: the address
+viser by itself accepts every connection. This server checks each browser before any data is sent: the address
 that it connects to must end with the token, or, without a token, name this machine (which stops DNS
-rebinding); a page of another origin is refused. What viser serves without a check is its own program.
+rebinding); a page of another origin is refused. Without a check, viser serves only its own web page (HTML and
+JavaScript).
 """
 
 import hmac
@@ -31,9 +32,10 @@ VIEW_MARGINS = (0.06, 0.06)
 LIGHTS = (2.0, (-2.0, -3.0, 5.0)), (1.1, (3.0, 2.0, 3.0)), (0.7, (-3.0, 3.0, 1.0))
 """Intensity and position of each light."""
 PANEL_OFFSET = 0.2
-"""Shift of the view to the left of the control panel, as a fraction of the window's height."""
+"""How far the arm is moved to the left, so that the control panel does not cover it, as a fraction of the
+window's height."""
 POLICY_VIOLATION = 1008
-"""Code with which WebSockets are closed that may not connect."""
+"""WebSocket close code for clients that may not connect."""
 
 
 def is_loopback(host: str) -> bool:
@@ -98,7 +100,7 @@ class PageServer(viser.ViserServer):
         async def check(client: infra.WebsockClientConnection) -> None:
             connection = websock._live_connections[client.client_id]
             request = connection.request
-            assert request is not None, "it was answered"
+            assert request is not None, "the handshake was answered, so there is a request"
             headers = request.headers
             hosts = headers.get_all("Host")
             origins = headers.get_all("Origin") or [None]
@@ -107,7 +109,8 @@ class PageServer(viser.ViserServer):
                 await connection.close(POLICY_VIOLATION)
 
         websock.on_client_connect(check)
-        websock.disconnect_all_clients()  # who came before; browsers connect again by themselves
+        # browsers that connected before the check existed; they reconnect by themselves and are then checked
+        websock.disconnect_all_clients()
 
     @property
     def url(self) -> str:
