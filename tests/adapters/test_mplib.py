@@ -1,5 +1,6 @@
 """MPlib's methods, arguments and results: motions end at the requested goal, and failures have a reason."""
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -23,10 +24,6 @@ def planner(**options: object) -> Planner:
     return Planner("panda", HAND, **values)  # type: ignore[arg-type]
 
 
-def tip(made: Planner, q: np.ndarray) -> np.ndarray:
-    return made.workspace.pose(q)
-
-
 def test_a_pose_is_reached_by_rows_of_one_time_step_within_the_limits_given() -> None:
     made = planner(joint_vel_limits=np.full(7, 0.9), joint_acc_limits=np.full(7, 0.9))
     goal = np.array([0.5, 0.2, 0.4, *DOWN])
@@ -35,7 +32,7 @@ def test_a_pose_is_reached_by_rows_of_one_time_step_within_the_limits_given() ->
     assert result["position"].shape == (len(result["time"]), 7)
     assert np.allclose(result["position"][0], QPOS[:7], atol=0.5 * 0.9 * 0.05**2)
     assert np.allclose(result["time"], 0.05 * np.arange(1, len(result["time"]) + 1))
-    assert np.allclose(tip(made, result["position"][-1]), matrix(goal), atol=1e-3)
+    assert np.allclose(made.workspace.pose(result["position"][-1]), matrix(goal), atol=1e-3)
     assert np.abs(result["velocity"]).max() <= 0.9 + 1e-6
     assert np.abs(result["acceleration"]).max() <= 0.9 + 1e-6
 
@@ -64,7 +61,7 @@ def test_fingers_need_not_be_equally_far_open() -> None:
 def test_limits_can_be_set_later() -> None:
     made = planner()
     assert np.array_equal(made.joint_vel_limits, np.ones(7))
-    made.joint_vel_limits = np.asarray(made.joint_vel_limits) * 0.5
+    made.joint_vel_limits = np.full(7, 0.5)
     made.joint_acc_limits = np.full(7, 2.0)
     result = made.plan_pose([0.5, 0.2, 0.4, *DOWN], QPOS, planning_time=10.0)
     assert np.abs(result["velocity"]).max() <= 0.5 + 1e-6
@@ -84,12 +81,12 @@ def test_both_versions_and_objects_with_p_and_q() -> None:
 
 def test_a_screw_is_a_straight_line() -> None:
     made = planner()
-    start = tip(made, QPOS[:7])
+    start = made.workspace.pose(QPOS[:7])
     end = start.copy()
     end[2, 3] -= 0.15
     result = made.plan_screw(end, QPOS, time_step=0.02, use_point_cloud=False)
     assert result["status"] == "Success"
-    places = np.array([tip(made, q)[:3, 3] for q in result["position"]])
+    places = np.array([made.workspace.pose(q)[:3, 3] for q in result["position"]])
     assert np.allclose(places[:, :2], start[:2, 3], atol=1e-3)
     assert np.allclose(places[-1], end[:3, 3], atol=1e-4)
 
@@ -116,7 +113,7 @@ def test_the_base_stands_in_the_world() -> None:
     goal = np.array([0.8, 0.0, 1.1, *DOWN])
     assert made.plan_pose(goal, QPOS, planning_time=10.0)["status"] == "Success"
     relative = made.plan_pose(goal - [0.3, -0.2, 0.7, 0, 0, 0, 0], QPOS, wrt_world=False, planning_time=10.0)
-    assert np.allclose(tip(made, relative["position"][-1]), matrix(goal), atol=1e-3)
+    assert np.allclose(made.workspace.pose(relative["position"][-1]), matrix(goal), atol=1e-3)
 
 
 def test_failures_say_why() -> None:
@@ -162,7 +159,7 @@ def test_where_no_motion_turns_evenly_one_that_turns_otherwise_has_a_note() -> N
     pose = [0.7810504, -0.0747778, 0.325, 0.0, 0.9510565, 0.0, 0.309017]
     result = made.plan_screw(pose, q, planning_time=0.5)
     assert result["status"] == "Success" and "this one turns otherwise" in result["note"]
-    line = [tip(made, q)[:3, 3] for q in result["position"]]
+    line = [made.workspace.pose(q)[:3, 3] for q in result["position"]]
     assert np.allclose(line, pose[:3], atol=8e-3) and np.allclose(line[-1], pose[:3], atol=1e-3)
 
 
@@ -174,10 +171,8 @@ def test_a_line_to_the_edge_of_reach_ends_tilted_with_a_note() -> None:
     assert not len(made.workspace.ik(far))
     result = made.plan_screw(far, q, planning_time=10.0)
     assert result["status"] == "Success" and "out of reach; the motion ends tilted by" in result["note"]
-    end = tip(made, result["position"][-1])
+    end = made.workspace.pose(result["position"][-1])
     assert np.allclose(end[:3, 3], far[:3, 3], atol=1e-3)
     assert 0.01 < np.arccos(end[2, 2] * far[2, 2]) < np.radians(15)
     far[0, 3] = 1.2
-    assert (
-        "out of reach" in made.plan_screw(far, q)["status"] or "brings" in made.plan_screw(far, q)["status"]
-    )
+    assert re.search("out of reach|brings", made.plan_screw(far, q)["status"])

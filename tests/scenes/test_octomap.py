@@ -13,6 +13,7 @@ from robotdiffuse.scenes.point_cloud import TREE_DEPTH, occupied_voxels, read_oc
 
 HALF = 2 ** (TREE_DEPTH - 1)
 Key = tuple[int, int, int]
+HEAD = b"# Octomap OcTree binary file\n"
 
 
 def tree(keys: set[Key], level: int = TREE_DEPTH, low: Key = (-HALF, -HALF, -HALF)) -> bytes:
@@ -59,13 +60,13 @@ def test_an_octomap_is_a_cloud_of_a_problem_file(tmp_path: Path) -> None:
     ("content", "message"),
     [
         (b"# something else\ndata\n", "no binary OctoMap file"),
-        (
-            b"# Octomap OcTree binary file\nid ColorOcTree\nres 0.1\ndata\n",
-            "'ColorOcTree'; it must be an OcTree",
-        ),
-        (b"# Octomap OcTree binary file\nid OcTree\nres 0\ndata\n\x01\x00", "resolution is 0.0"),
-        (b"# Octomap OcTree binary file\nid OcTree\nres 0.1\ndata\n\x03\x00", "the tree ends too soon"),
-        (b"# Octomap OcTree binary file\nid OcTree\nres 0.1\ndata\n\x02\x00", "more than 5,000,000"),
+        (HEAD + b"id ColorOcTree\nres 0.1\ndata\n", "'ColorOcTree'; it must be an OcTree"),
+        (HEAD + b"id OcTree\nres 0\ndata\n\x01\x00", "resolution is 0.0"),
+        (HEAD + b"id OcTree\nres 0.1\ndata\n\x03\x00", "the tree ends too soon"),
+        (HEAD + b"id OcTree\nres 0.1\ndata\n\x02\x00", "more than 5,000,000"),
+        (HEAD + b"id \nres 0.1\ndata\n", r"octomap .*map\.bt (holds|is damaged)"),
+        (HEAD + b"id\nres 0.1\ndata\n", r"octomap .*map\.bt (holds|is damaged)"),
+        (HEAD + b"id OcTree\nres\ndata\n", r"octomap .*map\.bt (holds|is damaged)"),
     ],
 )
 def test_damaged_octomaps(content: bytes, message: str, tmp_path: Path) -> None:
@@ -104,17 +105,6 @@ def test_wrong_height_maps() -> None:
     ):
         with pytest.raises(InputError, match=message):
             rd.HeightMap(heights, 0.1)
-
-
-@pytest.mark.parametrize("line", ["id ", "id", "res"])
-def test_a_header_with_a_word_alone_is_one_line(line: str, tmp_path: Path) -> None:
-    file = written(tmp_path / "map.bt", {(0, 0, 0)})
-    named = line.strip().encode()
-    file.write_bytes(
-        b"\n".join(line.encode() if row.startswith(named) else row for row in file.read_bytes().split(b"\n"))
-    )
-    with pytest.raises(InputError, match=r"octomap .*map\.bt (holds|is damaged)"):
-        read_octomap(file)
 
 
 @pytest.mark.parametrize("edge", [1, 2, 4, 8])

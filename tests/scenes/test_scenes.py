@@ -141,11 +141,6 @@ def test_a_sliver_in_reach_is_repeated() -> None:
     assert len(points) in (0, 512)
 
 
-def test_region_refuses_a_floor_above_the_reach() -> None:
-    with pytest.raises(InputError, match="floor is 2"):
-        VisibleRegion(floor=2.0)
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -164,9 +159,12 @@ def test_region_refuses_a_floor_above_the_reach() -> None:
         (lambda: PointCloud([[0, 0, np.inf]]), r"points\[0\] is \[0.0, 0.0, inf\]; it must be finite"),
         (lambda: PointCloud([[0, 0, 0], [1]]), "not numbers"),
         (lambda: Scene(["ball"]), r"scene\[0\] is a str"),  # type: ignore[list-item]
+        (lambda: Scene(None), "scene is None; it must be a list of shapes"),  # type: ignore[arg-type]
+        (lambda: Scene(5), "scene is 5; it must be a list of shapes"),  # type: ignore[arg-type]
+        (lambda: VisibleRegion(floor=2.0), "floor is 2"),
     ],
 )
-def test_wrong_shapes(make: Callable[[], Shape], message: str) -> None:
+def test_wrong_shapes(make: Callable[[], object], message: str) -> None:
     with pytest.raises(InputError, match=message) as raised:
         make()
     assert "\n" not in str(raised.value)
@@ -312,14 +310,9 @@ FORMS = ["npy", "npz", "ply ascii", "ply binary", *PCD_FORMS, "csv", "csv with n
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_point_files(form: str, tmp_path: Path) -> None:
+def test_point_files_without_points_that_are_not_finite(form: str, tmp_path: Path) -> None:
     points, notes = read_points(write_points(tmp_path, form, POINTS))
-    assert notes == ()
-    assert (points == POINTS).all()
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_points_that_are_not_finite_are_removed_and_said(form: str, tmp_path: Path) -> None:
+    assert notes == () and (points == POINTS).all()
     spoilt = POINTS.copy()
     spoilt[3] = np.nan
     spoilt[9, 1] = np.nan

@@ -18,19 +18,14 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path, Status, Trajectory
 from robotdiffuse.problems.files import problem_record
-from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.simulation import (
-    PyBulletOracle,
-    ReplaySettings,
-    replay,
-    world,
-)
+from robotdiffuse.simulation import PyBulletOracle, ReplaySettings, replay, world
 from robotdiffuse.trajectories.timing import time_parameterize
 from robotdiffuse.validation.validator import verify_trajectory
 
@@ -101,9 +96,7 @@ def test_contact_is_reported_where_the_motion_runs_into_an_obstacle() -> None:
 
 
 def test_links_that_touch_each_other_are_reported() -> None:
-    robot = replace(
-        box_arm(), allowed_collisions=frozenset({frozenset(("l1", "l2")), frozenset(("l2", "l3"))})
-    )
+    robot = box_arm()
     run = replay(robot, Scene(), motion(robot, np.zeros(3), np.array([0.0, 2.7, 2.0])))
     assert {(contact.link, contact.other) for contact in run.contacts} <= {("l1", "l3"), ("l3", "l1")}
     assert not run.free
@@ -131,22 +124,11 @@ def test_what_cannot_be_replayed() -> None:
 def result_file(folder: FilePath, scene: Scene) -> str:
     robot = load_robot("panda")
     goal = PANDA_START + 0.2
+    rows = Path(robot.joint_names, np.stack([PANDA_START, goal]))
     trajectory = motion(robot, PANDA_START, goal)
-    result = PlanResult(
-        Status.SOLVED,
-        "by hand",
-        "none",
-        "panda",
-        0.0,
-        0,
-        path=Path(robot.joint_names, np.stack([PANDA_START, goal])),
-        trajectory=trajectory,
-        min_clearance=0.1,
-    )
-    problem = Problem(robot, scene, PANDA_START, JointGoal(goal[None]))
-    file = folder / "result.json"
-    result.save(file, problem_record(problem))
-    return str(file)
+    result = PlanResult(Status.SOLVED, "by hand", "none", "panda", 0.0, 0, path=rows, trajectory=trajectory)
+    result.save(folder / "result.json", problem_record(Problem(robot, scene, PANDA_START, goal)))
+    return str(folder / "result.json")
 
 
 def test_importing_pybullet_without_standard_output() -> None:

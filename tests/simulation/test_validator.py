@@ -7,9 +7,11 @@ import trimesh
 pytest.importorskip("pybullet")
 
 from dataclasses import replace
+from itertools import combinations
 
 from helpers.box_arm import box_arm
 from helpers.example_robots import example_robot
+from helpers.sphere_oracles import solids
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path
@@ -17,7 +19,7 @@ from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere
+from robotdiffuse.scenes.shapes import Box, Mesh, PointCloud, Sphere
 from robotdiffuse.simulation import PyBulletOracle
 from robotdiffuse.simulation.world import World
 from robotdiffuse.validation.validator import verify
@@ -33,36 +35,15 @@ def vector(*values: float) -> np.ndarray:
 
 def every_shape() -> Scene:
     torus = trimesh.creation.torus(0.2, 0.05, major_sections=16, minor_sections=8)
-    return Scene(
-        [
-            Sphere(vector(0.5, 0.3, 0.6), 0.25),
-            Box(vector(0, 0.6, 0.4), vector(0.2, 0.3, 0.2), vector(0.9, 0.1, 0.3, 0.1)),
-            Cylinder(vector(0.4, -0.3, 0.2), 0.05, 0.4, vector(0.9, 0.3, 0, 0.1)),
-            Capsule(vector(-0.4, -0.3, 0.5), 0.05, 0.4, vector(0.9, 0.3, 0.5, 0.1)),
-            Mesh(
-                np.asarray(torus.vertices),
-                np.asarray(torus.faces),
-                vector(-0.3, 0.4, 0.7),
-                vector(0.5, 0.1, 0.2, 0.9),
-            ),
-        ]
-    )
+    mesh = Mesh(torus.vertices.view(np.ndarray), torus.faces, (-0.3, 0.4, 0.7), (0.5, 0.1, 0.2, 0.9))
+    return Scene([*solids().shapes, mesh])
 
 
 def far_pairs_only(robot: Robot) -> Robot:
     """The robot with pairs of links no more than two joints apart allowed to touch."""
-    links = list(robot.meshes)
-    near = [
-        frozenset((a, b))
-        for i, a in enumerate(links)
-        for b in links[i + 1 :]
-        if abs(robot.link_frame(a) - robot.link_frame(b)) <= 2
-    ]
+    pairs = combinations(robot.meshes, 2)
+    near = [frozenset(p) for p in pairs if abs(robot.link_frame(p[0]) - robot.link_frame(p[1])) <= 2]
     return replace(robot, allowed_collisions=frozenset(near))
-
-
-def solids(scene: Scene) -> Scene:
-    return Scene([shape for shape in scene.shapes if not isinstance(shape, Mesh)])
 
 
 @pytest.mark.parametrize(
@@ -71,7 +52,7 @@ def solids(scene: Scene) -> Scene:
 )
 def test_distances_agree_with_coal(name: str, locked: dict[str, float]) -> None:
     robot = far_pairs_only(example_robot(name).with_locked(locked))
-    scene = solids(every_shape())
+    scene = solids()
     exact = ExactCollision(robot, scene)
     with PyBulletOracle(robot, scene) as oracle:
         for q in np.random.default_rng(0).uniform(robot.lower, robot.upper, (40, robot.dof)):
@@ -107,14 +88,13 @@ def test_paths_that_the_validator_accepts_or_refuses() -> None:
             verdicts.append(report.valid)
             if report.valid:
                 assert found is None
-            elif found is not None:
-                assert report.violation is not None
+                continue
+            assert report.violation is not None and report.violation.excess is not None
+            if found is None:
+                assert report.violation.excess < 0.01
+            else:
                 assert found.other == report.violation.other
                 assert found.at == pytest.approx(report.violation.time, abs=0.05)
-            else:
-                assert report.violation is not None
-                assert report.violation.excess is not None
-                assert report.violation.excess < 0.01
     assert 5 < sum(verdicts) < 25
 
 
@@ -149,20 +129,13 @@ def test_frames_give_what_single_configurations_give() -> None:
 
 
 def test_scenes_are_replaced_and_the_robot_stays() -> None:
-    robot = box_arm()
-    q = np.zeros((1, 3))
-    blocked = Scene([Sphere(vector(1.2, 0, 0), 0.1)])
-    clear = Scene([Box(vector(0, 1, 0), vector(1, 0.1, 1))])
-    with PyBulletOracle(robot, clear) as oracle:
-        for _ in range(3):
-            assert oracle.check_frames(q) is None
-            oracle.set_scene(blocked)
-            found = oracle.check_frames(q)
-            assert found is not None and found.other == "sphere"
-            oracle.set_scene(clear)
-        oracle.set_scene(Scene([PointCloud(np.zeros((0, 3))), PointCloud(vector(1.2, 0, 0)[None])]))
-        found = oracle.check_frames(q)
-        assert found is not None and found.other == "point_cloud_2"
+    ball = Sphere(vector(1.2, 0, 0), 0.1)
+    clouds = [PointCloud(np.zeros((0, 3))), PointCloud(vector(1.2, 0, 0)[None])]
+    with PyBulletOracle(box_arm(), Scene([Box(vector(0, 1, 0), vector(1, 0.1, 1))])) as oracle:
+        for shapes, hit in ([ball], "sphere"), ([], None), ([ball], "sphere"), (clouds, "point_cloud_2"):
+            oracle.set_scene(Scene(shapes))
+            found = oracle.check_frames(np.zeros((1, 3)))
+            assert (found and found.other) == hit
 
 
 def test_obstacles_at_links_that_do_not_move_are_nothing() -> None:

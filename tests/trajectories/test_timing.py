@@ -91,6 +91,13 @@ def check(robot: Robot, p: Path, t: Trajectory, settings: TimingSettings) -> Non
         ["random", "there and back", "nearly straight", "repeated", "one joint", "steps of all sizes"]
     ),
 )
+@example(  # the path velocity of a rounded reversal peaks between grid points: it was 1.8 % too fast there
+    seed=0,
+    count=3,
+    scale=0.0,
+    settings=TimingSettings(velocity_scale=0.0625, corner_deviation=1.0),
+    kind="there and back",
+)
 def test_limits_rest_and_geometry(
     seed: int, count: int, scale: float, settings: TimingSettings, kind: str
 ) -> None:
@@ -112,14 +119,6 @@ def test_limits_rest_and_geometry(
     check(robot, p, time_parameterize(robot, p, valid, valid, settings), settings)
 
 
-def test_a_wide_reversal_keeps_its_velocity_limit() -> None:
-    """The path velocity of a rounded reversal peaks between grid points: it was 1.8 % too fast there."""
-    q = np.random.default_rng(0).uniform(-1, 1, (3, 7))[[0, 1, 0]]
-    settings = TimingSettings(velocity_scale=0.0625, corner_deviation=1.0)
-    p = path(arm(), q)
-    check(arm(), p, time_parameterize(arm(), p, always, always, settings), settings)
-
-
 def test_one_joint_against_the_closed_form() -> None:
     """Bang-bang: 2 sqrt(d / a) below the velocity limit, d / v + v / a above it."""
     robot = arm((2.0,), (8.0,))
@@ -136,16 +135,9 @@ def test_path_of_length_zero_is_two_rows_at_rest() -> None:
         assert (t.positions == 0.3).all() and not t.velocities.any() and not t.accelerations.any()
 
 
-def corner(robot: Robot) -> Path:
-    q = np.zeros((3, 7))
-    q[1:, 0] = 1.0
-    q[2, 1] = 1.0
-    return path(robot, q)
-
-
 def test_corner_is_rounded_when_valid_and_stopped_at_when_not() -> None:
     robot = arm()
-    p = corner(robot)
+    p = path(robot, np.tri(3, 7, -1))
     rounded = time_parameterize(robot, p, always, always)
     stopped = time_parameterize(robot, p, never, never)
     assert rounded.duration < 0.9 * stopped.duration
@@ -155,14 +147,12 @@ def test_corner_is_rounded_when_valid_and_stopped_at_when_not() -> None:
     assert distance_to_polyline(stopped.positions, p.positions).max() < 1e-12
 
 
-@pytest.mark.parametrize("size", [1e-5, 1e-4, 1e-3, 5e-3, 0.02, 0.1])
+@pytest.mark.parametrize("size", [1e-5, 1e-3, 0.02])
 def test_rows_of_the_shortest_pieces_agree(size: float) -> None:
     """Regression: between two close stops, rows at sample times did not show the acceleration."""
     robot = arm()
-    q = np.zeros((4, 7))
-    q[1:, 0] = 1.0
-    q[2:, 2] = size
-    q[3, 1] = 1.0
+    q = np.tri(4, 7, -1)
+    q[2:, 1] = size
     for accept in (never, always):
         t = time_parameterize(robot, path(robot, q), accept, accept)
         assert rate_violations(robot, t, VALIDATOR) == []
@@ -171,10 +161,7 @@ def test_rows_of_the_shortest_pieces_agree(size: float) -> None:
 def test_only_the_corner_that_fails_is_tightened() -> None:
     """An obstacle inside the first corner alone: the second keeps its rounding."""
     robot = arm()
-    q = np.zeros((4, 7))
-    q[1:, 0] = 1.0
-    q[2:, 1] = 1.0
-    q[3, 2] = 1.0
+    q = np.tri(4, 7, -1)
     p = path(robot, q)
 
     def cuts(positions: np.ndarray, k: int) -> float:
@@ -351,19 +338,15 @@ def test_the_estimated_time_is_near_the_exact_one(seed: int, narrow: float) -> N
     assert 0.97 < ratio < 1.1
 
 
-TORSO = (0.1, 1.25, 1.45, 1.57, 1.52, 1.57, 2.26, 2.26)
-"""Velocity limits of Fetch, a slow torso first [m/s] and [rad/s]."""
-
-
-@pytest.mark.parametrize("seed", [1868, 2571, 2972])
-def test_a_slow_torso_has_a_timing(seed: int) -> None:
+def test_a_slow_torso_has_a_timing() -> None:
     """A corner where the torso turns back was gone so fast at a grid point that only a stop could follow: no
     timing was found."""
-    robot = arm(TORSO, tuple(4 * v for v in TORSO))
-    q = np.cumsum(np.random.default_rng(seed).normal(0, 0.4, (7, 8)), axis=0)
-    q[:, 0] *= 0.3
-    p = path(robot, q)
-    check(robot, p, time_parameterize(robot, p, always, always), TimingSettings())
+    fetch = (0.1, 1.25, 1.45, 1.57, 1.52, 1.57, 2.26, 2.26)
+    robot = arm(fetch, tuple(4 * v for v in fetch))
+    for seed in (1868, 2571, 2972):
+        q = np.cumsum(np.random.default_rng(seed).normal(0, 0.4, (7, 8)), axis=0) * [0.3, *[1] * 7]
+        p = path(robot, q)
+        check(robot, p, time_parameterize(robot, p, always, always), TimingSettings())
 
 
 @given(
@@ -470,7 +453,7 @@ def test_a_dense_path_is_driven_without_stops() -> None:
 def test_a_corner_in_a_narrow_passage_is_no_stop() -> None:
     """A corner that was not free after two reductions of its rounding became a stop."""
     robot = arm()
-    p = corner(robot)
+    p = path(robot, np.tri(3, 7, -1))
 
     def free(piece: Path | Trajectory) -> bool:
         return bool(distance_to_polyline(piece.positions, p.positions).max() < 1e-3)
@@ -498,7 +481,7 @@ def test_lower_accelerations_that_did_not_help_are_given_up(accepted: int) -> No
 def test_joints_without_a_jerk_limit_have_the_stated_default() -> None:
     robot = arm()
     assert speed_limits.jerk_limits(robot, TimingSettings()).tolist() == [10 * a for a in ACCELERATION]
-    t = time_parameterize(robot, corner(robot), always, always)
+    t = time_parameterize(robot, path(robot, np.tri(3, 7, -1)), always, always)
     jerk = np.diff(t.accelerations, axis=0) / np.diff(t.times)[:, None]
     assert (np.abs(jerk) <= 10 * np.array(ACCELERATION) * (1 + 1e-9)).all()
 
@@ -506,10 +489,7 @@ def test_joints_without_a_jerk_limit_have_the_stated_default() -> None:
 def test_a_corner_that_its_neighbor_leaves_more_room_is_checked_again() -> None:
     """The second corner, accepted beside a wide neighbor, grew when that shrank, and left the clearance."""
     robot = arm()
-    q = np.zeros((4, 7))
-    q[1:, 0] = 1.0
-    q[2:, 1] = 1.0
-    q[3, 2] = 1.0
+    q = np.tri(4, 7, -1)
     p = path(robot, q)
 
     def keeps(corner: np.ndarray) -> bool:
