@@ -9,7 +9,6 @@ import pytest
 
 import robotdiffuse as rd
 from robotdiffuse.adapters.mplib import Planner, matrix
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.kinematic_tree import Mimic
 
 JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
@@ -28,8 +27,7 @@ def test_a_pose_is_reached_by_rows_of_one_time_step_within_the_limits_given() ->
     made = planner(joint_vel_limits=np.full(7, 0.9), joint_acc_limits=np.full(7, 0.9))
     goal = np.array([0.5, 0.2, 0.4, *DOWN])
     result = made.plan_qpos_to_pose(goal, QPOS, time_step=0.05, planning_time=10.0, wrt_world=True)
-    assert result["status"] == "Success"
-    assert result["position"].shape == (len(result["time"]), 7)
+    assert result["status"] == "Success" and result["position"].shape == (len(result["time"]), 7)
     assert np.allclose(result["position"][0], QPOS[:7], atol=0.5 * 0.9 * 0.05**2)
     assert np.allclose(result["time"], 0.05 * np.arange(1, len(result["time"]) + 1))
     assert np.allclose(made.workspace.pose(result["position"][-1]), matrix(goal), atol=1e-3)
@@ -135,7 +133,7 @@ def test_failures_say_why() -> None:
     ],
 )
 def test_bad_input(call: object, message: str) -> None:
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(rd.InputError, match=message):
         call(planner())  # type: ignore[operator]
 
 

@@ -9,41 +9,38 @@ import numpy as np
 import pytest
 import trimesh
 
+import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from robotdiffuse.certificates.bounds import Prover, Stretches
-from robotdiffuse.certificates.certificate import Certificate, load_certificate
 from robotdiffuse.certificates.checker import describe_claim
 from robotdiffuse.certificates.proof import StretchProof, Tolerances, hash_of, robot_parts, scene_parts
-from robotdiffuse.certificates.search import NotValidError, certify
+from robotdiffuse.certificates.search import NotValidError
 from robotdiffuse.collision.exact_meshes import ExactCollision
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Path, Trajectory
-from robotdiffuse.problems.problem import JointGoal, Problem
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Mesh, PointCloud, Shape, Sphere
+from robotdiffuse.scenes.shapes import Shape
 from robotdiffuse.validation.report import Report
-from robotdiffuse.validation.validator import VerifySettings, verify
+from robotdiffuse.validation.validator import VerifySettings
 
 SWING = np.array([[-0.6, 0.2, 0.3], [0.6, 0.2, 0.3], [0.6, 0.9, 0.3]])
 
 
-def problem_of(rows: np.ndarray, *shapes: Shape, robot: Robot | None = None) -> tuple[Problem, Path]:
+def problem_of(rows: np.ndarray, *shapes: Shape, robot: rd.Robot | None = None) -> tuple[rd.Problem, rd.Path]:
     robot = robot or box_arm()
-    return Problem(robot, Scene(shapes), rows[0], JointGoal(rows[-1:])), Path(robot.joint_names, rows)
+    return rd.Problem(robot, rd.Scene(shapes), rows[0], rd.JointGoal(rows[-1:])), rd.Path(
+        robot.joint_names, rows
+    )
 
 
 def near_things() -> dict[str, tuple[Shape, ...]]:
-    shelf = Box([0.6, 0, -0.032 - 0.05], [1.5, 1.5, 0.1])
+    shelf = rd.Box([0.6, 0, -0.032 - 0.05], [1.5, 1.5, 0.1])
     sides = trimesh.creation.box(shelf.size)
     side = np.linspace(-0.7, 0.7, 30)
     cloud = np.stack(np.meshgrid(side + 0.6, side, [-0.037]), axis=-1).reshape(-1, 3)
     return {
         "nothing": (),
-        "far": (Sphere([0, -1, 0], 0.2),),
+        "far": (rd.Sphere([0, -1, 0], 0.2),),
         "a box 2 mm below": (shelf,),
-        "a mesh 2 mm below": (Mesh(sides.vertices, sides.faces, shelf.center),),
-        "points 2 mm below": (PointCloud(cloud, 0.005),),
+        "a mesh 2 mm below": (rd.Mesh(sides.vertices, sides.faces, shelf.center),),
+        "points 2 mm below": (rd.PointCloud(cloud, 0.005),),
     }
 
 
@@ -51,8 +48,8 @@ def near_things() -> dict[str, tuple[Shape, ...]]:
 def test_what_is_valid_can_be_certified_and_what_is_certified_is_free(name: str) -> None:
     shapes = near_things()[name]
     problem, path = problem_of(SWING, *shapes)
-    report = verify(problem, path)
-    certificate = certify(problem, path)
+    report = rd.verify(problem, path)
+    certificate = rd.certify(problem, path)
     assert certificate.check(problem).differences == ()
     exact = ExactCollision(problem.robot, problem.scene)
     at = np.linspace(0, 2, 60)
@@ -64,9 +61,9 @@ def test_what_is_valid_can_be_certified_and_what_is_certified_is_free(name: str)
 
 
 def test_a_motion_that_is_not_valid_is_not_certified() -> None:
-    problem, path = problem_of(SWING, Sphere([1.1, 0.3, 0], 0.1))
+    problem, path = problem_of(SWING, rd.Sphere([1.1, 0.3, 0], 0.1))
     with pytest.raises(NotValidError, match=r"the motion is not valid: l\d is .* inside sphere"):
-        certify(problem, path)
+        rd.certify(problem, path)
 
 
 def test_the_checker_loads_neither_compiled_code_nor_coal() -> None:
@@ -103,10 +100,10 @@ def test_short_steps_hide_no_rate_from_the_checker(name: str, monkeypatch: pytes
     (place, times), wanted = TOO_QUICK[name]
     problem, path = problem_of(np.outer(place, [1, 0, 0]))
     still = np.zeros_like(path.positions)
-    motion = Trajectory(path.joint_names, times, path.positions, still, still)
+    motion = rd.Trajectory(path.joint_names, times, path.positions, still, still)
     report = Report(True, None, 1.0, 0.2)
     monkeypatch.setattr("robotdiffuse.certificates.search.verify", lambda *_: report)
-    found = certify(problem, motion).check(problem).differences
+    found = rd.certify(problem, motion).check(problem).differences
     assert any(wanted in line for line in found), found
     assert all(line.startswith("motion: ") and "j0" in line for line in found), found
 
@@ -116,14 +113,14 @@ def test_an_empty_proof_of_one_row_is_none(with_times: bool) -> None:
     """Start and goal inside a box: a motion of one row has no gap even without stretches."""
     robot = box_arm()
     here = np.zeros((1, 3))
-    problem = Problem(robot, Scene([Box([0.3, 0, 0], [2, 2, 2])]), here[0], JointGoal(here))
-    motion = Trajectory(robot.joint_names, np.zeros(1), here, here, here)
-    motion = motion if with_times else Path(robot.joint_names, here)
+    problem = rd.Problem(robot, rd.Scene([rd.Box([0.3, 0, 0], [2, 2, 2])]), here[0], rd.JointGoal(here))
+    motion = rd.Trajectory(robot.joint_names, np.zeros(1), here, here, here)
+    motion = motion if with_times else rd.Path(robot.joint_names, here)
     none = np.zeros(0)
     claims = Prover(robot, problem.scene, here).claims
     proof = StretchProof(claims, Stretches(none.astype(int), none, none), none.astype(bool), none, none, ())
     parts = robot_parts(robot), scene_parts(problem.scene), hash_of(motion)
-    certificate = Certificate(robot.name, *parts, Tolerances(), motion, none, 0.5, 0.5, proof)
+    certificate = rd.Certificate(robot.name, *parts, Tolerances(), motion, none, 0.5, 0.5, proof)
     assert certificate.check(problem).differences == tuple(
         f"proof: {describe_claim(claim)} is missing from row 0 to row 0" for claim in claims
     )
@@ -148,12 +145,12 @@ def test_tolerances_are_those_of_the_validator() -> None:
 def test_files_that_are_none(tmp_path: FilePath, text: str, wanted: str) -> None:
     file = tmp_path / "c.json"
     file.write_text(text)
-    with pytest.raises(InputError, match=wanted):
-        load_certificate(file)
+    with pytest.raises(rd.InputError, match=wanted):
+        rd.load_certificate(file)
 
 
 def test_certificates_of_robots_in_memory_need_their_problem() -> None:
     problem, path = problem_of(SWING)
-    certificate = certify(problem, path)
-    with pytest.raises(InputError, match="holds no problem; give the problem that it is for"):
+    certificate = rd.certify(problem, path)
+    with pytest.raises(rd.InputError, match="holds no problem; give the problem that it is for"):
         certificate.check()

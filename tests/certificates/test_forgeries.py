@@ -12,15 +12,10 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
-from robotdiffuse.certificates.certificate import load_certificate
 from robotdiffuse.certificates.proof import hash_of, request_parts, scene_parts
 from robotdiffuse.certificates.requirements import not_checked
-from robotdiffuse.certificates.search import certify
 from robotdiffuse.cli.verify import described
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.files import problem_from_record
-from robotdiffuse.problems.problem import Problem
 from robotdiffuse.trajectories.timing import time_parameterize
 
 pytest.importorskip("pinocchio", reason="the extra `dynamics` (pin) is not installed")
@@ -33,13 +28,13 @@ Record = dict[str, Any]
 
 
 @pytest.fixture(scope="module")
-def true(tmp_path_factory: pytest.TempPathFactory) -> tuple[FilePath, Problem]:
+def true(tmp_path_factory: pytest.TempPathFactory) -> tuple[FilePath, rd.Problem]:
     """A motion with a stop at a waypoint, above a near table, beside a moving ball, with a load, a cone and a
     speed limit."""
     robot = rd.load_robot("panda")
     table = rd.Box([0.5, 0.0, 0.194], [0.6, 1.6, 0.1], name="table")
     ball = rd.MovingObstacle(rd.Sphere([0.5, 1.4, 0.5], 0.1, "ball"), velocity=[0.0, -0.05, 0.0])
-    problem = Problem(
+    problem = rd.Problem(
         robot,
         rd.Scene([table]),
         START,
@@ -49,28 +44,23 @@ def true(tmp_path_factory: pytest.TempPathFactory) -> tuple[FilePath, Problem]:
         constraints=[rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], 0.5)],
         payload=rd.Payload(1.0, [0.0, 0.0, 0.05], HAND),
     )
-    rows = np.array([START, MIDDLE, GOAL])
-    halves = [
-        time_parameterize(robot, Path(robot.joint_names, part), lambda _: True, lambda _: True)
-        for part in (rows[:2], rows[1:])
-    ]
-    first, second = (
-        (half.positions, half.velocities, half.accelerations, half.times[:, None]) for half in halves
-    )
-    columns = [np.concatenate([a, b[1:]]) for a, b in zip(first[:3], second[:3], strict=True)]
-    times = np.append(halves[0].times, halves[0].duration + halves[1].times[1:])
-    motion = Trajectory(robot.joint_names, times, *columns)
-    certificate = certify(problem, motion)
+    ends = rd.Path(robot.joint_names, np.array([START, MIDDLE]))
+    half = time_parameterize(robot, ends, lambda _: True, lambda _: True)
+    positions = np.concatenate([half.positions, half.positions[1:] + np.subtract(GOAL, MIDDLE)])
+    rates = [np.concatenate([of, of[1:]]) for of in (half.velocities, half.accelerations)]
+    times = np.append(half.times, half.duration + half.times[1:])
+    motion = rd.Trajectory(robot.joint_names, times, positions, *rates)
+    certificate = rd.certify(problem, motion)
     assert certificate.check(problem).differences == () and certificate.proof.planes
     file = tmp_path_factory.mktemp("certificates") / "true.json"
     certificate.save(file)
     return file, problem
 
 
-def motion_of(record: Record) -> Path | Trajectory:
+def motion_of(record: Record) -> rd.Path | rd.Trajectory:
     motion = record["motion"]
     rows = {name: np.array(motion[name], float) for name in motion if name != "joint_names"}
-    return (Trajectory if "times" in rows else Path)(tuple(motion["joint_names"]), **rows)
+    return (rd.Trajectory if "times" in rows else rd.Path)(tuple(motion["joint_names"]), **rows)
 
 
 def sealed(record: Record) -> None:
@@ -312,7 +302,7 @@ PLAIN = [*FORGED][-2:]
 
 @pytest.mark.parametrize("name", FORGED)
 def test_forgeries_are_refused_with_the_reason(
-    name: str, true: tuple[FilePath, Problem], tmp_path: FilePath
+    name: str, true: tuple[FilePath, rd.Problem], tmp_path: FilePath
 ) -> None:
     forge, wanted = FORGED[name]
     record = json.loads(true[0].read_text())
@@ -322,30 +312,30 @@ def test_forgeries_are_refused_with_the_reason(
         if name not in PLAIN:
             sealed(record)
         file.write_text(json.dumps(record))
-        found = load_certificate(file).check(None if name in ALONE else true[1]).differences
-    except InputError as error:
+        found = rd.load_certificate(file).check(None if name in ALONE else true[1]).differences
+    except rd.InputError as error:
         found = (str(error),)
     assert any(re.search(wanted, line) for line in found), found
     assert not [line for line in found if "\n" in line]
 
 
-def test_another_robot_is_caught_and_named(true: tuple[FilePath, Problem]) -> None:
-    certificate, problem = load_certificate(true[0]), true[1]
+def test_another_robot_is_caught_and_named(true: tuple[FilePath, rd.Problem]) -> None:
+    certificate, problem = rd.load_certificate(true[0]), true[1]
     assert certificate.check().differences == certificate.check(problem).differences == ()
     opened = replace(problem, robot=problem.robot.with_locked({"panda_finger_joint1": 0.01}))
     assert "robot: joint panda_finger_joint1 has changed" in certificate.check(opened).differences
     wider = dict(problem.robot.spheres) | {"panda_link5": problem.robot.spheres["panda_link5"] * 1.1}
     found = certificate.check(replace(problem, robot=replace(problem.robot, spheres=wider))).differences
     assert "robot: spheres of panda_link5 has changed" in found
-    found = certificate.check(Problem(box_arm(), problem.scene, [0, 0, 0], [0, 0, 0])).differences
+    found = certificate.check(rd.Problem(box_arm(), problem.scene, [0, 0, 0], [0, 0, 0])).differences
     assert any(line.startswith("motion: its joints are panda_joint1") for line in found)
 
 
 def test_thin_spheres_are_refused() -> None:
     panda = rd.load_robot("panda")
     thin = {link: spheres * [1, 1, 1, 0.5] for link, spheres in panda.spheres.items()}
-    problem = Problem(replace(panda, spheres=thin), rd.Scene(), START, GOAL)
-    certificate = certify(problem, Path(panda.joint_names, np.array([START, GOAL])))
+    problem = rd.Problem(replace(panda, spheres=thin), rd.Scene(), START, GOAL)
+    certificate = rd.certify(problem, rd.Path(panda.joint_names, np.array([START, GOAL])))
     found = certificate.check(problem).differences
     assert any(
         re.match("robot: the meshes of panda_link5 stick out of its spheres by 0.0", line) for line in found
@@ -365,8 +355,8 @@ def test_the_robot_is_described() -> None:
     assert "not bundled" in described(replace(panda, name="mine"))
 
 
-def test_what_is_not_checked_is_told(true: tuple[FilePath, Problem]) -> None:
+def test_what_is_not_checked_is_told(true: tuple[FilePath, rd.Problem]) -> None:
     panda = rd.load_robot("panda")
-    problem = Problem(panda, rd.Scene(), START, GOAL, start_velocity=[0.1, 0, 0, 0, 0, 0, 0])
-    assert "start_velocity" in not_checked(problem, Path(panda.joint_names, np.array([START, GOAL])))
-    assert not_checked(true[1], load_certificate(true[0]).motion) == ["sharp reversals"]
+    problem = rd.Problem(panda, rd.Scene(), START, GOAL, start_velocity=[0.1, 0, 0, 0, 0, 0, 0])
+    assert "start_velocity" in not_checked(problem, rd.Path(panda.joint_names, np.array([START, GOAL])))
+    assert not_checked(true[1], rd.load_certificate(true[0]).motion) == ["sharp reversals"]

@@ -11,14 +11,9 @@ import pytest
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from robotdiffuse.certificates.bounds import MovingProver, Stretches
-from robotdiffuse.certificates.certificate import Certificate, load_certificate
 from robotdiffuse.certificates.proof import hash_of, request_parts
 from robotdiffuse.certificates.requirements import constraint_bounds
-from robotdiffuse.certificates.search import certify
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Trajectory
 from robotdiffuse.problems.compiled_constraints import PathConstraints
-from robotdiffuse.problems.problem import Problem
 
 PANDA = rd.load_robot("panda")
 HAND = "panda_hand"
@@ -38,18 +33,18 @@ ASKED: dict[str, dict[str, Any]] = {
 
 
 @cache
-def certified(asked: str) -> tuple[Problem, Certificate]:
-    problem = Problem(PANDA, rd.Scene([TABLE]), START, GOAL, **ASKED[asked])
+def certified(asked: str) -> tuple[rd.Problem, rd.Certificate]:
+    problem = rd.Problem(PANDA, rd.Scene([TABLE]), START, GOAL, **ASKED[asked])
     result = rd.load_planner("aorrtc").plan(problem, time_limit=20.0)
     assert result.trajectory is not None, result.reason
-    return problem, certify(problem, result.trajectory)
+    return problem, rd.certify(problem, result.trajectory)
 
 
 @pytest.mark.parametrize("asked", [pytest.param("line", marks=pytest.mark.slow), *list(ASKED)[1:]])
 def test_each_is_proved_and_its_file_holds(asked: str, tmp_path: FilePath) -> None:
     problem, certificate = certified(asked)
     certificate.save(tmp_path / "certificate.json")
-    read = load_certificate(tmp_path / "certificate.json")
+    read = rd.load_certificate(tmp_path / "certificate.json")
     assert read.check().differences == () and read.check(problem).differences == ()
     assert (read.moving is not None) == bool(problem.moving)
     assert len(read.constraints) == (2 if asked == "line" else len(problem.constraints))
@@ -72,7 +67,7 @@ def test_bounds_of_constraints_are_bounds() -> None:
             rd.OnLine(frame, rng.normal(size=3), normal, 0.1),
             rd.CartesianLine(frame, 0.1, 0.1),
         ]
-        problem = Problem(robot, rd.Scene(), rows[0], rows[-1], constraints=constraints)
+        problem = rd.Problem(robot, rd.Scene(), rows[0], rows[-1], constraints=constraints)
         shown = constraint_bounds(problem, rows, 0.0)
         s = np.linspace(0, 1, 60)[:, None]
         dense = np.concatenate([rows[i] + s * (rows[i + 1] - rows[i]) for i in range(3)])
@@ -104,7 +99,7 @@ def test_bounds_in_time_are_bounds() -> None:
         assert (there.clearance >= found.clearance - found.displacement - 1e-9).all()
 
 
-def refused(certificate: Certificate, problem: Problem, wanted: str) -> None:
+def refused(certificate: rd.Certificate, problem: rd.Problem, wanted: str) -> None:
     """With forged hashes too."""
     found = replace(certificate, request_parts=request_parts(problem)).check(problem).differences
     assert any(wanted in line for line in found), found
@@ -112,7 +107,7 @@ def refused(certificate: Certificate, problem: Problem, wanted: str) -> None:
 
 def test_a_motion_that_begins_slower_is_refused() -> None:
     problem, certificate = certified("start velocity")
-    assert isinstance(certificate.motion, Trajectory)
+    assert isinstance(certificate.motion, rd.Trajectory)
     late = replace(certificate.motion, velocities=0.5 * certificate.motion.velocities)
     certificate = replace(certificate, motion=late, motion_hash=hash_of(late))
     refused(certificate, problem, "motion: it does not begin at the problem's start_velocity")
@@ -129,10 +124,10 @@ def test_another_line_and_a_slower_one_need_another_proof() -> None:
 
 def test_paths_with_constraints_are_certified_and_with_moving_obstacles_refused(tmp_path: FilePath) -> None:
     path = rd.Path(PANDA.joint_names, np.array([START, GOAL]))
-    problem = Problem(PANDA, rd.Scene([TABLE]), START, GOAL, constraints=[CONE])
-    certify(problem, path).save(tmp_path / "certificate.json")
-    certificate = load_certificate(tmp_path / "certificate.json")
+    problem = rd.Problem(PANDA, rd.Scene([TABLE]), START, GOAL, constraints=[CONE])
+    rd.certify(problem, path).save(tmp_path / "certificate.json")
+    certificate = rd.load_certificate(tmp_path / "certificate.json")
     assert certificate.check().differences == certificate.check(problem).differences == ()
     refused(certificate, replace(problem, constraints=[NARROWER]), "is not shown to keep its limit")
-    with pytest.raises(InputError, match="certificates prove nothing about moving, without times"):
-        certify(replace(problem, constraints=(), moving=[ACROSS]), path)
+    with pytest.raises(rd.InputError, match="certificates prove nothing about moving, without times"):
+        rd.certify(replace(problem, constraints=(), moving=[ACROSS]), path)

@@ -10,35 +10,30 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.heavy_arms import ROBOTS, TURNED, pendulum, wild
-from robotdiffuse.certificates.certificate import Certificate, load_certificate
 from robotdiffuse.certificates.proof import request_parts
 from robotdiffuse.certificates.requirements import inverse_dynamics, torque_bounds
-from robotdiffuse.certificates.search import certify
-from robotdiffuse.core.types import Path, Trajectory
-from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots.bodies import Payload
 from robotdiffuse.robots.dynamics import Dynamics
 
 pytest.importorskip("pinocchio", reason="the extra `dynamics` (pin) is not installed")
 LOW = [-0.6, 0.2, 0, -1.2, 0, 2.2, 0.2]
 FAR = [0.6, 0.6, 0, -1.0, 0, 2.2, 0.2]
-PAYLOAD = Payload(1.5, [0.05, 0.0, 0.1], None, [0.01, 0.02, 0.03])
+PAYLOAD = rd.Payload(1.5, [0.05, 0.0, 0.1], None, [0.01, 0.02, 0.03])
 
 
 @cache
-def certified() -> tuple[Problem, Certificate]:
+def certified() -> tuple[rd.Problem, rd.Certificate]:
     """A motion at the limit of a joint's torque."""
-    payload = Payload(3.0, [0.0, 0.0, 0.1])
-    problem = Problem(rd.load_robot("panda"), rd.Scene(), LOW, FAR, payload=payload)
+    payload = rd.Payload(3.0, [0.0, 0.0, 0.1])
+    problem = rd.Problem(rd.load_robot("panda"), rd.Scene(), LOW, FAR, payload=payload)
     motion = rd.plan(problem, time_limit=20.0).trajectory
     assert motion is not None
-    return problem, certify(problem, motion)
+    return problem, rd.certify(problem, motion)
 
 
-def loaded(name: str) -> Problem:
+def loaded(name: str) -> rd.Problem:
     robot = ROBOTS[name]()
     middle = (robot.lower + robot.upper) / 2
-    return Problem(robot, rd.Scene(), middle, middle, payload=PAYLOAD, T_world_base=TURNED)
+    return rd.Problem(robot, rd.Scene(), middle, middle, payload=PAYLOAD, T_world_base=TURNED)
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -62,7 +57,7 @@ def test_bounds_are_bounds(name: str, step: float) -> None:
         samples = np.linspace(0, motion.times[-1], 201)[1:-1]
         # accelerations jump at rows, to which rounding would assign samples at random
         samples = samples[np.abs(samples[:, None] - motion.times).min(axis=1) > 1e-9]
-        for one, at in ((motion, samples), (Path(motion.joint_names, motion.positions), samples / step)):
+        for one, at in ((motion, samples), (rd.Path(motion.joint_names, motion.positions), samples / step)):
             few = torque_bounds(problem, one, np.zeros(0))
             dense = torque_bounds(problem, one, at)
             rows = np.sort(np.concatenate([motion.times / step, samples / step]))
@@ -76,22 +71,22 @@ def test_a_payload_is_proved_and_its_file_holds_without_pinocchio(
     problem, certificate = certified()
     certificate.save(tmp_path / "certificate.json")
     monkeypatch.setitem(sys.modules, "pinocchio", None)
-    read = load_certificate(tmp_path / "certificate.json")
+    read = rd.load_certificate(tmp_path / "certificate.json")
     assert read.check().differences == () and read.check(problem).differences == ()
     assert dict(read.torques)["panda_joint2"] == pytest.approx(87.0, rel=0.02)
 
 
 def test_paths_are_proved_to_be_held() -> None:
     problem, certificate = certified()
-    path = Path(problem.robot.joint_names, certificate.motion.positions[[0, -1]])
-    held = certify(problem, path)
+    path = rd.Path(problem.robot.joint_names, certificate.motion.positions[[0, -1]])
+    held = rd.certify(problem, path)
     assert held.check(problem).valid and len(held.torques) == 7
 
 
 def test_a_peak_between_rows_needs_samples() -> None:
     """The robot has no geometry, so there is nothing else to prove."""
-    problem = Problem(pendulum(9.75), rd.Scene(), [1.0], [2.0], payload=Payload(0.0))
-    certificate = certify(problem, Path(("hinge",), np.array([[1.0], [2.0]])))
+    problem = rd.Problem(pendulum(9.75), rd.Scene(), [1.0], [2.0], payload=rd.Payload(0.0))
+    certificate = rd.certify(problem, rd.Path(("hinge",), np.array([[1.0], [2.0]])))
     assert len(certificate.torque_samples) and certificate.check(problem).valid
     found = replace(certificate, torque_samples=np.zeros(0)).check(problem).differences
     assert any("hinge is not shown to keep its limit" in line for line in found)
@@ -100,7 +95,7 @@ def test_a_peak_between_rows_needs_samples() -> None:
 def test_another_payload_needs_another_proof() -> None:
     problem, certificate = certified()
     for payload, wanted in (
-        (Payload(3.5, [0.0, 0.0, 0.1]), "panda_joint2 is not shown to keep its limit"),
+        (rd.Payload(3.5, [0.0, 0.0, 0.1]), "panda_joint2 is not shown to keep its limit"),
         (None, "torques: the problem has no payload"),
     ):
         other = replace(problem, payload=payload)
@@ -113,5 +108,5 @@ def test_a_motion_of_one_row() -> None:
     row = np.array([LOW])
     still = np.zeros((1, 7))
     there = replace(problem, goal=rd.JointGoal([LOW]))
-    motion = Trajectory(problem.robot.joint_names, np.zeros(1), row, still, still)
-    assert certify(there, motion).check(there).valid
+    motion = rd.Trajectory(problem.robot.joint_names, np.zeros(1), row, still, still)
+    assert rd.certify(there, motion).check(there).valid

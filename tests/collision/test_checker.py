@@ -1,7 +1,6 @@
 """The compiled collision check against exact distances by hand, and against the exact meshes."""
 
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 import pytest
@@ -29,7 +28,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.kernel_arrays import robot_groups
 from robotdiffuse.collision.kernels.lane_clearance import block_clearances
-from robotdiffuse.collision.kernels.lane_collision import block_hits, free_many, make_workspace
+from robotdiffuse.collision.kernels.lane_collision import block_hits, free_many
 from robotdiffuse.collision.kernels.motions import motion_free
 from robotdiffuse.collision.point_cloud_grid import THINNING
 from robotdiffuse.problems.families.family import base_spheres
@@ -48,27 +47,25 @@ def test_clearances_are_exact(name: str) -> None:
     assert checker.link_clearances(q).shape == (150, len(checker.links))
     np.testing.assert_allclose(checker.link_clearances(q), right, atol=TOLERANCE)
     np.testing.assert_allclose(checker.link_clearances(q, limit=0.1), np.minimum(right, 0.1), atol=TOLERANCE)
-    between = pair_distances(robot, q)
     assert checker.pairs == robot.checked_pairs()
-    np.testing.assert_allclose(checker.pair_clearances(q), between, atol=TOLERANCE)
-    least = np.minimum(right.min(axis=1), between.min(axis=1, initial=1))
-    np.testing.assert_allclose(least_clearance(checker, q), least, atol=TOLERANCE)
+    np.testing.assert_allclose(checker.pair_clearances(q), pair_distances(robot, q), atol=TOLERANCE)
+
+
+def check_free(robot: rd.Robot, scene: rd.Scene, q: ndarray, padding: float = 0.0) -> None:
+    """The check answers with the signs of the least distances by the oracles, which are of both kinds."""
+    to_scene = link_distances(robot, scene, q).min(axis=1) - padding
+    least = np.minimum(to_scene, pair_distances(robot, q).min(axis=1, initial=1))
+    clear = np.abs(least) > TOLERANCE
+    free = CollisionChecker(robot, scene, padding).free(q)
+    np.testing.assert_array_equal(free[clear], (least > 0)[clear])
+    assert 0 < free.mean() < 1
 
 
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("padding", [0.0, 0.05])
 def test_free_is_the_sign_of_the_clearance(name: str, padding: float) -> None:
     robot = with_spheres(name)
-    scene = solids()
-    q = rows(robot, 500, seed=1)
-    checker = CollisionChecker(robot, scene, padding)
-    least = np.minimum(
-        link_distances(robot, scene, q).min(axis=1) - padding, pair_distances(robot, q).min(axis=1, initial=1)
-    )
-    clear = np.abs(least) > TOLERANCE
-    np.testing.assert_array_equal(checker.free(q)[clear], (least > 0)[clear])
-    np.testing.assert_array_equal((least_clearance(checker, q) > 0)[clear], (least > 0)[clear])
-    assert 0 < checker.free(q).mean() < 1
+    check_free(robot, solids(), rows(robot, 500, seed=1), padding)
 
 
 @given(kind=st.sampled_from(["sphere", "box", "cylinder", "capsule", "cloud"]), seed=st.integers(0, 2**32))
@@ -87,8 +84,7 @@ def test_every_shape_at_any_pose(kind: str, seed: int) -> None:
         blur = np.sqrt(3) * THINNING * radius
         near = right < 0.1
         assert (found <= right + TOLERANCE).all()
-        assert (found[near] >= right[near] - blur - TOLERANCE).all()
-        assert not checker.free(q)[hit].any()
+        assert (found[near] >= right[near] - blur - TOLERANCE).all() and not checker.free(q)[hit].any()
     else:
         np.testing.assert_allclose(found, right, atol=TOLERANCE)
         clear = np.abs(right).min(axis=1) > TOLERANCE
@@ -102,13 +98,8 @@ def test_any_number_of_obstacles(count: int) -> None:
     rng = np.random.default_rng(count)
     kinds = ("sphere", "box", "cylinder", "capsule")
     shapes = [random_shape(kinds[i % 4], rng) for i in range(count)]
-    scene = rd.Scene([shape for shape in shapes if np.linalg.norm(shape.center) > 0.6])  # type: ignore[attr-defined]
-    q = rows(robot, 600)
-    least = np.minimum(link_distances(robot, scene, q).min(axis=1), pair_distances(robot, q).min(axis=1))
-    clear = np.abs(least) > TOLERANCE
-    free = CollisionChecker(robot, scene).free(q)
-    np.testing.assert_array_equal(free[clear], (least > 0)[clear])
-    assert 0 < free.sum() < len(q)
+    far = [shape for shape in shapes if np.linalg.norm(shape.center) > 0.6]  # type: ignore[attr-defined]
+    check_free(robot, rd.Scene(far), rows(robot, 600))
 
 
 @pytest.mark.parametrize("count", [16, 17, 50])
@@ -121,43 +112,15 @@ def test_links_with_any_number_of_spheres(count: int) -> None:
         for link in arm.spheres
     }
     robot = replace(arm, spheres=spheres)
-    scene = solids()
-    q = rows(robot, 200, seed=2)
-    least = np.minimum(link_distances(robot, scene, q).min(axis=1), pair_distances(robot, q).min(axis=1))
-    clear = np.abs(least) > TOLERANCE
-    np.testing.assert_array_equal(CollisionChecker(robot, scene).free(q)[clear], (least > 0)[clear])
-    touching = pair_distances(robot, q).min(axis=1) < 0
-    assert 0 < touching.sum() < len(q)
-
-
-@pytest.mark.parametrize("stop_at_first", [False, True])
-def test_the_bits_of_a_block_are_its_configurations(stop_at_first: bool) -> None:
-    robot = with_spheres("panda")
-    scene = solids()
-    checker = CollisionChecker(robot, scene)
-    q = rows(robot, 16, seed=4).astype(np.float32)
-    arrays = checker.robot_arrays, checker.scene_arrays
-    work = make_workspace(*arrays)
-    hits = block_hits(*arrays, np.ascontiguousarray(q.T), np.float32(0), stop_at_first, work)
-    found = hits >> np.arange(16) & 1 == 1
-    right = ~checker.free(q)
-    assert 0 < right.sum() < 16
-    if stop_at_first:
-        assert found.sum() == 1
-        assert right[found].all()
-    else:
-        np.testing.assert_array_equal(found, right)
+    check_free(robot, solids(), rows(robot, 200, seed=2))
+    check_free(robot, rd.Scene(), rows(robot, 200, seed=2))
 
 
 def test_configurations_beyond_the_limits() -> None:
     """The tables of close links do not cover these, so the spheres decide."""
     robot = with_spheres("panda")
     q = np.random.default_rng(0).uniform(2 * robot.lower, 2 * robot.upper, (4000, robot.dof))
-    least = pair_distances(robot, q).min(axis=1)
-    clear = np.abs(least) > TOLERANCE
-    free = CollisionChecker(robot, rd.Scene()).free(q)
-    np.testing.assert_array_equal(free[clear], (least > 0)[clear])
-    assert 0.05 < free.mean() < 0.95
+    check_free(robot, rd.Scene(), q)
 
 
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 17])
@@ -166,18 +129,18 @@ def test_any_number_of_configurations(count: int) -> None:
     checker = CollisionChecker(robot, solids())
     q = rows(robot, 17)
     np.testing.assert_array_equal(checker.free(q[:count]), checker.free(q)[:count])
-    np.testing.assert_array_equal(least_clearance(checker, q[:count]), least_clearance(checker, q)[:count])
+    np.testing.assert_array_equal(checker.link_clearances(q[:count]), checker.link_clearances(q)[:count])
     assert checker.cost_gradients(q[:count], 0.05)[1].shape == (count, robot.dof)
 
 
 # -- against the exact meshes --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_free_by_spheres_is_free_by_mesh(seed: int) -> None:
     robot = with_spheres("panda")
     rng = np.random.default_rng(seed)
-    scene = (ROP if seed < 2 else ROP_DENSE).scene(rng, base_spheres(robot))
+    scene = (ROP if seed < 1 else ROP_DENSE).scene(rng, base_spheres(robot))
     shapes = [random_shape(kind, rng) for kind in ("cylinder", "capsule", "box", "cloud")]
     scene = rd.Scene([*scene.shapes, *shapes[: seed % 5]])
     q = rng.uniform(robot.lower, robot.upper, (600, robot.dof))
@@ -185,20 +148,6 @@ def test_free_by_spheres_is_free_by_mesh(seed: int) -> None:
     assert not ExactCollision(robot, scene).collides(q[free]).any()
     # a cover that sticks out by a centimeter or two cannot refuse much more than this
     assert (~free & ~ExactCollision(robot, scene).collides(q)).mean() < 0.1
-
-
-def test_self_collision() -> None:
-    robot = with_spheres("panda")
-    q = rows(rd.load_robot("panda"), 3000)
-    free = CollisionChecker(robot, rd.Scene()).free(q)
-    meshes = ExactCollision(robot, rd.Scene()).collides(q)
-    assert not (free & meshes).any()
-    assert (~free & ~meshes).mean() < 0.05
-    allowed = replace(robot, allowed_collisions=frozenset(map(frozenset, combinations(robot.link_names, 2))))
-    checker = CollisionChecker(allowed, rd.Scene())
-    assert checker.free(q).all()
-    assert checker.pair_clearances(q).shape == (3000, 0)
-    assert (least_clearance(checker, q) == 1).all()
 
 
 def test_locked_fingers_change_the_result() -> None:
@@ -211,15 +160,6 @@ def test_locked_fingers_change_the_result() -> None:
         other.link_clearances(q[:50]), link_distances(wide, scene, q[:50]), atol=TOLERANCE
     )
     assert (one.free(q) != other.free(q)).any()
-
-
-def test_padding_holds_towards_the_scene_alone() -> None:
-    robot = with_spheres("panda")
-    q = rows(rd.load_robot("panda"), 300)
-    near = CollisionChecker(robot, solids())
-    far = CollisionChecker(robot, solids(), 0.03)
-    np.testing.assert_allclose(far.link_clearances(q), near.link_clearances(q) - 0.03, atol=1e-6)
-    np.testing.assert_array_equal(far.pair_clearances(q), near.pair_clearances(q))
 
 
 @pytest.mark.parametrize("size", [2.0, 1e3, 9.9e3])
@@ -251,22 +191,17 @@ def test_a_robot_without_spheres_is_free() -> None:
     checker = CollisionChecker(robot, rd.Scene([rd.Sphere((0, 0, 0), 5.0), rd.PointCloud([[0.0, 0, 0]])]))
     q = rows(robot, 5)
     assert checker.links == checker.pairs == ()
-    assert checker.free(q).all()
-    assert (least_clearance(checker, q) == 1).all()
-    costs, gradients = checker.cost_gradients(q, 0.05)
-    assert not costs.any()
-    assert not gradients.any()
+    assert checker.free(q).all() and (least_clearance(checker, q) == 1).all()
+    assert not any(found.any() for found in checker.cost_gradients(q, 0.05))
 
 
 def test_links_without_spheres_are_left_out_and_fixed_ones_do_not_count_against_the_scene() -> None:
     arm = box_arm()
     robot = replace(arm, spheres={"l1": arm.spheres["l1"], "l3": np.zeros((0, 4))})
     checker = CollisionChecker(robot, rd.Scene())
-    assert checker.links == ("l1",) and checker.pairs == ()
-    assert checker.free(np.zeros((1, 3)))[0]
+    assert checker.links == ("l1",) and checker.pairs == () and checker.free(np.zeros((1, 3)))[0]
     checker = CollisionChecker(arm.with_locked({"j0": 0.0}), rd.Scene([rd.Sphere((0.2, 0, 0), 0.1)]))
-    assert checker.links == ("l2", "l3")
-    assert checker.free(np.zeros((1, 2)))[0]
+    assert checker.links == ("l2", "l3") and checker.free(np.zeros((1, 2)))[0]
 
 
 def test_wrong_configurations_are_refused() -> None:
@@ -281,26 +216,16 @@ def test_wrong_configurations_are_refused() -> None:
 def test_adding_an_obstacle_compiles_nothing() -> None:
     robot = with_spheres("panda")
     q = rows(robot, 20)
-
-    def use(scene: rd.Scene) -> None:
-        checker = CollisionChecker(robot, scene)
+    compiled = []
+    mesh = rd.Mesh(*box_triangles((0.2, 0.2, 0.2)))
+    many = [shape for shape in solids().shapes for _ in range(3)]  # rows of several
+    for shapes in ([], many, [*solids().shapes, rd.PointCloud([[0.5, 0.5, 0.5]]), mesh]):
+        checker = CollisionChecker(robot, rd.Scene(shapes))
         checker.free(q)
         least_clearance(checker, q)
         checker.cost_gradients(q, 0.05)
-
-    def compiled() -> list[int]:
-        return [len(f.signatures) for f in (free_many, block_hits, block_clearances, motion_free)]
-
-    use(rd.Scene())
-    before = compiled()
-    vertices, faces = box_triangles((0.2, 0.2, 0.2))
-    use(solids())
-    use(rd.Scene([*solids().shapes, rd.PointCloud([[0.5, 0.5, 0.5]]), rd.Mesh(vertices, faces)]))
-    use(rd.Scene([rd.PointCloud(np.zeros((0, 3)))]))
-    use(
-        rd.Scene([shape for shape in solids().shapes for _ in range(3)])
-    )  # rows of several, whatever is taken of them
-    assert compiled() == before
+        compiled.append([len(f.signatures) for f in (free_many, block_hits, block_clearances, motion_free)])
+    assert compiled[0] == compiled[1] == compiled[2]
 
 
 # -- gradients -----------------------------------------------------------------------------------------------
@@ -338,19 +263,3 @@ def test_cost_gradients_are_finite_differences(name: str) -> None:
         # deep inside a box the nearest face may change within the step: a kink, not an error
         wrong = np.abs(gradients[:, j] - slope) > 2e-4 + 2e-3 * np.abs(slope)
         assert wrong.mean() < 0.05
-
-
-def test_cost_gradients_of_a_cloud_point_away_from_it() -> None:
-    robot = with_spheres("panda")
-    rng = np.random.default_rng(0)
-    points = rng.normal(0, 0.05, (200, 3)) + np.array([0.45, 0.0, 0.5])
-    checker = CollisionChecker(robot, rd.Scene([rd.PointCloud(points, 0.01)]))
-    q = rows(robot, 3000)
-    costs, gradients = checker.cost_gradients(q, 0.05, 0.0)
-    own = CollisionChecker(robot, rd.Scene()).cost_gradients(q, 0.05, 0.0)[0]
-    touched = (costs > 1e-5) & (own == 0)
-    assert touched.sum() > 30
-    q = q[touched]
-    gradients = gradients[touched]
-    after = q - 0.002 * gradients / np.linalg.norm(gradients, axis=1, keepdims=True)
-    assert (checker.cost_gradients(after, 0.05, 0.0)[0] < costs[touched]).mean() > 0.95

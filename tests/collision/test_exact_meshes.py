@@ -8,9 +8,10 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
+import robotdiffuse as rd
 from helpers.box_arm import HALF_WIDTH, box_arm
 from helpers.example_robots import example_robot
-from robotdiffuse import Box, Capsule, Cylinder, Mesh, PointCloud, Scene, Sphere
+from helpers.sphere_oracles import solids
 from robotdiffuse.collision.exact_meshes import ExactCollision, explain_collision, forward_frames
 from robotdiffuse.robots.kinematics import link_pose
 
@@ -35,7 +36,7 @@ def box_distance(point: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
 
 @given(coordinate, coordinate, st.floats(-0.5, 0.5), st.floats(0.01, 0.4))
 def test_box_links_against_a_sphere_in_closed_form(x: float, y: float, z: float, radius: float) -> None:
-    exact = ExactCollision(box_arm(), Scene([Sphere(vector(x, y, z), radius)]))
+    exact = ExactCollision(box_arm(), rd.Scene([rd.Sphere(vector(x, y, z), radius)]))
     lows = np.array([[start, -HALF_WIDTH, -HALF_WIDTH] for start in (0, 0.5, 0.9)])
     highs = np.array([[end, HALF_WIDTH, HALF_WIDTH] for end in (0.5, 0.9, 1.2)])
     for found, low, high in zip(exact.link_distances(Q0), lows, highs, strict=True):
@@ -44,40 +45,34 @@ def test_box_links_against_a_sphere_in_closed_form(x: float, y: float, z: float,
         assert found.distance == pytest.approx(right, abs=1e-6 if right > 0 else 1e-5)
 
 
-def sphere_links(radius: float) -> ExactCollision:
-    """The arm with one sphere at each link's origin in place of meshes, and these obstacles."""
-    spheres = {f"l{i}": np.array([[0.0, 0.0, 0.0, radius]]) for i in (1, 2, 3)}
-    obstacles = [
-        Box(vector(0.5, 0.5, 0), vector(0.2, 0.3, 2)),
-        Capsule(vector(0.9, -0.4, 0), 0.1, 0.6),
-        Cylinder(vector(-0.6, 0, 0), 0.2, 1.0, vector(np.sqrt(0.5), np.sqrt(0.5), 0, 0)),
-    ]
-    return ExactCollision(replace(box_arm(), meshes={}, spheres=spheres), Scene(obstacles))
-
-
 def test_links_without_meshes_are_their_spheres() -> None:
-    first, second, third = sphere_links(0.04).link_distances(Q0)
-    assert (first.other, second.other, third.other) == ("cylinder", "box", "capsule")
-    assert first.distance == pytest.approx(0.6 - 0.2 - 0.04)
-    assert second.distance == pytest.approx(0.35 - 0.04)
-    assert third.distance == pytest.approx(0.4 - 0.1 - 0.04)
+    """The arm with one sphere at each link's origin in place of meshes."""
+    spheres = {f"l{i}": np.array([[0.0, 0.0, 0.0, 0.04]]) for i in (1, 2, 3)}
+    obstacles = [
+        rd.Box(vector(0.5, 0.5, 0), vector(0.2, 0.3, 2)),
+        rd.Capsule(vector(0.9, -0.4, 0), 0.1, 0.6),
+        rd.Cylinder(vector(-0.6, 0, 0), 0.2, 1.0, vector(np.sqrt(0.5), np.sqrt(0.5), 0, 0)),
+    ]
+    exact = ExactCollision(replace(box_arm(), meshes={}, spheres=spheres), rd.Scene(obstacles))
+    found = exact.link_distances(Q0)
+    assert [one.other for one in found] == ["cylinder", "box", "capsule"]
+    assert [one.distance for one in found] == pytest.approx([0.6 - 0.2 - 0.04, 0.35 - 0.04, 0.4 - 0.1 - 0.04])
 
 
 def test_pairs_of_links() -> None:
-    exact = ExactCollision(box_arm(), Scene())
+    exact = ExactCollision(box_arm(), rd.Scene())
     assert exact.pairs == (("l1", "l3"),)
     (folded,) = exact.pair_distances(np.array([0.3, np.pi / 2, 0]))
     assert folded.distance == pytest.approx(0.4 - HALF_WIDTH, abs=1e-6)
     (crossing,) = exact.pair_distances(np.array([1.0, 2.6, 2.6]))
-    assert crossing.distance < 0
-    assert crossing.other == "l3"
+    assert crossing.distance < 0 and crossing.other == "l3"
 
 
 def test_a_point_cloud_is_many_spheres() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform([-1, -1, -0.2], [1, 1, 0.2], (200, 3))
-    cloud = ExactCollision(box_arm(), Scene([PointCloud(points, 0.02)]))
-    spheres = ExactCollision(box_arm(), Scene([Sphere(point, 0.02) for point in points]))
+    cloud = ExactCollision(box_arm(), rd.Scene([rd.PointCloud(points, 0.02)]))
+    spheres = ExactCollision(box_arm(), rd.Scene([rd.Sphere(point, 0.02) for point in points]))
     configurations = rng.uniform(-2.5, 2.5, (60, 3))
     hit = spheres.collides(configurations)
     assert 0.1 < hit.mean() < 0.9
@@ -89,7 +84,7 @@ def test_a_point_cloud_is_many_spheres() -> None:
 
 @pytest.mark.parametrize("points", [np.zeros((1, 3)), np.zeros((500, 3)), np.tile([0.0, 0.0, 1.0], (3, 1))])
 def test_degenerate_point_clouds(points: np.ndarray) -> None:
-    exact = ExactCollision(box_arm(), Scene([PointCloud(points + np.array([0.2, 0.5, 0]), 0.01)]))
+    exact = ExactCollision(box_arm(), rd.Scene([rd.PointCloud(points + np.array([0.2, 0.5, 0]), 0.01)]))
     right = np.hypot(0.5 - HALF_WIDTH, max(points[0, 2] - HALF_WIDTH, 0)) - 0.01
     assert exact.link_distances(Q0)[0].distance == pytest.approx(right, abs=1e-6)
 
@@ -97,31 +92,31 @@ def test_degenerate_point_clouds(points: np.ndarray) -> None:
 def test_a_link_deep_in_a_point_cloud() -> None:
     """Depth at the deepest point: the middle of the box, less far from the side than from the top."""
     points = np.stack([np.full(21, 0.25), np.linspace(-0.02, 0.02, 21), np.zeros(21)], axis=1)
-    exact = ExactCollision(box_arm(), Scene([PointCloud(points, 0.01)]))
+    exact = ExactCollision(box_arm(), rd.Scene([rd.PointCloud(points, 0.01)]))
     assert exact.link_distances(Q0)[0].distance == pytest.approx(-HALF_WIDTH - 0.01, abs=1e-5)
 
 
 def test_equal_points_are_one() -> None:
     """150,000 equal points took the validator 10 s: Coal asked each of them."""
     two = np.array([[1.0, 0.12, 0.0], [-0.0, 0.5, 0.3]])
-    cloud = PointCloud(np.repeat(two, 500, axis=0) * 1.0, 0.01)
+    cloud = rd.PointCloud(np.repeat(two, 500, axis=0) * 1.0, 0.01)
     assert np.array_equal(cloud.distinct_points, two)
-    once, often = (ExactCollision(box_arm(), Scene([one])) for one in (PointCloud(two, 0.01), cloud))
+    once, often = (ExactCollision(box_arm(), rd.Scene([one])) for one in (rd.PointCloud(two, 0.01), cloud))
     assert once.link_distances(Q0) == often.link_distances(Q0)
 
 
 def test_an_empty_point_cloud_is_an_empty_scene() -> None:
-    exact = ExactCollision(box_arm(), Scene([PointCloud(np.zeros((0, 3)))]))
+    exact = ExactCollision(box_arm(), rd.Scene([rd.PointCloud(np.zeros((0, 3)))]))
     assert exact.link_distances(Q0)[0] == ("l1", None, np.inf)
     assert not exact.collides(np.zeros((2, 3))).any()
 
 
 def test_a_mesh_is_its_surface() -> None:
     mesh = trimesh.creation.box((0.2, 0.3, 0.4)).subdivide()
-    solid = Box(vector(0.6, 0.6, 0.1), vector(0.2, 0.3, 0.4), vector(0.9, 0.1, 0.3, 0.2))
+    solid = rd.Box(vector(0.6, 0.6, 0.1), vector(0.2, 0.3, 0.4), vector(0.9, 0.1, 0.3, 0.2))
     q = np.array([0.2, 0.1, 0.3])
-    surface = Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), solid.center, solid.wxyz)
-    a, b = (ExactCollision(box_arm(), Scene([shape])) for shape in (solid, surface))
+    surface = rd.Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), solid.center, solid.wxyz)
+    a, b = (ExactCollision(box_arm(), rd.Scene([shape])) for shape in (solid, surface))
     assert least(a, q) == pytest.approx(least(b, q), abs=1e-6)
     rows = np.random.default_rng(1).uniform(-2.5, 2.5, (300, 3))
     np.testing.assert_array_equal(a.collides(rows), b.collides(rows))
@@ -129,14 +124,12 @@ def test_a_mesh_is_its_surface() -> None:
 
 
 def test_nearest_honors_cutoffs_and_stops() -> None:
-    exact = ExactCollision(box_arm(), Scene([Sphere(vector(0.2, 0.5, 0), 0.1)]))
+    exact = ExactCollision(box_arm(), rd.Scene([rd.Sphere(vector(0.2, 0.5, 0), 0.1)]))
     q = np.zeros((4, 3))
     checks = np.array([0, 0, 2, 0])
     distances, names = exact.nearest(q, checks, np.array([1.0, 0.2, 1.0, 1.0]), stop=0.3)
-    assert distances[0] == pytest.approx(0.4 - HALF_WIDTH)
-    assert distances[1] == 0.2
-    assert np.isnan(distances[2:]).all()
-    assert names == ["sphere", None, None, None]
+    assert distances[0] == pytest.approx(0.4 - HALF_WIDTH) and distances[1] == 0.2
+    assert np.isnan(distances[2:]).all() and names == ["sphere", None, None, None]
 
 
 def test_frames_agree_with_the_kinematics() -> None:
@@ -151,35 +144,24 @@ def test_frames_agree_with_the_kinematics() -> None:
 def test_collides_is_the_sign_of_the_distance() -> None:
     robot = box_arm()
     rng = np.random.default_rng(3)
-    scene = Scene(
-        [
-            Cylinder(vector(0.5, 0.5, 0), 0.1, 0.3),
-            Capsule(vector(-0.4, 0.2, 0), 0.05, 0.3),
-            Sphere(vector(0, -1, 0), 0.3),
-        ]
-    )
-    exact = ExactCollision(robot, scene)
+    exact = ExactCollision(robot, solids())
     q = rng.uniform(robot.lower, robot.upper, (200, 3))
     np.testing.assert_array_equal(exact.collides(q), [least(exact, row) <= 0 for row in q])
     assert exact.collides(np.zeros((0, 3))).shape == (0,)
 
 
 def test_collisions_are_explained() -> None:
-    robot = box_arm()
-    scene = Scene([Sphere(vector(0, 1, 0), 0.1), Sphere(vector(0.25, 0.1, 0), 0.1)])
-    assert explain_collision(robot, scene, Q0) == "l1 is 3.0 cm inside sphere_2"
-    assert (
-        explain_collision(robot, Scene([Sphere(vector(0.25, 0.1275, 0), 0.1)]), Q0)
-        == "l1 is 2.5 mm inside sphere"
-    )
-    assert explain_collision(robot, Scene(), Q0) is None
-    crossing = explain_collision(robot, Scene(), np.array([1.0, 2.6, 2.6]))
-    assert crossing is not None
-    assert crossing.startswith("l1 and l3 overlap by ")
+    for shapes, wanted in (
+        ([rd.Sphere((0, 1, 0), 0.1), rd.Sphere((0.25, 0.1, 0), 0.1)], "l1 is 3.0 cm inside sphere_2"),
+        ([rd.Sphere((0.25, 0.1275, 0), 0.1)], "l1 is 2.5 mm inside sphere"),
+        ([], None),
+    ):
+        assert explain_collision(box_arm(), rd.Scene(shapes), Q0) == wanted
+    crossing = explain_collision(box_arm(), rd.Scene(), np.array([1.0, 2.6, 2.6]))
+    assert crossing is not None and crossing.startswith("l1 and l3 overlap by ")
 
 
 def test_fixed_links_do_not_count_against_the_scene() -> None:
     robot = box_arm().with_locked({"j0": 0.0})
-    exact = ExactCollision(robot, Scene([Sphere(vector(0.2, 0, 0), 0.1)]))
-    assert exact.links == ("l2", "l3")
-    assert not exact.collides(np.zeros((1, 2)))[0]
+    exact = ExactCollision(robot, rd.Scene([rd.Sphere(vector(0.2, 0, 0), 0.1)]))
+    assert exact.links == ("l2", "l3") and not exact.collides(np.zeros((1, 2)))[0]

@@ -4,22 +4,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import distance_transform_edt
 
+import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.sphere_oracles import (
     TOLERANCE,
     box_triangles,
     least_clearance,
     link_distances,
-    pair_distances,
     rows,
     with_spheres,
 )
-from robotdiffuse import Box, Mesh, PointCloud, Scene, Sphere
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
-from robotdiffuse.collision.kernel_arrays import compile_scene
-from robotdiffuse.collision.point_cloud_grid import THINNING, build_grid, cover_triangles, thin_points
+from robotdiffuse.collision.kernels.nearest_voxels import nearest_voxels
+from robotdiffuse.collision.point_cloud_grid import cover_triangles, thin_points
 
 
 def test_a_point_cloud_is_many_spheres() -> None:
@@ -27,8 +27,8 @@ def test_a_point_cloud_is_many_spheres() -> None:
     robot = with_spheres("panda")
     rng = np.random.default_rng(0)
     points = rng.uniform([-0.8, -0.8, 0.0], [0.8, 0.8, 1.2], (60, 3))
-    cloud = CollisionChecker(robot, Scene([PointCloud(points, 0.02)]))
-    spheres = CollisionChecker(robot, Scene([Sphere(point, 0.02) for point in points]))
+    cloud = CollisionChecker(robot, rd.Scene([rd.PointCloud(points, 0.02)]))
+    spheres = CollisionChecker(robot, rd.Scene([rd.Sphere(point, 0.02) for point in points]))
     q = rows(robot, 3000)
     np.testing.assert_array_equal(cloud.free(q), spheres.free(q))
     assert 0.05 < cloud.free(q).mean() < 0.95
@@ -41,16 +41,6 @@ def test_a_point_cloud_is_many_spheres() -> None:
     assert (found >= np.minimum(right, 0.2) - 0.08).all()
 
 
-def test_a_dense_cloud_is_joined_on_the_safe_side() -> None:
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-0.3, 0.3, (20_000, 3)) * (1, 1, 0.01)
-    joined = thin_points(points, 0.02, 1.5)
-    assert len(joined) < 0.25 * len(points)
-    for point in points[::97]:
-        assert (np.linalg.norm(joined[:, :3] - point, axis=1) + 0.02 <= joined[:, 3] + 1e-9).any()
-    assert joined[:, 3].max() <= 0.02 + np.sqrt(3) * THINNING * 0.02
-
-
 def test_the_nearest_of_a_dense_cloud() -> None:
     """The search in cells must not miss a point that the grid promises."""
     robot = with_spheres("box_arm")
@@ -58,10 +48,10 @@ def test_the_nearest_of_a_dense_cloud() -> None:
     points = rng.normal(size=(3000, 3))
     points = 0.4 * points / np.linalg.norm(points, axis=1, keepdims=True) + np.array([0.7, 0.5, 0])
     cloud = thin_points(points, 0.004, 2.0)
-    scene = Scene([Sphere(c[:3], c[3]) for c in cloud])
+    scene = rd.Scene([rd.Sphere(c[:3], c[3]) for c in cloud])
     q = rows(robot, 200)
     right = CollisionChecker(robot, scene)
-    found = CollisionChecker(robot, Scene([PointCloud(points, 0.004)]))
+    found = CollisionChecker(robot, rd.Scene([rd.PointCloud(points, 0.004)]))
     np.testing.assert_array_equal(found.free(q), right.free(q))
     near = right.link_clearances(q) < 0.08
     np.testing.assert_allclose(found.link_clearances(q)[near], right.link_clearances(q)[near], atol=TOLERANCE)
@@ -70,9 +60,9 @@ def test_the_nearest_of_a_dense_cloud() -> None:
 def test_empty_and_distant_clouds_are_empty_scenes() -> None:
     robot = with_spheres("panda")
     q = rows(robot, 200)
-    right = CollisionChecker(robot, Scene()).free(q)
+    right = CollisionChecker(robot, rd.Scene()).free(q)
     for points in (np.zeros((0, 3)), np.full((5, 3), 50.0), np.array([[1e4, -1e4, 1e4], [-1e4, 0, 0]])):
-        checker = CollisionChecker(robot, Scene([PointCloud(points, 0.01)]))
+        checker = CollisionChecker(robot, rd.Scene([rd.PointCloud(points, 0.01)]))
         np.testing.assert_array_equal(checker.free(q), right)
         assert (checker.link_clearances(q) == 1).all()
 
@@ -80,7 +70,7 @@ def test_empty_and_distant_clouds_are_empty_scenes() -> None:
 def test_points_just_beyond_the_reach_count() -> None:
     """They limit the clearance and, with padding, the freedom of an arm that is stretched out."""
     robot = with_spheres("box_arm")
-    scene = Scene([PointCloud([[1.32, 0.0, 0.0]], 0.01)])
+    scene = rd.Scene([rd.PointCloud([[1.32, 0.0, 0.0]], 0.01)])
     q = np.zeros((1, 3))
     right = link_distances(robot, scene, q).min()
     assert 0.02 < right < 0.1
@@ -92,13 +82,10 @@ def test_points_just_beyond_the_reach_count() -> None:
 @pytest.mark.parametrize("radius", [1e-9, 1e-4, 0.3])
 def test_tiny_and_large_points(radius: float) -> None:
     robot = with_spheres("panda")
-    rng = np.random.default_rng(0)
-    points = rng.uniform([-0.8, -0.8, 0.0], [0.8, 0.8, 1.2], (20, 3))
-    scene = Scene([PointCloud(points, radius)])
+    points = np.random.default_rng(0).uniform([-0.8, -0.8, 0.0], [0.8, 0.8, 1.2], (20, 3))
+    scene = rd.Scene([rd.PointCloud(points, radius)])
     q = rows(robot, 500)
-    hit = (link_distances(robot, scene, q) < -TOLERANCE).any(axis=1) | (pair_distances(robot, q) < 0).any(
-        axis=1
-    )
+    hit = (link_distances(robot, scene, q) < -TOLERANCE).any(axis=1)
     assert not CollisionChecker(robot, scene).free(q)[hit].any()
 
 
@@ -106,27 +93,15 @@ def test_links_with_spheres_larger_than_the_grids_band() -> None:
     robot = replace(box_arm(), spheres={"l3": np.array([[0.2, 0, 0, 0.4]])}, meshes={})
     rng = np.random.default_rng(0)
     points = rng.uniform(-1.6, 1.6, (40, 3)) * (1, 1, 0.2)
-    cloud = CollisionChecker(robot, Scene([PointCloud(points, 0.02)]))
-    spheres = CollisionChecker(robot, Scene([Sphere(point, 0.02) for point in points]))
+    cloud = CollisionChecker(robot, rd.Scene([rd.PointCloud(points, 0.02)]))
+    spheres = CollisionChecker(robot, rd.Scene([rd.Sphere(point, 0.02) for point in points]))
     q = rows(robot, 500)
     np.testing.assert_array_equal(cloud.free(q), spheres.free(q))
     free = cloud.free(q)
-    assert 0 < free.mean() < 1
-    assert ((least_clearance(cloud, q) > 0) == free).all()
+    assert 0 < free.mean() < 1 and ((least_clearance(cloud, q) > 0) == free).all()
     # no cost from points that are further away than the margin
     clear = least_clearance(spheres, q) > 0.05
     assert (cloud.cost_gradients(q[clear], 0.04)[0] == 0).all()
-
-
-def test_mesh_obstacles_are_covered() -> None:
-    vertices, faces = box_triangles((0.5, 0.3, 0.4))
-    spheres = cover_triangles(vertices[faces], 1.5)
-    rng = np.random.default_rng(0)
-    weights = rng.dirichlet((1, 1, 1), 300)
-    points = np.einsum("nk,nkd->nd", weights, vertices[faces[rng.integers(len(faces), size=300)]])
-    gap = np.linalg.norm(points[:, None] - spheres[:, :3], axis=-1) - spheres[:, 3]
-    assert gap.min(axis=1).max() <= 0
-    assert spheres[:, 3].max() < 0.02
 
 
 def test_mesh_obstacles_against_the_exact_surface() -> None:
@@ -135,11 +110,11 @@ def test_mesh_obstacles_against_the_exact_surface() -> None:
     vertices, faces = box_triangles((0.3, 0.4, 0.5))
     center = np.array([0.5, 0.1, 0.4])
     wxyz = np.array([0.9, 0.1, 0.2, 0.3])
-    scene = Scene([Mesh(vertices, faces, center, wxyz)])
+    scene = rd.Scene([rd.Mesh(vertices, faces, center, wxyz)])
     q = rng.uniform(robot.lower, robot.upper, (1500, robot.dof))
     free = CollisionChecker(robot, scene).free(q)
     assert not ExactCollision(robot, scene).collides(q[free]).any()
-    solid = CollisionChecker(robot, Scene([Box(center, (0.3, 0.4, 0.5), wxyz)])).free(q)
+    solid = CollisionChecker(robot, rd.Scene([rd.Box(center, (0.3, 0.4, 0.5), wxyz)])).free(q)
     assert (free == solid).mean() > 0.97
 
 
@@ -147,29 +122,23 @@ def test_a_ground_of_huge_triangles_is_as_fine_as_a_small_one() -> None:
     far = 1e4
     vertices = np.array([[-far, -far, -0.2], [far, -far, -0.2], [0.0, 2 * far, -0.2]])
     spheres = cover_triangles(vertices[None], 1.5)
-    assert spheres[:, 3].max() < 0.03
-    assert np.linalg.norm(spheres[:, :3], axis=1).max() < 2
+    assert spheres[:, 3].max() < 0.03 and np.linalg.norm(spheres[:, :3], axis=1).max() < 2
     on_ground = np.array([[0.0, 0, -0.2], [1.2, 0.3, -0.2], [-0.5, -1.1, -0.2]])
     gap = np.linalg.norm(on_ground[:, None] - spheres[:, :3], axis=-1) - spheres[:, 3]
     assert (gap.min(axis=1) <= 0).all()
 
 
-def test_the_grid_is_a_lower_bound() -> None:
+@pytest.mark.parametrize(
+    ("shape", "count"), [((9, 12, 7), 4), ((1, 1, 30), 2), ((30, 1, 1), 1), ((20, 17, 13), 900)]
+)
+def test_nearest_voxels_are_those_of_a_distance_transform(shape, count) -> None:
     rng = np.random.default_rng(0)
-    cloud = np.column_stack([rng.uniform(-0.5, 0.5, (300, 3)), np.full(300, 0.01)])
-    found = build_grid(cloud, 0.05)
-    low = found.grid_frame[:3]
-    voxel = found.grid_frame[3]
-    shape = found.grid_frame[8:11].astype(int)
-    axes = [low[i] + voxel * (np.arange(shape[i]) + 0.5) for i in range(3)]
-    centers = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    pick = rng.integers(len(centers), size=3000)
-    gap = np.linalg.norm(centers[pick, None] - cloud[:, :3], axis=-1).min(axis=1)
-    assert (found.grid[pick] <= gap + 1e-5).all()
-    exact = found.grid[pick] < found.grid_frame[7]
-    np.testing.assert_allclose(found.grid[pick][exact], gap[exact], atol=1e-5)
-    np.testing.assert_array_equal(exact, gap < found.grid_frame[7])
-    to_known = np.linalg.norm(centers[pick] - found.points[found.nearest[pick], :3], axis=-1)
-    np.testing.assert_allclose(to_known[exact], gap[exact], atol=1e-5)
-    assert (to_known - gap < 2 * np.sqrt(3) * voxel)[found.nearest[pick] >= 0].all()
-    assert compile_scene(Scene()).grid.shape == (0,)
+    run = np.full(shape, -1, np.int32)
+    held = rng.choice(run.size, count, replace=False)
+    run.ravel()[held] = np.arange(count)
+    squares, holders = nearest_voxels(run)
+    there = np.stack(np.unravel_index(held, shape), axis=-1)[holders]
+    away = there - np.moveaxis(np.indices(shape), 0, -1)
+    np.testing.assert_array_equal(squares, (away**2).sum(axis=-1))
+    distances = np.asarray(distance_transform_edt(run < 0))
+    np.testing.assert_allclose(np.sqrt(squares), distances, rtol=1e-6)

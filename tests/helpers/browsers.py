@@ -1,6 +1,11 @@
 """The browser that tests drive."""
 
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 FLAGS = [
@@ -14,3 +19,24 @@ FLAGS = [
     "--enable-unsafe-swiftshader",
 ]
 """WebGL without a graphics card."""
+MARKS = [
+    pytest.mark.browser,
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium"),
+]
+"""Of tests that need it."""
+PATIENCE = 300.0
+"""A new machine compiles first, and WebGL without a graphics card is slow [s]."""
+
+
+@contextmanager
+def opened(url: str, width: int = 900, height: int = 600) -> Iterator[Any]:
+    """A page of the browser at this address."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="browsers are driven by playwright")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, headless=True, args=FLAGS)
+        view = browser.new_page(viewport={"width": width, "height": height})
+        view.set_default_timeout(1000 * PATIENCE)
+        view.goto(url)
+        yield view
+        browser.close()

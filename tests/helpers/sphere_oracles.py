@@ -145,3 +145,20 @@ def box_triangles(size: tuple[float, float, float]) -> tuple[ndarray, ndarray]:
     faces = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)]
     faces += [(2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
     return corners, np.array(faces)
+
+
+def depth_of_balls(
+    balls: ndarray, T: ndarray, intrinsics: tuple[float, ...], size: tuple[int, int]
+) -> ndarray:
+    """A depth image of balls (x, y, z, radius), by hand: |depth ray - center| = radius; inf elsewhere."""
+    v, u = np.mgrid[: size[1], : size[0]]
+    fx, fy, cx, cy = intrinsics
+    rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones(u.shape)], -1) @ T[:3, :3].T
+    a = (rays**2).sum(-1)
+    depth = np.full(u.shape, np.inf)
+    for *center, radius in balls:
+        away = np.array(center) - T[:3, 3]
+        b = rays @ away
+        under = b * b - a * (away @ away - radius**2)
+        depth = np.where(under > 0, np.minimum(depth, (b - np.sqrt(np.maximum(under, 0))) / a), depth)
+    return depth

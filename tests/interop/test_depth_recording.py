@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 import robotdiffuse as rd
 from helpers.explorations import FLOOR, HOME, WALL
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.interop import ros2
 from robotdiffuse.interop.depth_recording import (
@@ -22,20 +21,18 @@ from robotdiffuse.interop.depth_recording import (
     TRANSFORMS,
     StampedView,
     TransformHistory,
-    read_depth_views,
     write_depth_views,
 )
 from robotdiffuse.interop.ros2 import JOINT_STATE, McapWriter, to_message, typestore
 from robotdiffuse.perception.occupancy_map import OccupancyMap
 from robotdiffuse.planning.exploration.simulated import RecordedExplorer, camera_beside, explore, wrist_camera
-from robotdiffuse.planning.exploration.steps import ExplorerSettings
 
 PANDA = rd.load_robot("panda")
 PROBLEM = rd.Problem(PANDA, rd.Scene([FLOOR, WALL]), HOME, HOME + 0.2)
 
 
 def test_a_recorded_exploration_is_read_again_and_gives_the_same_voxels(tmp_path: Path) -> None:
-    settings = ExplorerSettings(time_limit=1.0, max_looks=1)
+    settings = rd.ExplorerSettings(time_limit=1.0, max_looks=1)
     explorer = RecordedExplorer(PANDA, [wrist_camera(PANDA)], rd.Scene([FLOOR]), settings=settings)
     explorer.observe(camera_beside(PROBLEM, None, 0))
     for _ in explore(PROBLEM, explorer):
@@ -54,7 +51,7 @@ def test_a_recorded_exploration_is_read_again_and_gives_the_same_voxels(tmp_path
     np.testing.assert_allclose([one.stamp for one in read], [one.time for one in explorer.views], atol=1e-9)
     np.testing.assert_array_equal(again.occupied, explorer.map.occupied)
     np.testing.assert_array_equal(again.free, explorer.map.free)
-    alone = list(read_depth_views(tmp_path / "seen.mcap", PANDA, ["/beside/depth/image_rect_raw"]))
+    alone = list(rd.read_depth_views(tmp_path / "seen.mcap", PANDA, ["/beside/depth/image_rect_raw"]))
     assert len(alone) == len(views["beside"])
 
 
@@ -75,11 +72,7 @@ def pose(parent: str, child: str, at: float, turn: float = 0.0, x: float = 0.0) 
     """A transform with a turn about z."""
     rotation = {"x": 0.0, "y": 0.0, "z": np.sin(turn / 2), "w": np.cos(turn / 2)}
     place = {"translation": {"x": x, "y": 0.0, "z": 0.0}, "rotation": rotation}
-    return {
-        "header": {"stamp": stamp(at), "frame_id": parent},
-        "child_frame_id": child,
-        "transform": place,
-    }
+    return {"header": {"stamp": stamp(at), "frame_id": parent}, "child_frame_id": child, "transform": place}
 
 
 def camera(frame: str, at: float, encoding: str, unit: float, zeros: int = 0) -> tuple[Any, Any]:
@@ -138,7 +131,7 @@ def write_bag(bag: Writer1 | Writer2, messages: list[tuple[str, str, Any]]) -> N
 
 
 def test_poses_and_configurations_are_interpolated_and_millimeters_read(tmp_path: Path) -> None:
-    [(stamp, view)] = read_depth_views(recording(tmp_path / "r.mcap"), PANDA)
+    [(stamp, view)] = rd.read_depth_views(recording(tmp_path / "r.mcap"), PANDA)
     assert stamp == pytest.approx(1.05)
     np.testing.assert_allclose(view.depth, [[0.5, 0.0], [1.5, 2.0]], rtol=1e-6)
     assert view.intrinsics == (300.0, 310.0, 0.5, 0.4)
@@ -149,16 +142,16 @@ def test_poses_and_configurations_are_interpolated_and_millimeters_read(tmp_path
 
 @pytest.mark.parametrize("name", ("r.bag", "folder"))
 def test_bags_hold_what_mcap_files_do(name: str, tmp_path: Path) -> None:
-    [(stamp, view)] = read_depth_views(recording(tmp_path / name), PANDA)
-    [(same, twin)] = read_depth_views(recording(tmp_path / "r.mcap"), PANDA)
+    [(stamp, view)] = rd.read_depth_views(recording(tmp_path / name), PANDA)
+    [(same, twin)] = rd.read_depth_views(recording(tmp_path / "r.mcap"), PANDA)
     assert stamp == same and view.intrinsics == twin.intrinsics
     np.testing.assert_array_equal(view.depth, twin.depth)
     np.testing.assert_array_equal(view.T_base_camera, twin.T_base_camera)
     assert view.configuration is not None and twin.configuration is not None
     np.testing.assert_array_equal(view.configuration, twin.configuration)
     if name == "folder":
-        with pytest.raises(InputError, match="part of a ROS 2 bag: give the folder"):
-            list(read_depth_views(next((tmp_path / name).glob("*.db3")), PANDA))
+        with pytest.raises(rd.InputError, match="part of a ROS 2 bag: give the folder"):
+            list(rd.read_depth_views(next((tmp_path / name).glob("*.db3")), PANDA))
 
 
 def realsense(file: Path, compression: Writer1.CompressionFormat | None = None, zeros: int = 0) -> Path:
@@ -180,12 +173,12 @@ def realsense(file: Path, compression: Writer1.CompressionFormat | None = None, 
 def test_bags_of_librealsense(compression: Writer1.CompressionFormat | None, tmp_path: Path) -> None:
     file = realsense(tmp_path / "r.bag", compression)
     T = transform(np.array([1.0, 0.0, 0.5]))
-    [(stamp, view)] = read_depth_views(file, PANDA, T_base_camera=T)
+    [(stamp, view)] = rd.read_depth_views(file, PANDA, T_base_camera=T)
     assert stamp == 3.0 and view.configuration is None and view.intrinsics == (300.0, 310.0, 0.5, 0.4)
     np.testing.assert_allclose(view.depth, [[0.5, 0.0], [1.5, 2.0]], rtol=1e-6)
     np.testing.assert_array_equal(view.T_base_camera, T)
-    with pytest.raises(InputError, match="no transforms lead from panda_link0 to 0"):
-        list(read_depth_views(file, PANDA))
+    with pytest.raises(rd.InputError, match="no transforms lead from panda_link0 to 0"):
+        list(rd.read_depth_views(file, PANDA))
 
 
 @pytest.mark.parametrize("compression", Writer1.CompressionFormat)
@@ -195,16 +188,16 @@ def test_small_bags_that_unpack_to_much_are_refused(
     monkeypatch.setattr("robotdiffuse.interop.ros2.MAX_UNPACKED", 10**6)
     file = realsense(tmp_path / "r.bag", compression, zeros=2 * 10**6)
     assert file.stat().st_size < 10**5
-    with pytest.raises(InputError, match="a chunk of more than 1,000,000 bytes"):
-        list(read_depth_views(file, PANDA, T_base_camera=np.eye(4)))
+    with pytest.raises(rd.InputError, match="a chunk of more than 1,000,000 bytes"):
+        list(rd.read_depth_views(file, PANDA, T_base_camera=np.eye(4)))
 
 
 @pytest.mark.parametrize("size", (0, 40, 5000))
 def test_damaged_bags_are_refused(size: int, tmp_path: Path) -> None:
     file = realsense(tmp_path / "r.bag")
     file.write_bytes(file.read_bytes()[:size])
-    with pytest.raises(InputError, match=r"r\.bag is damaged"):
-        list(read_depth_views(file, PANDA, T_base_camera=np.eye(4)))
+    with pytest.raises(rd.InputError, match=r"r\.bag is damaged"):
+        list(rd.read_depth_views(file, PANDA, T_base_camera=np.eye(4)))
 
 
 def with_velocities_alone(messages: dict[str, Any]) -> None:
@@ -223,7 +216,7 @@ def test_only_joint_states_near_in_time_and_with_positions_count(
     change: Callable[[dict[str, Any]], object], at: float, tmp_path: Path
 ) -> None:
     """One far away was interpolated with, and one without positions was reported as damage."""
-    [(_, view)] = read_depth_views(recording(tmp_path / "r.mcap", change), PANDA)
+    [(_, view)] = rd.read_depth_views(recording(tmp_path / "r.mcap", change), PANDA)
     assert view.configuration is not None
     np.testing.assert_allclose(view.configuration, HOME + at, atol=1e-9)
 
@@ -237,7 +230,7 @@ def test_continuous_joints_are_interpolated_the_short_way(tmp_path: Path) -> Non
             positions = np.where(gen3.continuous, angle, 0.5).tolist()
             state |= {"name": list(gen3.joint_names), "position": positions}
 
-    [(_, view)] = read_depth_views(recording(tmp_path / "r.mcap", of_gen3), gen3, base="panda_link0")
+    [(_, view)] = rd.read_depth_views(recording(tmp_path / "r.mcap", of_gen3), gen3, base="panda_link0")
     assert view.configuration is not None
     halfway = np.where(gen3.continuous, -1.0, np.cos(0.5))
     np.testing.assert_allclose(np.cos(view.configuration), halfway, atol=1e-9)
@@ -251,7 +244,7 @@ def test_an_image_without_a_joint_state_leaves_the_rest(tmp_path: Path) -> None:
         early = image | {"header": image["header"] | {"stamp": stamp(0.5)}}
         messages["/camera/image_rect"] = [early, image | {"encoding": "mono16"}]
 
-    [(at, view)] = read_depth_views(recording(tmp_path / "r.mcap", early_too), PANDA)
+    [(at, view)] = rd.read_depth_views(recording(tmp_path / "r.mcap", early_too), PANDA)
     assert at == pytest.approx(1.05)
     np.testing.assert_allclose(view.depth, [[0.5, 0.0], [1.5, 2.0]], rtol=1e-6)
 
@@ -273,19 +266,19 @@ def test_an_image_without_a_joint_state_leaves_the_rest(tmp_path: Path) -> None:
 def test_what_is_missing_is_said(
     change: Callable[[dict[str, Any]], object], message: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(InputError, match=message) as error:
-        list(read_depth_views(recording(tmp_path / "r.mcap", change), PANDA))
+    with pytest.raises(rd.InputError, match=message) as error:
+        list(rd.read_depth_views(recording(tmp_path / "r.mcap", change), PANDA))
     assert "\n" not in str(error.value)
 
 
 def test_other_files_and_topics_are_refused(tmp_path: Path) -> None:
     (tmp_path / "text.mcap").write_text("no recording")
-    with pytest.raises(InputError, match="damaged"):
-        list(read_depth_views(tmp_path / "text.mcap", PANDA))
-    with pytest.raises(InputError, match="'/other' holds no images; topics of images: /camera/image_rect"):
-        list(read_depth_views(recording(tmp_path / "r.mcap"), PANDA, ["/other"]))
+    with pytest.raises(rd.InputError, match="damaged"):
+        list(rd.read_depth_views(tmp_path / "text.mcap", PANDA))
+    with pytest.raises(rd.InputError, match="'/other' holds no images; topics of images: /camera/image_rect"):
+        list(rd.read_depth_views(recording(tmp_path / "r.mcap"), PANDA, ["/other"]))
     view = rd.DepthView(np.ones((2, 2)), (300, 300, 0.5, 0.5), np.eye(4))
-    with pytest.raises(InputError, match="the view of wrist at 0 s has no configuration"):
+    with pytest.raises(rd.InputError, match="the view of wrist at 0 s has no configuration"):
         write_depth_views(PANDA, {"wrist": [StampedView(0.0, view)]}, tmp_path / "w.mcap")
 
 
@@ -308,15 +301,15 @@ def test_chains_are_followed_and_interpolated_and_at_the_ends_the_nearest_counts
 
 
 def test_missing_transforms_are_said() -> None:
-    with pytest.raises(InputError, match=r"no transform of link within 0\.1 s of the image"):
+    with pytest.raises(rd.InputError, match=r"no transform of link within 0\.1 s of the image"):
         history().at("base", "camera", 6.0, 0.1, "the image")
-    with pytest.raises(InputError, match=r"no transforms lead from world to camera.*lead to link, base"):
+    with pytest.raises(rd.InputError, match=r"no transforms lead from world to camera.*lead to link, base"):
         history().at("world", "camera", 5.0, 0.1, "the image")
     circle = history()
     circle.add(pose("camera", "base", 5.0), static=True)
-    with pytest.raises(InputError, match="no transforms lead from world"):
+    with pytest.raises(rd.InputError, match="no transforms lead from world"):
         circle.at("world", "camera", 5.0, 0.1, "the image")
     bad = pose("base", "link", 5.0)
     bad["transform"]["rotation"] = dict.fromkeys("xyzw", 0.0)
-    with pytest.raises(InputError, match="the transform of link has the rotation"):
+    with pytest.raises(rd.InputError, match="the transform of link has the rotation"):
         circle.add(bad, static=False)

@@ -18,9 +18,9 @@ from helpers import waiting
 from helpers.box_arm import box_arm
 from helpers.full_disk import full_disk
 from helpers.made_arms import chain, written
-from robotdiffuse.core.errors import InputError, OutputError
+from robotdiffuse import InputError, Problem, Scene, Trajectory
+from robotdiffuse.core.errors import OutputError
 from robotdiffuse.core.transforms import transform
-from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop import READERS, TRAJECTORY_ENDINGS, WRITERS, read_motion, ros2, write_motion
 from robotdiffuse.interop.recorded_motion import (
     checked_motion,
@@ -30,8 +30,6 @@ from robotdiffuse.interop.recorded_motion import (
     problem_of_motion,
     publish,
 )
-from robotdiffuse.problems.problem import Problem
-from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.validator import verify_trajectory
 
 START = [-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
@@ -49,8 +47,11 @@ PROBLEM = Problem(
 )
 
 
+Planned = tuple[Problem, Trajectory]
+
+
 @pytest.fixture(scope="module")
-def planned() -> tuple[Problem, Trajectory]:
+def planned() -> Planned:
     shapes = [
         rd.Sphere([0.5, 0.0, 0.5], 0.2, "ball"),
         rd.Box([0.5, 0, -0.06], [2, 2, 0.1], name="table"),
@@ -67,15 +68,14 @@ def planned() -> tuple[Problem, Trajectory]:
 
 @pytest.mark.parametrize("ending", [ending for ending in (*WRITERS, ".csv", ".json") if ending in READERS])
 def test_what_is_exported_is_read_again_and_validated_the_same(
-    ending: str, planned: tuple[Problem, Trajectory], tmp_path: Path
+    ending: str, planned: Planned, tmp_path: Path
 ) -> None:
     problem, trajectory = planned
     file = tmp_path / f"motion{ending}"
     for _ in range(2):  # a file that is there is replaced
         write_motion(problem, trajectory, file)
     found = motion_of_robot(read_motion(file), problem.robot)
-    assert found.notes == ()
-    assert isinstance(found.motion, Trajectory)
+    assert found.notes == () and isinstance(found.motion, Trajectory)
     np.testing.assert_array_equal(found.motion.positions, trajectory.positions)
     np.testing.assert_array_equal(found.motion.velocities, trajectory.velocities)
     np.testing.assert_allclose(found.motion.times, trajectory.times, atol=1e-9)  # messages count nanoseconds
@@ -83,6 +83,12 @@ def test_what_is_exported_is_read_again_and_validated_the_same(
     assert (here.valid, here.violation) == (there.valid, there.violation)
     assert there.min_clearance == pytest.approx(here.min_clearance, rel=1e-6)
     assert [path.name for path in tmp_path.iterdir()] == [file.name]
+
+
+def refuse(file: Path, message: str, topic: str | None = None) -> None:
+    with pytest.raises(InputError, match=message) as error:
+        read_motion(file, topic)
+    assert "\n" not in str(error.value)
 
 
 def in_mcap(file: Path) -> tuple[dict[str, Any], list[Any], dict[str, bytes], list[tuple[str, str]]]:
@@ -99,22 +105,23 @@ def in_mcap(file: Path) -> tuple[dict[str, Any], list[Any], dict[str, bytes], li
     return {entity.id: entity for entity in scene.entities}, frames, attached, messages
 
 
-def test_mcap_holds_scene_urdf_frames_and_joint_states(
-    planned: tuple[Problem, Trajectory], tmp_path: Path
-) -> None:
+def test_mcap_holds_scene_urdf_frames_and_joint_states(planned: Planned, tmp_path: Path) -> None:
     problem, trajectory = planned
     write_motion(problem, trajectory, tmp_path / "m.mcap")
     entities, frames, attached, messages = in_mcap(tmp_path / "m.mcap")
     topics = [topic for topic, _ in messages]
     assert topics.count("/tf") == topics.count("/joint_states") == len(trajectory.times)
     assert topics.count("/joint_trajectory") == topics.count("/points/point_cloud") == 1
-    assert entities["ball"].spheres[0].size.x == 0.4
-    assert entities["table"].frame_id == "panda_link0"
+    assert entities["ball"].spheres[0].size.x == 0.4 and entities["table"].frame_id == "panda_link0"
     assert {"capsule", "cylinder", "mesh"} <= entities.keys()
     assert any(name.startswith("panda_link5/") for name in entities)
     placed = {frame.child_frame_id for frame in frames[0]} | {"panda_link0"}
     assert {entity.frame_id for entity in entities.values()} <= placed
     assert json.loads(attached["problem.json"])["start"] == START
+    found = motion_of_robot(read_motion(tmp_path / "m.mcap", "/joint_states"), PANDA)
+    assert "panda_finger_joint1, panda_finger_joint2 stay at their locked values" in found.notes
+    np.testing.assert_array_equal(found.motion.positions, trajectory.positions)
+    refuse(tmp_path / "m.mcap", r"topic '/tf' holds no motion; topics: .*/joint_trajectory", "/tf")
     raised = replace(problem, T_world_base=transform(np.array([1.0, 2.0, 3.0])))
     write_motion(raised, trajectory, tmp_path / "m.mcap")
     again = ros2.problem_in(tmp_path / "m.mcap")
@@ -132,18 +139,6 @@ def test_a_urdf_goes_along(tmp_path: Path) -> None:
     assert ("/robot_description", "std_msgs/msg/String") in messages
 
 
-def test_joint_states_are_a_motion_too(planned: tuple[Problem, Trajectory], tmp_path: Path) -> None:
-    problem, trajectory = planned
-    write_motion(problem, trajectory, tmp_path / "m.mcap")
-    found = motion_of_robot(read_motion(tmp_path / "m.mcap", "/joint_states"), problem.robot)
-    assert isinstance(found.motion, Trajectory)
-    assert "panda_finger_joint1, panda_finger_joint2 stay at their locked values" in found.notes
-    np.testing.assert_array_equal(found.motion.positions, trajectory.positions)
-    assert verify_trajectory(problem, found.motion).valid
-    with pytest.raises(InputError, match=r"topic '/tf' holds no motion; topics: .*/joint_trajectory"):
-        read_motion(tmp_path / "m.mcap", "/tf")
-
-
 def in_rrd(file: Path, column: str) -> dict[str, list[Any]]:
     """The values of a column by entity, empty for those that lack it."""
     from rerun.chunk import RrdReader
@@ -157,7 +152,7 @@ def in_rrd(file: Path, column: str) -> dict[str, list[Any]]:
     return found
 
 
-def test_rerun_recordings_hold_the_joints(planned: tuple[Problem, Trajectory], tmp_path: Path) -> None:
+def test_rerun_recordings_hold_the_joints(planned: Planned, tmp_path: Path) -> None:
     problem, trajectory = planned
     write_motion(problem, trajectory, tmp_path / "m.rrd")
     found = in_rrd(tmp_path / "m.rrd", "Scalars:scalars")
@@ -187,26 +182,23 @@ def test_a_recording_that_unpacks_to_gigabytes_is_refused(
         writer.finish()
     assert (folder / "m.mcap").stat().st_size < 5_000
     (tmp_path / "m.mcap").write_bytes((folder / "m.mcap").read_bytes())
-    with pytest.raises(InputError, match=r"m\.mcap has a chunk of 150,\d+ bytes; 100,000 are allowed"):
-        read_motion(tmp_path / name)
+    refuse(tmp_path / name, r"m\.mcap has a chunk of 150,\d+ bytes; 100,000 are allowed")
 
 
 def test_a_motion_of_too_many_messages_is_refused(
-    planned: tuple[Problem, Trajectory], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    planned: Planned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_motion(*planned, tmp_path / "m.mcap")
     write_motion(*planned, tmp_path / "bag.rosbag2")
     monkeypatch.setattr(ros2, "check_chunks", lambda *given: None)
     monkeypatch.setattr(ros2, "MAX_UNPACKED", 100)
     for name in ("m.mcap", "bag.rosbag2"):
-        with pytest.raises(InputError, match="the messages of /joint_trajectory take more than 100 bytes"):
-            read_motion(tmp_path / name, "/joint_trajectory")
+        wanted = "the messages of /joint_trajectory take more than 100 bytes"
+        refuse(tmp_path / name, wanted, "/joint_trajectory")
 
 
 @pytest.mark.parametrize("ending", sorted([*WRITERS, *TRAJECTORY_ENDINGS]))
-def test_a_disk_that_fills_up_is_one_line(
-    planned: tuple[Problem, Trajectory], tmp_path: Path, ending: str
-) -> None:
+def test_a_disk_that_fills_up_is_one_line(planned: Planned, tmp_path: Path, ending: str) -> None:
     """ROS 2 bags and Rerun's recordings ended with tracebacks of SQLite and of Rerun."""
     problem, trajectory = planned
     with full_disk(4096), pytest.raises(OutputError, match=r"m\.\w+ cannot be written: ") as caught:
@@ -228,8 +220,7 @@ def test_joints_are_put_into_order_by_name() -> None:
     for point in record["points"]:
         point["positions"] = point["positions"][::-1]
     found = motion_of_robot(motion_from_record(record, "it"), PANDA)
-    assert found.motion.positions[0].tolist() == START
-    assert "joints were reordered by name" in found.notes
+    assert found.motion.positions[0].tolist() == START and "joints were reordered by name" in found.notes
     assert "no accelerations are given: those of the cubics through the rows are validated" in found.notes
 
 
@@ -279,18 +270,10 @@ def of_panda(names: list[str], rows: list[list[float]]) -> None:
 REFUSED: dict[str, tuple[Callable[..., object], tuple[Any, ...], str]] = {
     "twice": (checked_motion, (["a", "a"], [[0, 0]]), "joint_names has a more than once"),
     "no rows": (checked_motion, (["a"], []), "positions is empty; it must be n x 1 finite numbers"),
-    "ragged": (
-        checked_motion,
-        (["a"], [[0], [0, 1]]),
-        r"positions is \[\[0\], \[0, 1\]\]; it must be n x 1",
-    ),
+    "ragged": (checked_motion, (["a"], [[0], [0, 1]]), r"positions is \[\[0\], .*; it must be n x 1"),
     "nan": (checked_motion, (["a"], [[0], [np.nan]]), r"positions\[1\] is \[nan\]; its numbers"),
     "huge": (checked_motion, (["a"], [[1e30]]), "must be finite and within ±10000"),
-    "short rates": (
-        checked_motion,
-        (["a"], [[0], [1]], [0, 1], [[0]]),
-        "velocities is an array of 1 x 1; it must be 2",
-    ),
+    "short rates": (checked_motion, (["a"], [[0], [1]], [0, 1], [[0]]), "velocities is an array of 1 x 1"),
     "nan time": (checked_motion, (["a"], [[0], [1]], [0, np.nan]), r"times\[1\] is nan"),
     "backwards": (checked_motion, (["a"], [[0], [1]], [1, 1]), "times do not increase: 1 s in row 0, 1 s"),
     "two weeks": (checked_motion, (["a"], [[0], [1]], [0, 1.2e6]), r"times span 1.2e\+06 s; a motion must"),
@@ -317,11 +300,7 @@ REFUSED: dict[str, tuple[Callable[..., object], tuple[Any, ...], str]] = {
         "multi_dof_joint_trajectory has points; only arms on a fixed base can be validated",
     ),
     "two parts": (motion_from_record, ({"trajectory": [{}, {}]}, "it"), "trajectory has 2 parts"),
-    "no plan": (
-        motion_from_record,
-        ({"status": "timeout"}, "it"),
-        "it holds no motion: its status is 'timeout'",
-    ),
+    "no plan": (motion_from_record, ({"status": "timeout"}, "it"), "it holds no motion: its status is 't"),
 }
 
 
@@ -333,13 +312,7 @@ def test_bad_motions_are_refused_in_one_line(name: str) -> None:
     assert "\n" not in str(error.value)
 
 
-def refuse(file: Path, message: str) -> None:
-    with pytest.raises(InputError, match=message) as error:
-        read_motion(file)
-    assert "\n" not in str(error.value)
-
-
-def test_damaged_files_are_refused_in_one_line(planned: tuple[Problem, Trajectory], tmp_path: Path) -> None:
+def test_damaged_files_are_refused_in_one_line(planned: Planned, tmp_path: Path) -> None:
     write_motion(*planned, tmp_path / "m.mcap")
     whole = (tmp_path / "m.mcap").read_bytes()
     for size in (0, 10, 1000, len(whole) // 2, len(whole) - 20):
@@ -380,9 +353,7 @@ def test_damaged_files_are_refused_in_one_line(planned: tuple[Problem, Trajector
 )
 def test_bad_csv(text: str, wanted: str, tmp_path: Path) -> None:
     (tmp_path / "m.csv").write_text(text)
-    with pytest.raises(InputError, match=wanted) as error:
-        read_motion(tmp_path / "m.csv")
-    assert str(error.value).startswith(str(tmp_path / "m.csv"))
+    refuse(tmp_path / "m.csv", rf"^{tmp_path}/m\.csv.*{wanted}")
 
 
 def test_names_of_joints_are_no_formulas_for_a_spreadsheet(tmp_path: Path) -> None:
@@ -402,8 +373,7 @@ def test_yaml_as_ros2_topic_echo_prints_it(tmp_path: Path) -> None:
         "  time_from_start: {sec: 0, nanosec: 500000000}\n---\n"
     )
     found = read_motion(tmp_path / "m.yaml")
-    assert found.joint_names == ("a", "b")
-    assert found.velocities is None
+    assert found.joint_names == ("a", "b") and found.velocities is None
 
 
 def test_a_motion_alone_says_what_it_solves() -> None:
@@ -413,7 +383,7 @@ def test_a_motion_alone_says_what_it_solves() -> None:
     assert motion_of_robot(motion, problem.robot).motion.positions[-1].tolist() == GOAL
 
 
-def test_unknown_endings_list_the_known_ones(planned: tuple[Problem, Trajectory], tmp_path: Path) -> None:
+def test_unknown_endings_list_the_known_ones(planned: Planned, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"unknown ending '\.foo'; known: \.json, \.csv, \.mcap"):
         write_motion(*planned, tmp_path / "m.foo")
     with pytest.raises(InputError, match=r"unknown motion format '\.foo'; known: \.csv"):
@@ -440,9 +410,7 @@ def test_a_missing_extra_says_what_to_install(
         use()
 
 
-def test_motions_are_published_to_a_rosbridge(
-    planned: tuple[Problem, Trajectory], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_motions_are_published_to_a_rosbridge(planned: Planned, monkeypatch: pytest.MonkeyPatch) -> None:
     """Subscribers had no time to match the publisher, which sent and ended at once."""
     from websockets.sync.server import serve
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from robotdiffuse import DepthView, InputError, Scene
+import robotdiffuse as rd
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_about, transform
 from robotdiffuse.perception.depth_view import DepthNoise, SeenPoints
 from robotdiffuse.perception.depth_view_files import read_depth, read_views, view_entry
@@ -25,7 +25,7 @@ def test_points_of_pixels() -> None:
     depth[0, 0] = np.nan
     depth[1, 1] = np.inf
     depth[2, 2] = -1.0
-    view = DepthView(depth, K, T)
+    view = rd.DepthView(depth, K, T)
     by_hand = T @ [(20 - 31.5) / 50 * 2, (10 - 23.5) / 50 * 2, 2.0, 1.0]
     assert np.allclose(view.points(), by_hand[:3])
 
@@ -35,15 +35,15 @@ def test_a_cloud_becomes_the_image_that_its_camera_had() -> None:
     u, v = np.meshgrid(np.linspace(-0.5, 0.5, 200), np.linspace(-0.4, 0.4, 160))
     near, far = (np.stack([u * z, v * z, np.full_like(u, z)], -1).reshape(-1, 3) for z in (1.0, 2.0))
     points = np.concatenate([far, near[: len(near) // 2]]) @ T[:3, :3].T + T[:3, 3]
-    view = DepthView.from_cloud(points, T)
+    view = rd.DepthView.from_cloud(points, T)
     h, w = view.depth.shape
     assert np.array_equal(view.points(), points) and h * w <= 320 * 240
     upper = view.depth[2 : h // 2 - 2, 2:-2]
     lower = view.depth[h // 2 + 2 : -2, 2:-2]
     for half, z in ((upper, 1.0), (lower, 2.0)):
         assert np.mean(half > 0) > 0.6 and np.allclose(half[half > 0], z, atol=1e-5)
-    with pytest.raises(InputError, match="none of 10 is in front"):
-        DepthView.from_cloud(T[:3, 3] - T[:3, 2] + np.zeros((10, 3)), T)
+    with pytest.raises(rd.InputError, match="none of 10 is in front"):
+        rd.DepthView.from_cloud(T[:3, 3] - T[:3, 2] + np.zeros((10, 3)), T)
 
 
 @pytest.mark.parametrize(
@@ -52,13 +52,15 @@ def test_a_cloud_becomes_the_image_that_its_camera_had() -> None:
         ({"depth": np.zeros(5)}, "view.depth is an array of 5"),
         ({"intrinsics": (0.0, 1.0, 0.0, 0.0)}, "fx and fy must be at least"),
         ({"intrinsics": (1.0, 1.0)}, "view.intrinsics is .* 4 finite numbers"),
+        ({"intrinsics": {"fx": 1.0}}, r"view\.intrinsics has \['fx'\]; it must have fx, fy, cx, cy"),
+        ({"intrinsics": [[460.0, 1, 319.5], [0, 461.0, 239.5], [0, 0, 1]]}, "without skew"),
         ({"T_base_camera": 2 * np.eye(4)}, "it must be a rotation"),
         ({"configuration": [np.nan]}, "view.configuration"),
     ],
 )
 def test_what_is_refused(change: dict, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        DepthView(**{"depth": np.ones((4, 4)), "intrinsics": K, "T_base_camera": T} | change)
+    with pytest.raises(rd.InputError, match=message):
+        rd.DepthView(**{"depth": np.ones((4, 4)), "intrinsics": K, "T_base_camera": T} | change)
 
 
 def test_depth_files(tmp_path: Path) -> None:
@@ -80,7 +82,7 @@ def test_depth_files(tmp_path: Path) -> None:
         "none.png": "does not exist",
         "a.jpg": "unknown depth image format",
     }.items():
-        with pytest.raises(InputError, match=message):
+        with pytest.raises(rd.InputError, match=message):
             read_depth(tmp_path / name)
 
 
@@ -109,11 +111,9 @@ def test_views_survive_their_files(tmp_path: Path) -> None:
     assert written[0].items() >= {"range": 4.0, "pose_deviation": [0.005, 0.02]}.items()
     assert read_views(written, tmp_path)[0][0].noise == DepthNoise(spread=0.006)
     assert [w["depth" if "depth" in w else "cloud"] for w in written] == ["a.png", "cloud.npy"]
-    inline = [DepthView(views[0].depth, K, T), DepthView.from_cloud(points, T)]
-    for view in (
-        *read_views(written, tmp_path)[0],
-        *read_views([view_entry(v, None) for v in inline], tmp_path)[0],
-    ):
+    inline = [rd.DepthView(views[0].depth, K, T), rd.DepthView.from_cloud(points, T)]
+    again = read_views([view_entry(v, None) for v in inline], tmp_path)[0]
+    for view in (*read_views(written, tmp_path)[0], *again):
         twin = views[0] if view.cloud is None else views[1]
         assert np.array_equal(view.depth, twin.depth) and np.allclose(view.points(), twin.points())
         assert np.allclose(view.T_base_camera, T)
@@ -146,55 +146,41 @@ def test_intrinsics_beside_an_image(name: str, content: Any, tmp_path: Path) -> 
     assert view.intrinsics == K
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ({"K": [1.0, 2.0]}, "a.json holds no intrinsics"),
-        ({"fx": "wide", "fy": 1.0, "cx": 1.0, "cy": 1.0}, "view.intrinsics is"),
-    ],
-)
-def test_files_without_intrinsics(content: Any, message: str, tmp_path: Path) -> None:
-    Image.fromarray(np.full((6, 8), 1500, np.uint16)).save(tmp_path / "a.png")
-    camera = {"xyz": [0, 0, 0], "wxyz": [1, 0, 0, 0]}
-    with pytest.raises(InputError, match=r"views\[0\] has no intrinsics"):
-        read_views([{"depth": "a.png", "camera": camera}], tmp_path)
-    (tmp_path / "a.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match=message):
-        read_views([{"depth": "a.png", "camera": camera}], tmp_path)
+CAMERA = {"xyz": [0, 0, 0], "wxyz": [1, 0, 0, 0]}
 
 
 @pytest.mark.parametrize(
     ("entry", "message"),
     [
         ({"cloud": "a.ply", "camera": {}, "scale": 1}, r"unknown field of views\[0\]"),
-        ({"cloud": "a.ply", "camera": {"xyz": [0, 0], "wxyz": [1, 0, 0, 0]}}, r"views\[0\]: camera.xyz"),
-        ({"cloud": "a.ply", "camera": {"xyz": [0, 0, 0], "wxyz": [1, 0, 0, 0]}}, "a.ply does not exist"),
+        ({"cloud": "a.ply", "camera": CAMERA | {"xyz": [0, 0]}}, r"views\[0\]: camera.xyz"),
+        ({"cloud": "a.ply", "camera": CAMERA}, "a.ply does not exist"),
         ("a.png", r"views\[0\] is 'a.png'"),
+        ({"depth": "a.png", "camera": CAMERA}, r"views\[0\] has no intrinsics"),
+        ({"depth": "b.png", "camera": CAMERA}, "b.json holds no intrinsics"),
+        ({"depth": "c.png", "camera": CAMERA}, "view.intrinsics is"),
     ],
 )
-def test_what_is_wrong_in_a_file(entry: object, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        read_views([entry], Path())
+def test_what_is_wrong_in_a_file(entry: object, message: str, tmp_path: Path) -> None:
+    for name in "abc":
+        Image.fromarray(np.full((6, 8), 1500, np.uint16)).save(tmp_path / f"{name}.png")
+    (tmp_path / "b.json").write_text('{"K": [1.0, 2.0]}')
+    (tmp_path / "c.json").write_text('{"fx": "wide", "fy": 1.0, "cx": 1.0, "cy": 1.0}')
+    with pytest.raises(rd.InputError, match=message):
+        read_views([entry], tmp_path)
 
 
 def test_points_that_were_seen_are_sampled_as_a_cloud() -> None:
     """The network was asked for a scene with a kind of point cloud, and its surface looked for a mesh."""
     points = np.random.default_rng(0).uniform(0.2, 0.5, (50, 3))
-    found = sample_surface(Scene([SeenPoints(points, 0.01)]), 20, np.random.default_rng(1))
+    found = sample_surface(rd.Scene([SeenPoints(points, 0.01)]), 20, np.random.default_rng(1))
     assert len(found) == 20 and all((point == points).all(axis=1).any() for point in found)
 
 
 def test_intrinsics_as_a_mapping_or_a_matrix() -> None:
-    numbers = (460.0, 461.0, 319.5, 239.5)
-    named: dict[str, float] = dict(zip(("fx", "fy", "cx", "cy"), numbers, strict=True))
-    matrix = [[460.0, 0, 319.5], [0, 461.0, 239.5], [0, 0, 1]]
-    each: list[Any] = [numbers, named, matrix, np.array(matrix)]
+    each: list[Any] = [K, dict(zip(("fx", "fy", "cx", "cy"), K, strict=True)), MATRIX, np.array(MATRIX)]
     for given in each:
-        assert DepthView(np.ones((2, 2)), given, np.eye(4)).intrinsics == numbers
-    with pytest.raises(InputError, match=r"view\.intrinsics has \['fx'\]; it must have fx, fy, cx, cy"):
-        DepthView(np.ones((2, 2)), {"fx": 1.0}, np.eye(4))
-    with pytest.raises(InputError, match="without skew"):
-        DepthView(np.ones((2, 2)), [[460.0, 1, 319.5], *matrix[1:]], np.eye(4))
+        assert rd.DepthView(np.ones((2, 2)), given, np.eye(4)).intrinsics == K
 
 
 def test_small_images_cannot_fill_the_memory(tmp_path: Path) -> None:
@@ -209,5 +195,5 @@ def test_small_images_cannot_fill_the_memory(tmp_path: Path) -> None:
         OpenEXR.File({}, {"Z": huge.astype(np.float16)}).write(str(tmp_path / "huge.exr"))
         endings.append("exr")
     for ending in endings:
-        with pytest.raises(InputError, match="16,781,312 pixels; it must have at most 16,777,216"):
+        with pytest.raises(rd.InputError, match="16,781,312 pixels; it must have at most 16,777,216"):
             read_depth(tmp_path / f"huge.{ending}")

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from robotdiffuse import DepthView, InputError, load_robot
+import robotdiffuse as rd
+from helpers.sphere_oracles import depth_of_balls
 from robotdiffuse.perception.observed_volume import ObservedVolume, observe
 from robotdiffuse.perception.voxel_grid import LOW, SHAPE, VOXEL
 from robotdiffuse.robots.kinematics import link_pose, placed_spheres
 
-PANDA = load_robot("panda")
+PANDA = rd.load_robot("panda")
 HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 AWAY = np.array([3.0, 0.0, 0.0, -0.1, 0.0, 1.571, 0.785])
 """The arm stretched upwards, out of the way of what these views look at."""
@@ -28,9 +29,9 @@ def camera(x: float = 1.6, y: float = 0.0, z: float = 0.5, back: bool = False) -
     return T
 
 
-def view(depth: np.ndarray, T: np.ndarray | None = None, q: np.ndarray = AWAY) -> DepthView:
+def view(depth: np.ndarray, T: np.ndarray | None = None, q: np.ndarray = AWAY) -> rd.DepthView:
     intrinsics = (FOCAL, FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
-    return DepthView(depth, intrinsics, camera() if T is None else T, q)
+    return rd.DepthView(depth, intrinsics, camera() if T is None else T, q)
 
 
 def flat(depth: float) -> np.ndarray:
@@ -55,8 +56,7 @@ def test_before_a_wall_is_free_on_it_occupied_and_behind_unknown() -> None:
     np.testing.assert_array_equal(free, x > wall + VOXEL / 2)
     hidden = x < wall - VOXEL / 2
     np.testing.assert_allclose(behind[hidden], (wall - x)[hidden], atol=1e-5)
-    assert (behind[~hidden] == 0).all()
-    assert not (seen.free & seen.occupied).any()
+    assert (behind[~hidden] == 0).all() and not (seen.free & seen.occupied).any()
 
 
 def test_what_is_beside_the_image_is_out_of_view() -> None:
@@ -98,8 +98,7 @@ def test_several_views_add_up() -> None:
     back = view(flat(0.82), camera(x=-1.6, back=True))
     both = observe([front, back], PANDA, AWAY)
     for one in (observe([front], PANDA, AWAY), observe([back], PANDA, AWAY)):
-        assert both.occupied[one.occupied].all()
-        assert (both.free | both.occupied)[one.free].all()
+        assert both.occupied[one.occupied].all() and (both.free | both.occupied)[one.free].all()
     x, occupied, free, behind = ahead(both)
     assert occupied.sum() == 2 and free[x > 0.8].all() and free[x < -0.81].all()
     between = ~occupied & ~free
@@ -110,15 +109,8 @@ def test_several_views_add_up() -> None:
 def test_the_arm_is_no_obstacle_and_casts_a_shadow() -> None:
     spheres = placed_spheres(PANDA, HOME)
     T = camera()
-    local = (spheres[:, :3] - T[:3, 3]) @ T[:3, :3]
-    u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
-    rays = np.stack([(u - (WIDTH - 1) / 2) / FOCAL, (v - (HEIGHT - 1) / 2) / FOCAL, np.ones(u.shape)], -1)
-    depth = flat(2.2)
-    for center, radius in zip(local, spheres[:, 3], strict=True):  # by hand: |d ray - center| = radius
-        a = (rays**2).sum(-1)
-        b = rays @ center
-        under = b * b - a * (center @ center - radius**2)
-        depth = np.where(under > 0, np.minimum(depth, (b - np.sqrt(np.maximum(under, 0))) / a), depth)
+    intrinsics = (FOCAL, FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+    depth = np.minimum(depth_of_balls(spheres, T, intrinsics, (WIDTH, HEIGHT)), 2.2)
     arm = depth < 2.19
     assert arm.any()
     seen = observe([view(depth.astype(np.float32), q=HOME)], PANDA, AWAY)
@@ -157,7 +149,7 @@ def test_missing_returns_and_flying_pixels_change_little() -> None:
 
 
 def test_no_views_and_another_robots_configuration_are_refused() -> None:
-    with pytest.raises(InputError, match="views is empty"):
+    with pytest.raises(rd.InputError, match="views is empty"):
         observe([], PANDA, HOME)
-    with pytest.raises(InputError, match="has 3 numbers; panda plans 7"):
+    with pytest.raises(rd.InputError, match="has 3 numbers; panda plans 7"):
         observe([view(flat(1.0), q=np.zeros(3))], PANDA, HOME)

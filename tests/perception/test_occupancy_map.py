@@ -5,20 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robotdiffuse import Box, DepthView, InputError, Scene, load_robot
+import robotdiffuse as rd
 from robotdiffuse.perception.depth_view import DepthNoise
 from robotdiffuse.perception.observed_volume import FREE, OUT, carve_view
 from robotdiffuse.perception.occupancy_map import OccupancyMap
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
 from robotdiffuse.perception.voxel_grid import MAP
 
-PANDA = load_robot("panda")
+PANDA = rd.load_robot("panda")
 HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
-FLOOR, CRATE = Box((0, 0, -0.05), (6, 6, 0.1)), Box((0.6, 0.3, 0.2), (0.3, 0.3, 0.4))
-SCENE = Scene([FLOOR, CRATE])
+FLOOR, CRATE = rd.Box((0, 0, -0.05), (6, 6, 0.1)), rd.Box((0.6, 0.3, 0.2), (0.3, 0.3, 0.4))
+SCENE = rd.Scene([FLOOR, CRATE])
 
 
-def view_from(bearing: float, distance: float = 1.5, scene: Scene = SCENE) -> DepthView:
+def view_from(bearing: float, distance: float = 1.5, scene: rd.Scene = SCENE) -> rd.DepthView:
     position = np.array([distance * np.cos(bearing), distance * np.sin(bearing), 0.8])
     T = looking_at(position, np.array([0.2, 0.0, 0.3]))
     return ray_cast(scene, T, (290.0, 290.0, 159.5, 119.5), (320, 240), PANDA, HOME)
@@ -99,12 +99,12 @@ def test_what_went_away_becomes_free_and_old_evidence_is_forgotten() -> None:
     known.add(view_from(2.8))
     assert known.occupied[middle]
     for _ in range(3):
-        known.add(view_from(2.8, scene=Scene([FLOOR])))
+        known.add(view_from(2.8, scene=rd.Scene([FLOOR])))
     assert known.free[middle]
     ageing = OccupancyMap(PANDA, max_age=1.0)
     ageing.add(view_from(2.8), stamp=10.0)
     assert ageing.occupied[middle]
-    ageing.add(view_from(-1.4, scene=Scene([FLOOR])), stamp=12.0)
+    ageing.add(view_from(-1.4, scene=rd.Scene([FLOOR])), stamp=12.0)
     assert not ageing.occupied[middle]
 
 
@@ -114,7 +114,7 @@ def test_points_and_free_zones() -> None:
     assert known.free.sum() == 30 * 30 * 35
     known.add_points(np.array([[0.01, 0.01, 0.01], [9.0, 0.0, 0.0]]))
     assert known.occupied.sum() == 1 and known.free.sum() == 30 * 30 * 35 - 1
-    with pytest.raises(InputError, match="free_zone is"):
+    with pytest.raises(rd.InputError, match="free_zone is"):
         known.declare_free(((0.3, 0.0, 0.0), (0.1, 1.0, 1.0)))
-    with pytest.raises(InputError, match=r"view\.configuration is None; a map needs"):
+    with pytest.raises(rd.InputError, match=r"view\.configuration is None; a map needs"):
         known.add(replace(view_from(0.0), configuration=None))

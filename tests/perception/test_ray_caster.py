@@ -1,5 +1,6 @@
 """Depth images by rays: they lie on the surfaces, nothing nearer is missed, and another renderer agrees."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,28 +9,20 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers.sphere_oracles import distance
-from robotdiffuse import Box, Capsule, Cylinder, InputError, PointCloud, Scene, Sphere, load_robot
+import robotdiffuse as rd
+from helpers.sphere_oracles import distance, random_shape
 from robotdiffuse.perception.ray_caster import MAX_RANGE, looking_at, ray_cast, voxels_within
 from robotdiffuse.perception.voxel_grid import VoxelGrid
 from robotdiffuse.robots.kinematics import placed_spheres
-from robotdiffuse.scenes.shapes import Shape
 
-PANDA = load_robot("panda")
+PANDA = rd.load_robot("panda")
 SIZE = (64, 48)
 INTRINSICS = (60.0, 60.0, 31.5, 23.5)
 
 
-def random_scene(rng: np.random.Generator, count: int = 6) -> Scene:
-    shapes: list[Shape] = []
-    for kind in rng.integers(4, size=count):
-        center, (a, b, c), wxyz = rng.uniform(-0.6, 0.6, 3), rng.uniform(0.05, 0.4, 3), rng.normal(size=4)
-        shapes.append(
-            [Sphere(center, a), Box(center, (a, b, c), wxyz), Cylinder(center, a / 2, b, wxyz)][kind]
-            if kind < 3
-            else Capsule(center, a / 2, b, wxyz)
-        )
-    return Scene(shapes)
+def random_scene(rng: np.random.Generator, count: int = 6) -> rd.Scene:
+    shapes = [random_shape(kind, rng) for kind in rng.choice(["sphere", "box", "cylinder", "capsule"], count)]
+    return rd.Scene([replace(shape, center=0.6 * shape.center) for shape in shapes])  # type: ignore
 
 
 @settings(max_examples=15, deadline=None)
@@ -56,7 +49,7 @@ def test_points_lie_on_surfaces_and_nothing_is_nearer(seed: int) -> None:
 def test_the_arm_is_its_covering_spheres() -> None:
     q = np.array([0.3, -0.5, 0.0, -2.0, 0.0, 1.5, 0.8])
     T = looking_at(np.array([1.5, 0.5, 0.6]), np.array([0.0, 0.0, 0.4]))
-    view = ray_cast(Scene(), T, INTRINSICS, SIZE, PANDA, q)
+    view = ray_cast(rd.Scene(), T, INTRINSICS, SIZE, PANDA, q)
     spheres = placed_spheres(PANDA, q)
     gaps = np.linalg.norm(view.points()[:, None] - spheres[:, :3], axis=-1) - spheres[:, 3]
     assert len(gaps) > 100 and np.abs(gaps.min(axis=1)).max() < 2e-5
@@ -79,8 +72,8 @@ def test_cameras_look_where_they_are_told_and_stand_upright() -> None:
 
 def test_pybullets_camera_sees_the_same(tmp_path: Path) -> None:
     pybullet = pytest.importorskip("pybullet")
-    box = Box((0.5, 0.1, 0.2), (0.2, 0.3, 0.4), (0.9, 0.1, 0.2, 0.3))
-    ball = Sphere((0.2, 0.5, 0.5), 0.15)
+    box = rd.Box((0.5, 0.1, 0.2), (0.2, 0.3, 0.4), (0.9, 0.1, 0.2, 0.3))
+    ball = rd.Sphere((0.2, 0.5, 0.5), 0.15)
     (width, height), field, near, far = (160, 120), 0.96, 0.1, 4.0
     eye, target = (1.4, 0.6, 0.9), (0.3, 0.1, 0.3)
     client = pybullet.connect(pybullet.DIRECT)
@@ -93,7 +86,7 @@ def test_pybullets_camera_sees_the_same(tmp_path: Path) -> None:
             (ball, pybullet.createVisualShape(pybullet.GEOM_MESH, fileName=file)),
         )
         for shape, visual in seen:
-            w, *xyz = shape.wxyz.tolist() if isinstance(shape, Box) else (1.0, 0.0, 0.0, 0.0)
+            w, *xyz = shape.wxyz.tolist() if isinstance(shape, rd.Box) else (1.0, 0.0, 0.0, 0.0)
             pybullet.createMultiBody(0.0, -1, visual, shape.center.tolist(), [*xyz, w])
         *_, depth, bodies = pybullet.getCameraImage(
             width,
@@ -111,7 +104,7 @@ def test_pybullets_camera_sees_the_same(tmp_path: Path) -> None:
     # PyBullet samples at the lower left corner of its pixels
     intrinsics = (focal, focal, width / 2, height / 2 - 1)
     view = ray_cast(
-        Scene([box, ball]), looking_at(np.array(eye), np.array(target)), intrinsics, (width, height)
+        rd.Scene([box, ball]), looking_at(np.array(eye), np.array(target)), intrinsics, (width, height)
     )
     both = found & np.isfinite(view.depth)
     off = np.abs(image[both] - view.depth[both])
@@ -133,5 +126,5 @@ def test_voxels_that_hold_obstacles(seed: int) -> None:
 
 
 def test_what_rays_do_not_know_is_refused() -> None:
-    with pytest.raises(InputError, match="point_cloud is a point_cloud; only spheres, boxes"):
-        ray_cast(Scene([PointCloud(np.zeros((1, 3)))]), np.eye(4), INTRINSICS, SIZE)
+    with pytest.raises(rd.InputError, match="point_cloud is a point_cloud; only spheres, boxes"):
+        ray_cast(rd.Scene([rd.PointCloud(np.zeros((1, 3)))]), np.eye(4), INTRINSICS, SIZE)

@@ -42,11 +42,8 @@ def returns(depth: np.ndarray, ball: np.ndarray, radius: float, more: int) -> np
     fx, fy, cx, cy = INTRINSICS
     u = fx * points[:, 0] / points[:, 2] + cx
     v = fy * points[:, 1] / points[:, 2] + cy
-    u0 = np.floor(u.min())
-    u1 = np.ceil(u.max())
-    v0 = np.floor(v.min())
-    v1 = np.ceil(v.max())
-    u0, u1, v0, v1 = (int(n) for n in (u0 - more, u1 + more, v0 - more, v1 + more))
+    u0, v0 = (int(np.floor(of.min())) - more for of in (u, v))
+    u1, v1 = (int(np.ceil(of.max())) + more for of in (u, v))
     if points[:, 2].min() <= 0 or min(u0, v0) < 0 or u1 >= SIZE[0] or v1 >= SIZE[1]:
         return None
     return depth[v0 : v1 + 1, u0 : u1 + 1]

@@ -7,7 +7,6 @@ import pytest
 
 import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.scenes.point_cloud import TREE_DEPTH, occupied_voxels, read_octomap
 
@@ -71,7 +70,7 @@ def test_an_octomap_is_a_cloud_of_a_problem_file(tmp_path: Path) -> None:
 )
 def test_damaged_octomaps(content: bytes, message: str, tmp_path: Path) -> None:
     (tmp_path / "map.bt").write_bytes(content)
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(rd.InputError, match=message):
         read_octomap(tmp_path / "map.bt")
 
 
@@ -103,7 +102,7 @@ def test_wrong_height_maps() -> None:
         ([[0.0, 1e9], [0, 0]], "not within"),
         ([[np.nan, 1], [0, 0]], "no cell of four heights"),
     ):
-        with pytest.raises(InputError, match=message):
+        with pytest.raises(rd.InputError, match=message):
             rd.HeightMap(heights, 0.1)
 
 

@@ -7,23 +7,18 @@ import numpy as np
 import pytest
 import trimesh
 
+import robotdiffuse as rd
 from helpers.box_arm import box_arm
-from robotdiffuse.certificates.search import certify
 from robotdiffuse.collision.checker import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path as JointPath
-from robotdiffuse.planning import plan
-from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
-from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots import load_robot
+from robotdiffuse.problems.files import problem_from_record, problem_record, save_problem
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.scenes.scene import Scene, contact_notes
-from robotdiffuse.scenes.shapes import Box, Mesh, PointCloud, Shape, Sphere
-from robotdiffuse.validation.validator import verify
+from robotdiffuse.scenes.scene import contact_notes
+from robotdiffuse.scenes.shapes import Shape
 
-BALL = Sphere([1.15, 0.0, 0.0], 0.1, "ball")
-WALL = Box([0.9, 0.6, 0.0], [0.05, 0.4, 0.4], name="wall")
+BALL = rd.Sphere([1.15, 0.0, 0.0], 0.1, "ball")
+WALL = rd.Box([0.9, 0.6, 0.0], [0.05, 0.4, 0.4], name="wall")
 FINGERS = ("panda_hand", "panda_leftfinger", "panda_rightfinger")
 HOME = np.array([0.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 AWAY = np.array([1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
@@ -33,26 +28,26 @@ def solid(kind: str, at: np.ndarray) -> Shape:
     """An object around a place, between the fingers."""
     made = trimesh.creation.cylinder(0.03, 0.1)
     shapes: dict[str, Shape] = {
-        "box": Box(at, [0.05, 0.05, 0.05], name="mug"),
-        "mesh": Mesh(made.vertices, made.faces, at, name="mug"),
-        "point_cloud": PointCloud(made.vertices + at, 0.02, name="mug"),
+        "box": rd.Box(at, [0.05, 0.05, 0.05], name="mug"),
+        "mesh": rd.Mesh(made.vertices, made.faces, at, name="mug"),
+        "point_cloud": rd.PointCloud(made.vertices + at, 0.02, name="mug"),
     }
     return shapes[kind]
 
 
-def grasp(kind: str, contacts: dict[str, object]) -> Problem:
+def grasp(kind: str, contacts: dict[str, object]) -> rd.Problem:
     """A Panda whose fingers are around an object, before it moves away past a ball."""
-    robot = load_robot("panda")
+    robot = rd.load_robot("panda")
     T = link_pose(robot, HOME, "panda_hand")
-    shapes = [solid(kind, T[:3, 3] + 0.09 * T[:3, 2]), Sphere([0.62, 0.33, 0.5], 0.1, "ball")]
-    return Problem(robot, Scene(shapes, contacts), HOME, AWAY)  # type: ignore[arg-type]
+    shapes = [solid(kind, T[:3, 3] + 0.09 * T[:3, 2]), rd.Sphere([0.62, 0.33, 0.5], 0.1, "ball")]
+    return rd.Problem(robot, rd.Scene(shapes, contacts), HOME, AWAY)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("kind", ["box", "mesh", "point_cloud"])
 def test_an_allowed_contact_is_allowed_everywhere(kind: str) -> None:
     oracle = pytest.importorskip("robotdiffuse.simulation.validator")
     problem = grasp(kind, {"mug": FINGERS})
-    result = plan(problem, time_limit=2.0)
+    result = rd.plan(problem, time_limit=2.0)
     assert result.solved and result.trajectory is not None, result.reason
     assert "contact of mug with panda_hand, panda_leftfinger, panda_rightfinger is allowed" in result.notes
     rows = result.trajectory.positions[::8]
@@ -61,26 +56,26 @@ def test_an_allowed_contact_is_allowed_everywhere(kind: str) -> None:
         assert bullet.check_frames(rows) is None
         nearest = bullet.nearest(HOME)
         assert nearest is None or nearest.distance > 0
-    assert not certify(problem, result.trajectory).check(problem).differences
+    assert not rd.certify(problem, result.trajectory).check(problem).differences
     assert problem.clearance_at(HOME) > 0
 
-    other = replace(problem, scene=Scene(problem.scene.shapes))
-    report = verify(other, result.trajectory)
+    other = replace(problem, scene=rd.Scene(problem.scene.shapes))
+    report = rd.verify(other, result.trajectory)
     assert report.violation is not None and "mug" in report.violation.message
     assert ExactCollision(other.robot, other.scene).collides(HOME[None]).all()
-    assert certify(problem, result.trajectory).check(other).differences
-    assert other.clearance_at(HOME) <= 0 and not plan(other, time_limit=0.1).solved
+    assert rd.certify(problem, result.trajectory).check(other).differences
+    assert other.clearance_at(HOME) <= 0 and not rd.plan(other, time_limit=0.1).solved
 
 
 def test_other_links_may_not_touch_it() -> None:
     """The last link may touch the ball: a motion in which another one does is refused by all."""
     contacts = {"ball": ["l3"]}
     folded = JointPath(box_arm().joint_names, np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]]))
-    free = Problem(box_arm(), Scene([BALL], contacts), folded.positions[0], folded.positions[1])
-    assert verify(free, folded).valid
+    free = rd.Problem(box_arm(), rd.Scene([BALL], contacts), folded.positions[0], folded.positions[1])
+    assert rd.verify(free, folded).valid
     near = replace(BALL, center=[0.8, 0.2, 0.0])  # beside the middle link
-    scene = Scene([near], contacts)
-    report = verify(replace(free, scene=scene), folded)
+    scene = rd.Scene([near], contacts)
+    report = rd.verify(replace(free, scene=scene), folded)
     assert report.violation is not None and report.violation.message.startswith("l2")
     checker = CollisionChecker(box_arm(), scene)
     assert list(checker.free(folded.positions)) == [True, False]
@@ -89,53 +84,56 @@ def test_other_links_may_not_touch_it() -> None:
 
 def test_costs_pass_over_allowed_contacts() -> None:
     q = np.zeros((1, 3))
-    cost, gradient = CollisionChecker(box_arm(), Scene([BALL], {"ball": "all"})).cost_gradients(q, 0.05)
+    cost, gradient = CollisionChecker(box_arm(), rd.Scene([BALL], {"ball": "all"})).cost_gradients(q, 0.05)
     assert cost[0] == 0 and not gradient.any()
-    assert CollisionChecker(box_arm(), Scene([BALL])).cost_gradients(q, 0.05)[0][0] > 0
+    assert CollisionChecker(box_arm(), rd.Scene([BALL])).cost_gradients(q, 0.05)[0][0] > 0
 
 
 def test_a_large_mesh_that_may_be_touched_is_still_seen_by_other_links() -> None:
     made = trimesh.creation.icosphere(subdivisions=6, radius=0.1)  # 81,920 triangles
-    mesh = Mesh(made.vertices, made.faces, BALL.center, name="ball")
+    mesh = rd.Mesh(made.vertices, made.faces, BALL.center, name="ball")
     q = np.zeros((1, 3))
     for links, free in ((["l3"], True), (["l1", "l2"], False)):
-        checker = CollisionChecker(box_arm(), Scene([mesh], {"ball": links}))
-        assert len(checker.scene_arrays.solids) <= 1000
-        assert checker.free(q)[0] == free
+        checker = CollisionChecker(box_arm(), rd.Scene([mesh], {"ball": links}))
+        assert len(checker.scene_arrays.solids) <= 1000 and checker.free(q)[0] == free
 
 
 def test_held_objects_are_links() -> None:
-    robot = box_arm().attach(Box([0.35, 0.0, 0.0], [0.1, 0.05, 0.05], name="cup"), "l3")
+    robot = box_arm().attach(rd.Box([0.35, 0.0, 0.0], [0.1, 0.05, 0.05], name="cup"), "l3")
     q = np.zeros(3)
-    scene = Scene([Box([1.26, 0.0, 0.0], [0.06, 0.2, 0.2], name="shelf")], {"shelf": ["cup"]})
+    scene = rd.Scene([rd.Box([1.26, 0.0, 0.0], [0.06, 0.2, 0.2], name="shelf")], {"shelf": ["cup"]})
     path = JointPath(robot.joint_names, np.array([q, [0.0, 0.0, 1.0]]))
-    assert verify(Problem(robot, scene, q, path.positions[1]), path).valid
-    assert not verify(Problem(robot, Scene(scene.shapes), q, path.positions[1]), path).valid
+    assert rd.verify(rd.Problem(robot, scene, q, path.positions[1]), path).valid
+    assert not rd.verify(rd.Problem(robot, rd.Scene(scene.shapes), q, path.positions[1]), path).valid
 
 
 def test_unknown_names_are_errors_with_the_known_ones() -> None:
-    with pytest.raises(InputError, match=r"unknown obstacle in allowed_contacts: 'cup'; known: ball, wall"):
-        Scene([BALL, WALL], {"cup": "all"})
-    with pytest.raises(InputError, match=r"unknown link in allowed_contacts of ball: 'l9'; known: .*l1, l2"):
-        Problem(box_arm(), Scene([BALL], {"ball": ["l9"]}), [0, 0, 1.0], [0, 0, -1.0])
+    with pytest.raises(
+        rd.InputError, match=r"unknown obstacle in allowed_contacts: 'cup'; known: ball, wall"
+    ):
+        rd.Scene([BALL, WALL], {"cup": "all"})
+    with pytest.raises(
+        rd.InputError, match=r"unknown link in allowed_contacts of ball: 'l9'; known: .*l1, l2"
+    ):
+        rd.Problem(box_arm(), rd.Scene([BALL], {"ball": ["l9"]}), [0, 0, 1.0], [0, 0, -1.0])
     for wrong in ([["ball"]], "ball", 3, {"ball": "l3"}, {"ball": 3}, {"ball": [3]}, {3: "all"}):
-        with pytest.raises(InputError, match="allowed_contacts"):
-            Scene([BALL], wrong)  # type: ignore[arg-type]
+        with pytest.raises(rd.InputError, match="allowed_contacts"):
+            rd.Scene([BALL], wrong)  # type: ignore[arg-type]
 
 
 def test_a_name_given_twice_stands_for_both() -> None:
-    scene = Scene([BALL, BALL, WALL], {"ball": ["l3"], "ball_2": ["l2"]})
+    scene = rd.Scene([BALL, BALL, WALL], {"ball": ["l3"], "ball_2": ["l2"]})
     assert scene.allowed_contacts == (("ball", ("l3",)), ("ball_2", ("l3", "l2")))
     more = scene.with_shapes([*scene.shapes[1:], BALL])
     assert [shape.name for shape in more.shapes] == ["ball_2", "wall", "ball"]
-    grown = Scene([BALL], {"ball": ["l3"]}).with_shapes([BALL, replace(BALL, center=[1.1, 0.3, 0.0])])
+    grown = rd.Scene([BALL], {"ball": ["l3"]}).with_shapes([BALL, replace(BALL, center=[1.1, 0.3, 0.0])])
     assert grown.may_touch("l3", "ball") and not grown.may_touch("l3", "ball_2")
     assert not scene.with_shapes([WALL]).allowed_contacts
-    assert contact_notes(Scene([BALL], {"ball": "all"})) == ("contact of ball with all links is allowed",)
+    assert contact_notes(rd.Scene([BALL], {"ball": "all"})) == ("contact of ball with all links is allowed",)
 
 
 def test_moved_attached_and_detached_scenes_keep_what_remains() -> None:
-    scene = Scene([BALL, WALL], {"ball": ["l3"], "wall": "all"})
+    scene = rd.Scene([BALL, WALL], {"ball": ["l3"], "wall": "all"})
     assert scene.moved(np.eye(4)).allowed_contacts == scene.allowed_contacts
     left, holding = scene.attach("ball", box_arm(), np.zeros(3), "l3")
     assert left.allowed_contacts == (("wall", "all"),)
@@ -150,7 +148,7 @@ def test_allowed_contacts_come_back_from_files(tmp_path: Path) -> None:
     save_problem(problem, tmp_path / "grasp.yaml")
     text = (tmp_path / "grasp.yaml").read_text()
     assert "ball: all" in text
-    assert load_problem(tmp_path / "grasp.yaml").scene.allowed_contacts == problem.scene.allowed_contacts
+    assert rd.load_problem(tmp_path / "grasp.yaml").scene.allowed_contacts == problem.scene.allowed_contacts
     (tmp_path / "grasp.yaml").write_text(text.replace("ball: all", "bell: all"))
-    with pytest.raises(InputError, match=r"grasp.yaml: unknown obstacle in allowed_contacts: 'bell'"):
-        load_problem(tmp_path / "grasp.yaml")
+    with pytest.raises(rd.InputError, match=r"grasp.yaml: unknown obstacle in allowed_contacts: 'bell'"):
+        rd.load_problem(tmp_path / "grasp.yaml")

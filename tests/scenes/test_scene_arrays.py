@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 
 from helpers.sphere_oracles import distance
-from robotdiffuse.core.errors import InputError
+from robotdiffuse import Box, Capsule, Cylinder, InputError, Scene
 from robotdiffuse.problems.families.rop import ROP_DENSE
-from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import PackedScenes
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder
 
 FLOOR = Box([0, 0, -0.05], [2, 2, 0.1], name="floor")
 

@@ -13,52 +13,41 @@ from hypothesis.extra.numpy import arrays
 from numpy import ndarray
 from trimesh.triangles import closest_point
 
-from robotdiffuse.core.errors import InputError
+import robotdiffuse as rd
+from helpers.sphere_oracles import distance
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.scenes.files import SHAPES as KINDS
 from robotdiffuse.scenes.files import read_scene, scene_entries
 from robotdiffuse.scenes.point_cloud import crop, distinct, lzf_unpacked, read_points, voxel_thin
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, HeightMap, Mesh, PointCloud, Shape, Sphere
+from robotdiffuse.scenes.shapes import Shape
 from robotdiffuse.scenes.surface_points import VisibleRegion, draw, sample_surface
 
 TURN = (0.8, 0.2, -0.5, 0.3)
 """Not of length 1, on purpose."""
 TETRAHEDRON = ([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 SHAPES: dict[str, Shape] = {
-    "sphere": Sphere([0.1, 0.2, 0.9], 0.3),
-    "box": Box([0.1, 0.2, 0.9], [0.2, 0.5, 0.9], TURN),
-    "cylinder": Cylinder([0.1, 0.2, 0.9], 0.1, 0.7, TURN),
-    "capsule": Capsule([0.1, 0.2, 0.9], 0.1, 0.7, TURN),
-    "mesh": Mesh(*TETRAHEDRON, xyz=[0.1, 0.2, 0.3], wxyz=TURN),
-    "point_cloud": PointCloud(np.random.default_rng(0).uniform(0.2, 0.6, (500, 3))),
+    "sphere": rd.Sphere([0.1, 0.2, 0.9], 0.3),
+    "box": rd.Box([0.1, 0.2, 0.9], [0.2, 0.5, 0.9], TURN),
+    "cylinder": rd.Cylinder([0.1, 0.2, 0.9], 0.1, 0.7, TURN),
+    "capsule": rd.Capsule([0.1, 0.2, 0.9], 0.1, 0.7, TURN),
+    "mesh": rd.Mesh(*TETRAHEDRON, xyz=[0.1, 0.2, 0.3], wxyz=TURN),
+    "point_cloud": rd.PointCloud(np.random.default_rng(0).uniform(0.2, 0.6, (500, 3))),
 }
 
 
 def surface_distance(shape: Shape, points: ndarray) -> ndarray:
     """How far points are from the surface, by another form than those that draw."""
-    if isinstance(shape, PointCloud):
+    if isinstance(shape, rd.PointCloud):
         return np.abs(points[:, None] - shape.points).max(axis=2).min(axis=1)
-    if isinstance(shape, Mesh):
+    if isinstance(shape, rd.Mesh):
         triangles = shape.world_vertices[shape.faces]
         gaps = [points - closest_point(np.repeat(t[None], len(points), 0), points) for t in triangles]
         return np.linalg.norm(gaps, axis=2).min(axis=0)
-    assert isinstance(shape, Sphere | Box | Cylinder | Capsule)
-    local = points - shape.center
-    if isinstance(shape, Sphere):
-        return np.abs(np.linalg.norm(local, axis=1) - shape.radius)
-    local = local @ shape.rotation
-    if isinstance(shape, Box):
-        return np.abs((np.abs(local) - shape.size / 2).max(axis=1))
-    radial = np.linalg.norm(local[:, :2], axis=1)
-    along = np.abs(local[:, 2]) - shape.height / 2
-    if isinstance(shape, Cylinder):
-        return np.abs(np.maximum(radial - shape.radius, along))
-    return np.abs(np.hypot(radial, np.maximum(0, along)) - shape.radius)
+    return np.abs(distance(shape, points))
 
 
 def test_points_are_drawn_on_every_shape() -> None:
-    drawn_by_triangles = {HeightMap}
+    drawn_by_triangles = {rd.HeightMap}
     assert {*KINDS.values()} - drawn_by_triangles == {type(shape) for shape in SHAPES.values()}
 
 
@@ -66,8 +55,7 @@ def test_points_are_drawn_on_every_shape() -> None:
 def test_samples_lie_on_the_surface_and_in_the_bounds(name: str) -> None:
     shape = SHAPES[name]
     points = draw(shape, 2000, np.random.default_rng(1))
-    assert points.shape == (2000, 3)
-    assert surface_distance(shape, points).max() < 1e-9
+    assert points.shape == (2000, 3) and surface_distance(shape, points).max() < 1e-9
     low, high = shape.bounds
     assert (points > low - 1e-9).all() and (points < high + 1e-9).all()
     # Tight: some point comes near each side (3 % of the extent; a tetrahedron's corners are rarely hit).
@@ -108,10 +96,9 @@ def test_areas() -> None:
 
 
 def test_surface_is_shared_by_area_and_seeded() -> None:
-    scene = Scene([Sphere([0.3, 0, 0.5], 0.1), Sphere([-0.3, 0, 0.5], 0.2)])
+    scene = rd.Scene([rd.Sphere([0.3, 0, 0.5], 0.1), rd.Sphere([-0.3, 0, 0.5], 0.2)])
     points = sample_surface(scene, 5000, np.random.default_rng(3))
-    assert points.shape == (5000, 3)
-    assert abs((points[:, 0] > 0).mean() - 1 / 5) < 0.03
+    assert points.shape == (5000, 3) and abs((points[:, 0] > 0).mean() - 1 / 5) < 0.03
     # In random order: any part of the points is of the whole scene.
     assert abs((points[:1000, 0] > 0).mean() - 1 / 5) < 0.07
     assert (points == sample_surface(scene, 5000, np.random.default_rng(3))).all()
@@ -119,53 +106,52 @@ def test_surface_is_shared_by_area_and_seeded() -> None:
 
 def test_surface_keeps_to_the_region() -> None:
     region = VisibleRegion()
-    floor = Box([0, 0, -0.05], [2, 2, 0.1])
-    table = Box([1.5, 0, 0.4], [4.0, 4.0, 0.02])
-    points = sample_surface(Scene([floor, table]), 512, np.random.default_rng(4))
-    assert len(points) == 512
-    assert (points[:, 2] > region.floor).all()
+    floor = rd.Box([0, 0, -0.05], [2, 2, 0.1])
+    table = rd.Box([1.5, 0, 0.4], [4.0, 4.0, 0.02])
+    points = sample_surface(rd.Scene([floor, table]), 512, np.random.default_rng(4))
+    assert len(points) == 512 and (points[:, 2] > region.floor).all()
     assert (np.linalg.norm(points - region.center, axis=1) < region.reach).all()
 
 
 @pytest.mark.parametrize(
     "shapes",
-    [[], [Sphere([5, 0, 0.5], 0.2)], [Box([0, 0, -0.05], [2, 2, 0.1])], [PointCloud([])]],
+    [[], [rd.Sphere([5, 0, 0.5], 0.2)], [rd.Box([0, 0, -0.05], [2, 2, 0.1])], [rd.PointCloud([])]],
     ids=["nothing", "out of reach", "floor alone", "empty cloud"],
 )
 def test_surface_of_nothing_visible(shapes: list[Shape]) -> None:
-    assert sample_surface(Scene(shapes), 64, np.random.default_rng(5)).shape == (0, 3)
+    assert sample_surface(rd.Scene(shapes), 64, np.random.default_rng(5)).shape == (0, 3)
 
 
 def test_a_sliver_in_reach_is_repeated() -> None:
-    points = sample_surface(Scene([Sphere([1.3, 0, 0.3], 0.1001)]), 512, np.random.default_rng(6))
+    points = sample_surface(rd.Scene([rd.Sphere([1.3, 0, 0.3], 0.1001)]), 512, np.random.default_rng(6))
     assert len(points) in (0, 512)
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Sphere([0, 0], 1), r"sphere.center is \[0, 0\]; it must be 3 finite numbers"),
-        (lambda: Sphere([0, 0, np.nan], 1), "sphere.center"),
-        (lambda: Sphere(["a", 0, 0], 1), "sphere.center"),
-        (lambda: Sphere([0, 0, 0], -1), "sphere.radius is -1; it must be a positive number"),
-        (lambda: Sphere([0, 0, 0], 1, name=""), "sphere.name"),
-        (lambda: Box([0, 0, 0], [1, 0, 1]), "box.size"),
-        (lambda: Box([0, 0, 0], [1, 1, 1], [0, 0, 0, 0]), "must not be zero"),
-        (lambda: Cylinder([0, 0, 0], 1, np.inf), "cylinder.height is inf"),
-        (lambda: Capsule([0, 0, 0], None, 1), "capsule.radius is None"),  # type: ignore[arg-type]
-        (lambda: Mesh([[0, 0, 0]], [[0, 0, 1]]), "indices of the 1 vertices"),
-        (lambda: Mesh([[0, 0, 0]], []), "mesh.faces"),
-        (lambda: PointCloud([[0, 0]]), "an array of 1 x 2; it must be n x 3"),
-        (lambda: PointCloud([[0, 0, np.inf]]), r"points\[0\] is \[0.0, 0.0, inf\]; it must be finite"),
-        (lambda: PointCloud([[0, 0, 0], [1]]), "not numbers"),
-        (lambda: Scene(["ball"]), r"scene\[0\] is a str"),  # type: ignore[list-item]
-        (lambda: Scene(None), "scene is None; it must be a list of shapes"),  # type: ignore[arg-type]
-        (lambda: Scene(5), "scene is 5; it must be a list of shapes"),  # type: ignore[arg-type]
+        (lambda: rd.Sphere([0, 0], 1), r"sphere.center is \[0, 0\]; it must be 3 finite numbers"),
+        (lambda: rd.Sphere([0, 0, np.nan], 1), "sphere.center"),
+        (lambda: rd.Sphere(["a", 0, 0], 1), "sphere.center"),
+        (lambda: rd.Sphere([0, 0, 0], -1), "sphere.radius is -1; it must be a positive number"),
+        (lambda: rd.Sphere([0, 0, 0], 1, name=""), "sphere.name"),
+        (lambda: rd.Box([0, 0, 0], [1, 0, 1]), "box.size"),
+        (lambda: rd.Box([0, 0, 0], [1, 1, 1], [0, 0, 0, 0]), "must not be zero"),
+        (lambda: rd.Cylinder([0, 0, 0], 1, np.inf), "cylinder.height is inf"),
+        (lambda: rd.Capsule([0, 0, 0], None, 1), "capsule.radius is None"),  # type: ignore[arg-type]
+        (lambda: rd.Mesh([[0, 0, 0]], [[0, 0, 1]]), "indices of the 1 vertices"),
+        (lambda: rd.Mesh([[0, 0, 0]], []), "mesh.faces"),
+        (lambda: rd.PointCloud([[0, 0]]), "an array of 1 x 2; it must be n x 3"),
+        (lambda: rd.PointCloud([[0, 0, np.inf]]), r"points\[0\] is \[0.0, 0.0, inf\]; it must be finite"),
+        (lambda: rd.PointCloud([[0, 0, 0], [1]]), "not numbers"),
+        (lambda: rd.Scene(["ball"]), r"scene\[0\] is a str"),  # type: ignore[list-item]
+        (lambda: rd.Scene(None), "scene is None; it must be a list of shapes"),  # type: ignore[arg-type]
+        (lambda: rd.Scene(5), "scene is 5; it must be a list of shapes"),  # type: ignore[arg-type]
         (lambda: VisibleRegion(floor=2.0), "floor is 2"),
     ],
 )
 def test_wrong_shapes(make: Callable[[], object], message: str) -> None:
-    with pytest.raises(InputError, match=message) as raised:
+    with pytest.raises(rd.InputError, match=message) as raised:
         make()
     assert "\n" not in str(raised.value)
 
@@ -325,11 +311,14 @@ def test_point_files_without_points_that_are_not_finite(form: str, tmp_path: Pat
 def test_files_of_no_points(form: str, tmp_path: Path) -> None:
     file = write_points(tmp_path, form, POINTS[:0])
     if file.stat().st_size == 0:
-        with pytest.raises(InputError, match="is empty"):
+        with pytest.raises(rd.InputError, match="is empty"):
             read_points(file)
     else:
         points, notes = read_points(file)
         assert points.shape == (0, 3) and "holds no points" in notes[0]
+
+
+PACKED = PCD.format(n=10**9, data="binary_compressed").encode() + struct.pack("<II", 2, 40) + b"ab"
 
 
 @pytest.mark.parametrize(
@@ -341,11 +330,7 @@ def test_files_of_no_points(form: str, tmp_path: Path) -> None:
         ("cloud.csv", b"1,2\n3,4\n", "an array of 2 x 2; it must be n x 3"),
         ("cloud.xyz", b"1 2 3\n4 five 6\n", "cannot be read"),
         ("cloud.pcd", PCD.format(n=1, data="zipped").encode(), "stored as 'zipped'"),
-        (
-            "cloud.pcd",
-            PCD.format(n=10**9, data="binary_compressed").encode() + struct.pack("<II", 2, 40) + b"ab",
-            "unpacks to 40 bytes, not to 1,000,000,000 points",
-        ),
+        ("cloud.pcd", PACKED, "unpacks to 40 bytes, not to 1,000,000,000 points"),
         (
             "cloud.pcd",
             PCD.replace("x y z", "i j k").format(n=1, data="ascii").encode(),
@@ -356,7 +341,7 @@ def test_files_of_no_points(form: str, tmp_path: Path) -> None:
 def test_wrong_point_files(name: str, content: bytes | None, message: str, tmp_path: Path) -> None:
     if content is not None:
         (tmp_path / name).write_bytes(content)
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(rd.InputError, match=message):
         read_points(tmp_path / name)
 
 
@@ -369,7 +354,7 @@ def test_mesh_files(ending: str, tmp_path: Path) -> None:
     assert np.abs(vertices).max(axis=0) == pytest.approx(extents)
 
 
-def assert_equal(a: Scene, b: Scene) -> None:
+def assert_equal(a: rd.Scene, b: rd.Scene) -> None:
     assert [type(shape) for shape in a.shapes] == [type(shape) for shape in b.shapes]
     for one, other in zip(a.shapes, b.shapes, strict=True):
         for name in one.__dataclass_fields__:  # type: ignore[attr-defined]
@@ -377,7 +362,7 @@ def assert_equal(a: Scene, b: Scene) -> None:
 
 
 def test_scene_entries_are_read_back_exactly(tmp_path: Path) -> None:
-    scene = Scene([*SHAPES.values(), *SHAPES.values(), Box([0, 0, 0], [1, 1, 1], name="lid")])
+    scene = rd.Scene([*SHAPES.values(), *SHAPES.values(), rd.Box([0, 0, 0], [1, 1, 1], name="lid")])
     back, notes = read_scene(scene_entries(scene, tmp_path), tmp_path)
     assert notes == ()
     assert_equal(scene, back)
@@ -401,13 +386,13 @@ def test_shapes_from_files_are_written_as_names_of_files(tmp_path: Path) -> None
 def test_meshes_and_clouds_from_files_with_a_scale(tmp_path: Path) -> None:
     trimesh.creation.box((200, 200, 200)).export(tmp_path / "cube.stl")
     np.save(tmp_path / "cloud.npy", np.array([[100.0, 0, 0], [np.nan, 0, 0]]))
-    mesh = Mesh.from_file(tmp_path / "cube.stl", xyz=[0.5, 0, 0], scale=0.001, name="cube")
+    mesh = rd.Mesh.from_file(tmp_path / "cube.stl", xyz=[0.5, 0, 0], scale=0.001, name="cube")
     assert mesh.name == "cube" and mesh.file is None
     np.testing.assert_allclose(mesh.bounds, [[0.4, -0.1, -0.1], [0.6, 0.1, 0.1]])
-    assert Mesh.from_file(tmp_path / "cube.stl").file == str(tmp_path / "cube.stl")
+    assert rd.Mesh.from_file(tmp_path / "cube.stl").file == str(tmp_path / "cube.stl")
     with pytest.warns(UserWarning, match="1 of 2 points are not finite"):
-        cloud = PointCloud.from_file(tmp_path / "cloud.npy", 0.02, scale=0.001)
+        cloud = rd.PointCloud.from_file(tmp_path / "cloud.npy", 0.02, scale=0.001)
     np.testing.assert_allclose(cloud.points, [[0.1, 0, 0]])
     assert cloud.point_radius == 0.02
-    with pytest.raises(InputError, match=r"mesh\.scale is 0; it must be a positive number"):
-        Mesh.from_file(tmp_path / "cube.stl", scale=0)
+    with pytest.raises(rd.InputError, match=r"mesh\.scale is 0; it must be a positive number"):
+        rd.Mesh.from_file(tmp_path / "cube.stl", scale=0)

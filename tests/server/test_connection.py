@@ -3,6 +3,7 @@
 import asyncio
 import json
 import socket
+from http.client import HTTPResponse
 from typing import Any
 
 import h11
@@ -14,29 +15,27 @@ from helpers.box_arm import box_arm
 
 pytest.importorskip("fastapi")
 
+from fastapi import Request
 from uvicorn import Config
 from uvicorn.server import ServerState
 
+import robotdiffuse as rd
 from robotdiffuse.planning.context import PlanningContext
-from robotdiffuse.problems.problem import Problem
-from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.server import connection, worker
+from robotdiffuse.server.app import JSON, read_body
 from robotdiffuse.server.connection import Connection
 from robotdiffuse.server.settings import ServeSettings
+from robotdiffuse.server.worker_pool import WorkerPool
 
 
 def answer(server: httpx.Client, sent: bytes) -> tuple[int, Any]:
     """Status code and body of the answer to raw bytes."""
     with socket.create_connection((server.base_url.host, server.base_url.port or 0), 10) as client:
         client.sendall(sent)
-        stream = client.makefile("rb")
-        code = int(stream.readline().split()[1])
-        headers = {}
-        while line := stream.readline().strip():
-            name, _, value = line.partition(b": ")
-            headers[name.lower()] = value
-        body = b"" if sent.startswith(b"HEAD") else stream.read(int(headers.get(b"content-length", 0)))
-    return code, json.loads(body) if body else None
+        response = HTTPResponse(client, method="HEAD" if sent.startswith(b"HEAD") else "GET")
+        response.begin()
+        body = response.read()
+    return response.status, json.loads(body) if body else None
 
 
 RIGHT = b"Host: localhost\r\n"
@@ -60,8 +59,7 @@ CASES = {
 def test_what_is_wrong_is_one_line_of_json(server: httpx.Client, case: str) -> None:
     sent, code, message = CASES[case]
     given, record = answer(server, sent)
-    assert given == code and message in record["error"]
-    assert server.get("/health").status_code == 200
+    assert given == code and message in record["error"] and server.get("/health").status_code == 200
 
 
 def test_a_damaged_chunk_after_head_is_answered_without_a_body(server: httpx.Client) -> None:
@@ -73,63 +71,61 @@ def test_a_damaged_chunk_after_head_is_answered_without_a_body(server: httpx.Cli
 class Transport(asyncio.Transport):
     """Records the bytes written."""
 
-    def __init__(self, connection: Connection) -> None:
-        super().__init__()
-        self.connection = connection
-        self.written = b""
-        self.closed = False
+    written = b""
+    connection: Connection | None = None
 
     def write(self, data: Any) -> None:
-        assert not self.closed
+        assert self.connection is not None
         self.written += data
 
     def is_closing(self) -> bool:
-        return self.closed
+        return self.connection is None
 
     def close(self) -> None:
-        if self.closed:
-            return
-        self.closed = True
-        self.connection.connection_lost(None)
+        made = self.connection
+        self.connection = None
+        if made is not None:
+            made.connection_lost(None)
 
     abort = close
 
 
-def connected(application: Any) -> Connection:
-    config = Config(application, interface="asgi3", lifespan="off", log_level="critical")
-    return Connection(config, ServerState(), {})
+async def slow(scope: Any, receive: Any, send: Any) -> None:
+    """An application that answers late."""
+    await send({"type": "http.response.start", "status": 200, "headers": []})
+    await asyncio.sleep(0.01)
+    await send({"type": "http.response.body", "body": b"late"})
 
 
-def talked(sent: bytes, monkeypatch: pytest.MonkeyPatch, stuck: bool = False) -> tuple[bytes, bool]:
-    """What a connection wrote in the first 0.2 s after these bytes, and whether it closed itself; its
-    application never answers."""
+async def never(scope: Any, receive: Any, send: Any) -> None:
+    while (await receive())["type"] != "http.disconnect":
+        pass
 
-    async def never(scope: Any, receive: Any, send: Any) -> None:
-        while (await receive())["type"] != "http.disconnect":
-            pass
 
-    async def talk() -> tuple[bytes, bool]:
-        made = connected(never)
-        transport = Transport(made)
+def talked(application: Any, *sent: bytes, stuck: bool = False) -> tuple[bytes, bool, Any]:
+    """What a connection wrote in 0.2 s after these bytes, whether it closed itself, and its state."""
+
+    async def talk() -> tuple[bytes, bool, Any]:
+        config = Config(application, interface="asgi3", lifespan="off", log_level="critical")
+        made = Connection(config, ServerState(), {})
+        transport = Transport()
+        transport.connection = made
         made.connection_made(transport)
-        if sent:
-            made.data_received(sent)
+        for data in sent:
+            made.data_received(data)
+            await asyncio.sleep(0.005)
         if stuck:
             made.pause_writing()
-        assert not transport.closed
+        assert application is slow or not transport.is_closing()
         await asyncio.sleep(0.2)
-        found = transport.written, transport.closed
+        found = transport.written, transport.is_closing(), made.conn.our_state
         transport.close()
         return found
 
-    monkeypatch.setattr(connection, "READ_TIMEOUT", 0.05)
-    monkeypatch.setattr(connection, "WRITE_TIMEOUT", 0.05)
     return asyncio.run(talk())
 
 
 WHOLE = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"
-
-
 LATE = (b"HTTP/1.1 408", b"took more than 0.05 s", True)
 
 
@@ -147,52 +143,26 @@ LATE = (b"HTTP/1.1 408", b"took more than 0.05 s", True)
 def test_slow_clients_are_answered_and_disconnected(
     sent: bytes, stuck: bool, expected: tuple[bytes, bytes, bool], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(connection, "READ_TIMEOUT", 0.05)
+    monkeypatch.setattr(connection, "WRITE_TIMEOUT", 0.05)
     start, holds, ends = expected
-    written, closed = talked(sent, monkeypatch, stuck)
+    written, closed, _ = talked(never, *([sent] if sent else []), stuck=stuck)
     assert closed == ends and written.startswith(start) and holds in written and bool(written) == bool(start)
 
 
-def test_nothing_is_written_after_a_refusal(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_written_after_a_refusal() -> None:
     """h11 raised LocalProtocolError for a damaged chunk just before the application answered."""
-
-    async def slow(scope: Any, receive: Any, send: Any) -> None:
-        await asyncio.sleep(0.01)
-        await send({"type": "http.response.start", "status": 200, "headers": []})
-        await send({"type": "http.response.body", "body": b"late"})
-
-    async def talk() -> Connection:
-        made = connected(slow)
-        transport = Transport(made)
-        made.connection_made(transport)
-        made.data_received(b"POST / HTTP/1.1\r\nHost: a\r\nTransfer-Encoding: chunked\r\n\r\n0x5\r\n")
-        await asyncio.sleep(0.05)
-        assert transport.written.startswith(b"HTTP/1.1 400") and b"late" not in transport.written
-        return made
-
-    assert asyncio.run(talk()).conn.our_state in (h11.MUST_CLOSE, h11.CLOSED, h11.DONE)
+    head = b"POST / HTTP/1.1\r\nHost: a\r\nTransfer-Encoding: chunked\r\n\r\n0x5\r\n"
+    written, _, state = talked(slow, head)
+    assert written.startswith(b"HTTP/1.1 400") and b"late" not in written
+    assert state in (h11.MUST_CLOSE, h11.CLOSED, h11.DONE)
 
 
 @pytest.mark.parametrize("head", [b"HTTP/1.0\r\n", b"HTTP/1.1\r\nHost: a\r\nConnection: close\r\n"])
 def test_bytes_after_the_last_request_do_not_cut_its_answer_off(head: bytes) -> None:
     """They were refused as not HTTP, and the connection closed before the body was written."""
-
-    async def slow(scope: Any, receive: Any, send: Any) -> None:
-        await send({"type": "http.response.start", "status": 200, "headers": []})
-        await asyncio.sleep(0.01)
-        await send({"type": "http.response.body", "body": b"late"})
-
-    async def talk() -> Transport:
-        made = connected(slow)
-        transport = Transport(made)
-        made.connection_made(transport)
-        made.data_received(b"POST / " + head + b"Content-Length: 2\r\n\r\n{}]]")
-        await asyncio.sleep(0.005)
-        made.data_received(b"]]]]")
-        await asyncio.sleep(0.05)
-        return transport
-
-    ended = asyncio.run(talk())
-    assert ended.written.startswith(b"HTTP/1.1 200") and b"late" in ended.written and ended.closed
+    written, closed, _ = talked(slow, b"POST / " + head + b"Content-Length: 2\r\n\r\n{}]]", b"]]]]")
+    assert written.startswith(b"HTTP/1.1 200") and b"late" in written and closed
 
 
 def test_a_cancelled_call_is_left_before_it_begins_and_when_it_checks_its_time(
@@ -209,10 +179,34 @@ def test_a_cancelled_call_is_left_before_it_begins_and_when_it_checks_its_time(
     answers = iter([False, False, True])
 
     def planning(*_: object) -> worker.Answer:
-        call = PlanningContext("aorrtc", Problem(box_arm(), Scene(), np.zeros(3), np.ones(3)))
+        call = PlanningContext("aorrtc", rd.Problem(box_arm(), rd.Scene(), np.zeros(3), np.ones(3)))
         while True:
             assert call.remaining > 0
 
     monkeypatch.setattr(worker, "answer_plan", planning)
     with pytest.raises(worker.Cancelled):
         worker.respond(worker.PLAN, b"{}")
+
+
+class Piece(bytes):
+    """Counts how often any piece's length is asked for."""
+
+    asked = 0
+
+    def __len__(self) -> int:
+        Piece.asked += 1
+        return super().__len__()
+
+
+def test_the_work_for_a_body_in_pieces_grows_with_their_number() -> None:
+    """All pieces were measured again for each one: 20,000 of a byte each kept the server busy for 15 s."""
+    pieces = [Piece(b"x") for _ in range(300)]
+
+    async def receive() -> dict[str, Any]:
+        body = pieces.pop()
+        return {"type": "http.request", "body": body, "more_body": bool(pieces)}
+
+    scope = {"type": "http", "method": "POST", "headers": [(b"content-type", JSON.encode())]}
+    pool = WorkerPool({}, ServeSettings(max_request_size=300))
+    assert asyncio.run(read_body(Request(scope, receive), pool, JSON)) == b"x" * 300
+    assert pool.arriving == 0 and Piece.asked < 3000

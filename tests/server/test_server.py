@@ -35,6 +35,7 @@ from robotdiffuse.trajectories.speed_limits import MIN_SCALING
 LEFT = [0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785]
 RIGHT = [-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785]
 JOINTS = [f"panda_joint{i}" for i in range(1, 8)]
+FAR = {"joint_names": JOINTS, "positions": [[1e9] * 7]}
 JSON = {"Content-Type": "application/json"}
 LINES = {"Content-Type": "application/x-ndjson"}
 PROMPT = 60.0
@@ -81,14 +82,9 @@ def test_a_plan_is_that_of_the_bare_planner_and_the_validator_agrees(server: htt
     }
     verdict = server.post("/verify", json=motion).json()
     assert verdict["valid"] and verdict["trajectory"]["valid"] and verdict["path"]["min_clearance"] > 0
-
-
-def test_a_motion_through_the_wall_is_not_valid(server: httpx.Client) -> None:
-    motion = {"problem": problem(), "path": {"joint_names": JOINTS, "positions": [LEFT, RIGHT]}}
-    verdict = server.post("/verify", json=motion).json()
-    assert not verdict["valid"]
-    assert verdict["path"]["violation"]["kind"] == "scene_collision"
-    assert verdict["path"]["violation"]["other"] == "wall"
+    straight = {"problem": problem(), "path": {"joint_names": JOINTS, "positions": [LEFT, RIGHT]}}
+    verdict = server.post("/verify", json=straight).json()
+    assert not verdict["valid"] and verdict["path"]["violation"]["other"] == "wall"
 
 
 def test_every_field_of_the_schema_may_be_sent_with_its_default(server: httpx.Client) -> None:
@@ -134,21 +130,10 @@ def test_a_batch_is_answered_line_by_line_in_order(server: httpx.Client) -> None
         ("/plan", {"problem": problem(robot="/etc/passwd")}, 400, "unknown robot '/etc/passwd'; known: "),
         ("/plan", {"problem": problem(robot="../panda")}, 400, "unknown robot"),
         ("/plan", {"problem": problem(scene="scene.yaml")}, 400, "is a file, and files are not read here"),
-        (
-            "/plan",
-            {"problem": problem(scene=[{"mesh": {"file": "/etc/passwd.stl"}}])},
-            400,
-            "files are not read here",
-        ),
-        ("/plan", {"problem": problem(scene=[{"mesh": {"file": "no.stl"}}])}, 400, "files are not read here"),
+        ("/plan", {"problem": problem(scene=[{"mesh": {"file": "/etc/p.stl"}}])}, 400, "files are not read"),
         ("/verify", {"problem": problem()}, 400, "neither path nor trajectory"),
         ("/verify", {"problem": problem(), "path": {"joint_names": JOINTS}}, 400, "path has no positions"),
-        (
-            "/verify",
-            {"problem": problem(), "path": {"joint_names": JOINTS, "positions": [[1e9] * 7]}},
-            400,
-            "its numbers must be finite and within",
-        ),
+        ("/verify", {"problem": problem(), "path": FAR}, 400, "its numbers must be finite and within"),
         ("/plan", b" " * (2**21 + 1), 413, "it may have 2097152 bytes"),
     ],
 )
@@ -157,8 +142,7 @@ def test_wrong_requests_are_one_line(
 ) -> None:
     content = body if isinstance(body, bytes) else json.dumps(body)
     answer = server.post(path, content=content, headers=JSON)
-    assert answer.status_code == code
-    assert re.search(message, error(answer))
+    assert answer.status_code == code and re.search(message, error(answer))
 
 
 def test_other_hosts_content_types_and_methods_are_refused(server: httpx.Client) -> None:
@@ -174,8 +158,7 @@ def test_lists_health_metrics_and_a_page_without_scripts(server: httpx.Client) -
     robots = {robot["name"]: robot for robot in server.get("/robots").json()}
     assert [joint["name"] for joint in robots["panda"]["joints"]] == JOINTS
     assert "robotdiffuse" in {planner["name"] for planner in server.get("/planners").json()}
-    assert server.get("/health").json()["status"] == "ok"
-    assert gauge(server, "workers_ready") == 1
+    assert server.get("/health").json()["status"] == "ok" and gauge(server, "workers_ready") == 1
     page = server.get("/").text
     assert "/requests/{name}" in page and "http://" not in page and "https://" not in page
     description = server.get("/openapi.json").json()
@@ -264,8 +247,7 @@ def test_a_request_beyond_its_time_limit_is_stopped(server: httpx.Client) -> Non
         until(lambda: gauge(server, "workers_busy") == 1 or late.done())
         assert server.get("/health", timeout=PROMPT).status_code == 200
     assert late.result().status_code == 503
-    stopped = "the request was stopped 5 s beyond its time limit, and its worker replaced"
-    assert error(late.result()) == stopped
+    assert "stopped 5 s beyond its time limit, and its worker replaced" in error(late.result())
     assert server.post("/plan", json=asked(3)).json()["status"] == "solved"
     assert gauge(server, "workers_lost_total") == lost + 1
 
@@ -309,16 +291,16 @@ def test_each_request_is_logged() -> None:
     assert re.search(r" 127\.0\.0\.1:\d+ GET /nothing%0Ahere 404 \d+\.\d{3} s -$", nothing)
 
 
-def test_an_exception_is_one_line(server: httpx.Client) -> None:
-    answer = server.post("/plan", json=asked(RAISES, "faulty"))
-    assert answer.status_code == 500 and error(answer) == "ValueError: no such thing"
-
-
-def test_a_planner_that_exits_stops_neither_server_nor_worker(server: httpx.Client) -> None:
+@pytest.mark.parametrize(
+    ("seed", "line"), [(RAISES, "ValueError: no such thing"), (EXITS, "SystemExit: no license")]
+)
+def test_a_planner_that_fails_stops_neither_server_nor_worker(
+    server: httpx.Client, seed: int, line: str
+) -> None:
     """Its SystemExit reached the server's event loop and stopped it."""
     lost = gauge(server, "workers_lost_total")
-    answer = server.post("/plan", json=asked(EXITS, "faulty"))
-    assert answer.status_code == 500 and error(answer) == "SystemExit: no license"
+    answer = server.post("/plan", json=asked(seed, "faulty"))
+    assert answer.status_code == 500 and error(answer) == line
     assert server.post("/plan", json=asked(3)).json()["status"] == "solved"
     assert gauge(server, "workers_lost_total") == lost
 
@@ -357,14 +339,6 @@ def test_a_client_that_disconnects_frees_its_worker(server: httpx.Client) -> Non
     until(lambda: gauge(server, "workers_busy") == 0 and gauge(server, "requests_waiting") == 0)
     assert server.post("/plan", json=asked(3)).json()["status"] == "solved"
     assert gauge(server, "workers_lost_total") == lost
-
-
-def test_a_planner_that_ignores_its_time_limit_costs_its_worker(server: httpx.Client) -> None:
-    lost = gauge(server, "workers_lost_total")
-    with pytest.raises(httpx.ReadTimeout):
-        server.post("/plan", json=asked(HANGS, "faulty", time_limit=0.1), timeout=BRIEF)
-    assert server.post("/plan", json=asked(3)).json()["status"] == "solved"
-    assert gauge(server, "workers_lost_total") == lost + 1
 
 
 def test_a_full_queue_says_when_to_try_again(server: httpx.Client) -> None:

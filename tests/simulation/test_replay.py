@@ -11,21 +11,15 @@ pytest.importorskip("pybullet")
 
 from dataclasses import replace
 
-from helpers.box_arm import box_arm
+import robotdiffuse as rd
+from helpers.box_arm import box_arm, box_mesh
 from helpers.example_robots import example_robot
 from robotdiffuse.cli import main
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Path, Status, Trajectory
 from robotdiffuse.problems.files import problem_record
-from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.moving_obstacles import MovingObstacle
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Sphere
+from robotdiffuse.robots.robot import ConvexMesh
 from robotdiffuse.simulation import PyBulletOracle, ReplaySettings, replay, world
+from robotdiffuse.simulation.world import mass_and_center
 from robotdiffuse.trajectories.timing import time_parameterize
 from robotdiffuse.validation.validator import verify_trajectory
 
@@ -35,8 +29,8 @@ pytestmark = pytest.mark.sim
 PANDA_START = np.array([-0.6, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 
 
-def motion(robot: Robot, *waypoints: np.ndarray) -> Trajectory:
-    path = Path(robot.joint_names, np.stack(waypoints))
+def motion(robot: rd.Robot, *waypoints: np.ndarray) -> rd.Trajectory:
+    path = rd.Path(robot.joint_names, np.stack(waypoints))
     return time_parameterize(robot, path, lambda _: True, lambda _: True)
 
 
@@ -44,17 +38,16 @@ def test_a_motion_of_one_row_holds_still() -> None:
     """The simulated arm was NaN."""
     robot = box_arm()
     stay = np.full((1, 3), 0.1)
-    run = replay(robot, Scene(), Trajectory(robot.joint_names, np.zeros(1), stay, 0 * stay, 0 * stay))
+    run = replay(robot, rd.Scene(), rd.Trajectory(robot.joint_names, np.zeros(1), stay, 0 * stay, 0 * stay))
     assert run.free and run.max_errors.max() < 1e-3 and (run.reference == stay).all()
 
 
 def test_a_panda_tracks_a_timed_motion_the_better_the_finer_the_step() -> None:
-    robot = load_robot("panda")
+    robot = rd.load_robot("panda")
     trajectory = motion(robot, PANDA_START, PANDA_START + 0.4, PANDA_START + np.linspace(0.5, -0.3, 7))
-    coarse = replay(robot, Scene([Sphere([0.0, 0.9, 0.6], 0.1)]), trajectory)
-    fine = replay(robot, Scene(), trajectory, ReplaySettings(time_step=1 / 960))
-    assert coarse.free and fine.free
-    assert coarse.times[-1] >= trajectory.duration + 0.25
+    coarse = replay(robot, rd.Scene([rd.Sphere([0.0, 0.9, 0.6], 0.1)]), trajectory)
+    fine = replay(robot, rd.Scene(), trajectory, ReplaySettings(time_step=1 / 960))
+    assert coarse.free and fine.free and coarse.times[-1] >= trajectory.duration + 0.25
     # with Bullet's default of 50 solver iterations, tips are off by up to 0.6 mm
     assert coarse.max_errors.max() < 2e-5 and coarse.tip_errors.max() < 2e-5
     assert (coarse.rms_errors <= coarse.max_errors).all()
@@ -67,20 +60,19 @@ def test_a_panda_tracks_a_timed_motion_the_better_the_finer_the_step() -> None:
 
 
 def test_weak_motors_sag_under_gravity() -> None:
-    robot = load_robot("panda")
+    robot = rd.load_robot("panda")
     stay = np.stack([PANDA_START, PANDA_START])
-    trajectory = Trajectory(robot.joint_names, np.array([0.0, 0.5]), stay, 0 * stay, 0 * stay)
+    trajectory = rd.Trajectory(robot.joint_names, np.array([0.0, 0.5]), stay, 0 * stay, 0 * stay)
     weak = ReplaySettings(force=5.0)
-    fallen = replay(robot, Scene(), trajectory, weak)
-    assert fallen.tip_errors[-1] > 0.1
-    assert fallen.max_errors[1] > 0.1
-    assert replay(robot, Scene(), trajectory, replace(weak, gravity=0.0)).tip_errors.max() < 1e-6
-    assert replay(robot, Scene(), trajectory).tip_errors.max() < 1e-3
+    fallen = replay(robot, rd.Scene(), trajectory, weak)
+    assert fallen.tip_errors[-1] > 0.1 and fallen.max_errors[1] > 0.1
+    assert replay(robot, rd.Scene(), trajectory, replace(weak, gravity=0.0)).tip_errors.max() < 1e-6
+    assert replay(robot, rd.Scene(), trajectory).tip_errors.max() < 1e-3
 
 
 def test_contact_is_reported_where_the_motion_runs_into_an_obstacle() -> None:
     robot = box_arm()
-    scene = Scene([Sphere([0.9, 0.55, 0], 0.15), Box([-0.9, 0, 0], [0.1, 0.1, 0.1])])
+    scene = rd.Scene([rd.Sphere([0.9, 0.55, 0], 0.15), rd.Box([-0.9, 0, 0], [0.1, 0.1, 0.1])])
     trajectory = motion(robot, np.zeros(3), np.array([1.2, 0.0, 0.0]))
     run = replay(robot, scene, trajectory)
     with PyBulletOracle(robot, scene) as oracle:
@@ -89,45 +81,46 @@ def test_contact_is_reported_where_the_motion_runs_into_an_obstacle() -> None:
     contact = run.contacts[0]
     assert (contact.link, contact.other) == ("l3", "sphere")
     assert contact.time == pytest.approx(run.times[int(first.at)], abs=0.02)
-    assert -0.001 <= contact.depth < 0.05
-    assert run.max_errors[0] > 0.1
-    apart = Scene([Sphere([0.9, 0.55, 0.25], 0.15)])
+    assert -0.001 <= contact.depth < 0.05 and run.max_errors[0] > 0.1
+    apart = rd.Scene([rd.Sphere([0.9, 0.55, 0.25], 0.15)])
     assert replay(robot, apart, trajectory).free
 
 
 def test_links_that_touch_each_other_are_reported() -> None:
     robot = box_arm()
-    run = replay(robot, Scene(), motion(robot, np.zeros(3), np.array([0.0, 2.7, 2.0])))
+    run = replay(robot, rd.Scene(), motion(robot, np.zeros(3), np.array([0.0, 2.7, 2.0])))
     assert {(contact.link, contact.other) for contact in run.contacts} <= {("l1", "l3"), ("l3", "l1")}
     assert not run.free
     allowed = replace(robot, allowed_collisions=robot.allowed_collisions | {frozenset(("l1", "l3"))})
-    assert replay(allowed, Scene(), motion(robot, np.zeros(3), np.array([0.0, 2.7, 2.0]))).free
+    assert replay(allowed, rd.Scene(), motion(robot, np.zeros(3), np.array([0.0, 2.7, 2.0]))).free
 
 
 def test_skew_axes_sliding_joints_and_a_branch() -> None:
     robot = example_robot("awkward")
     middle = (robot.lower + robot.upper) / 2
-    run = replay(robot, Scene(), motion(robot, middle, middle + 0.2))
+    run = replay(robot, rd.Scene(), motion(robot, middle, middle + 0.2))
     assert run.free and run.max_errors.max() < 0.01
 
 
 def test_what_cannot_be_replayed() -> None:
     robot = box_arm()
     trajectory = motion(robot, np.zeros(3), np.ones(3))
-    with pytest.raises(InputError, match="the trajectory moves a, b, c; planar plans j0, j1, j2"):
-        replay(robot, Scene(), replace(trajectory, joint_names=("a", "b", "c")))
+    with pytest.raises(rd.InputError, match="the trajectory moves a, b, c; planar plans j0, j1, j2"):
+        replay(robot, rd.Scene(), replace(trajectory, joint_names=("a", "b", "c")))
     for name, value in (("time_step", 0.01), ("force", -1.0), ("gravity", np.nan)):
-        with pytest.raises(InputError, match=f"replay.{name} is {value}"):
+        with pytest.raises(rd.InputError, match=f"replay.{name} is {value}"):
             ReplaySettings(**{name: value})
 
 
-def result_file(folder: FilePath, scene: Scene) -> str:
-    robot = load_robot("panda")
+def result_file(folder: FilePath, scene: rd.Scene) -> str:
+    robot = rd.load_robot("panda")
     goal = PANDA_START + 0.2
-    rows = Path(robot.joint_names, np.stack([PANDA_START, goal]))
+    rows = rd.Path(robot.joint_names, np.stack([PANDA_START, goal]))
     trajectory = motion(robot, PANDA_START, goal)
-    result = PlanResult(Status.SOLVED, "by hand", "none", "panda", 0.0, 0, path=rows, trajectory=trajectory)
-    result.save(folder / "result.json", problem_record(Problem(robot, scene, PANDA_START, goal)))
+    result = rd.PlanResult(
+        rd.Status.SOLVED, "by hand", "none", "panda", 0.0, 0, path=rows, trajectory=trajectory
+    )
+    result.save(folder / "result.json", problem_record(rd.Problem(robot, scene, PANDA_START, goal)))
     return str(folder / "result.json")
 
 
@@ -145,12 +138,12 @@ def test_a_world_that_fails_to_load_leaves_no_simulation(monkeypatch: pytest.Mon
     monkeypatch.setattr(world.pybullet, "connect", lambda mode: clients.append(connect(mode)) or clients[0])
     monkeypatch.setattr(world, "write_urdf", failing)
     with pytest.raises(OSError, match="no space left"):
-        world.World(box_arm(), Scene())
+        world.World(box_arm(), rd.Scene())
     assert not world.pybullet.isConnected(clients[0])
 
 
 def test_command(tmp_path: FilePath, capsys: pytest.CaptureFixture[str]) -> None:
-    file = result_file(tmp_path, Scene([Sphere([0.0, 0.9, 0.6], 0.1)]))
+    file = result_file(tmp_path, rd.Scene([rd.Sphere([0.0, 0.9, 0.6], 0.1)]))
     assert main(["simulate", file]) == 0
     printed = capsys.readouterr().out
     assert "panda: free" in printed and "panda_joint7" in printed and "mrad" in printed
@@ -158,8 +151,8 @@ def test_command(tmp_path: FilePath, capsys: pytest.CaptureFixture[str]) -> None
     assert "known: .html, .png" in capsys.readouterr().err
     assert main(["simulate", file, "--out", str(tmp_path / "page.html")]) == 0
     assert "panda_joint7" in (tmp_path / "page.html").read_text("utf-8")
-    end = link_pose(load_robot("panda"), PANDA_START + 0.2, "panda_hand")[:3, 3]
-    file = result_file(tmp_path, Scene([Sphere(end, 0.05)]))
+    end = link_pose(rd.load_robot("panda"), PANDA_START + 0.2, "panda_hand")[:3, 3]
+    file = result_file(tmp_path, rd.Scene([rd.Sphere(end, 0.05)]))
     assert main(["simulate", file]) == 1
     printed = capsys.readouterr().out
     assert "panda: contact" in printed and "panda_hand" in printed and "sphere" in printed
@@ -168,27 +161,56 @@ def test_command(tmp_path: FilePath, capsys: pytest.CaptureFixture[str]) -> None
 def test_command_without_pybullet(
     tmp_path: FilePath, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    file = result_file(tmp_path, Scene())
+    file = result_file(tmp_path, rd.Scene())
     for name in [name for name in sys.modules if name.startswith("robotdiffuse.simulation")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "pybullet", None)
-    assert main(["simulate", file]) == 2
-    assert 'pip install "robotdiffuse[sim]"' in capsys.readouterr().err
+    assert main(["simulate", file]) == 2 and 'pip install "robotdiffuse[sim]"' in capsys.readouterr().err
 
 
 def test_moving_obstacles_are_contacts_where_the_validator_refuses_the_motion() -> None:
     """`simulate` called a motion free that runs into one."""
-    robot = load_robot("panda")
+    robot = rd.load_robot("panda")
     end = PANDA_START * [-1, 1, 1, 1, 1, 1, 1]
     trajectory = motion(robot, PANDA_START, end)
     free = []
     for side in (1, -1):  # meets the arm, and keeps away from it
-        ball = MovingObstacle(Sphere([0.55, side * 0.45, 0.5], 0.12, name="ball"), velocity=[0, -0.3, 0])
-        problem = Problem(robot, Scene(), PANDA_START, end, moving=[ball])
+        ball = rd.MovingObstacle(
+            rd.Sphere([0.55, side * 0.45, 0.5], 0.12, name="ball"), velocity=[0, -0.3, 0]
+        )
+        problem = rd.Problem(robot, rd.Scene(), PANDA_START, end, moving=[ball])
         report = verify_trajectory(problem, trajectory)
-        run = replay(robot, Scene(), trajectory, moving=problem.moving)
+        run = replay(robot, rd.Scene(), trajectory, moving=problem.moving)
         assert run.free == report.valid
         if report.violation is not None:
             assert abs(run.contacts[0].time - report.violation.time) < 0.05
         free.append(run.free)
     assert free[0] is False
+
+
+def test_the_model_s_masses_are_those_of_boxes() -> None:
+    low = np.array([0.1, -0.1, 0.0])
+    high = np.array([0.5, 0.1, 0.3])
+    whole = box_mesh(low, high)
+    inside_out = ConvexMesh(whole.vertices, whole.faces[:, ::-1].copy())
+    halves = (box_mesh(low, np.array([0.3, 0.1, 0.3])), box_mesh(np.array([0.3, -0.1, 0.0]), high))
+    a, b, c = high - low
+    for meshes in ((whole,), (inside_out,), halves):
+        mass, center = mass_and_center(meshes, 500.0)
+        assert mass == pytest.approx(500 * a * b * c) and center == pytest.approx((low + high) / 2)
+
+
+PYBULLET = """
+import os
+os.write(1, b"printed by another thread\\n")
+for stream in (1, 2):
+    os.write(stream, b"pybullet build time: now\\n")
+"""
+
+
+def test_only_the_build_time_is_left_out(tmp_path: FilePath) -> None:
+    (tmp_path / "pybullet.py").write_text(PYBULLET)
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import robotdiffuse.simulation"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout == "printed by another thread\n" and ended.stderr == ""

@@ -9,20 +9,13 @@ pytest.importorskip("pybullet")
 from dataclasses import replace
 from itertools import combinations
 
+import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.example_robots import example_robot
 from helpers.sphere_oracles import solids
 from robotdiffuse.collision.exact_meshes import ExactCollision
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Path
-from robotdiffuse.problems.problem import JointGoal, Problem
-from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Mesh, PointCloud, Sphere
 from robotdiffuse.simulation import PyBulletOracle
 from robotdiffuse.simulation.world import World
-from robotdiffuse.validation.validator import verify
 
 pytestmark = pytest.mark.sim
 TOLERANCE = 7e-4
@@ -33,13 +26,13 @@ def vector(*values: float) -> np.ndarray:
     return np.array(values, float)
 
 
-def every_shape() -> Scene:
+def every_shape() -> rd.Scene:
     torus = trimesh.creation.torus(0.2, 0.05, major_sections=16, minor_sections=8)
-    mesh = Mesh(torus.vertices.view(np.ndarray), torus.faces, (-0.3, 0.4, 0.7), (0.5, 0.1, 0.2, 0.9))
-    return Scene([*solids().shapes, mesh])
+    mesh = rd.Mesh(torus.vertices.view(np.ndarray), torus.faces, (-0.3, 0.4, 0.7), (0.5, 0.1, 0.2, 0.9))
+    return rd.Scene([*solids().shapes, mesh])
 
 
-def far_pairs_only(robot: Robot) -> Robot:
+def far_pairs_only(robot: rd.Robot) -> rd.Robot:
     """The robot with pairs of links no more than two joints apart allowed to touch."""
     pairs = combinations(robot.meshes, 2)
     near = [frozenset(p) for p in pairs if abs(robot.link_frame(p[0]) - robot.link_frame(p[1])) <= 2]
@@ -77,13 +70,15 @@ def test_collisions_agree_with_coal_meshes_included() -> None:
 def test_paths_that_the_validator_accepts_or_refuses() -> None:
     robot = box_arm()
     rng = np.random.default_rng(5)
-    scene = Scene([Sphere(vector(0.7, 0.5, 0), 0.15), Box(vector(-0.5, -0.4, 0), vector(0.1, 0.2, 0.3))])
+    scene = rd.Scene(
+        [rd.Sphere(vector(0.7, 0.5, 0), 0.15), rd.Box(vector(-0.5, -0.4, 0), vector(0.1, 0.2, 0.3))]
+    )
     verdicts = []
     with PyBulletOracle(robot, scene) as oracle:
         for _ in range(30):
             rows = rng.uniform(-1.5, 1.5, (1, 3)) + rng.uniform(-0.7, 0.7, (3, 3))
-            path = Path(robot.joint_names, rows)
-            report = verify(Problem(robot, scene, rows[0], JointGoal(rows[-1:])), path)
+            path = rd.Path(robot.joint_names, rows)
+            report = rd.verify(rd.Problem(robot, scene, rows[0], rd.JointGoal(rows[-1:])), path)
             found = oracle.check_path(path)
             verdicts.append(report.valid)
             if report.valid:
@@ -100,40 +95,20 @@ def test_paths_that_the_validator_accepts_or_refuses() -> None:
 
 def test_a_single_waypoint_is_checked() -> None:
     robot = box_arm()
-    with PyBulletOracle(robot, Scene([Sphere(vector(1.2, 0, 0), 0.1)])) as oracle:
-        found = oracle.check_path(Path(robot.joint_names, np.zeros((1, 3))))
-        with pytest.raises(InputError, match=r"tolerance is -0\.1; it must not be negative"):
+    with PyBulletOracle(robot, rd.Scene([rd.Sphere(vector(1.2, 0, 0), 0.1)])) as oracle:
+        found = oracle.check_path(rd.Path(robot.joint_names, np.zeros((1, 3))))
+        with pytest.raises(rd.InputError, match=r"tolerance is -0\.1; it must not be negative"):
             oracle.check_frames(np.zeros((1, 3)), -0.1)
-    assert found is not None
-    assert (found.link, found.other, found.at) == ("l3", "sphere", 0.0)
+    assert found is not None and (found.link, found.other, found.at) == ("l3", "sphere", 0.0)
     assert found.distance == pytest.approx(-0.1, abs=0.001)
 
 
-def test_frames_give_what_single_configurations_give() -> None:
-    robot = far_pairs_only(example_robot("panda"))
-    scene = every_shape()
-    rng = np.random.default_rng(1)
-    ends = rng.uniform(robot.lower, robot.upper, (12, robot.dof))
-    hits = 0
-    with PyBulletOracle(robot, scene) as oracle:
-        for a, b in zip(ends[::2], ends[1::2], strict=True):
-            frames = a + np.linspace(0, 1, 60)[:, None] * (b - a)
-            for tolerance in (0.0, 0.001, 0.02):
-                single = [oracle.collides(q, tolerance) for q in frames]
-                found = oracle.check_frames(frames, tolerance)
-                assert (found is not None) == any(single)
-                if found is not None:
-                    assert found.at == single.index(True)
-                    hits += 1
-    assert 4 < hits < 18
-
-
 def test_scenes_are_replaced_and_the_robot_stays() -> None:
-    ball = Sphere(vector(1.2, 0, 0), 0.1)
-    clouds = [PointCloud(np.zeros((0, 3))), PointCloud(vector(1.2, 0, 0)[None])]
-    with PyBulletOracle(box_arm(), Scene([Box(vector(0, 1, 0), vector(1, 0.1, 1))])) as oracle:
+    ball = rd.Sphere(vector(1.2, 0, 0), 0.1)
+    clouds = [rd.PointCloud(np.zeros((0, 3))), rd.PointCloud(vector(1.2, 0, 0)[None])]
+    with PyBulletOracle(box_arm(), rd.Scene([rd.Box(vector(0, 1, 0), vector(1, 0.1, 1))])) as oracle:
         for shapes, hit in ([ball], "sphere"), ([], None), ([ball], "sphere"), (clouds, "point_cloud_2"):
-            oracle.set_scene(Scene(shapes))
+            oracle.set_scene(rd.Scene(shapes))
             found = oracle.check_frames(np.zeros((1, 3)))
             assert (found and found.other) == hit
 
@@ -141,9 +116,10 @@ def test_scenes_are_replaced_and_the_robot_stays() -> None:
 def test_obstacles_at_links_that_do_not_move_are_nothing() -> None:
     robot = far_pairs_only(example_robot("panda"))
     q = np.array([[0, -0.785, 0, -2.356, 0, 1.571, 0.785]])
-    with PyBulletOracle(robot, Scene([Box(vector(0, 0, -0.05), vector(2, 2, 0.12), name="floor")])) as oracle:
-        assert oracle.check_frames(q) is None
-        assert oracle.nearest(q[0], 0.0) is None
+    with PyBulletOracle(
+        robot, rd.Scene([rd.Box(vector(0, 0, -0.05), vector(2, 2, 0.12), name="floor")])
+    ) as oracle:
+        assert oracle.check_frames(q) is None and oracle.nearest(q[0], 0.0) is None
 
 
 def test_point_clouds_agree_with_coal() -> None:
@@ -151,7 +127,7 @@ def test_point_clouds_agree_with_coal() -> None:
     rng = np.random.default_rng(4)
     ball = rng.normal(size=(400, 3))
     points = vector(0.4, 0.2, 0.5) + 0.25 * ball / np.linalg.norm(ball, axis=1, keepdims=True)
-    scene = Scene([PointCloud(points, 0.02)])
+    scene = rd.Scene([rd.PointCloud(points, 0.02)])
     exact = ExactCollision(robot, scene)
     q = rng.uniform(robot.lower, robot.upper, (40, robot.dof))
     with PyBulletOracle(robot, scene) as oracle:
@@ -166,15 +142,15 @@ def test_point_clouds_agree_with_coal() -> None:
 def test_a_mesh_that_comes_again_takes_no_memory_again() -> None:
     """PyBullet keeps what it was given of a mesh, 0.15 kB a triangle, after its body is removed too."""
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
-    panda = load_robot("panda")
+    panda = rd.load_robot("panda")
     home = np.zeros(7)
-    with World(panda, Scene([])) as world, PyBulletOracle(panda, Scene([])) as oracle:
+    with World(panda, rd.Scene([])) as world, PyBulletOracle(panda, rd.Scene([])) as oracle:
         for x in (0.6, 0.8, 0.6):
-            scene = Scene([Mesh(ball.vertices, ball.faces, xyz=(x, 0.0, 0.4))])
+            scene = rd.Scene([rd.Mesh(ball.vertices, ball.faces, xyz=(x, 0.0, 0.4))])
             world.set_scene(scene)
             oracle.set_scene(scene)
             assert len(world.mesh_shapes) == 1
             with PyBulletOracle(panda, scene) as fresh:
                 assert oracle.distance(home) == pytest.approx(fresh.distance(home), abs=1e-9)
-        world.set_scene(Scene([Mesh(1.1 * ball.vertices, ball.faces)]))
+        world.set_scene(rd.Scene([rd.Mesh(1.1 * ball.vertices, ball.faces)]))
         assert len(world.mesh_shapes) == 2

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from robotdiffuse import InputError
+import robotdiffuse as rd
 from robotdiffuse.trajectories.straight_line import straight_line_time
 
 START = np.zeros(2)
@@ -70,5 +70,5 @@ def test_along_a_line_as_toppra_times_it():
 
 
 def test_refuses_limits_that_are_not_positive():
-    with pytest.raises(InputError, match="acceleration"):
+    with pytest.raises(rd.InputError, match="acceleration"):
         straight_line_time(START, FAR, np.ones(2), np.zeros(2))

@@ -75,8 +75,7 @@ def test_torques_are_those_of_the_cubics() -> None:
     rows = np.array([[-0.25], [0.25]])
     still = np.zeros((2, 1))
     motion = rd.Trajectory(("hinge",), np.array([0.0, 0.5]), rows, still, still)
-    assert beyond(5.3, trajectory_pieces(motion))
-    assert not beyond(6.0, trajectory_pieces(motion))
+    assert beyond(5.3, trajectory_pieces(motion)) and not beyond(6.0, trajectory_pieces(motion))
 
 
 def test_a_motion_that_winds_on_and_on_is_refused_in_bounded_time() -> None:
@@ -98,8 +97,7 @@ def test_a_torque_that_touches_its_limit_is_settled() -> None:
     """Halving ends at a thousandth of the limit."""
     limit = 9.81 / 1.01
     held = static_pieces(np.array([[1.0], [2.0]]))
-    assert beyond(limit, held)
-    assert not beyond(1.002 * limit, held)
+    assert beyond(limit, held) and not beyond(1.002 * limit, held)
 
 
 def test_what_is_proved_holds_at_every_look() -> None:

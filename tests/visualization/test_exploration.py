@@ -1,47 +1,27 @@
 """Explorations: moments, faces of voxels, the strip of pictures, and the page, also in a browser."""
 
 import base64
-import json
-import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from helpers.browsers import CHROMIUM, FLAGS
+import robotdiffuse as rd
+from helpers.browsers import CHROMIUM, opened
 from helpers.explorations import FLOOR, recorded
-from robotdiffuse.core.errors import InputError
+from helpers.pages import page_data
 from robotdiffuse.perception.voxel_grid import MAP
 from robotdiffuse.visualization.exploration import (
     GAP,
     READING_TIME,
     faces_between,
     faces_surface,
-    frustum,
-    in_known_scene,
     moments,
-    shown_voxels,
-    title,
     write_exploration,
     write_exploration_picture,
 )
 from robotdiffuse.visualization.picture import PictureSettings
-
-
-def test_moments_show_what_was_known_before_them() -> None:
-    _, explorer = recorded()
-    known = in_known_scene(explorer)
-    found = moments(explorer)
-    assert [moment.number for moment in found] == list(range(1, len(explorer.acts) + 1))
-    for moment in found:
-        assert moment.known.act < moment.number - 1 or moment.known.act == -1
-        (occupied, _), (predicted, _), (unknown, _) = shown_voxels(moment.known, moment.act, known)
-        assert not (occupied & known).any() and not (predicted & ~unknown).any()
-        assert title(moment.act).startswith(
-            {"done": "at the goal"}.get(moment.act.step.kind, moment.act.step.kind)
-        )
-        assert len(frustum(explorer, moment.act)) == (5 if moment.act.T_base_camera is not None else 0)
 
 
 def test_a_cube_has_six_faces_around_it() -> None:
@@ -52,20 +32,15 @@ def test_a_cube_has_six_faces_around_it() -> None:
     at = (1 * 5 + 2) * 6 + 3
     assert numbers.tolist() == [at - 30, at, size + at - 6, size + at, 2 * size + at - 1, 2 * size + at]
     assert first.tolist() == [False, True] * 3
+    outside = np.zeros_like(inside)
+    outside[0, 2, 3] = True
+    assert faces_between(inside, outside)[0].tolist() == [at - 30], "between the two sets alone"
     surface = faces_surface(inside, ~inside, (255, 0, 0))
     center = (np.array([1.5, 2.5, 3.5])) * MAP.edge + MAP.low
     away = surface.vertices - center
     np.testing.assert_allclose(np.abs(away), MAP.edge / 2)
     np.testing.assert_allclose((away * surface.normals).sum(axis=1), MAP.edge / 2)
     assert len(surface.faces) == 12 and (surface.colors == [1, 0, 0]).all()
-
-
-def test_faces_lie_between_the_two_sets_alone() -> None:
-    unknown, free = np.zeros((2, 3, 3, 3), np.bool_)
-    unknown[0] = True
-    free[1, 0, 0] = True
-    numbers, first = faces_between(unknown, free)
-    assert numbers.tolist() == [0] and first.tolist() == [True]
 
 
 SMALL = PictureSettings(width=240, height=150, ghosts=1)
@@ -83,12 +58,9 @@ def test_each_moment_has_a_picture(tmp_path: Path) -> None:
         first = np.asarray(image)[:100, :240].astype(int)
     blue = (first[..., 2] > first[..., 0] + 25).sum()
     assert blue > 50, "the wall was seen"
-    with pytest.raises(InputError):
-        write_exploration_picture(explorer, problem.scene, tmp_path / "explore.html", SMALL)
-
-
-PATIENCE = 300_000
-"""WebGL without a graphics card is slow [ms]."""
+    for write, ending in ((write_exploration_picture, "html"), (write_exploration, "png")):
+        with pytest.raises(rd.InputError):
+            write(explorer, problem.scene, tmp_path / f"explore.{ending}")
 
 
 @pytest.fixture(scope="module")
@@ -117,9 +89,7 @@ def numbers(text: str) -> list[int]:
 
 def test_the_page_holds_what_was_known_at_each_time(page: Path) -> None:
     _, explorer = recorded()
-    found = re.search(r'id="data">(.*?)</script>', page.read_text("utf-8"), re.S)
-    assert found is not None
-    data = json.loads(found[1])
+    data = page_data(page)
     told = data["exploration"]
     assert [shape["name"] for shape in data["scene"]] == [FLOOR.name]
     assert [shape["name"] for shape in told["true_scene"]] == ["floor", "wall"]
@@ -141,32 +111,19 @@ def test_the_page_holds_what_was_known_at_each_time(page: Path) -> None:
     assert len(unknown) > 1000, "the boundary of unknown space, without that at the known floor"
 
 
-def test_another_ending_is_refused(tmp_path: Path) -> None:
-    problem, explorer = recorded()
-    with pytest.raises(InputError):
-        write_exploration(explorer, problem.scene, tmp_path / "explore.png")
-
-
 @pytest.mark.browser
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
 def test_a_browser_shows_the_steps(page: Path) -> None:
-    playwright = pytest.importorskip("playwright.sync_api", reason="browsers are driven by playwright")
     _, explorer = recorded()
     errors: list[str] = []
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, headless=True, args=FLAGS)
-        shown = browser.new_page(viewport={"width": 480, "height": 300})
-        shown.set_default_timeout(PATIENCE)
+    with opened("about:blank", 480, 300) as shown:
         shown.on("pageerror", lambda error: errors.append(str(error)))
         shown.goto(f"{page.as_uri()}#at=1")
         rows = shown.evaluate("[...document.querySelectorAll('#steps li')].map((row) => row.ariaCurrent)")
-        toggles = shown.evaluate(
-            "[...document.querySelectorAll('#toggles button')].map((b) => b.textContent)"
-        )
+        names = "[...document.querySelectorAll('#toggles button')].map((b) => b.textContent)"
+        toggles = shown.evaluate(names)
         pixels = shown.evaluate("layers.map((layer) => layer.meshes[0].geometry.index.count)")
-        browser.close()
-    assert not errors
-    assert rows == ["false"] * (len(explorer.acts) - 1) + ["true"]
+    assert not errors and rows == ["false"] * (len(explorer.acts) - 1) + ["true"]
     assert toggles[:5] == ["Occupied", "Predicted", "Unknown", "Next look", "True scene"]
     assert np.array(pixels)[[0, 2]].min() > 6000

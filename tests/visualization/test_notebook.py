@@ -61,8 +61,3 @@ def test_outside_a_notebook(result: rd.PlanResult, monkeypatch: pytest.MonkeyPat
     monkeypatch.delitem(sys.modules, "IPython", raising=False)
     with pytest.raises(rd.InputError, match=r"rd\.show is for notebooks; elsewhere .* `robotdiffuse view`"):
         rd.show(result)
-
-
-def test_results_of_many_know_their_problems(problem: rd.Problem) -> None:
-    [many] = rd.plan_many([problem], "aorrtc", workers=1, until="first", time_limit=300.0)
-    assert many.problem is problem

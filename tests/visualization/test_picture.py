@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Path
+from robotdiffuse import InputError, Path, Scene
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.visualization import PictureSettings, write_comparison, write_picture
 from robotdiffuse.visualization.picture import COMPARED, render
 
@@ -21,8 +19,7 @@ def test_picture_shows_the_tip_where_kinematics_puts_it(arm, motion, tmp_path):
     middle_of_tip = link_pose(arm, motion.positions[-1], "tip") @ [0, 0, 0.1, 1]
     column, row, _ = camera.project(middle_of_tip[None, :3])[0].astype(int)
     away, _ = render(arm, Scene(), Path(arm.joint_names, motion.positions[:1]), replace(SMALL, ghosts=0))
-    assert away.shape == (200, 320, 3)
-    assert 0 < column < 320 and 0 < row < 200
+    assert away.shape == (200, 320, 3) and 0 < column < 320 and 0 < row < 200
     patch = pixels[row - 2 : row + 3, column - 2 : column + 3].reshape(-1, 3).astype(int)
     assert np.ptp(patch, axis=1).max() < 60, "the arm is gray; the trace ends beyond the middle of the tip"
     background = pixels[3, 3].astype(int)

@@ -1,7 +1,5 @@
 """Drawings of problems without a motion: start, goal, and the links that collide."""
 
-import json
-import re
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +7,7 @@ import pytest
 from PIL import Image
 
 import robotdiffuse as rd
+from helpers.pages import page_data
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.visualization.replay_page import COLLIDING, write_problem
 
@@ -22,9 +21,7 @@ FAR[0, 3] = 1.5
 
 def page(problem: rd.Problem, file: Path) -> dict:
     write_problem(problem, file)
-    found = re.search(r'id="data">(.*?)</script>', file.read_text("utf-8"), re.S)
-    assert found is not None
-    return json.loads(found[1])
+    return page_data(file)
 
 
 def marks(data: dict, color: tuple[int, int, int]) -> list[dict]:
@@ -59,8 +56,7 @@ def test_a_goal_out_of_reach_has_axes(moved: bool, tmp_path: Path) -> None:
         T[:3, 3] = 1.0, 2.0, 0.5
         problem = rd.Problem.in_world(T, PANDA, rd.Scene(), START, rd.PoseGoal("panda_hand", T @ FAR))
     data = page(problem, tmp_path / "a.html")
-    assert data["positions"] == [START.tolist()]
-    assert len(data["scene"]) == 3
+    assert data["positions"] == [START.tolist()] and len(data["scene"]) == 3
     assert dict(data["facts"])["goal"] == "no configuration within the joint limits"
 
 

@@ -1,62 +1,40 @@
 """Replays: content, size, self-containment, and errors for bad output files."""
 
 import base64
-import json
 import re
 
 import numpy as np
 import pytest
 
 import robotdiffuse as rd
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Path, Status
+from helpers.pages import page_data
+from robotdiffuse import InputError, Mesh, Path, PlanResult, PointCloud, Scene, Status
 from robotdiffuse.drawables import decimated
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Mesh, PointCloud
 from robotdiffuse.visualization import PictureSettings, write_picture, write_replay
 from robotdiffuse.visualization.arm import DrawnArm
 
 SMALL = PictureSettings(width=320, height=200, ghosts=2)
 
 
-def page_data(text: str) -> dict:
-    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
-    assert found is not None
-    return json.loads(found[1])
-
-
 def test_replay_holds_everything(arm, scene, motion, tmp_path):
     path = Path(arm.joint_names, motion.positions)
-    result = PlanResult(
-        Status.SOLVED,
-        "",
-        "robotdiffuse",
-        arm.name,
-        0.0123,
-        0,
-        "refinement",
-        path,
-        motion,
-        min_clearance=0.042,
-    )
+    told = Status.SOLVED, "", "robotdiffuse", arm.name, 0.0123, 0, "refinement", path, motion
+    result = PlanResult(*told, min_clearance=0.042)
     file = tmp_path / "replay.html"
     write_replay(
         arm, scene, motion, file, result=result, title="a < b </script> {{data}}", candidates=(path, path)
     )
     text = file.read_text("utf-8")
-    data = page_data(text)
+    data = page_data(file)
     assert "a &lt; b &lt;/script&gt; {{data}}" in text
     assert data["robot"]["joints"] == list(arm.joint_names)
     assert [shape["kind"] for shape in data["scene"]] == [shape.kind for shape in scene.shapes]
     assert len(data["times"]) == len(data["positions"]) == 121, "60 rows a second and no more"
     np.testing.assert_allclose(data["positions"][0], motion.positions[0], atol=1e-5)
     np.testing.assert_allclose(data["positions"][-1], motion.positions[-1], atol=1e-5)
-    assert np.shape(data["candidates"]) == (2, 120, 3)
-    assert dict(data["facts"])["clearance"] == "42.0 mm"
+    assert np.shape(data["candidates"]) == (2, 120, 3) and dict(data["facts"])["clearance"] == "42.0 mm"
     assert dict(data["facts"])["planner"] == "robotdiffuse · refinement"
-    assert data["robot"]["spheres"] == [[3, 0.0, 0.0, 0.1, 0.12]]
-    assert file.stat().st_size < 800_000
+    assert data["robot"]["spheres"] == [[3, 0.0, 0.0, 0.1, 0.12]] and file.stat().st_size < 800_000
 
 
 def test_replay_loads_nothing(arm, scene, motion, tmp_path):
@@ -72,7 +50,7 @@ def test_replay_loads_nothing(arm, scene, motion, tmp_path):
 
 def test_replay_geometry_decodes_to_the_meshes(arm, scene, motion, tmp_path):
     write_replay(arm, scene, motion, tmp_path / "replay.html")
-    data = page_data((tmp_path / "replay.html").read_text("utf-8"))
+    data = page_data(tmp_path / "replay.html")
     for surface, part in zip(DrawnArm(arm).surfaces, data["robot"]["frames"], strict=True):
         raw = np.frombuffer(base64.b64decode(part["vertices"]), "<u2").reshape(-1, 3)
         np.testing.assert_allclose(part["low"] + raw * part["step"], surface.vertices, atol=1e-5)
@@ -85,7 +63,7 @@ def test_path_that_does_not_move(arm, rows, tmp_path):
     path = Path(arm.joint_names, np.tile([0.1, 0.2, 0.1], (rows, 1)))
     write_replay(arm, Scene(), path, tmp_path / "still.html", candidates=[path])
     write_picture(arm, Scene([PointCloud(np.zeros((0, 3)))]), path, tmp_path / "still.png", settings=SMALL)
-    assert page_data((tmp_path / "still.html").read_text("utf-8"))["times"] == [0.0] * rows
+    assert page_data(tmp_path / "still.html")["times"] == [0.0] * rows
 
 
 def test_large_input_stays_small(arm, tmp_path):
@@ -119,13 +97,13 @@ def test_names_of_obstacles_stay_text_in_a_replay(arm, motion, tmp_path) -> None
     name = "</script><script>alert(1)</script>"
     write_replay(arm, Scene([rd.Sphere([1, 1, 1], 0.1, name=name)]), motion, tmp_path / "replay.html")
     text = (tmp_path / "replay.html").read_text("utf-8")
-    assert "<script>alert" not in text and page_data(text)["scene"][0]["name"] == name
+    assert "<script>alert" not in text and page_data(tmp_path / "replay.html")["scene"][0]["name"] == name
 
 
 def test_moving_obstacles_are_on_the_page_and_in_the_picture(arm, motion, tmp_path):
     ball = rd.MovingObstacle(rd.Sphere([0.5, 0.2, 0.3], 0.1, name="ball"), velocity=[0.0, -0.3, 0.0])
     write_replay(arm, Scene(), motion, tmp_path / "replay.html", moving=[ball])
-    [mover] = page_data((tmp_path / "replay.html").read_text("utf-8"))["moving"]
+    [mover] = page_data(tmp_path / "replay.html")["moving"]
     assert mover["shape"]["name"] == "ball"
     np.testing.assert_allclose(mover["track"][0], [0, 0, 0, 1, 0, 0, 0], atol=1e-6)
     np.testing.assert_allclose(mover["track"][-1][1], -0.3 * motion.duration, atol=1e-5)

@@ -1,18 +1,16 @@
 """Surfaces, traces and visual meshes."""
 
 from dataclasses import replace
-from pathlib import Path as FilePath
 
 import numpy as np
 import pytest
 
+import robotdiffuse as rd
 from helpers.three_bars import CORNERS, CUBE
-from robotdiffuse.core.types import Path
 from robotdiffuse.drawables import creased
-from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.robots.visual_meshes import UNIT, VisualMesh, has_visual, load_visual
-from robotdiffuse.visualization.arm import DrawnArm, dense, facts
+from robotdiffuse.robots.visual_meshes import has_visual, load_visual
+from robotdiffuse.visualization.arm import DrawnArm, facts
 
 
 def test_trace_follows_the_outer_end_of_the_tip(arm, motion):
@@ -25,8 +23,7 @@ def test_creases_keep_edges_of_a_box_and_smooth_a_ball():
     import trimesh
 
     box = creased(CORNERS, CUBE, np.ones((12, 3)))
-    assert len(box.vertices) == 24
-    assert np.sort(np.abs(box.normals), axis=1)[:, :2].max() < 1e-12
+    assert len(box.vertices) == 24 and np.sort(np.abs(box.normals), axis=1)[:, :2].max() < 1e-12
     ball = trimesh.creation.icosphere(subdivisions=3)
     smooth = creased(
         ball.vertices.view(np.ndarray), ball.faces.view(np.ndarray), np.ones((len(ball.faces), 3))
@@ -35,47 +32,25 @@ def test_creases_keep_edges_of_a_box_and_smooth_a_ball():
     assert (smooth.normals * smooth.vertices).sum(axis=1).min() > 0.999
 
 
-def test_dense_steps_are_equal():
-    q = dense(np.array([[0.0, 0], [1, 0], [1, 3]]), 41)
-    np.testing.assert_allclose(np.linalg.norm(np.diff(q, axis=0), axis=1), 0.1, atol=1e-12)
-
-
 def test_without_meshes_the_spheres_are_drawn(arm):
     drawn = load_visual(replace(arm, meshes={}))
     assert list(drawn) == ["tip"]
     assert np.linalg.norm(drawn["tip"][0].vertices - [0, 0, 0.1], axis=1).max() == pytest.approx(0.12)
 
 
-def write_visual(visual: dict[str, VisualMesh], file: FilePath) -> None:
-    """As in the bundles: vertices in units of UNIT, faces, a palette and its index by face."""
-    arrays = {}
-    for link, mesh in visual.items():
-        palette, color = np.unique(mesh.colors, axis=0, return_inverse=True)
-        arrays[f"{link}/vertices"] = np.round(mesh.vertices / UNIT).astype(np.int32)
-        arrays[f"{link}/faces"] = mesh.faces.astype(np.uint16)
-        arrays[f"{link}/palette"] = palette
-        arrays[f"{link}/color"] = color.reshape(-1).astype(np.uint8)
-    np.savez_compressed(file, **arrays)
+def test_visual_meshes_that_are_elsewhere_than_the_collision_meshes_are_not_drawn():
+    panda = rd.load_robot("panda")
+    moved = {
+        link: tuple(replace(m, vertices=m.vertices + 0.1) for m in of) for link, of in panda.meshes.items()
+    }
+    drawn = load_visual(replace(panda, meshes=moved))
+    for link in ("panda_link5", "panda_hand"):
+        np.testing.assert_array_equal(drawn[link][0].vertices, moved[link][0].vertices)
 
 
-def test_visual_meshes_survive_the_file_and_must_agree(arm, tmp_path, monkeypatch):
-    colors = np.tile(np.array([[10, 20, 30], [200, 100, 0]], np.uint8), (6, 1))
-    written = VisualMesh(arm.meshes["tip"][0].vertices, CUBE, colors)
-    elsewhere = VisualMesh(written.vertices + 0.1, CUBE, colors)
-    folder = tmp_path / "data" / arm.name
-    folder.mkdir(parents=True)
-    write_visual({"tip": written, "arm": elsewhere}, folder / "visual.npz")
-    monkeypatch.setattr("robotdiffuse.robots.visual_meshes.files", lambda _: tmp_path)
-    drawn = load_visual(arm)
-    np.testing.assert_allclose(drawn["tip"][0].vertices, written.vertices, atol=2.5e-5)
-    np.testing.assert_array_equal(drawn["tip"][0].faces, CUBE)
-    np.testing.assert_array_equal(drawn["tip"][0].colors, colors)
-    np.testing.assert_array_equal(drawn["arm"][0].vertices, arm.meshes["arm"][0].vertices)
-
-
-@pytest.mark.parametrize("name", ["panda", "ur5", "ur5e", "ur10", "xarm7"])
+@pytest.mark.parametrize("name", ["panda", "ur5", "xarm7"])
 def test_bundled_visual_meshes_are_drawn(name):
-    robot = load_robot(name)
+    robot = rd.load_robot(name)
     assert has_visual(robot)
     plain = {
         link
@@ -86,9 +61,9 @@ def test_bundled_visual_meshes_are_drawn(name):
 
 
 def test_the_caption_says_that_collision_geometry_is_drawn():
-    motion = Path(("a",), np.zeros((2, 1)))
-    assert ("drawn by", "collision geometry") in facts(motion, None, load_robot("iiwa14"))
-    assert ("drawn by", "collision geometry") not in facts(motion, None, load_robot("ur5e"))
+    motion = rd.Path(("a",), np.zeros((2, 1)))
+    assert ("drawn by", "collision geometry") in facts(motion, None, rd.load_robot("iiwa14"))
+    assert ("drawn by", "collision geometry") not in facts(motion, None, rd.load_robot("ur5e"))
 
 
 @pytest.mark.parametrize("flat", [[[1, 1, 1]] * 3, [[1, 1, 1], [2, 2, 2], [3, 3, 3]]])

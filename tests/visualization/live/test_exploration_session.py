@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -10,8 +11,7 @@ import pytest
 import robotdiffuse as rd
 from helpers import waiting
 from helpers.explorations import BEYOND, FLOOR, HOME, WALL
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.planning.exploration.steps import DONE, LOOK, ExplorerSettings
+from robotdiffuse.planning.exploration.steps import DONE, LOOK
 
 pytest.importorskip("viser", reason="the page needs viser: pip install 'robotdiffuse[live]'")
 
@@ -32,7 +32,7 @@ from robotdiffuse.visualization.live.session import NO_MOTION, VALID
 
 PATIENCE = 300.0
 """[s]; a new machine compiles first."""
-SETTINGS = ExplorerSettings(time_limit=2.0)
+SETTINGS = rd.ExplorerSettings(time_limit=2.0)
 until = partial(waiting.state_when, patience=PATIENCE)
 
 
@@ -48,6 +48,7 @@ def test_it_goes_one_step_and_then_to_the_end(session: ExplorationSession) -> No
     seen: list[ExplorationState] = []
     session.on_change = lambda: seen.append(session.state)
     assert session.state.phase == WAITING and session.state.known is None
+    assert exploration_badge(session.state).headline == "not begun"
     session.set_mode(STEPPING)
     state = until(session, lambda state: state.acts and state.phase == WAITING)
     [act] = state.acts
@@ -55,8 +56,12 @@ def test_it_goes_one_step_and_then_to_the_end(session: ExplorationSession) -> No
     np.testing.assert_allclose(state.configuration, act.trajectory.positions[-1], atol=1e-9)
     if act.step.kind == LOOK:
         assert act.step.wanted is not None and act.step.wanted.any()
+    badge = exploration_badge(replace(state, phase=MOVING))
+    assert badge.headline.startswith("1. ") and badge.lines[0] == act.step.reason
+    assert badge.lines[-1].startswith("of the map ")
     session.set_mode(RUNNING)
     state = until(session, lambda state: state.phase == ENDED)
+    assert exploration_badge(state).kind == (VALID if state.acts[-1].step.kind == DONE else NO_MOTION)
     assert not state.failure and not state.violation and state.acts[-1].step.motion is None
     assert {CHOOSING, MOVING} <= {one.phase for one in seen}
     assert state.known is state.explorer.views[-1]  # type: ignore[union-attr]
@@ -75,7 +80,7 @@ def test_a_pause_holds_the_arm_and_a_restart_begins_anew(session: ExplorationSes
 
     waiting.until(rests, PATIENCE)  # after the frame that was being computed
     assert session.state.phase == MOVING
-    with pytest.raises(InputError, match=r"unknown explorer\.policy 'bold'"):
+    with pytest.raises(rd.InputError, match=r"unknown explorer\.policy 'bold'"):
         session.restart(policy="bold")
     session.restart(policy="probabilistic", noise=True)
     assert session.state.configuration.tolist() == HOME.tolist() and not session.state.acts
@@ -98,17 +103,3 @@ def test_an_error_is_shown_and_a_restart_helps(
         assert exploration_badge(state).lines == ("ValueError: no camera",)
     session.restart()
     until(session, lambda state: state.acts)
-
-
-def test_the_badge_says_what_the_arm_does(session: ExplorationSession) -> None:
-
-    assert exploration_badge(session.state).headline == "not begun"
-    session.set_mode(RUNNING)
-    state = until(session, lambda state: state.phase == MOVING)
-    badge = exploration_badge(state)
-    step = state.acts[-1].step
-    assert badge.headline.startswith(f"{len(state.acts)}. ") and badge.lines[0] == step.reason
-    assert badge.lines[-1].startswith("of the map ")
-    state = until(session, lambda state: state.phase == ENDED)
-    reached = state.acts[-1].step.kind == DONE
-    assert exploration_badge(state).kind == (VALID if reached else NO_MOTION)

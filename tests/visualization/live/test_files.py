@@ -5,18 +5,9 @@ import re
 
 import pytest
 
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.planning import load_planner
+from robotdiffuse import InputError, Problem, load_robot
 from robotdiffuse.problems.files import problem_record
-from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots import load_robot
-from robotdiffuse.visualization.live.session import (
-    first_problem,
-    problem_for,
-    problem_text,
-    uploaded_problem,
-)
-from robotdiffuse.visualization.replay_page import result_page
+from robotdiffuse.visualization.live.session import first_problem, problem_for, problem_text, uploaded_problem
 
 
 @pytest.fixture(scope="module")
@@ -29,12 +20,6 @@ def test_problems_go_out_and_come_back(demo: Problem) -> None:
     assert problem_record(back) == problem_record(demo)
     text = json.dumps(problem_record(demo)).encode()
     assert problem_record(uploaded_problem(text, "problem.json", demo.robot)) == problem_record(demo)
-
-
-def test_a_replay_holds_the_motion(demo: Problem) -> None:
-    result = load_planner("aorrtc").plan(demo, 20.0)
-    page = result_page(demo, result)
-    assert page.startswith("<!doctype html>") and "bottle" in page and "src=" not in page
 
 
 @pytest.mark.parametrize("name", ["panda", "so101", "ur10"])

@@ -4,15 +4,15 @@ import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
 
+import robotdiffuse as rd
 from helpers import waiting
-from helpers.browsers import CHROMIUM, FLAGS
+from helpers.browsers import MARKS, PATIENCE, opened
 from robotdiffuse.core.transforms import rotation_from_quaternion, transform
-from robotdiffuse.problems.goals import PoseGoal
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.visualization.live.session import (
     PageOptions,
@@ -22,56 +22,33 @@ from robotdiffuse.visualization.live.session import (
     problem_text,
 )
 
-if TYPE_CHECKING:
-    from robotdiffuse.visualization.live.page import Page
-
 pytest.importorskip("viser", reason="the page needs viser: pip install 'robotdiffuse[live]'")
-playwright = pytest.importorskip("playwright.sync_api", reason="browsers are driven by playwright")
 
-# [ms]; a new machine compiles before the first plan.
-PATIENCE = 120_000
-COMPILING = 300_000
+from robotdiffuse.visualization.live.page import Page
+from robotdiffuse.visualization.live.server import PageServer, free_port
+
 VALID = "[data-validity=valid]"
 INVALID = "[data-validity=invalid]"
 
-until = partial(waiting.until, patience=PATIENCE / 1000)
-
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium"),
-]
+until = partial(waiting.until, patience=PATIENCE)
+pytestmark = MARKS
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, headless=True, args=FLAGS)
-        yield browser
-        browser.close()
-
-
-@pytest.fixture(scope="module")
-def live() -> Iterator["tuple[Page, str]"]:
-    from robotdiffuse.visualization.live.page import Page
-    from robotdiffuse.visualization.live.server import PageServer, free_port
-
+def page() -> Iterator[Page]:
     server = PageServer("127.0.0.1", free_port("127.0.0.1", 0))
     page = Page(Session(first_problem(None, None), PageOptions("aorrtc", 10.0)), server)
-    # in whichever test a worker begins, it compiles here: later waits are for the page alone
-    until(lambda: page.session.state.motion is not None, patience=COMPILING / 1000)
-    yield page, server.url
+    until(lambda: page.session.state.motion is not None)
+    yield page
     page.close()
 
 
 @pytest.fixture(scope="module")
-def view(browser: Any, live: "tuple[Page, str]") -> Any:
+def view(page: Page) -> Iterator[Any]:
     """A browser with the page open and a valid motion."""
-    view = browser.new_page(viewport={"width": 900, "height": 500})
-    view.set_default_timeout(PATIENCE)
-    view.goto(live[1])
-    view.locator(VALID).wait_for()
-    return view
+    with opened(page.server.url, height=500) as view:
+        view.locator(VALID).wait_for()
+        yield view
 
 
 def beside(view: Any, label: str) -> Any:
@@ -79,10 +56,8 @@ def beside(view: Any, label: str) -> Any:
     return view.get_by_text(label, exact=True).locator("xpath=following::input[not(@type='hidden')][1]")
 
 
-def test_an_obstacle_in_the_way_turns_it_red_and_the_next_plan_green(
-    view: Any, live: "tuple[Page, str]"
-) -> None:
-    session = live[0].session
+def test_an_obstacle_in_the_way_turns_it_red_and_the_next_plan_green(view: Any, page: Page) -> None:
+    session = page.session
     beside(view, "Plan automatically").uncheck(force=True)
     until(lambda: not session.state.options.follow)
     view.get_by_role("tab", name="Obstacles").click()
@@ -105,8 +80,7 @@ def test_an_obstacle_in_the_way_turns_it_red_and_the_next_plan_green(
     until(lambda: session.state.answer is not None)
 
 
-def test_a_size_is_typed_beside_its_slider(view: Any, live: "tuple[Page, str]") -> None:
-    page = live[0]
+def test_a_size_is_typed_beside_its_slider(view: Any, page: Page) -> None:
     view.get_by_role("tab", name="Obstacles").click()
     page.select("ball")
     entry = beside(view, "radius")
@@ -116,18 +90,17 @@ def test_a_size_is_typed_beside_its_slider(view: Any, live: "tuple[Page, str]") 
     page.select("")
 
 
-def test_the_target_is_dragged(view: Any, live: "tuple[Page, str]") -> None:
+def test_the_target_is_dragged(view: Any, page: Page) -> None:
     """Drags the target by an arrow of its gizmo."""
-    page = live[0]
     before = page.session.state.goal_pose.copy()
     dragged = any(drag_arrow(view, page, before, axis) for axis in (2, 0, 1))
-    assert dragged and isinstance(page.session.state.problem.goal, PoseGoal)
+    assert dragged and isinstance(page.session.state.problem.goal, rd.PoseGoal)
     page.session.move_goal(before)
     until(lambda: page.session.state.answer is not None)
     view.locator(VALID).wait_for()
 
 
-def drag_arrow(view: Any, page: "Page", T: np.ndarray, axis: int) -> bool:
+def drag_arrow(view: Any, page: Page, T: np.ndarray, axis: int) -> bool:
     """Whether the target follows when the mouse drags an arrow of its gizmo, which may be seen end-on."""
     arrow = page.goal_gizmo.handle.scale * T[:3, axis]
     view.mouse.move(*on_screen(view, page, T[:3, 3] + 0.7 * arrow))
@@ -139,7 +112,7 @@ def drag_arrow(view: Any, page: "Page", T: np.ndarray, axis: int) -> bool:
     return not np.array_equal(page.session.state.goal_pose, T)
 
 
-def on_screen(view: Any, page: "Page", point: np.ndarray) -> tuple[float, float]:
+def on_screen(view: Any, page: Page, point: np.ndarray) -> tuple[float, float]:
     """Pixel of a point [m], from the camera that the browser reports."""
     [client] = page.server.get_clients().values()
     camera = client.camera
@@ -149,8 +122,7 @@ def on_screen(view: Any, page: "Page", point: np.ndarray) -> tuple[float, float]
     return 0.5 * size["width"] + focal * x / z, 0.5 * size["height"] + focal * y / z
 
 
-def test_the_trees_of_the_search_are_drawn_when_asked_for(view: Any, live: "tuple[Page, str]") -> None:
-    page = live[0]
+def test_the_trees_of_the_search_are_drawn_when_asked_for(view: Any, page: Page) -> None:
     drawn = page.server.scene._handle_from_node_name
     answer = page.session.state.answer
     view.get_by_role("tab", name="Plan").click()
@@ -163,8 +135,7 @@ def test_the_trees_of_the_search_are_drawn_when_asked_for(view: Any, live: "tupl
     assert page.session.state.answer is answer, "drawing them is no reason to plan"
 
 
-def test_it_plays_and_is_scrubbed(view: Any, live: "tuple[Page, str]") -> None:
-    page = live[0]
+def test_it_plays_and_is_scrubbed(view: Any, page: Page) -> None:
     view.get_by_role("button", name="Play").click()
     until(lambda: page.player.playing and page.player.time > 0)
     view.get_by_role("button", name="Pause").click()
@@ -181,10 +152,8 @@ def test_it_plays_and_is_scrubbed(view: Any, live: "tuple[Page, str]") -> None:
     assert not page.player.playing
 
 
-def test_files_are_loaded_and_saved_and_broken_ones_are_a_note(
-    view: Any, live: "tuple[Page, str]", tmp_path: Path
-) -> None:
-    session = live[0].session
+def test_files_are_loaded_and_saved_and_broken_ones_are_a_note(view: Any, page: Page, tmp_path: Path) -> None:
+    session = page.session
     view.get_by_role("tab", name="Files").click()
     with view.expect_download() as saved:
         view.get_by_role("button", name="Save problem").click()
@@ -205,16 +174,14 @@ def test_files_are_loaded_and_saved_and_broken_ones_are_a_note(
     view.locator(VALID).wait_for()
 
 
-def test_it_comes_back_after_the_server_restarts(browser: Any, live: "tuple[Page, str]") -> None:
-    from robotdiffuse.visualization.live.page import Page
-    from robotdiffuse.visualization.live.server import PageServer, free_port
-
-    view = browser.new_page(viewport={"width": 500, "height": 400})
-    view.set_default_timeout(PATIENCE)
+def test_it_comes_back_after_the_server_restarts(view: Any, page: Page) -> None:
+    problem = page.session.state.problem
+    view = view.context.browser.new_page(viewport={"width": 500, "height": 400})
+    view.set_default_timeout(1000 * PATIENCE)
     number = 0
     for planner in ("aorrtc", "rrt_connect"):
         server = PageServer("127.0.0.1", free_port("127.0.0.1", number))
-        page = Page(Session(live[0].session.state.problem, PageOptions(planner, 10.0)), server)
+        page = Page(Session(problem, PageOptions(planner, 10.0)), server)
         if not number:
             number = server.get_port()
             view.goto(server.url)

@@ -10,7 +10,7 @@ pytest.importorskip("viser", reason="live needs viser: pip install 'robotdiffuse
 
 import viser
 
-from robotdiffuse.core.errors import InputError
+import robotdiffuse as rd
 from robotdiffuse.visualization.live import server as module
 from robotdiffuse.visualization.live.server import free_port, is_loopback, may_connect
 
@@ -20,27 +20,19 @@ def test_viser_is_silent_and_other_threads_print(
 ) -> None:
     """While viser started or stopped, sys.stdout was replaced for all threads: others' output was lost."""
     during = []
-    start = viser.ViserServer.__init__
-    stop = viser.ViserServer.stop
+    for name in ("__init__", "stop"):
+        own = getattr(viser.ViserServer, name)
 
-    def watched_start(self: Any, *words: Any, **options: Any) -> None:
-        during.append(sys.stdout)
-        start(self, *words, **options)
+        def watched(*words: Any, own: Any = own, **options: Any) -> None:
+            during.append(sys.stdout)
+            own(*words, **options)
 
-    def watched_stop(self: Any) -> None:
-        during.append(sys.stdout)
-        stop(self)
-
-    monkeypatch.setattr(viser.ViserServer, "__init__", watched_start)
-    monkeypatch.setattr(viser.ViserServer, "stop", watched_stop)
+        monkeypatch.setattr(viser.ViserServer, name, watched)
     module.PageServer("127.0.0.1", module.free_port("127.0.0.1", 0)).stop()
-    assert during == [sys.stdout, sys.stdout]
-    assert capsys.readouterr().out == ""
+    assert during == [sys.stdout, sys.stdout] and capsys.readouterr().out == ""
 
 
-@pytest.mark.parametrize("host", ["localhost:8080", "127.0.0.1:8080", "[::1]:9000", "localhost"])
-def test_names_of_this_machine_are_let_in(host: str) -> None:
-    assert may_connect("/", host, None, "") and may_connect("/", host, f"http://{host}", "")
+HERE = ["localhost:8080", "127.0.0.1:8080", "[::1]:9000", "localhost"]
 
 
 @pytest.mark.parametrize(
@@ -56,7 +48,8 @@ def test_names_of_this_machine_are_let_in(host: str) -> None:
         ("localhost", "http://[::1"),
     ],
 )
-def test_others_are_not(host: str, origin: str | None) -> None:
+def test_names_of_this_machine_are_let_in_and_others_are_not(host: str, origin: str | None) -> None:
+    assert all(may_connect("/", here, known, "") for here in HERE for known in (None, f"http://{here}"))
     assert not may_connect("/", host, origin, "")
 
 
@@ -72,13 +65,12 @@ def test_elsewhere_the_path_is_the_token() -> None:
 def test_a_port_that_is_taken_and_a_host_that_is_none() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         number = taken.getsockname()[1]
-        with pytest.raises(InputError, match=f"port {number} of 127.0.0.1 cannot be used: .*--port"):
+        with pytest.raises(rd.InputError, match=f"port {number} of 127.0.0.1 cannot be used: .*--port"):
             free_port("127.0.0.1", number)
-    with pytest.raises(InputError, match="--host is 'no such host'"):
+    with pytest.raises(rd.InputError, match="--host is 'no such host'"):
         free_port("no such host", 0)
 
 
 def test_loopback() -> None:
-    for host, only_here in {"127.0.0.1": True, "::1": True, "localhost": True, "0.0.0.0": False}.items():
-        assert is_loopback(host) is only_here
-    assert not is_loopback("") and not is_loopback("localhost.example")
+    assert all(is_loopback(host) for host in ("127.0.0.1", "::1", "localhost"))
+    assert not any(is_loopback(host) for host in ("0.0.0.0", "", "localhost.example"))

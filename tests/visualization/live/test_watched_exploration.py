@@ -8,9 +8,8 @@ import pytest
 
 import robotdiffuse as rd
 from helpers import waiting
-from helpers.browsers import CHROMIUM, FLAGS
+from helpers.browsers import MARKS, PATIENCE, opened
 from helpers.explorations import BEYOND, FLOOR, HOME, WALL
-from robotdiffuse.planning.exploration.steps import ExplorerSettings
 
 pytest.importorskip("viser", reason="the page needs viser: pip install 'robotdiffuse[live]'")
 
@@ -24,33 +23,18 @@ from robotdiffuse.visualization.live.exploration import (
 )
 from robotdiffuse.visualization.live.server import PageServer, free_port
 
-playwright = pytest.importorskip("playwright.sync_api", reason="browsers are driven by playwright")
-
-PATIENCE = 300.0
-"""[s]; a new machine compiles before the first step."""
-
 until = partial(waiting.until, patience=PATIENCE)
-
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium"),
-]
+pytestmark = MARKS
 
 
 @pytest.fixture
 def view() -> Iterator[tuple[Any, ExplorationSession, dict[str, Any]]]:
     """A browser at the page, the session, and what is drawn by name."""
     problem = rd.Problem(rd.load_robot("panda"), rd.Scene([FLOOR, WALL]), HOME, BEYOND)
-    session = ExplorationSession(problem, ExplorerSettings(time_limit=5.0), False, 0, speed=0.1)
+    session = ExplorationSession(problem, rd.ExplorerSettings(time_limit=5.0), False, 0, speed=0.1)
     page = ExplorationPage(session, PageServer("127.0.0.1", free_port("127.0.0.1", 0)))
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, headless=True, args=FLAGS)
-        view = browser.new_page(viewport={"width": 900, "height": 600})
-        view.set_default_timeout(1000 * PATIENCE)
-        view.goto(page.server.url)
+    with opened(page.server.url) as view:
         yield view, session, page.server.scene._handle_from_node_name
-        browser.close()
     page.close()
 
 

@@ -1,0 +1,14 @@
+"""What the pages of replays hold."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+
+def page_data(file: Path) -> Any:
+    found = re.search(
+        r'<script type="application/json" id="data">(.*?)</script>', file.read_text("utf-8"), re.S
+    )
+    assert found is not None
+    return json.loads(found[1])
