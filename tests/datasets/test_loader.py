@@ -95,7 +95,7 @@ def test_the_same_epoch_from_the_same_generator(store):
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_standard_loader(store, workers):
+def test_standard_loader_and_pickles(store, workers):
     data = RopDataset(store, "validation", points=12)
     batches = list(DataLoader(data, batch_size=5, num_workers=workers))
     q = torch.cat([batch["trajectories"] for batch in batches])
@@ -106,6 +106,10 @@ def test_standard_loader(store, workers):
     torch.testing.assert_close(data[-1]["trajectories"], q[-1], atol=0, rtol=0)
     with pytest.raises(IndexError, match=f"there are {len(data)} items"):
         data[len(data)]
+    content = pickle.dumps(data)
+    assert len(content) < 2000, "without the trajectories"
+    again = joined(pickle.loads(content).batches(50))
+    torch.testing.assert_close(again.points, joined(data.batches(50)).points, atol=0, rtol=0)
 
 
 def test_resampling():
@@ -122,14 +126,6 @@ def test_resampling():
         wanted = [np.interp(np.linspace(0, at[-1], 48), at, path[:, j]) for j in range(3)]
         np.testing.assert_array_equal(found[[0, -1]], path[[0, -1]])
         np.testing.assert_array_equal(found, np.stack(wanted, 1).astype(np.float32))
-
-
-def test_pickled_without_the_trajectories(store):
-    data = RopDataset(store, points=4)
-    content = pickle.dumps(data)
-    assert len(content) < 2000
-    again = joined(pickle.loads(content).batches(50))
-    torch.testing.assert_close(again.points, joined(data.batches(50)).points, atol=0, rtol=0)
 
 
 def test_bad_input(store, tmp_path):

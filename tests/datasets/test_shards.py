@@ -59,6 +59,10 @@ def test_what_is_written_is_read(tmp_path, arrays):
     assert set(shards.read_shard(tmp_path, 3, ("cost", "seed")).arrays) == {"cost", "seed"}
     assert shards.shard_indices(tmp_path) == [3]
     shards.check_shard(tmp_path, 3, manifest_of(ARM, WAYPOINTS))
+    group = zarr.open_group(shards.shard_path(tmp_path, 3), mode="r")
+    assert group.metadata.zarr_format == 3 and group.attrs["format"] == 1, "plain zarr"
+    for name, array in group.arrays():
+        assert array.nchunks == 1 and (array.compressors == ()) == (name == "trajectories"), name
 
 
 def test_times_and_no_rows(tmp_path, arrays):
@@ -69,15 +73,6 @@ def test_times_and_no_rows(tmp_path, arrays):
     assert shard["trajectories"].shape == (0, WAYPOINTS, ARM.dof)
     with pytest.raises(InputError, match="array times: it must be there only where timing is time"):
         shards.check_shard(tmp_path, 0, manifest_of(ARM, WAYPOINTS))
-
-
-def test_the_store_is_plain_zarr(store):
-    group = zarr.open_group(shards.shard_path(store, 0), mode="r")
-    assert group.metadata.zarr_format == 3
-    assert dict(group.attrs)["format"] == 1
-    for name, array in group.arrays():
-        assert array.nchunks == 1, name
-        assert (array.compressors == ()) == (name == "trajectories")
 
 
 def test_same_arrays_same_bytes_or_none_where_arrays_do_not_fit(tmp_path, arrays):

@@ -133,11 +133,8 @@ def test_an_outcome_is_what_was_found_by_then() -> None:
     assert (between.found, between.returned) == (0.5, 1.0)
     assert (between.joint_length, between.link_length) == (4.0, pytest.approx(12.0))  # 9 x 4 / 3
     assert (after.joint_length, after.link_length) == (3.0, 9.0)
-
-
-def test_the_validator_may_end_after_the_limit_of_the_call_alone() -> None:
-    record = solved("mpd", "a", 1.0, [(1.08, 4.0)])
-    assert bench_report.outcome(record, 1.0).found == 1.0
+    # the validator may end after the limit of the call alone
+    assert bench_report.outcome(solved("mpd", "a", 1.0, [(1.08, 4.0)]), 1.0).found == 1.0
     assert not bench_report.outcome(solved("mpd", "a", 1.0, [(1.2, 4.0)]), 1.0).solved
     assert not bench_report.outcome(solved("mpd", "a", 2.0, [(1.08, 4.0)]), 1.0).solved
 

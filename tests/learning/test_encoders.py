@@ -163,20 +163,6 @@ def test_settings_are_read_by_name(name):
         replace(settings, encoder_settings=other)
 
 
-@pytest.mark.parametrize(
-    ("kind", "changes", "message"),
-    [
-        (encoders.PointAutoencoderSettings, {"points": ()}, r"encoder.points is \(\)"),
-        (encoders.PointNetSettings, {"second": (8, 0)}, "encoder.second is"),
-        (encoders.DGCNNSettings, {"neighbors": 0}, "encoder.neighbors is 0"),
-        (encoders.PointsSettings, {"cloud": 20}, "points.code is 96; it must be three times cloud, 60"),
-    ],
-)
-def test_bad_settings(kind, changes, message):
-    with pytest.raises(InputError, match=message):
-        kind(**changes)
-
-
 def test_arranged_clouds():
     """Points are sorted like the ordered clouds of `surface_clouds`, and thinned or repeated evenly.
     Both round coordinates to a millionth of the largest."""
@@ -348,6 +334,10 @@ def test_batches_with_clouds_instead_of_codes(data):
         (PlannerTraining, {"encoder": "e", "denoiser": "cross_attention"}, "encoder is e .* need each other"),
         (PlannerTraining, {"encoder": "e", "encoder_settings": SMALL["pointnet"]}, "unknown encoder 'e'"),
         (EncoderTraining, {"minutes": 3.0, "samples": 4}, "exactly one"),
+        (encoders.PointAutoencoderSettings, {"points": ()}, r"encoder.points is \(\)"),
+        (encoders.PointNetSettings, {"second": (8, 0)}, "encoder.second is"),
+        (encoders.DGCNNSettings, {"neighbors": 0}, "encoder.neighbors is 0"),
+        (encoders.PointsSettings, {"cloud": 20}, "points.code is 96; it must be three times cloud, 60"),
         (EncoderTraining, {"name": "pointnet"}, "name is pointnet.*jointly"),
         (MotionModelSettings, {"encoder": "points", "encoder_settings": SMALL["points"]}, "need each other"),
     ],

@@ -54,11 +54,6 @@ def test_nearest_and_chamfer_against_all_pairs():
     torch.testing.assert_close(chamfer(a, b, allowed), sum(rms), atol=1e-4, rtol=1e-4)
 
 
-def test_a_joint_without_a_range_is_refused():
-    with pytest.raises(InputError, match="joint 1"):
-        JointNormalizer(np.array([0.0, 1.0]), np.array([1.0, 1.0]))
-
-
 @pytest.mark.parametrize("smooth", [False, True])
 def test_noise_is_zero_at_the_ends_and_has_the_data_s_covariance(smooth):
     s = np.linspace(0, np.pi, 16)[:, None]
@@ -129,20 +124,19 @@ def test_a_sampler_by_name_is_that_of_a_checkpoint() -> None:
         np.testing.assert_array_equal(by_setting, by_default)
 
 
-def test_sampling_settings_are_checked() -> None:
+def test_what_makes_no_sense_is_refused() -> None:
+    with pytest.raises(InputError, match="joint 1"):
+        JointNormalizer(np.array([0.0, 1.0]), np.array([1.0, 1.0]))
+    # matrices of 10**25 rows were asked for; found by fuzzing
+    for kind, values in ((MotionModelSettings, {}), (PlannerTraining, {"data": "d", "encoder": "e"})):
+        with pytest.raises(InputError, match=r"waypoints is 1000+; it must be between 3 and 4096"):
+            kind.from_json(values | {"waypoints": 10**25}, "x")
     with pytest.raises(InputError, match=r"unknown sampling\.sampler 'heun'; known: ddim, ddpm"):
         SamplingSettings(sampler="heun")
     with pytest.raises(InputError, match=r"guided_share is 1.5"):
         SamplingSettings(guided_share=1.5)
     with pytest.raises(InputError, match="sampling steps is 201; it must be between 1 and 200"):
         sample_with(small_model(), SamplingSettings(sampling_steps=201))
-
-
-def test_numbers_of_waypoints_are_bounded():
-    """Matrices of 10**25 rows were asked for; found by fuzzing."""
-    for kind, values in ((MotionModelSettings, {}), (PlannerTraining, {"data": "d", "encoder": "e"})):
-        with pytest.raises(InputError, match=r"waypoints is 1000+; it must be between 3 and 4096"):
-            kind.from_json(values | {"waypoints": 10**25}, "x")
 
 
 PANDA = rd.load_robot("panda")

@@ -12,7 +12,7 @@ import robotdiffuse as rd
 from helpers.explorations import FLOOR, HOME, WALL, ZONE, recorded
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.perception.depth_view import DepthNoise
-from robotdiffuse.perception.occupancy_map import COVER_RADIUS, OccupancyMap, ViewMemory
+from robotdiffuse.perception.occupancy_map import OccupancyMap, ViewMemory
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.perception.unknown_space import CARVING_MARGIN
 from robotdiffuse.perception.visibility import surface_balls
@@ -94,18 +94,6 @@ def test_strict_motions_enter_no_voxel_that_was_not_seen_free() -> None:
     ends = [placed_spheres(PANDA, q).astype(np.float32) for q in step.motion.path.positions[[0, -1]]]
     # covering spheres are larger than the links that the validator checks
     assert (unseen & ~MAP.within(np.concatenate(ends), 2 * CARVING_MARGIN)).sum() <= 20
-
-
-def test_obstacles_cover_what_is_not_seen_free_but_at_the_ends() -> None:
-    one = explorer()
-    cloud, parts, *walls = not_seen_free(one.map, rd.Scene([FLOOR]), RIGHT, (HOME,))
-    assert isinstance(cloud, rd.PointCloud) and isinstance(parts, rd.PointCloud) and len(walls) == 6
-    spheres = placed_spheres(PANDA, HOME)
-    for balls, distance in ((cloud, CARVING_MARGIN), (parts, CARVING_MARGIN - COVER_RADIUS / 2)):
-        at = np.floor((balls.points - MAP.low) / MAP.edge).astype(int)
-        assert not one.map.free[tuple(at.T)].any()
-        distances = np.linalg.norm(balls.points[:, None] - spheres[None, :, :3], axis=2) - spheres[:, 3]
-        assert distances.min() > distance
 
 
 def test_nothing_further_than_the_margin_from_a_goal_is_exempt() -> None:

@@ -43,19 +43,14 @@ def test_solved_means_verified(name: str, number: int) -> None:
     assert lengths[-1] == pytest.approx(result.path.length)
 
 
-def test_a_goal_in_collision_is_reported(name: str) -> None:
+def test_a_goal_in_collision_is_reported_and_time_limit_and_seed_are_checked(name: str) -> None:
     problem = rd.Problem(rd.load_robot("panda"), rd.Scene([rd.Sphere((0.2, 0.5, 0.5), 0.3)]), START, GOAL)
-    result = rd.load_planner(name).plan(problem, time_limit=30.0)
-    assert result.status is rd.Status.INVALID_GOAL and "in collision" in result.reason
-
-
-def test_time_limit_and_seed_are_checked(name: str) -> None:
-    problem = rd.Problem(rd.load_robot("panda"), rd.Scene([]), START, GOAL)
     planner = rd.load_planner(name)
-    with pytest.raises(rd.InputError, match="time_limit is 0"):
-        planner.plan(problem, time_limit=0.0)
-    with pytest.raises(rd.InputError, match="seed is -1"):
-        planner.plan(problem, seed=-1)
+    result = planner.plan(problem, time_limit=30.0)
+    assert result.status is rd.Status.INVALID_GOAL and "in collision" in result.reason
+    for wrong, message in (({"time_limit": 0.0}, "time_limit is 0"), ({"seed": -1}, "seed is -1")):
+        with pytest.raises(rd.InputError, match=message):
+            planner.plan(problem, **wrong)
 
 
 def test_weights_are_for_learned_planners_alone(name: str) -> None:

@@ -57,20 +57,6 @@ def planner_settings(data, **changes) -> PlannerTraining:
     return replace(settings, **changes)
 
 
-def stop_at(monkeypatch, step):
-    """Interrupt training after this step, as Ctrl-C would. Returns a function that undoes it."""
-    original = TrainingRun.step
-
-    def interrupted(self):
-        original(self)
-        if self.at.step == step:
-            self.save()
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(TrainingRun, "step", interrupted)
-    return lambda: monkeypatch.setattr(TrainingRun, "step", original)
-
-
 def start(kind, settings, out, *launcher):
     file = out.parent / f"{out.name}.json"
     file.write_text(json.dumps(settings.to_json()))
@@ -203,10 +189,16 @@ def test_interrupted_training_ends_the_same(kind, tmp_path, data, monkeypatch):
         return train_planner(planner_settings(data), str(out))
 
     whole = train(tmp_path / "whole")
-    resume = stop_at(monkeypatch, 5)
-    with pytest.raises(KeyboardInterrupt):
+
+    def interrupted(self, step=TrainingRun.step):
+        step(self)
+        if self.at.step == 5:
+            self.save()
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(TrainingRun, "step", interrupted)
         train(tmp_path / "parts")
-    resume()
     assert train(tmp_path / "parts") == whole
     name = "encoder" if kind == "encoder" else "model"
     files = [tmp_path / part / f"{name}.safetensors" for part in ("whole", "parts")]
@@ -244,12 +236,6 @@ def test_every_choice_trains_and_plans(changes, tmp_path, data, arm, monkeypatch
     assert q.shape == (3, WAYPOINTS, 3) and np.isfinite(q).all()
     assert (q[:, 0] == start).all() and (q[:, -1] == goal).all()
     assert (q >= arm.lower).all() and (q <= arm.upper).all()
-
-
-def test_two_trainings_do_not_share_a_folder(tmp_path, data):
-    out = tmp_path / "out"
-    with lock_folder(out), pytest.raises(rd.InputError, match="another process"):
-        train_planner(planner_settings(data), str(out))
 
 
 @pytest.mark.parametrize("objective", OBJECTIVES)
@@ -309,6 +295,8 @@ def test_other_settings_and_a_damaged_checkpoint_are_refused(tmp_path, data):
     train_planner(planner_settings(data, samples=16), str(tmp_path / "out"))
     with pytest.raises(rd.InputError, match=r"learning_rate = 0\.003, now it is 0\.1"):
         train_planner(planner_settings(data, learning_rate=0.1), str(tmp_path / "out"))
+    with lock_folder(tmp_path / "out"), pytest.raises(rd.InputError, match="another process"):
+        train_planner(planner_settings(data), str(tmp_path / "out"))
     file = tmp_path / "out" / "training.safetensors"
     file.write_bytes(file.read_bytes()[:1000])
     with pytest.raises(rd.InputError, match=r"training\.safetensors is (damaged|no checkpoint)"):

@@ -100,12 +100,6 @@ def test_no_valid_sample_says_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> 
     assert result.refused == "scene_collision"
 
 
-def test_a_robot_without_weights_is_refused() -> None:
-    stranger = replace(PANDA, name="stranger")
-    with pytest.raises(rd.InputError, match="no weights of the network model come with"):
-        Diffusion().plan(rd.Problem(stranger, rd.Scene([BALL]), LEFT, rd.JointGoal(RIGHT[None])))
-
-
 def test_an_encoder_of_one_size_gets_clouds_of_that_size(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = DGCNNSettings(code=8, cloud=50, neighbors=4, edges=(8,), embedding=16, head=(16,))
     model = MotionNetwork(
@@ -148,3 +142,5 @@ def test_locked_joints_that_the_network_does_not_know_keep_the_weights() -> None
         robot = rd.load_robot("panda", locked={"panda_finger_joint1": opening})
         assert weights_for("model", robot) is not None and Diffusion().network(robot) is not None
     assert weights_for("model", rd.load_robot("panda", locked={"panda_joint7": 0.3})) is None
+    with pytest.raises(rd.InputError, match="no weights of the network model come with the package for"):
+        Diffusion().plan(replace(PROBLEM, robot=replace(PANDA, name="stranger")))

@@ -51,7 +51,7 @@ def test_a_start_that_is_hit_at_once_is_invalid_and_a_wall_that_comes_cannot_be_
     found = rd.load_planner("rrt_connect").plan(problem(at))
     assert found.status is rd.Status.INVALID_START and "touches ball" in found.reason
     wall = rd.MovingObstacle(rd.Box([0, 2.0, 0.5], [4, 0.1, 4], name="wall"), velocity=[0, -2.5, 0])
-    found = rd.load_planner("rrt_connect").plan(problem(wall), 3.0)
+    found = rd.load_planner("rrt_connect").plan(problem(wall), 1.0)
     assert found.status is rd.Status.TIMEOUT and "passes the moving obstacles" in found.reason
 
 
