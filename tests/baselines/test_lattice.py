@@ -17,7 +17,6 @@ from robotdiffuse.baselines.lattice import (
     DStarLiteSettings,
     LatticeSearch,
     Outcome,
-    lattice_moves,
 )
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free
@@ -222,14 +221,6 @@ def test_two_arms_do_not_outrun_the_time_limit(settings: AStarSettings | DStarLi
     assert running.run(stop) is Outcome.GOING
     edges = {1: 28, 2: 392}[settings.joints_per_move]
     assert np.diff(looks).min() > 0 and edges * np.diff(looks).max() <= 4000
-
-
-def test_moves_of_several_joints_are_all_once_few_joints_first() -> None:
-    for dof, joints in ((1, 1), (3, 2), (4, 4), (3, 7)):
-        half = lattice_moves(dof, joints)
-        every = {m for m in product((-1, 0, 1), repeat=dof) if 0 < sum(map(abs, m)) <= joints}
-        assert len(half) == len(every) / 2 and {*map(tuple, half), *map(tuple, -half)} == every
-        assert (np.diff(np.abs(half).sum(axis=1)) >= 0).all()
 
 
 def test_too_many_nodes_or_edges_are_refused() -> None:

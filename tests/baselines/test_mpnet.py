@@ -152,16 +152,6 @@ def test_dropout_is_on_in_planning_and_drawn_from_the_generator(weights: str) ->
     assert len(np.unique(states, axis=0)) == 8
 
 
-def test_ends_meet_where_nothing_is_in_the_way(weights: str) -> None:
-    one = planning(weights, wall_problem(Scene([])))
-    for path in one.between(one.starts, one.goals):
-        np.testing.assert_array_equal(path[[0, -1]], np.stack([LEFT, RIGHT]).astype(np.float32))
-        assert one.segments_free(path).all()
-    assert one.best().broken == 0
-    result = MPNet(MPNetPlannerSettings(weights)).plan(wall_problem(Scene([])), 10.0)
-    assert result.solved and len(result.path.positions) == 2
-
-
 def test_contraction_never_lengthens_and_stays_free(weights: str) -> None:
     one = planning(weights, wall_problem())
     over = np.array(

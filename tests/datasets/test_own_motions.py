@@ -14,28 +14,20 @@ PANDA = rd.load_robot("panda")
 START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 FLOOR = rd.Box([0, 0, -0.05], [3, 3, 0.1], name="floor")
 COUNT = 24
-
-
-@pytest.fixture
-def motions() -> list[np.ndarray]:
-    rng = np.random.default_rng(0)
-    return [START + np.linspace(0, 1, 5 + i)[:, None] * rng.uniform(-0.2, 0.2, 7) for i in range(COUNT)]
-
-
-@pytest.fixture
-def scenes() -> list[rd.Scene]:
-    return [rd.Scene([FLOOR, rd.Sphere([0.6, 0.01 * i, 0.9], 0.1)][: 1 + (i % 3 > 0)]) for i in range(COUNT)]
+RNG = np.random.default_rng(0)
+MOTIONS = [START + np.linspace(0, 1, 5 + i)[:, None] * RNG.uniform(-0.2, 0.2, 7) for i in range(COUNT)]
+SCENES = [rd.Scene([FLOOR, rd.Sphere([0.6, 0.01 * i, 0.9], 0.1)][: 1 + (i % 3 > 0)]) for i in range(COUNT)]
 
 
 def test_own_motions_are_a_data_set_like_any_other(
-    tmp_path: Path, motions: list[np.ndarray], scenes: list[rd.Scene], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    mixed = [rd.Path(PANDA.joint_names, motions[0]), motions[1].tolist(), *motions[2:]]
-    assert rd.write_dataset(mixed, scenes, tmp_path / "own", "panda", waypoints=48) == COUNT
+    mixed = [rd.Path(PANDA.joint_names, MOTIONS[0]), MOTIONS[1].tolist(), *MOTIONS[2:]]
+    assert rd.write_dataset(mixed, SCENES, tmp_path / "own", "panda", waypoints=48) == COUNT
     manifest = read_manifest(tmp_path / "own")
     assert (manifest.waypoints, manifest.slots, manifest.robot) == (48, 1, "panda")
     shard = check_shard(tmp_path / "own", 0, manifest)
-    np.testing.assert_allclose(shard["trajectories"][3][[0, -1]], motions[3][[0, -1]], atol=1e-6)
+    np.testing.assert_allclose(shard["trajectories"][3][[0, -1]], MOTIONS[3][[0, -1]], atol=1e-6)
     names = [shape.name for shape in problem_of(manifest, PANDA, shard, 1).scene.shapes]
     assert names == ["floor", "sphere"] and shard["line_free"][1]
     batch = next(iter(rd.RopDataset(tmp_path / "own").batches(4)))
@@ -43,17 +35,17 @@ def test_own_motions_are_a_data_set_like_any_other(
     assert run("data", "check", tmp_path / "own", "--workers", 1, "--no-pybullet") == 0
     assert "24" in capsys.readouterr().out
     with pytest.raises(rd.InputError, match="holds data already"):
-        rd.write_dataset(motions, scenes, tmp_path / "own", PANDA)
+        rd.write_dataset(MOTIONS, SCENES, tmp_path / "own", PANDA)
 
 
-def test_what_is_wrong_is_named(tmp_path: Path, motions: list[np.ndarray], scenes: list[rd.Scene]) -> None:
-    far = [*motions[:2], motions[2] + 9.0]
+def test_what_is_wrong_is_named(tmp_path: Path) -> None:
+    far = [*MOTIONS[:2], MOTIONS[2] + 9.0]
     for paths, around, message in (
-        ([], scenes[0], "paths is empty"),
-        ([[0.0] * 7], scenes[0], r"paths\[0\] is .* it must be n x 7 numbers"),
-        (far, scenes[:3], r"paths\[2\], row 0: panda_joint1 is 9 rad; its limits are -2.8973"),
-        (motions, scenes[:3], "scenes are 3; they must be one rd.Scene, or one for each of 24 paths"),
-        (motions[:1], rd.Scene([rd.Cylinder([1, 1, 1], 0.1, 0.1)]), "only spheres and boxes can be packed"),
+        ([], SCENES[0], "paths is empty"),
+        ([[0.0] * 7], SCENES[0], r"paths\[0\] is .* it must be n x 7 numbers"),
+        (far, SCENES[:3], r"paths\[2\], row 0: panda_joint1 is 9 rad; its limits are -2.8973"),
+        (MOTIONS, SCENES[:3], "scenes are 3; they must be one rd.Scene, or one for each of 24 paths"),
+        (MOTIONS[:1], rd.Scene([rd.Cylinder([1, 1, 1], 0.1, 0.1)]), "only spheres and boxes can be packed"),
     ):
         with pytest.raises(rd.InputError, match=message):
             rd.write_dataset(paths, around, tmp_path / "own")  # type: ignore[arg-type]

@@ -9,7 +9,7 @@ from robotdiffuse.core.transforms import rotation_from_quaternion
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.training.batches import random_scenes
 from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
-from robotdiffuse.scenes.surface_points import PANDA_REGION, sample_surface
+from robotdiffuse.scenes.surface_points import PANDA_REGION
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -45,6 +45,8 @@ def test_points_lie_on_surfaces():
         else:
             # float32 of coordinates of up to 1.5 m
             np.testing.assert_allclose(np.abs(depths(*scene)).min(0), 0, atol=1e-6)
+    near = surface_clouds(scenes, 200, seeded(), region=PANDA_REGION).numpy()
+    assert PANDA_REGION.holds(near[near.any((1, 2))]).all() and near.any((1, 2)).sum() > 20
 
 
 def test_uniform_by_area():
@@ -68,21 +70,6 @@ def test_uniform_by_area():
     heights = (cloud[~on_box] - params[0, 2, :3]) / 0.15
     np.testing.assert_allclose(heights.mean(0), 0, atol=4 / np.sqrt(3 * len(heights)))
     np.testing.assert_allclose(heights.T @ heights / len(heights), np.eye(3) / 3, atol=0.015)
-
-
-def test_agrees_with_the_clouds_of_single_scenes():
-    scenes = some_scenes(20, 5, 3)
-    n = 4000
-    rng = np.random.default_rng(0)
-    ours = surface_clouds(scenes, n, seeded(), region=PANDA_REGION).numpy()
-    single = [sample_surface(scenes.scene(i), n, rng, PANDA_REGION) for i in range(len(scenes))]
-    theirs = np.stack([points if len(points) else np.zeros((n, 3)) for points in single])
-    assert PANDA_REGION.holds(ours[ours.any((1, 2))]).all()
-    np.testing.assert_array_equal(ours.any((1, 2)), theirs.any((1, 2)))
-    # means and spreads of n points that are spread over up to 1.2 m, some of them repeated
-    for moment in (1, 2):
-        difference = (ours**moment).mean(1) - (theirs**moment).mean(1)
-        assert np.abs(difference).max() < 5 * 0.7 * np.sqrt(2 / (0.3 * n))
 
 
 def test_ordered_clouds_are_the_same_points():

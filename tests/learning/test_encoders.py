@@ -180,16 +180,6 @@ def test_arranged_clouds():
     torch.testing.assert_close(repeated, every.repeat_interleave(4, 1), atol=2e-6, rtol=0)
 
 
-def test_clouds_along_a_curve():
-    encoder = networks.CompressionAutoencoder(replace(SMALL_CAE, cloud=400))
-    loose = cloud(400, 5)
-    arranged = encoder.arrange(loose)
-    assert torch.equal(encoder.arrange(loose.flip(1)), arranged)
-    assert torch.equal(arranged.sum(1) != 0, loose.sum(1) != 0)
-    steps = [points.diff(dim=1).norm(dim=-1).mean() for points in (arranged, loose)]
-    assert steps[0] < 0.4 * steps[1]
-
-
 def test_edge_convolution_is_the_maximum_over_edges():
     """Against the layer as in the paper, edge by edge."""
     torch.manual_seed(0)

@@ -29,23 +29,6 @@ def best_predictor(schedule: NoiseSchedule) -> Callable[[np.ndarray, int], np.nd
     return predict
 
 
-def exact_flow(schedule: NoiseSchedule, x: np.ndarray) -> np.ndarray:
-    """Where the probability flow takes x from the last level: deviations along each principal axis scale."""
-    a = schedule.signal[-1]
-    s = schedule.noise[-1]
-    values, axes = np.linalg.eigh(COVARIANCE)
-    scale = np.sqrt(values / (a**2 * values + s**2))
-    return MEAN + (x - a * MEAN) @ (axes * scale) @ axes.T
-
-
-def flow_errors(name: str, schedule: NoiseSchedule, steps: list[int]) -> np.ndarray:
-    noise = np.random.default_rng(0).standard_normal((64, 2))
-    exact = exact_flow(schedule, noise)
-    predict = best_predictor(schedule)
-    samples = [SAMPLERS.load(name)(predict, schedule, lambda: noise, n, 0.0) for n in steps]
-    return np.array([np.sqrt(((x - exact) ** 2).mean()) for x in samples])
-
-
 def exact_moments(
     name: str, schedule: NoiseSchedule, steps: int, eta: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -66,13 +49,6 @@ def exact_moments(
 
 def slope(steps: list[int], errors: np.ndarray) -> float:
     return -np.polyfit(np.log(steps), np.log(errors), 1)[0]
-
-
-def test_order_of_ddim() -> None:
-    steps = [32, 64, 128, 256]
-    errors = flow_errors("ddim", cosine_schedule(8192), steps)
-    assert (np.diff(errors) < 0).all()
-    assert slope(steps, errors) > 0.95
 
 
 @pytest.mark.parametrize("name", SAMPLERS)

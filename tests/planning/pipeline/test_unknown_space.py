@@ -6,17 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from jaxtyping import Float32
 from numpy import ndarray
 
 import robotdiffuse as rd
-from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.types import FIRST
-from robotdiffuse.perception import voxel_grid
 from robotdiffuse.perception.depth_view import SeenPoints
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
 from robotdiffuse.perception.unknown_space import CARVING_MARGIN, PADDINGS, RATES, OccupiedVoxels, Padded
+from robotdiffuse.perception.voxel_grid import COARSE, FINE
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.pipeline import attempt, unknown_space
 from robotdiffuse.planning.planner import Planner
@@ -45,10 +43,6 @@ def partial(unknown: str, *views: rd.DepthView) -> rd.Problem:
     return rd.Problem(PANDA, rd.Scene(), START, GOAL, views=views or (taken(DEEP),), unknown=unknown)
 
 
-def true_voxels() -> Float32[ndarray, "nx ny nz"]:
-    return voxels_within(DEEP, voxel_grid.FINE).astype(np.float32)
-
-
 @pytest.mark.parametrize("unknown", ["optimistic", "padded", "occupied"])
 def test_solved_means_free_of_what_was_seen(planner: Planner, unknown: str) -> None:
     problem = partial(unknown)
@@ -65,9 +59,10 @@ def test_solved_means_free_of_what_was_seen(planner: Planner, unknown: str) -> N
 def test_predicted_obstacles_are_kept_clear_of(planner: Planner, tmp_path: Path) -> None:
     """As seen, the path leads through the back of the box; with its voxels predicted, past it."""
     truth = rd.Problem(PANDA, DEEP, START, GOAL)
+    true = voxels_within(DEEP, FINE).astype(np.float32)
     through = planner.plan(partial("optimistic"), time_limit=2.0)
     assert through.path is not None and not rd.verify(truth, through.path).valid
-    past = unknown_space.plan_with_unknown_space(planner, partial("predicted"), REQUEST, true_voxels())
+    past = unknown_space.plan_with_unknown_space(planner, partial("predicted"), REQUEST, true)
     assert past.assumption == "predicted, p > 0.1" and past.swept_probability == 0
     assert past.path is not None and rd.verify(truth, past.path).valid
     assert past.confidence is not None and through.confidence is not None
@@ -79,17 +74,14 @@ def test_predicted_obstacles_are_kept_clear_of(planner: Planner, tmp_path: Path)
 
 
 def test_of_several_motions_the_one_that_sweeps_least_probability(planner: Planner) -> None:
-    everywhere = np.full(voxel_grid.FINE_SHAPE, np.float32(0.01))
+    everywhere = np.full(FINE.shape, np.float32(0.01))
     problem = partial("predicted")
     chosen = unknown_space.plan_with_unknown_space(planner, problem, REQUEST, everywhere)
     first = attempt(planner, replace(problem, views=()), PlanRequest(1.0))
     unknown = observe(problem.views, PANDA, START).unknown.repeat(2, 0).repeat(2, 1).repeat(2, 2)
-    ends = np.concatenate([placed_spheres(PANDA, q) for q in (START, GOAL)]).astype(np.float32)
-    assert first.path is not None and chosen.swept_probability is not None
-    swept = voxel_grid.FINE.swept(PANDA, first.path)
-    assert chosen.swept_probability <= 0.01 * (swept & unknown & ~voxel_grid.FINE.within(ends)).sum() * (
-        1 + 1e-3
-    )
+    crossed = FINE.swept(PANDA, first.path) & unknown & ~FINE.filled(PANDA, (START, GOAL))
+    assert chosen.swept_probability is not None
+    assert chosen.swept_probability <= 0.01 * crossed.sum() * (1 + 1e-3)
 
 
 def test_occupied_crosses_nothing_unknown_but_at_the_ends(planner: Planner) -> None:
@@ -100,13 +92,9 @@ def test_occupied_crosses_nothing_unknown_but_at_the_ends(planner: Planner) -> N
     problem = replace(partial("occupied", *views), goal=near)
     result = planner.plan(problem, time_limit=20.0, until=FIRST)
     assert result.assumption == "unknown is occupied" and result.confidence == RATES["unknown is occupied"]
-    ends = np.concatenate([placed_spheres(PANDA, q) for q in (START, near)]).astype(np.float32)
-    swept = np.zeros(voxel_grid.SHAPE, np.bool_)
-    path = result.path.positions.astype(np.float32)
-    voxel_grid.sweep(compile_robot(PANDA), path, np.float32(0), *voxel_grid.COARSE.frame, swept)
-    filled = voxel_grid.COARSE.within(ends, CARVING_MARGIN + voxel_grid.VOXEL / 2)
+    filled = COARSE.filled(PANDA, (START, near), CARVING_MARGIN + COARSE.edge / 2)
     unknown = observe(problem.views, PANDA, START).unknown & ~filled
-    assert unknown.any() and not (swept & unknown).any()
+    assert unknown.any() and not (COARSE.swept(PANDA, result.path) & unknown).any()
 
 
 def test_an_end_in_what_was_seen_is_named_which_may_be_the_arm_itself(planner: Planner) -> None:
@@ -121,11 +109,10 @@ def test_an_end_in_what_was_seen_is_named_which_may_be_the_arm_itself(planner: P
 
 def test_assumptions_are_carved_free_at_the_ends() -> None:
     ends = np.concatenate([placed_spheres(PANDA, q) for q in (START, GOAL)]).astype(np.float32)
-    solid = np.ones(voxel_grid.FINE_SHAPE, np.bool_)
+    solid = np.ones(FINE.shape, np.bool_)
     volume = observe([taken(DEEP)], PANDA, START)
-    chain = [
-        a for p in ("padded", "occupied") for a in unknown_space.assumptions_of(partial(p), volume, None)
-    ]
+    policies = ("padded", "occupied")
+    chain = [one for p in policies for one in unknown_space.assumptions_of(partial(p), volume, None)]
     assert [assumption.padding for assumption in chain if isinstance(assumption, Padded)] == list(PADDINGS)
     for assumption in (*chain, OccupiedVoxels("all", solid, PANDA, rd.Scene())):
         cloud = assumption.obstacles(ends)
@@ -161,7 +148,7 @@ def test_the_default_policy_is_prediction_where_the_network_covers_the_reach() -
 
 
 def test_a_fallback_to_another_assumption_is_a_note(planner: Planner) -> None:
-    everywhere = np.ones(voxel_grid.FINE_SHAPE, np.float32)
+    everywhere = np.ones(FINE.shape, np.float32)
     result = unknown_space.plan_with_unknown_space(planner, partial("predicted"), REQUEST, everywhere)
     assert result.assumption == unknown_space.AS_SEEN
     assert "predicted, p > 0.1" in result.notes[-1] and "unknown space taken as free" in result.notes[-1]
