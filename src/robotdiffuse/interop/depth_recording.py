@@ -144,8 +144,8 @@ def read_depth_views(
         robot: The robot whose joint states it holds.
         topics: Topics of the images; None: all with depth images (32FC1 in m, 16UC1 or mono16 in mm).
         base: The frame of the arm's base in the file; None: `robot.base`.
-        T_base_camera: The pose of a camera that stands [4, 4], in place of the file's transforms. Views of a
-            file without joint states have no configuration then.
+        T_base_camera: The pose of a fixed camera [4, 4], in place of the file's transforms. Views of a file
+            without joint states have no configuration then.
 
     Raises:
         InputError: For a file that is damaged or holds no depth images, if no image has joint states and

@@ -30,15 +30,17 @@ from robotdiffuse.perception.visibility import surface_balls
 from robotdiffuse.robots.robot import Robot
 
 GATES = np.geomspace(0.15, 0.012, 25)
-"""Points farther from the arm than this do not count, in rounds of the estimate [m]."""
+"""One distance for each round of the estimate, falling [m]: points farther from the arm than this are ignored
+in the round."""
 MAX_POINTS = 1500
-"""Points of a view that an estimate uses."""
+"""Approximate number of points of a view that an estimate uses."""
 MODEL_CELL = 0.01
 """One point of the arm's surface is used for each cell of this edge [m]."""
 NEIGHBORS = 10
-"""Points of the surface that its normal is estimated from."""
+"""Number of neighboring points of the surface from which a normal is estimated."""
 POINTS_PER_ERROR = 25
-"""So many neighboring points have about one error in common."""
+"""Errors of neighboring points are correlated: in the covariance, this many points count as one independent
+measurement."""
 
 
 def offset(first: Pose, second: Pose) -> tuple[float, float]:
@@ -55,7 +57,8 @@ class CameraCalibration:
     covariance: Float[ndarray, "6 6"]
     """Of the position [m] and the rotation vector [rad] of the camera, in the base frame."""
     agreement: float
-    """Part of the image cells with the arm in them that have its depth."""
+    """Of the image cells in which the arm should be visible, the share whose measured depth is that of the
+    arm's model."""
 
     @property
     def pose_deviation(self) -> tuple[float, float]:
@@ -67,19 +70,20 @@ class CameraCalibration:
 
 
 def calibrate_camera(views: Sequence[DepthView], robot: Robot) -> CameraCalibration:
-    """Estimate the pose of a camera that stands, from views of the arm in several configurations.
+    """Estimate the pose of a fixed camera from views of the arm in several configurations.
 
     Args:
-        views: Depth images of one camera, each with the arm's configuration. Their `T_base_camera` is where
-            the search begins: within about 10 cm and 5 degrees, or one of the usual mistakes away.
+        views: Depth images of one camera, each with the arm's configuration. The search begins at their
+            `T_base_camera`. It must be within about 10 cm and 5 degrees of the true pose, or become so once
+            one of the usual mistakes is undone (an inverse, the axes of OpenGL, ...).
         robot: The robot in the images.
 
     Returns:
         The pose, its covariance, and how well the images agree with it.
 
     Raises:
-        InputError: Without views, for views of several poses or without a configuration, where the arm is
-            not seen, and where no pose nearby agrees with the images.
+        InputError: If there are no views, if they differ in `T_base_camera`, if one lacks a configuration, if
+            the arm is hardly seen, or if no pose nearby agrees with the images.
 
     Example:
         ```python
@@ -90,13 +94,11 @@ def calibrate_camera(views: Sequence[DepthView], robot: Robot) -> CameraCalibrat
     each = [(view, view.configuration) for view in views if view.configuration is not None]
     if not each or len(each) < len(views):
         raise InputError(
-            f"{len(each)} of {len(views)} views have a configuration; calibrate_camera needs it of each"
+            f"{len(each)} of {len(views)} views have a configuration; calibrate_camera needs one for each"
         )
     first, q = each[0]
     if any(not np.allclose(view.T_base_camera, first.T_base_camera) for view in views):
-        raise InputError(
-            "views differ in T_base_camera; calibrate_camera takes those of one camera that stands"
-        )
+        raise InputError("views differ in T_base_camera; calibrate_camera takes views of one fixed camera")
     begins = [first, *(other for _, other in mistakes(first) if other.intrinsics == first.intrinsics)]
     scores = [share * (count >= MIN_CELLS) for share, _, count in (agreement(v, robot, q) for v in begins)]
     best = int(np.argmax(scores))
@@ -131,7 +133,8 @@ def calibrate_camera(views: Sequence[DepthView], robot: Robot) -> CameraCalibrat
     if agrees < MIN_NAMED:
         raise InputError(
             f"no pose near T_base_camera agrees with the images: the best explains {100 * agrees:.0f} % of "
-            "the arm's depths; begin nearer, or check the intrinsics and the joint positions"
+            "the arm's depths; set T_base_camera of the views closer to the true pose, or check the "
+            "intrinsics and the joint positions"
         )
     return CameraCalibration(T, POINTS_PER_ERROR * spread**2 * np.linalg.inv(hessian), agrees)
 

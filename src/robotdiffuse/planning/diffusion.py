@@ -1,17 +1,19 @@
 """The diffusion model alone: encoder, sampling, guidance, without search.
 
 The scene's point cloud is encoded; trajectories from start to goal are sampled by the diffusion model, under
-collision guidance; every sample goes to the validator as it is, and the shortest valid one is the answer.
-Where none is valid, the next batch is drawn from new noise, until time runs out. There is no straight line,
-no search, no refinement, and nothing is shortened: what this planner solves, the network and its guidance
-solve. With the settings samples=1, guidance_steps=0, repeat=false and weights of config `paper`, which have
-no clearances as inputs, it does only what the paper says.
+collision guidance; every sample goes to the validator, and the shortest valid one is returned. If none is
+valid, the next batch is drawn from new noise, until time runs out. There is no straight line, no search, no
+refinement, and nothing is shortened: what this planner solves, the network and its guidance solve. With the
+settings samples=1, repeat=false and weights of config `paper`, which do not take clearances as inputs, it
+does only what the paper says; with guidance_steps=0 too, it is the row JPC of the paper's Table 2, which has
+no guidance.
 
-Path constraints are one more cost of guidance, and each waypoint of a sample is projected onto them before
-validation, which proves them between the waypoints too. The network was trained without constraints.
+Path constraints are one more cost of guidance. Before validation, the inner waypoints of each sample are
+projected onto the constraints; the validator proves that the constraints hold between the waypoints too. The
+network was trained without constraints.
 
-The weights name the sampler and the number of steps, unless the settings do. With `guidance_steps` 0 the
-network runs without guidance.
+The sampler and the number of its steps are those stored with the weights, unless the settings give others.
+With guidance_steps=0 the network runs without guidance.
 """
 
 from dataclasses import dataclass, field, replace
@@ -41,21 +43,22 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class DiffusionSettings(SamplingSettings, LearnedSettings, name="diffusion"):
     guidance_steps: Natural = 8
-    """Gradient steps at each guided denoising step."""
+    """Number of gradient steps at each guided denoising step."""
     points: Count = 320
-    """Points of the encoder's input cloud (paper: 1,400), unless it takes clouds of one size."""
+    """Number of points in the encoder's input cloud (paper: 1,400); ignored if the encoder needs a fixed
+    number."""
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
     optimize_time: NotNegative = 0.0
     """Time for more batches after the first one with a valid sample [s]; the shortest of all is returned."""
     repeat: bool = True
-    """Whether more batches are drawn where the validator accepts no sample of the first (the paper: no)."""
+    """Whether more batches are drawn if the validator accepts no sample of the first one (the paper: no)."""
 
 
 def encode(
     model: "MotionModel", checker: CollisionChecker, points: int, rng: np.random.Generator
 ) -> Float[ndarray, "code"]:
-    """The encoding z of a scene: its point cloud of `points` points through the frozen encoder, unless the
-    encoder has a fixed size."""
+    """The embedding z of a scene: a cloud of `points` points on its surfaces, or as many as the encoder
+    needs, encoded by the frozen encoder."""
     of_encoder = model.settings.encoder_settings
     assert of_encoder is not None  # unconditional priors are not used by these planners
     count = points if of_encoder.any_size else of_encoder.cloud
@@ -63,8 +66,8 @@ def encode(
 
 
 def _projected(constraints: PathConstraints, path: Configurations) -> Configurations:
-    """The path with its inner waypoints projected onto the constraints; the path itself, for the validator to
-    refuse, if the projection of one fails."""
+    """The path with its inner waypoints projected onto the constraints. If the projection of a waypoint
+    fails, the path itself, which the validator will refuse."""
     between = constraints.projected(path[1:-1], TOLERANCE_FRACTION)
     return np.concatenate([path[:1], between, path[-1:]]) if len(between) == len(path) - 2 else path
 

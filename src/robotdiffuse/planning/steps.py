@@ -27,9 +27,10 @@ Contacts = Mapping[str, Sequence[str] | str]
 TIP = "tip"
 WORLD = "world"
 LINE_TIME_LIMIT = 0.3
-"""Longest time for one straight line, while another end of an earlier step may be tried instead [s]."""
+"""Time limit for planning one straight line [s], if an earlier `MoveTo` step could be planned again to end in
+another configuration."""
 SAME_END = 0.1
-"""Ends of a motion differ by more than this in at least one joint [rad] or [m]."""
+"""Two end configurations of a step count as the same if no joint differs by more than this [rad] or [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +38,8 @@ class MoveTo:
     """A step of `Workspace.plan_steps`: move around the obstacles to a goal."""
 
     goal: Any
-    """A pose [4, 4] in the frame of the world, or several [n, 4, 4], any of which may be reached; or another
-    goal as of `Workspace.plan`."""
+    """A pose [4, 4] in the frame of the world, or several [n, 4, 4], any of which may be reached; or any
+    other goal that `Workspace.plan` takes."""
     link: str | None = None
     """The link or held object that poses are of; None: the tip of the workspace."""
     constraints: Sequence[Constraint] = ()
@@ -51,12 +52,12 @@ class MoveTo:
 
 @dataclass(frozen=True, eq=False)
 class MoveRelative:
-    """A step of `Workspace.plan_steps`: move the tip along a straight line, without a turn."""
+    """A step of `Workspace.plan_steps`: move the tip along a straight line and keep its orientation."""
 
     xyz: ArrayLike
     """How far to move [3] [m]."""
     frame: str = TIP
-    """Whose axes `xyz` is along: "tip" or "world"."""
+    """The frame in whose axes `xyz` is given: "tip" or "world"."""
     tolerance: float = 0.001
     """Largest distance of the tip from the line [m]."""
     contacts: Contacts = field(default_factory=dict)
@@ -88,8 +89,7 @@ class Attach:
 
 @dataclass(frozen=True, eq=False)
 class Detach:
-    """A step of `Workspace.plan_steps`: the robot lets a held object go, which is an obstacle from then
-    on."""
+    """A step of `Workspace.plan_steps`: the robot releases a held object, which then is an obstacle."""
 
     held: str
     """Name of the object."""
@@ -111,9 +111,9 @@ class StepsResult:
     workspace: Any
     """The `Workspace` after these steps: where obstacles are then, and what the robot holds."""
     reason: str
-    """A sentence to act on; of a failure it begins with the step."""
+    """What happened, in a sentence; if a step failed, it begins with this step and says why."""
     planning_time: float
-    """Wall time of the call, without that for loading code [s]."""
+    """Wall time of the call, without the time for loading code [s]."""
 
     def __repr__(self) -> str:
         outcome = "solved" if self.solved else "failed"
@@ -139,13 +139,15 @@ class StepsResult:
 
     @property
     def begins(self) -> Float[ndarray, "steps"]:
-        """When each step begins in `trajectory` [s]: those of `Attach` and `Detach` are when the gripper
+        """When each step begins in `trajectory` [s]; for `Attach` and `Detach`, this is when the gripper
         acts."""
-        durations = [0.0 if one is None or not one.solved else one.duration for one in self.results]
+        durations = [
+            result.duration if result is not None and result.solved else 0.0 for result in self.results
+        ]
         return np.cumsum([0.0, *durations])[:-1]
 
     def goal_index(self, name: str) -> int:
-        """Which of the goals of a step its motion ends at, from 0 on.
+        """Index of the goal at which the motion of a step ends, counted from 0.
 
         Args:
             name: Name of a `MoveTo` step.
@@ -162,8 +164,8 @@ class StepsResult:
 def plan_steps(
     space: Any, steps: Sequence[Step], start: AnyConfiguration, time_limit: float, **request: Any
 ) -> StepsResult:
-    """See `Workspace.plan_steps`. Where a step fails, the last step before it that can end elsewhere, at
-    another goal or in another configuration, is planned again."""
+    """See `Workspace.plan_steps`. If a step fails, the last step before it that can end at another goal or in
+    another configuration is planned again."""
     began = clock()
     check_type("steps", steps, (list, tuple), "a list of steps")
     for i, step in enumerate(steps):
@@ -207,7 +209,8 @@ def plan_steps(
     def planned(
         k: int, space: Any, q: Configuration, results: tuple[PlanResult | None, ...]
     ) -> StepsResult | None:
-        """A result for all steps, of which the first k are planned; None if one of the others fails."""
+        """A result for all steps, of which the first k are planned already; None if one of the others
+        fails."""
         nonlocal furthest, others
         if k == len(steps):
             return StepsResult(tuple(steps), results, space, f"solved in {k} steps", clock() - began)

@@ -1,9 +1,10 @@
 """The planners RRT-Connect and AORRTC, and their anytime search: rounds of two trees find a first path and
 shorter ones; paths are validated on the way.
 
-Rounds run at falling clearances. Those of AORRTC grow new trees with paths little longer than the best one
-known; the path that a round finds is simplified and tightened, and bounds the next round if it is the
-shortest. Those of RRT-Connect are restarts without a bound.
+If rounds find no path, the next ones require a smaller clearance. In a round of AORRTC, new trees keep only
+nodes through which a path of at most BOUND_FACTOR times the best known length can still run; the path that
+the round finds is simplified and tightened, and bounds the next round if it is the shortest. The rounds of
+RRT-Connect are restarts without a bound.
 
 With the objective "length" a call returns the shortest path found. With "time", every path found is also
 the start of a local search for a faster motion, and the call returns the motion that takes the least time.
@@ -42,52 +43,58 @@ from robotdiffuse.trajectories.simplification import simplify, tighten
 from robotdiffuse.trajectories.speed_limits import scaled_limits
 
 MIN_CLEARANCE = 0.002
-"""Clearance that is tried even if none is requested [m]: telling contact from near contact is costly, and
-paths are hardly longer."""
+"""Clearance that is tried before 0, even if none is requested [m]: with it, collision checks need not tell
+contact from near contact, which is costly, and paths become hardly longer."""
 FALLING_FRACTIONS = (1.0, 0.5, 0.25)
-"""Fractions of a clearance that are tried; after those of one above the default clearance, the default's."""
+"""Fractions of the requested clearance that are tried in turn. If it is above the default clearance, its
+fractions above the default come first, then those of the default."""
 ITERATIONS_PER_CLEARANCE = 400
-"""Iterations at a clearance before the next lower one is tried."""
+"""Number of iterations at a clearance before the next lower one is tried."""
 BOUND_FACTOR = 1.15
-"""The length bound of a round is this factor of the best length: unsimplified tree paths are longer than
-simplified ones, so with a tight bound the trees would miss shorter ways than a long detour."""
+"""The length bound of a round is this factor times the best length. Paths of trees are longer before they are
+simplified: if the best path is a long detour, a bound of just its length could exclude another way that is
+shorter once it is simplified."""
 TIGHTENING_FACTOR = 1.05
-"""Paths longer than this factor of the best length are not tightened: tightening shortens by less."""
+"""A path longer than this factor times the best length is not tightened: tightening would not make it shorter
+than the best one."""
 OPTIMALITY_TOLERANCE = 1e-4
-"""A path that exceeds the straight line by no more than this part is optimal."""
+"""A path whose length exceeds that of the straight line by no more than this fraction is optimal."""
 NEAR_FACTOR = 1.3
-"""Paths up to this factor of the best length may become the fastest motion."""
+"""Paths of at most this factor times the best length may become the fastest motion."""
 LONG_ROUND_FACTOR = 5
 """If the first round finds no path, rounds have this many times as many iterations until there is one: larger
 trees find a narrow passage sooner than new ones."""
 VALIDATION_INTERVAL = 4_000
-"""Iterations between two validations of shorter paths. Validating only at the end could lose everything found
-since the last valid path."""
+"""Number of iterations between two validations of shorter paths. Validating only at the end could lose
+everything found since the last valid path."""
 ATTEMPTS_PER_ITERATION = 0.2
-"""Attempts to make a motion faster per iteration of the search; both then take about the same time."""
+"""Number of attempts to make a motion faster, per iteration of the search; attempts and iterations then take
+about the same time."""
 ATTEMPTS_AFTER_SEARCH = 200
-"""Attempts between two checks whether to go on, once the search has ended."""
-# With until "converged", attempts end when doubling them reduced the time by less than this part, but not
-# before this many.
+"""Number of attempts between two checks whether to go on, once the search has ended."""
+# With until="converged", attempts end once doubling their number has reduced the motion's time by less than
+# the fraction TIME_GAIN, but not before TIME_PATIENCE attempts.
 TIME_GAIN = 0.0025
 TIME_PATIENCE = 1_600
 MIN_TIME_GAIN = 0.01
-"""A faster motion is validated before the search ends if its estimated time is less by this part."""
+"""While the search goes on, a motion is validated only if its estimated time is below that of the best
+validated motion by at least this fraction."""
 MAX_DETOUR = 1.05
-"""To a pose, whose nearest configuration a straight line reaches, motions are at most this factor longer."""
+"""If a goal is a pose: once there is a motion no longer than this factor times the straight line to the
+nearest goal configuration, only such motions are kept."""
 FINAL_CANDIDATES = 2
 """Number of valid motions of which the fastest is returned, if there is time to validate as many."""
 END_MARGIN = 1e-6
 """Under path constraints, tolerances are widened to the values at the start and the goals, plus this
 margin."""
 PATHS_TO_FIND = 2
-"""Number of paths that RRT-Connect, or any search under path constraints, finds with until "converged"; the
+"""Number of paths that RRT-Connect, or any search under path constraints, finds with until="converged"; the
 best is returned."""
 STRAIGHT_EXCESS = 0.02
-"""Under path constraints, a path is the shortest if it exceeds the straight line by no more than this
-part."""
+"""Under path constraints, a path counts as the shortest if its length exceeds that of the straight line by no
+more than this fraction."""
 SHORTCUTS = 60
-"""Under path constraints, shortcuts that are tried on each path found."""
+"""Under path constraints, number of shortcuts that are tried on each path found."""
 
 
 @dataclass(frozen=True)
@@ -100,12 +107,13 @@ class SearchSettings(Settings):
     """No point of the arm moves further than this between two checks of a motion [m]; the validator's
     certificate covers the rest. The search halves it after a path that the validator refuses."""
     smoothings: Natural = 1
-    """Rounds of smoothing for each path found."""
+    """Number of rounds of smoothing for each path found."""
     tightenings: Natural = 200
-    """Attempts to shorten each path but the first by small moves of its waypoints."""
+    """Number of attempts to shorten a path by small moves of its waypoints. The first path is shortened only
+    once there is time to improve it."""
     iterations: Count = 20_000
-    """Most iterations of a round; its trees hold at most as many nodes. Five times as many where the first
-    round finds no path."""
+    """Largest number of iterations of a round, and of nodes in its trees. If the first round finds no path,
+    the next ones have five times as many."""
     keep_trees: bool = False
     """Whether results hold the trees of the search, for drawing."""
 
@@ -117,9 +125,9 @@ class AnytimeSearch:
     """
 
     clock_interval = 100
-    """Iterations between two calls of `stop`."""
+    """Number of iterations between two calls of `stop`."""
     spare_nodes = 0
-    """Nodes that an iteration may add to a tree besides one."""
+    """How many nodes beyond one an iteration may add to a tree."""
     limits: tuple | None = None
     """Path constraints that the edges of trees keep."""
 
@@ -135,12 +143,10 @@ class AnytimeSearch:
         stop: Callable[[], bool] = lambda: False,
         improved: Callable[[float], None] = lambda length: None,
     ) -> None:
-        """
-        name: the stage that results name for paths found here.
-        clearances: clearances to try, falling [m].
-        bounded: whether rounds search below a bound on length (AORRTC); False: they are restarts.
-        tries: iterations without a path before the next clearance is tried.
-        improved: called with the length [rad] of each path that is the best so far.
+        """name: what results give as the `stage` of paths that this search finds. clearances: clearances to
+        try, falling [m]. bounded: whether rounds search below a bound on length (AORRTC); False: they are
+        restarts. tries: iterations without a path before the next clearance is tried. improved: called with
+        the length [rad] of each path that is the best so far.
         """
         self.start_goal = start_goal
         self.settings = settings
@@ -151,9 +157,9 @@ class AnytimeSearch:
         """The shortest path so far, free at the resolution of the search."""
         self.length = np.float32(np.inf)
         self.stage = ""
-        """The stage that it comes from."""
+        """The stage that found the best path."""
         self.work = 0
-        """Iterations so far."""
+        """Number of iterations so far."""
         self.found = 0
         """Number of paths that the search found."""
         self.history = list[tuple[ndarray, str]]()
@@ -162,15 +168,17 @@ class AnytimeSearch:
         """The fastest motions near the paths found, if the objective is time."""
         self._lengths = list[tuple[int, float]]()
         self._untightened = False
-        """Whether the best path is not tightened yet: the first one is, once there is time to improve it."""
+        """Whether the best path still has to be tightened. The first path is tightened later, when there is
+        time to improve it."""
         self._shortens = True
         """Whether paths are simplified, and straight lines tried."""
         self._state = random_state(seed)
         self._trees: rrt_kernel.Trees | None = None
         self._round_end = 0
-        """The work at which the trees are given up."""
+        """The number of iterations (`work`) after which the present trees are dropped."""
         self._grown: rrt_kernel.Trees | None = None
-        """The trees that found the shortest path of the search; those that grow until there is one."""
+        """The trees that found the shortest path so far; before there is a path, the trees that are
+        growing."""
         self._clearances = clearances
         self._tries = tries
         self._stop = stop
@@ -208,10 +216,11 @@ class AnytimeSearch:
         """Whether no path to any goal can be shorter."""
         return self._near_straight(OPTIMALITY_TOLERANCE)
 
-    def _near_straight(self, part: float) -> bool:
-        """Whether the best path exceeds the straight line by no more than this part."""
+    def _near_straight(self, fraction: float) -> bool:
+        """Whether the length of the best path exceeds that of the straight line by no more than the fraction
+        `part`."""
         straight = np.linalg.norm(self.goals - self.start, axis=1).min()
-        return bool(self.length <= straight * (1 + part))
+        return bool(self.length <= straight * (1 + fraction))
 
     @property
     def trees(self) -> tuple[Tree, ...]:
@@ -246,8 +255,8 @@ class AnytimeSearch:
             self._iterate()
 
     def improves(self, gain: float, patience: int) -> bool:
-        """Whether to search on: the last doubling of the work shortened the path by at least the part `gain`,
-        or there were fewer than `patience` iterations."""
+        """Whether to go on searching: the last doubling of the number of iterations shortened the path by at
+        least the fraction `gain`, or there were fewer than `patience` iterations."""
         return still_improves(self._lengths, self.work, float(self.length), gain, patience)
 
     def offer(self, path: Configurations, stage: str) -> bool:
@@ -283,8 +292,8 @@ class AnytimeSearch:
 
     def refuse(self, accepted: Configurations | None) -> None:
         """Halve the resolution after the validator refused the best path, and go back to the last accepted
-        one. At the finest resolution, paths stay as they are found from then on: shortened, they could all
-        become the refused one."""
+        one. Once the finest resolution is reached, further paths are not shortened, because shortening could
+        turn each of them into the refused path again."""
         finer = finer_resolution(self.settings.resolution)
         self._shortens = finer < self.settings.resolution
         self.settings = replace(self.settings, resolution=finer)
@@ -374,8 +383,8 @@ class ConstrainedSearch(AnytimeSearch):
 
     @property
     def shortest(self) -> bool:
-        """Whether no path can be shorter by more than a small part: the constraints hardly bend the straight
-        line."""
+        """Whether no path can be shorter by more than a small fraction, because the constraints hardly bend
+        the straight line."""
         return self._near_straight(STRAIGHT_EXCESS)
 
     def keeps_clearance(self, q: Configurations) -> bool:
@@ -409,8 +418,8 @@ class ConstrainedSearch(AnytimeSearch):
 
 
 def usual_clearances(wanted: float) -> list[float]:
-    """The clearances that a search tries one after the other [m]: the wanted one and fractions of it, the
-    default one's if that is less, MIN_CLEARANCE and 0."""
+    """The clearances that a search tries in turn, falling [m]: the wanted one and its fractions; if it is
+    above the default clearance, then also the default and its fractions; last MIN_CLEARANCE and 0."""
     falling = [share * wanted for share in FALLING_FRACTIONS]
     if wanted > DEFAULT_CLEARANCE:
         usual = [share * DEFAULT_CLEARANCE for share in FALLING_FRACTIONS]
@@ -428,7 +437,7 @@ class _Validation:
         self._by_time = context.request.objective == TIME
         self._path: ndarray | None = None
         self._shortest: PlanResult | None = None
-        """The last valid path of the search, and its result."""
+        """Result of the last valid path of the search, which is `_path`."""
         self._timed = list[ndarray]()
         """The paths of the search that were validated."""
         self._validated_at = 0
@@ -440,8 +449,8 @@ class _Validation:
         """Whether to validate now: the first path at once, better ones every VALIDATION_INTERVAL iterations,
         or at once under path constraints."""
         interval = 0 if self.context.problem.constraints else VALIDATION_INTERVAL
-        rested = self.search.work >= self._validated_at + interval
-        return self.best is None or (rested and self._improved())
+        interval_passed = self.search.work >= self._validated_at + interval
+        return self.best is None or (interval_passed and self._improved())
 
     def _improved(self) -> bool:
         motions = self.search.motions
@@ -472,9 +481,11 @@ class _Validation:
         return False
 
     def run_last(self) -> None:
-        """Make the best result the fastest of the best motions found and of the shortest path's.
+        """Choose the final result: the fastest among the best motions found and the motion along the shortest
+        path.
 
-        Results before these count only if time ran out, or else the clock would decide which is returned.
+        Results validated before count only if time ran out: when they were validated depends on the clock,
+        and the same seed must give the same result.
         """
         search = self.search
         motions = self.search.motions
@@ -504,7 +515,9 @@ class _Validation:
         self._timed.append(path)
         paths = [self.search.start_goal.complete(path, direct) for direct in (True, False)]
         result = None
-        if len(paths[0]) < len(paths[1]):  # covering spheres touch at an end, but the meshes may be free
+        if len(paths[0]) < len(
+            paths[1]
+        ):  # shorter without a configuration beside the start or goal, where spheres collide
             result = self._finished(paths[0], stage, None)
         if result is None:
             result = self._finished(paths[1], stage, None)
@@ -517,7 +530,8 @@ class _Validation:
         start_goal = self.search.start_goal
         max_deviation = self.context.timing.corner_deviation
         path = start_goal.complete(candidate.path)
-        # the exact start or goal may be added beside the ends of the search
+        # `complete` may have added the exact start before the search's first waypoint, or the goal after its
+        # last
         deviations = np.full(len(path), max_deviation)
         begins = start_goal.start_lead
         assert begins is not None  # else there would be no path
@@ -535,8 +549,8 @@ class _Validation:
             used_cm = 100 * search.clearance
             target_cm = 100 * target_clearance
             notes = (
-                f"searched with a clearance of {used_cm:.2g} cm, not {target_cm:.2g} cm: "
-                "no path was found with that",
+                f"no path was found with a clearance of {target_cm:.2g} cm; "
+                f"this one was searched with {used_cm:.2g} cm",
             )
         result = self.context.finish(path, stage, notes=notes, keeps=keeps, deviations=deviations)
         self._keep(result)
@@ -612,14 +626,14 @@ def anytime(
 
 
 IMPROVEMENT_STEP = 1_000
-"""Iterations of AORRTC between two checks whether to search on."""
+"""Number of iterations of AORRTC between two checks whether to go on searching."""
 
 
 @dataclass(frozen=True)
 class AORRTCSettings(SearchSettings, name="aorrtc"):
     gain: Annotated[float, Bound(least=0.0, below=1.0)] = 0.0025
-    """With until "converged", the search ends when doubling its work shortened the path by less than this
-    part ..."""
+    """With until="converged", the search ends once doubling the number of iterations has shortened the path
+    by less than this fraction, ..."""
     patience: Natural = 16_000
     """... but not before this many iterations."""
 
@@ -627,7 +641,7 @@ class AORRTCSettings(SearchSettings, name="aorrtc"):
 @dataclass(frozen=True)
 class RRTConnectSettings(SearchSettings, name="rrt_connect"):
     optimize_time: NotNegative = 0.0
-    """With until "converged": time for restarts after the first path [s]."""
+    """With until="converged": time for restarts after the first path [s]."""
 
 
 class AORRTC(Planner[AORRTCSettings]):
@@ -659,8 +673,8 @@ class RobotDiffuse(AORRTC):
 
 
 class RRTConnect(Planner[RRTConnectSettings]):
-    """Two trees grown towards each other (Kuffner and LaValle, 2000), simplified; restarts while time is
-    left."""
+    """RRT-Connect (Kuffner and LaValle, 2000): two trees grow towards each other. Each path found is
+    simplified. Then the search restarts, for as long as `until` says."""
 
     name = "rrt_connect"
     settings_class = RRTConnectSettings
