@@ -12,20 +12,6 @@ from torch import Tensor
 from helpers.short_training import trained
 from robotdiffuse import InputError, JointGoal, Problem, Scene, Sphere, Status, load_robot
 from robotdiffuse.baselines import guided_prior
-from robotdiffuse.baselines.guided_prior import (
-    EDMP,
-    ENSEMBLE,
-    MPD,
-    EDMPSettings,
-    collision_gradient,
-    exponential_levels,
-    implicit_step,
-    position_precision,
-    quadratic_levels,
-    sample,
-    shared_out,
-    state_precision,
-)
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.learning.denoisers import UNetSettings
 from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
@@ -128,7 +114,7 @@ def test_share_of_trivial_motions() -> None:
 def test_samples_have_the_mean_and_variance_of_the_data(gaussian: Gaussian) -> None:
     starts, goals = (np.repeat(end[None], 300, 0) for end in (LEFT, RIGHT))
     levels = gaussian.schedule.sampling_levels(100)[:-1]
-    q = sample(gaussian, starts, goals, levels, np.random.default_rng(0), stay)
+    q = guided_prior.sample(gaussian, starts, goals, levels, np.random.default_rng(0), stay)
     assert q is not None
     x = gaussian.normalizer.to_unit(q.astype(np.float64))
     t = np.linspace(0, 1, WAYPOINTS)[:, None]
@@ -151,7 +137,7 @@ def test_samples_hold_their_ends_exactly() -> None:
     def guide(q: ndarray, left: int) -> ndarray:
         return q + np.float32(0.1 * (left < 2))
 
-    q = sample(network, starts, goals, np.array([255, 100, 20, 1]), rng, guide)
+    q = guided_prior.sample(network, starts, goals, np.array([255, 100, 20, 1]), rng, guide)
     assert q is not None and q.dtype == np.float32 and q.shape == (3, WAYPOINTS, PANDA.dof)
     assert np.array_equal(q[:, 0], starts) and np.array_equal(q[:, -1], goals)
     assert np.all(q >= PANDA.lower - 1e-5) and np.all(q <= PANDA.upper + 1e-5)
@@ -165,13 +151,17 @@ def test_the_guide_gets_the_number_of_steps_to_come(gaussian: Gaussian) -> None:
         return q
 
     ends = LEFT[None], RIGHT[None]
-    sample(gaussian, *ends, np.array([255, 90, 1]), np.random.default_rng(0), guide, quiet_steps=2)
+    guided_prior.sample(
+        gaussian, *ends, np.array([255, 90, 1]), np.random.default_rng(0), guide, quiet_steps=2
+    )
     assert told == [2, 1, 0, 0, 0]
-    stopped = sample(gaussian, *ends, np.array([255, 1]), np.random.default_rng(0), guide, stop=lambda: True)
+    stopped = guided_prior.sample(
+        gaussian, *ends, np.array([255, 1]), np.random.default_rng(0), guide, stop=lambda: True
+    )
     assert stopped is None and len(told) == 5
 
 
-@pytest.mark.parametrize("spaced", [exponential_levels, quadratic_levels])
+@pytest.mark.parametrize("spaced", [guided_prior.exponential_levels, guided_prior.quadratic_levels])
 @pytest.mark.parametrize("steps", [2, 25, 255])
 def test_spaced_levels(spaced, steps: int) -> None:
     schedule = NoiseSchedule(ScheduleSettings(steps=255))
@@ -197,15 +187,15 @@ def test_the_precision_is_that_of_the_process() -> None:
         covariance[here, here] = transition @ covariance[before, before] @ transition.T + noise
     states = np.linalg.inv(covariance)
     states[:2, :2] -= np.linalg.inv(vague)
-    assert state_precision(waypoints) == pytest.approx(states, abs=1e-4)
+    assert guided_prior.state_precision(waypoints) == pytest.approx(states, abs=1e-4)
     positions = np.linalg.inv(covariance[::2, ::2])
-    assert position_precision(waypoints) == pytest.approx(positions, abs=0.01)
+    assert guided_prior.position_precision(waypoints) == pytest.approx(positions, abs=0.01)
 
 
 def test_implicit_step_of_the_process() -> None:
     q = np.random.default_rng(0).normal(size=(2, 10, 3))
-    x = implicit_step(q, 5.0)
-    precision = position_precision(10)
+    x = guided_prior.implicit_step(q, 5.0)
+    precision = guided_prior.position_precision(10)
     assert np.array_equal(x[:, [0, -1]], q[:, [0, -1]])
     assert x[:, 1:-1] == pytest.approx((q - 5.0 * precision @ x)[:, 1:-1])
     assert np.all((x * (precision @ x)).sum((1, 2)) < (q * (precision @ q)).sum((1, 2)))
@@ -221,28 +211,31 @@ def lines(count: int) -> Float[ndarray, "count waypoints dof"]:
 def test_gradient_of_the_collision_cost(between: int) -> None:
     """Along itself; where spheres enter a margin and at corners of boxes it has kinks, hence 3 %."""
     q = lines(3)
-    costs, gradient = collision_gradient(CHECKER, q, 0.05, 0.01, between)
+    costs, gradient = guided_prior.collision_gradient(CHECKER, q, 0.05, 0.01, between)
     size = np.sqrt((gradient**2).sum((1, 2)))[:, None, None]
     step = 1e-2 * gradient / size
-    up, _ = collision_gradient(CHECKER, q + step, 0.05, 0.01, between)
-    down, _ = collision_gradient(CHECKER, q - step, 0.05, 0.01, between)
+    up, _ = guided_prior.collision_gradient(CHECKER, q + step, 0.05, 0.01, between)
+    down, _ = guided_prior.collision_gradient(CHECKER, q - step, 0.05, 0.01, between)
     assert np.all(costs > 0.1)
     assert (up - down) / 2e-2 == pytest.approx(size[:, 0, 0], rel=0.03)
 
 
 def test_guidance_lowers_the_collision_cost() -> None:
     q = lines(12)
-    before, _ = collision_gradient(CHECKER, q, 0.0, 0.0, 0)
-    for moved in (MPD().guided(CHECKER, q), EDMP(EDMPSettings(samples=12)).guided(CHECKER, q, 0)):
-        after, _ = collision_gradient(CHECKER, moved, 0.0, 0.0, 0)
+    before, _ = guided_prior.collision_gradient(CHECKER, q, 0.0, 0.0, 0)
+    for moved in (
+        guided_prior.MPD().guided(CHECKER, q),
+        guided_prior.EDMP(guided_prior.EDMPSettings(samples=12)).guided(CHECKER, q, 0),
+    ):
+        after, _ = guided_prior.collision_gradient(CHECKER, moved, 0.0, 0.0, 0)
         assert np.all(after < before) and np.array_equal(moved[:, [0, -1]], q[:, [0, -1]])
 
 
 def test_each_guide_moves_only_its_rows() -> None:
-    edmp = EDMP(EDMPSettings(samples=30))
+    edmp = guided_prior.EDMP(guided_prior.EDMPSettings(samples=30))
     shares = edmp.settings.shares()
     assert np.array_equal(np.concatenate([np.arange(30)[share] for share in shares]), np.arange(30))
-    assert len(set(ENSEMBLE)) == len(shares) == 12
+    assert len(set(guided_prior.ENSEMBLE)) == len(shares) == 12
     same = np.repeat(lines(1), 30, 0)
     moved = edmp.guided(CHECKER, same, 10)
     first = [moved[share][0] for share in shares]
@@ -250,42 +243,48 @@ def test_each_guide_moves_only_its_rows() -> None:
         assert all(np.array_equal(one, row) for row in moved[shares[i]])
         assert not any(np.array_equal(one, other) for other in first[:i])
     # before any guide begins
-    late = EDMP(EDMPSettings(guides=tuple(replace(guide, guided_share=0.4) for guide in ENSEMBLE)))
+    late = guided_prior.EDMP(
+        guided_prior.EDMPSettings(
+            guides=tuple(replace(guide, guided_share=0.4) for guide in guided_prior.ENSEMBLE)
+        )
+    )
     assert np.array_equal(late.guided(CHECKER, same[:24], 12), same[:24])
 
 
 def test_goals_take_turns() -> None:
     goals = np.stack([RIGHT, LEFT + 0.1, LEFT + 0.2])
-    starts, shared = shared_out(LEFT, goals, 8)
+    starts, shared = guided_prior.shared_out(LEFT, goals, 8)
     assert np.all(starts == LEFT) and np.array_equal(shared, np.stack([goals[1], goals[2]] * 4))
-    assert np.all(shared_out(LEFT, goals, 3)[1] == goals[1])
+    assert np.all(guided_prior.shared_out(LEFT, goals, 3)[1] == goals[1])
 
 
 @pytest.fixture(params=["mpd", "edmp"])
 def planner(request: pytest.FixtureRequest, gaussian: Gaussian, monkeypatch: pytest.MonkeyPatch):
-    made = MPD() if request.param == "mpd" else EDMP()
+    made = guided_prior.MPD() if request.param == "mpd" else guided_prior.EDMP()
     monkeypatch.setattr(made, "network", lambda _robot: gaussian)
     return made
 
 
-def test_the_same_seed_gives_the_same_path(planner: MPD | EDMP) -> None:
+def test_the_same_seed_gives_the_same_path(planner: guided_prior.MPD | guided_prior.EDMP) -> None:
     paths = [planner.plan(PROBLEM, time_limit=120.0, seed=seed).path.positions for seed in (0, 0, 1)]
     assert np.array_equal(paths[0], paths[1]) and not np.array_equal(paths[0], paths[2])
     assert np.array_equal(paths[0][[0, -1]], np.stack([LEFT, RIGHT]))
 
 
-def test_failure_says_what_was_wrong(planner: MPD | EDMP, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failure_says_what_was_wrong(
+    planner: guided_prior.MPD | guided_prior.EDMP, monkeypatch: pytest.MonkeyPatch
+) -> None:
     drawn = lines(planner.settings.samples)
     monkeypatch.setattr(guided_prior, "sample", lambda *_arguments: drawn)
     planner.plan(PROBLEM, time_limit=0.1)  # compiles and loads
-    result = planner.plan(PROBLEM, time_limit=2.0)
+    result = planner.plan(PROBLEM, time_limit=0.5)
     assert result.status is Status.TIMEOUT and result.path is None
     assert result.refused == "scene_collision" and "samples" in result.reason
 
 
 def test_missing_weights(tmp_path) -> None:
     with pytest.raises(InputError, match="train planner --config trajectory_prior"):
-        EDMP(EDMPSettings(weights=str(tmp_path))).plan(PROBLEM, time_limit=1.0)
+        guided_prior.EDMP(guided_prior.EDMPSettings(weights=str(tmp_path))).plan(PROBLEM, time_limit=1.0)
 
 
 @pytest.mark.parametrize(
@@ -294,7 +293,7 @@ def test_missing_weights(tmp_path) -> None:
         (lambda: replace(SMALL, encoder="pointnet"), r"model.encoder is pointnet and encoder_settings are"),
         (lambda: replace(SMALL, denoiser="encoder_decoder"), r"denoiser is encoder_decoder"),
         (lambda: replace(TRAINING, smooth_noise=True), r"target is limits and smooth_noise is True"),
-        (lambda: EDMPSettings(samples=11), r"edmp.samples is 11 and guides are 12"),
+        (lambda: guided_prior.EDMPSettings(samples=11), r"edmp.samples is 11 and guides are 12"),
     ],
 )
 def test_bad_settings(make, message: str) -> None:

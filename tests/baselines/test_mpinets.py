@@ -116,7 +116,7 @@ def straight_weights(monkeypatch: pytest.MonkeyPatch) -> mpinets.MPiNetsNetwork:
 def test_a_path_in_collision_is_no_result() -> None:
     problem = Problem(PANDA, Scene([Box(WALL[:3], WALL[3:6])]), LEFT, RIGHT)
     MPiNets().plan(problem, 0.1, 1)  # compiles and loads
-    result = MPiNets().plan(problem, 2.0, 1)
+    result = MPiNets().plan(problem, 0.5, 1)
     assert result.status is Status.TIMEOUT and result.refused == "scene_collision"
     assert "not free of collision" in result.reason
 

@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+import robotdiffuse as rd
 from helpers import faulty_planner, waiting
 from robotdiffuse.cli import main
 from robotdiffuse.core import registry
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.registry import Entry
-from robotdiffuse.core.types import Path as Motion
 from robotdiffuse.evaluation import bench
 from robotdiffuse.evaluation.bench_report import LATE_SECONDS
 from robotdiffuse.evaluation.metrics import METRICS
@@ -30,7 +29,6 @@ from robotdiffuse.planning.diffusion import Diffusion
 from robotdiffuse.planning.search.rrt import AORRTCSettings, RRTConnect
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.held_out import held_out_problem, line_length
-from robotdiffuse.validation.validator import verify
 
 RECORD = Record(
     "rrt_connect", "rop", "rop/0", "rop", False, 0, 1.0, "solved", "", 0.01, progress=((0.01, 2.0),)
@@ -67,8 +65,8 @@ def test_records_hold_what_was_measured_and_are_not_made_twice(tmp_path: Path) -
     assert solved and len(runs) == 2
     for record in solved:
         problem = held_out_problem("rop", int(record.name.partition("/")[2]))
-        path = Motion(problem.robot.joint_names, record.waypoints)
-        assert verify(problem, path).valid
+        path = rd.Path(problem.robot.joint_names, record.waypoints)
+        assert rd.verify(problem, path).valid
         assert record.joint_length == pytest.approx(path.length, rel=1e-6)
         assert record.progress[-1][1] == pytest.approx(path.length, rel=1e-5)
         assert record.memory is not None and record.memory > 50
@@ -103,7 +101,7 @@ def test_failures_of_every_kind_are_records_and_the_run_goes_on(tmp_path: Path) 
 
 def test_a_planner_of_the_program_itself_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PLANNERS, "mine", Entry("__main__:Mine", "for tests"))
-    with pytest.raises(InputError, match="planner mine is in the program that was started"):
+    with pytest.raises(rd.InputError, match="planner mine is in the program that was started"):
         bench.run_bench(settings(tmp_path, "mine", count=1), quiet, quiet)
 
 
@@ -187,7 +185,7 @@ def test_a_planner_is_restarted_until_its_time_is_used_up(tmp_path: Path) -> Non
         assert again.progress[-1][1] == pytest.approx(again.joint_length, rel=1e-5)
         assert list(again.progress) == sorted(again.progress) and again.progress[-1][0] <= 2.0 + LATE_SECONDS
         problem = held_out_problem("rop", int(again.name.partition("/")[2]))
-        assert verify(problem, Motion(problem.robot.joint_names, again.waypoints)).valid
+        assert rd.verify(problem, rd.Path(problem.robot.joint_names, again.waypoints)).valid
         assert not again.ended_by_itself
 
 
@@ -227,7 +225,7 @@ def test_a_planner_with_settings() -> None:
     calls = bench.PlannerSpec.parse("aorrtc:until=time_limit:gain=0.01:clearance=0")
     assert calls.request()["until"] == "time_limit" and calls.request()["clearance"] == 0
     assert calls.load().settings == AORRTCSettings(gain=0.01)
-    with pytest.raises(InputError, match="until 'soon'; known: converged"):
+    with pytest.raises(rd.InputError, match="until 'soon'; known: converged"):
         bench.PlannerSpec.parse("aorrtc:until=soon")
     nested = bench.PlannerSpec.parse("diffusion:guidance.margin=0.02:samples=4").load()
     assert isinstance(nested, Diffusion)
@@ -256,7 +254,7 @@ def test_line_that_was_cut_off_is_made_again(tmp_path: Path, cut: int) -> None:
     appended.append(replace(RECORD, seed=2))
     assert RecordFile(file).records == [RECORD, replace(RECORD, seed=2)]
     file.write_text(file.read_text() + '{"planner": 1}\n' + json.dumps(RECORD.row()) + "\n")
-    with pytest.raises(InputError, match="line 3 is no record"):
+    with pytest.raises(rd.InputError, match="line 3 is no record"):
         RecordFile(file)
 
 
@@ -282,7 +280,7 @@ def test_problems_of_files_and_folders(tmp_path: Path) -> None:
     assert [(case.problem_set, case.family) for case in cases] == [("mine", family) for family in "aba"]
     assert len(gather_cases([str(folder)], 2, tmp_path / "out", quiet)) == 2
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="holds no usable problem"):
+    with pytest.raises(rd.InputError, match="holds no usable problem"):
         gather_cases([str(tmp_path / "empty")], None, tmp_path / "out", quiet)
 
 
@@ -296,10 +294,12 @@ def test_other_problems_of_the_same_name_are_refused(tmp_path: Path) -> None:
     other = str(tmp_path / "b" / "mine.jsonl")
     for _ in range(2):
         assert len(gather_cases([first], None, tmp_path / "out", quiet)) == 1
-    with pytest.raises(InputError, match=r"problems called mine that were read from .*; those in .* others"):
+    with pytest.raises(
+        rd.InputError, match=r"problems called mine that were read from .*; those in .* others"
+    ):
         gather_cases([other], None, tmp_path / "out", quiet)
     (tmp_path / "rop.jsonl").write_text(lines[0])
-    with pytest.raises(InputError, match="have the name of the family rop"):
+    with pytest.raises(rd.InputError, match="have the name of the family rop"):
         gather_cases([str(tmp_path / "rop.jsonl")], None, tmp_path / "out", quiet)
 
 
@@ -313,7 +313,7 @@ def test_other_weights_of_the_same_name_are_refused(tmp_path: Path, monkeypatch:
     first, other = (settings(tmp_path / "out", f"mpnet@{tmp_path / at}/best", count=1) for at in "ab")
     for _ in range(2):
         bench.run_bench(first, quiet, quiet)
-    with pytest.raises(InputError, match="has records of mpnet@best with other weights than those in"):
+    with pytest.raises(rd.InputError, match="has records of mpnet@best with other weights than those in"):
         bench.run_bench(other, quiet, quiet)
 
 
@@ -333,7 +333,7 @@ def test_other_weights_of_the_same_name_are_refused(tmp_path: Path, monkeypatch:
     ],
 )
 def test_bad_settings_are_told_before_anything_is_made(tmp_path: Path, change: dict, match: str) -> None:
-    with pytest.raises(InputError, match=match):
+    with pytest.raises(rd.InputError, match=match):
         bench.run_bench(replace(settings(tmp_path / "out"), **change), quiet, quiet)
     assert not (tmp_path / "out" / "records").exists()
 
@@ -360,7 +360,7 @@ def test_the_command_runs_every_stage_of_a_preset(tmp_path: Path, monkeypatch: p
 
 
 def test_a_preset_in_place_of_planners_and_limits(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(InputError, match="unknown preset 'table2'; known: anytime"):
+    with pytest.raises(rd.InputError, match="unknown preset 'table2'; known: anytime"):
         bench.preset_settings("table2", tmp_path)
     asked = ["bench", "run", "--out", str(tmp_path)]
     assert main([*asked, "--planners", "rrt_connect"]) == 2

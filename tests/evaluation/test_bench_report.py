@@ -9,10 +9,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+import robotdiffuse as rd
 from robotdiffuse.cli import main
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.tables import Table
-from robotdiffuse.core.types import Path as Motion
 from robotdiffuse.evaluation import bench_report
 from robotdiffuse.evaluation.metrics import METRICS, Metric, measured
 from robotdiffuse.evaluation.problem_sets import case_file
@@ -306,7 +305,7 @@ def test_a_metric_is_declared_in_one_place(
     monkeypatch.setitem(METRICS, waypoints.name, waypoints)
     problem = held_out_problem("rop", 0)
     line = np.stack([problem.start, problem.start + 0.1, problem.start])
-    figures = measured(problem.robot, Motion(problem.robot.joint_names, line))
+    figures = measured(problem.robot, rd.Path(problem.robot.joint_names, line))
     record = solved("robotdiffuse", "rop/9", 1.0, [(0.1, 0.5)], measures=figures)
     assert record.row()["waypoint_count"] == 3
     assert record_of_row(json.loads(json.dumps(record.row()))) == record
@@ -371,14 +370,14 @@ def test_what_is_shown_is_hard_or_failed(small: Path) -> None:
 def test_bad_input_is_one_clear_line(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (small / "new" / "records").mkdir(parents=True)
     (small / "new" / "records" / "mpnet.jsonl").touch()
-    with pytest.raises(InputError, match="no records yet"):
+    with pytest.raises(rd.InputError, match="no records yet"):
         bench_report.read_bench(small / "new")
-    with pytest.raises(InputError, match=r"no records of foo; it has .*mpnet, "):
+    with pytest.raises(rd.InputError, match=r"no records of foo; it has .*mpnet, "):
         bench_report.read_bench(small, ["foo"])
-    with pytest.raises(InputError, match="no planner was run that long"):
+    with pytest.raises(rd.InputError, match="no planner was run that long"):
         bench_report.sections(bench_report.read_bench(small, ["ompl_rrt_star"]), [60.0])
     (small / "runs.jsonl").write_text('{"date": 1}\n')
-    with pytest.raises(InputError, match=r"runs\.jsonl is damaged"):
+    with pytest.raises(rd.InputError, match=r"runs\.jsonl is damaged"):
         bench_report.read_bench(small)
     with (small / "records" / "mpnet.jsonl").open("a") as stream:
         stream.write("{broken\n")

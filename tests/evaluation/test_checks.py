@@ -10,7 +10,6 @@ import pytest
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.motion_stores import line, random_motions, record, write_motions
-from robotdiffuse.core.types import Path as Motion
 from robotdiffuse.datasets.rows import motion_of, problem_of
 from robotdiffuse.datasets.shards import pick_rows, read_shard, shard_path, write_shard
 from robotdiffuse.evaluation.checks import check_data
@@ -92,9 +91,8 @@ def test_limits_on_the_way_are_found_but_not_of_continuous_joints(tmp_path, pybu
     robot = rd.load_robot("gen3")
     q = line(np.where(robot.continuous, 9.6, 0.0), np.where(robot.continuous, 9.5, 0.1))
     write_motions(tmp_path / "gen3", robot, [record(robot, rd.Scene([]), q)])
-    assert (
-        any(robot.continuous) and check_data(tmp_path / "gen3", robot, pybullet=False).counts["limits"] == 0
-    )
+    checked = check_data(tmp_path / "gen3", robot, pybullet=False)
+    assert any(robot.continuous) and checked.counts["limits"] == 0
 
 
 WRONG = {
@@ -158,9 +156,8 @@ def test_missing_pybullet_is_one_line(tmp_path, monkeypatch):
 
 
 def test_rows_are_problems_again(tmp_path):
-    near = record(
-        ARM, rd.Scene([rd.Sphere([0.0, 1.5, 0.0], 0.1), rd.Box([1, 0, 1], [0.1, 0.2, 0.3])]), line(AWAY, BACK)
-    )
+    shapes = rd.Sphere([0.0, 1.5, 0.0], 0.1), rd.Box([1, 0, 1], [0.1, 0.2, 0.3])
+    near = record(ARM, rd.Scene(shapes), line(AWAY, BACK))
     manifest = write_motions(tmp_path, ARM, [near])
     shard = read_shard(tmp_path, 0)
     problem = problem_of(manifest, ARM, shard, 0)
@@ -168,7 +165,7 @@ def test_rows_are_problems_again(tmp_path):
     assert np.array_equal(problem.start, near["start"])
     assert isinstance(problem.goal, rd.JointGoal) and np.allclose(problem.goal.positions, near["goals"][:2])
     motion = motion_of(ARM, shard, 0)
-    assert isinstance(motion, Motion) and np.array_equal(motion.positions, near["trajectories"])
+    assert isinstance(motion, rd.Path) and np.array_equal(motion.positions, near["trajectories"])
 
     floor = {"center": [0.0, 0.0, -0.2], "size": [3.0, 2.0, 0.4]}
     floored = replace(manifest, floors={"rop": floor, "rop_dense": None})

@@ -11,7 +11,6 @@ import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.motion_stores import random_motions, write_motions
 from robotdiffuse.evaluation import data_report
-from robotdiffuse.evaluation import data_report as report
 
 ARM = box_arm()
 
@@ -51,7 +50,7 @@ def test_figures(tmp_path, rows):
 
 
 def test_large_sets_are_sampled_evenly(tmp_path, rows, monkeypatch):
-    monkeypatch.setattr(report, "SAMPLED_MOTIONS", 4)
+    monkeypatch.setattr(data_report, "SAMPLED_MOTIONS", 4)
     write_motions(tmp_path, ARM, rows, shard=3)
     found = data_report.read_figures(tmp_path)
     assert len(found.all["cost"]) == 11

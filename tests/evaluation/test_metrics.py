@@ -35,9 +35,6 @@ def path_of(trajectory: rd.Trajectory) -> rd.Path:
     return rd.Path(trajectory.joint_names, trajectory.positions[[0, -1]])
 
 
-# Figures of one motion
-
-
 @pytest.mark.parametrize(
     ("rows", "joint", "link", "tip", "turned"),
     [
@@ -140,9 +137,8 @@ def test_a_motion_that_stands_still_has_figures(rows: np.ndarray) -> None:
 def test_clearance_to_the_scene_and_to_itself_apart() -> None:
     rows = np.stack([START, START + 0.01])
     top = PANDA.fk(START, "panda_link4")[:3, 3]
-    problem = rd.Problem(
-        PANDA, rd.Scene([rd.Sphere(top + np.array([0, 0, 0.4]), 0.1)]), START, rd.JointGoal(rows[1:])
-    )
+    ball = rd.Sphere(top + np.array([0, 0, 0.4]), 0.1)
+    problem = rd.Problem(PANDA, rd.Scene([ball]), START, rows[1])
     path = rd.Path(PANDA.joint_names, rows)
     verdict = rd.verify(problem, path)
     found = metrics.measured(PANDA, path, None, verdict)
@@ -150,9 +146,6 @@ def test_clearance_to_the_scene_and_to_itself_apart() -> None:
     assert apart == pytest.approx((verdict.scene_clearance, verdict.self_clearance), rel=1e-6)
     assert found["min_clearance"] == min(apart) and 0.05 < apart[0] < 0.3
     assert "scene_clearance" not in metrics.measured(PANDA, path)
-
-
-# The paper's criteria of success, on the Panda: each alone is what makes the validator refuse
 
 
 @pytest.mark.parametrize(
@@ -169,9 +162,6 @@ def test_one_centimeter_and_fifteen_degrees_are_settings(shift: float, angle: fl
     for settings, expected in ((VerifySettings(), kind), (loose, ""), (strict, "goal")):
         violation = rd.verify(problem, path, settings).violation
         assert ("" if violation is None else violation.kind) == expected
-
-
-# Statistics
 
 
 @pytest.mark.parametrize(
@@ -230,9 +220,6 @@ def test_paired_without_common_solutions() -> None:
     assert (none.neither, none.p_success, none.ratio) == (0, 1.0, None)
     still = statistics.compare(np.zeros(3), np.zeros(3))  # start and goal are the same
     assert (still.ratio, still.p_length) == (1.0, 1.0)
-
-
-# ComScore
 
 
 PAPER = [row.indicators for row in PAPER_TABLE_1]

@@ -9,7 +9,6 @@ import pytest
 
 import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.core.types import Path as Motion
 from robotdiffuse.evaluation.methods import planned, restarted, sampled
 from robotdiffuse.evaluation.runs import Fields, Record, Run, run_all
 from robotdiffuse.planning.search.rrt import RRTConnect
@@ -100,6 +99,6 @@ def test_a_motion_that_stands_still_is_not_planned_again() -> None:
     """A length of 0 counted as no path."""
     problem = rd.Problem(PANDA, rd.Scene(), START, rd.JointGoal(START[None]))
     found = RRTConnect().plan(problem, time_limit=2.0, seed=0)
-    first = replace(found, path=Motion(PANDA.joint_names, START[None]))
+    first = replace(found, path=rd.Path(PANDA.joint_names, START[None]))
     again, best = restarted(RRTConnect(), problem, 0, 2.0, first, {})
     assert (again, best.path_length) == (0, 0.0)

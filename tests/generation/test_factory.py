@@ -1,7 +1,14 @@
 """The data factory: the same data whatever happens, and motions that are what they claim to be."""
 
 import json
+import multiprocessing
+import os
+import random
+import re
+import resource
 import shutil
+import signal
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -13,12 +20,12 @@ import pytest
 from numpy import ndarray
 
 import robotdiffuse as rd
-from helpers.factory_runs import contents, in_this_process
+from helpers import factory_runs
 from helpers.sphere_oracles import least_clearance
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.errors import OutputError
 from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.core.transforms import rotation_from_quaternion
-from robotdiffuse.core.types import Path as Motion
 from robotdiffuse.datasets.rows import path_of, problem_of
 from robotdiffuse.datasets.shards import check_shard, read_manifest, read_shard
 from robotdiffuse.generation import GenerationSettings, factory, generate
@@ -37,7 +44,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("data") / "new"
     seen = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(factory, "on_this_machine", in_this_process)
+        patch.setattr(factory, "on_this_machine", factory_runs.in_this_process)
         assert generate(SETTINGS, out, progress=lambda *at: seen.append(at)) == 12
     assert seen == [(0, 12), (4, 12), (8, 12), (12, 12)]
     return out
@@ -53,8 +60,8 @@ def test_a_folder_called_like_a_robot_does_not_hide_it_from_nodes(
 
 
 def rows_of(folder: Path) -> dict[str, ndarray]:
-    shards = [read_shard(folder, index) for index in range(SETTINGS.shards)]
-    return {name: np.concatenate([shard[name] for shard in shards]) for name in shards[0].arrays}
+    parts = [read_shard(folder, index) for index in range(SETTINGS.shards)]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0].arrays}
 
 
 def test_the_same_data_with_more_workers_and_after_an_interruption(folder: Path, tmp_path: Path) -> None:
@@ -69,7 +76,7 @@ def test_the_same_data_with_more_workers_and_after_an_interruption(folder: Path,
     seen: list[tuple[int, int]] = []
     assert generate(SETTINGS, tmp_path, 2, progress=lambda *at: seen.append(at)) == 12
     assert seen == [(4, 12), (8, 12), (12, 12)]
-    assert contents(tmp_path) == contents(folder)
+    assert factory_runs.contents(tmp_path) == factory_runs.contents(folder)
     assert (tmp_path / "shard_00001.zarr").stat().st_mtime_ns == kept
     before = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*")}
     assert generate(SETTINGS, tmp_path) == 12
@@ -116,7 +123,7 @@ def test_every_trajectory_is_what_it_claims_to_be(i: int, folder: Path) -> None:
     np.testing.assert_array_equal(q[0], row["start"])
     np.testing.assert_array_equal(q[-1], goal)
     assert ((q >= PANDA.lower - 1e-6) & (q <= PANDA.upper + 1e-6)).all()
-    assert rd.verify(problem, Motion(PANDA.joint_names, q.astype(float))).valid
+    assert rd.verify(problem, rd.Path(PANDA.joint_names, q.astype(float))).valid
     fine = np.concatenate([a + np.linspace(0, 1, 20)[:, None] * (b - a) for a, b in pairwise(q)])
     assert least_clearance(checker, fine.astype(float)).min() > -1e-3
 
@@ -216,10 +223,10 @@ def test_other_settings_are_refused_by_name(folder: Path) -> None:
         ),
         (replace(SETTINGS, search=search), r"search\.safety_distance 0\.05, not 0\.02"),
     ):
-        before = contents(folder)
+        before = factory_runs.contents(folder)
         with pytest.raises(rd.InputError, match=message):
             generate(changed, folder)
-        assert contents(folder) == before
+        assert factory_runs.contents(folder) == before
 
 
 @pytest.mark.parametrize(
@@ -295,7 +302,7 @@ def test_motions_are_free_reach_a_goal_and_keep_their_distance(name: str) -> Non
     for row in (dict(zip(arrays, values, strict=True)) for values in zip(*arrays.values(), strict=True)):
         drawn = draw(settings, robot, np.random.default_rng([settings.seed, int(row["seed"])]))[1]
         q = np.asarray(row["trajectories"], np.float64)
-        assert rd.verify(drawn.problem(robot), Motion(robot.joint_names, q)).valid
+        assert rd.verify(drawn.problem(robot), rd.Path(robot.joint_names, q)).valid
         np.testing.assert_array_equal(q[-1], row["goals"][row["goal_index"]])
         assert np.isfinite(row["goal_costs"]).sum() == 1
         length = np.linalg.norm(np.diff(q, axis=0), axis=1).sum()
@@ -322,3 +329,103 @@ def test_goals_a_turn_away_are_taken_the_short_way() -> None:
         if len(far) == 3:
             return
     pytest.fail(f"only {len(far)} such problems")
+
+
+TRAJECTORIES = 54
+SHARD = 3
+WAYPOINTS = 16
+SHARDS = TRAJECTORIES // SHARD
+MANY = GenerationSettings(trajectories=TRAJECTORIES, shard=SHARD, waypoints=WAYPOINTS)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    out = tmp_path_factory.mktemp("undisturbed")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(factory, "on_this_machine", factory_runs.in_this_process)
+        generate(MANY, out)
+    assert factory_runs.shards(out) == SHARDS
+    return factory_runs.contents(out)
+
+
+@pytest.mark.slow
+def test_killed_at_a_random_moment_it_ends_in_the_same_data(
+    undisturbed: dict[str, bytes], tmp_path: Path
+) -> None:
+    run = factory_runs.start(tmp_path, TRAJECTORIES, SHARD, WAYPOINTS, 2)
+    factory_runs.wait_for_shards(run, tmp_path, 1)
+    time.sleep(random.uniform(0, 0.1))
+    assert len(factory_runs.members(run.pid)) >= 2, (
+        "the command and a worker; the other may be at its start or end"
+    )
+    run.kill()
+    run.communicate(timeout=500)
+    assert run.returncode == -signal.SIGKILL and factory_runs.shards(tmp_path) < SHARDS
+    assert factory_runs.group_ends(run.pid), "workers outlive the command"
+    run = factory_runs.start(tmp_path, TRAJECTORIES, SHARD, WAYPOINTS, 2)
+    said, complaints = run.communicate(timeout=400)
+    assert run.returncode == 0 and re.fullmatch(rf"trajectories: \d+ of {TRAJECTORIES}\n", complaints)
+    assert said == f"{TRAJECTORIES} trajectories of {WAYPOINTS} waypoints in {tmp_path}\n"
+    assert factory_runs.contents(tmp_path) == undisturbed
+    assert factory_runs.group_ends(run.pid)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [0, 1])
+def test_ctrl_c_stops_all_in_one_line(count: int, tmp_path: Path) -> None:
+    """As a terminal does it, to all processes: while the workers start, and while they work."""
+    run = factory_runs.start(tmp_path, TRAJECTORIES, SHARD, WAYPOINTS, 2)
+    while len(factory_runs.members(run.pid)) < 3:
+        assert run.poll() is None
+        time.sleep(0.02)
+    factory_runs.wait_for_shards(run, tmp_path, count)
+    os.killpg(run.pid, signal.SIGINT)
+    said, complaints = run.communicate(timeout=500)
+    assert (run.returncode, said) == (130, "")
+    assert re.fullmatch(rf"(trajectories: 0 of {TRAJECTORIES}\n)?robotdiffuse: stopped\n", complaints)
+    assert factory_runs.group_ends(run.pid)
+    assert factory_runs.shards(tmp_path) < SHARDS
+    assert not [name for name in factory_runs.contents(tmp_path) if name.startswith(".")]
+
+
+@pytest.mark.slow
+def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
+    undisturbed: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Files may not grow beyond a kilobyte: the system's error, as that of a full disk, at any file."""
+    monkeypatch.setattr(factory, "on_this_machine", factory_runs.in_this_process)
+    most = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fill_up(done: int, _total: int) -> None:
+        if done == 2 * SHARD:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (1000, most[1]))
+
+    try:
+        with pytest.raises(OutputError, match=r"shard_00002\.zarr cannot be written: File too large$"):
+            generate(MANY, tmp_path, progress=fill_up)
+        assert factory_runs.shards(tmp_path) == 2 and len(list(tmp_path.iterdir())) == 3
+        with pytest.raises(OutputError, match=r"manifest\.json.*: File too large$"):
+            generate(MANY, tmp_path / "other")
+        assert not list((tmp_path / "other").iterdir())
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, most)
+    (tmp_path / "other").rmdir()
+    generate(MANY, tmp_path)
+    assert factory_runs.contents(tmp_path) == undisturbed
+
+
+@pytest.mark.slow
+def test_a_worker_killed_from_outside_is_one_line_and_the_next_call_goes_on(
+    undisturbed: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def kill(done: int, _total: int) -> None:
+        if done == SHARD:
+            worker = multiprocessing.active_children()[0]
+            os.kill(worker.pid or 0, signal.SIGKILL)
+
+    with pytest.raises(rd.InputError, match=r"worker process was killed.*run the same command again$"):
+        generate(MANY, tmp_path, workers=2, progress=kill)
+    assert 0 < factory_runs.shards(tmp_path) < SHARDS
+    monkeypatch.setattr(factory, "on_this_machine", factory_runs.in_this_process)
+    generate(MANY, tmp_path)
+    assert factory_runs.contents(tmp_path) == undisturbed

@@ -49,7 +49,6 @@ def test_wrong_robot_is_refused(tmp_path):
 
 
 def weights(change):
-
     def damage(folder):
         file = folder / "model.safetensors"
         data = file.read_bytes()
@@ -61,7 +60,6 @@ def weights(change):
 
 
 def described(change):
-
     def damage(folder):
         values = json.loads((folder / "model.json").read_text())
         change(values)

@@ -12,7 +12,6 @@ import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.small_model import cloud, small_model
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.learning.denoisers import TransformerSettings
 from robotdiffuse.learning.denoisers.networks import MAX_UNFUSED_TOKENS, attend
@@ -84,9 +83,8 @@ def test_clearances_are_inputs_of_the_denoiser():
     model = small_model()
     reference = model.reference(np.zeros((2, 3)), np.ones((2, 3)))
     x = np.zeros((2, 16, 3), np.float32)
-    features = model.features(
-        x, reference, lambda q: np.stack([q[..., 0] * 0 + d for d in (-5, 0.15, 9)], -1)
-    )
+    clearances = np.array([-5, 0.15, 9])
+    features = model.features(x, reference, lambda q: np.tile(clearances, (*q.shape[:-1], 1)))
     assert features.shape == (2, 16, 9)
     np.testing.assert_allclose(features[0, 0, 6:], [-1, 0, 1], atol=1e-6)
 
@@ -125,17 +123,17 @@ def test_a_sampler_by_name_is_that_of_a_checkpoint() -> None:
 
 
 def test_what_makes_no_sense_is_refused() -> None:
-    with pytest.raises(InputError, match="joint 1"):
+    with pytest.raises(rd.InputError, match="joint 1"):
         JointNormalizer(np.array([0.0, 1.0]), np.array([1.0, 1.0]))
     # matrices of 10**25 rows were asked for; found by fuzzing
     for kind, values in ((MotionModelSettings, {}), (PlannerTraining, {"data": "d", "encoder": "e"})):
-        with pytest.raises(InputError, match=r"waypoints is 1000+; it must be between 3 and 4096"):
+        with pytest.raises(rd.InputError, match=r"waypoints is 1000+; it must be between 3 and 4096"):
             kind.from_json(values | {"waypoints": 10**25}, "x")
-    with pytest.raises(InputError, match=r"unknown sampling\.sampler 'heun'; known: ddim, ddpm"):
+    with pytest.raises(rd.InputError, match=r"unknown sampling\.sampler 'heun'; known: ddim, ddpm"):
         SamplingSettings(sampler="heun")
-    with pytest.raises(InputError, match=r"guided_share is 1.5"):
+    with pytest.raises(rd.InputError, match=r"guided_share is 1.5"):
         SamplingSettings(guided_share=1.5)
-    with pytest.raises(InputError, match="sampling steps is 201; it must be between 1 and 200"):
+    with pytest.raises(rd.InputError, match="sampling steps is 201; it must be between 1 and 200"):
         sample_with(small_model(), SamplingSettings(sampling_steps=201))
 
 

@@ -19,7 +19,6 @@ def cosine_schedule(steps: int = 200) -> NoiseSchedule:
 
 
 def best_predictor(schedule: NoiseSchedule) -> Callable[[np.ndarray, int], np.ndarray]:
-
     def predict(x, level):
         a = schedule.signal[level]
         s = schedule.noise[level]

@@ -73,11 +73,8 @@ def test_both_hands_are_brought_to_their_poses() -> None:
 
 def test_links_that_share_a_joint_are_brought_there_together(tmp_path: Path) -> None:
     """Each arm alone turns the waist as it likes; both hands need one value of it."""
-    parts = (
-        chain("base", ["waist"]),
-        chain("waist_link", row("left_", 6)),
-        chain("waist_link", row("right_", 6)),
-    )
+    arms = (chain("waist_link", row(side, 6)) for side in ("left_", "right_"))
+    parts = chain("base", ["waist"]), *arms
     robot = read_urdf(written(tmp_path, *parts), group="both")
     there = np.random.default_rng(1).uniform(0.5 * robot.lower, 0.5 * robot.upper)
     goal = poses_at(robot, there, robot.tips)
@@ -101,9 +98,8 @@ def test_constraints_are_kept_at_the_poses() -> None:
     start, there = free()[:2]
     right = link_pose(baxter(), there, "right_gripper")
     down = transform(np.array([0.7, 0.25, 0.4]), np.diag([1.0, -1.0, -1.0]))
-    goal = rd.PosesGoal(
-        [rd.PoseGoal("left_gripper", down, None, [0.4, 0.4, np.pi]), rd.PoseGoal("right_gripper", right)]
-    )
+    left = rd.PoseGoal("left_gripper", down, None, [0.4, 0.4, np.pi])
+    goal = rd.PosesGoal([left, rd.PoseGoal("right_gripper", right)])
     upright = rd.AxisCone("left_gripper", [0, 0, 1], [0, 0, -1], 0.1)
     problem = rd.Problem(baxter(), rd.Scene(), start, goal, constraints=[upright])
     found = pose_configurations(problem, goal, np.random.default_rng(0))

@@ -86,6 +86,5 @@ def test_every_network_normalizes_by_the_joint_limits(name: str) -> None:
     network = NETWORKS.load(name)(RobotIdentity.of(panda), NETWORKS.defaults(name))
     ends = np.stack([panda.lower, panda.upper])
     np.testing.assert_allclose(network.normalizer.to_unit(ends), [[-1] * 7, [1] * 7])
-    torch.testing.assert_close(
-        network.from_unit(network.to_unit(torch.from_numpy(ends))), torch.from_numpy(ends)
-    )
+    given = torch.from_numpy(ends)
+    torch.testing.assert_close(network.from_unit(network.to_unit(given)), given)

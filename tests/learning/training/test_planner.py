@@ -260,9 +260,8 @@ def test_errors_in_the_workspace_have_the_same_weight_for_every_objective(data, 
 @pytest.mark.usefixtures("no_export")
 def test_planner_learns_which_side(tmp_path, data, arm):
     out = tmp_path / "out"
-    report = train_planner(
-        planner_settings(data, samples=16 * 300, losses=LossSettings(point=0.01)), str(out)
-    )
+    settings = planner_settings(data, samples=16 * 300, losses=LossSettings(point=0.01))
+    report = train_planner(settings, str(out))
     rows = read_log(out)
     assert float(rows[-1]["loss"]) < 0.3 * float(rows[0]["loss"])
     assert report["samples"] == 4800
@@ -270,9 +269,8 @@ def test_planner_learns_which_side(tmp_path, data, arm):
     assert list((out / "tensorboard").iterdir()), "the extra `train` is installed: a log for TensorBoard"
     model = load_model(out, arm)
     about = json.loads((out / "model.json").read_text())
-    assert about["training"]["trajectories"] == len(
-        load_data(str(data), arm, model.encoder, WAYPOINTS, print)
-    )
+    loaded = load_data(str(data), arm, model.encoder, WAYPOINTS, print)
+    assert about["training"]["trajectories"] == len(loaded)
     rng = np.random.default_rng(0)
     start = np.array([-1.0, 0.2, 0.5])
     goal = np.array([1.0, -0.3, 0.4])

@@ -102,9 +102,8 @@ def test_no_valid_sample_says_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_an_encoder_of_one_size_gets_clouds_of_that_size(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = DGCNNSettings(code=8, cloud=50, neighbors=4, edges=(8,), embedding=16, head=(16,))
-    model = MotionNetwork(
-        RobotIdentity.of(PANDA), MotionModelSettings(encoder="dgcnn", encoder_settings=settings)
-    )
+    settings = MotionModelSettings(encoder="dgcnn", encoder_settings=settings)
+    model = MotionNetwork(RobotIdentity.of(PANDA), settings)
     sizes: list[int] = []
 
     def z(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -121,9 +120,7 @@ def test_a_point_cloud_in_place_of_shapes() -> None:
     points = sample_surface(PROBLEM.scene, 4000, np.random.default_rng(0))
     problem = rd.Problem(PANDA, rd.Scene([rd.PointCloud(points, 0.01)]), LEFT, rd.JointGoal(RIGHT[None]))
     result = Diffusion().plan(problem, time_limit=60.0)
-    assert result.path is not None and rd.verify(PROBLEM, result.path).valid, (
-        "the ball lies within its points"
-    )
+    assert rd.verify(PROBLEM, result.path).valid, "the ball lies within its points"
 
 
 def test_the_guidance_scale_reaches_the_network() -> None:

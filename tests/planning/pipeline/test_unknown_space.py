@@ -140,9 +140,8 @@ def test_the_default_policy_is_prediction_where_the_network_covers_the_reach() -
     assert unknown_space.policy_for(problem) == ("predicted", "")
     assert unknown_space.policy_for(partial("optimistic")) == ("optimistic", "")
     arm = rd.load_robot("ur10")
-    far = rd.Problem(
-        arm, rd.Scene(), np.zeros(6), np.zeros(6), views=[replace(taken(DEEP), configuration=None)]
-    )
+    view = replace(taken(DEEP), configuration=None)
+    far = rd.Problem(arm, rd.Scene(), np.zeros(6), np.zeros(6), views=[view])
     policy, note = unknown_space.policy_for(far)
     assert policy == "padded" and "ur10 reaches farther" in note
 

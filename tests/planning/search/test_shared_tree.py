@@ -17,19 +17,12 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.random import random_state
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.planning.search import rrt_kernel, shared_tree
-from robotdiffuse.planning.search.shared_tree import (
-    SharedTreeRRTStar,
-    SharedTreeSearch,
-    SharedTreeSettings,
-    grow,
-    make_goals,
-)
 
 PANDA = rd.load_robot("panda")
 LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 WALL = rd.Scene([rd.Box([0.45, 0.0, 0.25], [0.3, 0.05, 0.5], name="wall")])
-ENDLESS = SharedTreeSettings(improvement=0.0)
+ENDLESS = shared_tree.SharedTreeSettings(improvement=0.0)
 TOUCHING = replace(ENDLESS, safety_distance=0.0)
 
 
@@ -83,18 +76,18 @@ def test_rrt_star_alone_converges_to_the_optimum(planar) -> None:
     space = search_space(checker, 0.01)
     start = start.astype(np.float32)
     trees = rrt_kernel.make_trees(start, np.empty((0, 2), np.float32), 60_000)
-    goals = make_goals(start, goal[None])
+    goals = shared_tree.make_goals(start, goal[None])
     state = random_state(0)
     costs = []
     for iterations in (500, 3_000, 30_000):
-        grow(space, trees, goals, np.float32(0.5), iterations, state)
+        shared_tree.grow(space, trees, goals, np.float32(0.5), iterations, state)
         costs.append(float(trees.costs[0, goals.node[0]]) / optimum)
     assert costs[0] > costs[1] > costs[2]
     # the grid's own error: 0.4 % of direction, and cells of 0.02 rad at the obstacle's edge
     assert 0.985 < costs[2] < 1.01
     # rounds with both get there quickly
     settings = replace(TOUCHING, resolution=0.01)
-    search = SharedTreeSearch(checker, start, goal[None], settings, random_state(1))
+    search = shared_tree.SharedTreeSearch(checker, start, goal[None], settings, random_state(1))
     for _ in range(40):
         search.round()
     assert 0.985 < search.cost / optimum < 1.01
@@ -119,7 +112,9 @@ def test_the_tree_stays_a_tree(capacity: int, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(shared_tree, "CAPACITY", capacity)
     checker = CollisionChecker(PANDA, WALL)
     goals = RIGHT + np.pad([[0.0, 0.0, 0.0], [0.2, 0.2, 0.0], [0.1, -0.3, 0.3]], ((0, 0), (0, 4)))
-    search = SharedTreeSearch(checker, LEFT, goals, replace(TOUCHING, growth=200), random_state(2))
+    search = shared_tree.SharedTreeSearch(
+        checker, LEFT, goals, replace(TOUCHING, growth=200), random_state(2)
+    )
     for _ in range(4):
         search.round()
     assert 64 < search.tree.sizes[0] <= capacity
@@ -176,14 +171,16 @@ def test_the_cheapest_goal_wins_and_every_goal_has_its_cost() -> None:
     goals[1:, :2] += [[0.2, 0.2], [0.1, 0.4]]
     checker = CollisionChecker(PANDA, WALL)
     assert checker.free(goals).all()
-    search = SharedTreeSearch(checker, LEFT, goals, TOUCHING, random_state(0))
+    search = shared_tree.SharedTreeSearch(checker, LEFT, goals, TOUCHING, random_state(0))
     assert search.best_goal == 2 and search.finished, "its straight line is free: nothing can be shorter"
-    search = SharedTreeSearch(checker, LEFT, goals[:2], TOUCHING, random_state(0))
+    search = shared_tree.SharedTreeSearch(checker, LEFT, goals[:2], TOUCHING, random_state(0))
     for _ in range(30):
         search.round()
     costs = search.goal_costs
     assert np.isfinite(costs[search.best_goal]) and search.cost == costs.min()
-    single = [SharedTreeSearch(checker, LEFT, g[None], TOUCHING, random_state(1)) for g in goals[:2]]
+    single = [
+        shared_tree.SharedTreeSearch(checker, LEFT, g[None], TOUCHING, random_state(1)) for g in goals[:2]
+    ]
     for other in single:
         for _ in range(30):
             other.round()
@@ -192,9 +189,9 @@ def test_the_cheapest_goal_wins_and_every_goal_has_its_cost() -> None:
 
 def searched(
     checker: CollisionChecker, start: np.ndarray, distance: float
-) -> tuple[SharedTreeSearch, np.ndarray]:
+) -> tuple[shared_tree.SharedTreeSearch, np.ndarray]:
     settings = replace(ENDLESS, safety_distance=distance, resolution=0.01)
-    search = SharedTreeSearch(checker, start, RIGHT[None], settings, random_state(0))
+    search = shared_tree.SharedTreeSearch(checker, start, RIGHT[None], settings, random_state(0))
     for _ in range(10):
         search.round()
     path = search.path()
@@ -238,7 +235,7 @@ def test_a_gap_too_narrow_for_the_distance_lowers_it() -> None:
     goal = np.array([0.9])
     least = checker.link_clearances(np.linspace(start, goal, 200)).min()
     assert 0.01 < least < 0.02
-    search = SharedTreeSearch(checker, start, goal[None], ENDLESS, random_state(0))
+    search = shared_tree.SharedTreeSearch(checker, start, goal[None], ENDLESS, random_state(0))
     search.run(lambda: search.cost < np.inf)
     assert search.safety_distance == pytest.approx(0.01) and search.cost == pytest.approx(1.8)
 
@@ -248,6 +245,6 @@ def test_no_way_ends_at_the_time_limit_or_when_it_was_searched_for_at_every_dist
     sealed = rd.Scene([*walls, rd.Box([0.0, 0.0, 1.35], [3.0, 0.02, 1.3])])
     problem = rd.Problem(PANDA, sealed, LEFT, rd.JointGoal(RIGHT[None]))
     for step_rounds, limit, status in ((10**9, 0.3, rd.Status.TIMEOUT), (1, 60.0, rd.Status.NO_PATH)):
-        settings = SharedTreeSettings(step_rounds=step_rounds, growth=10, connect_iterations=10)
-        result = SharedTreeRRTStar(settings).plan(problem, time_limit=limit)
+        settings = shared_tree.SharedTreeSettings(step_rounds=step_rounds, growth=10, connect_iterations=10)
+        result = shared_tree.SharedTreeRRTStar(settings).plan(problem, time_limit=limit)
         assert result.status is status and result.path is None and result.reason
