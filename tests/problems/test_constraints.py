@@ -196,12 +196,15 @@ BAD: list[tuple[Callable[[], object], str]] = [
         lambda: replace(problem(EACH[4]), waypoints=(GOAL,)),
         "cartesian_line cannot be combined",
     ),  # type: ignore[arg-type]
-    (lambda: PathConstraints(replace(problem(EACH[4]), goal=[START, GOAL])), "2 configurations .* different"),  # type: ignore[arg-type]
+    (
+        lambda: PathConstraints(replace(problem(EACH[4]), goal=[START, GOAL])),
+        "2 goal configurations .* different",
+    ),  # type: ignore[arg-type]
     (
         lambda: PathConstraints(
             replace(problem(EACH[4]), goal=rd.PoseGoal(HAND, link_pose(PANDA, GOAL, HAND), [0.1, 0, 0]))
         ),
-        "the goal must determine its pose, but it has tolerances",
+        "the goal must determine the pose of this link, but the goal has tolerances",
     ),
 ]
 

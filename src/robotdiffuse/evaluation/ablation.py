@@ -1,8 +1,8 @@
 """The paper's Table 2: every row is trained with the same budget and evaluated on the same held-out problems.
 
-Collision guidance alone, without a network, solves many problems. What a row owes to its network is measured
-without guidance, and by controls: fixed vias, the nearest motions of the data, and smooth noise, with and
-without guidance.
+Collision guidance alone, without a network, solves many problems. So the contribution of a network is
+measured without guidance, and by comparison with controls: motions through fixed configurations (vias), the
+nearest motions of the data, and smooth noise, with and without guidance.
 """
 
 import json
@@ -36,7 +36,7 @@ from robotdiffuse.evaluation.methods import (
     sampling_digest,
 )
 from robotdiffuse.evaluation.metrics import link_length
-from robotdiffuse.evaluation.paper import paper_report, straight_line_shares
+from robotdiffuse.evaluation.paper import paper_report, straight_line_counts
 from robotdiffuse.evaluation.problem_sets import hard_cases
 from robotdiffuse.evaluation.report import Report, share_cell
 from robotdiffuse.evaluation.runs import Record, run_all
@@ -62,7 +62,8 @@ class Row(NamedTuple):
     guided: bool
     """Whether samples are drawn under collision guidance."""
     paper: tuple[float | None, ...]
-    """The paper's success [%], collision [%], length and time [s]; None if it has no such row."""
+    """The paper's success [%], collision [%], length and time [s]; None for numbers that the paper does not
+    have."""
 
 
 ROWS: dict[str, Row] = {
@@ -81,15 +82,15 @@ ROWS: dict[str, Row] = {
 
 class ControlRow(NamedTuple):
     source: str
-    """As for `ControlSettings`."""
+    """Where the candidates come from; see `ControlSettings`."""
     samples: int | None
-    """None: as many as for the networks."""
+    """Number of candidates; None: as many as the networks draw."""
     guided: bool
 
 
 CONTROLS = {
-    "no network: one via": ControlRow(VIAS, 1, False),
-    "no network: 16 vias": ControlRow(VIAS, 16, False),
+    "no network: through one fixed configuration": ControlRow(VIAS, 1, False),
+    "no network: through 16 fixed configurations": ControlRow(VIAS, 16, False),
     "no network: nearest motions": ControlRow(NEAREST, None, True),
     "no network: smooth noise": ControlRow(NOISE, None, True),
 }
@@ -104,17 +105,17 @@ class AblationSettings(Settings):
     out: str
     """Folder for the trained networks; existing ones are kept, interrupted trainings continue."""
     samples: Count = 300_000
-    """Training samples of each row, the equal budget."""
+    """Number of training samples of each row: all rows have the same budget."""
     encoder_samples: Count = 300_000
-    """Clouds that the frozen encoder is trained on first."""
+    """Number of point clouds on which an encoder is trained before it is frozen."""
     problems: Count = 500
-    """Held-out problems that the straight line does not solve and search does."""
+    """Number of held-out problems that the straight line does not solve and a search does."""
     family: Annotated[str, OneOf(FAMILIES)] = "rop"
     """Family of the problems, a name in `problems.families`."""
     candidates: Count = 16
-    """Trajectories sampled for each problem."""
+    """Number of trajectories sampled for each problem."""
     seeds: Count = 1
-    """Trainings of each row, with seeds 0, 1, ...; figures are means over them."""
+    """Number of trainings of each row, with seeds 0, 1, ...; figures are means over the trainings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,11 +125,11 @@ class Evaluation:
     single: Values
     """Share of the sampled trajectories that passed the validator."""
     best: Values
-    """1 if any of them passed."""
+    """1 if any sampled trajectory passed the validator, else 0."""
     collided: Values
     """Share of the sampled trajectories in collision."""
     length: Values
-    """Link path length of the shortest that passed [m]; NaN without one."""
+    """Link path length of the shortest trajectory that passed [m]; NaN if none passed."""
     seconds: Values
     """CPU time of encoding and sampling on one thread [s]."""
 
@@ -139,20 +140,21 @@ class Evaluation:
         return cls(single, (single > 0) * 1.0, collided, length, seconds)
 
     @classmethod
-    def mean(cls, of: "list[Evaluation]") -> "Evaluation":
-        """The mean over several trainings, of each problem; NaN lengths do not count."""
-        values = [np.stack([getattr(each, f.name) for each in of]) for f in fields(cls)]
+    def mean(cls, trainings: "list[Evaluation]") -> "Evaluation":
+        """For each problem, the mean over several trainings; NaN lengths do not count."""
+        values = [np.stack([getattr(each, f.name) for each in trainings]) for f in fields(cls)]
         return cls(*(np.ma.masked_invalid(x).mean(axis=0).filled(np.nan) for x in values))
 
 
 class RowResult(NamedTuple):
     name: str
     alone: Evaluation
-    """Without guidance."""
+    """Evaluation without guidance."""
     guided: Evaluation
-    """With it."""
+    """Evaluation with guidance."""
     by_seed: tuple[float, ...] = ()
-    """Share of samples that pass the validator, as in the paper's row, of each training."""
+    """For each training, the share of samples that pass the validator, with guidance if the paper's row has
+    it."""
 
     @property
     def as_in_paper(self) -> Evaluation:
@@ -212,7 +214,7 @@ def run_ablation(
             [evaluations[Training(row.config, seed), guided] for seed in range(settings.seeds)]
             for guided in (False, True)
         )
-        by_seed = tuple(float(of.single.mean()) for of in (guided if row.guided else alone))
+        by_seed = tuple(float(x.single.mean()) for x in (guided if row.guided else alone))
         results.append(RowResult(name, Evaluation.mean(alone), Evaluation.mean(guided), by_seed))
     controls = [RowResult(name, evaluations[name, False], evaluations[name, True]) for name in CONTROLS]
     return [*results, *controls]
@@ -226,12 +228,13 @@ class Training(NamedTuple):
 
     @property
     def folder(self) -> str:
-        """Name of the folder of its weights."""
+        """Name of the folder of the trained weights."""
         return f"{self.config}_seed{self.seed}" if self.seed else self.config
 
 
 def _training(file: FilePath, name: str, budget: int) -> dict[str, Any]:
-    """What a network's file says of its training. Raises InputError if that had another budget."""
+    """What the file of a network says about the training. Raises InputError if the training had another
+    budget."""
     about = json.loads(file.read_text())["training"]
     samples = about["settings"]["samples"]
     if samples != budget:
@@ -255,7 +258,7 @@ def _train(settings: AblationSettings, training: Training) -> Training:
 def _evaluate(
     settings: AblationSettings, which: Training | str, guided: bool, cases: list[Case]
 ) -> Evaluation:
-    """which: a training, or a name in CONTROLS."""
+    """Evaluate a network or a control on problems. which: a training, or a name in CONTROLS."""
     robot = load_robot("panda")
     out = FilePath(settings.out)
     if isinstance(which, str):
@@ -288,24 +291,26 @@ def _evaluate(
 
 
 NOTES = (
-    "single: share of samples that pass the validator; best: of problems with at least one such sample.",
-    "length: of the shortest such sample, over the problems that have one; to first: the mean ratio to that "
-    "of the first row, over the problems that both solve. Intervals are over problems, not over trainings: "
-    "another seed may move a row by more.",
-    "no network: fixed vias without guidance; and the nearest motions of the data, bent to start and goal, "
-    f"and smooth noise, which networks start from, with {EQUAL_TIME_STEPS} gradient steps, as many as take a "
-    "network's time. The straight line solves none of these problems, by their choice.",
+    "single: share of samples that pass the validator; best: share of problems with at least one such "
+    "sample.",
+    "length: mean length of the shortest such sample, over the problems that have one; to first: mean ratio "
+    "of this length to that of the first row, over the problems that both rows solve. Intervals are over "
+    "problems, not over trainings: another seed may change a row by more.",
+    "no network: motions through fixed configurations, without guidance; the nearest motions of the data, "
+    "bent to start and goal; smooth noise, which networks start from. The last two get "
+    f"{EQUAL_TIME_STEPS} gradient steps, as many as take the time of a network. Problems that the straight "
+    "line solves were left out.",
 )
 LINE_FAMILIES = {"spheres and cubes": ROP, "spheres alone": Rop(kinds=("sphere",))}
 LINE_NOTES = (
     "The straight line in joint space, under the authors' own draw of problems, with inverse kinematics of "
-    "the position alone: share of problems on which it is free. The paper's rows are of all problems, "
-    "trivial ones too, so a row near these shares has shown no planner.",
+    "the position alone: share of problems on which it is free. The paper's rows are over all problems, also "
+    "those that the straight line solves: a row near these shares does not show that its planner plans.",
 )
 
 
 def table2(settings: AblationSettings, results: list[RowResult]) -> Report:
-    """Table 2 and, beside its rows, no planner at all."""
+    """The report of Table 2, with a second table that compares its rows with the straight line."""
     command = (
         f"robotdiffuse reproduce table2 --data DATA --out FOLDER --samples {settings.samples} "
         f"--encoder-samples {settings.encoder_samples} --problems {settings.problems} "
@@ -359,11 +364,12 @@ def table(settings: AblationSettings, results: list[RowResult]) -> Table:
 
 
 def straight_line_table(problems: int) -> Table:
-    """No planner under the authors' own draw, beside the paper's rows of Table 2."""
+    """Success of the straight line on problems drawn as the authors draw them, among the paper's rows of
+    Table 2."""
     printed = {name: row.paper[0] or 0.0 for name, row in ROWS.items()}
     rows = [(f"paper: {name}", Figure(f"{success}", success / 100)) for name, success in printed.items()]
     for obstacles, family in LINE_FAMILIES.items():
-        for goals, free in straight_line_shares(problems, family).items():
+        for goals, free in straight_line_counts(problems, family).items():
             name = f"no planner: straight line to {goals}, {obstacles}"
             rows.append((name, share_cell(free / problems, wilson_interval(free, problems))))
     columns = ("row", Column("success", "%"))

@@ -47,7 +47,7 @@ from robotdiffuse.planning import PLANNERS, load_planner, planner_settings
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.files import problem_from_record, problem_record
-from robotdiffuse.problems.held_out import Case
+from robotdiffuse.problems.held_out import Case, Progress
 from robotdiffuse.processes.ray_cluster import CLUSTERS
 from robotdiffuse.processes.workers import EndedError, NotStartedError, OverrunError, Worker
 from robotdiffuse.robots.robot import Robot
@@ -63,9 +63,9 @@ class PlannerSpec:
     name: str
     """In `planning.PLANNERS`."""
     weights: str | None = None
-    """Folder of its weights; None: the bundled ones."""
+    """Folder of the planner's weights; None: the bundled weights."""
     settings: tuple[str, ...] = ()
-    """NAME=VALUE of the planner's settings and of its calls' arguments (`PlanRequest`)."""
+    """Settings of the planner and arguments of its calls (`PlanRequest`), each as NAME=VALUE."""
 
     @classmethod
     def parse(cls, text: str) -> "PlannerSpec":
@@ -85,13 +85,13 @@ class PlannerSpec:
 
     @property
     def label(self) -> str:
-        """Its name in results."""
+        """The planner's name in results."""
         name = self.name if self.weights is None else f"{self.name}@{FilePath(self.weights).name}"
         return ":".join([name, *self.settings])
 
     @property
     def weights_hashes(self) -> dict[str, Any]:
-        """SHA-256 of the weights in its folder, by network; empty without a folder."""
+        """SHA-256 of the weights in the folder, by network; empty if the planner uses the bundled weights."""
         if self.weights is None:
             return {}
         folder = FilePath(self.weights)
@@ -99,7 +99,7 @@ class PlannerSpec:
         return {name: read_description(folder, name).get("weights_sha256") for name in names}
 
     def request(self) -> dict[str, Any]:
-        """Arguments of its calls: until, clearance, ..."""
+        """Arguments of the planner's calls: until, clearance, ..."""
         request = PlanRequest().changed(text for text in self.settings if _of_call(text))
         return {name: getattr(request, name) for name in CALL_ARGUMENTS}
 
@@ -126,7 +126,7 @@ def _of_call(text: str) -> bool:
 
 
 START_TIMEOUT = 300.0
-"""Timeout for starting a process, and for warming it up [s]; on a new machine this compiles kernels."""
+"""Timeout for starting a process, and for warming it up [s]: on a new machine, kernels are compiled."""
 GRACE = 20.0
 """A process that has not answered this long after the time limit is killed [s]. This time includes the
 validation and timing of the motion."""
@@ -146,8 +146,8 @@ class PlannerProcess:
         self._worker = Worker(_prepare, (spec, str(log), cpu_time))
 
     def warm(self, run: Run) -> None:
-        """Warm up for a run's robot. If the process dies of that, `plan` will report it. Raises InputError if
-        the program cannot start processes."""
+        """Warm up for a run's robot. If the process dies while it warms up, `plan` will report it. Raises
+        InputError if the program cannot start processes."""
         try:
             self._worker.start()
         except NotStartedError as error:
@@ -177,7 +177,7 @@ class PlannerProcess:
         self._worker.close(0.0)
 
     def _ask(self, timeout: float, call: Callable[..., Fields | None], *arguments: Any) -> Fields | None:
-        """The answer of a call in the process, or the record of a process that gave none."""
+        """The answer of a call in the process; if the process gave no answer, a record that says why."""
         try:
             return self._worker.call(call, *arguments, timeout=timeout)
         except OverrunError:
@@ -195,9 +195,9 @@ _planner: Planner
 _request: Fields
 """Further arguments of the planner's calls."""
 _answers: Iterator[Fields]
-"""Answers of the current run that are not yet sent."""
+"""Answers of the current run that were not sent yet."""
 _warm: set[Robot] = set()
-"""Robots that the planner is warmed up for."""
+"""Robots for which the planner is warmed up."""
 
 
 def _prepare(spec: PlannerSpec, log: str, cpu_time: bool) -> None:
@@ -214,7 +214,7 @@ def _prepare(spec: PlannerSpec, log: str, cpu_time: bool) -> None:
 
 
 def _warm_up(record: Fields) -> None:
-    """Compile, load and fill caches, those of the metrics too."""
+    """Compile and load kernels and fill the caches of the planner and of the metrics."""
     problem = problem_from_record(record)
     if problem.robot in _warm:
         return
@@ -304,7 +304,7 @@ def on_cluster(settings: "BenchSettings", runs: Sequence[Run], session: str) -> 
 
 
 def records_of(run: Run, answers: Sequence[Fields], about: Fields) -> list[Record]:
-    """The records of a run: the first call's, and that of the restarts if there is one."""
+    """The records of a run: of the first call and, if there were restarts, of all its calls together."""
     labels = (run.method, run.method + RESTARTED)
     pairs = zip(labels, answers, strict=False)
     return [run.record({"planner": label, **about, **answer}) for label, answer in pairs]
@@ -315,7 +315,7 @@ def _log_file(logs: FilePath, label: str) -> FilePath:
 
 
 def _run_task(spec: PlannerSpec, runs: list[Run], restarts: bool) -> tuple[list[list[Fields]], str]:
-    """The answers to the runs, and the planner's output."""
+    """The answers of the planner to these runs, and what the planner printed."""
     with TemporaryDirectory() as folder:
         log = FilePath(folder) / "log"
         process = PlannerProcess(spec, log)
@@ -327,7 +327,7 @@ def _run_task(spec: PlannerSpec, runs: list[Run], restarts: bool) -> tuple[list[
 
 
 PACKAGES = ("numpy", "numba", "onnxruntime", "ompl")
-"""Packages whose versions are kept with the results."""
+"""Packages whose versions are stored with the results."""
 
 
 @dataclass(frozen=True)
@@ -335,19 +335,20 @@ class BenchSettings(Settings):
     """What `bench run` runs."""
 
     planners: Annotated[tuple[str, ...], Filled()]
-    """Texts of planners, see `PlannerSpec.parse`; or `all` alone."""
+    """Planners, each as text for `PlannerSpec.parse`; or only `all`."""
     problems: Annotated[tuple[str, ...], Filled()]
-    """Families (rop, rop_dense, ..., each also with _nontrivial), files or folders."""
+    """Problem sets: families (rop, rop_dense, ...; FAMILY_nontrivial has no trivial problems), files or
+    folders."""
     out: FilePath
     """Folder for problems and results."""
     time_limit: Positive = 1.0
     """Time limit of a call [s]."""
     seeds: Count = 1
-    """Calls on each problem, with seeds 0, 1, ..."""
+    """Number of calls on each problem, with seeds 0, 1, ..."""
     count: Count | None = None
-    """Problems of each set; None: 100 of a family, all of a file or folder."""
+    """Number of problems of each set; None: 100 of a family, all of a file or folder."""
     workers: Count = 1
-    """Planners that run at once, each in a process of its own."""
+    """Number of planners that run at the same time, each in its own process."""
     cluster: Annotated[str, OneOf(CLUSTERS)] | None = None
     """ray: on the cluster that RAY_ADDRESS names; None: this machine."""
     equal_time: bool = False
@@ -370,7 +371,7 @@ class BenchSettings(Settings):
 
     @property
     def logs(self) -> FilePath:
-        """What the planners print."""
+        """Folder of the files with what the planners print."""
         return self.out / "logs"
 
     @cached_property
@@ -383,12 +384,11 @@ class BenchSettings(Settings):
         return specs
 
 
-Report = Callable[[str], None]
 Done = Callable[[int, int], None]
 """Called with the number of finished calls and the number of all calls."""
 
 
-def run_bench(settings: BenchSettings, report: Report, done: Done) -> int:
+def run_bench(settings: BenchSettings, report: Progress, done: Done) -> int:
     """Make the calls that are missing in the folder; returns how many were made.
 
     A call that ended before a shorter time limit is not repeated, since more time would not change it. Raises
@@ -432,7 +432,8 @@ def open_runs(
 
 
 def _check_weights(settings: BenchSettings, sessions: Sequence[Mapping[str, Any]]) -> None:
-    """Raise InputError if a planner of this name was run here with other weights: its records would mix."""
+    """Raise InputError if a planner of the same name was run in this folder with other weights: the records
+    of different weights would be mixed."""
     for label, spec in settings.specs.items():
         recorded_hashes = [
             session["weights"][label] for session in sessions if label in session.get("weights", {})
@@ -480,7 +481,7 @@ ROP = ("rop_nontrivial", "rop_dense_nontrivial")
 
 @dataclass(frozen=True)
 class Preset:
-    """Planners on the first problems of each set, once with each time limit."""
+    """A named comparison: planners run on the first problems of each set, once with each time limit."""
 
     description: str
     planners: tuple[str, ...]
@@ -488,7 +489,7 @@ class Preset:
     limits: tuple[float, ...]
     """Time limit of a call [s]."""
     count: int
-    """Problems of each set."""
+    """Number of problems of each set."""
     equal_time: bool = True
     """See `BenchSettings`."""
 

@@ -46,8 +46,7 @@ from robotdiffuse.planning.pose_goals import GOAL_COUNT, pose_configurations
 from robotdiffuse.problems.families.family import POSITION
 from robotdiffuse.problems.families.rop import ROP, Rop
 from robotdiffuse.problems.goals import JointGoal, PoseGoal
-from robotdiffuse.problems.held_out import SEED, Case, CaseFile, goal_of
-from robotdiffuse.problems.held_out import Report as ReportProgress
+from robotdiffuse.problems.held_out import SEED, Case, CaseFile, Progress, goal_of
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
 
@@ -112,7 +111,7 @@ def problem_file(out: FilePath, problem_set: str) -> FilePath:
     return out / "problems" / f"{problem_set}.jsonl"
 
 
-def write_problems(out: FilePath, count: int, report: ReportProgress) -> None:
+def write_problems(out: FilePath, count: int, report: Progress) -> None:
     """Draw the first `count` non-trivial problems of both sets and write them into the folder of a bench,
     unless it has them."""
     files = {name: CaseFile(problem_file(out, name)) for name in GOALS}
@@ -135,7 +134,7 @@ def trivial_share(out: FilePath, problem_set: str) -> float:
     return 1 - len(cases) / (1 + int(cases[-1].name.partition("/")[2]))
 
 
-def straight_line_shares(count: int, family: Rop = ROP) -> dict[str, int]:
+def straight_line_counts(count: int, family: Rop = ROP) -> dict[str, int]:
     """Number of problems, of `count`, in which the straight line is free: to one goal configuration, to the
     nearest of ten, and to any of ten.
 
@@ -144,7 +143,7 @@ def straight_line_shares(count: int, family: Rop = ROP) -> dict[str, int]:
     """
     robot = load_robot("panda")
     names = ("a single goal", "the nearest of ten goals", "any of ten goals")
-    shares: dict[str, int] = dict.fromkeys(names, 0)
+    counts: dict[str, int] = dict.fromkeys(names, 0)
     for number in range(count):
         rng = np.random.default_rng([SEED, STREAM + 1, number])
         sample = family.draw(robot, rng, GOAL_COUNT, POSITION)
@@ -152,9 +151,9 @@ def straight_line_shares(count: int, family: Rop = ROP) -> dict[str, int]:
         lines = free_lines(problem, sample.goals)
         single = free_lines(problem, sample.goals[:1])[0]
         free = (single is not None, lines[0] is not None, any(line is not None for line in lines))
-        for name, is_free in zip(shares, free, strict=True):
-            shares[name] += is_free
-    return shares
+        for name, is_free in zip(counts, free, strict=True):
+            counts[name] += is_free
+    return counts
 
 
 # Table 1
@@ -312,7 +311,7 @@ class Table1Settings:
         )
 
 
-def run_table1(settings: Table1Settings, report: ReportProgress, done: Done) -> Bench:
+def run_table1(settings: Table1Settings, report: Progress, done: Done) -> Bench:
     """Make the calls that are missing in the folder; returns the bench with all calls.
 
     Raises InputError for paper weights with clearances as inputs or with more steps than fit into the time

@@ -14,7 +14,7 @@ from robotdiffuse.core.types import LENGTH, Path
 from robotdiffuse.planning.search.rrt import AORRTC, AORRTCSettings
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.files import load_problems
-from robotdiffuse.problems.held_out import Case, CaseFile, Report, line_length
+from robotdiffuse.problems.held_out import Case, CaseFile, Progress, line_length
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.validation.validator import VerifySettings, verifier
 
@@ -44,7 +44,7 @@ def case_file(folder: FilePath | None, name: str) -> CaseFile:
 
 
 def hard_cases(
-    family: str, count: int, folder: FilePath | None = None, report: Report = lambda text: None
+    family: str, count: int, folder: FilePath | None = None, report: Progress = lambda text: None
 ) -> list[Case]:
     """The first hard held-out problems of a family; the folder keeps what is known of them."""
     return case_file(folder, family).held_out(family, count, validator, search, report)
@@ -67,7 +67,7 @@ def problem_set_name(text: str) -> str:
     return name
 
 
-def gather_cases(names: list[str], count: int | None, out: FilePath, report: Report) -> list[Case]:
+def gather_cases(names: list[str], count: int | None, out: FilePath, report: Progress) -> list[Case]:
     """The first `count` problems of each set (None: all of a file or folder, 100 of a family).
 
     They are kept in `out`/problems, one file for each set, and read from there next time; a larger count adds
@@ -87,7 +87,7 @@ def read_cases(out: FilePath, problem_set: str) -> list[Case]:
     return _of_set(case_file(out / "problems", name).cases(hard=name != problem_set), problem_set)
 
 
-def _set(text: str, count: int | None, folder: FilePath, report: Report) -> list[Case]:
+def _set(text: str, count: int | None, folder: FilePath, report: Progress) -> list[Case]:
     name = problem_set_name(text)
     family = text.removesuffix(NONTRIVIAL_SUFFIX)
     if family in FAMILIES:
@@ -126,7 +126,7 @@ def _of_set(cases: list[Case], problem_set: str) -> list[Case]:
     return [replace(case, problem_set=problem_set) for case in cases]
 
 
-def _read_place(place: FilePath, name: str, report: Report) -> list[Case]:
+def _read_place(place: FilePath, name: str, report: Progress) -> list[Case]:
     """The cases of a file, of a MotionBenchMaker folder, or of all files and such folders in a folder."""
     cases = []
     for part in _parts(place):

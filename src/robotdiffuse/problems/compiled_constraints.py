@@ -1,8 +1,8 @@
-"""PathConstraints: the constraints of a problem as arrays; evaluates, proves and projects with the Numba
-kernel.
+"""PathConstraints: the constraints of a problem as arrays. Evaluates the constraints, proves that motions
+satisfy them, and projects configurations onto them.
 
-The compiled functions are in `constraint_kernel.py` and `projection_kernel.py`; this file builds their arrays
-and interprets results.
+The compiled functions are in `constraint_kernel.py` and `projection_kernel.py`; this file builds the arrays
+that they need and interprets their results.
 """
 
 from collections.abc import Sequence
@@ -45,18 +45,20 @@ from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 
 MIN_SEGMENT_FRACTION = 1e-7
-"""Fraction of a segment down to which a proof splits it."""
-# Step [rad] and number of the configurations at which the maximum of a violation is searched for.
+"""A proof splits a segment into pieces no shorter than this fraction of the segment."""
 VIOLATION_STEP = 0.01
+"""Joint-space distance between the configurations at which the maximum of a violation is searched for
+[rad]."""
 VIOLATION_STEPS = 1000
+"""Number of these configurations."""
 PROJECTION_FRACTION = 0.5
-"""Fraction of a tolerance that projection aims for."""
+"""Projection aims at this fraction of a tolerance, to end well within the tolerance."""
 POSE_TOLERANCE = 2e-6
 """Tolerance of the pose of a projected link [m], [rad]."""
-# Part of the tolerances of a goal that projected configurations leave free, and the part of them that
-# projection aims for.
 GOAL_MARGIN = 1e-3
+"""Projected configurations keep this fraction of a goal's tolerances as a reserve."""
 INNER_GOAL_FRACTION = 0.9
+"""Projection aims at this fraction of what is left of a goal's tolerances."""
 MIN_LINE_LENGTH = 1e-3
 """Along shorter lines, the orientation does not follow the position: the link turns in place [m]."""
 SAME_POSE_TOLERANCE = 1e-3
@@ -117,9 +119,8 @@ class PathConstraints:
         poses: Sequence[PoseGoal] = (),
         exact: tuple[float, float] = (POSE_TOLERANCE, POSE_TOLERANCE),
     ) -> None:
-        """poses: poses that links must reach within the tolerances of each, as additional rows for
-        projection.
-        exact: the tolerances of positions and orientations without one [m], [rad].
+        """poses: additional goals for projection; each link must reach its pose within the pose's tolerances.
+        exact: tolerances of the position [m] and of the orientation [rad] of poses that state none.
 
         Raises InputError if a Cartesian line has no unique end pose.
         """
@@ -130,7 +131,7 @@ class PathConstraints:
         at = [(pose.frame, row) for pose in poses for row in _pose_rows(pose, *exact)]
         frames = [owner.frame for owner in self.owners] + [frame for frame, _ in at]
         self.rows = _arrays(problem.robot, frames, [row for _, row in each + at])
-        self._paced = [
+        self._speed_limited_rows = [
             (m, owner.speed)
             for m, owner in enumerate(self.owners)
             if isinstance(owner, CartesianLine)
@@ -192,35 +193,41 @@ class PathConstraints:
 
     def speeds(self, q: Configurations, rates: JointRows) -> Float[ndarray, "n limited"]:
         """Speeds of the frames with a speed limit [m/s], one column each, at joint velocities `rates`."""
-        columns = [kernel.speeds(self.rows, m, for_kernels(q), for_kernels(rates)) for m, _ in self._paced]
+        columns = [
+            kernel.speeds(self.rows, m, for_kernels(q), for_kernels(rates))
+            for m, _ in self._speed_limited_rows
+        ]
         return np.stack(columns, axis=1) if columns else np.zeros((len(q), 0))
 
-    def speed_bends(self, way: Float[ndarray, "3 n dof"]) -> Float[ndarray, "n limited"]:
-        """Bounds on the third derivatives of the positions of these frames along n stretches of a motion;
-        `way` bounds the first three derivatives of the joints' positions.
+    def third_derivative_bounds(self, derivatives: Float[ndarray, "3 n dof"]) -> Float[ndarray, "n limited"]:
+        """Bounds on the third derivatives of the positions of the frames with a speed limit, on n pieces of a
+        motion.
 
-        A derivative of the position by several joints is no longer than the lever of the last of them. The
-        sum of the products whose last joint is m grows with m as the product of the sums up to m does.
+        A partial derivative of a frame's position by several joints is at most as long as the lever of the
+        last of these joints in the chain. The sum of all products of joint rates whose last joint is m is the
+        product of the sums over the joints up to m, less the product of the sums up to m - 1.
+
+        derivatives: bounds on the first three derivatives of the joint positions, for each piece.
         """
-        bends = np.empty((way.shape[1], len(self._paced)))
-        for k, (m, _) in enumerate(self._paced):
+        bounds = np.empty((derivatives.shape[1], len(self._speed_limited_rows)))
+        for k, (m, _) in enumerate(self._speed_limited_rows):
             count = self.rows.chain_length[m]
-            first, second, third = way[:, :, self.rows.chain[m, :count]]
-            speed = np.cumsum(first, axis=1)
-            bend = np.cumsum(second, axis=1)
-            products = np.diff(3 * bend * speed + speed**3, axis=1, prepend=0.0)
-            bends[:, k] = (third + products) @ self.rows.lever_bounds[m, :count]
-        return bends
+            first, second, third = derivatives[:, :, self.rows.chain[m, :count]]
+            first_sums = np.cumsum(first, axis=1)
+            second_sums = np.cumsum(second, axis=1)
+            products = np.diff(3 * second_sums * first_sums + first_sums**3, axis=1, prepend=0.0)
+            bounds[:, k] = (third + products) @ self.rows.lever_bounds[m, :count]
+        return bounds
 
     @property
     def speed_limits(self) -> Float[ndarray, "limited"]:
-        """Speed limits of these frames [m/s]."""
-        return np.array([speed for _, speed in self._paced])
+        """Speed limits of the frames that have one [m/s]."""
+        return np.array([speed for _, speed in self._speed_limited_rows])
 
     @property
     def speed_limited(self) -> list[Constraint]:
-        """The constraints that set these limits."""
-        return [self.owners[m] for m, _ in self._paced]
+        """The constraints with a speed limit."""
+        return [self.owners[m] for m, _ in self._speed_limited_rows]
 
     def _maximum(self, q: ndarray, segment: int, fraction: float, row: int) -> float:
         """The maximum value of a row from a place on the motion until it is satisfied again."""
@@ -279,12 +286,12 @@ def _line_rows(problem: Problem, line: CartesianLine) -> list[_Row]:
     turn = rotation_vector(T_goal[:3, :3] @ T_start[:3, :3].T)
     total_angle = float(np.linalg.norm(turn))
     if length < MIN_LINE_LENGTH and total_angle > 0:
-        # in place: the axis stays where it is, and an arm at right angles to it turns to either side of its
-        # middle by half the angle
+        # The link turns in place: the axis of the turn keeps its direction, and a vector perpendicular to the
+        # axis stays within half the total angle of where it points in the middle of the turn.
         axis = turn / total_angle
-        arm = rotation_z_to(axis)[:, 0]
-        middle = rotation_about(axis, total_angle / 2) @ arm
-        for link_axis, direction, spread in ((axis, axis, 0.0), (arm, middle, total_angle / 2)):
+        across = rotation_z_to(axis)[:, 0]
+        middle = rotation_about(axis, total_angle / 2) @ across
+        for link_axis, direction, spread in ((axis, axis, 0.0), (across, middle, total_angle / 2)):
             limit = min(spread + line.angle, np.pi)
             rows.append(_Row(CONE, limit, line.angle, a=T_start[:3, :3].T @ link_axis, b=direction))
     else:
@@ -305,19 +312,21 @@ def line_end(problem: Problem, line: CartesianLine) -> Pose:
             for T in off
         ):
             return poses[0]
-        why = f"its {len(poses)} configurations put {line.frame} at different poses"
+        why = f"the {len(poses)} goal configurations put {line.frame} at different poses"
     elif poses := poses_of(goal):
         for pose in poses:
             if robot.link_frame(pose.frame) == robot.link_frame(line.frame) and not pose.tolerant:
                 between = inverse(robot.T_frame_link(pose.frame)) @ robot.T_frame_link(line.frame)
                 return pose.T_base_frame @ between
-        frames = " and of ".join(pose.frame for pose in poses)
-        why = f"it is a pose of {frames}, which is not rigidly connected to {line.frame}"
+        frames = " and ".join(pose.frame for pose in poses)
+        why = f"no pose of the goal, for {frames}, is rigidly connected to {line.frame}"
         if any(robot.link_frame(pose.frame) == robot.link_frame(line.frame) for pose in poses):
-            why = "it has tolerances"
+            why = "the goal has tolerances"
     else:
-        why = "it is any of several goals"
-    raise InputError(f"cartesian_line of {line.frame}: the goal must determine its pose, but {why}")
+        why = "the goal is any of several goals"
+    raise InputError(
+        f"cartesian_line of {line.frame}: the goal must determine the pose of this link, but {why}"
+    )
 
 
 def rotation_vector(rotation: Rotation) -> Vector:
@@ -335,7 +344,7 @@ def rotation_vector(rotation: Rotation) -> Vector:
 def _pose_rows(pose: PoseGoal, position: float, angle: float) -> list[_Row]:
     """Rows for the position and the orientation of a pose.
 
-    position, angle: the tolerances where the pose has none [m], [rad].
+    position, angle: tolerances of poses that state none [m], [rad].
     """
     T = pose.T_base_frame
     rows = []

@@ -29,7 +29,7 @@ Validator = Callable[[Problem, Path], bool]
 """Whether a path solves a problem."""
 Search = Callable[[Problem], float | None]
 """Length of the shortest path that a search finds [rad]; None if it finds none."""
-Report = Callable[[str], None]
+Progress = Callable[[str], None]
 """Receives progress messages."""
 REPORT_EVERY = 20
 """Problems between two progress messages."""
@@ -127,7 +127,7 @@ class CaseFile:
         count: int,
         validator: Validator,
         search: Search | None = None,
-        report: Report = lambda text: None,
+        report: Progress = lambda text: None,
     ) -> list[Case]:
         """The first `count` held-out problems of a family; with a search, the first hard ones.
 

@@ -51,7 +51,8 @@ class LinkPairTable(Value):
     lower: tuple[float, ...]
     """Joint values at which the table begins [rad] or [m]."""
     upper: tuple[float, ...]
-    """Joint values at which it ends. A range of one whole turn repeats itself."""
+    """Joint values at which the table ends. If the range of a joint is one whole turn, the table is periodic
+    in this joint."""
     apart: Bool[ndarray, "*cells"]
     """Whether the links are apart throughout a cell."""
 
@@ -101,9 +102,10 @@ class LinkPairTable(Value):
 
 
 LOCKED_CACHE = 256
-"""Number of robots with locked joints in the cache, least recently used out first: about 0.1 MB each."""
+"""Largest number of robots with locked joints in the cache, about 0.1 MB each; the least recently used one is
+dropped first."""
 ATTACHED_CACHE = 64
-"""Number of robots with attached bodies in the cache."""
+"""Largest number of robots with attached bodies in the cache."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -136,8 +138,8 @@ class Robot(KinematicTree):
     root: str = ""
     """Root link of the URDF; if empty, the base is the root."""
     above: dict[str, Pose] = field(default_factory=dict)
-    """T_base_link of the links above the base that only fixed joints connect to it. The root is among them
-    unless a movable joint lies between."""
+    """T_base_link of the links between the root of the URDF and the base that are rigidly connected to the
+    base. The root is one of them unless a movable joint lies between the root and the base."""
     poses: dict[str, dict[str, float]] = field(default_factory=dict)
     """Named poses of the SRDF: joint values by name [rad] or [m]."""
     source: str | None = None
@@ -154,10 +156,10 @@ class Robot(KinematicTree):
     """For pairs of links that pass closer than spheres can resolve: the joint values at which they do not
     collide."""
     surfaces: dict[str, Surface] = field(default_factory=dict)
-    """Collision meshes as the URDF gives them, of the links in `grazing`. `meshes` contain them."""
+    """Original collision meshes of the URDF, for the links in `grazing`. The convex `meshes` enclose them."""
     grazing: frozenset[frozenset[str]] = frozenset()
-    """Pairs of links whose `meshes` can overlap where their `surfaces` are apart; see
-    `collision.surface_pairs`."""
+    """Pairs of links that pass so close that their convex `meshes` may overlap although their `surfaces` do
+    not touch; see `collision.surface_pairs`."""
 
     def fk(self, q: ArrayLike, link: str | None = None) -> ndarray:
         """Forward kinematics: the pose of a link in the frame of the base.
@@ -239,8 +241,8 @@ class Robot(KinematicTree):
         return inverse_kinematics(self, link or self.tip, cast(ndarray, pose), count, rng=rng, near=seeded)
 
     def checked_pairs(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of links that are checked against each other: with geometry, on different frames, not
-        allowed."""
+        """Pairs of links that are checked against each other: both links have geometry, they are on different
+        frames, and the pair is not in `allowed_collisions`."""
         return tuple(
             pair
             for pair in moving_pairs(self, self.spheres)
@@ -520,8 +522,8 @@ def configurations(robot: Robot, q: ArrayLike) -> ndarray:
 def named_pose(robot: Robot, field: str, name: str) -> list[float]:
     """The planned joints' values in a named pose of the robot [rad] or [m].
 
-    Raises InputError, naming the field, for an unknown name (the message lists those that hold all planned
-    joints) and for a pose that lacks some.
+    Raises InputError, naming the field, for an unknown name (the message lists the poses with values for all
+    planned joints) and for a pose without a value for some planned joint.
     """
     complete = [pose for pose, values in robot.poses.items() if {*robot.joint_names} <= values.keys()]
     if not complete:
@@ -529,13 +531,13 @@ def named_pose(robot: Robot, field: str, name: str) -> list[float]:
         raise InputError(f"{field} is {shown(name)}; it must be {values} ({robot.name} has no named poses)")
     if name not in robot.poses:
         raise unknown_name(f"pose in {field}:", name, complete)
-    advice = f"; whole poses: {', '.join(complete)}"
+    advice = f"; poses with all planned joints: {', '.join(complete)}"
     return robot.planned_values(f"{field}: the pose {name!r}", robot.poses[name], advice)
 
 
 DIGITS = 9
-"""Numbers are rounded to this many decimals, since rotations from quaternions differ by machine in the last
-bits."""
+"""Number of decimals to which numbers are rounded, since the last bits of rotations from quaternions differ
+between machines."""
 
 
 def hashed_content(names: object, *numbers: object) -> bytes:

@@ -18,7 +18,7 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere
 
 MAX_SAMPLING_ROUNDS = 6
-"""Rounds of sampling in `sample_surface` before it repeats points."""
+"""Largest number of rounds in which `sample_surface` draws points; then it repeats points."""
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class VisibleRegion(Settings, name="region"):
     plane."""
 
     floor: float = 0.02
-    """Points must be higher than this [m]: every scene contains the mounting plane, which carries no
-    information."""
+    """Points must be higher than this [m]: points of the mounting plane carry no information, since nearly
+    all scenes contain it."""
     center: tuple[float, float, float] = (0.0, 0.0, 0.3)
     """Center of the region in the base frame [m]: on the base axis, near a Panda's shoulder."""
     reach: Positive = 1.2
@@ -52,8 +52,8 @@ PANDA_REGION = VisibleRegion()
 
 @singledispatch
 def draw(shape: Any, n: int, rng: Generator) -> ndarray:
-    """n points on a shape, uniform by area, in the base frame: those of its triangles, if no function for its
-    class is registered."""
+    """n points on a shape, uniform by area, in the base frame. This default samples the triangles of the
+    shape's mesh; classes with a registered function are sampled by it."""
     mesh = shape.mesh
     edges = np.cumsum(mesh.face_areas)
     face = np.searchsorted(edges[:-1], rng.random(n) * edges[-1], side="right")

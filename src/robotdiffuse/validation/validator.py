@@ -344,7 +344,7 @@ class Verifier:
             return []
         pieces = trajectory_pieces(trajectory)
         speeds = self.constraints.speeds
-        bends = self.constraints.speed_bends(pieces.along.v) / cubics.steps
+        bends = self.constraints.third_derivative_bounds(pieces.along.v) / cubics.steps
         beyond = first_beyond(
             limits, lambda q, v, _: speeds(q, v), bends, pieces.states, self.settings.rate_slack
         )
