@@ -1,7 +1,6 @@
 """MPiNets: the grouping of points against brute force, the network's properties, roll-outs as a planner."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -121,9 +120,7 @@ def test_a_path_in_collision_is_no_result() -> None:
     assert "not free of collision" in result.reason
 
 
-def test_trained_weights_are_read_and_the_same_seed_gives_the_same_path(
-    tmp_path: Path, network: mpinets.MPiNetsNetwork
-) -> None:
+def test_trained_weights_are_read_and_the_same_seed_gives_the_same_path(tmp_path, network):
     save_network("mpinets", network, tmp_path, {})
     planner = MPiNets(MPiNetsSettings(weights=str(tmp_path), near=0.299))
     q = torch.tensor(LEFT[None], dtype=torch.float32)

@@ -10,7 +10,6 @@ from helpers.short_training import trained
 from robotdiffuse import Box, InputError, JointGoal, Problem, Scene, load_robot, verify
 from robotdiffuse.baselines.mpnet import MPNet, MPNetPlannerSettings, NeuralPlanning
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.kernels.motions import path_length
 from robotdiffuse.datasets.rows import resample
 from robotdiffuse.learning.checkpoint import save_network
 from robotdiffuse.learning.mpnet import MPNetNetwork, MPNetSettings, sorted_along_curve
@@ -150,27 +149,6 @@ def test_dropout_is_on_in_planning_and_drawn_from_the_generator(weights: str) ->
     one = planning(weights, wall_problem())
     states = one.next_states(np.tile(LEFT, (8, 1)).astype(np.float32), one.goals[:8])
     assert len(np.unique(states, axis=0)) == 8
-
-
-def test_contraction_never_lengthens_and_stays_free(weights: str) -> None:
-    one = planning(weights, wall_problem())
-    over = np.array(
-        [LEFT, [0.45, -0.3, 0, -1.9, 0, 2.2, 0.785], UP, [-0.45, -0.3, 0, -1.9, 0, 2.2, 0.785], RIGHT]
-    )
-    rng = np.random.default_rng(0)
-    tried = 0
-    for _ in range(30):
-        path = np.repeat(over, 2, axis=0)
-        path[1:-1] += rng.normal(0, 0.08, path[1:-1].shape)
-        path = path.astype(np.float32)
-        if not one.segments_free(path).all():
-            continue
-        tried += 1
-        shorter = one.contracted(path)
-        assert one.segments_free(shorter).all() and len(shorter) < len(path)
-        assert path_length(shorter) <= path_length(path) * (1 + 1e-6)
-        np.testing.assert_array_equal(shorter[[0, -1]], path[[0, -1]])
-    assert tried > 5
 
 
 def test_replanning_keeps_what_is_free_and_leaves_out_states_in_collision(weights: str) -> None:

@@ -19,9 +19,7 @@ MOTIONS = [START + np.linspace(0, 1, 5 + i)[:, None] * RNG.uniform(-0.2, 0.2, 7)
 SCENES = [rd.Scene([FLOOR, rd.Sphere([0.6, 0.01 * i, 0.9], 0.1)][: 1 + (i % 3 > 0)]) for i in range(COUNT)]
 
 
-def test_own_motions_are_a_data_set_like_any_other(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_own_motions_are_a_data_set_like_any_other(tmp_path, capsys):
     mixed = [rd.Path(PANDA.joint_names, MOTIONS[0]), MOTIONS[1].tolist(), *MOTIONS[2:]]
     assert rd.write_dataset(mixed, SCENES, tmp_path / "own", "panda", waypoints=48) == COUNT
     manifest = read_manifest(tmp_path / "own")

@@ -48,8 +48,7 @@ def files(folder: Path) -> dict[str, bytes]:
 def test_what_is_written_is_read(tmp_path, arrays):
     shards.write_shard(tmp_path, 3, arrays, {"tried": 9, "solved": 7})
     shard = shards.read_shard(tmp_path, 3)
-    assert len(shard) == 7
-    assert shard.counts == {"tried": 9, "solved": 7}
+    assert len(shard) == 7 and shard.counts == {"tried": 9, "solved": 7}
     assert set(shard.arrays) == shards.ARRAYS.keys() - {"times"}
     for name, array in arrays.items():
         assert shard[name].dtype == np.dtype(shards.ARRAYS[name][0])
@@ -69,8 +68,7 @@ def test_times_and_no_rows(tmp_path, arrays):
     timed = {name: array[:0] for name, array in arrays.items()} | {"times": np.zeros((0, WAYPOINTS))}
     shards.write_shard(tmp_path, 0, timed, {})
     shard = shards.check_shard(tmp_path, 0, manifest_of(ARM, WAYPOINTS, timing="time"))
-    assert len(shard) == 0
-    assert shard["trajectories"].shape == (0, WAYPOINTS, ARM.dof)
+    assert len(shard) == 0 and shard["trajectories"].shape == (0, WAYPOINTS, ARM.dof)
     with pytest.raises(InputError, match="array times: it must be there only where timing is time"):
         shards.check_shard(tmp_path, 0, manifest_of(ARM, WAYPOINTS))
 

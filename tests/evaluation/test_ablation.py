@@ -40,8 +40,7 @@ def test_what_is_given_beside_a_config_wins() -> None:
 
 def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     base = ["reproduce", "table2", "--data", str(tmp_path), "--out", str(tmp_path / "out")]
-    assert main([*base, "--rows", "Ourz"]) == 2
-    assert "known: " in capsys.readouterr().err
+    assert main([*base, "--rows", "Ourz"]) == 2 and "known: " in capsys.readouterr().err
     assert main([*base, "--family", "ropp"]) == 2
     assert "known: cabinet, clutter, crate" in capsys.readouterr().err
     assert main(base) == 2 and "no data set" in capsys.readouterr().err

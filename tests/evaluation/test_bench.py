@@ -159,8 +159,7 @@ def test_runs_that_are_left_and_restarts_where_time_is_left(tmp_path: Path) -> N
         asked = replace(settings(tmp_path), time_limit=time_limit, seeds=seeds, **more)
         return [(int(run.case.name[-1]), run.seed) for run in bench.open_runs(by_planner, cases, asked)]
 
-    assert left([], 1.0) == []
-    assert left([], 10.0) == [(1, 0), (2, 0)]
+    assert left([], 1.0) == [] and left([], 10.0) == [(1, 0), (2, 0)]
     assert left([], 0.5) == [(0, 0), (1, 0), (2, 0)]
     assert left([], 1.0, seeds=2) == [(0, 1), (1, 1), (2, 1)]
     again = [replace(RECORD, planner="rrt_connect+restarts", time=0.99, restarts=80)]

@@ -125,10 +125,8 @@ def test_a_call_counts_for_shorter_limits_and_for_longer_ones_if_it_ended_by_its
 def test_an_outcome_is_what_was_found_by_then() -> None:
     record = solved("ompl_rrt_star", "a", 10.0, [(0.5, 4.0), (2.0, 3.0)], time=10.0)
     before, between, after = (bench_report.outcome(record, t) for t in (0.4, 1.0, 10.0))
-    assert not before.solved
-    assert np.isnan(before.joint_length)
-    assert before.returned == 0.4
-    assert before.failure == bench_report.LATER
+    assert not before.solved and np.isnan(before.joint_length)
+    assert before.returned == 0.4 and before.failure == bench_report.LATER
     assert (between.found, between.returned) == (0.5, 1.0)
     assert (between.joint_length, between.link_length) == (4.0, pytest.approx(12.0))  # 9 x 4 / 3
     assert (after.joint_length, after.link_length) == (3.0, 9.0)
@@ -151,8 +149,7 @@ def test_figures_of_a_small_run(small: Path) -> None:
     assert [row.figures.success for row in star] == [25, 50, 75]
     assert star[0].figures.length == 9.0  # improved by 0.075 s
     assert [o.found for o in star[1].solved] == [0.05, 0.5]
-    assert star[1].figures.time == 1.0
-    assert star[2].failures == {bench_report.RAN_OUT: 1}
+    assert star[1].figures.time == 1.0 and star[2].failures == {bench_report.RAN_OUT: 1}
     net = rows(whole, 1.0)["mpnet"]
     assert (net.figures.success, net.figures.collision) == (50, 25)
     assert net.interval == pytest.approx((0.150, 0.850), abs=1e-3)
@@ -188,12 +185,10 @@ def test_compared_are_problems_that_all_planners_were_given_this_time_for(tmp_pa
     keep_problems(folder, names)
     (section,) = bench_report.sections(bench_report.read_bench(folder))
     whole = {c.limit: c for c in section.comparisons}
-    assert whole[1.0].problems == 6
-    assert whole[1.0].missing == ()
+    assert whole[1.0].problems == 6 and whole[1.0].missing == ()
     assert (whole[10.0].problems, whole[10.0].of) == (2, 6)
     assert whole[10.0].missing == ("edmp",)
-    assert rows(section, 10.0)["mpd"].figures.success == 0
-    assert section.main.limit == 1.0
+    assert rows(section, 10.0)["mpd"].figures.success == 0 and section.main.limit == 1.0
 
 
 def test_seeds_of_a_problem_are_one_row_of_the_comparison(tmp_path: Path) -> None:
@@ -206,8 +201,7 @@ def test_seeds_of_a_problem_are_one_row_of_the_comparison(tmp_path: Path) -> Non
         records.append(one if seed == 0 else failed("mpd", "b", 1.0, 1.0, seed=seed))
     (section,) = bench_report.sections(bench_report.read_bench(write(tmp_path / "run", records)), [1.0])
     row = rows(section, 1.0)["mpd"]
-    assert section.main.seeds == 3
-    assert row.figures.success == pytest.approx(400 / 6)
+    assert section.main.seeds == 3 and row.figures.success == pytest.approx(400 / 6)
     assert row.paired is not None and (row.paired.both, row.paired.b_only) == (1, 1)
     assert row.paired.ratio == pytest.approx(1.5)
 
@@ -219,8 +213,7 @@ def test_curves_end_where_they_are_no_longer_known_of_all_problems(small: Path) 
     assert curves["ompl_rrt_star"].found.tolist() == [0.05, 0.5, 5.0]
     # best known 2: first paths of 4, the second of the three at 0.5 s; 3 from 0.75 s on
     star = curves["ompl_rrt_star"]
-    assert star.times[0] == pytest.approx(0.5, rel=0.06)
-    assert star.ratios[0] == 2.0
+    assert star.times[0] == pytest.approx(0.5, rel=0.06) and star.ratios[0] == 2.0
     assert star.ratios[-1] == 1.5
 
 
@@ -297,9 +290,7 @@ def test_rows_that_were_timed_under_other_loads_are_told_in_the_table(tmp_path: 
     assert table.notes[0] == "All rows were timed alike: run a, 2 at once; load average 1.5 to 2.2."
 
 
-def test_a_metric_is_declared_in_one_place(
-    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_metric_is_declared_in_one_place(small, tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
     waypoints = Metric("waypoint_count", "kilo", "less", ".4f", lambda m: len(m.path.positions), 1e-3)
     monkeypatch.setitem(METRICS, waypoints.name, waypoints)
@@ -319,23 +310,19 @@ def test_a_metric_is_declared_in_one_place(
 
 
 @pytest.mark.slow
-def test_the_command_writes_everything(
-    small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_everything(small, tmp_path, capsys):
     pytest.importorskip("matplotlib")
     keep_problems(small, ["rop/0", "rop/1"])
     out = tmp_path / "out"
     assert main(["bench", "report", str(small), "--out", str(out), "--limits", "1,10", "--no-replays"]) == 0
     said = capsys.readouterr().out
-    assert "rop, non-trivial, 10 s: 3 problems" in said
-    assert "ompl_rrt_star" in said
+    assert "rop, non-trivial, 10 s: 3 problems" in said and "ompl_rrt_star" in said
     page = (out / "index.html").read_text()
     for name in ("robotdiffuse", "mpnet", "ompl_rrt_star"):
         assert page.count(f">{name}<") >= 4, name
     assert "http" not in re.sub(r'xmlns(:\w+)?="[^"]*"|<metadata>.*?</metadata>', "", page, flags=re.DOTALL)
     names = re.findall(r'\bid="([^"]*)"', page)
-    assert len(names) == len(set(names))
-    assert not (out / "replays.html").exists()
+    assert len(names) == len(set(names)) and not (out / "replays.html").exists()
     plots = re.findall(r"!\[.*?\]\((.*?)\)", (out / "report.md").read_text())
     assert {"success_rop.svg", "length_rop_non_trivial.svg"} < set(plots)
     for name in plots:

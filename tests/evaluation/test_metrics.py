@@ -45,9 +45,7 @@ def path_of(trajectory: rd.Trajectory) -> rd.Path:
         ([[0, 0], [1, 1e-7], [2, 0]], 2, 1.0, None, 2e-7),
     ],
 )
-def test_lengths_of_an_arm_of_two_links(
-    rows: list, joint: float, link: float, tip: float | None, turned: float
-) -> None:
+def test_lengths_of_an_arm_of_two_links(rows, joint, link, tip, turned):
     motion = minimum_jerk(2.0, np.zeros(2), np.array([1.5, 0.0]))
     found = metrics.measured(ARM, rd.Path(motion.joint_names, np.array(rows, float)), motion)
     assert found["joint_length"] == pytest.approx(joint)

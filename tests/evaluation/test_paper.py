@@ -71,7 +71,7 @@ def test_a_limit_that_no_sample_keeps_is_refused_before_the_first_call(tmp_path:
 @pytest.mark.slow
 def test_a_small_page_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lines = (
-        paper.Row(paper.ROWS[4].name, "straight_line", paper.OURS),
+        paper.Row(paper.ROWS[4].name, "straight_line", paper.PAPER_METHOD),
         paper.Row("nearest", "straight_line:goals=nearest"),
     )
     monkeypatch.setattr(paper, "ROWS", lines)

@@ -9,7 +9,6 @@ import resource
 import shutil
 import signal
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -50,9 +49,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_a_folder_called_like_a_robot_does_not_hide_it_from_nodes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_called_like_a_robot_does_not_hide_it_from_nodes(tmp_path, monkeypatch):
     """Nodes got the path of any folder of this name in the working folder."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "panda").mkdir()
@@ -238,9 +235,7 @@ def test_other_settings_are_refused_by_name(folder: Path) -> None:
         (lambda data: data.update(format=9), "format is 9"),
     ],
 )
-def test_data_of_other_versions_and_robots_are_refused(
-    change: Callable[[dict[str, Any]], None], message: str, folder: Path, tmp_path: Path
-) -> None:
+def test_data_of_other_versions_and_robots_are_refused(change, message, folder, tmp_path):
     data = json.loads((folder / "manifest.json").read_text())
     change(data)
     (tmp_path / "manifest.json").write_text(json.dumps(data))
@@ -349,9 +344,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 
 @pytest.mark.slow
-def test_killed_at_a_random_moment_it_ends_in_the_same_data(
-    undisturbed: dict[str, bytes], tmp_path: Path
-) -> None:
+def test_killed_at_a_random_moment_it_ends_in_the_same_data(undisturbed, tmp_path):
     run = factory_runs.start(tmp_path, TRAJECTORIES, SHARD, WAYPOINTS, 2)
     factory_runs.wait_for_shards(run, tmp_path, 1)
     time.sleep(random.uniform(0, 0.1))
@@ -383,15 +376,12 @@ def test_ctrl_c_stops_all_in_one_line(count: int, tmp_path: Path) -> None:
     said, complaints = run.communicate(timeout=500)
     assert (run.returncode, said) == (130, "")
     assert re.fullmatch(rf"(trajectories: 0 of {TRAJECTORIES}\n)?robotdiffuse: stopped\n", complaints)
-    assert factory_runs.group_ends(run.pid)
-    assert factory_runs.shards(tmp_path) < SHARDS
+    assert factory_runs.group_ends(run.pid) and factory_runs.shards(tmp_path) < SHARDS
     assert not [name for name in factory_runs.contents(tmp_path) if name.startswith(".")]
 
 
 @pytest.mark.slow
-def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
-    undisturbed: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(undisturbed, tmp_path, monkeypatch):
     """Files may not grow beyond a kilobyte: the system's error, as that of a full disk, at any file."""
     monkeypatch.setattr(factory, "on_this_machine", factory_runs.in_this_process)
     most = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -51,9 +51,7 @@ def cluster(head: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 @pytest.mark.slow
-def test_a_node_killed_midway_changes_nothing(
-    cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_node_killed_midway_changes_nothing(cluster, tmp_path, monkeypatch):
     node = cluster.add_node(num_cpus=1, object_store_memory=STORE)
     cluster.wait_for_nodes()
     begun = threading.Event()
@@ -75,8 +73,7 @@ def test_a_node_killed_midway_changes_nothing(
     finally:
         begun.set()
         killer.join()
-    assert seen == list(range(0, 25, 2))
-    assert not ray.is_initialized()
+    assert seen == list(range(0, 25, 2)) and not ray.is_initialized()
     assert len(cluster.list_all_nodes()) == 1
 
     # nodes that make other data are refused, by what differs
@@ -114,9 +111,7 @@ def test_bench_on_a_cluster_is_as_on_this_machine(cluster: Any, tmp_path: Path) 
     assert [record.positions for record in sorted(there, key=lambda r: r.name)] == [r.positions for r in here]
 
 
-def test_many_problems_with_a_node_killed_are_as_on_this_machine(
-    cluster: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_many_problems_with_a_node_killed_are_as_on_this_machine(cluster, monkeypatch):
     monkeypatch.setattr(plan_many, "PROBLEMS_PER_TASK", 1)
     node = cluster.add_node(num_cpus=1, object_store_memory=STORE)
     cluster.wait_for_nodes()

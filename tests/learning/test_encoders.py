@@ -312,8 +312,7 @@ def test_batches_with_clouds_instead_of_codes(data):
     batches = Batches(kept, model, lambda scenes, q: np.ones((*q.shape[:2], 3)), 0.1, 5.0)
     first, again = (batches.draw(8, np.random.default_rng(3)) for _ in range(2))
     assert first.clouds is not None and again.clouds is not None
-    assert first.clouds.shape == (8, 32, 3)
-    assert torch.equal(first.clouds, again.clouds)
+    assert first.clouds.shape == (8, 32, 3) and torch.equal(first.clouds, again.clouds)
     assert (first.condition[:, :8] == 0).all() and (first.condition[:, 8:] != 0).any()
 
 

@@ -54,8 +54,7 @@ def test_steps_take_a_motion_out_of_collision_and_leave_others_and_ends() -> Non
 def test_short_trajectories(waypoints: int) -> None:
     checker, lines = swing()
     moved, _ = CollisionGuidance(checker)(lines[:, WAYPOINTS // 2 - 1 :][:, :waypoints], 3)
-    assert moved.shape == (2, waypoints, 3)
-    assert np.isfinite(moved).all()
+    assert moved.shape == (2, waypoints, 3) and np.isfinite(moved).all()
 
 
 NOTHING = GuidanceSettings(margin=None, self_margin=None, length=0.0, push=0.05)

@@ -57,8 +57,7 @@ def test_stochastic_samples_have_the_data_s_moments(name):
     steps = [32, 64, 128, 256]
     moments = [exact_moments(name, schedule, n, 1.0) for n in steps]
     off = np.array([np.abs(covariance - COVARIANCE).max() for _, covariance in moments])
-    assert (np.diff(off) < 0).all()
-    assert slope(steps, off) > 0.8
+    assert (np.diff(off) < 0).all() and slope(steps, off) > 0.8
     assert off[-1] < 0.09
     assert max(np.abs(mean - MEAN).max() for mean, _ in moments) < 2e-4
 
@@ -81,8 +80,7 @@ def test_calls_of_the_predictor(name, steps):
     x = SAMPLERS.load(name)(
         predict, schedule, lambda: rng.standard_normal((2, 3), dtype=np.float32), steps, 0.5
     )
-    assert x is predictions[-1]
-    assert x.dtype == np.float32
+    assert x is predictions[-1] and x.dtype == np.float32
     assert levels == schedule.sampling_levels(steps)[:-1].tolist()
     assert np.isfinite(x).all()
 
@@ -189,7 +187,6 @@ def test_objectives_weigh_levels_alike(name, limit):
     free = weight < limit
     assert free.sum() > 50
     np.testing.assert_allclose(weight[free], (wanted * moved**2)[free])
-    assert (weight <= limit).all()
-    assert (weight > 0).all()
+    assert (weight <= limit).all() and (weight > 0).all()
     if name == "clean":
         np.testing.assert_allclose(weight, wanted)

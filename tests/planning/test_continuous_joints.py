@@ -60,8 +60,7 @@ def test_a_pose_is_reached_across_half_a_turn_and_the_long_way_where_something_b
     goal = rd.PoseGoal("tip", ARM.fk([-2.9, 0.5, 0.2], "tip"))
     assert planned("aorrtc", [2.9, 0.5, 0.2], goal).length < 0.6
     path = planned("aorrtc", [2.8, 0.0, 0.0], [-2.8, 0.0, 0.0], POST)
-    assert path.positions[-1, 0] == pytest.approx(-2.8)
-    assert path.length > 5.5
+    assert path.positions[-1, 0] == pytest.approx(-2.8) and path.length > 5.5
 
 
 def test_values_wrapped_to_half_a_turn_are_no_motion_but_those_of_a_file_are_unwrapped() -> None:

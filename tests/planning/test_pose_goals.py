@@ -59,8 +59,7 @@ def both_hands() -> tuple[rd.Problem, rd.PosesGoal]:
 def test_both_hands_are_brought_to_their_poses() -> None:
     problem, goal = both_hands()
     found = pose_configurations(problem, goal, np.random.default_rng(0))
-    assert len(found) == 10
-    assert max(off(baxter(), goal, q) for q in found) < 1e-5
+    assert len(found) == 10 and max(off(baxter(), goal, q) for q in found) < 1e-5
     between = np.abs(found[:, None] - found).max(axis=2)
     assert between[~np.eye(10, dtype=bool)].min() > 0.1
     result = rd.plan(problem, time_limit=20.0)

@@ -58,9 +58,7 @@ def test_the_same_seed_gives_the_same_motion() -> None:
 
 
 @pytest.mark.parametrize("planner", ["aorrtc", "rrt_connect"])
-def test_the_first_call_and_later_ones_give_the_same_path_although_paths_are_refused(
-    planner: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_first_call_and_later_ones_give_the_same_path_although_paths_are_refused(planner, monkeypatch):
     """The time of validations in earlier calls decided when later calls validated, and a refused path changes
     what the search does next."""
     accepted = Verifier.path

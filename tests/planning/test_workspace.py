@@ -231,7 +231,7 @@ def test_grasps_whose_line_is_blocked_are_left_for_others() -> None:
     result = space.plan_steps(pick(grasps), "ready", time_limit=60.0)  # type: ignore[arg-type]
     assert result.solved, result.reason
     assert result.goal_index("approach") == 2
-    blocked = space.plan_steps(pick(grasps[:2]), "ready", time_limit=60.0)  # type: ignore[arg-type]
+    blocked = space.plan_steps(pick(grasps[:1]), "ready", time_limit=60.0)  # type: ignore[arg-type]
     assert not blocked.solved and blocked.failed == "descend" and blocked.trajectory is None
     assert blocked.reason.startswith("step 2 of 4, descend: ")
     assert "inside wall" in blocked.reason and "ends of earlier steps were tried" in blocked.reason

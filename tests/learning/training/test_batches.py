@@ -19,8 +19,7 @@ def test_codes_are_cached_beside_the_data(data, arm):
     messages = []
     first = load_data(str(data), arm, encoder, WAYPOINTS, messages.append)
     cached = sorted((data / "codes").iterdir())
-    assert len(cached) == 2
-    assert f"{len(first)} trajectories" in messages[-1]
+    assert len(cached) == 2 and f"{len(first)} trajectories" in messages[-1]
     cached[0].write_bytes(b"damaged")
     again = load_data(str(data), arm, encoder, WAYPOINTS, messages.append)
     np.testing.assert_array_equal(again.codes, first.codes)
@@ -45,8 +44,7 @@ def test_splits_and_waypoints(data, arm):
     assert set(split_of(train.scenes)) == {0}
     assert set(split_of(validation.scenes)) == {1}
     assert 120 < len(train) + len(validation) == len(loaded) < 160
-    assert len(loaded.split(2)[1]) == 2
-    assert train.q.shape[1:] == (WAYPOINTS, arm.dof)
+    assert len(loaded.split(2)[1]) == 2 and train.q.shape[1:] == (WAYPOINTS, arm.dof)
 
 
 @pytest.mark.parametrize(

@@ -40,8 +40,7 @@ def test_motion_is_certified_in_time(obstacle: rd.MovingObstacle, jerk: float | 
     assert still is not None
     found = planner.plan(task, 10.0, jerk=jerk)
     assert found.status is rd.Status.SOLVED, found.reason
-    assert found.trajectory is not None
-    assert rd.verify(task, found.trajectory).valid
+    assert found.trajectory is not None and rd.verify(task, found.trajectory).valid
     assert found.scene_clearance is not None
     assert 0 < found.scene_clearance <= min(clearances(found.trajectory, obstacle)) + 1e-9
 
@@ -60,8 +59,7 @@ def test_the_earliest_schedule_waits_for_a_passing_obstacle() -> None:
     clear[1, 1:4] = False
     args = np.array([0, 2]), np.array([0]), np.array([1]), np.array([0, 3]), np.array([0, 1, 2])
     way, found = earliest(clear, *args)
-    assert found
-    assert way == [WAITED] * 4 + [0]
+    assert found and way == [WAITED] * 4 + [0]
     clear[0, 2] = False  # and it comes by the start before
     assert not earliest(clear, *args)[1]
     with deadline(lambda: -1.0), pytest.raises(OutOfTimeError, match="the grid of times"):
@@ -86,8 +84,7 @@ def test_other_requests_hold_among_moving_obstacles(asked: str) -> None:
     found = rd.load_planner("rrt_connect").plan(task, 20.0)
     assert found.trajectory is not None, found.reason
     motion = found.trajectory
-    assert rd.verify(task, motion).valid
-    assert min(clearances(motion, obstacle)) > 0
+    assert rd.verify(task, motion).valid and min(clearances(motion, obstacle)) > 0
     if task.constraints:
         down = min(-PANDA.fk(q, "panda_hand")[2, 2] for q in motion.positions)
         assert down >= np.cos(UPRIGHT.angle + 1e-6)

@@ -72,9 +72,7 @@ def excess(constraint: Constraint, q: np.ndarray) -> float:
         for i, case in enumerate(CASES)
     ],
 )
-def test_motions_keep_constraints_at_every_millimeter(
-    name: str, stage: str, constraints: list[Constraint], scene: rd.Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_motions_keep_constraints_at_every_millimeter(name, stage, constraints, scene, monkeypatch):
     monkeypatch.setattr(rrt.RRTConnect, "follows_lines", False)
     made = problem(constraints, scene)
     result = rd.load_planner(name).plan(made, time_limit=20.0)
