@@ -209,7 +209,7 @@ def test_where_no_look_can_be_reached_the_arm_leaves_a_goal_by_the_way_in() -> N
     one = rd.Explorer(PANDA, [camera], rd.Scene([FLOOR]), zone, rd.ExplorerSettings(time_limit=1.0))
     view = simulated.camera_beside(PROBLEM, None, 0)
     one.observe(replace(view, depth=np.zeros_like(view.depth)))
-    inner = PROBLEM.start + np.array([0.1, 0.0, 0.0, -0.1, 0.0, 0.0, 0.0])
+    inner = PROBLEM.start + np.array([0.8, 0.0, 0.0, -0.1, 0.0, 0.0, 0.0])
     one.set_goal(inner)
     step = one.next(PROBLEM.start)
     assert step.kind == "go"

@@ -103,7 +103,7 @@ def calibrate_camera(views: Sequence[DepthView], robot: Robot) -> CameraCalibrat
     scores = [share * (count >= MIN_CELLS) for share, _, count in (agreement(v, robot, q) for v in begins)]
     best = int(np.argmax(scores))
     T = begins[best if scores[best] > BETTER * scores[0] else 0].T_base_camera
-    models = [_surface(robot, q) for _, q in each]
+    models = [arm_surface(robot, q) for _, q in each]
     points = [_near_arm(view, T, tree) for (view, _), (tree, _, _) in zip(each, models, strict=True)]
     hessian = np.eye(6)
     spread = 0.0
@@ -139,7 +139,7 @@ def calibrate_camera(views: Sequence[DepthView], robot: Robot) -> CameraCalibrat
     return CameraCalibration(T, POINTS_PER_ERROR * spread**2 * np.linalg.inv(hessian), agrees)
 
 
-def _surface(robot: Robot, q: Configuration) -> tuple[KDTree, Points, Points]:
+def arm_surface(robot: Robot, q: Configuration) -> tuple[KDTree, Points, Points]:
     """Points on the arm's surface at a configuration, as a tree and an array [m], and the normals there."""
     balls = surface_balls(robot, q).astype(np.float64)
     points = balls[np.unique(np.floor(balls / MODEL_CELL), axis=0, return_index=True)[1]]

@@ -2,6 +2,7 @@
 ViewMemory: the views that showed most, with what each of them shows, computed once.
 """
 
+from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
@@ -176,6 +177,8 @@ class OccupancyMap:
 
 MAX_VIEWS = 12
 """Views that are kept."""
+MUCH_BETTER = 0.8
+"""Views get a new pose if its deviation is less than this part of the old one's."""
 ALONE_DISTANCE = 0.02
 """With noise, a point of one view with no other point within this distance is stray [m]. Of surfaces at 1 m,
 99 of 100 points have three or more there."""
@@ -184,10 +187,11 @@ ALONE_DISTANCE = 0.02
 class _Kept:
     """A view, and what it shows, computed when it is first needed."""
 
-    def __init__(self, view: DepthView, robot: Robot, new_voxels: int) -> None:
+    def __init__(self, view: DepthView, robot: Robot, new_voxels: int, stated: DepthView) -> None:
         self.view = view
         self._robot = robot
         self.new_voxels = new_voxels
+        self.stated = stated
 
     @cached_property
     def volume(self) -> ObservedVolume:
@@ -218,11 +222,20 @@ class ViewMemory:
     def __len__(self) -> int:
         return len(self._kept)
 
-    def add(self, view: DepthView, new_voxels: int) -> None:
-        """Keep a view with a configuration. new_voxels: the number of voxels that it showed first."""
+    def add(self, view: DepthView, new_voxels: int, stated: DepthView) -> None:
+        """Keep a view with a configuration. new_voxels: the number of voxels that it showed first. stated:
+        the view with the pose that is stated of it."""
         if len(self) >= self._most:
             self._kept.remove(min(self._kept, key=lambda kept: kept.new_voxels))
-        self._kept.append(_Kept(view, self._robot, new_voxels))
+        self._kept.append(_Kept(view, self._robot, new_voxels, stated))
+
+    def refine(self, refined: Callable[[DepthView], DepthView]) -> None:
+        """Give the kept views refined poses where they are much better. refined: a view with its pose as it
+        is known now, from one with the stated pose."""
+        for at, kept in enumerate(self._kept):
+            view = refined(kept.stated)
+            if sum(view.pose_deviation) < MUCH_BETTER * sum(kept.view.pose_deviation):
+                self._kept[at] = _Kept(view, self._robot, kept.new_voxels, kept.stated)
 
     @property
     def views(self) -> list[DepthView]:

@@ -31,12 +31,20 @@ from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import FIRST, Configuration, Configurations, Path, Status, Trajectory
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.occupancy_map import Corners, OccupancyMap, ViewMemory
+from robotdiffuse.perception.pose_refinement import PoseRefinement
 from robotdiffuse.perception.seen_points import point_shapes
 from robotdiffuse.perception.unknown_space import UnknownSpace, explored_confidence
 from robotdiffuse.perception.voxel_grid import LAYERS_BELOW, MAP, Probabilities, Voxels, refined, surface
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
-from robotdiffuse.planning.exploration.looks import ReachableTree, best_looks, first_parts, swept_unseen
+from robotdiffuse.planning.exploration.looks import (
+    CONFINED,
+    ReachableTree,
+    best_looks,
+    first_parts,
+    moved,
+    swept_unseen,
+)
 from robotdiffuse.planning.exploration.seen_free import (
     GoalSeen,
     cover,
@@ -111,6 +119,8 @@ class Explorer:
         self._planner = load_planner("robotdiffuse")
         self._rng = np.random.default_rng(seed)
         self._seed = seed
+        on_arm = [(camera.link, camera.T_link_camera) for camera in cameras]
+        self._poses = PoseRefinement(robot, scene, on_arm)
         self._views = ViewMemory(robot)
         self._goal_seen = GoalSeen(robot, self.map, self._views, settings.see_goal)
         self._goal: Goal | None = None
@@ -151,8 +161,10 @@ class Explorer:
         Raises:
             InputError: For a view that does not fit the robot.
         """
+        stated = view
+        view = self._poses.observe(view)
         new_voxels = self.map.add(view, stamp)
-        self._views.add(view, new_voxels)
+        self._views.add(view, new_voxels, stated)
         self._goal_seen.observe(view)
         self._news.append(view)
 
@@ -175,6 +187,7 @@ class Explorer:
         if not len(self._views):
             return Step(LOOK, "nothing was seen yet: observe a view from here")
         goals = self._goal.positions if isinstance(self._goal, JointGoal) else q[None]
+        self._views.refine(self._poses.refined)
         points, errors = self._views.points(self.map.free)
         self.map.doubt(points, errors)
         self._free = self.map.free
@@ -329,8 +342,11 @@ class Explorer:
         """A motion by a policy to where a camera sees most of the wanted voxels; None if none was found."""
         allowed = self._seen_free(problem) if policy == STRICT else problem
         tree = ReachableTree(self.robot, allowed.scene, problem.start)
+        way_in = self._way_in_to(problem.start)
+        hemmed_in = way_in is None or bool(moved(self.robot, way_in[:1], [problem.start])[0] < CONFINED)
+        taken = self._goal_seen.taken
         for camera in self.cameras:
-            ways = best_looks(self.map, tree, camera, wanted, predicted, self._rng, self._goal_seen.taken)
+            ways = best_looks(self.map, tree, camera, wanted, predicted, self._rng, taken, hemmed_in)
             for waypoints in islice(ways, self.settings.look_attempts):
                 if policy == STRICT:
                     way = self._along(allowed, waypoints, "look")
@@ -341,10 +357,15 @@ class Explorer:
                     return way
         return None
 
+    def _way_in_to(self, q: Configuration) -> Configurations | None:
+        """The latest motion that was returned, if it ended here."""
+        way = self._way_in
+        return way if way is not None and np.abs(way[-1] - q).max() <= AT_GOAL else None
+
     def _way_back(self, problem: Problem) -> PlanResult | None:
         """A motion that leaves by the way in, as far as there is more room; None if there is none."""
-        way = self._way_in
-        if way is None or np.abs(way[-1] - problem.start).max() > AT_GOAL:
+        way = self._way_in_to(problem.start)
+        if way is None:
             return None
         for waypoints in first_parts(way[::-1]):
             motion = self._within_seen_free(problem, waypoints, "back on the way in")

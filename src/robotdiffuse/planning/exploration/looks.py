@@ -27,6 +27,7 @@ from robotdiffuse.planning.exploration.steps import ArmCamera
 from robotdiffuse.planning.pipeline.unknown_space import policy_for, unknown_space_of
 from robotdiffuse.planning.search.rrt_kernel import extend, make_trees
 from robotdiffuse.problems.problem import PREDICTED, Problem, check_problem
+from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.trajectories.simplification import simplify
@@ -79,6 +80,13 @@ class ReachableTree:
         return way
 
 
+def moved(robot: Robot, to: Configurations, others: Sequence[Configuration]) -> Float[ndarray, "n"]:
+    """How far the arm is in each configuration from where it is in the nearest of others: the mean of its
+    covering spheres [m]."""
+    reached, away = (np.stack([placed_spheres(robot, q)[:, :3] for q in some]) for some in (to, others))
+    return np.min([np.linalg.norm(reached - one, axis=2).mean(axis=1) for one in away], axis=0)
+
+
 def first_parts(waypoints: Configurations) -> Iterator[Configurations]:
     """The first parts of a way, the shortest first, and all of it."""
     at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1))])
@@ -110,6 +118,9 @@ UNSEEN_WEIGHT = 0.05
 """Weight of a swept voxel that is surely free, by the prediction; one that is surely occupied has 1 more."""
 MIN_SEEN = 0.02
 """Looks that see a smaller part of the weight are of no use."""
+CONFINED = 0.1
+"""An arm that gets no farther than this is hemmed in by what its own shadow hides from cameras beside it. It
+moves as far as it can first, so that the shadow moves too [m]."""
 SIMILAR_LOOK = 0.2
 """A look that is nearer than this to one that did not show what is wanted counts less [rad]."""
 
@@ -131,6 +142,7 @@ def best_looks(
     probability: Probabilities | None,
     rng: np.random.Generator,
     taken: Sequence[Configuration] = (),
+    hemmed_in: bool = False,
 ) -> Iterator[Configurations]:
     """Ways to configurations from which the camera sees wanted voxels, the best first: weighted by the
     prediction if there is one, against the way to get there.
@@ -139,6 +151,8 @@ def best_looks(
     nothing hides it: neither the arm, nor what is occupied or predicted.
     taken: configurations of earlier images that did not show the wanted voxels; looks from nearby count
     less, once for each of them.
+    hemmed_in: whether there is no way back. At last, and first for an arm that is CONFINED, there is a way to
+    where the arm is farthest from where images were taken.
     """
     robot = known.robot
     at = np.argwhere(wanted)
@@ -187,10 +201,16 @@ def best_looks(
         best = tree.configurations[np.argsort(-score, kind="stable")[:REFINED]].repeat(NEIGHBORS, axis=0)
         tree.grow(best + spread * rng.standard_normal(best.shape), np.full(len(best), np.inf))
         score = np.concatenate([score, scored(tree.configurations[len(score) :])])
+    distances = moved(robot, tree.configurations, [start, *taken])
+    farthest = int(distances.argmax())
+    if hemmed_in and distances[farthest] < CONFINED:
+        yield tree.way(farthest)
     for number in np.argsort(-score, kind="stable"):
         if score[number] == 0:
-            return
+            break
         yield tree.way(int(number))
+    if hemmed_in:
+        yield tree.way(farthest)
 
 
 RING_RADIUS = 1.6
