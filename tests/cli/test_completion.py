@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from helpers.code_blocks import PAGES, code_blocks
-from helpers.commands import PROBLEM, run
+from helpers.commands import PROBLEM, Said
 from robotdiffuse.problems.fields import problem_schema
 
 ROOT = Path(__file__).parents[2]
@@ -43,9 +43,8 @@ def test_the_schema_refuses_what_files_may_not_hold(changes: dict[str, object]) 
     assert not jsonschema.Draft202012Validator(problem_schema()).is_valid(PROBLEM | changes)
 
 
-def test_the_schema_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("schema") == 0
-    assert json.loads(capsys.readouterr().out) == problem_schema()
+def test_the_schema_is_printed(said: Said) -> None:
+    assert json.loads(said(0, "schema")) == problem_schema()
 
 
 def completed(script: str, *words: str) -> list[str]:
@@ -57,15 +56,12 @@ def completed(script: str, *words: str) -> list[str]:
     return ended.stdout.split()
 
 
-def test_bash_completes_commands_and_options(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert run("completion", "bash") == 0
-    script = capsys.readouterr().out
+def test_bash_completes_commands_and_options(said: Said) -> None:
+    script = said(0, "completion", "bash")
     assert completed(script, "robotdiffuse", "pl") == ["plan", "planner"]
     assert completed(script, "robotdiffuse", "plan", "--cl") == ["--clearance"]
     assert completed(script, "robotdiffuse", "data", "inf") == ["info"]
     assert "--page" in completed(script, "robotdiffuse", "data", "info", "folder", "--")
     assert completed(script, "robotdiffuse", "completion", "") == ["bash", "zsh"]
     assert completed(script, "robotdiffuse", "plan", "prob") == []  # then bash completes names of files
-    assert run("completion", "zsh") == 0 and "bashcompinit" in capsys.readouterr().out
+    assert "bashcompinit" in said(0, "completion", "zsh")

@@ -1,10 +1,5 @@
 """The commands `explore` and `demo --explore`: exit status, what they print, and the files they write."""
 
-import re
-import signal
-import subprocess
-import sys
-import urllib.request
 from functools import partial
 from pathlib import Path
 
@@ -36,48 +31,9 @@ def test_explore_writes_a_replay_a_strip_and_a_recording(
     assert first.view.configuration is not None and first.view.configuration.tolist() == START
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--out", "seen.gif"], ".html, .png"),
-        (["--record", "seen.bag"], ".mcap"),
-        (["--policy", "bold"], "unknown explorer.policy"),
-        (["--policy", "probabilistic", "--see-goal"], "it needs policy 'strict'"),
-        (["--live", "--out", "seen.html"], "--live writes no files; leave out --out, --view and --record"),
-        (["--speed", "2"], "add --live"),
-        (["--live", "--port", "0", "--host", "no such host"], "--host is 'no such host'"),
-    ],
-)
-def test_bad_input_is_one_line(
-    options: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run("explore", write_problem(tmp_path), *options) == 2
-    error = capsys.readouterr().err
-    assert message in error and error.count("\n") == 1
-
-
-def test_the_live_page_is_served_until_it_is_stopped(tmp_path: Path) -> None:
-    pytest.importorskip("viser", reason="explore --live needs viser: pip install 'robotdiffuse[live]'")
-    command = [sys.executable, "-m", "robotdiffuse", "explore", str(write_problem(tmp_path)), "--live"]
-    server = subprocess.Popen([*command, "--port", "0"], stdout=subprocess.PIPE, text=True)
-    try:
-        assert server.stdout is not None
-        found = re.search(r"http://127.0.0.1:\d+/", server.stdout.readline())
-        assert found is not None
-        with urllib.request.urlopen(found[0], timeout=300) as page:
-            assert b"viser" in page.read().lower()
-    finally:
-        server.send_signal(signal.SIGINT)
-        assert server.wait(timeout=300) == 130
-
-
 @pytest.mark.slow
 def test_demo_explore_says_what_happened(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status = run("demo", "--explore")
     printed = capsys.readouterr().out
     assert "look: " in printed and f"The arm is {'' if status == 0 else 'not '}at the goal: " in printed
     assert (tmp_path / "explore.png").is_file() and (tmp_path / "explore.html").is_file()
-
-
-def test_demo_explores_or_takes_one_image() -> None:
-    assert run("demo", "--explore", "--camera") == 2

@@ -8,27 +8,18 @@ import sys
 
 import pytest
 
-from robotdiffuse.cli import main
+from helpers.commands import Said
 
 pytest.importorskip("viser", reason="live needs viser: pip install 'robotdiffuse[live]'")
 from websockets.exceptions import ConnectionClosed
 
 
-@pytest.fixture
-def wrong(capsys: pytest.CaptureFixture[str]):
-    def line(*words: str) -> str:
-        try:
-            status = main(["live", *words])
-        except SystemExit as stop:  # of the parser of the command line
-            status = stop.code
-        error = capsys.readouterr().err
-        assert status == 2 and error.count("\n") == 1, error
+def test_bad_input_is_one_line(said: Said, monkeypatch: pytest.MonkeyPatch) -> None:
+    def wrong(*words: str) -> str:
+        error = said(2, "live", *words)
+        assert error.count("\n") == 1, error
         return error
 
-    return line
-
-
-def test_bad_input_is_one_line(wrong, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "unknown planner 'best'; known: " in wrong("--planner", "best")
     assert "'99999' is not a port, an integer from 0 to 65535" in wrong("--port", "99999")
     assert "time_limit is 61" in wrong("--time-limit", "61")

@@ -4,14 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from helpers.commands import run
+from helpers.commands import Said, run
 from helpers.made_arms import chain, row, written
 from helpers.quick_preparation import QUICK, coarse_grids
 from robotdiffuse.robots import load_robot
 
 
 def test_robot_add_with_srdf_and_robot_list(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], said: Said, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Pairs that an SRDF or the command allows, the comparison with sampling, progress without a terminal."""
     monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
@@ -33,18 +33,14 @@ def test_robot_add_with_srdf_and_robot_list(
     given = ("--srdf", str(tmp_path / "made.srdf"), "--name", "by_srdf")
     with coarse_grids():
         assert run("robot", "add", str(file), *given) == 0
-    capsys.readouterr()
     assert frozenset(("base", "j4_link")) in load_robot("by_srdf").allowed_collisions
-    assert run("robot", "add", str(file), "--allow", "base", "moon") == 2
-    assert "unknown link in allow 'moon'" in capsys.readouterr().err
+    assert "unknown link in allow 'moon'" in said(2, "robot", "add", str(file), "--allow", "base", "moon")
 
-    assert run("robot", "list") == 0
-    out = capsys.readouterr().out
+    out = said(0, "robot", "list")
     assert all(name in out for name in ("panda", "made", "by_srdf"))
     assert len(str(load_robot("panda")).splitlines()) <= 10
 
 
-def test_robot_info(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("robot", "info", "panda") == 0
-    printed = capsys.readouterr().out
+def test_robot_info(said: Said) -> None:
+    printed = said(0, "robot", "info", "panda")
     assert "panda_joint7" in printed and "2.8973" in printed and "spheres on" in printed

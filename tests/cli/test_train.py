@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from helpers.commands import run
+from helpers.commands import Said, run
 from robotdiffuse.learning.denoisers import UNetSettings
 from robotdiffuse.learning.training.config import CONFIGS, PlannerTraining
 
@@ -25,9 +25,8 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[PlannerTraining]:
     return trained
 
 
-def test_unknown_config_lists_them_with_what_they_are(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(*TRAIN, "--config", "papre") == 2
-    error = capsys.readouterr().err
+def test_unknown_config_lists_them_with_what_they_are(said: Said) -> None:
+    error = said(2, *TRAIN, "--config", "papre")
     assert error.startswith("robotdiffuse: error: unknown config 'papre'; known:\n")
     for name, config in CONFIGS.items():
         assert f"  {name}: {config.description}\n" in error
@@ -64,10 +63,11 @@ def test_the_bundled_encoder_is_taken_where_none_is_named(trained: list[PlannerT
 
 @pytest.mark.parametrize("data", [("--data", "d"), ("--robot", "ur5e")])
 def test_cross_attention_without_points_is_refused_before_anything_is_made(
-    data: tuple[str, str], capsys: pytest.CaptureFixture[str]
+    data: tuple[str, str], said: Said
 ) -> None:
-    assert run("train", "planner", *data, "--out", "o", "--denoiser", "cross_attention") == 2
-    assert "denoiser cross_attention need each other" in capsys.readouterr().err
+    assert "denoiser cross_attention need each other" in said(
+        2, "train", "planner", *data, "--out", "o", "--denoiser", "cross_attention"
+    )
     assert not Path("o").exists()
 
 
@@ -80,8 +80,7 @@ def test_the_encoder_of_the_config_is_that_of_an_arm_too(
     assert trained[0].encoder == encoder and not Path("o", "encoder").exists()
 
 
-def test_config_paper_needs_its_encoder(capsys: pytest.CaptureFixture[str]) -> None:
+def test_config_paper_needs_its_encoder(said: Said) -> None:
     command = ("train", "planner", "--config", "paper", "--out", "o")
     for rest in (("--data", "d"), ("--robot", "panda")):
-        assert run(*command, *rest) == 2
-        assert "--config paper needs --encoder" in capsys.readouterr().err
+        assert "--config paper needs --encoder" in said(2, *command, *rest)

@@ -8,11 +8,10 @@ from pathlib import Path
 import pytest
 
 import robotdiffuse as rd
+from helpers.commands import Said
 from helpers.factory_runs import contents, in_this_process
-from robotdiffuse.cli import main
 from robotdiffuse.cli import train as train_robot
 from robotdiffuse.cli.train import data_settings, train_for_robot
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.generation import factory
 from robotdiffuse.generation.factory import GenerationSettings
 from robotdiffuse.learning.denoisers import TransformerSettings
@@ -20,7 +19,6 @@ from robotdiffuse.learning.training.config import planner_training
 from robotdiffuse.learning.training.loop import TrainingRun
 from robotdiffuse.learning.weight_files import user_weights, weights_for
 from robotdiffuse.planning.diffusion import Diffusion
-from robotdiffuse.robots import load_robot
 
 STEPS = 20
 BATCH = 8
@@ -48,7 +46,7 @@ def made(robot: str, out: Path | None = None) -> Path:
 
 @pytest.mark.slow
 def test_an_arm_of_five_joints_plans_with_its_trained_network(tmp_path: Path) -> None:
-    robot = load_robot("so101")
+    robot = rd.load_robot("so101")
     assert weights_for("model", robot) is None
     kept = made("so101")
     assert kept == tmp_path / "robots" / "so101" / "weights" == weights_for("model", robot)
@@ -58,11 +56,11 @@ def test_an_arm_of_five_joints_plans_with_its_trained_network(tmp_path: Path) ->
     problem = rd.Problem(robot, rd.Scene(), start, rd.JointGoal(start + 0.2))
     result = planner.plan(problem, 20.0)
     assert result.solved and result.stage == "network"
-    assert weights_for("model", replace(load_robot("ur5e"), name="so101")) is None
+    assert weights_for("model", replace(rd.load_robot("ur5e"), name="so101")) is None
 
 
 def test_data_are_in_the_size_of_the_arm() -> None:
-    large, small = (data_settings(name, load_robot(name), None, None) for name in ("ur5e", "so101"))
+    large, small = (data_settings(name, rd.load_robot(name), None, None) for name in ("ur5e", "so101"))
     assert large.search.safety_distance == 0.05 and small.search.safety_distance == pytest.approx(0.02)
 
 
@@ -104,13 +102,8 @@ def interrupted(call, at: int, save: bool = False):
     return counted
 
 
-def test_bad_input_is_a_clear_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def error(*arguments: str) -> str:
-        assert main(["train", "planner", *arguments]) == 2
-        return capsys.readouterr().err
-
+def test_bad_input_is_a_clear_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: Said) -> None:
+    error = partial(said, 2, "train", "planner")
     assert "unknown robot 'ur5x'; known: " in error("--robot", "ur5x")
     assert "give --robot to generate data" in error()
     assert "--data needs --out" in error("--data", str(tmp_path))
@@ -124,8 +117,8 @@ def test_bad_input_is_a_clear_line(
     (tmp_path / "half" / "data").mkdir(parents=True)
     (tmp_path / "half" / "data" / "manifest.json").write_text("{")
     assert "manifest.json is damaged" in error("--robot", "ur5e", "--out", str(tmp_path / "half"))
-    file = user_weights(load_robot("ur5e")) / "model.json"
+    file = user_weights(rd.load_robot("ur5e")) / "model.json"
     file.parent.mkdir(parents=True)
     file.write_text(json.dumps({"format": 2}))
-    with pytest.raises(InputError, match=r"weights/model\.json: robot is None"):
-        weights_for("model", load_robot("ur5e"))
+    with pytest.raises(rd.InputError, match=r"weights/model\.json: robot is None"):
+        weights_for("model", rd.load_robot("ur5e"))

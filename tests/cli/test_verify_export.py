@@ -6,13 +6,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from helpers.commands import run
+from helpers.commands import BALL, PROBLEM, Said, run
 from helpers.full_disk import full_disk
 
-START = [-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
-GOAL = [1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
-BALL = {"sphere": {"center": [0.5, 0.0, 0.5], "radius": 0.15, "name": "ball"}}
-PROBLEM = {"robot": "panda", "scene": [BALL], "start": START, "goal": {"joints": GOAL}}
 SCENE = {
     "world": {
         "collision_objects": [
@@ -43,18 +39,16 @@ def planned(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monkey
     return folder
 
 
-def test_a_certificate_is_written_and_checked(planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("verify", planned / "r.json", "--certificate", "c.json") == 0
-    assert "wrote c.json" in capsys.readouterr().out
-    assert run("certificate", "check", "c.json") == 0
-    lines = capsys.readouterr().out.splitlines()
+def test_a_certificate_is_written_and_checked(planned: Path, said: Said) -> None:
+    assert "wrote c.json" in said(0, "verify", planned / "r.json", "--certificate", "c.json")
+    lines = said(0, "certificate", "check", "c.json").splitlines()
     assert lines[0].startswith("robot: panda, ") and lines[1] == "problem: the one in the certificate"
     assert lines[2].startswith("not checked: ") and lines[3].startswith("holds: at least")
     assert run("certificate", "check", "c.json", "--problem", planned / "problem.json") == 0
-    assert run("certificate", "check", "c.json", "--problem", planned / "other.json") == 1
-    assert "scene: new was added" in capsys.readouterr().out
-    assert run("certificate", "check", planned / "r.json") == 2
-    assert "is not a certificate" in capsys.readouterr().err
+    assert "scene: new was added" in said(
+        1, "certificate", "check", "c.json", "--problem", planned / "other.json"
+    )
+    assert "is not a certificate" in said(2, "certificate", "check", planned / "r.json")
 
 
 @pytest.mark.parametrize(
@@ -67,55 +61,49 @@ def test_a_certificate_is_written_and_checked(planned: Path, capsys: pytest.Capt
         "view {} --out r.html",
     ],
 )
-def test_a_full_disk_is_status_3(command: str, planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_full_disk_is_status_3(command: str, planned: Path, said: Said) -> None:
     """It was 2, as bad input, and scripts could not tell them apart."""
     with full_disk():
-        assert run(*command.format(planned / "r.json").split()) == 3
-    error = capsys.readouterr().err
+        error = said(3, *command.format(planned / "r.json").split())
     assert error.count("\n") == 1 and "cannot be written" in error
 
 
-def test_motions_from_other_programs(planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_motions_from_other_programs(planned: Path, said: Said) -> None:
     for file in ("m.rosbag2", "m.yaml", "r.json"):
-        assert run("verify", planned / file, "--problem", planned / "problem.json") == 0
-        assert "trajectory: valid" in capsys.readouterr().out
+        assert "trajectory: valid" in said(0, "verify", planned / file, "--problem", planned / "problem.json")
     assert run("verify", planned / "m.yaml", "--scene", planned / "scene.yaml", "--robot", "panda") == 0
     assert run("export", planned / "r.json", "--out", "m.mcap") == 0
     assert run("verify", "m.mcap") == 0  # the problem is in it
-    assert run("verify", planned / "m.yaml") == 2
-    assert "holds no problem; give --problem FILE, or --scene FILE" in capsys.readouterr().err
-    assert run("verify", planned / "m.yaml", "--scene", planned / "scene.yaml") == 2
-    assert "--scene and --robot belong together" in capsys.readouterr().err
+    assert "holds no problem; give --problem FILE, or --scene FILE" in said(2, "verify", planned / "m.yaml")
+    assert "--scene and --robot belong together" in said(
+        2, "verify", planned / "m.yaml", "--scene", planned / "scene.yaml"
+    )
 
 
-def test_all_violations_are_listed(planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_all_violations_are_listed(planned: Path, said: Said) -> None:
     asked = ("verify", planned / "m.yaml", "--problem", planned / "other.json")
-    assert run(*asked, "--certificate", "c.json") == 1
-    first = capsys.readouterr().out
+    first = said(1, *asked, "--certificate", "c.json")
     assert first.count("not valid") == 1 and "inside new" in first
     assert not Path("c.json").exists()
-    assert run(*asked, "--all") == 1
-    every = capsys.readouterr().out.splitlines()
+    every = said(1, *asked, "--all").splitlines()
     assert len(every) > 1
     assert all("new" in line for line in every)
     times = [float(line.rpartition("(at ")[2].rstrip(")")) for line in every]
     assert times == sorted(times)
 
 
-def test_only_valid_motions_are_exported(planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_only_valid_motions_are_exported(planned: Path, said: Said) -> None:
     assert run("export", planned / "r.json", "--out", "a.csv", "--out", "a.rrd") == 0
     record = json.loads((planned / "r.json").read_text())
     record["problem"] = json.loads((planned / "other.json").read_text())
     Path("bad.json").write_text(json.dumps(record))
     for command in (("export", "bad.json", "--out", "b.yaml"), ("publish", "bad.json", "--to", "localhost")):
-        assert run(*command) == 2
-        assert "is not exported: its motion is not valid" in capsys.readouterr().err
+        assert "is not exported: its motion is not valid" in said(2, *command)
     assert not Path("b.yaml").exists()
-    assert run("publish", planned / "r.json", "--to", "host:0") == 2
-    assert "'host:0' is not HOST or HOST:PORT" in capsys.readouterr().err
+    assert "'host:0' is not HOST or HOST:PORT" in said(2, "publish", planned / "r.json", "--to", "host:0")
     assert run("export", planned / "r.json", "--out", "fine.csv", "--rate", "1000") == 0
     assert Path("fine.csv").read_text().splitlines()[2].startswith("0.001,")
     assert run("export", planned / "r.json", "--out", "fine.csv", "--rate", "-1") == 2
-    capsys.readouterr()
-    assert run("export", planned / "r.json", "--out", "a.foo") == 2
-    assert "known: .json, .csv, .mcap, .rosbag2, .rrd, .yaml" in capsys.readouterr().err
+    assert "known: .json, .csv, .mcap, .rosbag2, .rrd, .yaml" in said(
+        2, "export", planned / "r.json", "--out", "a.foo"
+    )

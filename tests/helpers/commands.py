@@ -1,10 +1,13 @@
 """Runs commands in this process, and the problem of their tests."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 from robotdiffuse.cli import main
 
+Said = Callable[..., str]
+"""What a command with these words prints, to standard error if it is refused; its status comes first."""
 START = [-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
 GOAL = [1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
 BALL = {"sphere": {"center": [0.5, 0.0, 0.5], "radius": 0.15}}

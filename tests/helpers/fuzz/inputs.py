@@ -6,7 +6,9 @@ there is time for.
 """
 
 import copy
+import io
 import json
+import tempfile
 import traceback
 from collections.abc import Callable
 from functools import cache
@@ -14,26 +16,32 @@ from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
+import trimesh
+from PIL import Image
 
-from helpers.fuzz.examples import (
-    CLOUDS,
-    CONSTRAINED,
-    EQUIPPED,
-    HELD,
-    IN_MOTION,
-    JOINTS,
-    LIMITS,
-    MESHES,
-    MOVEIT,
-    MOVING,
-    POSE,
-    PROBLEM,
-    REQUEST,
-    SRDF,
-    URDF,
-    VIEW,
-)
+from helpers.fuzz import examples, server
 from helpers.fuzz.mutation import damaged, mutated, nasty, numbers_changed, text_of
+from robotdiffuse.certificates.certificate import load_certificate
+from robotdiffuse.certificates.search import certify
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.results import load_result
+from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.interop import read_motion, write_motion
+from robotdiffuse.interop.recorded_motion import joint_trajectory, motion_of_robot
+from robotdiffuse.problems.files import (
+    load_motion_bench_maker,
+    load_problem,
+    problem_from_record,
+    problem_record,
+)
+from robotdiffuse.problems.problem import JointGoal
+from robotdiffuse.robots import DATA, load_robot, read_robot_folder
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.parsing.srdf import read_srdf
+from robotdiffuse.robots.parsing.urdf import UrdfTree, read_limits, with_limits
+from robotdiffuse.scenes.point_cloud import read_points
+from robotdiffuse.scenes.shapes import PointCloud
+from robotdiffuse.validation.validator import Verifier
 
 MAX_MESSAGE_LENGTH = 1000
 """Characters of an error message; names of files and lists of known names make some long."""
@@ -44,8 +52,6 @@ Make = Callable[[np.random.Generator, FilePath], Callable[[], object]]
 
 def outcome(call: Callable[[], object]) -> tuple[str, str]:
     """`answer`, `error` or `fault`, and the error message."""
-    from robotdiffuse.core.errors import InputError
-
     try:
         call()
     except InputError as error:
@@ -65,14 +71,16 @@ def outcome_of(kind: str, seed: int, folder: FilePath) -> tuple[str, str]:
 
 
 def _problem(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    data = dict(PROBLEM)
+    data = dict(examples.PROBLEM)
     if rng.random() < 0.2:
-        data["goal"] = {"pose": POSE}
+        data["goal"] = {"pose": examples.POSE}
     if rng.random() < 0.1:
-        data["views"] = [VIEW]
+        data["views"] = [examples.VIEW]
         data["unknown"] = "optimistic"
     else:
-        data |= (*({},) * 3, EQUIPPED, CONSTRAINED, MOVING, IN_MOTION)[rng.integers(7)]
+        data |= (*({},) * 3, examples.EQUIPPED, examples.CONSTRAINED, examples.MOVING, examples.IN_MOTION)[
+            rng.integers(7)
+        ]
     ending = (".yaml", ".json", ".jsonl")[rng.integers(3)]
     file = folder / f"problem{ending}"
     file.write_bytes(text_of(rng, data, ending))
@@ -81,11 +89,6 @@ def _problem(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]
 
 def _validated(file: FilePath) -> None:
     """Read a problem and, if its goal is a configuration, validate the straight line to it."""
-    from robotdiffuse.core.types import Path
-    from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record
-    from robotdiffuse.problems.problem import JointGoal
-    from robotdiffuse.validation.validator import Verifier
-
     problem = load_problem(file)
     problem_from_record(problem_record(problem))
     if isinstance(problem.goal, JointGoal):
@@ -94,12 +97,10 @@ def _validated(file: FilePath) -> None:
 
 
 def _moveit(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    from robotdiffuse.problems.files import load_motion_bench_maker
-
-    asked = copy.deepcopy(REQUEST)
+    asked = copy.deepcopy(examples.REQUEST)
     if rng.random() < 0.3:
-        asked["start_state"]["attached_collision_objects"] = [HELD]
-    scene, request = (yaml_text(rng, data, i) for i, data in enumerate((MOVEIT, asked)))
+        asked["start_state"]["attached_collision_objects"] = [examples.HELD]
+    scene, request = (yaml_text(rng, data, i) for i, data in enumerate((examples.MOVEIT, asked)))
     (folder / "scene0001.yaml").write_bytes(scene)
     (folder / "request0001.yaml").write_bytes(request)
 
@@ -115,12 +116,7 @@ def yaml_text(rng: np.random.Generator, data: Any, other: int) -> bytes:
 
 
 def _cloud(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    import io
-
-    from robotdiffuse.scenes.point_cloud import read_points
-    from robotdiffuse.scenes.shapes import PointCloud
-
-    ending = CLOUDS[rng.integers(len(CLOUDS))]
+    ending = examples.CLOUDS[rng.integers(len(examples.CLOUDS))]
     points = rng.normal(size=(5, 3)).astype(np.float32)
     if rng.random() < 0.2:
         points[0, 0] = (np.inf, 1e38, 0)[rng.integers(3)]
@@ -138,8 +134,6 @@ def _cloud(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
         if not binary:
             np.savetxt(stream, points)
     else:
-        import trimesh
-
         stream.write(trimesh.PointCloud(points).export(file_type="ply"))  # type: ignore[arg-type]
     file = folder / f"cloud.{ending}"
     file.write_bytes(damaged(rng, stream.getvalue()))
@@ -148,8 +142,6 @@ def _cloud(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
 def mesh_file(rng: np.random.Generator, folder: FilePath, name: str, ending: str) -> FilePath:
     """A small mesh with its bytes damaged."""
-    import trimesh
-
     content = trimesh.creation.box((0.1, 0.2, 0.3)).export(file_type=ending)
     content = content.encode() if isinstance(content, str) else bytes(content)
     file = folder / f"{name}.{ending}"
@@ -158,26 +150,21 @@ def mesh_file(rng: np.random.Generator, folder: FilePath, name: str, ending: str
 
 
 def _mesh(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    file = mesh_file(rng, folder, "part", MESHES[rng.integers(len(MESHES))])
-    problem = PROBLEM | {"scene": [{"mesh": {"file": file.name, "xyz": [2, 2, 2]}}]}
+    file = mesh_file(rng, folder, "part", examples.MESHES[rng.integers(len(examples.MESHES))])
+    problem = examples.PROBLEM | {"scene": [{"mesh": {"file": file.name, "xyz": [2, 2, 2]}}]}
     (folder / "problem.json").write_text(json.dumps(problem))
     return lambda: _validated(folder / "problem.json")
 
 
 def _urdf(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    import trimesh
-
-    from robotdiffuse.robots.parsing.srdf import read_srdf
-    from robotdiffuse.robots.parsing.urdf import UrdfTree, read_limits, with_limits
-
     part = bytes(trimesh.creation.box((0.1, 0.05, 0.3)).export(file_type="stl"))  # type: ignore[arg-type]
     (folder / "part.stl").write_bytes(damaged(rng, part) if rng.random() < 0.2 else part)
     files = {name: folder / name for name in ("two.urdf", "two.srdf", "limits.yaml")}
     which = rng.integers(4)
-    files["two.urdf"].write_bytes(numbers_changed(rng, URDF) if which < 2 else URDF)
-    files["two.srdf"].write_bytes(numbers_changed(rng, SRDF) if which == 2 else SRDF)
+    files["two.urdf"].write_bytes(numbers_changed(rng, examples.URDF) if which < 2 else examples.URDF)
+    files["two.srdf"].write_bytes(numbers_changed(rng, examples.SRDF) if which == 2 else examples.SRDF)
     files["limits.yaml"].write_bytes(
-        text_of(rng, LIMITS, ".yaml") if which == 3 else json.dumps(LIMITS).encode()
+        text_of(rng, examples.LIMITS, ".yaml") if which == 3 else json.dumps(examples.LIMITS).encode()
     )
 
     def read() -> None:
@@ -191,17 +178,13 @@ def _urdf(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
 
 def _result(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    from robotdiffuse.core.results import load_result
-    from robotdiffuse.problems.files import problem_from_record
-    from robotdiffuse.validation.validator import Verifier
-
-    rows = np.linspace(PROBLEM["start"], PROBLEM["goal"]["joints"], 3).tolist()
+    rows = np.linspace(examples.PROBLEM["start"], examples.PROBLEM["goal"]["joints"], 3).tolist()
     record = {
         "status": "solved",
         "reason": "solved by hand",
         "planner": "hand",
         "robot": "panda",
-        "joint_names": JOINTS,
+        "joint_names": examples.JOINTS,
         "planning_time": 0.1,
         "verified": True,
         "seed": 0,
@@ -211,7 +194,7 @@ def _result(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
         "velocities": [[0.0] * 7, [0.3] + [0.0] * 6, [0.0] * 7],
         "accelerations": [[0.0] * 7] * 3,
         "progress": [[0.1, 0.4]],
-        "problem": PROBLEM | {"scene": PROBLEM["scene"][:1]},
+        "problem": examples.PROBLEM | {"scene": examples.PROBLEM["scene"][:1]},
     }
     file = folder / "result.json"
     file.write_bytes(text_of(rng, record, ".json"))
@@ -228,9 +211,6 @@ def _result(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
 
 def _bundle(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    from robotdiffuse.robots import DATA, read_robot_folder
-    from robotdiffuse.robots.kinematics import link_pose
-
     source = DATA / "panda"
     text = (source / "robot.json").read_text()
     meshes = (source / "meshes.npz").read_bytes()
@@ -238,8 +218,6 @@ def _bundle(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     content = text_of(rng, json.loads(text), ".json") if damage else text.encode()
     (folder / "robot.json").write_bytes(content)
     if not damage and rng.random() < 0.7:
-        import io
-
         stream = io.BytesIO()
         arrays = dict(np.load(source / "meshes.npz"))
         name = ("sizes", "vertices", "faces")[rng.integers(3)]
@@ -262,13 +240,15 @@ def _bundle(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
 def asked(rng: np.random.Generator, right: float = 0.0) -> tuple[str, bytes]:
     """The endpoint of a request over HTTP, and its body; with probability `right` it is not damaged."""
-    rows = np.linspace(PROBLEM["start"], PROBLEM["goal"]["joints"], 3).tolist()
+    rows = np.linspace(examples.PROBLEM["start"], examples.PROBLEM["goal"]["joints"], 3).tolist()
     problem = (
-        PROBLEM | {"scene": PROBLEM["scene"][: rng.integers(7)]} | (EQUIPPED if rng.random() < 0.1 else {})
+        examples.PROBLEM
+        | {"scene": examples.PROBLEM["scene"][: rng.integers(7)]}
+        | (examples.EQUIPPED if rng.random() < 0.1 else {})
     )
     plan = {"problem": problem, "planner": "rrt_connect", "time_limit": 0.05, "seed": 1, "until": "first"}
     plan |= {"velocity_scaling": 0.5, "acceleration_scaling": 0.5, "clearance": 0.01}
-    motion = {"joint_names": JOINTS, "positions": rows}
+    motion = {"joint_names": examples.JOINTS, "positions": rows}
     rates = {"velocities": [[0.0] * 7] * 3, "accelerations": [[0.0] * 7] * 3}
     validated = {
         "problem": problem,
@@ -284,8 +264,6 @@ def asked(rng: np.random.Generator, right: float = 0.0) -> tuple[str, bytes]:
 
 def _http(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     """Request bodies, answered as a worker of `robotdiffuse serve` answers them."""
-    from robotdiffuse.core.errors import InputError
-    from robotdiffuse.robots import load_robot
     from robotdiffuse.server import worker
     from robotdiffuse.server.settings import ServeSettings
 
@@ -303,9 +281,6 @@ def _http(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
 def _socket(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     """Requests to a running `robotdiffuse serve`, which is itself checked now and then."""
-    from helpers.fuzz import server
-    from robotdiffuse.core.errors import InputError
-
     (what, body), (_, other) = asked(rng, 0.5), asked(rng, 0.5)
     sent = server.sent(rng, server.draft(rng, what, body, other), damaged)
     looks = rng.random() < 1 / server.INPUTS_BETWEEN_CHECKS
@@ -322,14 +297,8 @@ def _socket(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
 
 def _motion(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    from robotdiffuse.core.types import Trajectory
-    from robotdiffuse.interop import read_motion, write_motion
-    from robotdiffuse.interop.recorded_motion import joint_trajectory, motion_of_robot
-    from robotdiffuse.problems.files import problem_from_record
-    from robotdiffuse.validation.validator import Verifier
-
-    problem = problem_from_record(PROBLEM | {"scene": PROBLEM["scene"][:1]})
-    rows = np.linspace(PROBLEM["start"], PROBLEM["goal"]["joints"], 3)
+    problem = problem_from_record(examples.PROBLEM | {"scene": examples.PROBLEM["scene"][:1]})
+    rows = np.linspace(examples.PROBLEM["start"], examples.PROBLEM["goal"]["joints"], 3)
     times = np.array([0.0, 10.0, 20.0])
     still = np.zeros_like(rows)
     trajectory = Trajectory(problem.robot.joint_names, times, rows, still, still)
@@ -361,24 +330,16 @@ def _motion(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
 @cache
 def _certificate_record() -> dict[str, Any]:
-    import tempfile
-
-    from robotdiffuse.certificates.search import certify
-    from robotdiffuse.core.types import Path
-    from robotdiffuse.problems.files import problem_from_record
-
-    start = PROBLEM["start"]
+    start = examples.PROBLEM["start"]
     rows = np.array([start, start])
     rows[1, 0] += 0.05
-    problem = problem_from_record(PROBLEM | {"scene": [], "goal": {"joints": rows[1].tolist()}})
+    problem = problem_from_record(examples.PROBLEM | {"scene": [], "goal": {"joints": rows[1].tolist()}})
     with tempfile.TemporaryDirectory() as folder:
         certify(problem, Path(problem.robot.joint_names, rows)).save(f"{folder}/c.json")
         return json.loads(FilePath(f"{folder}/c.json").read_text())
 
 
 def _certificate(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    from robotdiffuse.certificates.certificate import load_certificate
-
     file = folder / "certificate.json"
     file.write_bytes(text_of(rng, _certificate_record(), ".json"))
     return lambda: load_certificate(file).check()
@@ -386,8 +347,6 @@ def _certificate(rng: np.random.Generator, folder: FilePath) -> Callable[[], obj
 
 def _depth(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     """Depth images, and the views that name them."""
-    from PIL import Image
-
     ending = (".png", ".npy", ".npz")[rng.integers(3)]
     image = rng.integers(0, 3000, (6, 8)).astype(np.uint16)
     file = folder / f"depth{ending}"
@@ -397,9 +356,13 @@ def _depth(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
         (np.save if ending == ".npy" else np.savez)(file, image if rng.random() < 0.5 else image / 1000)
     if rng.random() < 0.6:
         file.write_bytes(damaged(rng, file.read_bytes()))
-    view = VIEW | {"depth": file.name, "intrinsics": [6.0, 6.0, 4, 3], "scale": 0.001}
+    view = examples.VIEW | {"depth": file.name, "intrinsics": [6.0, 6.0, 4, 3], "scale": 0.001}
     del view["cloud"]
-    problem = PROBLEM | {"scene": PROBLEM["scene"][:1], "views": [view], "unknown": "padded"}
+    problem = examples.PROBLEM | {
+        "scene": examples.PROBLEM["scene"][:1],
+        "views": [view],
+        "unknown": "padded",
+    }
     (folder / "problem.json").write_bytes(
         text_of(rng, problem, ".json") if rng.random() < 0.5 else json.dumps(problem).encode()
     )
@@ -408,10 +371,11 @@ def _depth(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
 def _upload(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     """Problem files that browsers send to the live page."""
-    from robotdiffuse.robots import load_robot
     from robotdiffuse.visualization.live.session import Session, problem_text, uploaded_problem
 
-    problem = PROBLEM | ({}, EQUIPPED, CONSTRAINED, MOVING)[rng.integers(4)]
+    problem = (
+        examples.PROBLEM | ({}, examples.EQUIPPED, examples.CONSTRAINED, examples.MOVING)[rng.integers(4)]
+    )
     ending = (".yaml", ".json")[rng.integers(2)]
     content = text_of(rng, problem, ending)
 
@@ -454,7 +418,6 @@ def _weights(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]
     """Folders with the weights of a network."""
     from robotdiffuse.learning.checkpoint import load_network
     from robotdiffuse.learning.weight_files import BUNDLED
-    from robotdiffuse.robots import load_robot
 
     about, tensors = (BUNDLED / "panda" / f"mpinets.{ending}" for ending in ("json", "safetensors"))
     whole = rng.random() < 0.8
@@ -469,13 +432,11 @@ def _weights(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]
 
 def _npz(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     """The authors' data sets."""
-    import io
-
     from robotdiffuse.datasets.external import import_npz
 
     stream = io.BytesIO()
     x = np.zeros((2, 254, 7), np.float32)
-    x += np.array(PROBLEM["start"], np.float32)
+    x += np.array(examples.PROBLEM["start"], np.float32)
     y = np.concatenate([x[:, 0], x[:, -1], np.ones((2, 9), np.float32)], axis=1)
     if rng.random() < 0.3:
         y[0, rng.integers(y.shape[1])] = (np.nan, 1e30, np.inf)[rng.integers(3)]
