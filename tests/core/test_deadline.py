@@ -8,8 +8,6 @@ import pytest
 import robotdiffuse as rd
 from robotdiffuse.collision import exact_meshes, kernel_arrays
 from robotdiffuse.core.deadline import LONG, OutOfTimeError, check_time, check_timing, deadline
-from robotdiffuse.planning.pipeline import waypoints
-from robotdiffuse.planning.planner import one_of_each
 from robotdiffuse.planning.search.rrt import RRTConnect
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.trajectories import speed_limits
@@ -68,20 +66,6 @@ def test_a_motion_whose_timing_takes_too_long_is_a_time_out(
     assert "rows of a motion of" in result.reason
 
 
-def test_a_start_velocity_whose_timing_takes_too_long_is_a_time_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    moving = rd.Problem(PANDA, rd.Scene(), LEFT, RIGHT, start_velocity=-0.1 * np.eye(7)[0])
-    attempt = waypoints.attempt
-
-    def then_slow(*arguments: object) -> object:
-        found = attempt(*arguments)  # type: ignore[arg-type]
-        monkeypatch.setattr(speed_limits, "SECONDS_PER_ROW", 1e3)
-        return found
-
-    monkeypatch.setattr(waypoints, "attempt", then_slow)
-    result = RRTConnect().plan(moving, 20.0)
-    assert result.status is rd.Status.TIMEOUT and "too short for timing" in result.reason
-
-
 def test_a_motion_too_long_to_be_validated_ends_the_search() -> None:
     """It went on until its time ran out, and did not say why."""
     joints = tuple(replace(joint, velocity=1e-6) for joint in PANDA.joints)
@@ -119,14 +103,3 @@ def test_a_tree_of_the_validator_that_takes_too_long_is_refused(
     assert "the validator's tree over the" in refused.reason
     monkeypatch.undo()
     assert RRTConnect().plan(asked, time_limit=20.0).status is rd.Status.INVALID_START
-
-
-def test_warming_up_prepares_no_large_scene() -> None:
-    cloud = rd.PointCloud(wall().vertices, 0.01)
-    small = one_of_each(
-        rd.Scene([wall(), wall(), cloud, rd.Sphere([1, 1, 1], 0.1), rd.Box([2, 2, 2], [1, 1, 1])])
-    )
-    mesh, points, sphere, box = small.shapes
-    assert isinstance(mesh, rd.Mesh) and len(mesh.faces) == 1
-    assert isinstance(points, rd.PointCloud) and len(points.points) == 1
-    assert isinstance(sphere, rd.Sphere) and isinstance(box, rd.Box)

@@ -64,8 +64,6 @@ def one_line(call: Callable[[], object]) -> str:
     ("text", "message"),
     [
         ("[" * DEEP, "more than 64 levels deep"),
-        ("[" * DEEP + "]" * DEEP, "more than 64 levels deep"),
-        ('{"a":' * DEEP, "more than 64 levels deep"),
         ('"' + "[" * DEEP, "is not valid JSON"),
         ("9" * 5000, "integer 9999"),
         ("[1, 2", "line 1, column 6"),
@@ -94,9 +92,7 @@ def test_brackets_in_texts_are_no_nesting() -> None:
         ("? [1, 2]\n: 3", "a key is not a plain string in line 1"),
         ("9" * 5000, "integer 9999"),
         ("a: 1\n---\nb: 2", "more than one document"),
-        ("a: [1, 2", "in line 2"),
         ("a: 0x_", "'0x_' is not a number in line 1"),
-        ("a: -0b_", "'-0b_' is not a number in line 1"),
         ("\0", "is not valid YAML"),
         ("\ud800", "surrogate"),
     ],
@@ -148,9 +144,13 @@ def test_any_bytes_are_a_value_or_one_line(content: bytes) -> None:
         (b"<a>" * DEEP + b"</a>" * DEEP, "more than 64 levels deep"),
         (b'<?xml version="1.0" encoding="klingon"?><robot/>', "unknown encoding"),
         (b"", "no element found"),
+        (f'<!DOCTYPE r [<!ENTITY a "lol">{NESTED}]><r>&j;</r>'.encode(), "not well-formed XML"),
+        (f'<!DOCTYPE r [<!ENTITY a "{50_000 * "x"}">]><r>{2000 * "&a;"}</r>'.encode(), "not well-formed XML"),
+        (b'<!DOCTYPE r [<!ENTITY a SYSTEM "file:///etc/passwd">]><r n="&a;"/>', "not well-formed XML"),
+        (b'<!DOCTYPE r [<!ENTITY a SYSTEM "file:///etc/passwd">]><r>&a;</r>', "not well-formed XML"),
     ],
 )
-def test_xml_that_is_no_xml(text: bytes, message: str) -> None:
+def test_xml_that_is_no_xml_or_a_bomb(text: bytes, message: str) -> None:
     assert message in one_line(lambda: parse_xml(text, "it"))
 
 
@@ -226,30 +226,12 @@ def test_a_pipe_that_a_mesh_file_names_is_not_waited_for(kind: str, tmp_path: Pa
         assert len(read_triangles(tmp_path / f"model.{kind}")[1]) == 12
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        f'<!DOCTYPE robot [<!ENTITY a "lol">{NESTED}]><robot>&j;</robot>',
-        f'<!DOCTYPE robot [<!ENTITY a "{50_000 * "x"}">]><robot>{2000 * "&a;"}</robot>',
-        '<!DOCTYPE robot [<!ENTITY a SYSTEM "file:///etc/passwd">]><robot name="&a;"/>',
-        '<!DOCTYPE robot [<!ENTITY a SYSTEM "file:///etc/passwd">]><robot>&a;</robot>',
-    ],
-    ids=["nested entities", "a long entity many times", "a file in an attribute", "a file as text"],
-)
-def test_xml_bombs_are_refused_in_one_line(text: str) -> None:
-    with pytest.raises(InputError, match="not well-formed XML"):
-        parse_xml(text.encode(), "it")
-
-
 def test_arrays_of_python_objects_are_refused(tmp_path: Path) -> None:
     for name, save in (("points.npy", np.save), ("points.npz", np.savez)):
         save(tmp_path / name, np.array([{"a": 1}], object))
         with pytest.raises(InputError, match="is damaged"):
             read_arrays(tmp_path / name)
-
-
-def test_an_archive_called_npy_is_refused(tmp_path: Path) -> None:
-    """It was returned unread and open."""
+    # an archive called .npy was returned unread and open
     np.savez(tmp_path / "points.npz", points=np.zeros(3))
     file = (tmp_path / "points.npz").rename(tmp_path / "points.npy")
     with pytest.raises(InputError, match="is damaged"):
@@ -260,6 +242,9 @@ def test_errors_survive_pickling() -> None:
     """The listed lines were joined into one."""
     error = InputError("it is wrong:", ["a b", "c"])
     assert str(copy.copy(error)) == str(error) == "it is wrong:\n  a b\n  c"
+
+
+PICKLING = {"pickle", "dill", "joblib", "shelve", "marshal"}
 
 
 def test_nothing_unpickles_files() -> None:
@@ -274,13 +259,7 @@ def test_nothing_unpickles_files() -> None:
         for node in ast.walk(ast.parse(text)):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
-            found = {name.partition(".")[0] for name in names} & {
-                "pickle",
-                "dill",
-                "joblib",
-                "shelve",
-                "marshal",
-            }
+            found = PICKLING.intersection(name.partition(".")[0] for name in names)
             assert not found, f"{file}: {found}"
             call = isinstance(node, ast.Call) and ast.unparse(node.func)
             assert call != "torch.load", f"{file}: {call}"

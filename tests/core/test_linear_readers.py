@@ -5,7 +5,6 @@ from typing import ClassVar
 import pytest
 
 from robotdiffuse import Box, InputError, Scene
-from robotdiffuse.core.input_files import parse_json
 from robotdiffuse.core.types import check_motion_arrays
 from robotdiffuse.scenes.scene import MAX_CONTACT_LINKS
 
@@ -34,12 +33,6 @@ def test_joint_names_are_compared_a_few_times_each(names: list[str]) -> None:
     with pytest.raises(InputError, match="joint_names has j7 more than once"):
         check_motion_arrays([*names, Name("j7")], {"positions": [[0.0]]})
     assert Name.compared < 5 * COUNT
-
-
-def test_the_last_key_of_many_is_found_to_be_the_first_again() -> None:
-    keys = ", ".join(f'"k{i}": 0' for i in range(30_000))
-    with pytest.raises(InputError, match="k0 appears twice"):
-        parse_json(f'{{{keys}, "k0": 1}}', "the request")
 
 
 def test_links_that_may_touch_an_obstacle_are_compared_a_few_times_each(names: list[str]) -> None:

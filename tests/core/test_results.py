@@ -9,7 +9,6 @@ import pytest
 
 from robotdiffuse import InputError, Path, PlanResult, Status, Trajectory, load_result
 from robotdiffuse.core.errors import OutputError
-from robotdiffuse.core.output_files import check_output
 
 NAMES = ("shoulder", "elbow")
 
@@ -87,14 +86,6 @@ def test_results_of_earlier_versions_lack_fields(solved: PlanResult, tmp_path: F
     assert (read.progress, read.refused, read.goal_index) == ((), "", None)
 
 
-@pytest.mark.parametrize("wrong", [-1, 1.5, True, "0"])
-def test_a_goal_index_that_is_none_is_one_line(solved: PlanResult, tmp_path: FilePath, wrong: object) -> None:
-    file = tmp_path / "r.json"
-    file.write_text(json.dumps(solved.record() | {"goal_index": wrong}))
-    with pytest.raises(InputError, match=r"goal_index is .*; it must be a whole number from 0 on"):
-        load_result(file)
-
-
 def test_failed_result_round_trip(failed: PlanResult, tmp_path: FilePath) -> None:
     file = tmp_path / "result.json"
     failed.save(str(file))
@@ -147,12 +138,14 @@ DAMAGE = [
     ({"joint_names": [1, 2]}, r"joint_names is \[1, 2\]; it must be a list of names"),
     ({"planning_time": "soon"}, "planning_time is 'soon'; it must be a finite number"),
     ({"progress": [[0.1]]}, "progress is an array of 1 x 1; it must be n x 2"),
+    ({"goal_index": -1}, "goal_index is -1; it must be a whole number from 0 on"),
+    ({"goal_index": True}, "goal_index is True; it must be a whole number from 0 on"),
     ({"reason": 7}, "reason is 7; it must be a string"),
     ({"problem": [1]}, r"problem is \[1\]; it must be an object"),
 ]
 
 
-@pytest.mark.parametrize(("change", "message"), DAMAGE, ids=[next(iter(change)) for change, _ in DAMAGE])
+@pytest.mark.parametrize(("change", "message"), DAMAGE)
 def test_damaged_result_is_refused(
     change: dict, message: str, solved: PlanResult, tmp_path: FilePath
 ) -> None:
@@ -173,7 +166,3 @@ def test_not_a_result_file(text: str, message: str, tmp_path: FilePath) -> None:
     file.write_text(text)
     with pytest.raises(InputError, match=message):
         load_result(file)
-
-
-def test_check_output_takes_capitals(tmp_path: FilePath) -> None:
-    assert check_output(tmp_path / "A.JSON", (".json",)).name == "A.JSON"

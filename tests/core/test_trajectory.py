@@ -53,13 +53,6 @@ def test_a_cubic_is_exact_at_any_time():
     assert np.allclose(one.positions, rough.at(np.array([0.7])).positions[0])
 
 
-def test_rows_are_their_own():
-    motion = smooth(2)
-    state = motion.at(motion.times)
-    for got, right in zip(state, (motion.positions, motion.velocities, motion.accelerations), strict=False):
-        assert np.allclose(got, right, rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize("time", [-0.1, 2.1, np.nan, np.array([0.5, 3.0])])
 def test_times_outside_are_refused(time):
     with pytest.raises(InputError, match=r"it must be in \[0, 2\]"):

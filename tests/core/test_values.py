@@ -13,7 +13,7 @@ from numpy import ndarray
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
-from robotdiffuse.core.bounds import Value, for_kernels, read_only
+from robotdiffuse.core.bounds import Value, read_only
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
 from robotdiffuse.problems.constraints import FrameConstraint
 from robotdiffuse.robots.bodies import AttachedBody, ConvexMesh, Surface
@@ -139,12 +139,6 @@ def test_large_arrays_are_shown_by_their_shape_and_defaults_not_at_all() -> None
     )
 
 
-def test_what_is_prepared_for_a_robot_is_not_among_its_names() -> None:
-    arm = robot()
-    arm.__dict__["some.module.prepared"] = 1
-    assert "joint_names" in dir(arm) and not any("." in name for name in dir(arm))
-
-
 @pytest.mark.parametrize("kind", VALUES, ids=lambda kind: kind.__name__)
 def test_nobody_can_write_to_the_arrays_of_a_value(kind: type[Value]) -> None:
     before = [array.copy() for array in GIVEN]
@@ -169,19 +163,6 @@ def test_views_of_what_can_be_written_to_are_copied() -> None:
     mine[:] = 1
     assert (kept == 0).all()
     assert read_only(kept) is kept
-    assert read_only(kept[0]).base is kept
-    assert read_only(np.frombuffer(bytes(8))).base is not None
-    buffer = np.frombuffer(bytearray(8))
-    buffer.setflags(write=False)
-    assert not np.shares_memory(buffer, read_only(buffer))
-
-
-def test_compiled_code_gets_arrays_of_one_type() -> None:
-    mine = np.zeros(3)
-    kept = read_only(np.zeros(3))
-    assert for_kernels(mine) is mine
-    assert for_kernels(kept).flags.writeable
-    assert not np.shares_memory(for_kernels(kept), kept)
 
 
 def test_a_verdict_is_of_the_scene_as_it_is() -> None:

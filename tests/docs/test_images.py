@@ -1,12 +1,12 @@
 """Texts in the drawings of the documentation lie inside the drawing and do not overlap."""
 
-import shutil
 from itertools import combinations
 from pathlib import Path
 
 import pytest
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+from helpers.browsers import CHROMIUM
+
 DRAWINGS = sorted((Path(__file__).parents[2] / "docs").rglob("*.svg"))
 BOXES = """[...document.querySelectorAll("text")].map(text => {
     const box = text.getBoundingClientRect();

@@ -2,15 +2,15 @@
 
 import os
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from helpers.browsers import CHROMIUM
+
 ROOT = Path(__file__).parents[2]
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 LOADED = re.compile(r'<(?:script|img|iframe|source)[^>]*\ssrc="(?:https?:)?//|<link[^>]*stylesheet[^>]*//')
 
 
@@ -49,15 +49,9 @@ def test_the_search_works_without_a_server(site: Path) -> None:
 
 
 def test_the_command_reference_has_every_option(site: Path) -> None:
-
     page = (site / "reference" / "commands.html").read_text(encoding="utf-8")
-    for word in (
-        "robotdiffuse data generate",
-        "--safety-distance",
-        "robotdiffuse bench report",
-        "--no-replays",
-    ):
-        assert word in page
+    options = ("data generate", "--safety-distance", "robotdiffuse bench report", "--no-replays")
+    assert all(option in page for option in options)
 
 
 def test_the_python_reference_has_every_public_name(site: Path) -> None:
