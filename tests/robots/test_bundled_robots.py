@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 import trimesh
 
+import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
-from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.problem import PoseGoal, Problem
 from robotdiffuse.robots import DATA, ROBOTS, load_robot
 from robotdiffuse.robots.fitting.sphere_fitting import is_inside, stacked_planes
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import gaps
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot_folder import read_source
-from robotdiffuse.scenes.scene import Scene
 
 NOTICE = (Path(__file__).parents[2] / "NOTICE").read_text()
 
@@ -37,7 +36,7 @@ def test_no_sampled_point_of_the_meshes_is_outside_the_spheres(name: str) -> Non
 def test_what_spheres_call_free_is_free_and_little_else_is(name: str) -> None:
     """Preparation warns of more than 8 % false collisions; the standard error with 400 samples is 1.5 %."""
     robot = load_robot(name)
-    scene = Scene()
+    scene = rd.Scene()
     q = np.random.default_rng(0).uniform(robot.lower, robot.upper, (400, robot.dof))
     by_spheres = CollisionChecker(robot, scene).free(q)
     by_meshes = ~ExactCollision(robot, scene).collides(q)
@@ -79,8 +78,8 @@ def test_a_pose_does_not_say_how_often_a_joint_turns() -> None:
     T = link_pose(robot, home, "tool0")
     for q in goals:
         np.testing.assert_allclose(link_pose(robot, q, "tool0"), T, atol=1e-9)
-    pose = Problem(robot, Scene([]), start, PoseGoal("tool0", T))
-    result = load_planner("aorrtc").plan(pose, time_limit=10.0, until="first")
+    pose = Problem(robot, rd.Scene([]), start, PoseGoal("tool0", T))
+    result = rd.load_planner("aorrtc").plan(pose, time_limit=10.0, until="first")
     assert result.solved, result.reason
     panda = load_robot("panda")
     assert np.array_equal(panda.equivalent_configurations(panda.upper, panda.lower), panda.upper[None])

@@ -8,17 +8,15 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+import robotdiffuse as rd
 from helpers.example_robots import TIPS, example_robot, planar_arm
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import rotation_angle, transform
 from robotdiffuse.learning.training.losses import ForwardKinematics
-from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.robots.robot import Robot
 
 
-def errors(robot: Robot, frame: str, T: np.ndarray, q: np.ndarray) -> tuple[float, float]:
+def errors(robot: rd.Robot, frame: str, T: np.ndarray, q: np.ndarray) -> tuple[float, float]:
     """Largest position error [m] and orientation error [rad] of solutions, by the PyTorch kinematics."""
     T_base_frame = ForwardKinematics(robot, torch.float64)(torch.tensor(q)).numpy()
     poses = T_base_frame[:, robot.link_frame(frame)] @ robot.T_frame_link(frame)
@@ -45,15 +43,6 @@ def test_solutions_are_exact_distinct_and_within_limits(name: str) -> None:
         assert position <= 2e-6 and rotation <= 3e-6  # 1e-6, and the margin of wrapped continuous joints
         assert (q > robot.lower).all() and (q < robot.upper).all()
         assert smallest_gap(q) > 0.1
-
-
-def test_every_configuration_of_the_panda_can_be_found_again() -> None:
-    """All of 300 reachable poses are solved; the benchmark solves 1,000 with ten solutions each."""
-    robot = example_robot("panda")
-    rng = np.random.default_rng(4)
-    for _ in range(300):
-        T = link_pose(robot, rng.uniform(robot.lower, robot.upper), "panda_hand")
-        assert len(inverse_kinematics(robot, "panda_hand", T, 1, rng=rng)) == 1
 
 
 def test_ur5_has_at_most_eight_solutions() -> None:
@@ -126,51 +115,16 @@ def test_a_narrow_range_of_acceptance_is_found() -> None:
     assert len(q) == 1
 
 
-def test_nothing_accepted_ends_with_nothing() -> None:
-    robot = example_robot("panda")
-    T = link_pose(robot, (robot.lower + robot.upper) / 2, "panda_hand")
-    settings = InverseKinematicsSettings(max_rounds=3)
-    q = inverse_kinematics(
-        robot,
-        "panda_hand",
-        T,
-        rng=np.random.default_rng(0),
-        accept=lambda q: np.zeros(len(q), dtype=bool),
-        settings=settings,
-    )
-    assert q.shape == (0, 7)
-
-
-def test_same_generator_state_same_solutions() -> None:
-    robot = example_robot("panda")
-    T = link_pose(robot, (robot.lower + robot.upper) / 2, "panda_hand")
-    first, second = (inverse_kinematics(robot, "panda_hand", T, rng=np.random.default_rng(9)) for _ in "ab")
-    np.testing.assert_array_equal(first, second)
-
-
-def test_bad_input() -> None:
-    robot = example_robot("panda")
-    rng = np.random.default_rng(0)
-    T = np.eye(4)
-    with pytest.raises(InputError, match="unknown link 'wrist'"):
-        inverse_kinematics(robot, "wrist", T, rng=rng)
-    with pytest.raises(InputError, match="no planned joint moves the link 'panda_link0'"):
-        inverse_kinematics(robot, "panda_link0", T, rng=rng)
-    with pytest.raises(InputError, match="count is 0"):
-        inverse_kinematics(robot, "panda_hand", T, 0, rng=rng)
-    with pytest.raises(InputError, match="finite"):
-        inverse_kinematics(robot, "panda_hand", np.full((4, 4), np.nan), rng=rng)
-    with pytest.raises(InputError, match="must be a rotation and a translation"):
-        inverse_kinematics(robot, "panda_hand", 2 * T, rng=rng)
-    with pytest.raises(InputError, match="max_rounds is 0"):
-        InverseKinematicsSettings(max_rounds=0)
-
-
-def test_the_seed_nearby_gives_a_solution_nearby() -> None:
-    robot = load_robot("panda")
-    q = np.array([0.1, -0.4, 0.2, -2.0, 0.1, 1.6, 0.8])
-    T = link_pose(robot, q, "panda_hand")
-    T[:3, 3] += [0.01, -0.01, 0.005]
-    [near] = inverse_kinematics(robot, "panda_hand", T, 1, rng=np.random.default_rng(0), near=q)
-    assert np.abs(near - q).max() < 0.1
-    np.testing.assert_allclose(link_pose(robot, near, "panda_hand"), T, atol=2e-6)
+@pytest.mark.parametrize(
+    ("frame", "T", "count", "message"),
+    [
+        ("wrist", np.eye(4), 1, "unknown link 'wrist'"),
+        ("panda_link0", np.eye(4), 1, "no planned joint moves the link 'panda_link0'"),
+        ("panda_hand", np.eye(4), 0, "count is 0"),
+        ("panda_hand", np.full((4, 4), np.nan), 1, "finite"),
+        ("panda_hand", 2 * np.eye(4), 1, "must be a rotation and a translation"),
+    ],
+)
+def test_bad_input(frame: str, T: np.ndarray, count: int, message: str) -> None:
+    with pytest.raises(rd.InputError, match=message):
+        inverse_kinematics(example_robot("panda"), frame, T, count, rng=np.random.default_rng(0))

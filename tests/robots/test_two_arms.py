@@ -14,11 +14,9 @@ from helpers.made_arms import chain, row, written
 from helpers.urdfs import read_urdf
 from robotdiffuse.certificates.checker import check
 from robotdiffuse.certificates.requirements import constraint_bounds
-from robotdiffuse.cli import main
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.kernel_arrays import reach_ball, reach_bound
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.bodies import Payload, inertia_of
 from robotdiffuse.robots.fitting.covering_spheres import cover
 from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
@@ -49,7 +47,7 @@ def test_both_arms_and_the_joint_that_they_share_are_planned(tmp_path: Path) -> 
         assert robot.tips == ("left_4_link", "right_4_link") and not robot.locked
         assert robot.parents.tolist() == [0, 1, 2, 3, 4, 1, 6, 7, 8] and robot.kernel_parents is not None
         assert robot.chain("right_2_link") == (0, 5, 6) and robot.at_end("left_4_link")
-    with pytest.raises(InputError, match="choose one, or both as one robot"):
+    with pytest.raises(rd.InputError, match="choose one, or both as one robot"):
         read_urdf(written(tmp_path, *PARTS))
     left = read_urdf(written(tmp_path, *PARTS), group="left")
     assert left.kernel_parents is None and left.tips == ("left_4_link",)
@@ -73,7 +71,7 @@ def test_groups_of_an_srdf_may_have_several_chains(tmp_path: Path) -> None:
     robot = read_urdf(written(tmp_path, *PARTS), group="some", srdf=srdf)
     assert robot.joint_names == ("left_1", "left_3", "right_2") and robot.parents.tolist() == [0, 1, 0]
     with pytest.raises(
-        InputError, match=r"right_1, right_2, right_3 of group both_arms do not lead to left_4_link"
+        rd.InputError, match=r"right_1, right_2, right_3 of group both_arms do not lead to left_4_link"
     ):
         read_urdf(written(tmp_path, *PARTS), group="both_arms", srdf=srdf, tip="left_4_link")
 
@@ -123,9 +121,7 @@ def test_the_other_arm_keeps_its_values_in_inverse_kinematics() -> None:
 def test_planners_move_both_arms_past_each_other(planner: str) -> None:
     robot = two_arms()
     start, goal = _crossing(robot)
-    problem = rd.Problem(
-        robot=robot, scene=rd.Scene([rd.Sphere([0.45, 0.0, 0.75], 0.05)]), start=start, goal=goal
-    )
+    problem = rd.Problem(robot, rd.Scene([rd.Sphere([0.45, 0.0, 0.75], 0.05)]), start, goal)
     result = rd.load_planner(planner).plan(problem, time_limit=20.0, seed=0, until="first")
     assert result.solved, result.reason
     assert result.path is not None and rd.verify(problem, result.path).valid
@@ -154,7 +150,7 @@ def test_a_pose_of_one_hand_leaves_the_other_arm_where_it_starts() -> None:
     there = free[1].copy()
     there[4:] = start[4:]  # left arm and waist elsewhere
     goal = rd.PoseGoal("left_hand", link_pose(robot, there, "left_hand"))
-    problem = rd.Problem(robot=robot, scene=rd.Scene(), start=start, goal=goal)
+    problem = rd.Problem(robot, rd.Scene(), start, goal)
     result = rd.plan(problem, time_limit=20.0)
     assert result.solved and result.path is not None
     np.testing.assert_array_equal(result.path.positions[-1][4:], start[4:])
@@ -164,9 +160,7 @@ def test_a_pose_of_one_hand_leaves_the_other_arm_where_it_starts() -> None:
 def test_certificates_prove_motions_of_both_arms() -> None:
     robot = two_arms()
     start, goal = _crossing(robot)
-    problem = rd.Problem(
-        robot=robot, scene=rd.Scene([rd.Box([0.6, 0, -0.2], [0.2, 0.2, 0.1])]), start=start, goal=goal
-    )
+    problem = rd.Problem(robot, rd.Scene([rd.Box([0.6, 0, -0.2], [0.2, 0.2, 0.1])]), start, goal)
     result = rd.plan(problem, time_limit=20.0)
     assert result.solved and result.path is not None
     certificate = rd.certify(problem, result.path)
@@ -219,25 +213,6 @@ def test_a_tool_on_the_second_hand_is_its_tip_and_is_checked() -> None:
     assert armed.tips == ("left_hand", "tool") and ("left_lower", "tool") in armed.checked_pairs()
     assert robot.with_tool("left_hand", np.eye(4)).tips == ("tool", "right_hand")
     assert robot.with_tool("torso", np.eye(4)).tips == robot.tips
-
-
-@pytest.mark.slow
-def test_added_planned_and_verified_from_the_command_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
-    wide = {"xyz": "0.12 0 0.12"}
-    parts = chain("base", row("left_", 4), **wide), chain("base", row("right_", 4), xyz="-0.12 0 0.12")
-    assert main(["robot", "add", str(written(tmp_path, *parts)), "--group", "both"]) == 0
-    assert "right_4_link" in capsys.readouterr().out
-    problem = tmp_path / "problem.yaml"
-    problem.write_text(
-        "robot: made\nscene: [{sphere: {center: [0, 0.4, 0.3], radius: 0.05}}]\n"
-        "start: [0, 0, 0, 0, 0, 0, 0, 0]\ngoal: {joints: [0.8, 0.4, 0.2, 0.1, -0.6, 0.5, 0.2, -0.3]}\n"
-    )
-    out = tmp_path / "result.json"
-    assert main(["plan", str(problem), "--planner", "rrt_connect", "--out", str(out)]) == 0
-    assert main(["verify", str(out)]) == 0
 
 
 def test_both_arms_reach_as_far_as_one() -> None:

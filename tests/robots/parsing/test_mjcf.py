@@ -11,13 +11,10 @@ import trimesh
 import robotdiffuse as rd
 from helpers.quick_preparation import QUICK, coarse_grids
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.fitting.preparation import add_robot
 from robotdiffuse.robots.fitting.self_collisions import SamplingSettings
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.parsing.urdf import UrdfTree
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene import Scene
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")
 
@@ -73,13 +70,13 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def arm(file: Path, tmp_path_factory: pytest.TempPathFactory) -> Robot:
+def arm(file: Path, tmp_path_factory: pytest.TempPathFactory) -> rd.Robot:
     settings = replace(QUICK, sampling=SamplingSettings(samples=300, descents=3))
     with coarse_grids():
         return add_robot(file, out=tmp_path_factory.mktemp("robots") / "arm", settings=settings).robot
 
 
-def state_of(model: Any, robot: Robot, q: np.ndarray) -> Any:
+def state_of(model: Any, robot: rd.Robot, q: np.ndarray) -> Any:
     """MuJoCo's data at a configuration; other joints are where the robot holds them."""
     data = mujoco.MjData(model)
     values = dict(zip(robot.joint_names, q, strict=True)) | robot.locked
@@ -116,10 +113,10 @@ def test_limits_poses_and_mimics_are_those_of_the_model(file: Path) -> None:
     assert any("no velocity limit" in note for note in robot.notes)
 
 
-def test_self_collisions_are_those_of_mujoco(file: Path, arm: Robot) -> None:
+def test_self_collisions_are_those_of_mujoco(file: Path, arm: rd.Robot) -> None:
     """Deeper than 1 mm MuJoCo and the validator's meshes agree; what the model excludes is not checked."""
     model = mujoco.MjModel.from_xml_path(str(file))
-    checker = CollisionChecker(arm, Scene())
+    checker = CollisionChecker(arm, rd.Scene())
     rng = np.random.default_rng(1)
     collisions = 0
     for q in rng.uniform(arm.lower, arm.upper, (200, arm.dof)):
@@ -147,31 +144,26 @@ def test_a_scene_is_all_that_is_not_the_robot(file: Path) -> None:
     np.testing.assert_allclose(crate.bounds, [[0.55, -0.1, 0.2], [0.65, 0.3, 0.4]])
     raised = rd.Scene.from_mujoco(model, data, base="base")
     np.testing.assert_allclose(raised.shapes[0].bounds[1, 2], -0.55)
-    with pytest.raises(InputError, match="body"):
+    with pytest.raises(rd.InputError, match="body"):
         rd.Scene.from_mujoco(model, base="bse")
 
 
-HILL = """
-<mujoco>
-  <asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset>
-  <worldbody><geom name="hill" type="hfield" hfield="h"/></worldbody>
-</mujoco>
-"""
+FIELD = '<asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset>'
+CLOTH = '<flexcomp name="cloth" type="grid" count="3 3 1" spacing="1 1 1" radius="0.1" dim="2"/>'
 
 
-def test_geoms_without_a_solid_are_refused() -> None:
-    model = mujoco.MjModel.from_xml_string(HILL)
-    with pytest.raises(InputError, match="geom hill is of type hfield; obstacles may be planes"):
+@pytest.mark.parametrize(
+    ("assets", "world", "message"),
+    [
+        (FIELD, '<geom name="hill" type="hfield" hfield="h"/>', "geom hill is of type hfield; obstacles may"),
+        ("", CLOTH, "flex cloth is soft; obstacles must be rigid"),
+    ],
+)
+def test_obstacles_that_are_no_solids_are_refused(assets: str, world: str, message: str) -> None:
+    """Soft bodies were left out without a word."""
+    model = mujoco.MjModel.from_xml_string(f"<mujoco>{assets}<worldbody>{world}</worldbody></mujoco>")
+    with pytest.raises(rd.InputError, match=message):
         rd.Scene.from_mujoco(model)
-
-
-CLOTH = """
-<mujoco>
-  <worldbody>
-    <flexcomp name="cloth" type="grid" count="3 3 1" spacing="1 1 1" radius="0.1" dim="2"/>
-  </worldbody>
-</mujoco>
-"""
 
 
 def test_obstacles_without_names_have_numbers() -> None:
@@ -180,15 +172,9 @@ def test_obstacles_without_names_have_numbers() -> None:
     assert [shape.name for shape in rd.Scene.from_mujoco(model).shapes] == ["geom0"]
 
 
-def test_soft_bodies_are_refused() -> None:
-    """They were left out without a word."""
-    with pytest.raises(InputError, match="flex cloth is soft; obstacles must be rigid"):
-        rd.Scene.from_mujoco(mujoco.MjModel.from_xml_string(CLOTH))
-
-
 HILLY = """
 <mujoco>
-  <asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset>
+  FIELD
   <worldbody>
     <body name="b">
       <joint name="j" range="-1 1"/>
@@ -197,7 +183,7 @@ HILLY = """
     </body>
   </worldbody>
 </mujoco>
-"""
+""".replace("FIELD", FIELD)
 
 
 def test_a_height_field_that_collides_with_nothing_is_left_out(tmp_path: Path) -> None:
@@ -223,9 +209,9 @@ BODY = "<mujoco><worldbody><body>{}<geom size='1'/></body></worldbody></mujoco>"
 )
 def test_bad_models_are_one_line(text: str, wanted: str, tmp_path: Path) -> None:
     (tmp_path / "m.xml").write_text(text)
-    with pytest.raises(InputError, match=wanted) as error:
+    with pytest.raises(rd.InputError, match=wanted) as raised:
         UrdfTree(tmp_path / "m.xml", {}).robot()
-    assert "\n" not in str(error.value)
+    assert "\n" not in str(raised.value)
 
 
 PLACED = """

@@ -6,10 +6,9 @@ from pathlib import Path
 import pytest
 import trimesh
 
+import robotdiffuse as rd
 from helpers.made_arms import BALL, chain, joint, link, row, written
 from helpers.urdfs import read_urdf
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.parsing.urdf import UrdfTree
 
 NAME = "package://some_arm/meshes/box.stl"
@@ -27,7 +26,7 @@ def test_packages_by_option_environment_and_upwards(tmp_path: Path, monkeypatch:
     far = mesh(tmp_path / "ws" / "src" / "some_arm")
     (tmp_path / "elsewhere").mkdir()
     file = written(tmp_path / "elsewhere", PARTS)
-    with pytest.raises(InputError, match="--package some_arm=FOLDER, or ROS_PACKAGE_PATH") as error:
+    with pytest.raises(rd.InputError, match="--package some_arm=FOLDER, or ROS_PACKAGE_PATH") as error:
         read_urdf(file)
     assert NAME in str(error.value) and "\n" not in str(error.value)
     assert "end" in read_urdf(file, packages={"some_arm": far}).meshes
@@ -97,11 +96,11 @@ def test_xacro_that_cannot_be_compiled_says_what_helps(
         ('<xacro:include filename="$(find lost)/a.xacro"/>', "'lost' is not found; .*--package lost="),
         ('<xacro:nothing name="a"/>', "xacro cannot compile it .*; compile it with its arguments: xacro"),
     ):
-        with pytest.raises(InputError, match=message) as error:
+        with pytest.raises(rd.InputError, match=message) as raised:
             read_urdf(xacro(tmp_path, content))
-        assert "\n" not in str(error.value)
+        assert "\n" not in str(raised.value)
     monkeypatch.setitem(sys.modules, "xacrodoc", None)
-    with pytest.raises(InputError, match=r"pip install 'robotdiffuse\[xacro\]'"):
+    with pytest.raises(rd.InputError, match=r"pip install 'robotdiffuse\[xacro\]'"):
         read_urdf(xacro(tmp_path, PARTS))
 
 
@@ -119,9 +118,11 @@ def test_only_robot_add_compiles_xacro(tmp_path: Path, monkeypatch: pytest.Monke
         ("argument.urdf", PARTS.replace('name="j1"', 'name="$(arg prefix)"')),
     ):
         file = xacro(tmp_path, link("base") + content, name)
-        with pytest.raises(InputError, match=r"is a xacro file.* robotdiffuse robot add .*--name") as error:
-            load_robot(file)
-        assert "\n" not in str(error.value)
+        with pytest.raises(
+            rd.InputError, match=r"is a xacro file.* robotdiffuse robot add .*--name"
+        ) as raised:
+            rd.load_robot(file)
+        assert "\n" not in str(raised.value)
 
 
 def test_a_urdf_that_xacro_wrote_is_no_xacro(tmp_path: Path) -> None:

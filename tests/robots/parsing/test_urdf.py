@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 import trimesh
 
+import robotdiffuse as rd
 import robotdiffuse.robots as robots
 from helpers import made_arms
-from helpers.example_robots import AWKWARD
 from helpers.made_arms import chain, joint, row, written
 from helpers.quick_preparation import QUICK, coarse_grids
 from helpers.urdfs import read_urdf
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_rpy
-from robotdiffuse.robots import ROBOTS, load_robot
+from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.fitting import preparation
 from robotdiffuse.robots.fitting.convex_parts import MIN_THICKNESS, convex_hull
 from robotdiffuse.robots.fitting.preparation import PreparationSettings, add_robot
@@ -24,7 +23,6 @@ from robotdiffuse.robots.fitting.self_collisions import SamplingSettings
 from robotdiffuse.robots.fitting.sphere_fitting import covered
 from robotdiffuse.robots.kinematic_tree import CONTINUOUS_LIMIT
 from robotdiffuse.robots.parsing.urdf import UrdfTree, read_limits, with_limits
-from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.robot_folder import read_robot_folder, read_source, write_robot_folder
 
 ARM = """<robot name="tiny">
@@ -74,19 +72,6 @@ def test_joints_limits_and_geometry(tmp_path: Path) -> None:
     assert len(box) == 8
     np.testing.assert_allclose(np.linalg.norm(box[:, :2], axis=1), 0.03 * 2**0.5)
     np.testing.assert_allclose(np.unique(box[:, 2].round(9)), [0, 0.3])
-    tube = robot.meshes["fore"][0]
-    solid = trimesh.Trimesh(tube.vertices, tube.faces, process=False)
-    assert solid.is_watertight and 0 < solid.volume / (np.pi * 0.03**2 * 0.2) - 1 < 0.01
-
-
-def test_base_and_tip_are_selectable(tmp_path: Path) -> None:
-    file = urdf(tmp_path, AWKWARD)
-    whole = read_urdf(file)
-    part = read_urdf(file, base="turret", tip="wrist")
-    assert (whole.base, whole.tip) == ("floor", "tool")
-    assert whole.locked == {"lid_joint": 0.0}
-    assert part.joint_names == ("arm_joint", "wrist_joint")
-    assert "rail" not in part.link_names
 
 
 @pytest.mark.parametrize(
@@ -107,34 +92,6 @@ def test_what_has_no_thickness_is_given_some(corners: list[list[float]], thin: i
     assert solid.is_watertight and solid.volume > 0 and solid.contains(turned.mean(0)[None]).all()
 
 
-MESH = '<mesh filename="package://a/b.stl"/>'
-FORE = '<parent link="upper"/><child link="fore"/>'
-LOOP = '<parent link="base"/><child link="upper"/>'
-BAD = {
-    "not XML": ("<robot", "well-formed"),
-    "not a robot": ("<model/>", "<model>"),
-    "two roots": (ARM.replace("</robot>", '<link name="loose"/></robot>'), "one root"),
-    "two parents": (ARM.replace(FORE, LOOP), "two parent"),
-    "unknown link": (ARM.replace('<child link="fore"/>', '<child link="hand"/>'), "'hand'"),
-    "floating": (ARM.replace('type="continuous"', 'type="floating"'), "joint bend has type 'floating'"),
-    "no limits": (ARM.replace('lower="-2" upper="1" ', ""), "joint turn is revolute and has no <limit"),
-    "limits swapped": (ARM.replace('lower="-2"', 'lower="2"'), "joint turn: lower limit 2"),
-    "endless": (ARM.replace('velocity="1.5"', 'velocity="1e-300"'), "is 1e-300; it must be at least 1e-06"),
-    "not a number": (ARM.replace('upper="1"', 'upper="one"'), "joint turn: upper limit is 'one'"),
-    "zero axis": (ARM.replace("0 1 0", "0 0 0"), "joint bend: its axis is zero"),
-    "short vector": (ARM.replace("0 0 0.05", "0 0"), "origin xyz is '0 0'"),
-    "missing mesh": (ARM.replace(BOX, MESH), "b.stl"),
-}
-
-
-@pytest.mark.parametrize("name", BAD)
-def test_bad_urdf_gives_one_clear_line(name: str, tmp_path: Path) -> None:
-    text, message = BAD[name]
-    with pytest.raises(InputError) as error:
-        read_urdf(urdf(tmp_path, text))
-    assert message in str(error.value) and "\n" not in str(error.value)
-
-
 def test_bad_arguments_give_one_clear_line(tmp_path: Path) -> None:
     file = urdf(tmp_path)
     for call, message in (
@@ -146,12 +103,12 @@ def test_bad_arguments_give_one_clear_line(tmp_path: Path) -> None:
         (lambda: load_robot("no_such_robot"), "baxter_left, baxter_right, "),
         (lambda: load_robot("nowhere/arm.urdf"), "arm.urdf"),
     ):
-        with pytest.raises(InputError, match=r"^[^\n]*$") as error:
+        with pytest.raises(rd.InputError, match=r"^[^\n]*$") as error:
             call()
         assert message in str(error.value)
 
 
-def same(a: Robot, b: Robot) -> None:
+def same(a: rd.Robot, b: rd.Robot) -> None:
     assert (a.name, a.base, a.tip, a.locked, a.notes) == (b.name, b.base, b.tip, b.locked, b.notes)
     assert a.allowed_collisions == b.allowed_collisions
     assert [(j.name, j.kind, j.lower, j.jerk) for j in a.joints] == [
@@ -182,23 +139,6 @@ def test_robot_folder_round_trip(tmp_path: Path) -> None:
     assert sorted(file.name for file in folder.iterdir()) == ["meshes.npz", "other.txt", "robot.json"]
 
 
-@pytest.mark.parametrize("name", ROBOTS)
-def test_bundled_robots_are_complete(name: str) -> None:
-    robot = load_robot(name)
-    assert robot.dof > 0 and robot.spheres.keys() == robot.meshes.keys()
-    assert (robot.velocity > 0).all() and (robot.acceleration > 0).all() and (robot.jerk > 0).all()
-    assert load_robot(name) is robot
-
-
-def test_panda() -> None:
-    robot = load_robot("panda", locked={"panda_finger_joint1": 0.065})
-    assert (robot.base, robot.tip, robot.dof) == ("panda_link0", "panda_hand", 7)
-    assert robot.locked == {"panda_finger_joint1": 0.065, "panda_finger_joint2": 0.04}
-    np.testing.assert_allclose(robot.upper, [2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
-    np.testing.assert_allclose(robot.acceleration, [15, 7.5, 10, 12.5, 15, 20, 20])
-    np.testing.assert_allclose(robot.jerk, [7500, 3750, 5000, 6250, 7500, 10000, 10000])
-
-
 def damage_json(**change: object) -> str:
     data = json.loads((robots.DATA / "panda" / "robot.json").read_text()) | change
     return json.dumps({key: value for key, value in data.items() if value is not None})
@@ -208,26 +148,22 @@ def damage_json(**change: object) -> str:
     "file, content",
     [
         ("robot.json", "{"),
-        ("robot.json", "[]"),
         ("robot.json", damage_json(format=99)),
         ("robot.json", damage_json(joints=None)),
-        ("robot.json", damage_json(joints=[])),
         ("robot.json", damage_json(spheres={"panda_link1": [[0, 0, 0]]})),
         ("robot.json", damage_json(spheres={"nobody": [[0, 0, 0, 1]]})),
         ("robot.json", damage_json(tip="nobody")),
-        ("robot.json", damage_json(locked={"panda_joint1": "x"})),
         ("meshes.npz", "no archive"),
-        ("meshes.npz", ""),
     ],
 )
 def test_damaged_folder_names_the_file(file: str, content: str, tmp_path: Path) -> None:
     for name in ("robot.json", "meshes.npz"):
         (tmp_path / name).write_bytes((robots.DATA / "panda" / name).read_bytes())
     (tmp_path / file).write_text(content)
-    with pytest.raises(InputError, match=file):
+    with pytest.raises(rd.InputError, match=file):
         read_robot_folder(tmp_path)
     (tmp_path / file).unlink()
-    with pytest.raises(InputError, match=file):
+    with pytest.raises(rd.InputError, match=file):
         read_robot_folder(tmp_path)
 
 
@@ -243,6 +179,11 @@ def test_limits_file(tmp_path: Path) -> None:
     np.testing.assert_allclose(robot.acceleration, [8, 3.5])
     np.testing.assert_allclose(robot.jerk, [80, 35])
     np.testing.assert_allclose(robot.lower, [-2, -1])
+    file.write_text("default_velocity_scaling_factor: 0.1\njoint_limits: {j: {max_velocity: 1}}\n")
+    assert read_limits(file) == (
+        {"j": {"velocity": 1.0}},
+        ("limits.yaml: default_velocity_scaling_factor 0.1 is ignored; plan with velocity_scaling=0.1",),
+    )
     for text, message in (
         ("joint_limits: [", "not valid YAML"),
         ("limits: {}", "no joint_limits"),
@@ -253,7 +194,7 @@ def test_limits_file(tmp_path: Path) -> None:
         ("joint_limits: {turn: {min_position: 5}}", "turn: min_position"),
     ):
         file.write_text(text)
-        with pytest.raises(InputError) as error:
+        with pytest.raises(rd.InputError) as error:
             with_limits(read_urdf(urdf(tmp_path)), read_limits(file)[0])
         assert message in str(error.value)
 
@@ -276,7 +217,7 @@ def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.Mo
     assert {pair.links: pair.reason for pair in report.pairs}["base", "upper"] == "adjacent"
     for key in ("tiny", str(file), file, str(report.folder)):
         same(load_robot(key), report.robot)
-    with pytest.raises(InputError, match=r"known: .*panda, .*tiny"):
+    with pytest.raises(rd.InputError, match=r"known: .*panda, .*tiny"):
         load_robot("other")
 
     # a changed URDF is another robot, prepared and stored anew
@@ -308,15 +249,6 @@ def test_soft_limits_are_noted(tmp_path: Path) -> None:
     soft = '<safety_controller k_velocity="20" soft_lower_limit="-1" soft_upper_limit="1"/>'
     [note] = read_urdf(written(tmp_path, chain("base", ["j"], more=soft))).notes
     assert note.startswith("joint j: the soft limits") and "lower -1, upper 1" in note
-
-
-def test_scaling_factors_of_a_limits_file_are_noted(tmp_path: Path) -> None:
-    file = tmp_path / "limits.yaml"
-    file.write_text("default_velocity_scaling_factor: 0.1\njoint_limits: {j: {max_velocity: 1}}\n")
-    assert read_limits(file) == (
-        {"j": {"velocity": 1.0}},
-        ("limits.yaml: default_velocity_scaling_factor 0.1 is ignored; plan with velocity_scaling=0.1",),
-    )
 
 
 def test_a_mesh_without_volume_is_noted(tmp_path: Path) -> None:
@@ -351,6 +283,6 @@ def test_preparations_of_one_urdf_that_differ_are_refused(
         limits = tmp_path / "limits.yaml"
         limits.write_text("joint_limits: {j1: {max_velocity: 1}}")
         add_robot(file, name="limited", limits=limits, settings=QUICK)
-    with pytest.raises(InputError, match="was added as limited, plain, same, which differ") as error:
+    with pytest.raises(rd.InputError, match="was added as limited, plain, same, which differ") as raised:
         load_robot(file)
-    assert "\n" not in str(error.value)
+    assert "\n" not in str(raised.value)
