@@ -63,17 +63,6 @@ def test_the_least_distance_at_one_configuration_or_several() -> None:
         PROBLEM.clearance_at([0.0])
 
 
-def test_named_poses_are_goals_among_others() -> None:
-    T = link_pose(PANDA, Q, "panda_hand")
-    both = rd.Problem(PANDA, rd.Scene(), "ready", ["extended", Q]).goal
-    assert isinstance(both, rd.JointGoal) and len(both.positions) == 2
-    mixed = rd.Problem(PANDA, rd.Scene(), "ready", ["extended", rd.PoseGoal("panda_hand", T), Q]).goal
-    assert isinstance(mixed, rd.AnyGoal)
-    assert [type(one) for one in mixed.goals] == [rd.JointGoal, rd.PoseGoal, rd.JointGoal]
-    with pytest.raises(rd.InputError, match=r"unknown pose in goal\[1\]: 'home'"):
-        rd.Problem(PANDA, rd.Scene(), "ready", [Q, "home"])
-
-
 FROM = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
 TO = [0.4, -0.7, 0.0, -2.3, 0.0, 1.571, 0.785]
 VIEW = ray_cast(
@@ -94,7 +83,6 @@ def _notes(*shapes: rd.Box | rd.Mesh | rd.PointCloud | rd.Sphere, **options: obj
     [
         (rd.Mesh(200 * CUBE + [500, 300, 600], FACES), "mesh is 200 m long"),
         (rd.PointCloud(1600 * CUBE - 800), "point_cloud is 1600 m long"),
-        (rd.Box([500, 300, 600], [200, 200, 200]), "box is 200 m long"),
         (rd.Sphere([0, 5, 0], 0.2), "beyond the arm's reach of"),
     ],
 )

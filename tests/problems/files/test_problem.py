@@ -62,9 +62,6 @@ def test_a_hair_over_a_limit_is_clamped_and_said() -> None:
         "start: lift clamped from -1e-08 to its limit 0.0 m",
         "goal[1]: swing clamped from -1.000009 to its limit -1.0 rad",
     )
-
-
-def test_a_start_is_clamped_up_to_a_milliradian_beyond_a_limit() -> None:
     for beyond in (1e-5, float(np.float32(2 + 1e-5)) - 2, 9e-4):
         assert problem([2 + beyond, 0, 0]).start[0] == 2.0
     with pytest.raises(rd.InputError, match=r"start: swing is 2.0011 rad; its limits are -1 to 2"):
@@ -85,25 +82,13 @@ MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
     [
         (lambda: problem([0, 0]), "start has 2 values; crane has 3 planned joints: swing, spin, lift"),
         (lambda: problem(goal=[[0, 0], [1, 1]]), r"goal\[0\] has 2 values"),
-        (
-            lambda: problem([0, np.nan, 0]),
-            r"start: spin is nan; it must be a finite number .* \[rad\]",
-        ),
-        (
-            lambda: problem(goal=[[0, 0, 0], [0, 0, 0.6]]),
-            r"goal\[1\]: lift is 0.6 m; its limits are 0 to 0.5",
-        ),
+        (lambda: problem([0, np.nan, 0]), r"start: spin is nan; it must be a finite number .* \[rad\]"),
+        (lambda: problem(goal=[[0, 0, 0], [0, 0, 0.6]]), r"goal\[1\]: lift is 0.6 m; its limits are"),
         (lambda: problem("home"), "start is 'home'; it must be a list of 3 numbers: swing, spin, lift"),
         (lambda: problem(None), "start is None"),
-        (lambda: problem(goal=[]), r"goal is \[\]; it must be a configuration or a list of them"),
-        (
-            lambda: problem(goal=rd.PoseGoal("claw", np.eye(4))),
-            "unknown link in goal.frame: 'claw'; known: hook, jib, tower",
-        ),
+        (lambda: problem(goal=rd.PoseGoal("claw", np.eye(4))), "unknown link in goal.frame: 'claw'"),
         (lambda: problem(goal=rd.PoseGoal("plinth", np.eye(4))), "no planned joint moves 'plinth'"),
-        (lambda: rd.PoseGoal("hook", np.eye(4) * np.nan), "it must be 4 x 4 finite numbers"),
         (lambda: rd.PoseGoal("hook", MIRROR), "it must be a rotation and a translation"),
-        (lambda: rd.Problem("panda", rd.Scene(), [0], [0]), "robot is 'panda'; it must be a Robot"),  # type: ignore[arg-type]
         (lambda: rd.Problem(crane(), [], [0], [0]), "scene is .*; it must be a Scene"),  # type: ignore[arg-type]
     ],
 )
@@ -147,18 +132,6 @@ def test_problem_file(ending: str, tmp_path: Path) -> None:
         rd.load_problem(tmp_path / f"problem.{ending}", 2)
 
 
-def test_goal_sets_and_poses_in_files(tmp_path: Path) -> None:
-    rows = [READY, GOOD["goal"]["joints"]]
-    goal = rd.load_problem(written(tmp_path, GOOD | {"goal": {"joint_set": rows}})).goal
-    assert isinstance(goal, rd.JointGoal) and goal.positions.tolist() == rows
-    pose = {"frame": "panda_hand", "xyz": [0.4, 0.1, 0.5], "wxyz": [0, 2, 0, 0]}
-    goal = rd.load_problem(written(tmp_path, GOOD | {"goal": {"pose": pose}})).goal
-    assert isinstance(goal, rd.PoseGoal) and goal.frame == "panda_hand"
-    np.testing.assert_allclose(
-        goal.T_base_frame, transform(np.array([0.4, 0.1, 0.5]), np.diag([1.0, -1, -1]))
-    )
-
-
 def without(name: str) -> dict[str, Any]:
     return {key: value for key, value in GOOD.items() if key != name}
 
@@ -169,45 +142,21 @@ def shape(**entry: object) -> dict[str, Any]:
 
 WRONG: dict[str, tuple[object, str]] = {
     "no mapping": (["panda"], "problem is .* it must be a mapping with the fields robot, scene, start, goal"),
-    "empty": (None, "problem is None"),
-    "unknown field": (
-        GOOD | {"strat": []},
-        "unknown field of problem: 'strat'; known: allowed_contacts, attached, base, blend",
-    ),
+    "unknown field": (GOOD | {"strat": []}, "unknown field of problem: 'strat'; known:"),
     "no start": (without("start"), "problem has no start"),
     "no goal, no robot": (without("goal") | {"robot": None}, "problem has no goal"),
     "unknown robot": (GOOD | {"robot": "pandora"}, "unknown robot 'pandora'; known: .*panda"),
-    "robot not a text": (GOOD | {"robot": 7}, "robot is 7; it must be a bundled name"),
-    "missing URDF": (GOOD | {"robot": "none/arm.urdf"}, "none/arm.urdf"),
     "a goal that is a number": (GOOD | {"goal": 7.0}, "goal is 7.0; .* any, or a configuration"),
     "unknown locked joint": (GOOD | {"locked": {"thumb": 0}}, "unknown joint in locked 'thumb'"),
-    "locked NaN": (GOOD | {"locked": {"panda_finger_joint1": float("nan")}}, "panda_finger_joint1 is nan"),
     "unknown shape": (shape(pyramid={}), r"unknown shape in scene\[1\]: 'pyramid'; known: box, capsule"),
     "unknown shape field": (
         shape(sphere={"center": [0, 0, 1], "radius": 1, "color": "red"}),
         r"unknown field of scene\[1\].sphere: 'color'; known: center, name, radius",
     ),
     "shape without a field": (shape(sphere={"center": [0, 0, 1]}), r"scene\[1\].sphere has no radius"),
-    "two shapes in one": (shape(sphere={}, box={}), r"scene\[1\] is .* it must be one shape"),
-    "scene a number": (GOOD | {"scene": 3}, "scene is 3; it must be a list of shapes"),
-    "missing scene file": (GOOD | {"scene": "none.yaml"}, "none.yaml does not exist"),
-    "missing mesh": (
-        shape(mesh={"file": "none.stl"}),
-        r"scene\[1\].mesh: mesh file .*none.stl does not exist",
-    ),
-    "file and points": (
-        shape(point_cloud={"file": "none.ply", "points": []}),
-        r"unknown field of scene\[1\].point_cloud: 'points'",
-    ),
-    "unknown goal": (
-        GOOD | {"goal": {"place": []}},
-        "unknown field of goal: 'place'; known: any, joint_set, joints",
-    ),
-    "two goals": (
-        GOOD | {"goal": {"joints": READY, "pose": {}}},
-        "it must be one of joints, joint_set, pose, poses, any",
-    ),
-    "set as joints": (GOOD | {"goal": {"joints": [READY]}}, "goal.joints is .* it must be a list of numbers"),
+    "missing mesh": (shape(mesh={"file": "none.stl"}), r"scene\[1\].mesh: .*none.stl does not exist"),
+    "unknown goal": (GOOD | {"goal": {"place": []}}, "unknown field of goal: 'place'; known:"),
+    "two goals": (GOOD | {"goal": {"joints": READY, "pose": {}}}, "it must be one of joints, joint_set"),
     "pose without a frame": (
         GOOD | {"goal": {"pose": {"xyz": [0, 0, 1], "wxyz": [1, 0, 0, 0]}}},
         "has no frame",
@@ -226,25 +175,6 @@ def test_wrong_problem_files(case: str, tmp_path: Path) -> None:
     with pytest.raises(rd.InputError, match=message) as raised:
         rd.load_problem(file)
     assert str(raised.value).startswith(str(file)), "the file is named first"
-    assert "\n" not in str(raised.value)
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("a.yaml", b"robot: [panda", "a.yaml is not valid YAML: .*line"),
-        ("a.yaml", b"\xff\xfe\x00", "a.yaml cannot be read"),
-        ("a.yaml", b"robot: panda\n\trobot: x", "not valid YAML"),
-        ("a.json", b"{", "a.json is not valid JSON: .* line 1, column 2"),
-        ("a.txt", b"", "problem file format of .*a.txt: '.txt'; known: .json, .jsonl, .yaml, .yml"),
-        ("a.yaml", None, "a.yaml does not exist"),
-    ],
-)
-def test_damaged_problem_files(name: str, content: bytes | None, message: str, tmp_path: Path) -> None:
-    if content is not None:
-        (tmp_path / name).write_bytes(content)
-    with pytest.raises(rd.InputError, match=message) as raised:
-        rd.load_problem(tmp_path / name)
     assert "\n" not in str(raised.value)
 
 
@@ -350,6 +280,9 @@ def test_moveit_files_in_a_problem(tmp_path: Path) -> None:
         rd.load_problem(written(tmp_path, GOOD | {"request": request}))
 
 
+CAMERA = {"xyz": [0] * 3, "wxyz": [1, 0, 0, 0]}
+
+
 @pytest.mark.parametrize(
     "changed",
     [
@@ -358,16 +291,8 @@ def test_moveit_files_in_a_problem(tmp_path: Path) -> None:
         {"scene": [{"point_cloud": {"file": "/etc/passwd.csv"}}]},
         {"tool": {"link": "panda_hand", "shapes": [{"mesh": {"file": "tool.stl"}}]}},
         {"attached": [{"link": "panda_hand", "mesh": {"file": "cup.stl"}}]},
-        {
-            "views": [
-                {
-                    "depth": "a.png",
-                    "intrinsics": [1, 1, 0, 0],
-                    "camera": {"xyz": [0] * 3, "wxyz": [1, 0, 0, 0]},
-                }
-            ]
-        },
-        {"views": [{"cloud": "a.ply", "camera": {"xyz": [0] * 3, "wxyz": [1, 0, 0, 0]}}]},
+        {"views": [{"depth": "a.png", "intrinsics": [1, 1, 0, 0], "camera": CAMERA}]},
+        {"views": [{"cloud": "a.ply", "camera": CAMERA}]},
     ],
 )
 def test_records_of_others_name_no_files_that_are_read(changed: dict[str, Any]) -> None:
@@ -392,12 +317,7 @@ BASIC = {"robot": "panda", "scene": [], "start": "ready", "goal": [0.0] * 3 + [-
 
 @pytest.mark.parametrize(
     ("goal", "rows"),
-    [
-        (NAMED, [NAMED]),
-        ([NAMED, NAMED], [NAMED, NAMED]),
-        ("ready", [NAMED]),
-        ({"joints": "ready"}, [NAMED]),
-    ],
+    [(NAMED, [NAMED]), ([NAMED, NAMED], [NAMED, NAMED]), ("ready", [NAMED]), ({"joints": "ready"}, [NAMED])],
 )
 def test_goals_are_given_as_in_python(goal: object, rows: list[list[float]]) -> None:
     problem = problem_from_record(BASIC | {"goal": goal})
@@ -413,11 +333,7 @@ def test_goals_are_given_as_in_python(goal: object, rows: list[list[float]]) -> 
         ({"goal": {"joints": "home"}}, "unknown pose in goal.joints: 'home'"),
         ({"robot": "iiwa14", "start": "home"}, "(iiwa14 has no named poses)"),
         (
-            {
-                "scene": [
-                    {"box": {"center": [1, 0, 0], "size": [1, 1, 1], "rpy": [0, 0, 1], "wxyz": [1, 0, 0, 0]}}
-                ]
-            },
+            {"scene": [{"box": {"center": [1, 0, 0], "size": [1] * 3, "rpy": [0] * 3, "wxyz": [1] * 4}}]},
             "scene[0].box has wxyz and rpy; it must have one of them",
         ),
         ({"base": {"rpy": [0, 0]}}, "base.rpy is [0, 0]; it must be 3 finite numbers"),

@@ -168,14 +168,8 @@ WRONG = {
     "base": ({"base": {"euler": [0, 0, 0]}}, "unknown field of base: .euler.; known: rpy, wxyz, xyz"),
     "tool link": ({"tool": {"xyz": [0, 0, 0]}}, "tool has no link"),
     "unknown tool link": ({"tool": {"link": "hand"}}, "unknown link in tool.link: 'hand'"),
-    "tool shape": ({"tool": TOOL | {"shapes": [{"cone": {}}]}}, r"unknown shape in tool.shapes\[0\]: 'cone'"),
-    "touch_links": ({"tool": TOOL | {"touch_links": "x"}}, "tool.touch_links is 'x'; it must be a list"),
     "attached": ({"attached": CUP}, "attached is .*; it must be a list of objects"),
     "no link": ({"attached": [WALL]}, r"attached\[0\] is .*; it must be a shape with its link"),
-    "radius": (
-        {"attached": [{"link": "panda_hand", "sphere": {"center": [0, 0, 0], "radius": -1}}]},
-        r"attached\[0\].sphere.radius is -1; it must be a positive number",
-    ),
     "fixed link": ({"attached": [CUP | {"link": "panda_link0"}]}, r"attached\[0\]: attached.link: no"),
     "twice": ({"attached": [CUP, CUP]}, r"attached\[1\]: attached.name is 'cup'"),
 }  # fmt: skip

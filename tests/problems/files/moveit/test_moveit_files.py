@@ -9,21 +9,9 @@ import pytest
 import trimesh
 import yaml
 
+import robotdiffuse as rd
 from helpers.moveit_files import MOTION_BENCH_MAKER, MOUNTED, QUARTER, ball, change, request_data, scene_data
 from helpers.urdfs import read_urdf
-from robotdiffuse import (
-    Box,
-    Cylinder,
-    InputError,
-    JointGoal,
-    Mesh,
-    PointCloud,
-    PoseGoal,
-    Robot,
-    Sphere,
-    load_problem,
-    load_robot,
-)
 from robotdiffuse.core.input_files import read_yaml
 from robotdiffuse.core.transforms import (
     quaternion_from_rotation,
@@ -31,18 +19,13 @@ from robotdiffuse.core.transforms import (
     rotation_from_quaternion,
     transform,
 )
-from robotdiffuse.problems.files import (
-    load_motion_bench_maker,
-    load_problems,
-    problem_record,
-)
+from robotdiffuse.problems.files import ProblemEntry, load_motion_bench_maker, load_problems, problem_record
 from robotdiffuse.problems.moveit import (
     MoveItFrames,
     matrix_contacts,
     moveit_frames,
     moveit_request,
     moveit_scene,
-    object_shapes,
     read_moveit_scene,
     scene_robot_notes,
 )
@@ -52,9 +35,9 @@ from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_fold
 
 def test_scene_as_motion_bench_maker_writes_it() -> None:
     can, board = read_moveit_scene(MOTION_BENCH_MAKER / "scene0001.yaml")[0].shapes
-    assert isinstance(can, Cylinder) and (can.name, can.height, can.radius) == ("can", 0.14, 0.03)
+    assert isinstance(can, rd.Cylinder) and (can.name, can.height, can.radius) == ("can", 0.14, 0.03)
     assert can.center.tolist() == [0.5, -0.4, 0.3]
-    assert isinstance(board, Box) and board.size.tolist() == [1.2, 0.8, 0.04]
+    assert isinstance(board, rd.Box) and board.size.tolist() == [1.2, 0.8, 0.04]
     # A quarter turn about z: the long side lies along y.
     np.testing.assert_allclose(board.bounds[1] - board.bounds[0], [0.8, 1.2, 0.04], atol=1e-12)
 
@@ -64,23 +47,23 @@ def test_folder() -> None:
     assert good.name == "motion_bench_maker/0001" and good.error == ""
     problem = good.load()
     assert problem.start.tolist() == [0, -0.785, 0, -2.356, 0, 1.571, 0.785]
-    assert isinstance(problem.goal, JointGoal)
+    assert isinstance(problem.goal, rd.JointGoal)
     assert problem.goal.positions.tolist() == [[1.2, -0.3, 0.5, -1.9, -0.2, 2.1, 0.1]]
     assert problem.robot.locked == {"panda_finger_joint1": 0.065, "panda_finger_joint2": 0.065}
     assert [shape.name for shape in problem.scene.shapes] == ["can", "board"]
     assert bad.problem is None
     with pytest.raises(
-        InputError, match=r"request0002.yaml: goal: panda_joint1 is 3.1 rad; its limits are -2.8"
+        rd.InputError, match=r"request0002.yaml: goal: panda_joint1 is 3.1 rad; its limits are -2.8"
     ):
         bad.load()
     assert [entry.name for entry in load_problems(MOTION_BENCH_MAKER)] == [good.name, bad.name]
-    robot = load_robot("panda")
+    robot = rd.load_robot("panda")
     assert load_motion_bench_maker(MOTION_BENCH_MAKER, robot)[0].load().robot.locked == problem.robot.locked
     assert robot.locked["panda_finger_joint1"] == 0.04
 
 
 def test_unusable_folders(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"has no files scene\*.yaml"):
+    with pytest.raises(rd.InputError, match=r"has no files scene\*.yaml"):
         load_motion_bench_maker(tmp_path)
     shutil.copy(MOTION_BENCH_MAKER / "scene0001.yaml", tmp_path)
     [entry] = load_motion_bench_maker(tmp_path)
@@ -93,24 +76,20 @@ def test_unusable_folders(tmp_path: Path) -> None:
     assert "not valid YAML" in entry.error and "\n" not in entry.error
 
 
-def test_vectors_as_mappings_types_as_numbers() -> None:
+def test_vectors_as_mappings_types_as_numbers_and_poses_of_the_object_alone() -> None:
     data = scene_data(
         id=3,
         primitives=[{"type": 3, "dimensions": [0.4, 0.1]}],
         primitive_poses=[
-            {"position": {"x": 1, "y": 2, "z": 3}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}},
+            {"position": {"x": 1, "y": 2, "z": 3}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
         ],
     )
     [shape] = moveit_scene(data, moveit_frames(data), Path()).shapes
-    assert isinstance(shape, Cylinder) and shape.center.tolist() == [1, 2, 3]
+    assert isinstance(shape, rd.Cylinder) and shape.center.tolist() == [1, 2, 3]
     assert (shape.name, shape.height, shape.radius) == ("3", 0.4, 0.1)
-
-
-def test_pose_of_the_object_alone_is_enough() -> None:
     entry = ball(pose={"position": [0, 0, 2], "orientation": [0, 0, 0, 1]})
     del entry["primitive_poses"]
-    [shape] = moveit_scene(scene_data(**entry), moveit_frames({}), Path()).shapes
-    assert isinstance(shape, Sphere) and shape.center.tolist() == [0, 0, 2]
+    assert place(scene_data(**entry)) == [0, 0, 2]
 
 
 def test_meshes(tmp_path: Path) -> None:
@@ -126,14 +105,13 @@ def test_meshes(tmp_path: Path) -> None:
         mesh_poses=[at, at],
     )
     triangle, cube = moveit_scene(data, moveit_frames(data), tmp_path).shapes
-    assert isinstance(triangle, Mesh) and isinstance(cube, Mesh)
+    assert isinstance(triangle, rd.Mesh) and isinstance(cube, rd.Mesh)
     np.testing.assert_allclose(triangle.world_vertices, [[0, 0, 1], [0, 1, 1], [-1, 0, 1]], atol=1e-12)
     np.testing.assert_allclose(cube.bounds, [[-0.5, -1, 0.5], [0.5, 1, 1.5]], atol=1e-12)
     assert (triangle.name, cube.name) == ("things", "things_2")
 
 
 CONE = {"type": "cone", "dimensions": [0.4, 0.1]}
-SHORT = {"type": "box", "dimensions": [0.4, 0.1]}
 
 
 def octomap(data: list[int]) -> dict[str, object]:
@@ -146,36 +124,29 @@ def test_cones_planes_and_octomaps() -> None:
     place = {"position": [1, 0, 0], "orientation": [0, 0, 0, 1]}
     data = scene_data(**ball(primitives=[CONE], primitive_poses=[place]))
     [cone] = moveit_scene(data, moveit_frames(data), Path()).shapes
-    assert isinstance(cone, Mesh)
+    assert isinstance(cone, rd.Mesh)
     np.testing.assert_allclose(cone.bounds, [[0.9, -0.1, -0.2], [1.1, 0.1, 0.2]], atol=1e-3)
     flat = {"id": "ground", "planes": [{"coef": [0, 0, 2, -1]}], "plane_poses": [place]}
     data = scene_data(**flat)
     [ground] = moveit_scene(data, moveit_frames(data), Path()).shapes
-    assert isinstance(ground, Box) and ground.name == "ground"
+    assert isinstance(ground, rd.Box) and ground.name == "ground"
     np.testing.assert_allclose(ground.bounds[1], [11, 10, 0.5])
     data = octomap([-1 & 3, 0] + 14 * [3, 0] + [2, 0])  # the voxel at the lower end of everything
     [cloud] = moveit_scene(data, moveit_frames(data), Path()).shapes
-    assert isinstance(cloud, PointCloud) and cloud.point_radius == pytest.approx(0.05 * 3**0.5)
+    assert isinstance(cloud, rd.PointCloud) and cloud.point_radius == pytest.approx(0.05 * 3**0.5)
     np.testing.assert_allclose(cloud.points, [np.array([0, 0, 1]) - 0.1 * (2**15 - 0.5)])
 
 
 WRONG_SCENES: dict[str, tuple[object, str]] = {
-    "number": (3, "a planning scene is 3; it must be a mapping"),
-    "prism": (
-        scene_data(**ball(primitives=[CONE | {"type": 5}])),
-        "object ball: unknown type of .*'prism'; known: box, cone, cylinder",
-    ),
-    "dimensions": (scene_data(**ball(primitives=[SHORT])), r"primitives\[0\].dimensions .* 3 finite numbers"),
+    "prism": (scene_data(**ball(primitives=[CONE | {"type": 5}])), "unknown type of .*'prism'; known"),
     "poses": (scene_data(**ball(primitive_poses=[])), "has 1 primitives and 0 primitive_poses"),
     "quaternion": (
         scene_data(**ball(primitive_poses=[{"position": [0, 0, 0], "orientation": [0, 0, 0, 0]}])),
         r"ball: primitive_poses\[0\].orientation .* must not be zero",
     ),
-    "frame": (
-        scene_data(**ball(header={"frame_id": "moon"})),
-        "unknown frame_id of header: 'moon'; known: world",
-    ),
+    "frame": (scene_data(**ball(header={"frame_id": "moon"})), "header: 'moon'; known: world"),
     "plane": (scene_data(**ball(planes=[{"coef": [0, 0, 0, 1]}])), "must not all be zero"),
+    "planes": (scene_data(**ball(planes=[{"coef": [0, 0, 1, 1]}] * 2000)), "2,000 planes; at most 1,000"),
     "package": (
         scene_data(**ball(meshes=[{"resource": "package://a/b.stl"}], mesh_poses=ball()["primitive_poses"])),
         r"object ball: meshes\[0\].resource is package://a/b.stl",
@@ -191,7 +162,7 @@ def test_wrong_scenes(case: str, tmp_path: Path) -> None:
     data, message = WRONG_SCENES[case]
     file = tmp_path / "scene.yaml"
     file.write_text(yaml.safe_dump(data))
-    with pytest.raises(InputError, match=message) as raised:
+    with pytest.raises(rd.InputError, match=message) as raised:
         read_moveit_scene(file)
     assert str(raised.value).startswith(str(file)) and "\n" not in str(raised.value)
 
@@ -231,13 +202,12 @@ def test_defaults_decide_where_no_pair_does() -> None:
     "data",
     [
         {"entry_names": ["hand", "can"], "entry_values": [[0, 1]]},
-        {"entry_names": ["hand"], "entry_values": [[0, 1]]},
         {"entry_names": "hand"},
         ["hand"],
     ],
 )
 def test_a_damaged_matrix_is_an_error(data: object) -> None:
-    with pytest.raises(InputError, match="allowed_collision_matrix"):
+    with pytest.raises(rd.InputError, match="allowed_collision_matrix"):
         matrix_contacts(data, ["can"], LINKS)
 
 
@@ -248,12 +218,12 @@ def test_a_scene_and_a_problem_file_allow_contacts(tmp_path: Path) -> None:
     names = [entry["id"] for entry in data["world"]["collision_objects"]]
     data["allowed_collision_matrix"] = matrix(["panda_hand", names[0], "gone"], [("panda_hand", names[0])])
     file.write_text(yaml.safe_dump(data))
-    scene, _ = read_moveit_scene(file, load_robot("panda"))
+    scene, _ = read_moveit_scene(file, rd.load_robot("panda"))
     assert scene.allowed_contacts == ((names[0], ("panda_hand",)),)
 
     problem = {"robot": "panda", "scene": "scene0001.yaml", "request": "request0001.yaml"}
     (tmp_path / "problem.yaml").write_text(yaml.safe_dump(problem | {"allowed_contacts": {names[1]: "all"}}))
-    loaded = load_problem(tmp_path / "problem.yaml")
+    loaded = rd.load_problem(tmp_path / "problem.yaml")
     assert loaded.scene.allowed_contacts == ((names[0], ("panda_hand",)), (names[1], "all"))
 
 
@@ -281,50 +251,50 @@ def ur5_files(folder: Path, model: str, more: list[str]) -> Path:
 def test_files_of_another_robot_are_refused_by_its_joints(tmp_path: Path) -> None:
     """A UR5 on the table took scenes of one on a stand with a gripper: 224 of 238 motions met something."""
     file = ur5_files(tmp_path, "ur5_robotiq85", ["gripper_finger1_joint"])
-    with pytest.raises(InputError) as raised:
-        load_problem(file)
+    with pytest.raises(rd.InputError) as raised:
+        rd.load_problem(file)
     text = str(raised.value)
     assert (
         "robot_state.joint_state has values of gripper_finger1_joint, movable joints that ur5 lacks" in text
     )
     assert "robot_model_name is ur5_robotiq85" in text and "its own are shoulder_pan_joint, " in text
-    with pytest.raises(InputError, match=r"scene0001.yaml: .* gripper_finger1_joint"):
-        read_moveit_scene(tmp_path / "scene0001.yaml", load_robot("ur5"))
-    [entry] = load_motion_bench_maker(tmp_path, load_robot("ur5"))
+    with pytest.raises(rd.InputError, match=r"scene0001.yaml: .* gripper_finger1_joint"):
+        read_moveit_scene(tmp_path / "scene0001.yaml", rd.load_robot("ur5"))
+    [entry] = load_motion_bench_maker(tmp_path, rd.load_robot("ur5"))
     assert "gripper_finger1_joint" in entry.error
     scene = read_yaml(tmp_path / "scene0001.yaml")
     assert isinstance(scene, dict)
     del scene["robot_state"]["joint_state"]
     (tmp_path / "scene0001.yaml").write_text(yaml.safe_dump(scene))
-    with pytest.raises(InputError, match=r"start_state.joint_state has values of gripper_finger1_joint"):
-        load_problem(file)
+    with pytest.raises(rd.InputError, match=r"start_state.joint_state has values of gripper_finger1_joint"):
+        rd.load_problem(file)
 
 
 def test_joints_that_the_robot_lacks_can_be_ignored(tmp_path: Path) -> None:
     file = ur5_files(tmp_path, "ur5_robotiq85", ["gripper_finger1_joint"])
-    notes = load_problem(file, ignore_joints=True).notes
+    notes = rd.load_problem(file, ignore_joints=True).notes
     assert "the scene's robot_model_name is ur5_robotiq85; planned for ur5" in notes
     assert "start_state.joint_state: ignored gripper_finger1_joint, which ur5 lacks" in notes
-    [entry] = load_motion_bench_maker(tmp_path, load_robot("ur5"), ignore_joints=True)
+    [entry] = load_motion_bench_maker(tmp_path, rd.load_robot("ur5"), ignore_joints=True)
     assert entry.load().notes == notes
-    read_moveit_scene(tmp_path / "scene0001.yaml", load_robot("ur5"), ignore_joints=True)
+    read_moveit_scene(tmp_path / "scene0001.yaml", rd.load_robot("ur5"), ignore_joints=True)
 
 
 def test_another_model_name_with_known_joints_is_a_note(tmp_path: Path) -> None:
-    notes = load_problem(ur5_files(tmp_path, "ur5_lab", [])).notes
+    notes = rd.load_problem(ur5_files(tmp_path, "ur5_lab", [])).notes
     assert notes == ("the scene's robot_model_name is ur5_lab; planned for ur5",)
-    assert load_problem(ur5_files(tmp_path, "ur5", [])).notes == ()
+    assert rd.load_problem(ur5_files(tmp_path, "ur5", [])).notes == ()
 
 
 def test_fixed_joints_of_the_robot_are_known_where_they_stand(tmp_path: Path) -> None:
-    fixed = next(joint.name for joint in load_robot("ur5").joints if joint.kind == "fixed")
+    fixed = next(joint.name for joint in rd.load_robot("ur5").joints if joint.kind == "fixed")
     file = ur5_files(tmp_path, "ur5", [fixed])
-    assert load_problem(file).notes == ()
+    assert rd.load_problem(file).notes == ()
     request = read_yaml(tmp_path / "request0001.yaml")
     change(request, ["start_state", "joint_state", "position", 6], 0.3)  # type: ignore[arg-type]
     (tmp_path / "request0001.yaml").write_text(yaml.safe_dump(request))
-    with pytest.raises(InputError, match=f"has values of {fixed}, movable joints that ur5 lacks"):
-        load_problem(file)
+    with pytest.raises(rd.InputError, match=f"has values of {fixed}, movable joints that ur5 lacks"):
+        rd.load_problem(file)
 
 
 def test_a_mimic_joint_elsewhere_than_its_master_puts_it_is_a_note(tmp_path: Path) -> None:
@@ -346,22 +316,13 @@ def test_a_mimic_joint_elsewhere_than_its_master_puts_it_is_a_note(tmp_path: Pat
 
 def test_padding_and_scale_of_links_are_noted() -> None:
     data = {
-        "link_padding": [
-            {"link_name": "panda_hand", "padding": 0.02},
-            {"link_name": "b", "padding": 0.0},
-        ],
+        "link_padding": [{"link_name": "panda_hand", "padding": 0.02}, {"link_name": "b", "padding": 0.0}],
         "link_scale": [{"link_name": "panda_hand", "scale": 1.1}, {"link_name": "other", "scale": 1.0}],
     }
-    assert scene_robot_notes(data, load_robot("panda")) == (
+    assert scene_robot_notes(data, rd.load_robot("panda")) == (
         "the scene's link_padding of panda_hand is ignored",
         "the scene's link_scale of panda_hand is ignored",
     )
-
-
-def test_an_object_of_too_many_planes_is_one_line() -> None:
-    planes = [{"coef": [0, 0, 1, 1]}] * 100_000
-    with pytest.raises(InputError, match="has 100,000 planes; at most 1,000"):
-        object_shapes({"id": "a", "planes": planes}, moveit_frames({}), Path())
 
 
 def pose_constraint() -> dict[str, Any]:
@@ -378,13 +339,24 @@ def test_several_goal_constraints_are_a_set() -> None:
     assert len(moveit_request(data, moveit_frames({})).joint_goals) == 2
 
 
-def test_pose_goal(tmp_path: Path) -> None:
+def asked(folder: Path, data: dict[str, Any]) -> ProblemEntry:
+    """The first of MotionBenchMaker's problems with this request."""
     for file in MOTION_BENCH_MAKER.glob("*0001.yaml"):
-        shutil.copy(file, tmp_path)
+        shutil.copy(file, folder)
+    (folder / "request0001.yaml").write_text(yaml.safe_dump(data))
+    return load_motion_bench_maker(folder)[0]
+
+
+def test_a_goal_without_a_joint_is_refused(tmp_path: Path) -> None:
+    data = request_data()
+    del data["goal_constraints"][0]["joint_constraints"][3]
+    assert "goal_constraints[0] has no panda_joint4" in asked(tmp_path, data).error
+
+
+def test_pose_goal(tmp_path: Path) -> None:
     data = request_data() | {"goal_constraints": [pose_constraint()]}
-    (tmp_path / "request0001.yaml").write_text(yaml.safe_dump(data))
-    goal = load_motion_bench_maker(tmp_path)[0].load().goal
-    assert isinstance(goal, PoseGoal) and goal.frame == "panda_hand"
+    goal = asked(tmp_path, data).load().goal
+    assert isinstance(goal, rd.PoseGoal) and goal.frame == "panda_hand"
     np.testing.assert_allclose(goal.T_base_frame[:3, 3], [0.4, 0, 0.5])
     np.testing.assert_allclose(goal.T_base_frame[:3, :3], np.diag([1.0, -1, -1]), atol=1e-12)
     link, T = moveit_request(data, MoveItFrames(None, np.diag([-1.0, -1, 1, 1]))).pose_goal or ("", np.eye(4))
@@ -396,15 +368,10 @@ def test_pose_goal(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("frame", ["panda_hand", "world"])
 def test_objects_are_held_at_the_start(frame: str, tmp_path: Path) -> None:
-    for file in MOTION_BENCH_MAKER.glob("*0001.yaml"):
-        shutil.copy(file, tmp_path)
-    bare = load_motion_bench_maker(tmp_path)[0].load()
+    bare = asked(tmp_path, request_data()).load()
     T_base_hand = link_pose(bare.robot, bare.start, "panda_hand")
-    T = (
-        T_base_hand @ transform(np.array([0.0, 0.0, 0.2]))
-        if frame == "world"
-        else transform(np.array([0, 0, 0.2]))
-    )
+    T_hand_rod = transform(np.array([0.0, 0.0, 0.2]))
+    T = T_base_hand @ T_hand_rod if frame == "world" else T_hand_rod
     x, y, z, w = np.roll(quaternion_from_rotation(T[:3, :3]), -1).tolist()
     held = {
         "link_name": "panda_hand",
@@ -417,11 +384,10 @@ def test_objects_are_held_at_the_start(frame: str, tmp_path: Path) -> None:
         },
     }
     data = change(request_data(), ["start_state", "attached_collision_objects"], [held])
-    (tmp_path / "request0001.yaml").write_text(yaml.safe_dump(data))
-    problem = load_motion_bench_maker(tmp_path)[0].load()
+    problem = asked(tmp_path, data).load()
     [rod] = problem.robot.attached
     assert rod.name == "rod" and rod.touch_links == ("panda_link6",)
-    np.testing.assert_allclose(rod.T_link_body, transform(np.array([0.0, 0.0, 0.2])), atol=1e-9)
+    np.testing.assert_allclose(rod.T_link_body, T_hand_rod, atol=1e-9)
     T_world = problem_record(problem)["attached"][0]["cylinder"]  # type: ignore[index]
     np.testing.assert_allclose(T_world["center"], [0, 0, 0.2], atol=1e-9)
 
@@ -434,49 +400,28 @@ def test_scaling_factors_and_the_velocity_of_a_start_state_are_noted() -> None:
     asked = {"max_velocity_scaling_factor": 0.1, "max_acceleration_scaling_factor": 1.0}
     data: dict[str, Any] = request_data() | asked
     data["start_state"]["joint_state"]["velocity"] = [0.0, 0.3]
-    assert {*moveit_request(data, moveit_frames({}, load_robot("panda"))).notes} == {
+    assert {*moveit_request(data, moveit_frames({}, rd.load_robot("panda"))).notes} == {
         "the request's max_velocity_scaling_factor 0.1 is ignored: plan with velocity_scaling=0.1",
         "start_state.joint_state.velocity [0.0, 0.3] is ignored: the motion begins at rest",
     }
 
 
 WRONG_REQUESTS: dict[str, tuple[object, str]] = {
-    "number": (3, "a motion plan request is 3"),
     "no goal": (request_data() | {"goal_constraints": []}, "goal_constraints is empty"),
     "path constraints": (
         request_data() | {"path_constraints": {"joint_constraints": [1]}},
         "path_constraints",
     ),
-    "reference": (request_data() | {"reference_trajectories": [{}]}, "reference_trajectories is not supp"),
-    "scaling": (
-        request_data() | {"max_velocity_scaling_factor": 2},
-        "max_velocity_scaling_factor is 2; it must be a number from 0 to 1",
-    ),
+    "scaling": (request_data() | {"max_velocity_scaling_factor": 2}, "is 2; it must be a number from 0 to 1"),
     "attached": (
         change(request_data(), ["start_state", "attached_collision_objects"], [1]),
         r"attached_collision_objects\[0\] is 1; it must be a mapping",
-    ),
-    "attached shape": (
-        change(
-            request_data(),
-            ["start_state", "attached_collision_objects"],
-            [{"link_name": "panda_hand", "object": {"planes": [1], "header": {"frame_id": "panda_hand"}}}],
-        ),
-        r"attached_collision_objects\[0\].object: planes\[0\] is 1; it must be a mapping",
-    ),
-    "value": (
-        change(request_data(), ["goal_constraints", 0, "joint_constraints", 2, "position"], None),
-        r"goal_constraints\[0\].joint_constraints\[2\].position is \[None\]",
     ),
     "two poses": (
         request_data() | {"goal_constraints": [pose_constraint(), pose_constraint()]},
         "joint_constraints alone, or be the only goal",
     ),
     "position alone": (pose_request(["orientation_constraints"], []), "one position and one orientation"),
-    "two links": (
-        pose_request(["orientation_constraints", 0, "link_name"], "x"),
-        "both must constrain one link",
-    ),
     "offset": (pose_request(["position_constraints", 0, "target_point_offset"], [0, 0, 1]), "must be zero"),
 }
 
@@ -484,19 +429,9 @@ WRONG_REQUESTS: dict[str, tuple[object, str]] = {
 @pytest.mark.parametrize("case", WRONG_REQUESTS)
 def test_wrong_requests(case: str) -> None:
     data, message = WRONG_REQUESTS[case]
-    with pytest.raises(InputError, match=message) as raised:
+    with pytest.raises(rd.InputError, match=message) as raised:
         moveit_request(data, moveit_frames({}))
     assert "\n" not in str(raised.value)
-
-
-def test_goal_without_a_joint(tmp_path: Path) -> None:
-    for file in MOTION_BENCH_MAKER.glob("*0001.yaml"):
-        shutil.copy(file, tmp_path)
-    data = request_data()
-    del data["goal_constraints"][0]["joint_constraints"][3]
-    (tmp_path / "request0001.yaml").write_text(yaml.safe_dump(data))
-    [entry] = load_motion_bench_maker(tmp_path)
-    assert "goal_constraints[0] has no panda_joint4" in entry.error
 
 
 Z = np.array([0.0, 0.0, 1.0])
@@ -525,9 +460,9 @@ WHEELS = {
 }
 
 
-def place(data: dict[str, Any], robot: Robot | None = None) -> list[float]:
+def place(data: dict[str, Any], robot: rd.Robot | None = None) -> list[float]:
     [shape] = moveit_scene(data, moveit_frames(data, robot), Path()).shapes
-    assert isinstance(shape, Sphere)
+    assert isinstance(shape, rd.Sphere)
     return shape.center.round(9).tolist()
 
 
@@ -542,7 +477,7 @@ def state(frame: str, *translations: list[float]) -> dict[str, Any]:
     return {"robot_state": {"multi_dof_joint_state": floating}}
 
 
-def mounted(folder: Path, kind: str) -> Robot:
+def mounted(folder: Path, kind: str) -> rd.Robot:
     """As `robot add --base base` keeps it, less the spheres, which take their time."""
     (folder / "mounted.urdf").write_text(MOUNTED.format(kind=kind))
     write_robot_folder(read_urdf(folder / "mounted.urdf", base="base"), folder / "mounted", {})
@@ -552,10 +487,7 @@ def mounted(folder: Path, kind: str) -> Robot:
 def test_poses_compose_from_the_base_outwards() -> None:
     """The base stands at [1, 0, 0] and is turned; a frame, the object and its part are offset and turned."""
     data = scene_data(
-        **ball(
-            header={"frame_id": "table"},
-            pose={"position": [0, 2, 0], "orientation": QUARTER},
-        )
+        **ball(header={"frame_id": "table"}, pose={"position": [0, 2, 0], "orientation": QUARTER})
     )
     data["robot_state"] = {
         "multi_dof_joint_state": {"transforms": [{"translation": [1, 0, 0], "rotation": QUARTER}]}
@@ -565,49 +497,22 @@ def test_poses_compose_from_the_base_outwards() -> None:
         {"transform": {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1]}, "child_frame_id": "world"},
         {"header": {"frame_id": "world"}, "transform": table, "child_frame_id": "table"},
     ]
-    [shape] = moveit_scene(data, moveit_frames(data), Path()).shapes
     turn = rotation_about(Z, np.pi / 2)
     in_object = np.array([1.0, 0, 0])
     in_world = np.array([0, 0, 5.0]) + turn @ (np.array([0, 2.0, 0]) + turn @ in_object)
     expected = turn.T @ (in_world - np.array([1.0, 0, 0]))
-    assert isinstance(shape, Sphere)
-    np.testing.assert_allclose(shape.center, expected, atol=1e-12)
+    np.testing.assert_allclose(place(data), expected, atol=1e-9)
     data["world"]["collision_objects"][0]["header"]["frame_id"] = "panda_link0"
-    [shape] = moveit_scene(data, moveit_frames(data, load_robot("panda")), Path()).shapes
-    assert isinstance(shape, Sphere)
-    np.testing.assert_allclose(shape.center, np.array([0, 2.0, 0]) + turn @ in_object, atol=1e-12)
-
-
-def test_scene_in_the_world_of_a_robot_whose_base_is_not_its_root(tmp_path: Path) -> None:
-    """`robot add --base` once dropped the transform between them: verified motions met obstacles by 8 cm."""
-    robot = mounted(tmp_path, "fixed")
-    in_base = np.array([0.5, 0.0, 0.1])
-    turn = rotation_about(Z, np.pi / 2)
-    in_world = turn @ in_base + [1, 2, 0.8]
-    for frame, at in {
-        "": in_world,
-        "world": in_world,
-        "stand": in_base + np.array([0, 0, 0.3]),
-        "base": in_base,
-    }.items():
-        pose = {"position": at.tolist(), "orientation": [0, 0, 0, 1]}
-        data = scene_data(**ball(header={"frame_id": frame}, primitive_poses=[pose]))
-        [shape] = moveit_scene(data, moveit_frames(data, robot), tmp_path).shapes
-        assert isinstance(shape, Sphere)
-        np.testing.assert_allclose(shape.center, in_base, atol=1e-9, err_msg=frame)
+    expected = np.array([0, 2.0, 0]) + turn @ in_object
+    np.testing.assert_allclose(place(data, rd.load_robot("panda")), expected, atol=1e-9)
 
 
 def test_scene_in_the_world_of_a_robot_whose_base_moves_there_is_refused(tmp_path: Path) -> None:
     robot = mounted(tmp_path, "prismatic")
-    data = scene_data(**ball(header={"frame_id": "world"}))
-    data["fixed_frame_transforms"] = [
-        {"transform": {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1]}, "child_frame_id": "world"}
-    ]
-    with pytest.raises(InputError, match="a joint moves base in world"):
-        moveit_scene(data, moveit_frames(data, robot), tmp_path)
-    data = scene_data(**ball(header={"frame_id": "base"}))
-    [shape] = moveit_scene(data, moveit_frames(data, robot), tmp_path).shapes
-    assert isinstance(shape, Sphere) and shape.center.tolist() == [1, 0, 0]
+    fixed = {"transform": {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1]}, "child_frame_id": "world"}
+    with pytest.raises(rd.InputError, match="a joint moves base in world"):
+        place(at("world", fixed_frame_transforms=[fixed]), robot)
+    assert place(at("base"), robot) == [0, 0, 0]
 
 
 @pytest.mark.parametrize("wheels", WHEELS)
@@ -616,8 +521,7 @@ def test_a_scene_places_what_a_mobile_base_carries(tmp_path: Path, wheels: str) 
     (tmp_path / "wheeled.urdf").write_text(WHEELED.format(above=WHEELS[wheels]))
     robot = read_urdf(tmp_path / "wheeled.urdf", base="base")
     assert robot.root == robot.base == "base"
-    data = scene_data(**ball(header={"frame_id": "world"})) | state("world", [0.5, 0, 0])
-    assert place(data, robot) == [0.5, 0, 0]
+    assert place(at("world", **state("world", [0.5, 0, 0])), robot) == [-0.5, 0, 0]
 
 
 def test_a_lift_is_no_mobile_base(tmp_path: Path) -> None:
@@ -634,17 +538,18 @@ def test_scene_in_a_frame_that_the_robot_is_placed_in(tmp_path: Path) -> None:
     expected = (turn @ (-np.array([3.0, 0, 0]) - base_in_root)).round(9).tolist()
     for frame in ("odom", "/odom", ""):
         assert place(at(frame, **state("odom", [3, 0, 0])), robot) == expected
-    panda = load_robot("panda")
-    with pytest.raises(InputError, match=r"unknown frame_id of header: 'world'; known: odom, panda_link0"):
+    panda = rd.load_robot("panda")
+    with pytest.raises(rd.InputError, match=r"unknown frame_id of header: 'world'; known: odom, panda_link0"):
         place(at("world", **state("odom", [3, 0, 0])), panda)
     for named in ("world", "panda_link0", ""):
         assert place(at("world", **state(named, [3, 0, 0])), panda) == [-3, 0, 0]
-    with pytest.raises(InputError, match="has 2 transforms; it must have one"):
+    with pytest.raises(rd.InputError, match="has 2 transforms; it must have one"):
         place(at("world", **state("odom", [3, 0, 0], [0, 0, 0])), panda)
 
 
 def test_links_of_the_robot_are_frames_where_they_stand(tmp_path: Path) -> None:
-    """Also a link called world that is not the root; a file cannot place a link of the robot anew."""
+    """Also a link called world that is not the root; a file cannot place a link of the robot anew. `robot add
+    --base` once dropped the transform between root and base: verified motions met obstacles by 8 cm."""
     text = MOUNTED.format(kind="fixed").replace(
         '<link name="world"/>',
         """<link name="map"/><link name="world"/><link name="camera"/>
@@ -654,10 +559,13 @@ def test_links_of_the_robot_are_frames_where_they_stand(tmp_path: Path) -> None:
     )
     (tmp_path / "arm.urdf").write_text(text)
     robot = read_urdf(tmp_path / "arm.urdf", base="base")
+    write_robot_folder(robot, tmp_path / "kept", {})
+    robot = read_robot_folder(tmp_path / "kept")
     assert place(at("camera"), robot) == [0, 0, 1]
+    assert place(at("base"), robot) == [0, 0, 0]
     assert place(at("world"), robot) == [-2, 1, -0.8]
     assert place(at(""), robot) == [-2, 1, -7.8]
     fixed = {"transform": {"translation": [9, 9, 9], "rotation": [0, 0, 0, 1]}, "child_frame_id": "stand"}
     assert place(at("stand", fixed_frame_transforms=[fixed]), robot) == [0, 0, -0.3]
-    with pytest.raises(InputError, match=r"unknown frame_id of header: 'arm'; known: base, camera, map"):
+    with pytest.raises(rd.InputError, match=r"unknown frame_id of header: 'arm'; known: base, camera, map"):
         place(at("arm"), robot)
