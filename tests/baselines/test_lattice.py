@@ -27,6 +27,7 @@ PANDA = load_robot("panda")
 LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 WALL = Scene([Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.8], name="wall")])
+AROUND = Problem(PANDA, WALL, LEFT, JointGoal(RIGHT[None]))
 SPACING = 0.35
 
 
@@ -184,21 +185,11 @@ def test_start_buried_and_freed_again():
     [(AStar, AStarSettings(spacing=0.1, max_nodes=300)), (DStarLite, DStarLiteSettings(max_nodes=300))],
 )
 def test_full_memory_and_the_time_limit_are_reported(planner, settings):
-    problem = Problem(PANDA, WALL, LEFT, JointGoal(RIGHT[None]))
-    result = planner(settings).plan(problem, time_limit=5.0)
+    result = planner(settings).plan(AROUND, time_limit=5.0)
     assert result.status is Status.NO_PATH
     assert "memory is full" in result.reason and "coarser" in result.reason
-    result = planner(replace(settings, spacing=0.08, max_nodes=10**7)).plan(problem, time_limit=0.1)
+    result = planner(replace(settings, spacing=0.08, max_nodes=10**7)).plan(AROUND, time_limit=0.1)
     assert result.status is Status.TIMEOUT and "expansions" in result.reason
-
-
-def test_updates_refuse_another_robot_and_places_off_the_lattice():
-    checker, start, goals, _ = arm_problem(0)
-    search = LatticeSearch(checker, start, goals, DStarLiteSettings())
-    with pytest.raises(InputError, match="robot"):
-        search.update(CollisionChecker(PANDA, WALL))
-    with pytest.raises(InputError, match="start is"):
-        search.update(checker, start + np.float32(0.1))
 
 
 @pytest.mark.slow
@@ -223,11 +214,22 @@ def test_two_arms_do_not_outrun_the_time_limit(settings: AStarSettings | DStarLi
     assert np.diff(looks).min() > 0 and edges * np.diff(looks).max() <= 4000
 
 
-def test_too_many_nodes_or_edges_are_refused() -> None:
-    problem = Problem(PANDA, WALL, LEFT, JointGoal(RIGHT[None]))
-    with pytest.raises(InputError, match=r"a_star.spacing is 0.001.*a spacing of 0.0"):
-        AStar(AStarSettings(spacing=0.001)).plan(problem)
-    baxter = load_robot("baxter")
+def test_too_many_nodes_or_edges_other_robots_and_places_off_the_lattice_are_refused() -> None:
+    baxter = CollisionChecker(load_robot("baxter"), Scene())
     ends = np.zeros((2, 14), np.float32)
-    with pytest.raises(InputError, match=r"joints_per_move is 14; on baxter .* 4782968 edges.* at most 5"):
-        LatticeSearch(CollisionChecker(baxter, Scene()), ends[0], ends[1:], AStarSettings(joints_per_move=14))
+    checker, start, goals, _ = arm_problem(0)
+    search = LatticeSearch(checker, start, goals, DStarLiteSettings())
+    for call, message in (
+        (
+            lambda: AStar(AStarSettings(spacing=0.001)).plan(AROUND),
+            r"spacing is 0.001.*a spacing of 0.0",
+        ),
+        (
+            lambda: LatticeSearch(baxter, ends[0], ends[1:], AStarSettings(joints_per_move=14)),
+            r"joints_per_move is 14; on baxter .* 4782968 edges.* at most 5",
+        ),
+        (lambda: search.update(CollisionChecker(PANDA, WALL)), "robot"),
+        (lambda: search.update(checker, start + np.float32(0.1)), "start is"),
+    ):
+        with pytest.raises(InputError, match=message):
+            call()

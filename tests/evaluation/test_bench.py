@@ -217,7 +217,7 @@ def test_planners_take_turns_with_each_problem(tmp_path: Path, monkeypatch: pyte
         assert [record.name for record in records] == [f"rop/{i}" for i in range(3)]
 
 
-def test_a_planner_with_settings() -> None:
+def test_a_planner_with_settings_or_weights_of_the_package() -> None:
     planner = bench.PlannerSpec.parse("rrt_connect:optimize_time=0.05:tightenings=0").load()
     assert isinstance(planner, RRTConnect)
     assert (planner.settings.optimize_time, planner.settings.tightenings) == (0.05, 0)
@@ -229,10 +229,7 @@ def test_a_planner_with_settings() -> None:
     nested = bench.PlannerSpec.parse("diffusion:guidance.margin=0.02:samples=4").load()
     assert isinstance(nested, Diffusion)
     assert (nested.settings.guidance.margin, nested.settings.samples) == (0.02, 4)
-
-
-def test_weights_of_the_package_are_found_by_their_name() -> None:
-    """They were sought in the working folder, and the row of Table 1 without clearances could not run."""
+    # weights of the package were sought in the working folder
     spec = bench.PlannerSpec.parse("diffusion@panda_points:samples=1")
     assert spec.label == "diffusion@panda_points:samples=1" and list(spec.weights_hashes) == ["model"]
     planner = spec.load()

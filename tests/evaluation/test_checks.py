@@ -155,7 +155,7 @@ def test_missing_pybullet_is_one_line(tmp_path, monkeypatch):
     assert not check_data(tmp_path, ARM, pybullet=False).findings
 
 
-def test_rows_are_problems_again(tmp_path):
+def test_rows_are_problems_and_motions_again(tmp_path):
     shapes = rd.Sphere([0.0, 1.5, 0.0], 0.1), rd.Box([1, 0, 1], [0.1, 0.2, 0.3])
     near = record(ARM, rd.Scene(shapes), line(AWAY, BACK))
     manifest = write_motions(tmp_path, ARM, [near])
@@ -174,12 +174,8 @@ def test_rows_are_problems_again(tmp_path):
     assert len(others) == 2
     with pytest.raises(rd.InputError, match="family is 0; the manifest has 0"):
         problem_of(replace(manifest, families={}, floors={}), ARM, shard, 0)
-
-
-def test_timed_rows_move_in_time(tmp_path):
-    row = record(ARM, rd.Scene([]), line(AWAY, BACK))
-    times = np.linspace(0, 2, len(row["trajectories"]))
-    write_shard(tmp_path, 0, {k: v[None] for k, v in (row | {"times": times}).items()}, {})
+    times = np.linspace(0, 2, len(near["trajectories"]))
+    write_shard(tmp_path, 0, {k: v[None] for k, v in (near | {"times": times}).items()}, {})
     motion = motion_of(ARM, read_shard(tmp_path, 0), 0)
     assert isinstance(motion, rd.Trajectory) and motion.duration == 2
     assert np.allclose(motion.velocities[:, 0], 1.75, atol=1e-5)

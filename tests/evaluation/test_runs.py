@@ -44,7 +44,9 @@ def test_methods_take_turns_on_each_case_with_the_same_random_numbers() -> None:
     assert found["x"][0].reference == LENGTH_OF_LINE and found["x"][0].workers == 1
 
 
-def test_what_is_kept_is_not_made_again_also_after_an_interruption(tmp_path: Path) -> None:
+def test_what_is_kept_is_not_made_again_but_for_other_limits(
+    tmp_path: Path,
+) -> None:
     calls: list[tuple[str, str, int]] = []
 
     def stopping(run: Run) -> Iterator[Fields]:
@@ -59,16 +61,10 @@ def test_what_is_kept_is_not_made_again_also_after_an_interruption(tmp_path: Pat
     assert [int(record.joint_length or 0) for record in again["x"]] == [1, 2]
     backwards = run_all(CASES[::-1], {"x": quick(3.0, calls)["x"]}, folder=tmp_path, bar=False)
     assert len(calls) == 2 and [record.name for record in backwards["x"]] == ["b", "a"]
-
-
-def test_another_time_limit_is_another_run(tmp_path: Path) -> None:
-    """Records of any time limit were returned."""
-    calls: list[tuple[str, str, int]] = []
-    case = Case("x#1", "free", FREE, True, LENGTH_OF_LINE, "mine")
-    for limit in (1.0, 2.0, 2.0):
-        found = run_all([case], quick(1.0, calls), limit=limit, folder=tmp_path, bar=False)
-        assert [(r.name, r.time_limit) for r in found["x"]] == [("x#1", limit)]
-    assert len(calls) == 4
+    # records of any time limit were returned
+    for limit, made in ((9.0, 4), (9.0, 4), (8.0, 6)):
+        found = run_all(CASES, {"x": quick(1.0, calls)["x"]}, limit=limit, folder=tmp_path, bar=False)
+        assert {record.time_limit for record in found["x"]} == {limit} and len(calls) == made
 
 
 def test_samples_are_validated_as_they_are_and_the_shortest_that_passes_is_measured() -> None:

@@ -37,18 +37,14 @@ def test_progress_falls_and_ends_with_the_returned_path_when_it_was_found() -> N
         assert (result.progress[-1][0] < result.planning_time) == (len(found) == 1)
 
 
-def test_failures_name_what_the_validator_refused() -> None:
+def test_failures_name_what_the_validator_refused_and_what_ended_the_search() -> None:
     context = context_for(BLOCKED)
-    assert context.unsolved().refused == ""
-    assert context.finish(np.stack([START, turned(1.2)]), "test") is None
-    assert context.unsolved().refused == "scene_collision"
-    assert context.finish(np.stack([START, turned(0.1)]), "test") is None
-    assert context.unsolved().refused == "goal"
-
-
-def test_a_search_that_ended_differs_from_one_that_ran_out_of_time() -> None:
-    ended = context_for(BLOCKED).unsolved()
-    assert ended.status is Status.NO_PATH and "the search ended" in ended.reason
+    for angle, refused in ((None, ""), (1.2, "scene_collision"), (0.1, "goal")):
+        if angle is not None:
+            assert context.finish(np.stack([START, turned(angle)]), "test") is None
+        ended = context.unsolved()
+        assert ended.refused == refused
+        assert ended.status is Status.NO_PATH and "the search ended" in ended.reason
     late = context_for(BLOCKED, 1e-9).unsolved()
     assert late.status is Status.TIMEOUT and "longer time limit" in late.reason
 
