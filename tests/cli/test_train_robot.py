@@ -9,14 +9,13 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.commands import Said
-from helpers.factory_runs import contents, in_this_process
+from helpers.factory_runs import in_this_process
 from robotdiffuse.cli import train as train_robot
 from robotdiffuse.cli.train import data_settings, train_for_robot
 from robotdiffuse.generation import factory
 from robotdiffuse.generation.factory import GenerationSettings
 from robotdiffuse.learning.denoisers import TransformerSettings
 from robotdiffuse.learning.training.config import planner_training
-from robotdiffuse.learning.training.loop import TrainingRun
 from robotdiffuse.learning.weight_files import user_weights, weights_for
 from robotdiffuse.planning.diffusion import Diffusion
 
@@ -62,44 +61,6 @@ def test_an_arm_of_five_joints_plans_with_its_trained_network(tmp_path: Path) ->
 def test_data_are_in_the_size_of_the_arm() -> None:
     large, small = (data_settings(name, rd.load_robot(name), None, None) for name in ("ur5e", "so101"))
     assert large.search.safety_distance == 0.05 and small.search.safety_distance == pytest.approx(0.02)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("phase", ["data", "training"])
-def test_it_continues_where_it_was_interrupted(
-    phase: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole = made("ur5e", tmp_path / "whole")
-    expected = contents(whole)
-    with monkeypatch.context() as patch:
-        if phase == "data":
-            patch.setattr(factory, "write_shard", interrupted(factory.write_shard, 2))
-        else:
-            patch.setattr(TrainingRun, "step", interrupted(TrainingRun.step, 8, save=True))
-        with pytest.raises(KeyboardInterrupt):
-            made("ur5e", tmp_path / "stopped")
-    shards = sorted(file.name for file in (tmp_path / "stopped" / "data").glob("shard_*"))
-    assert len(shards) == (1 if phase == "data" else 3)
-    assert (tmp_path / "stopped" / "training.safetensors").is_file() == (phase == "training")
-    again = made("ur5e", tmp_path / "stopped")
-    weights = "model.safetensors"
-    assert contents(again)[weights] == expected[weights]
-
-
-def interrupted(call, at: int, save: bool = False):
-    """The call, whose `at`-th use raises KeyboardInterrupt instead."""
-    calls = 0
-
-    def counted(*arguments: object) -> object:
-        nonlocal calls
-        calls += 1
-        if calls == at:
-            if save:
-                arguments[0].save()  # type: ignore[attr-defined]
-            raise KeyboardInterrupt
-        return call(*arguments)
-
-    return counted
 
 
 def test_bad_input_is_a_clear_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: Said) -> None:

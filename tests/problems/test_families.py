@@ -7,7 +7,7 @@ import pytest
 
 from robotdiffuse import Box, InputError, Scene, Sphere, load_robot
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.generation.factory import TARGETS, GenerationSettings, draw
+from robotdiffuse.generation.factory import TARGETS
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.problems.families import family as drawing
 from robotdiffuse.problems.families.family import CONFIGURATION, POSE, POSITION
@@ -38,14 +38,6 @@ def test_problems_are_as_the_family_says(name: str, target: str) -> None:
         floors = () if family.floor is None else (family.floor,)
         assert drawn.scene.shapes[: len(floors)] == floors
         PackedScenes.pack([drawn.scene], family.max_obstacles, floor=bool(floors))
-
-
-@every_family
-def test_data_are_made_of_it(name: str) -> None:
-    settings = GenerationSettings(mix={"rop": 1.0, name: 1e6}, goals=2)
-    number, drawn = draw(settings, PANDA, np.random.default_rng(1))
-    assert list(settings.mix)[number] == name and 1 <= len(drawn.goals) <= 2
-    assert settings.slots >= load_family(name).max_obstacles
 
 
 @every_family

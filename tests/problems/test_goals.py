@@ -106,15 +106,6 @@ def test_one_motion_stops_at_waypoints_in_their_order() -> None:
     assert found is not None and found.kind == "waypoint" and "waypoints[1]" in found.message
 
 
-def test_a_motion_that_only_passes_a_waypoint_does_not_stop_there() -> None:
-    trajectory = rd.plan(rd.Problem(ROBOT, rd.Scene([]), START, END), time_limit=10.0).trajectory
-    assert trajectory is not None
-    way = [trajectory.positions[len(trajectory.times) // 2]]
-    passed = rd.Problem(ROBOT, rd.Scene([]), START, END, waypoints=way)
-    found = verify_trajectory(passed, trajectory).violation
-    assert found is not None and found.kind == "waypoint"
-
-
 def nearest(trajectory: rd.Trajectory, goal: rd.PoseGoal | rd.JointGoal) -> float:
     """How near the motion comes to a goal, on the cubics between its rows."""
     curve = CubicHermiteSpline(trajectory.times, trajectory.positions, trajectory.velocities)

@@ -87,15 +87,6 @@ def test_position_only(seed: int, x: float, y: float, z: float) -> None:
     assert errors(robot, "panda_link8", T, q)[0] <= 2e-6
 
 
-def test_a_link_in_the_middle_of_the_chain() -> None:
-    robot = example_robot("panda")
-    rng = np.random.default_rng(7)
-    T = link_pose(robot, rng.uniform(robot.lower, robot.upper), "panda_link4")
-    q = inverse_kinematics(robot, "panda_link4", T, 4, rng=rng)
-    assert len(q) == 4
-    assert max(errors(robot, "panda_link4", T, q)) <= 2e-6
-
-
 @pytest.mark.parametrize(
     "xyz", [(5.0, 0.0, 0.5), (0.85, 0.0, 0.6), (0.0, 0.0, -0.9)], ids=["far", "just too far", "below"]
 )

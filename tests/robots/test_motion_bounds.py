@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.example_robots import TIPS, example_robot, planar_arm
+from helpers.example_robots import TIPS, example_robot
 from robotdiffuse.learning.training.losses import ForwardKinematics
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot
@@ -53,15 +53,3 @@ def test_never_below_and_close_to_sampled_maxima(name: str) -> None:
     assert ((radii > 0) == (sampled > 0)).all()
     # the bound itself is within 1 %; the rest is the gap between sampled and true maxima
     assert (radii <= 1.04 * sampled + 1e-3).all()
-
-
-def test_planar_arm_by_hand() -> None:
-    arm = planar_arm(0.5, 0.4, 0.3)
-    joints = tuple(replace(joint, lower=-3.0, upper=3.0) for joint in arm.joints)
-    robot = replace(arm, joints=joints, spheres={"l0": np.ones((1, 4)), "tip": np.array([[0, 0, 9.0, 0.05]])})
-    # heights along the axes do not count; the sphere at the tip of the stretched arm is furthest
-    radii = motion_radii(robot)
-    np.testing.assert_array_equal(radii[0], 0)
-    exact = np.array([1.25, 0.75, 0.35])
-    assert (radii[1] >= exact).all()
-    np.testing.assert_allclose(radii[1], exact, rtol=0.02)

@@ -11,7 +11,6 @@ import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.problems.files import load_problem, save_problem
-from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot_folder import MESH_FILE, ROBOT_FILE, write_robot_folder
 
 LEFT = "panda_finger_joint1"
@@ -41,14 +40,6 @@ def test_equal_locked_values_are_one_robot() -> None:
     assert both.locked == {LEFT: 0.01, RIGHT: 0.02} and both.unlocked is panda
     moved = replace(panda, tip="panda_link7")
     assert moved.with_locked({LEFT: 0.01, RIGHT: 0.02}) is not both
-
-
-def test_a_function_of_a_robot_works_once() -> None:
-    seen = []
-    doubled = once_per_robot(lambda robot: seen.append(robot) or 2 * robot.dof)
-    robot = replace(box_arm())
-    assert [doubled(robot), doubled(robot), doubled(replace(robot))] == [6, 6, 6]
-    assert len(seen) == 2
 
 
 def test_a_folder_that_changes_is_read_again(tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ import robotdiffuse as rd
 from helpers.example_robots import example_robot
 from helpers.made_arms import chain, row, written
 from helpers.urdfs import read_urdf
-from robotdiffuse.certificates.checker import check
 from robotdiffuse.certificates.requirements import constraint_bounds
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
@@ -138,33 +137,6 @@ def _crossing(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
         free = checker.free(np.linspace(start, goal, 100))
         if free[0] and free[-1] and not free.all():
             return start, goal
-
-
-@pytest.mark.slow
-def test_a_pose_of_one_hand_leaves_the_other_arm_where_it_starts() -> None:
-    robot = two_arms()
-    rng = np.random.default_rng(5)
-    checker = CollisionChecker(robot, rd.Scene())
-    free = [q for q in rng.uniform(robot.lower, robot.upper, (200, robot.dof)) if checker.free(q[None])[0]]
-    start = free[0]
-    there = free[1].copy()
-    there[4:] = start[4:]  # left arm and waist elsewhere
-    goal = rd.PoseGoal("left_hand", link_pose(robot, there, "left_hand"))
-    problem = rd.Problem(robot, rd.Scene(), start, goal)
-    result = rd.plan(problem, time_limit=20.0)
-    assert result.solved and result.path is not None
-    np.testing.assert_array_equal(result.path.positions[-1][4:], start[4:])
-
-
-@pytest.mark.slow
-def test_certificates_prove_motions_of_both_arms() -> None:
-    robot = two_arms()
-    start, goal = _crossing(robot)
-    problem = rd.Problem(robot, rd.Scene([rd.Box([0.6, 0, -0.2], [0.2, 0.2, 0.1])]), start, goal)
-    result = rd.plan(problem, time_limit=20.0)
-    assert result.solved and result.path is not None
-    certificate = rd.certify(problem, result.path)
-    assert check(certificate, problem).valid
 
 
 def test_what_one_arm_keeps_is_not_loosened_by_the_other() -> None:

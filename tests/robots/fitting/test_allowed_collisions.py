@@ -9,7 +9,6 @@ import trimesh
 
 from helpers.box_arm import box_arm, box_mesh
 from robotdiffuse.core.transforms import transform
-from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.bodies import Surface
 from robotdiffuse.robots.fitting.convex_parts import convex_hull
 from robotdiffuse.robots.fitting.covering_spheres import cover
@@ -150,18 +149,6 @@ def test_share_of_collisions_by_hand() -> None:
     )
     # the cubes overlap up to joint 2 = 0.05, of 0.02 to 1; the spheres, which do not count, up to 0.1234
     assert pair.colliding == pytest.approx(0.03 / 0.98, abs=0.015)
-
-
-def test_bundled_panda_has_the_expected_pairs() -> None:
-    """Checked pairs include those of MoveIt's Panda with real contacts, and the hand against the forearm."""
-    checked = set(map(frozenset, load_robot("panda").checked_pairs()))
-    for a in ("panda_link0", "panda_link1", "panda_link2"):
-        for b in ("panda_link5", "panda_link6", "panda_link7", "panda_hand", "panda_leftfinger"):
-            assert frozenset((a, b)) in checked
-    assert frozenset(("panda_link5", "panda_hand")) in checked
-    for i in range(7):
-        assert frozenset((f"panda_link{i}", f"panda_link{i + 1}")) not in checked
-    assert frozenset(("panda_link5", "panda_link7")) not in checked
 
 
 def test_false_collisions_of_parts_after_true_ones_are_counted() -> None:

@@ -83,10 +83,7 @@ def test_an_arm_that_is_never_free_is_refused_with_the_pair_to_allow(tmp_path: P
     """No configuration of the vendor's Fetch was free, yet the exit status was 0."""
     pair = ("column", "bellows2_link")
     how = {"base": "base", "tip": "j3_link", "out": tmp_path / "robot", "settings": QUICK}
-    with (
-        coarse_grids(),
-        pytest.raises(rd.InputError, match="configuration collides with itself") as error,
-    ):
+    with coarse_grids(), pytest.raises(rd.InputError, match="configuration collides with itself") as error:
         add_robot(on_a_lift(tmp_path), **how)
     text = str(error.value)
     assert f"{pair[0]} and {pair[1]} collide in 100.0%" in text and "--srdf FILE" in text

@@ -244,86 +244,38 @@ def test_a_base_on_slides_without_range_is_held(actuator: str, tmp_path: Path) -
     np.testing.assert_allclose(link_pose(robot, np.array([0.0]), "base")[:3, 3], [0.1, 0, 0.2], atol=1e-12)
 
 
-COMPOSED = """
-<mujoco model="composed">
-  <compiler angle="degree" meshdir="parts" autolimits="true"/>
-  <include file="classes.xml"/>
-  <asset><model name="hand" file="hand.xml"/></asset>
+TURNED = """
+<mujoco model="turned">
+  <asset><mesh name="wedge" file="part.stl" scale="1 -0.5 2"/></asset>
   <worldbody>
     <frame pos="0.2 0 0.1" euler="0 0 30">
-      <body name="base" gravcomp="1">
-        <geom class="part" type="mesh" mesh="wedge"/>
-        <body name="arm" pos="0 0 0.4">
-          <joint class="turn" name="j1"/>
-          <geom class="part" fromto="0 0 0.1 0.1 0 0.4" size="0.03"/>
-          <replicate count="2" offset="0 0.1 0"><geom name="bolt" size="0.01" pos="0.05 0 0.2"/></replicate>
-          <body name="wrist" pos="0.1 0 0.5">
-            <joint class="turn" name="j2" axis="1 0 0"/>
-            <geom class="part" type="sphere" size="0.03"/>
-            <attach model="hand" body="palm" prefix="hand/"/>
-          </body>
-        </body>
+      <body name="base">
+        <geom type="mesh" mesh="wedge"/>
+        <body name="arm" pos="0 0 0.4"><joint name="j" range="-90 90"/><geom size="0.1" pos="0 0 0.2"/></body>
       </body>
     </frame>
     <body name="other" pos="2 0 0"><joint name="o" range="-10 10"/><geom size="0.1"/></body>
   </worldbody>
-  <tendon><fixed name="both"><joint joint="hand/left" coef="1"/></fixed></tendon>
-  <actuator><position joint="j1"/><motor joint="j2"/><position tendon="both"/></actuator>
-</mujoco>
-"""
-CLASSES = """
-<mujocoinclude>
-  <default>
-    <default class="part"><geom type="capsule" mass="1"/></default>
-    <default class="turn"><joint axis="0 1 0" range="-90 90"/></default>
-  </default>
-  <asset><mesh name="wedge" file="part.stl" scale="1 -0.5 2"/></asset>
-</mujocoinclude>
-"""
-HAND = """
-<mujoco model="hand">
-  <compiler angle="radian"/>
-  <asset><mesh name="wedge" vertex="0 0 0  0.05 0 0  0 0.05 0  0 0 0.05"/></asset>
-  <worldbody>
-    <body name="palm" pos="0 0 0.05">
-      <geom type="mesh" mesh="wedge"/>
-      <body name="left">
-        <joint name="left" type="slide" range="0 0.03"/><geom size="0.01" pos="0 0 0.1"/>
-      </body>
-      <body name="right">
-        <joint name="right" type="slide" axis="0 0 -1" range="0 0.03"/><geom size="0.01" pos="0.1 0 0.1"/>
-      </body>
-    </body>
-  </worldbody>
-  <equality><joint joint1="right" joint2="left"/></equality>
+  <actuator><position joint="j"/></actuator>
 </mujoco>
 """
 
 
-def test_models_of_several_files_are_read_as_mujoco_compiles_them(tmp_path: Path) -> None:
-    """Includes, classes, attached models with the same names of assets, mirrored meshes, replicas, frames."""
-    (tmp_path / "parts").mkdir()
+def test_mirrored_meshes_are_where_mujoco_has_them_and_what_is_not_driven_is_none(tmp_path: Path) -> None:
     part = trimesh.creation.box([0.1, 0.2, 0.1]).apply_translation([0.02, 0.05, 0.0])
-    part.export(tmp_path / "parts" / "part.stl")
-    for name, text in (("m", COMPOSED), ("classes", CLASSES), ("hand", HAND)):
-        (tmp_path / f"{name}.xml").write_text(text)
+    part.export(tmp_path / "part.stl")
+    (tmp_path / "m.xml").write_text(TURNED)
     tree = UrdfTree(tmp_path / "m.xml", {})
     robot = tree.robot()
-    model = mujoco.MjModel.from_xml_path(str(tmp_path / "m.xml"))
-    assert robot.joint_names == ("j1", "j2")
-    assert robot.tip == "hand/palm"
-    assert "other" not in robot.link_names
-    data = state_of(model, robot, np.array([0.5, -0.7]))
-    for name in ("base", "arm", "wrist", "hand/palm", "hand/right"):
-        T = link_pose(robot, np.array([0.5, -0.7]), name)
+    assert robot.joint_names == ("j",) and "other" not in robot.link_names
+    data = state_of(mujoco.MjModel.from_xml_path(str(tmp_path / "m.xml")), robot, np.array([0.5]))
+    for name in ("base", "arm"):
+        T = link_pose(robot, np.array([0.5]), name)
         np.testing.assert_allclose(T[:3, 3], data.body(name).xpos, atol=1e-9)
         np.testing.assert_allclose(T[:3, :3], data.body(name).xmat.reshape(3, 3), atol=1e-9)
     [wedge] = tree.surfaces("base")
     np.testing.assert_allclose(wedge.vertices.min(axis=0), [-0.03, -0.075, -0.1], atol=1e-6)
     np.testing.assert_allclose(wedge.vertices.max(axis=0), [0.07, 0.025, 0.1], atol=1e-6)
-    assert len(tree.surfaces("arm")) == 3
-    [palm] = tree.surfaces("hand/palm")
-    np.testing.assert_allclose(palm.vertices.max(axis=0), 0.05, atol=1e-6)
 
 
 HOLLOW = """

@@ -262,14 +262,6 @@ def test_a_mesh_without_volume_is_noted(tmp_path: Path) -> None:
     assert "link end has collision geometry without volume, made 1 mm thick" in robot.notes
 
 
-def test_a_large_hall_below_the_arm_is_noted(tmp_path: Path) -> None:
-    hall = '<collision><geometry><box size="30 30 0.1"/></geometry></collision>'
-    file = written(
-        tmp_path, chain("base", ["j"]), made_arms.link("hall", hall), joint("f", "base", "hall", "fixed")
-    )
-    assert any("link hall is 30 m long" in note for note in read_urdf(file).notes)
-
-
 def test_preparations_of_one_urdf_that_differ_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,6 +1,7 @@
 """MoveIt scenes, requests, joints and contacts: what is read, and what is refused rather than ignored."""
 
 import shutil
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,6 @@ import trimesh
 import yaml
 
 import robotdiffuse as rd
-from helpers.moveit_files import MOTION_BENCH_MAKER, MOUNTED, QUARTER, ball, change, request_data, scene_data
 from helpers.urdfs import read_urdf
 from robotdiffuse.core.input_files import read_yaml
 from robotdiffuse.core.transforms import (
@@ -31,6 +31,52 @@ from robotdiffuse.problems.moveit import (
 )
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
+
+MOTION_BENCH_MAKER = Path(__file__).parents[3] / "files" / "motion_bench_maker"
+QUARTER = [0, 0, 0.7071067811865476, 0.7071067811865476]
+"""xyzw of a quarter turn about z."""
+MOUNTED = """<robot name="mounted">
+  <link name="world"/><link name="stand"/>
+  <link name="base"><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
+  <link name="arm"><collision>
+    <origin xyz="0.3 0 0"/><geometry><box size="0.4 0.05 0.05"/></geometry></collision>
+  </link>
+  <joint name="mount" type="fixed"><parent link="world"/><child link="stand"/>
+    <origin xyz="1 2 0.5" rpy="0 0 1.5707963267948966"/></joint>
+  <joint name="rail" type="{kind}"><parent link="stand"/><child link="base"/><origin xyz="0 0 0.3"/>
+    <axis xyz="1 0 0"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint>
+  <joint name="turn" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
+    <limit lower="-3" upper="3" velocity="1" effort="1"/></joint>
+</robot>"""
+"""An arm on a stand in the world: its base is not the root of the URDF."""
+
+
+def scene_data(**world: object) -> dict[str, Any]:
+    return {"world": {"collision_objects": [dict(world)]}}
+
+
+def ball(**more: object) -> dict[str, Any]:
+    at = [{"position": [1, 0, 0], "orientation": [0, 0, 0, 1]}]
+    return {
+        "id": "ball",
+        "primitives": [{"type": "sphere", "dimensions": [0.2]}],
+        "primitive_poses": at,
+        **more,
+    }
+
+
+def request_data() -> dict[str, Any]:
+    data = read_yaml(MOTION_BENCH_MAKER / "request0001.yaml")
+    assert isinstance(data, dict)
+    return deepcopy(data)
+
+
+def change(data: dict[str, Any], path: list[Any], value: object) -> dict[str, Any]:
+    at: Any = data
+    for key in path[:-1]:
+        at = at[key]
+    at[path[-1]] = value
+    return data
 
 
 def test_scene_as_motion_bench_maker_writes_it() -> None:
@@ -199,12 +245,7 @@ def test_defaults_decide_where_no_pair_does() -> None:
 
 
 @pytest.mark.parametrize(
-    "data",
-    [
-        {"entry_names": ["hand", "can"], "entry_values": [[0, 1]]},
-        {"entry_names": "hand"},
-        ["hand"],
-    ],
+    "data", [{"entry_names": ["hand", "can"], "entry_values": [[0, 1]]}, {"entry_names": "hand"}, ["hand"]]
 )
 def test_a_damaged_matrix_is_an_error(data: object) -> None:
     with pytest.raises(rd.InputError, match="allowed_collision_matrix"):
@@ -314,17 +355,6 @@ def test_a_mimic_joint_elsewhere_than_its_master_puts_it_is_a_note(tmp_path: Pat
     assert entry.load().notes == ("start_state: follow is 0.01; planned at 0.03, which grip implies",)
 
 
-def test_padding_and_scale_of_links_are_noted() -> None:
-    data = {
-        "link_padding": [{"link_name": "panda_hand", "padding": 0.02}, {"link_name": "b", "padding": 0.0}],
-        "link_scale": [{"link_name": "panda_hand", "scale": 1.1}, {"link_name": "other", "scale": 1.0}],
-    }
-    assert scene_robot_notes(data, rd.load_robot("panda")) == (
-        "the scene's link_padding of panda_hand is ignored",
-        "the scene's link_scale of panda_hand is ignored",
-    )
-
-
 def pose_constraint() -> dict[str, Any]:
     region = {"primitive_poses": [{"position": [0.4, 0, 0.5], "orientation": [0, 0, 0, 1]}]}
     return {
@@ -396,7 +426,7 @@ def pose_request(path: list[Any], value: object) -> dict[str, Any]:
     return request_data() | {"goal_constraints": [change(pose_constraint(), path, value)]}
 
 
-def test_scaling_factors_and_the_velocity_of_a_start_state_are_noted() -> None:
+def test_scaling_factors_padding_and_the_velocity_of_a_start_state_are_noted() -> None:
     asked = {"max_velocity_scaling_factor": 0.1, "max_acceleration_scaling_factor": 1.0}
     data: dict[str, Any] = request_data() | asked
     data["start_state"]["joint_state"]["velocity"] = [0.0, 0.3]
@@ -404,6 +434,9 @@ def test_scaling_factors_and_the_velocity_of_a_start_state_are_noted() -> None:
         "the request's max_velocity_scaling_factor 0.1 is ignored: plan with velocity_scaling=0.1",
         "start_state.joint_state.velocity [0.0, 0.3] is ignored: the motion begins at rest",
     }
+    padded = [{"link_name": "panda_hand", "padding": 0.02}, {"link_name": "b", "padding": 0.0}]
+    notes = scene_robot_notes({"link_padding": padded}, rd.load_robot("panda"))
+    assert notes == ("the scene's link_padding of panda_hand is ignored",)
 
 
 WRONG_REQUESTS: dict[str, tuple[object, str]] = {
