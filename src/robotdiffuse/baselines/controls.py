@@ -29,20 +29,21 @@ VIAS = "vias"
 NEAREST = "nearest_motions"
 NOISE = "smooth_noise"
 LIBRARY_SHARDS = 10
-"""Shards of a data set that the nearest motions are taken from, some thousand motions."""
+"""Number of shards of a data set from which the nearest motions are taken: some thousand motions."""
 WAYPOINTS = 48
-"""Waypoints of candidates: as many as the networks have."""
+"""Number of waypoints of a candidate, the same as of the networks' motions."""
 SPREAD = 0.127
-"""Standard deviation of smooth noise over the waypoints, as a fraction of half a joint's range: the mean over
-the Panda's joints."""
+"""Standard deviation of smooth noise, as a fraction of half the range of a joint. It is that of the noise of
+the Panda's bundled network, averaged over the joints."""
 MAX_HALF_RANGE = np.pi
-"""Half a joint's range counts as no more than this [rad]: continuous joints have no limits."""
+"""Largest value of half a joint's range in this computation [rad]: continuous joints have no limits."""
 WAVES = 8
-"""Number of sines; more would add less than a hundredth."""
+"""Number of sines in the sum; more sines would add less than a hundredth."""
 VARIANCE_EXPONENT = 3.5
-"""The variance of the sine of k half waves falls as k to this power."""
+"""The variance of the sine with k half waves falls as k to the power of minus this."""
 EQUAL_TIME_STEPS = 110
-"""Gradient steps of 16 candidates that take about as long as six guided denoising steps of 16 samples."""
+"""Number of gradient steps of 16 candidates that take about as long as six guided denoising steps of 16
+samples."""
 
 
 @dataclass(frozen=True)
@@ -51,11 +52,11 @@ class ControlSettings(Settings, name="control"):
     """What candidates are: fixed vias, which only the Panda has; the motions of a data set with the nearest
     ends, bent to start and goal; or smooth noise about the straight line."""
     samples: Count = 16
-    """Candidates."""
+    """Number of candidates."""
     guidance_steps: Natural = EQUAL_TIME_STEPS
-    """Gradient steps of guidance on them."""
+    """Number of gradient steps of guidance on the candidates."""
     data: str | None = None
-    """Folder of the data set of the nearest motions."""
+    """Folder of the data set from which the nearest motions are taken."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -103,11 +103,11 @@ last one and in the steps without noise after it), to the mean after gradient st
 @dataclass(frozen=True)
 class PriorSettings(LearnedSettings):
     samples: Count = 16
-    """Trajectories per batch."""
+    """Number of trajectories in a batch."""
     sampling_steps: Annotated[int, Bound(least=2.0)] = 25
-    """Denoising steps."""
+    """Number of denoising steps."""
     self_margin: NotNegative = 0.01
-    """Links nearer to each other than this have a cost [m]."""
+    """Links whose distance from each other is below this have a cost [m]."""
     push: Positive = 0.1
     """Longest move of a waypoint in one gradient step [rad]."""
 
@@ -286,7 +286,7 @@ def limited(moves: Trajectories, most: float) -> Trajectories:
 
 
 GUIDE_STEPS = 5
-"""Gradient steps at each guided denoising step."""
+"""Number of gradient steps at each guided denoising step."""
 LIMIT_MARGIN = 0.02
 """Joints nearer to their limits than this are moved away from them [rad]."""
 COLLISION_WEIGHT = 0.1
@@ -304,11 +304,11 @@ class MPDSettings(PriorSettings, name="mpd"):
     """Settings of MPD. The noise levels are spaced as in MPD's exponential schedule."""
 
     guided_share: Share = 0.25
-    """Part of the denoising steps that are guided, the last ones; the quiet steps always are."""
+    """Fraction of the denoising steps that are guided: the last ones. The quiet steps are always guided."""
     margin: NotNegative = 0.04
-    """Spheres nearer to obstacles than this have a collision cost [m]."""
+    """Spheres whose distance to obstacles is below this have a collision cost [m]."""
     between: Natural = 1
-    """Places between two waypoints at which the collision cost is evaluated."""
+    """Number of places between two waypoints at which the collision cost is evaluated."""
 
 
 def exponential_levels(schedule: NoiseSchedule, steps: int) -> NoiseLevels:
@@ -410,16 +410,16 @@ class GuideSettings(Settings, name="edmp.guides"):
     """One guide of the ensemble."""
 
     between: Natural
-    """Places between two waypoints at which the cost is evaluated: 0 for the intersection cost, more for the
-    swept one."""
+    """Number of places between two waypoints at which the cost is evaluated: 0 for the intersection cost,
+    more for the swept-volume cost."""
     far_margin: NotNegative
     """Margin by which obstacles are expanded at the first guided step [m]."""
     near_margin: NotNegative
-    """Margin at the last step [m]; it falls linearly from one to the other."""
+    """Margin at the last guided step [m]; the margin falls linearly from `far_margin` to this."""
     weight: NotNegative
     """Weight of the cost [rad²/m]: a waypoint that is too close moves by about this times 0.5 m/rad."""
     guided_share: Share
-    """Part of the denoising steps that are guided, the last ones."""
+    """Fraction of the denoising steps that are guided: the last ones."""
 
     def margin(self, left: int, steps: int) -> float | None:
         """The margin where `left` of `steps` denoising steps are still to come [m]; None: not guided yet."""
@@ -441,9 +441,9 @@ ENSEMBLE = tuple(
 @dataclass(frozen=True)
 class EDMPSettings(PriorSettings, name="edmp"):
     samples: Count = 24
-    """Trajectories per batch, divided evenly among the guides."""
+    """Number of trajectories in a batch, divided evenly among the guides."""
     sampling_steps: Annotated[int, Bound(least=2.0)] = 30
-    """Denoising steps, closer where there is little noise."""
+    """Number of denoising steps; the noise levels are closer together where there is little noise."""
     push: Positive = 0.15
     """Longest move of a waypoint in one gradient step [rad]."""
     guides: Annotated[tuple[GuideSettings, ...], Filled()] = ENSEMBLE

@@ -43,11 +43,11 @@ forever."""
 @dataclass(frozen=True)
 class MPiNetsSettings(LearnedSettings, name="mpinets"):
     steps: Count = 150
-    """Most steps of a roll-out (the paper's)."""
+    """Largest number of steps of a roll-out (the paper's)."""
     near: NotNegative = 0.3
-    """Largest distance of a joint at which a straight edge to the goal is tried [rad]."""
+    """A straight edge to the goal is tried if no joint is further from the goal than this [rad]."""
     batch: Count = 8
-    """Roll-outs at once; the first one runs alone."""
+    """Number of roll-outs at once; the first one runs alone."""
     noise: NotNegative = 0.015
     """Standard deviation of the noise on the arm's configuration in the network inputs, as in training [rad];
     none in the first roll-out."""
@@ -130,7 +130,7 @@ class _Motion:
         self.goal = goal
         self.collided = self.arrived = False
         self.moving = True
-        """Whether it has neither arrived nor come to a standstill."""
+        """Whether the roll-out has neither arrived nor come to a standstill."""
 
     @property
     def free(self) -> bool:

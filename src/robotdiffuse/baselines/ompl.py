@@ -45,11 +45,12 @@ with needs("OMPL's Python bindings", "baselines"):
     from ompl import util as ou
 
 IMPROVEMENT = 0.01
-"""An anytime planner stops to have a path validated when it is shorter than the last by this part."""
+"""An anytime planner has a path validated when the path is shorter than the last validated one by this
+fraction."""
 OPTIMAL = 1e-4
-"""A path that exceeds the straight line by at most this part is optimal."""
+"""A path counts as optimal if it is longer than the straight line by at most this fraction."""
 SAME_STATE_DISTANCE = 1e-6
-"""A start and a goal closer than this are the same [rad]."""
+"""A start and a goal whose distance is below this count as the same [rad]."""
 
 
 @dataclass(frozen=True)
@@ -171,7 +172,7 @@ class OmplPlanner(Planner[OmplSettings]):
     settings_class = OmplSettings
     algorithm: ClassVar[type[ob.Planner]]
     anytime: ClassVar[bool] = False
-    """Whether it improves its first path."""
+    """Whether the planner improves its first path."""
     backwards: ClassVar[bool] = False
     """Whether OMPL searches from the goals to the start."""
 

@@ -48,17 +48,19 @@ from robotdiffuse.scenes.shapes import Box, Sphere
 
 ROWS_PER_SHARD = 500
 FAMILY = "own"
-"""Name of the family of all scenes of `write_dataset`."""
+"""Family name of all scenes of a data set written by `write_dataset`."""
 RESOLUTION = 0.02
 """No point of the arm moves further than this between two checks of the straight line [m]."""
 WAYPOINTS = 254
 DOF = 7
 CONDITION_NUMBERS = 23
-"""Numbers of a condition in robot.npz."""
+"""Number of values of a condition (a row of `y_train`) in robot.npz."""
 SPHERE_RADIUS = 0.25
-"""[m]; that of the authors' planner. Their loader and viewer use 0.2, which leaves a margin of 5 cm."""
+"""Radius of the spheres [m], as in the authors' planner. Their loader and viewer use 0.2, which leaves a
+margin of 5 cm."""
 END_TOLERANCE = 1e-4
-"""Largest difference of start and goal from the first and last waypoint [rad]."""
+"""Largest difference between the start and the first waypoint, and between the goal and the last waypoint
+[rad]."""
 ARRAYS_READ = ("trajectories", "start", "target_pose", "obstacle_kinds", "obstacle_params")
 
 

@@ -27,9 +27,9 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 
 SHARDS_PER_BLOCK = 16
-"""Shards that are shuffled together; 16 of 500 rows map 57 MB."""
+"""Number of shards whose rows are shuffled together. 16 shards of 500 rows map 57 MB."""
 MAX_THREADS = 8
-"""Most threads that prefetch batches."""
+"""Largest number of threads that prefetch batches."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,16 +39,16 @@ class RopBatch:
     trajectories: Float32[Tensor, "n waypoints dof"]
     """Scaled so that the robot's limits are -1 and 1."""
     start: Float32[Tensor, "n dof"]
-    """The first waypoint, scaled too."""
+    """The first waypoint, scaled like the trajectories."""
     goal: Float32[Tensor, "n dof"]
-    """The goal that was reached: the last waypoint, scaled too."""
+    """The goal that was reached, which is the last waypoint, scaled like the trajectories."""
     target_pose: Float32[Tensor, "n 7"]
     """Pose of the robot's tip in the base frame, wxyz_xyz."""
     obstacle_kinds: Int8[Tensor, "n slots"]
-    """As in `PackedScenes`."""
+    """Kinds of the obstacles, as in `PackedScenes`."""
     obstacle_params: Float32[Tensor, "n slots 10"]
     points: Float32[Tensor, "n points 3"]
-    """On the obstacles, in the base frame [m]."""
+    """Points on the obstacles, in the base frame [m]."""
 
     def __len__(self) -> int:
         return len(self.trajectories)

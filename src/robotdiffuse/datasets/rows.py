@@ -135,7 +135,7 @@ def motion_of(robot: Robot, shard: Shard, row: int) -> Path | Trajectory:
 # Training
 
 ARRAYS_READ = ("trajectories", "target_pose", "obstacle_kinds", "obstacle_params", "family")
-"""The arrays that `read_rows` reads if it does not check whole shards."""
+"""Names of the arrays that `read_rows` reads if it does not check whole shards."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,9 +145,9 @@ class Rows:
     shard: Shard
     """The shard that the rows come from; its arrays are never turned."""
     turn: int
-    """Number of the copy; 0 for the rows themselves."""
+    """Number of the turned copy; 0 for the rows as they are in the shard."""
     q: Float32[ndarray, "n waypoints dof"]
-    """[rad]"""
+    """Joint values of the waypoints [rad]."""
     scenes: PackedScenes
     """The scenes with their floors."""
     split: Int8[ndarray, "n"]

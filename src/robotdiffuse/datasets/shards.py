@@ -43,7 +43,7 @@ class Manifest(Settings):
     """Robot, scenes, settings and versions of a data set."""
 
     robot: str
-    """A bundled name, or the path of a URDF."""
+    """Name of a bundled robot, or the path of a URDF."""
     robot_fingerprint: str
     joint_names: tuple[str, ...]
     lower: tuple[float, ...]
@@ -55,17 +55,18 @@ class Manifest(Settings):
     families: dict[str, dict[str, Any]]
     """Settings of each family of scenes; their order gives the numbers of the array `family`."""
     floors: dict[str, dict[str, list[float]] | None]
-    """`center` and `size` of the box that the scenes of each family stand on [m]; None without one."""
+    """By family, `center` and `size` of the box on which its scenes stand [m]; None for a family without a
+    floor."""
     slots: Natural
     """Largest number of obstacles in a scene."""
     goals: Count
     """Largest number of goal configurations of a problem."""
     trajectories: Natural
-    """Number of trajectories of the whole set."""
+    """Number of trajectories of the whole data set."""
     shard: Count
-    """Rows per shard."""
+    """Number of rows of a shard."""
     settings: dict[str, Any]
-    """Settings of the generation."""
+    """Settings of the generation of the data set."""
     versions: dict[str, str]
 
     def __post_init__(self) -> None:
@@ -152,7 +153,7 @@ def check_format(file: FilePath, found: object) -> None:
 # Shards
 
 COMPRESSION_LEVEL = 3
-"""Level of Zstandard."""
+"""Compression level of Zstandard."""
 
 SPLITS = ("train", "validation", "test")
 SPLIT_PERCENT = (90, 5, 5)
@@ -200,7 +201,7 @@ class Shard:
     index: int
     fingerprint: str
     counts: dict[str, int]
-    """Numbers of problems tried, solved, unsolved, thinned, refused, ..."""
+    """Numbers of problems by outcome: tried, solved, unsolved, thinned, refused, ..."""
     arrays: dict[str, ndarray]
     """Arrays by their names in ARRAYS."""
 

@@ -61,7 +61,7 @@ class PlannerSpec:
     """A planner as the bench loads and calls it."""
 
     name: str
-    """In `planning.PLANNERS`."""
+    """Name of the planner in `planning.PLANNERS`."""
     weights: str | None = None
     """Folder of the planner's weights; None: the bundled weights."""
     settings: tuple[str, ...] = ()
@@ -134,7 +134,7 @@ RESTARTS_TIMEOUT_FACTOR = 20.0
 """Timeout of planners that restart, as a multiple of the time limit. It is long because the limit does not
 include the timing of each path."""
 RUNS_PER_TASK = 20
-"""Runs of one planner that a node of a cluster makes with one start of the process."""
+"""Number of runs of a planner that a node of a cluster makes before its process is started again."""
 
 
 class PlannerProcess:
@@ -342,7 +342,7 @@ class BenchSettings(Settings):
     out: FilePath
     """Folder for problems and results."""
     time_limit: Positive = 1.0
-    """Time limit of a call [s]."""
+    """ALL Time limit of a call [s]."""
     seeds: Count = 1
     """Number of calls on each problem, with seeds 0, 1, ..."""
     count: Count | None = None
@@ -487,7 +487,7 @@ class Preset:
     planners: tuple[str, ...]
     problems: tuple[str, ...]
     limits: tuple[float, ...]
-    """Time limit of a call [s]."""
+    """ALL Time limit of a call [s]."""
     count: int
     """Number of problems of each set."""
     equal_time: bool = True

@@ -40,12 +40,14 @@ from robotdiffuse.problems.held_out import Case
 from robotdiffuse.problems.problem import JointGoal
 
 LIMITS = (0.1, 1.0, 10.0, 60.0)
-"""Time limits that a report adds to those of its records, up to the longest of those [s]."""
+"""Time limits that a report evaluates in addition to the limits of its records, up to the longest of these
+[s]."""
 NONTRIVIAL_LABEL = ", non-trivial"
 LATE_SHARE = 0.1
+"""A late motion still counts if it is late by at most this fraction of the time limit, or by LATE_SECONDS:
+planners stop searching in time, but then the motion is validated."""
 LATE_SECONDS = 0.05
-"""A motion counts if it is late by at most this fraction of the limit, or this time [s]: planners stop
-searching in time, but validation follows."""
+"""See LATE_SHARE [s]."""
 RAN_OUT = "time ran out"
 GAVE_UP = "gave up before"
 LATER = "found one later"
@@ -60,7 +62,7 @@ it; the last path hit an obstacle, the arm itself, or broke limits, missed the g
 were refused; the process died, or did not answer and was killed; an exception."""
 
 Key = tuple[str, int]
-"""A problem of a set by name, and a seed."""
+"""Name of a problem in its set, and a seed."""
 Calls = dict[Key, list[Record]]
 """The records of one planner on one problem set, shorter limits first."""
 
@@ -76,7 +78,8 @@ class Bench:
     sessions: tuple[dict[str, Any], ...]
     """A note on each call of `bench run`: machine, versions, settings."""
     records: dict[str, list[Record]]
-    """By planner, in the order of PLANNERS; rows with restarts follow those without."""
+    """Records by planner, in the order of PLANNERS; the rows of a planner with restarts follow those
+    without."""
 
     @property
     def reference(self) -> str:
@@ -141,7 +144,7 @@ class Outcome:
     returned: float
     """Time at which the planner returns [s]; the limit for anytime planners and without a path."""
     joint_length: float
-    """Length of the best path by then [rad]; NaN without one."""
+    """Length of the best path found by the time limit [rad]; NaN without a path."""
     link_length: float
     """The paper's path length [m], scaled by the joint lengths if the path by then is not the returned one;
     NaN without a path."""
@@ -211,7 +214,7 @@ class Mean(NamedTuple):
 
     value: float
     half: float
-    """Half the width of its 95 % interval, by the standard error."""
+    """Half the width of the 95 % interval of the mean, computed from the standard error."""
 
     @classmethod
     def of(cls, values: Iterable[float | None]) -> "Mean":
@@ -235,20 +238,20 @@ class Row:
 
     planner: str
     outcomes: tuple[Outcome, ...]
-    """Of all problems and seeds of the table."""
+    """Outcomes of all problems and seeds of the table."""
     figures: Indicators
     """The paper's four indicators. The length is that of the solved problems, NaN without any; the time is
     the mean until the planner returns, the limit for an unsolved problem."""
     interval: tuple[float, float]
     """The 95 % interval of the share of solved problems, by E. B. Wilson's method over problems."""
     comscore: float
-    """Among the rows of this table."""
+    """ComScore, normalized over the rows of this table."""
     paired: Paired | None
     """Comparison with the reference by joint-space lengths; None for the reference and without it."""
     full: bool
     """Whether all solved calls used up the limit, with restarts or without."""
     timed: str
-    """The sessions that made the calls, and the calls at a time in these."""
+    """The sessions in which the calls were made, with the number of simultaneous calls in each."""
 
     @property
     def solved(self) -> list[Outcome]:
@@ -276,14 +279,14 @@ class Comparison:
     limit: float
     problems: int
     of: int
-    """Problems in the section."""
+    """Number of problems in the section."""
     seeds: int
     rows: tuple[Row, ...]
     missing: tuple[str, ...]
     """Planners without results for this limit."""
     keys: tuple[Key, ...]
     loads: tuple[float, ...]
-    """Load averages after the calls, where they were noted."""
+    """Load averages of the machine after the calls, as far as they were recorded."""
 
     @property
     def alike(self) -> bool:
@@ -303,11 +306,11 @@ class Curve:
     planner: str
     calls: int
     end: float
-    """Results later than this [s] are known for some problems only."""
+    """Until this time, results are known for all problems; later ones for some problems only [s]."""
     found: Values
     """Times of first paths [s], sorted."""
     times: Values
-    """Times from which half of these problems are solved [s]."""
+    """Times at which the median ratio is computed: half of these problems are solved by then [s]."""
     ratios: Values
     """Median at these times of joint-space length over the best known one, on the non-trivial problems that
     the planner solves in the end; problems not solved yet count as infinite."""
@@ -320,7 +323,7 @@ class Section:
     name: str
     problem_set: str
     comparisons: tuple[Comparison, ...]
-    """Shorter limits first."""
+    """Comparisons by time limit, shorter limits first."""
     curves: tuple[Curve, ...]
 
     @property
@@ -525,7 +528,7 @@ NOTES = """\
   closer to 0 is smoother.
 - p of success: McNemar's exact test; p of joint length: Wilcoxon's signed ranks; neither is corrected for
   the number of comparisons. With several seeds, a problem counts as solved if more than half of them are."""
-"""Markdown."""
+"""Notes below the tables, in Markdown."""
 
 
 def named(planner: str) -> str:
@@ -803,7 +806,7 @@ def crashes(bench: Bench) -> list[str]:
 
 MAX_REPLAYS = 12
 SOLVED_PROBLEMS = 2
-"""In replays, each with two planners; the other replays are of failures."""
+"""Number of solved problems in the replays, each with two planners. The other replays show failures."""
 
 
 class Replay(NamedTuple):

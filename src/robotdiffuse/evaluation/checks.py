@@ -52,29 +52,30 @@ KINDS: dict[str, str] = {
 }
 """Kinds of findings, with their titles."""
 EXAMPLES_PER_KIND = 5
-"""Findings of each kind that are listed."""
+"""Number of findings of each kind that are listed."""
 
 LIMIT_SLACK = 1e-6
 """Tolerance of limits [rad], as waypoints are in single precision."""
 CLEARANCE_TOLERANCE = 1e-4
-"""Largest difference of the recorded clearance from the least one of the waypoints by covering spheres
-[m]."""
+"""Largest difference between the recorded clearance and the minimum over the waypoints of the clearance of
+the covering spheres [m]."""
 COST_TOLERANCE = 0.05
-"""Largest share by which waypoints, which cut corners, may be shorter than the recorded length."""
+"""Largest fraction by which the path through the waypoints, which cuts corners, may be shorter than the
+recorded length."""
 ROUNDING = 1e-4
-"""Largest share by which waypoints may be longer than the recorded length; also the tolerance of the
-detour."""
+"""Largest fraction by which the path through the waypoints may be longer than the recorded length; also the
+tolerance of the detour."""
 PYBULLET_STEP = 0.01
 """PyBullet checks every waypoint, and configurations between them at most this far apart [rad, joint-space
 L2]."""
 PYBULLET_TOLERANCE = 0.001
 """Contacts of less depth are rounding errors of Bullet [m]."""
 MOTIONS_PER_TASK = 100
-"""Motions of a shard that a process checks in one task."""
+"""Number of motions of a shard that a process checks in one task."""
 
 
 Defects = Iterator[tuple[str, str]]
-"""Kind and message of each."""
+"""Defects, each as kind and message."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ class Finding:
     """One of KINDS."""
     shard: int
     row: int | None
-    """None for the whole shard."""
+    """Row in the shard; None if the finding is about the whole shard."""
     message: str
 
     @property
@@ -99,21 +100,22 @@ class DataCheck:
 
     robot: str
     shards: int
-    """Shards, complete or damaged."""
+    """Number of shards, complete or damaged."""
     motions: int
-    """Motions in complete shards."""
+    """Number of motions in complete shards."""
     planned: int
-    """Motions according to the manifest."""
+    """Number of motions according to the manifest."""
     checked: int
-    """Motions that were validated."""
+    """Number of motions that were validated."""
     pybullet: bool
     """Whether PyBullet checked too."""
     findings: tuple[Finding, ...]
-    """By shard and row."""
+    """Findings, ordered by shard and row."""
     least_clearance: float
-    """Least recorded distance between arm and obstacles of the validated motions [m]; NaN without any."""
+    """Smallest recorded distance between arm and obstacles over all validated motions [m]; NaN if there are
+    none."""
     seconds: float
-    """Wall time."""
+    """Wall time of the check [s]."""
 
     @property
     def counts(self) -> Counter[str]:
@@ -322,7 +324,7 @@ def _lengths(shard: Shard, row: int, path: Path) -> Defects:
 # Motions of a bench
 
 CONFIRM_STEP = 0.02
-"""Between checked configurations [rad, joint-space L2]."""
+"""Largest distance between two checked configurations [rad, joint-space L2]."""
 
 
 @dataclass(frozen=True)
@@ -330,7 +332,8 @@ class Confirmation:
     checked: dict[str, int]
     """Number of checked motions by planner."""
     refuted: "list[tuple[Record, OracleContact]]"
-    """Motions that were returned as solved and collide by PyBullet, with the first contact."""
+    """Records of motions that were returned as solved but collide according to PyBullet, each with the first
+    contact."""
 
 
 def confirm(out: FilePath, count: int | None, progress: Callable[[int, int], None]) -> Confirmation:

@@ -35,15 +35,15 @@ QUANTITIES = {
 SPREAD = {"least": 0.0, "5 %": 0.05, "median": 0.5, "95 %": 0.95, "most": 1.0}
 """Quantiles of each quantity over the motions."""
 SAMPLED_MOTIONS = 20_000
-"""Motions, spread evenly over the set, whose larger arrays are kept for the plots."""
+"""Number of motions, spread evenly over the data set, whose larger arrays are kept for the plots."""
 SAMPLED_WAYPOINTS = 24
-"""Waypoints of each of these motions, spread evenly."""
+"""Number of waypoints that are kept of each of these motions, spread evenly."""
 ARRAYS_OF_ALL = ("cost", "clearance", "end_clearance", "safety_distance", "line_free", "detour", "family")
 """Arrays that are read for all motions."""
 ARRAYS_OF_SAMPLE = ("goal_costs", "trajectories")
 """Arrays that are read for the sampled motions only."""
 ARRAYS_OF_SCENES = ("obstacle_kinds", "obstacle_params")
-"""Arrays from which the split of a row follows."""
+"""Arrays from which the split of a row is computed."""
 OUTCOMES = ("solved", "unsolved", "refused", "thinned")
 """Outcomes of problems."""
 DETOURS = {
@@ -73,13 +73,14 @@ class DataFigures:
     bytes: int
     """Size on disk."""
     counts: Counter[str]
-    """Numbers of problems `tried` and by OUTCOMES, over all shards."""
+    """Number of problems over all shards: all that were `tried`, and by outcome (see OUTCOMES)."""
     splits: dict[str, int]
-    """Trajectories by split."""
+    """Number of trajectories, by split."""
     all: dict[str, ndarray] = field(repr=False)
-    """ARRAYS_OF_ALL, of all motions."""
+    """The arrays of ARRAYS_OF_ALL, over all motions."""
     sample: dict[str, ndarray] = field(repr=False)
-    """ARRAYS_OF_SAMPLE, of the sample; `trajectories` with SAMPLED_WAYPOINTS waypoints."""
+    """The arrays of ARRAYS_OF_SAMPLE, over the sampled motions; `trajectories` have SAMPLED_WAYPOINTS
+    waypoints."""
 
     @property
     def trajectories(self) -> int:

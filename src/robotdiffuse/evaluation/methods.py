@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from robotdiffuse.learning.motion_model import ClearanceFn
 
 NETWORK_ALONE = DiffusionSettings(sampling_steps=6, guidance_steps=4)
-"""Settings of networks whose samples are measured."""
+"""Planner settings with which the samples of networks are measured."""
 UNSOLVED = Status.NO_PATH.value
 
 
@@ -145,7 +145,7 @@ def fields_of(result: PlanResult, robot: Robot) -> Fields:
 
 
 Draw = Callable[[Run, CollisionChecker], ndarray]
-"""A batch of trajectories [count, waypoints, dof] for a run."""
+"""A function that returns a batch of trajectories [count, waypoints, dof] for a run."""
 
 
 class Validated(NamedTuple):
@@ -156,7 +156,7 @@ class Validated(NamedTuple):
     """Which trajectories are in collision."""
     reports: list[Report]
     waypoints: Trajectories
-    """The trajectories with exact ends."""
+    """The trajectories; their first and last waypoints are exactly start and goal."""
 
 
 def validated(problem: Problem, q: Trajectories) -> Validated:

@@ -19,11 +19,12 @@ from robotdiffuse.problems.problem import Problem
 from robotdiffuse.validation.validator import VerifySettings, verifier
 
 NONTRIVIAL_SUFFIX = "_nontrivial"
-"""Suffix of a family: only problems that search solves and the straight line does not."""
+"""Suffix of a family's name for the set of its problems that a search solves and the straight line does
+not."""
 SEARCH_TIME = 10.0
-"""Problems that search does not solve in this time count as unsolvable [s]."""
+"""A problem counts as unsolvable if the search does not solve it in this time [s]."""
 REFERENCE_ITERATIONS = 20_000
-"""Least iterations of the search for the reference length."""
+"""Minimum number of iterations of the search for the reference length."""
 
 
 def validator(problem: Problem, path: Path) -> bool:

@@ -28,17 +28,17 @@ SOLVED = Status.SOLVED.value
 CRASHED = "crashed"
 OVERRAN = "overran"
 RAISED = "exception"
-"""Statuses of records beside those of `types.Status`: the process died, did not answer, or the planner
-raised."""
+"""Statuses of records in addition to `types.Status`: the process died (crashed), it did not answer (overran),
+or the planner raised an exception."""
 ENDED_EARLY = 0.9
 """A call that took less than this share of its time limit ended by itself: a longer limit changes nothing."""
 SHORTEST_FACTOR = 1 + 1e-6
-"""A path counts as the shortest if it is at most so many times as long as the shortest known or possible
+"""A path counts as the shortest if it is at most this factor longer than the shortest known or possible
 one."""
 RESTARTABLE = {SOLVED, Status.TIMEOUT.value, Status.NO_PATH.value}
 """Statuses that another seed can change."""
 RESTARTED = "+restarts"
-"""Suffix of a planner's name whose calls were repeated until the time limit."""
+"""Suffix of the name of a planner whose calls were repeated until the time limit."""
 
 
 @dataclass(frozen=True)
@@ -63,16 +63,17 @@ class Record:
     cpu: float | None = None
     """CPU time [s], where it was measured."""
     restarts: int | None = None
-    """How often the planner was called again; None if it was not to be."""
+    """How often the planner was called again; None if it should not be called again."""
     refused: str = ""
     """Why the validator refused the last path, see PlanResult."""
     stage: str = ""
     progress: tuple[tuple[float, float], ...] = ()
-    """Time of each shorter path [s] and its joint-space length [rad]."""
+    """Each path that was shorter than the ones before: the time when it was found [s] and its joint-space
+    length [rad]."""
     passed: float | None = None
     """Share of the samples of a batch that passed the validator."""
     collided: float | None = None
-    """Share of the samples in collision."""
+    """Share of the samples of a batch that collide."""
     reference: float | None = None
     """Length of the shortest known path [rad], see `held_out.Case`."""
     measures: dict[str, float] = field(default_factory=dict)
@@ -83,7 +84,7 @@ class Record:
     run: str = ""
     """Start of the session that made the call; empty if it was not noted."""
     workers: int | str = ""
-    """Number of calls at a time, or the cluster."""
+    """Number of simultaneous calls, or the name of the cluster."""
     load: float | None = None
     """Load average of the machine after the call."""
     positions: tuple[tuple[float, ...], ...] = ()
@@ -203,7 +204,7 @@ class Run:
     index: int
     """Place of the case among all cases."""
     method: str
-    """Its name in records."""
+    """Name of the planner or method in records."""
     seed: int
     limit: float = np.inf
     """Time limit [s]."""

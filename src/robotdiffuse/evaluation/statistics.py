@@ -43,7 +43,7 @@ class Paired:
     """Planner A against planner B on the same problems."""
 
     a_only: int
-    """Problems that A alone solves."""
+    """Number of problems that only A solves."""
     b_only: int
     both: int
     neither: int
@@ -51,7 +51,7 @@ class Paired:
     """Probability of a split of `a_only` and `b_only` this uneven or more if both planners were equally good:
     exact test of Q. McNemar 1947, two-sided; 1.0 if they solve the same problems."""
     ratio: float | None
-    """Median of length of A / length of B over the problems that both solve; None without any."""
+    """Median of the ratio of A's length to B's over the problems that both solve; None if there are none."""
     ratio_interval: tuple[float, float] | None
     """The 95 % interval of the ratio, by resampling the problems."""
     p_length: float
@@ -103,13 +103,13 @@ class Indicators:
     collision: float
     """Share of motions in collision."""
     length: float
-    """Path length; in the paper that of all links, without a unit."""
+    """Path length; in the paper the sum over all links, without a unit."""
     time: float
     """Time per problem [s]."""
 
 
 HIGHER_IS_BETTER = np.array([True, False, False, False])
-"""For the fields of Indicators, in their order."""
+"""For each field of Indicators, whether higher values are better."""
 
 
 def normalized(rows: Sequence[Indicators]) -> Float[ndarray, "n 4"]:

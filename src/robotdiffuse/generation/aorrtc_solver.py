@@ -20,7 +20,7 @@ from robotdiffuse.planning.start_goal import StartGoal, falling_clearances
 from robotdiffuse.robots.kinematic_tree import TURN
 
 ITERATIONS_PER_STEP = 500
-"""Between two checks whether to stop."""
+"""Number of iterations between two checks whether the search must stop."""
 
 
 @dataclass(frozen=True)
@@ -28,16 +28,17 @@ class AORRTCSearchSettings(Settings, name="aorrtc"):
     safety_distance: NotNegative = 0.05
     """Distance to obstacles that paths keep [m]; the default follows from the authors' scenes."""
     tries: Count = 1_500
-    """Iterations without a path before the distance is lowered; at the last step the search ends after three
-    times as many."""
+    """The safety distance is lowered after this many iterations without a path. At the lowest distance, the
+    search ends after three times as many."""
     range: Positive = 1.0
     """Longest extension of a tree [rad, joint-space L2]."""
     resolution: Positive = 0.02
     """No point of the arm moves further than this between two checks of a motion [m]."""
     gain: Annotated[float, Bound(least=0.0, below=1.0)] = 0.01
-    """The search ends when the last doubling of iterations shortened the path by less than this share."""
+    """The search ends when the last doubling of the iterations shortened the path by less than this
+    fraction."""
     patience: Natural = 4_000
-    """Minimum number of iterations."""
+    """Minimum number of iterations before `gain` can end the search."""
 
 
 class AORRTCSearch:
@@ -67,7 +68,7 @@ class AORRTCSearch:
             tries=settings.tries,
         )
         self.best_goal = -1
-        """Index of the goal that the path leads to; -1 without a path."""
+        """Index of the goal to which the path leads; -1 if there is no path."""
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Search until no path can be shorter, more iterations do not pay, there seems to be no path, or

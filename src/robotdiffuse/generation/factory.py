@@ -51,7 +51,7 @@ from robotdiffuse.trajectories.timing import time_parameterize
 from robotdiffuse.validation.validator import Verifier, VerifySettings
 
 PACKAGES = ("numpy", "numba", "zarr")
-"""Packages that the data depend on."""
+"""Names of the packages on whose versions the data depend."""
 SEARCHES = Registry(
     "planner of data",
     {
@@ -78,27 +78,28 @@ class GenerationSettings(Settings):
     interruptions."""
 
     robot: str = "panda"
-    """Bundled name, or path to a URDF."""
+    """Name of a bundled robot, or path to a URDF."""
     trajectories: Count = 140_000
-    """Solved and verified motions to make, each in a scene of its own (the paper: 0.14 million)."""
+    """Number of solved and validated motions, each in its own scene (the paper: 0.14 million)."""
     seed: Natural = 0
     mix: dict[str, float] = field(default_factory=lambda: {"rop": 1.0})
-    """Relative shares of problems by family of scenes; the default is the paper's. Rows of the data hold the
-    number of their family in this order."""
+    """Relative share of the problems of each family of scenes; the default is the paper's. A row of the data
+    contains the number of its family in this order."""
     trivial_share: Share = 1.0
-    """Share of the problems solved by the straight line that is kept; 1 is the paper's distribution."""
+    """Share of the trivial problems (those that the straight line solves) that is kept; 1 is the paper's
+    distribution."""
     target: Annotated[str, OneOf(TARGETS)] = POSITION
     """Goal of the tip: its position alone, as in the paper, or its pose. Families of furniture always use the
     pose."""
     goals: Annotated[int, Bound(least=1.0, most=127.0)] = 10
     """Largest number of goal configurations of a target, found by inverse kinematics (the paper's k)."""
     waypoints: Annotated[int, Bound(least=2.0)] = 254
-    """Waypoints of a trajectory (the authors' number)."""
+    """Number of waypoints of a trajectory (the authors' number)."""
     timing: Annotated[str, OneOf(TIMINGS)] = "arc"
     """Spacing of waypoints: evenly in joint-space length (arc), or in time by time parameterization
     (time)."""
     shard: Count = 500
-    """Trajectories in a shard. An interruption loses at most one shard."""
+    """Number of trajectories in a shard. An interruption loses at most one shard."""
     planner: Annotated[str, OneOf(SEARCHES)] = "shared_tree_rrt_star"
     """Planner that solves the problems; the default is the paper's."""
     search: Annotated[SharedTreeSettings | AORRTCSearchSettings, SettingsOf("planner", SEARCHES)] = field(
@@ -106,8 +107,8 @@ class GenerationSettings(Settings):
             resolution=0.02, improvement=0.01, patience=6, step_rounds=5, connect_iterations=800
         )
     )
-    """Settings of that planner. Those of the paper's planner make it faster than with its own defaults, and
-    paths 1 % longer."""
+    """Settings of the planner. With the default settings of this field, the paper's planner is faster than
+    with its own defaults, and paths are 1 % longer."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -143,9 +144,10 @@ class GenerationSettings(Settings):
 
 MAX_PROBLEMS_PER_ROW = 50
 EXTRA_PROBLEMS = 1_000
-"""A shard fails after MAX_PROBLEMS_PER_ROW problems for each of its rows and EXTRA_PROBLEMS more."""
+"""A shard fails after MAX_PROBLEMS_PER_ROW problems for each of its rows, and EXTRA_PROBLEMS more."""
 PROBLEMS_PER_SHARD = 2**32
-"""Problem numbers reserved for each shard, so that shards share none."""
+"""Number of problem numbers that are reserved for each shard, so that no two shards contain the same
+problem."""
 
 Arrays = dict[str, ndarray]
 Counts = dict[str, int]

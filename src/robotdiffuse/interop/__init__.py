@@ -24,7 +24,8 @@ WRITERS = Registry(
         ".yaml": Entry("robotdiffuse.interop.recorded_motion:write_yaml", "a ROS 2 JointTrajectory"),
     },
 )
-"""Functions of problem, trajectory and file, by the ending of the file."""
+"""Functions that write a trajectory, by the ending of the file. Their arguments are problem, trajectory and
+file."""
 READERS = Registry(
     "motion format",
     {
@@ -42,7 +43,8 @@ READERS = Registry(
         ".rosbag2": Entry("robotdiffuse.interop.ros2:read_recording", "a ROS 2 bag (a folder)"),
     },
 )
-"""Functions of a file and an optional topic, by the ending of the file."""
+"""Functions that read a motion, by the ending of the file. Their arguments are the file and an optional
+topic."""
 TRAJECTORY_ENDINGS = (".json", ".csv")
 """Endings that `Trajectory.save` writes."""
 

@@ -40,17 +40,18 @@ IMAGE = "sensor_msgs/msg/Image"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 ENCODINGS = {"32FC1": ("f4", 1.0), "16UC1": ("u2", 0.001), "mono16": ("u2", 0.001)}
-"""Types of the pixels of depth images, and meters per unit (REP 118)."""
+"""For each encoding of depth images, the type of the pixels and the length of a unit [m] (REP 118)."""
 Stamped = TypeVar("Stamped", bound=tuple[float, Any])
 MAX_SIZE = 64 * 10**9
-"""Largest recording [bytes]."""
+"""Largest size of a recording [bytes]."""
 MAX_GAP = 0.1
-"""Joint states and transforms are interpolated between two that are at most this far from the image [s]."""
+"""Joint states and transforms are interpolated between two messages that are at most this far from the image
+in time [s]."""
 
 
 class StampedView(NamedTuple):
     stamp: float
-    """When the image was taken [s]."""
+    """Time at which the image was taken [s]."""
     view: DepthView
 
 

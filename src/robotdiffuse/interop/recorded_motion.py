@@ -49,7 +49,7 @@ class RecordedMotion:
     joint_names: tuple[str, ...]
     positions: Float[ndarray, "n joints"]
     times: Values | None = None
-    """[s]; None if the rows are waypoints."""
+    """Times of the rows [s]; None if the rows are waypoints of a path."""
     velocities: Float[ndarray, "n joints"] | None = None
     accelerations: Float[ndarray, "n joints"] | None = None
     notes: tuple[str, ...] = ()
@@ -196,11 +196,12 @@ JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 PORT = 9090
 """Default port of rosbridge."""
 MATCH_TIME = 0.5
-"""Time for subscribers to match the publisher before it sends, and to receive before it ends [s]."""
+"""Waiting time before the message is sent, so that subscribers match the publisher, and after it, so that
+they receive it [s]."""
 TIMES = ("time", "t", "time_from_start", "timestamp")
-"""Names of the column of times."""
+"""Names that the column of times may have."""
 KINDS = {"position": "positions", "velocity": "velocities", "acceleration": "accelerations"}
-"""What the endings of columns mean."""
+"""Quantity of a column, by the ending of the column's name."""
 SUPPORTED = "it must hold a RobotDiffuse result, a JointTrajectory, RobotTrajectory or DisplayTrajectory"
 
 

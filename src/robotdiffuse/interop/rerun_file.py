@@ -19,7 +19,7 @@ with needs("rerun-sdk", "rerun"):
 
 TIMELINE = "time"
 FPS = 60.0
-"""Largest number of poses of each link per second."""
+"""Largest number of poses per second that are logged of each link."""
 
 
 def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:

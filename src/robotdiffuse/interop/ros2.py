@@ -216,9 +216,9 @@ FLOAT32 = 7
 MAX_UNPACKED = 128 * MEGABYTE
 """Largest size of a chunk, and of the messages of a motion [bytes]."""
 CHUNK_HEADER = 1 + 8 + 3 * 8 + 4
-"""Bytes of a chunk before the name of its compression: opcode, length, times, size and checksum."""
+"""Number of bytes of a chunk before the name of its compression: opcode, length, times, size and checksum."""
 FRAME_HEADER = 32
-"""Bytes that hold the header of a compressed frame."""
+"""Number of bytes at the beginning of a compressed frame that contain its header."""
 OBSTACLE_OPACITY = 0.8
 PROBLEM_ATTACHMENT = "problem.json"
 """Name of the attachment that holds the problem."""
@@ -433,7 +433,7 @@ DECOMPRESSORS: dict[Any, Any] = {
     bz2.decompress: bz2.BZ2Decompressor,
     lz4.frame.decompress: lz4.frame.LZ4FrameDecompressor,
 }
-"""Of the chunks of ROS 1 bags: those that can stop early."""
+"""Decompressors of the chunks of ROS 1 bags, by compression; each can stop before the end of a chunk."""
 VERSION = 9
 """Version of the bag's metadata; ROS 2 Humble reads the fields that it knows."""
 
@@ -521,16 +521,16 @@ def _check_unpacking(bag: Path) -> None:
 # Motions in MCAP files and bags
 
 Record = tuple[str, int, bytes, Callable[[bytes], Any]]
-"""Topic and log time [ns] of a message, its bytes, and what makes a message of them."""
+"""A message of a bag: its topic, log time [ns] and bytes, and the function that decodes the bytes."""
 
 
 class Recording(NamedTuple):
     """An open MCAP file or bag."""
 
     kinds: dict[str, str]
-    """The types of the ROS messages by topic."""
+    """Type of the ROS messages, by topic."""
     records: Callable[[Sequence[str]], Iterator[Record]]
-    """The messages on some topics, in the order of their log times."""
+    """A function from topics to the messages on these topics, in the order of their log times."""
 
     def messages(self, topics: Sequence[str], allowed: int = sys.maxsize) -> Iterator[tuple[str, int, Any]]:
         """Topic, log time [ns] and message of all messages on some topics, in the order of their log times.

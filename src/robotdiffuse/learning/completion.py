@@ -41,9 +41,10 @@ from robotdiffuse.scenes.scene import Scene
 
 Packed = UInt8[ndarray, "56 56 32"]
 SHOULDER = (0.0, 0.0, 0.33)
-"""The shoulder of a Panda, in the base frame [m]."""
+"""Position of a Panda's shoulder in the base frame [m]."""
 REACH = 1.0
-"""Voxels count within this distance of the shoulder [m]: no point of a Panda gets farther."""
+"""The network predicts the voxels within this distance of the shoulder [m]: no point of a Panda gets
+farther."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ def covers(robot: Robot) -> bool:
 
 
 DEPTH_STEP = 0.01
-"""Depths behind surfaces are stored in whole steps of this [m]."""
+"""Depths behind surfaces are stored as multiples of this step [m]."""
 OCCUPIED = 1
 FREE = 2
 SHADOW = 4
@@ -106,9 +107,9 @@ class CameraPlaces(Settings, name="cameras"):
     """Distribution of camera poses. Lengths in [m], angles in [rad]."""
 
     distance: Range = (1.2, 2.0)
-    """Horizontal distance from the base's axis."""
+    """Horizontal distance of the camera from the base's axis."""
     height: Range = (0.4, 1.6)
-    """Above the base."""
+    """Height of the camera above the base."""
     front_share: float = 0.75
     """Share of the cameras whose bearing from the base is drawn about the direction away from the obstacles;
     the bearings of the others are drawn from the whole circle."""
@@ -116,7 +117,8 @@ class CameraPlaces(Settings, name="cameras"):
     """Largest difference between such a bearing and the direction that, seen from the base, is opposite to
     the obstacles."""
     target_spread: float = 0.2
-    """Standard deviation of the point that a camera looks at, about a point in front of the arm."""
+    """Standard deviation, along each axis, of the point that a camera looks at. Its mean is 0.3 m high,
+    halfway between the base and the middle of the obstacles."""
     field_of_view: Range = (0.75, 1.1)
     """Vertical field of view."""
     roll: float = 0.05
@@ -144,14 +146,15 @@ IMAGE_SIZE = (160, 120)
 NOISE_SHARE = 0.5
 """Share of the samples that have noise, of up to twice the usual strength."""
 CAMERA_CLEARANCE = 0.05
-"""Cameras stand at least this far from obstacles, where a few draws find such a place [m]."""
+"""Distance of cameras from obstacles [m]. If none of the first `CAMERA_DRAWS` poses keeps it, the last of
+them is used."""
 CAMERA_DRAWS = 8
 OUT_OF_RANGE_SHARE = 0.5
 """Share of the noisy samples in which surfaces out of range return no depth, as with most real cameras."""
 MISSING_SHARE = 0.02
 """Share of the pixels, anywhere in the image, that return no depth if noise has its usual strength."""
 NOISE_FIELDS = ("spread", "missing", "stray", "flying", "edge_missing", "grazing")
-"""Fields of the noise that its strength multiplies."""
+"""Fields of `DepthNoise` that are multiplied by the strength of the noise."""
 NO_FLOOR_SHARE = 0.1
 """Share of the samples without a floor, as for an arm on a pedestal (the pedestal itself is not modeled)."""
 
@@ -237,7 +240,7 @@ def draw_samples(families: Sequence[str], robot: Robot, seeds: Sequence[int]) ->
 
 
 Completion = Callable[[ndarray, ndarray], ndarray]
-"""From a packed volume, as by `pack`, to the probability of each voxel of 2 cm."""
+"""A function from a volume packed by `pack` to the probability that each voxel of 2 cm is occupied."""
 
 
 def predict(volume: ObservedVolume, network: Completion | None = None) -> Float32[ndarray, "112 112 64"]:

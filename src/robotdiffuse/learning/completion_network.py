@@ -25,8 +25,8 @@ from robotdiffuse.perception.voxel_grid import SHAPE
 
 Packed = UInt8[Tensor, "n 56 56 32"]
 CHANNELS = 7
-"""Occupied, free, shadow of the arm, out of view, depth behind a surface, height, distance from the base's
-axis."""
+"""Number of input channels: occupied, free, shadow of the arm, out of view, depth behind a surface, height,
+distance from the base's axis."""
 DEPTH_SCALE = DEPTH_STEP / 0.5
 """Stored depths behind surfaces are multiplied by this: half a meter becomes 1."""
 

@@ -36,7 +36,7 @@ class ScheduleSettings(Settings, name="schedule"):
     offset: NotNegative = 0.008
     """The equation's s: it keeps the noise of the first levels from being too small."""
     floor: Annotated[float, Bound(above=0.0, below=1.0)] = 1e-4
-    """Smallest alpha_bar: the share of the variance that is still signal at the last level."""
+    """Smallest alpha_bar, which is the fraction of the variance that is still signal at the last level."""
     log_snr_shift: NotNegative = 0.0
     """Subtracted from the logarithm of every level's signal-to-noise ratio (Hoogeboom et al. 2023). White
     noise averages out over many waypoints: without a shift most levels hide nothing of a long motion."""
@@ -53,9 +53,9 @@ class NoiseSchedule:
         alpha_bar = alpha_bar / (alpha_bar + (1 - alpha_bar) * np.exp(settings.log_snr_shift))
         alpha_bar = np.maximum(alpha_bar, settings.floor)
         self.signal: Values = np.sqrt(alpha_bar)
-        """Factor of the clean trajectory in x_t."""
+        """Factor of the clean trajectory in x_t, by level."""
         self.noise: Values = np.sqrt(1 - alpha_bar)
-        """Factor of the unit noise in x_t."""
+        """Factor of the unit noise in x_t, by level."""
         with np.errstate(divide="ignore"):
             self.half_log_snr: Values = np.log(self.signal) - np.log(self.noise)
             """Half the logarithm of the signal-to-noise ratio; inf at level 0."""
@@ -170,18 +170,18 @@ OBJECTIVES = Registry(
         "noise": Entry(f"{__name__}:NoiseObjective", "the noise"),
     },
 )
-"""By the name in settings. A new one is a class and a line here."""
+"""Objectives by their name in settings. A new objective is a class and a line here."""
 
 Samples = Float[ndarray, "count ..."]
 NoiseLevels = Int[ndarray, "steps"]
 Predict = Callable[[ndarray, int], ndarray]
-"""From (x_t [count, ...], t) to the predicted clean x_0. It converts the network's output by the objective,
-holds the ends and applies guidance."""
+"""A function from (x_t [count, ...], t) to the predicted clean x_0. It converts the network's output as the
+objective requires, holds the ends and applies guidance."""
 DrawNoise = Callable[[], ndarray]
-"""Returns fresh standard noise of the shape of the samples."""
+"""A function that returns new standard noise in the shape of the samples."""
 MoveMean = Callable[[ndarray, int], ndarray]
-"""From the mean of a step [count, ...] and the number of steps that remain to the mean that is used
-instead."""
+"""A function from the mean of a denoising step [count, ...] and the number of remaining steps to the mean
+that is used instead."""
 
 
 def ddim(
@@ -260,4 +260,4 @@ SAMPLERS = Registry(
         "ddpm": Entry(f"{__name__}:ddpm", "ancestral sampling, the paper's"),
     },
 )
-"""By the name in settings and checkpoints: functions with the arguments of `ddim`."""
+"""Samplers by their name in settings and checkpoints; they have the arguments of `ddim`."""

@@ -30,8 +30,8 @@ from robotdiffuse.learning.weight_files import (
 from robotdiffuse.robots.robot import Robot
 
 EXTERNAL_DATA = b"\x0a\x08location"
-"""How ONNX writes that a tensor is in another file: the key of an entry of `external_data`.
-ONNX Runtime would look for the file in the current folder."""
+"""Bytes by which an ONNX file says that a tensor is in another file: the key of an entry of `external_data`.
+ONNX Runtime would look for that file in the current folder."""
 
 
 class OnnxNetwork:

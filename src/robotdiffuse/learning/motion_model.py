@@ -65,7 +65,7 @@ class Statistics(NamedTuple):
     residual_scale: Configuration
     """Standard deviation of the trajectories about their reference, in units of the joint limits."""
     residual_mean: Configuration
-    """Mean of the trajectories, in the same units, for the target `absolute`; else zero."""
+    """Mean of the trajectories in units of the joint limits, for the target `absolute`; else zero."""
     noise_factor: Float[ndarray, "waypoints waypoints"]
     """Matrix that turns white noise into the noise of the forward process, see `diffusion.noise_factor`."""
 
@@ -79,15 +79,15 @@ class Statistics(NamedTuple):
 @dataclass(frozen=True)
 class SamplingSettings(Settings, name="sampling"):
     samples: Count = 16
-    """Trajectories per batch."""
+    """Number of trajectories in a batch."""
     sampling_steps: Count | None = None
-    """Calls of the denoiser per batch; None: as many as the weights name."""
+    """Number of calls of the denoiser for a batch; None: the number that is stored with the weights."""
     sampler: Annotated[str, OneOf(SAMPLERS)] | None = None
-    """Name in `learning.diffusion.SAMPLERS`; None: the one that the weights name."""
+    """Name in `learning.diffusion.SAMPLERS`; None: the sampler that is stored with the weights."""
     eta: Share = 0.0
-    """Fresh noise per denoising step: 0 is DDIM, 1 is ancestral sampling."""
+    """Amount of new noise in each denoising step: 0 is DDIM, 1 is ancestral sampling."""
     guided_share: Share = 0.5
-    """Share of the denoising steps that are guided, the last ones: 0 none, 1 all (the paper's)."""
+    """Share of the denoising steps that are guided, which are the last ones: 0 none, 1 all (the paper's)."""
     guidance_scale: float = 1.0
     """Scale of classifier-free guidance: 1 uses the network's prediction as it is, larger values strengthen
     the condition, 0 ignores it. Values other than 1 need weights that were trained with a condition_drop
@@ -103,7 +103,7 @@ GRADIENT_UNIT = 2.0
 """Gradients are divided by this and clipped to [-1, 1] before they enter the denoiser [m/rad]."""
 MAX_POINTS = 2048
 """Larger clouds are reduced to this many random points before they are encoded. For an encoder that needs
-clouds of one size, that size holds instead."""
+clouds of a fixed size, they are reduced to that size."""
 
 ClearanceFn = Callable[[ndarray], ndarray]
 """A function from joint values [count, waypoints, dof] (float32) to the clearances of the links [count,
@@ -123,7 +123,7 @@ class ModelParts(Settings):
     """The settings that a model and its training have in common."""
 
     waypoints: Annotated[int, Bound(least=3.0, most=MAX_WAYPOINTS)] = 48
-    """Waypoints of a trajectory, evenly spaced along it (joint-space length; paper: 254)."""
+    """Number of waypoints of a trajectory, evenly spaced in joint-space length (paper: 254)."""
     denoiser: Annotated[str, OneOf(DENOISERS)] = "transformer"
     schedule: ScheduleSettings = field(default_factory=ScheduleSettings)
     sampler: Annotated[str, OneOf(SAMPLERS)] = "ddim"

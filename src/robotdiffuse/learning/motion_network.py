@@ -64,7 +64,7 @@ class MotionNetwork(Network, MotionModel):
         sizes = self.waypoints, self.dof, self.feature_count, self.condition_count
         self.denoiser: Denoiser = DENOISERS.load(settings.denoiser)(settings.denoiser_settings, *sizes)
         self.block = 1
-        """Waypoints whose mean the denoiser sees as one; see `coarsen`."""
+        """Number of waypoints whose mean is one token of the denoiser; see `coarsen`."""
         null = nn.Parameter(torch.zeros(self.condition_count)) if settings.null_condition else None
         self.register_parameter("null_condition", null)
 

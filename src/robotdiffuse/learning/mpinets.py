@@ -58,8 +58,8 @@ Configurations = Float32[Tensor, "n dof"]
 Clouds = Float32[Tensor, "n points 3"]
 Joints = Float32[ndarray, "n dof"]
 DIRECTION_OFFSET = 0.1
-"""Added to the distance to the goal [half joint ranges] by which the way to it is divided, so that the
-direction fades near the goal."""
+"""The vector to the goal is divided by its length plus this [half joint ranges] to give the direction, so
+that the direction fades near the goal."""
 LOSS_UNIT = 0.01
 """Losses are divided by this [m], so that they are near 1."""
 RADII = (0.2, 0.6)
@@ -73,31 +73,33 @@ COLLISION_WEIGHT = 5.0
 MARGIN = 0.03
 """Distance to the scene below which the collision loss acts [m] (the paper's)."""
 TRIVIAL_SHARE = 0.3
-"""Share of the samples from motions between ends whose straight line is free too."""
+"""Share of the training samples that come from trivial motions, whose straight line is free too."""
 
 
 @dataclass(frozen=True)
 class MPiNetsNetworkSettings(Settings, name="mpinets"):
     scene_points: Count = 256
-    """Points of the scene (paper: 4,096)."""
+    """Number of points of the scene (paper: 4,096)."""
     robot_points: Count = 12
-    """Points of each moving link at the current configuration (paper: 2,048 in all)."""
+    """Number of points of each moving link at the current configuration (paper: 2,048 in all)."""
     target_points: Count = 6
-    """So many of these points, the first, are also given at the goal (paper: 128 in all, of the gripper)."""
+    """Number of these points of each link that are given at the goal too (paper: 128 in all, of the
+    gripper)."""
     region: VisibleRegion = field(default_factory=VisibleRegion)
     """The region in which points of the scene count."""
     centers: tuple[Count, Count] = (96, 24)
-    """Centers of the two set abstractions (paper: 512, 128)."""
+    """Number of centers of each of the two set abstractions (paper: 512, 128)."""
     neighbors: tuple[Count, Count] = (16, 16)
-    """Points around each center (paper: 128, 128)."""
+    """Number of points around each center (paper: 128, 128)."""
     first_widths: Sizes = (32, 32, 64)
     """Widths of the layers of the first set abstraction (paper: 64, 64, 64)."""
     second_widths: Sizes = (96, 128, 192)
-    """Widths of the second (paper: 128, 128, 256)."""
+    """Widths of the layers of the second set abstraction (paper: 128, 128, 256)."""
     all_widths: Sizes = (256, 512)
     """Widths of the layers on all points together (paper: 512, 512, 1,024)."""
     cloud_widths: tuple[Count, Count] = (512, 256)
-    """Widths after PointNet++; the last one is the size of the code (paper: 4,096, 2,048, 2,048)."""
+    """Widths of the layers after PointNet++; the last one is the size of the embedding (paper: 4,096, 2,048,
+    2,048)."""
     noise: NotNegative = 0.015
     """Standard deviation of the noise on the input configuration [rad] (the paper's)."""
 
@@ -120,7 +122,7 @@ class MPiNetsNetworkSettings(Settings, name="mpinets"):
 
 
 GROUPS = 16
-"""Groups of the group normalization (the paper's)."""
+"""Number of groups of the group normalization (the paper's)."""
 
 
 class PooledLayers(nn.Module):

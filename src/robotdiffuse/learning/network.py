@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 Scalar = Float[Tensor, ""]
 EXPORT_PACKAGES = ("onnx", "onnxscript")
-"""What PyTorch's exporter needs."""
+"""Packages that PyTorch's exporter needs."""
 LEAST_STORED_IN_HALF = 1024
-"""Weights with at least so many numbers are stored in fp16 if that changes none of them."""
+"""Tensors of weights with at least this many numbers are stored in fp16 if that changes none of them."""
 
 
 class SavedModule(nn.Module):

@@ -36,11 +36,11 @@ class RobotIdentity(Settings):
     """The robot that weights were trained for, as checkpoints describe it."""
 
     source: str
-    """Bundled name, or path to its URDF."""
+    """Name of a bundled robot, or path to the robot's URDF."""
     joint_names: tuple[str, ...]
     lower: tuple[float, ...]
-    """Limits that joint values are normalized by [rad], [m] for prismatic joints. The weights serve robots
-    with other limits too: validation uses the limits of the robot itself."""
+    """Limits by which joint values are normalized [rad], [m] for prismatic joints. The weights can be used
+    for the robot with other limits too: validation uses the limits of the robot itself."""
     upper: tuple[float, ...]
     frame_offsets: tuple[tuple[tuple[float, ...], ...], ...]
     """`Robot.frame_offsets`, to distinguish robots with the same joint names but other dimensions."""

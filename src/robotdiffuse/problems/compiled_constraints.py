@@ -71,7 +71,7 @@ class ConstraintViolation:
 
     constraint: Constraint
     at: float
-    """Waypoint index plus fraction."""
+    """Place on the motion: waypoint index plus the fraction of the segment after it."""
     value: float
     """Maximum value until the constraint is satisfied again [m] or [rad]."""
     limit: float

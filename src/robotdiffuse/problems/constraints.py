@@ -23,9 +23,9 @@ SCALAR_BOUNDS = {
     "tolerance": (MIN_TOLERANCE, MAX_COORDINATE, "m"),
     "speed": (1e-4, MAX_COORDINATE, "m/s"),
 }
-"""Scalar fields: minimum, maximum, unit."""
+"""Minimum, maximum and unit of each scalar field."""
 DIRECTION_FIELDS = ("axis", "direction", "normal")
-"""Vector fields that are normalized."""
+"""Names of the vector fields that are normalized."""
 BASE_FRAME = read_only(np.eye(4))
 
 
@@ -160,7 +160,7 @@ class CartesianLine(FrameConstraint):
     angle: float | None = 0.05
     """Maximum angle from the interpolated orientation [rad]; None: any orientation."""
     speed: float | None = None
-    """Maximum speed of the link's origin [m/s]; None: limited by the joints alone."""
+    """Maximum speed of the link's origin [m/s]; None: only the joint limits limit the speed."""
 
 
 Constraint = AxisCone | PositionBox | OnPlane | OnLine | CartesianLine

@@ -86,7 +86,7 @@ VALUES: dict[str, Schema] = {
         ("center", "size", "xyz", "axis", "direction", "normal", "point", "low", "high"), NUMBERS
     ),
 }
-"""Fields of shapes and constraints that are no single numbers."""
+"""Schemas of the fields of shapes and constraints whose values are not single numbers."""
 POSE = {
     "xyz": _array(NUMBER, 3),
     "wxyz": _array(NUMBER, 4) | {"description": "quaternion, scalar first"},
@@ -105,7 +105,7 @@ TOOL_FIELDS = {"link": TEXT, "name": TEXT, **POSE, "shapes": _array(SHAPE), "tou
 PAYLOAD_FIELDS = {"mass": NUMBER, "com": NUMBERS, "link": TEXT, "moments": NUMBERS}
 MOTION_FIELDS = ("velocity", "times", "poses", "max_speed")
 WRITTEN_DECIMALS = 12
-"""Decimals of computed poses in files: enough to restore the values that were read."""
+"""Number of decimals of computed poses in files: enough to restore the values that were read."""
 
 
 def _fields_of(kind: type) -> tuple[dict[str, Schema], list[str]]:
@@ -227,7 +227,7 @@ class Setting(NamedTuple):
     scene: Scene
     folder: Path
     notes: list[str]
-    """Changes to the input, to which readers add."""
+    """Notes on changes to the input; the functions that read fields append to this list."""
 
 
 def read_goal(where: str, data: object, setting: Setting) -> Goal:
@@ -399,9 +399,9 @@ class Field(NamedTuple):
     read: Callable[[Any, Setting], Any] = lambda data, setting: data
     write: Callable[[Any, Path | None], Any] = lambda value, folder: value
     in_world: bool = False
-    """Whether it is in the world's frame."""
+    """Whether the value is in the frame of the world."""
     with_request: bool = True
-    """Whether a MoveIt request leaves it open."""
+    """Whether a problem file may give the field beside a MoveIt request."""
 
 
 FIELDS = {

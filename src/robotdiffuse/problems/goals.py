@@ -55,10 +55,11 @@ class PoseGoal(Value):
     """Name of the link."""
     T_base_frame: GivenPose
     xyz_tolerance: VectorOrNone = None  # pyright: ignore[reportAssignmentType]
-    """Along the axes of the goal [m]; None: the exact position, validated to 1 cm."""
+    """Tolerance of the position along the axes of the goal [m]; None: the exact position, validated to 1
+    cm."""
     rpy_tolerance: VectorOrNone = None  # pyright: ignore[reportAssignmentType]
-    """About the axes of the goal [rad], pi for any angle; None: the exact orientation, validated to 15
-    degrees."""
+    """Tolerance of the orientation about the axes of the goal [rad], pi for any angle; None: the exact
+    orientation, validated to 15 degrees."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.frame, str):

@@ -26,13 +26,14 @@ SEED = 20261121
 """Seed of the held-out problems; data sets use other seed sequences."""
 
 Validator = Callable[[Problem, Path], bool]
-"""Whether a path solves a problem."""
+"""A function that says whether a path solves a problem."""
 Search = Callable[[Problem], float | None]
-"""Length of the shortest path that a search finds [rad]; None if it finds none."""
+"""A function that searches a path for a problem and returns the length of the shortest path found [rad], or
+None."""
 Progress = Callable[[str], None]
-"""Receives progress messages."""
+"""A function that receives progress messages."""
 REPORT_EVERY = 20
-"""Problems between two progress messages."""
+"""Number of problems between two progress messages."""
 
 
 def goal_of(problem: Problem) -> Configuration:
@@ -88,7 +89,8 @@ def line_length(problem: Problem, validator: Validator) -> float | None:
 
 
 ROW_FIELDS = {"name", "family", "trivial", "searched", "reference", "problem"}
-"""Fields of a line: those of a case, whether a search for the reference has run, and the problem's record."""
+"""Fields of a line of a file: the fields of a case, whether a search for the reference length has run, and
+the record of the problem."""
 
 
 class CaseFile:

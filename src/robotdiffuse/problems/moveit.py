@@ -43,10 +43,10 @@ OCTOMAP = "<octomap>"
 PLANE_EXTENT = 20.0
 PLANE_THICKNESS = 0.01
 MAX_PLANES = 1000
-"""Most planes of a collision object; each is a box of its own."""
+"""Largest number of planes of a collision object; each becomes a box."""
 NO_POSE = {"position": [0, 0, 0], "orientation": [0, 0, 0, 1]}
 TYPE_NUMBERS = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone", 5: "prism"}
-"""Numbers of the types in messages (shape_msgs/SolidPrimitive)."""
+"""Names of the types of shape_msgs/SolidPrimitive, by their numbers in messages."""
 
 
 def mapping_of(where: str, value: object, *names: str) -> dict[str, Any]:

@@ -33,7 +33,8 @@ from robotdiffuse.scenes.scene import ALL_LINKS, Scene
 LIMIT_SLACK = 1e-3
 """Configurations beyond a joint limit by at most this are clamped to it, with a note [rad] or [m]."""
 VELOCITY_SLACK = 1e-6
-"""The same of start velocities, as a share of the limit: float32 rounds by up to 6e-8."""
+"""Start velocities beyond a limit by at most this fraction of the limit are clamped to it, with a note:
+float32 rounds by up to 6e-8."""
 # Bounds of a `Problem.blend` that is not 0 [rad] or [m].
 MIN_BLEND = 1e-3
 MAX_BLEND = 10.0
@@ -269,7 +270,7 @@ class StateValidity:
     """Whether a configuration is free: true in conditions if it is."""
 
     reason: str = ""
-    """Why it is not: a joint out of limits, or the deepest contact."""
+    """Why the configuration is not free: a joint out of limits, or the deepest contact."""
     links: tuple[str, ...] = ()
     """All links that touch an obstacle or another link, the deepest contact first."""
 
@@ -314,7 +315,8 @@ class Problem(Value):
     """Pose of the base in the world, for files and pictures; None: the base's frame is the world's. Scene,
     goal and views of a Problem are always in the base's frame; `in_world` accepts them in the world's."""
     waypoints: tuple[Goal, ...] = ()
-    """Where the motion stops on its way, in this order, or what it passes: see `blend`."""
+    """Goals at which the motion stops on its way, in this order, or which it passes without a stop: see
+    `blend`."""
     constraints: tuple[Constraint, ...] = ()
     """Path constraints, which hold along the whole motion."""
     moving: tuple[MovingObstacle, ...] = ()

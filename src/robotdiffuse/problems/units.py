@@ -17,7 +17,7 @@ MAX_EXTENT = 10.0
 """Meshes, clouds and views larger than this get a note [m]. Other shapes get one only if all their edges are
 longer: a floor may be wide, but it is flat."""
 VIEW_STRIDE = 4
-"""Every fourth row and column of a depth image is checked."""
+"""Only every fourth row and column of a depth image is checked."""
 MIN_POINTS_IN_ARM = 10
 """Fewer points than this inside the arm count as noise."""
 ADVICE = "lengths are in meters: divide millimeters by 1000"

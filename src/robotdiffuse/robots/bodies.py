@@ -15,7 +15,7 @@ from robotdiffuse.core.types import GivenVector, Points, Pose, Rotation, Vector
 TOOL = "tool"
 """Default name of a tool."""
 POLYGON_SIDES = 32
-"""Sides of the polygons that stand for circles."""
+"""Number of sides of the polygons that stand for circles."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class AttachedBody(Value):
     """Link to which the body is fixed."""
     T_link_body: Pose
     shapes: tuple[RigidShape, ...] = ()
-    """Shapes, posed in the frame of `link`. Without any, the body is only a frame."""
+    """Shapes, posed in the frame of `link`. A body without shapes is only a frame."""
     touch_links: tuple[str, ...] = ()
     """Links that the body may touch, besides those that move with it."""
     tool: bool = False
@@ -88,15 +88,15 @@ def _content(value: Any) -> object:
 
 
 SLACK = 1e-6
-"""Rounded files may have a slightly negative principal moment: largest such value, relative to the largest
-entry of the inertia matrix."""
+"""Largest size of a negative principal moment that is accepted as a rounding error of the file, relative to
+the largest entry of the inertia matrix."""
 
 
 class Inertia(NamedTuple):
     """Mass and inertia of a link, in its frame."""
 
     mass: float
-    """[kg]"""
+    """ALL Mass [kg]."""
     com: Vector
     """Center of mass [m]."""
     moments: Rotation
@@ -132,7 +132,7 @@ class Payload(Value):
     """
 
     mass: float
-    """[kg]"""
+    """ALL Mass [kg]."""
     com: GivenVector = (0.0, 0.0, 0.0)  # pyright: ignore[reportAssignmentType]
     """Center of mass, in the frame of the link [m]."""
     link: str | None = None

@@ -20,39 +20,39 @@ from robotdiffuse.robots.bodies import Inertia, Payload
 from robotdiffuse.robots.robot import Robot
 
 Jet = Float[ndarray, "3 n"]
-"""Upper bounds on the length of a vector, or the absolute value of a number, and on its first two
-derivatives, for n stretches of a motion."""
+"""Upper bounds on the length of a vector (or the absolute value of a number) and of its first two
+derivatives, on n pieces of a motion."""
 
 
 class Stretches(NamedTuple):
     """Bounds for n stretches of a motion, on each of which the motion is smooth."""
 
     q: Configurations
-    """Largest absolute joint positions."""
+    """Largest absolute values of the joint positions [rad] or [m]."""
     v: Float[ndarray, "3 n dof"]
-    """Largest absolute values of their first three derivatives."""
+    """Largest absolute values of the first three derivatives of the joint positions."""
     speed: Float[ndarray, "3 n dof"]
     """Largest absolute values of the joint velocities and of their first two derivatives."""
     pull: Float[ndarray, "3 n dof"]
-    """The same for joint accelerations. Velocities and accelerations are zero where the motion holds a
-    position."""
+    """Largest absolute values of the joint accelerations and of their first two derivatives. Velocities and
+    accelerations are zero where the motion holds a position."""
 
 
 class Body(NamedTuple):
     """The body that moves with a joint."""
 
     parent: int
-    """Index of the joint before it; -1 if there is none."""
+    """Index of the joint before this one in the tree; -1 if there is none."""
     slides: bool
     """Whether the joint is prismatic."""
     offset: float
-    """Distance of the frame's origin from the parent's, with a prismatic joint at zero [m]."""
+    """Distance of the frame's origin from that of the parent frame, with a prismatic joint at zero [m]."""
     mass: float
-    """[kg]"""
+    """Mass of the bodies that are fixed to the frame [kg]."""
     lever: float
     """Distance of the center of mass from the frame's origin [m]."""
     moment: float
-    """Largest principal moment about the center of mass [kg m²]."""
+    """Largest principal moment of inertia about the center of mass [kg m²]."""
 
 
 def product(a: Jet, b: Jet) -> Jet:

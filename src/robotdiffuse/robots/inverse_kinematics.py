@@ -22,11 +22,11 @@ POSITION_TOLERANCE = 1e-6
 ROTATION_TOLERANCE = 1e-6
 """Largest orientation error of a solution [rad]."""
 MIN_DISTANCE = 0.1
-"""Distinct solutions differ by more than this in at least one joint [rad or m]."""
+"""Two solutions count as distinct if they differ by more than this in at least one joint [rad or m]."""
 LIMIT_MARGIN = 1e-6
 """Distance kept from the joint limits [rad or m]."""
 MAX_ITERATIONS = 60
-"""Damped Newton steps per seed."""
+"""Largest number of damped Newton steps from each seed."""
 ROTATION_WEIGHT = 0.3
 """Weight of orientation errors against position errors [m/rad]."""
 PARAMETERS = IKParameters(
@@ -41,11 +41,11 @@ class InverseKinematicsSettings(Settings, name="inverse kinematics"):
     position_only: bool = False
     """Ignore the orientation of the pose, as in the paper's ROP problems."""
     seeds_per_round: Count = 64
-    """Random start configurations drawn per round."""
+    """Number of random start configurations drawn in each round."""
     max_rounds: Count = 64
-    """Rounds of seeds after which the search ends in any case."""
+    """Largest number of rounds."""
     patience: Count = 4
-    """Rounds without a new solution after which the search ends, if it has found one."""
+    """The search ends after this many rounds without a new solution, if it has found one."""
 
 
 def inverse_kinematics(

@@ -45,14 +45,14 @@ class Joint(Value):
     axis: Vector = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     """Unit axis in the joint frame."""
     lower: float = 0.0
-    """[rad] or [m]; -`CONTINUOUS_LIMIT` for a continuous joint."""
+    """Lower position limit [rad] or [m]; -`CONTINUOUS_LIMIT` for a continuous joint."""
     upper: float = 0.0
     velocity: float = 0.0
-    """[rad/s] or [m/s]"""
+    """Velocity limit [rad/s] or [m/s]."""
     acceleration: float = 0.0
     jerk: float = 0.0
     mimic: Mimic | None = None
-    """The joint that this one follows, if any; it is locked together with that one."""
+    """The joint that this joint follows, if any. The two are locked together."""
     effort: float = 0.0
     """Largest torque [N m] or force [N]; 0 if the URDF gives none."""
 

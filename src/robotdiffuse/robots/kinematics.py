@@ -9,9 +9,9 @@ from robotdiffuse.core.types import Configuration, Configurations, Points, Pose,
 from robotdiffuse.robots.kinematic_tree import KinematicTree, once_per_robot
 
 REACH_SAMPLES = 4096
-"""Random configurations for measuring the reach."""
+"""Number of random configurations at which the reach is measured."""
 REACH_QUANTILE = 0.99
-"""Quantile of the distances of the tip, since the largest ones are rare and random."""
+"""The reach is this quantile of the distances of the tip: the largest distances are rare and random."""
 
 
 def link_pose(robot: KinematicTree, q: Configuration, link: str) -> Pose:

@@ -12,7 +12,8 @@ from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot
 
 COLUMNS = 180
-"""Grid directions around the axis; bounds exceed the true maxima by about 0.1 % per joint in between."""
+"""Number of directions around a joint's axis in a grid. The bounds exceed the true maxima by about 0.1 % for
+each joint in between."""
 LIMIT_SLACK = 1e-3
 """Joint limits are widened by this [rad] or [m], so that the bounds also hold for configurations clipped to
 them."""
@@ -116,8 +117,8 @@ def _offset_interpolation(rotation: bytes) -> _Interpolation:
 
 
 _cached_interpolation = lru_cache(maxsize=64)(_offset_interpolation)
-"""Cache for arms with attached bodies, since each new object needs the same interpolations. About 1 MB
-each."""
+"""Cached for arms with attached bodies: every new object on the same arm needs the same interpolations. An
+entry takes about 1 MB."""
 
 
 def _rotated(

@@ -47,7 +47,7 @@ class LinkPairTable(Value):
 
     links: tuple[str, str]
     joints: tuple[str, ...]
-    """Joints between the links, from the base on."""
+    """Joints between the two links, in order from the base."""
     lower: tuple[float, ...]
     """Joint values at which the table begins [rad] or [m]."""
     upper: tuple[float, ...]
@@ -134,7 +134,7 @@ class Robot(KinematicTree):
     locked: dict[str, float] = field(default_factory=dict)
     """Values of the movable joints that are held while planning, by name [rad] or [m]."""
     notes: tuple[str, ...] = ()
-    """What was changed or ignored when the URDF was read."""
+    """Notes on what was changed or ignored when the URDF was read."""
     root: str = ""
     """Root link of the URDF; if empty, the base is the root."""
     above: dict[str, Pose] = field(default_factory=dict)

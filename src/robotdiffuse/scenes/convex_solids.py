@@ -10,7 +10,7 @@ from robotdiffuse.robots.bodies import ConvexMesh, polygon_around_circle
 from robotdiffuse.robots.fitting.convex_parts import Surface, convex_hull, convex_parts
 
 SPHERE_RINGS = 7
-"""Rings of vertices around a sphere, and around the caps of a capsule."""
+"""Number of rings of vertices on a sphere, and on the caps of a capsule."""
 
 
 def capsule_polyhedron(radius: float, height: float) -> ConvexMesh:
@@ -59,4 +59,5 @@ SOLIDS: dict[str, Callable[[Any], tuple[ConvexMesh, ...]]] = {
     "capsule": lambda shape: (capsule_polyhedron(shape.radius, shape.height),),
     "mesh": lambda shape: mesh_parts(shape.vertices.tobytes(), shape.faces.tobytes()),
 }
-"""By the kind of shape: convex meshes in the frame of a shape that enclose it."""
+"""Functions by kind of shape; each returns convex meshes that enclose the shape, in the frame of the
+shape."""

@@ -26,7 +26,7 @@ from robotdiffuse.scenes.shapes import Shape
 MAX_POINT_SPEED = 100.0
 """Speed limit of every point of an obstacle [m/s]; anything faster between two poses is a jump."""
 MAX_DURATION = 1e5
-"""How long a constant velocity lasts [s], about a day: the longest motion that is validated."""
+"""Duration of a motion with constant velocity [s], about a day: no longer motion is validated."""
 RIGID_SLACK = 1e-6
 """Largest deviation of a pose from a rigid transform."""
 POSE_TOLERANCE = 1e-6

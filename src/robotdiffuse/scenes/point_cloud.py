@@ -19,7 +19,7 @@ from robotdiffuse.core.types import Points, Vector
 
 FIRST_LINE = b"# Octomap OcTree binary file"
 TREE_DEPTH = 16
-"""Levels below the root; the root's edge is 2^16 voxels."""
+"""Number of levels of the tree below the root; the edge of the root is 2^16 voxels."""
 # Values of a child's two bits.
 OCCUPIED = 2
 INNER = 3

@@ -17,11 +17,11 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
 
 SHOWN_NAMES = 5
-"""Names of shapes in the text of a scene."""
+"""Largest number of names of shapes in the text that describes a scene."""
 ALL_LINKS = "all"
 """Stands for all links of a robot in `Scene.allowed_contacts`."""
 MAX_CONTACT_LINKS = 1000
-"""Most links that `Scene.allowed_contacts` may name for one obstacle."""
+"""Largest number of links that `Scene.allowed_contacts` may name for one obstacle."""
 
 PLANE_SIZE = 10.0
 """Edge of the box that stands for an infinite plane [m]."""

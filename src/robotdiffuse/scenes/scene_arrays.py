@@ -17,7 +17,7 @@ NONE = 0
 SPHERE = 1
 BOX = 2
 PARAMETERS = 10
-"""Parameters of a shape: see `PackedScenes.params`."""
+"""Number of parameters of a shape; see `PackedScenes.params`."""
 
 
 @dataclass(frozen=True, eq=False)

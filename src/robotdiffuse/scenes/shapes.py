@@ -386,12 +386,12 @@ class Mesh(_Posed, Triangulated):
     """
 
     vertices: GivenArray
-    """In the mesh's own frame [m]."""
+    """Vertices in the frame of the mesh [m]."""
     faces: GivenArray
     xyz: GivenVector = (0.0, 0.0, 0.0)  # type: ignore[assignment]
     wxyz: GivenArray = IDENTITY  # type: ignore[assignment]
     file: str | None = None
-    """The file that it was read from, for writing it back."""
+    """ALL The file that the shape was read from; files that are written refer to it."""
     name: str = "mesh"
     kind: ClassVar[str] = "mesh"
     origin: ClassVar[str] = "xyz"
@@ -474,7 +474,7 @@ class HeightMap(_Posed, Triangulated):
     xyz: GivenVector = (0.0, 0.0, 0.0)  # type: ignore[assignment]
     wxyz: GivenArray = IDENTITY  # type: ignore[assignment]
     file: str | None = None
-    """The file that it was read from, for writing it back."""
+    """ALL The file that the shape was read from; files that are written refer to it."""
     name: str = "height_map"
     kind: ClassVar[str] = "height_map"
     origin: ClassVar[str] = "xyz"

@@ -46,17 +46,18 @@ class AttentionSettings(DenoiserSettings):
     causal: ClassVar[bool] = False
     """Whether waypoints attend only to z_tk and the waypoints before them."""
     points: ClassVar[bool] = False
-    """Whether waypoints also attend to points of the scene, which are its code (encoder `points`)."""
+    """Whether waypoints also attend to points of the scene, which replace the embedding (encoder
+    `points`)."""
     width: Count = 160
     """Size of a token; even (paper: 512)."""
     layers: Count = 6
     """Number of blocks (paper: 8)."""
     heads: Count = 5
-    """Attention heads; a divisor of width."""
+    """ALL Number of attention heads; a divisor of `width`."""
     hidden: Count = 480
     """Size of the hidden layer of each feed-forward network."""
     patch: Count = 4
-    """Waypoints per token; a divisor of the number of waypoints (paper: 1)."""
+    """Number of waypoints in a token; a divisor of the number of waypoints (paper: 1)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -95,11 +96,11 @@ class EncoderDecoderSettings(AttentionSettings, name="encoder_decoder"):
     width: Count = 144
     """Size of a token; even."""
     layers: Count = 4
-    """Blocks of the decoder."""
+    """Number of blocks of the decoder."""
     encoder_layers: Count = 2
-    """Blocks of the encoder."""
+    """Number of blocks of the encoder."""
     heads: Count = 4
-    """Attention heads; a divisor of width."""
+    """ALL Number of attention heads; a divisor of `width`."""
     hidden: Count = 432
     """Size of the hidden layer of each feed-forward network."""
 
@@ -119,7 +120,7 @@ class DecoderOnlySettings(AttentionSettings, name="decoder_only"):
 class CrossAttentionSettings(AttentionSettings, name="cross_attention"):
     points = True
     patch: Count = 8
-    """Waypoints per token; a divisor of the number of waypoints."""
+    """Number of waypoints in a token; a divisor of the number of waypoints."""
 
     @classmethod
     def paper_size(cls) -> "CrossAttentionSettings":
@@ -129,12 +130,12 @@ class CrossAttentionSettings(AttentionSettings, name="cross_attention"):
 @dataclass(frozen=True)
 class UNetSettings(DenoiserSettings, name="unet"):
     width: Count = 48
-    """Channels at the full resolution; even."""
+    """Number of channels at the full resolution; even."""
     multiples: Sizes = (1, 2, 4)
-    """Channels at each resolution, in units of `width`; each resolution has half the waypoints of the one
-    before."""
+    """Number of channels at each resolution, in units of `width`; each resolution has half as many waypoints
+    as the one before."""
     kernel: Count = 5
-    """Waypoints that a convolution covers; odd."""
+    """Number of waypoints that a convolution covers; odd."""
     condition_width: Count = 128
     """Size of the vector that carries the condition and the noise level; even."""
 
@@ -178,4 +179,4 @@ DENOISERS = Registry(
         "unet": Entry(f"{_NETWORKS}:UNet", "temporal U-Net", f"{__name__}:UNetSettings"),
     },
 )
-"""By the name in settings and checkpoints."""
+"""Denoisers by their name in settings and checkpoints."""

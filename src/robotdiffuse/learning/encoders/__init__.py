@@ -25,11 +25,11 @@ class EncoderSettings(Settings, name="encoder"):
     ordered: ClassVar[bool] = False
     """Whether clouds must have exactly `cloud` points, sorted as by `in_order`."""
     along_curve: ClassVar[bool] = False
-    """Whether they are sorted along a space-filling curve; otherwise by x, then y, then z."""
+    """Whether the points are sorted along a space-filling curve; otherwise by x, then y, then z."""
     code: Count = 96
-    """Size of z (paper: 60, for two obstacles)."""
+    """Size of the scene embedding z (paper: 60, for two obstacles)."""
     cloud: Count = 512
-    """Points of an input cloud."""
+    """ALL Number of points of an input cloud."""
     region: VisibleRegion = PANDA_REGION
     """Points outside this region are ignored, since the arm does not reach them. For a robot with a large
     reach, the region contains whole surfaces."""
@@ -48,7 +48,7 @@ ORDER_STEPS = 2**20 - 1
 
 
 CURVE_STEP = 2.0**-16
-"""Coordinates are rounded to this before they are sorted along a curve [m]."""
+"""Coordinates are rounded to multiples of this before they are sorted along a curve [m]."""
 SPREADS = (
     (32, 0x001F00000000FFFF), (16, 0x001F0000FF0000FF), (8, 0x100F00F00F00F00F),
     (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249),
@@ -93,11 +93,11 @@ def in_order(
 @dataclass(frozen=True)
 class PointAutoencoderSettings(EncoderSettings):
     points: Sizes = (64, 128, 256)
-    """Layers of the perceptron on each point."""
+    """Widths of the layers of the perceptron on each point."""
     hidden: Count = 384
     """Width of the layer between the pooled features and z, and of the decoder's."""
     decoded: Count = 192
-    """Points that the decoder reconstructs."""
+    """Number of points that the decoder reconstructs."""
 
 
 @dataclass(frozen=True)
@@ -110,9 +110,10 @@ class CompressionAutoencoderSettings(EncoderSettings):
     code: Count = 60
     """Size of z."""
     cloud: Count = 1400
-    """Points of an input cloud; the input has three numbers for each."""
+    """Number of points of an input cloud; the input has three numbers for each."""
     hidden: Sizes = (786, 512, 256)
-    """Layers of the encoder between the cloud and z; the decoder has the same in reverse order."""
+    """Widths of the encoder's layers between the cloud and z; the decoder has the same widths in reverse
+    order."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +123,7 @@ class PointsSettings(EncoderSettings, name="points"):
     code: Count = 96
     """Size of z: three numbers for each point."""
     cloud: Count = 32
-    """Points of an input cloud."""
+    """ALL Number of points of an input cloud."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -135,17 +136,17 @@ class PointNetSettings(EncoderSettings):
     """Sizes for training on a CPU; the original's are in brackets."""
 
     cloud: Count = 256
-    """Points of an input cloud (1024)."""
+    """ALL Number of points of an input cloud (in the paper of the encoder: 1024)."""
     first: Sizes = (32, 32)
-    """Layers on each point before the feature transform (64, 64)."""
+    """Widths of the layers on each point before the feature transform (64, 64)."""
     second: Sizes = (32, 64, 192)
-    """Layers on each point after it (64, 128, 1024)."""
+    """Widths of the layers on each point after the feature transform (64, 128, 1024)."""
     transform: Sizes = (16, 32, 64)
-    """Layers on each point within a transform's network (64, 128, 1024)."""
+    """Widths of the layers on each point within a transform's network (64, 128, 1024)."""
     transform_head: tuple[Count, ...] = (32,)
-    """Layers of a transform's network after the maximum (512, 256)."""
+    """Widths of the layers of a transform's network after the maximum (512, 256)."""
     head: tuple[Count, ...] = (192,)
-    """Layers between the maximum and z (512, 256)."""
+    """Widths of the layers between the maximum and z (512, 256)."""
 
 
 @dataclass(frozen=True)
@@ -154,15 +155,15 @@ class DGCNNSettings(EncoderSettings):
 
     any_size = False  # distances to neighbors depend on the density of the cloud
     cloud: Count = 128
-    """Points of an input cloud (1024)."""
+    """ALL Number of points of an input cloud (in the paper of the encoder: 1024)."""
     neighbors: Count = 8
-    """Nearest points that each point is joined with (20)."""
+    """Number of nearest points to which each point is joined (20)."""
     edges: Sizes = (32, 32, 64)
     """Widths of the layers of edge convolution (64, 64, 128, 256)."""
     embedding: Count = 192
-    """Features of a point, computed from all these layers, that are pooled (1024)."""
+    """Number of features of a point, computed from all these layers, that are pooled (1024)."""
     head: tuple[Count, ...] = (192,)
-    """Layers between the pooled features and z (512, 256)."""
+    """Widths of the layers between the pooled features and z (512, 256)."""
 
 
 _NETWORKS = "robotdiffuse.learning.encoders.networks"

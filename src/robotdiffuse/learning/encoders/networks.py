@@ -114,7 +114,8 @@ def fp32(tensor: Tensor) -> torch.autocast:
 
 
 OCTAVES = 4
-"""Wavelengths (4 m, 2 m, ...) of the sines and cosines of a point's coordinates that are inputs too."""
+"""Number of wavelengths (4 m, 2 m, ...) of the sines and cosines of a point's coordinates that are additional
+inputs."""
 
 
 def wave_angles(points: Float[Tensor, "*batch 3"], octaves: int = OCTAVES) -> list[Float[Tensor, "*batch 3"]]:
@@ -193,9 +194,10 @@ class CompressionAutoencoder(Autoencoder):
 
 
 DISTANCE_QUERIES = 96
-"""Positions per cloud at which the distance field is reconstructed."""
+"""Number of positions for each cloud at which the distance field is reconstructed."""
 DISTANCE_WEIGHT = 4.0
-"""In training: weight of the error of the distance field relative to the Chamfer distance, both in meters."""
+"""Weight in the training loss of the error of the distance field relative to the Chamfer distance, both in
+meters."""
 DISTANCE_CAP = 0.5
 """Reconstructed distances are capped at this [m]."""
 
@@ -388,7 +390,7 @@ class PointNet(Encoder):
 NEGATIVE_SLOPE = 0.2
 """Slope of the leaky ReLU below zero, as in the original."""
 IGNORED_DISTANCE = 1e9
-"""Squared distance that is given to points that do not count."""
+"""Squared distance that is assigned to points that do not count."""
 
 
 def neighbors(x: Features, near: Near, count: int) -> Int64[Tensor, "batch points neighbors"]:

@@ -61,12 +61,12 @@ class TrajectoryData:
     """Planned trajectories with their scenes, in memory."""
 
     q: Trajectories
-    """[rad], float32, evenly spaced along the path."""
+    """Joint values of the waypoints [rad], float32, evenly spaced along the path."""
     scenes: PackedScenes
     trivial: Mask
     """Whether the straight line from start to goal is free too."""
     codes: Float[ndarray, "n code"] | None
-    """z of each scene, float16; None if there is no frozen encoder."""
+    """Embedding z of each scene, float16; None if there is no frozen encoder."""
     digest: str
     """The first 16 digits of the SHA-256 of the shards."""
     validation: int
@@ -106,7 +106,7 @@ class TrajectoryData:
 
 
 _Part = tuple[ndarray, PackedScenes, ndarray, ndarray]
-"""Trajectories, their scenes, whether they are trivial, and the codes of the scenes."""
+"""Trajectories, their scenes, whether each trajectory is trivial, and the embeddings of the scenes."""
 
 
 def load_data(
@@ -223,9 +223,9 @@ class Batch:
 
     features: Float[ndarray, "n waypoints features"]
     level: Values
-    """t / T"""
+    """Noise level t / T."""
     condition: Float[ndarray, "n condition"]
-    """C = [z, start, goal]; z is zero if there are clouds."""
+    """Condition C = [z, start, goal]; z is zero if `clouds` are given."""
     clouds: Float32[Tensor, "n points 3"] | None
     """Clouds of the scenes [m], for an encoder that is trained jointly."""
     clean: Trajectories

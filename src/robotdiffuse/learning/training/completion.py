@@ -46,9 +46,9 @@ Truth = Bool[ndarray, "m"]
 NICENESS = 5
 """Niceness of the workers: the training process has priority."""
 BATCHES_AHEAD = 3
-"""Batches drawn in advance, for each worker."""
+"""Number of batches that are drawn in advance for each worker."""
 SEED_LIMIT = 2**62
-"""Seeds of samples are below this."""
+"""Upper bound of the seeds of samples."""
 
 
 class SamplePrefetcher:
@@ -98,17 +98,17 @@ BUNDLED_WEIGHTS = "bundled"
 HELD_OUT_SEED = 20261122
 """Seed of the held-out samples; training samples are drawn from other seed sequences."""
 VALIDATION_SAMPLES = 4
-"""Held-out samples of each family for the validation at every checkpoint."""
+"""Number of held-out samples of each family for the validation at every checkpoint."""
 CALIBRATION_SAMPLES = 12
-"""Held-out samples of each family to which the temperature is fitted."""
+"""Number of held-out samples of each family to which the temperature is fitted."""
 TEST_SAMPLES = 24
-"""Held-out samples of each family for the figures of the trained network."""
+"""Number of held-out samples of each family on which the trained network is measured."""
 OCCUPIED_PROBABILITY = 0.1
 """Voxels above this probability count as occupied in precision and recall."""
 CALIBRATION_STRIDE = 17
 """The temperature is fitted to one voxel out of this many."""
 CALIBRATION_BINS = 20
-"""Bins of probabilities for the expected calibration error."""
+"""Number of bins of probabilities for the expected calibration error."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,11 +116,12 @@ class CompletionTraining(TrainingSettings):
     """Settings of the training of the completion network."""
 
     robot: str = "panda"
-    """Bundled name, or path to a URDF: the arm in the views."""
+    """Name of a bundled robot, or path to a URDF: the arm in the views."""
     families: Annotated[tuple[Annotated[str, OneOf(FAMILIES)], ...], Filled()] = tuple(FAMILIES)
-    """Families of the scenes, in equal parts."""
+    """Families of the scenes, with equal shares."""
     weights: str | None = None
-    """Folder with weights to begin with; "bundled": those that come with the package; None: random ones."""
+    """Folder with the initial weights; "bundled": the weights that come with the package; None: random
+    weights."""
     minutes: Positive | None = None
     samples: Count | None = 40_000
     batch: Count = 4
@@ -128,7 +129,7 @@ class CompletionTraining(TrainingSettings):
     warmup_steps: Natural = 100
     average: ShareBelowOne = 0.995
     workers: Natural = 1
-    """Worker processes that draw samples; 0: the training process draws them."""
+    """Number of worker processes that draw samples; 0: the training process draws them."""
     network: CompletionSettings = field(default_factory=CompletionSettings)
 
 

@@ -28,9 +28,9 @@ class Stage(NamedTuple):
     """A part of a progressive training."""
 
     end: float
-    """Share of the training at which it ends."""
+    """Share of the training after which the stage ends."""
     block: int
-    """Waypoints in a block, whose mean is a token."""
+    """Number of waypoints in a block; their mean is a token."""
 
 
 STAGES = (Stage(0.72, 9), Stage(0.90, 4), Stage(1.0, 1))
@@ -55,7 +55,7 @@ class TrainingSettings(Settings):
     """Length of the run in training samples. Runs of this kind are reproducible, timed ones are not."""
     seed: Natural = 0
     batch: Count = 128
-    """Samples per step."""
+    """Number of samples in a training step."""
     learning_rate: Positive = 1e-3
     """Peak learning rate of AdamW."""
     warmup_steps: Natural = 500
@@ -70,7 +70,8 @@ class TrainingSettings(Settings):
     """After this number of consecutive steps with a loss that is not finite, training goes back to the last
     checkpoint."""
     threads: Count = 1
-    """Threads of PyTorch. While other processes keep the cores busy, one is several times faster than two."""
+    """Number of threads of PyTorch. While other processes keep the cores busy, one thread is several times
+    faster than two."""
     device: Annotated[str, OneOf(("cpu", "cuda"))] | None = None
     """cpu or cuda; None: cuda if there is one."""
     checkpoint_seconds: NotNegative = 120.0
@@ -92,7 +93,7 @@ class EncoderTraining(TrainingSettings):
     """Name of an encoder that is trained alone."""
     minutes: Positive | None = 5.0
     batch: Count = 32
-    """Clouds per step."""
+    """Number of clouds in a training step."""
     learning_rate: Positive = 2e-3
     warmup_steps: Natural = 200
     average: ShareBelowOne = 0.999
@@ -100,10 +101,10 @@ class EncoderTraining(TrainingSettings):
     scenes: Annotated[str, OneOf(("mixed", "rop"))] = "mixed"
     """Training scenes: mixed, of every kind, or rop, two large obstacles each as in the paper's data."""
     max_obstacles: Natural = 12
-    """Most obstacles in a mixed training scene."""
+    """Largest number of obstacles in a mixed training scene."""
     points: Count = 256
-    """Largest training cloud; each step takes between an eighth and all of these points. An encoder for
-    clouds of one size gets that size."""
+    """Largest number of points of a training cloud; each step takes between an eighth and all of them. An
+    encoder for clouds of a fixed size gets that size."""
     encoder: Annotated[EncoderSettings | None, SettingsOf("name", ENCODERS)] = None
     """Settings of the encoder; None: its defaults."""
 
@@ -124,12 +125,12 @@ class MotionTraining(TrainingSettings):
     data: str
     """Folder of a data set of `robotdiffuse data generate`."""
     robot: str = "panda"
-    """Bundled name, or path to a URDF: the robot of the data."""
+    """Name of a bundled robot, or path to a URDF: the robot of the data."""
     waypoints: Annotated[int, Bound(least=3.0, most=MAX_WAYPOINTS)] = 48
-    """Waypoints of a trajectory (paper: 254)."""
+    """Number of waypoints of a trajectory (paper: 254)."""
     turned_copies: Natural = 5
-    """Copies of each trajectory, turned about the vertical with their scenes, if the first joint is
-    vertical."""
+    """Number of copies of each trajectory, turned about the vertical together with their scenes, if the axis
+    of the first joint is vertical."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,16 +152,16 @@ class PlannerTraining(MotionTraining, ModelParts):
     losses: LossSettings = field(default_factory=LossSettings)
     """The paper's losses of joints, points and collision."""
     trivial_share: Share = 0.1
-    """Share of the batch with a free straight line from start to goal, so that the network learns to keep
-    it."""
+    """Share of each batch whose straight line from start to goal is free, so that the network learns to keep
+    straight lines."""
     smooth_noise: bool = True
     """Whether the noise has the covariance of the trajectories over the waypoints; otherwise white (the
     paper's)."""
     progressive: bool = False
-    """Whether the denoiser sees means of blocks of waypoints in most of the training, which take a fraction
-    of the time, and single waypoints at its end, see `STAGES`."""
+    """Whether the denoiser's tokens are means of blocks of waypoints in most of the training, which takes a
+    fraction of the time, and single waypoints at the end of the training; see `STAGES`."""
     validation_problems: Natural = 32
-    """Held-out problems that are sampled without guidance at every checkpoint."""
+    """Number of held-out problems that are sampled without guidance at every checkpoint."""
     encoder_settings: Annotated[EncoderSettings | None, SettingsOf("encoder", ENCODERS)] = None
     """Settings of an encoder that is trained jointly; None: its defaults."""
     denoiser_settings: Annotated[DenoiserSettings | None, SettingsOf("denoiser", DENOISERS)] = None
@@ -211,7 +212,8 @@ class BaselineTraining(MotionTraining):
 JOINT = LossSettings()
 JOINT_POINT = LossSettings(point=0.3, waypoints=4)
 JOINT_POINT_COLLISION = LossSettings(point=0.3, collision=0.05, begin=0.3, waypoints=4)
-"""The paper gives no weights; with these the three losses are of one size when predictions are 5 cm off."""
+"""Weights of the losses; the paper gives none. With these, the three losses are about equally large when
+predictions are off by 5 cm."""
 
 _TABLE2_ROW = {"clearance_features": False, "condition_drop": 0.1, "losses": JOINT_POINT_COLLISION}
 

@@ -140,16 +140,16 @@ BAR_WIDTH = 24
 """Width of the progress bar [characters]: with its figures it fits into 80; a line that
 wraps is printed again."""
 LOG_EVERY = 50
-"""Steps per row of log.csv."""
+"""Number of training steps between two rows of log.csv."""
 MAX_ROLLBACKS = 5
-"""After so many returns to a checkpoint a run has diverged."""
+"""A run counts as diverged after this many returns to a checkpoint."""
 
 
 class Validation(NamedTuple):
     """Figures of a validation."""
 
     loss: float
-    """On held-out data."""
+    """Loss on held-out data."""
     success: float | None = None
     """Share of held-out problems that the network solves by itself; None: not measured."""
 
@@ -514,7 +514,7 @@ def train(task: TrainingTask, out: str) -> dict[str, float]:
 MAX_VALIDATION_TRAJECTORIES = 2000
 """Largest number of trajectories of the validation split that are used."""
 VALIDATION_BATCHES = 8
-"""Batches of these in a validation."""
+"""Number of batches of these trajectories in a validation."""
 
 
 class MotionTask(TrainingTask):

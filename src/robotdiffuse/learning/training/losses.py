@@ -43,7 +43,8 @@ class ForwardKinematics:
         turns[2, 0, 1] = -1
         slides = np.stack([np.eye(4), np.outer([0, 0, 1, 0], [0, 0, 0, 1])])
         self._steps = []
-        """By joint, [12, 4]: C, A and B transposed, stacked; [8, 4]: C and the slide of a prismatic joint."""
+        """For each joint, stacked transposed matrices: [12, 4] C, A and B; for a prismatic joint [8, 4] C and
+        the slide."""
         for offset, prismatic in zip(robot.frame_offsets, robot.prismatic, strict=True):
             self._steps.append(self.tensor(np.hstack(list(offset @ (slides if prismatic else turns))).T))
         self._last_row = self.tensor(np.array([[0.0], [0.0], [0.0], [1.0]]))
@@ -90,16 +91,16 @@ class LossSettings(Settings, name="losses"):
     joint: NotNegative = 1.0
     """The paper's lambda_joint."""
     point: NotNegative = 0.0
-    """lambda_point"""
+    """The paper's lambda_point."""
     collision: NotNegative = 0.0
-    """lambda_collision"""
+    """The paper's lambda_collision."""
     begin: Share = 0.0
     """Share of the training after which L_collision begins; it rises over a tenth of the training. Earlier
     predictions are too far off for a meaningful gradient."""
     points: Count = 6
-    """Points of each link's surface in L_point."""
+    """Number of points of each link's surface in L_point."""
     waypoints: Count = 8
-    """Waypoints, drawn for each batch, on which L_point and L_collision are computed."""
+    """Number of waypoints, drawn anew for each batch, on which L_point and L_collision are computed."""
 
     def collision_weight(self, fraction: float) -> float:
         """lambda_collision when this fraction of the training is done."""

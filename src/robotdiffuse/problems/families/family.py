@@ -46,15 +46,16 @@ POSITION = "position"
 POSE = "pose"
 
 BATCH_SIZE = 64
-"""Configurations sampled at once; many of them are free."""
+"""Number of configurations that are sampled at once; many of them are collision-free."""
 MAX_BATCHES = 8
-"""Batches before a scene is given up: some scenes leave hardly any free space."""
+"""A scene is given up after this many batches: some scenes leave hardly any free space."""
 MAX_SCENES = 100
-"""Scenes without a free start or goal before sampling fails with an error."""
+"""Sampling fails with an error after this many scenes without a free start or goal."""
 LIMIT_MARGIN = 1e-3
 """Joints within this distance of a limit count as clipped [rad]."""
 POSE_IK = InverseKinematicsSettings(max_rounds=4, patience=2)
-"""Few rounds: it is faster to sample another target than to search long for one inside an obstacle."""
+"""Settings of the inverse kinematics of targets. They allow few rounds, since sampling another target is
+faster than a long search for configurations at a target inside an obstacle."""
 MIN_POSE_DOF = 6
 """Minimum number of joints for an arm to reach arbitrary poses."""
 POSITION_IK = replace(POSE_IK, position_only=True)

@@ -52,9 +52,9 @@ DOWN = np.array([0.0, 0.0, -1.0])
 AHEAD = np.array([1.0, 0.0, 0.0])
 """Direction away from the arm, in the frame of the furniture."""
 MAX_TRIES = 1000
-"""Samples of a scene before the settings are rejected."""
+"""The settings are rejected after this many samples of a scene."""
 PLACE_TRIES = 30
-"""Samples of a free place for one object before the scene is sampled anew."""
+"""The scene is sampled anew after this many samples of a free place for one object."""
 MIN_GAP = 0.01
 """Minimum distance between the objects on a table or on the ground [m]."""
 # Minimum height of tables with a region beneath them, and of counters with one inside [m].
@@ -78,7 +78,7 @@ class Region:
     """A box without obstacles, rotated about the vertical axis, for the fingers at start or goal."""
 
     center: Vector
-    """In the base frame [m]."""
+    """Center of the region in the base frame [m]."""
     size: Vector
     """Full edge lengths [m]."""
     yaw: float
@@ -256,7 +256,7 @@ class LooseObject:
         self.size = (x, x, x) if self.ball else (x, y, min(rng.uniform(*settings.object_height), tallest))
         self.turn = float(rng.uniform(-np.pi, np.pi))
         self.half = x / 2 if self.ball else float(np.hypot(x, y)) / 2
-        """Half the side of a square that contains it at any rotation."""
+        """Half the side of a square that contains the object at any rotation."""
 
     def put(self, frame: FurnitureFrame, x: float, y: float, z: float) -> None:
         """Adds the shape at x, y of the frame, standing at height z."""
@@ -367,7 +367,7 @@ class Shelf(Furniture):
     """Larger than for other furniture: a hand that points forward reaches farther than one that points
     down."""
     distance: PositiveRange = (0.45, 0.7)
-    """From the base to the middle of the front."""
+    """ALL Distance from the base to the middle of the front."""
     boards: tuple[AtLeastTwo, AtLeastTwo] = (2, 4)
     """Number of boards."""
     lowest: tuple[NotNegative, NotNegative] = (0.0, 0.33)
@@ -428,7 +428,7 @@ class Crate(Furniture):
     object_height: PositiveRange = (0.1, 0.5)
     crates: tuple[Count, Count] = (1, 2)
     distance: PositiveRange = (0.4, 0.65)
-    """From the base to the middle of a crate, a loose object or a spot."""
+    """Distance from the base to the middle of a crate, a loose object or a spot."""
     length: PositiveRange = (0.25, 0.45)
     """Inner length and width of a crate."""
     height: PositiveRange = (0.12, 0.3)
@@ -502,11 +502,11 @@ class Table(Furniture):
     objects: tuple[Natural, Natural] = (3, 10)
     object_height: PositiveRange = (0.08, 0.35)
     distance: PositiveRange = (0.25, 0.4)
-    """From the base to the middle of the near edge of the table."""
+    """Distance from the base to the middle of the near edge of the table."""
     height: PositiveRange = (0.1, 0.5)
     """Height of the table's top."""
     length: PositiveRange = (0.45, 0.7)
-    """Extent away from the arm."""
+    """Extent of the table in the direction away from the arm."""
     width: PositiveRange = (0.8, 1.4)
     thickness: PositiveRange = (0.02, 0.04)
     """Thickness of the top and of a dividing wall."""
@@ -595,7 +595,7 @@ class Kitchen(Furniture):
     down."""
     objects: tuple[Natural, Natural] = (1, 5)
     distance: PositiveRange = (0.3, 0.45)
-    """From the base to the middle of the near edge of the counter."""
+    """Distance from the base to the middle of the near edge of the counter."""
     height: PositiveRange = (0.05, 0.4)
     """Height of the counter's top."""
     depth: PositiveRange = (0.4, 0.55)
@@ -608,7 +608,7 @@ class Kitchen(Furniture):
     solids: tuple[Natural, Natural] = (0, 2)
     """Number of solid appliances."""
     appliance_width: PositiveRange = (0.3, 0.45)
-    """Width of ovens; solid appliances have between half of it and all of it."""
+    """Width of ovens. The width of a solid appliance is between half of this and all of it."""
     appliance_depth: PositiveRange = (0.22, 0.38)
     appliance_height: PositiveRange = (0.22, 0.36)
     cupboards: tuple[Natural, Natural] = (0, 3)
@@ -617,7 +617,7 @@ class Kitchen(Furniture):
     cupboard_depth: PositiveRange = (0.2, 0.33)
     cupboard_height: PositiveRange = (0.26, 0.4)
     above: PositiveRange = (0.38, 0.55)
-    """From the counter to the cupboards."""
+    """Height of the cupboards above the counter."""
     door_share: Share = 0.3
     """Fraction of the cupboards with a door, which is open."""
     spots: tuple[Natural, Natural] = (1, 2)
@@ -702,7 +702,7 @@ class Cabinet(Furniture):
     object_height: PositiveRange = (0.03, 0.35)
     objects: tuple[Natural, Natural] = (0, 6)
     distance: PositiveRange = (0.35, 0.65)
-    """From the base to the middle of the front."""
+    """ALL Distance from the base to the middle of the front."""
     lowest: tuple[NotNegative, NotNegative] = (0.0, 0.7)
     """Height of the underside of the lowest board of a cabinet that does not stand on the ground."""
     ground_share: Share = 0.4

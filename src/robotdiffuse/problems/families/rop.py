@@ -35,7 +35,7 @@ KINDS = ("sphere", "box")
 FLOOR = Box((0.0, 0.0, -0.05), (2.0, 2.0, 0.1), name="floor")
 """A floor with its top at z = 0."""
 MAX_TRIES = 1000
-"""Samples of an obstacle before the settings are rejected."""
+"""The settings are rejected after this many samples of an obstacle."""
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,9 @@ from robotdiffuse.robots.fitting.sphere_fitting import MARGIN, SphereSettings
 LINK_TOLERANCES = SphereSettings()
 """Tolerances of the spheres of links."""
 HAND = (1, 0)
-"""Frame and number of joints of a robot that stand for a link at its end."""
+"""Arguments `frame` and `dof` of `SphereSettings.tolerance` for a body at the end of an arm."""
 MAX_SPHERES = 100
-"""Largest number of spheres per solid; if they do not suffice, they exceed the tolerance."""
+"""Largest number of spheres for each solid; if they do not suffice, the spheres exceed the tolerance."""
 MAX_PIECES_PER_AXIS = 40
 # Steps of the search for a small sphere around points. It ends early if all points are at least at this
 # fraction of the radius from the center.

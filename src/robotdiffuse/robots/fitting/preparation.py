@@ -60,7 +60,7 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.robot_folder import read_robot_folder, user_robots, write_robot_folder
 
 JOINT_SAMPLES = 9
-"""Values of the joint between two links at which points are tested."""
+"""Number of values of the joint between two links at which points are tested."""
 GAP = 0.004
 """Points this close to a neighbor count as inside [m]: gaps between links are about this thin."""
 BOX_PADDING = 10 * GAP
@@ -72,7 +72,8 @@ class Neighbor(NamedTuple):
 
     link: str
     T_link_neighbor: Poses
-    """At joint values over the range of the joint between them; one pose if it is fixed."""
+    """Poses of the neighbor in the frame of the link, at values over the range of the joint between the two;
+    one pose if the joint is fixed."""
 
 
 def neighbors(robot: Robot, link: str) -> tuple[Neighbor, ...]:
@@ -149,13 +150,15 @@ LARGE_REACH = 1.4
 """Reach beyond which the lengths in the settings grow with the reach [m]: a larger arm works in more space,
 and needs no more parts and spheres."""
 GRAZING_ROUNDS = 10
-"""Measurements of false collisions that look for grazing links: few configurations graze."""
+"""Number of measurements of false collisions that look for grazing links. In few configurations links graze,
+so one measurement does not find all of them."""
 Progress = Callable[[str, int, int], None]
 """Called with the current activity, the index of the step and the number of steps."""
 CONCAVITY_SHRINKAGE = 0.5
 """Factor per round on the concavity of convex parts with many false collisions."""
 UNREFINED_FRACTION = 0.6
-"""Fraction of the allowed false collisions that pairs left as they are may have together."""
+"""Pairs of links are left as they are as long as together they have at most this fraction of the allowed
+false collisions."""
 GAP_SHRINKAGE = 0.6
 """Factor per round on `GAP_FRACTION`."""
 GAP_FRACTION = 1.2
@@ -171,11 +174,12 @@ class PreparationSettings(Settings, name="preparation"):
     spheres: SphereSettings = SphereSettings()  # noqa: RUF009
     sampling: SamplingSettings = SamplingSettings()  # noqa: RUF009
     max_false_collisions: Annotated[float, Bound(above=0.0, below=1.0)] = 0.075
-    """Fraction of the free configurations with false collisions of spheres above which links are refined."""
+    """Links are refined while spheres collide falsely in more than this fraction of the free
+    configurations."""
     samples: Annotated[int, Bound(least=100.0)] = 4000
-    """Random configurations for measuring false collisions."""
+    """Number of random configurations at which false collisions are measured."""
     rounds: Natural = 2
-    """Largest number of refinements."""
+    """Largest number of rounds of refinement."""
     finest: float = 0.002
     """Smallest tolerance of spheres [m]."""
 
@@ -212,7 +216,7 @@ class Prepared:
     links: tuple[LinkReport, ...]
     pairs: tuple[PairReport, ...]
     sampled: tuple[PairReport, ...]
-    """The pairs as sampling alone classifies them."""
+    """Pairs of links as sampling alone classifies them."""
     false_collisions: FalseCollisions
 
 
@@ -460,13 +464,13 @@ def _floor(robot: Robot, link: str) -> tuple[ndarray, float] | None:
 MIN_FREE = 0.2
 MAX_FALSE_COLLISIONS = 0.08
 MAX_PROPOSED = 3
-"""Pairs proposed by the error for a robot that always collides with itself, if no single pair always
-collides."""
+"""Largest number of pairs that the error message proposes for a robot that always collides with itself
+although no single pair always collides."""
 ASSUMED_SAFE = {
     LIMITS: "up to a limit of one joint, and the URDF's limits allow that",
     POSE: "also in a pose that the SRDF names",
 }
-"""Reasons for allowing a pair that a person should check, with the evidence."""
+"""Reasons for allowing a pair that a person should check, each with what the reason rests on."""
 BYTES_PER_UNIT = 1 if sys.platform == "darwin" else 1024
 """Bytes per unit of `ru_maxrss`."""
 

@@ -37,7 +37,7 @@ most this fraction of the variance of the indicator "the links collide" unexplai
 BALL_MARGIN = 1e-9
 """Margin of bounding and inscribed balls of meshes [m], larger than rounding errors."""
 NEAR_DISTANCE = 0.1
-"""Pairs of links that stay further apart than this need fewer searches for a collision [m]."""
+"""Fewer searches for a collision are made for pairs of links that stay further apart than this [m]."""
 
 
 class Links:

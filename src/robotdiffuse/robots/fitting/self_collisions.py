@@ -35,7 +35,7 @@ LIMITS = "limits"
 NAMED = "named"
 BY_SRDF = "srdf"
 ADJACENT_STRIDE = 10
-"""One in this many samples is tested for adjacent links, which are allowed in any case."""
+"""Only every n-th sample is tested for adjacent links, which are allowed to touch in any case."""
 MIN_LIMITS_COLLIDING = 0.2
 """Smallest fraction of colliding configurations for the reason `limits`."""
 MAX_HELD_JOINTS = 1
@@ -214,11 +214,13 @@ class PairFalseCollisions:
     colliding: float
     """Fraction of the configurations in which the true meshes collide."""
     by_parts: float
-    """Fraction of the free configurations in which convex parts of the two collide."""
+    """Fraction of the free configurations in which convex parts of the two links collide."""
     by_spheres: float
-    """The same for spheres; includes configurations in which the parts collide too."""
+    """Fraction of the free configurations in which spheres of the two links collide; includes configurations
+    in which the convex parts collide too."""
     gaps: Values
-    """Distances between the parts in some of the configurations in which only the spheres collide [m]."""
+    """Distances between the convex parts in some of the configurations in which only the spheres collide
+    [m]."""
     places: dict[str, Spheres]
     """By link and in its frame: rows x y z where spheres touch although the parts are apart, and the smallest
     distance of the parts there [m]."""
@@ -238,7 +240,7 @@ class FalseCollisions:
     by_spheres: float
     """Fraction of the free configurations in which covering spheres collide."""
     pairs: tuple[PairFalseCollisions, ...]
-    """Pairs of links, most false collisions of spheres first."""
+    """Pairs of links; those with the most false collisions of spheres come first."""
 
 
 def measure_false_collisions(

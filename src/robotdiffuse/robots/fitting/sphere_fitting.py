@@ -68,11 +68,12 @@ class Bounds:
     """How far the spheres of a link may stick out of it."""
 
     tolerance: float
-    """[m]"""
+    """How far a sphere may stick out of the link [m]."""
     hidden: Callable[[Points], Mask] | None = None
     """Whether points are inside a neighbor, so that spheres may contain them."""
     tight: Spheres = field(default_factory=lambda: np.zeros((0, 4)))
-    """Rows x y z and how far spheres may stick out there [m]. Near these, `hidden` does not apply."""
+    """Tight places: rows of x, y, z and how far spheres may stick out there [m]. Near these places, `hidden`
+    does not apply."""
     floor: tuple[Vector, float] | None = None
     """Upward normal n and offset of a plane: spheres may not contain points x with n . x below the offset."""
 
@@ -222,7 +223,7 @@ def _grid_points(shape: tuple[int, ...] | ndarray, origin: Vector, spacing: floa
 
 
 MARGIN = 1e-5
-"""Added to the radii [m], for rounding in files and in single-precision kernels."""
+"""Margin added to the radii [m]: files and single-precision kernels round them."""
 BURIED_DEPTH = 1e-9
 """Points deeper than this in another part are not on the surface of the union [m]."""
 EXCESS_TOLERANCE = 0.1
@@ -232,10 +233,11 @@ EXCESS_TOLERANCE = 0.1
 COARSE_CELLS = (5.0, 60_000)
 FINE_CELLS = (8.0, 150_000)
 MAX_CROWD = 10
-"""If a surface has room for so many times the cells that are allowed, they are not made: they would not fit
-into memory."""
+"""Cells are not computed for a surface that has room for more than this many times the allowed number of
+cells: they would not fit into memory."""
 SMALLEST_TRIANGLE = 2e-6
-"""Smaller pieces of the surface that no single sphere contains count as uncovered [m]."""
+"""A piece of the surface that no single sphere contains is split down to this size [m]; then it counts as
+uncovered."""
 ADDED_SPACING = 0.02
 """Smallest distance between spheres that are added in one round [m]."""
 
@@ -247,19 +249,23 @@ class SphereSettings(Settings, name="sphere tolerances"):
     first_half: float = 0.015
     """How far a sphere may stick out of a link that at most half of the joints (rounded up) move [m]."""
     second_half: float = 0.009
-    """The same for the links beyond, which work closer to obstacles [m]."""
+    """How far a sphere may stick out of a link that more than half of the joints move [m]: these links work
+    closer to obstacles."""
     fixed: float = 0.03
-    """The same for links that no planned joint moves, which can only collide with the arm itself [m]."""
+    """How far a sphere may stick out of a link that no planned joint moves [m]: it can only collide with the
+    arm itself."""
     finest: Positive = 0.004
-    """Lower bound on the tolerance [m]."""
+    """Lower bound of these tolerances [m]."""
     candidates: int = 1000
-    """Candidate centers of the greedy cover."""
+    """Number of candidate centers of the greedy cover."""
     rounds: int = 5
-    """Rounds of assigning cells and moving spheres, for each number of spheres."""
+    """Number of rounds, for each number of spheres, in which cells are assigned to spheres and spheres are
+    moved."""
     tries: int = 3
-    """Failed attempts to drop a sphere after which a round of dropping ends."""
+    """A round of dropping spheres ends after this number of failed attempts."""
     most: int = 200
-    """Approximate largest number of spheres per link; if they do not suffice, they exceed the tolerance."""
+    """Approximate largest number of spheres for each link; if they do not suffice, the spheres exceed the
+    tolerance."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -341,7 +347,7 @@ class Cells:
 
     points: Points
     corners: Int[ndarray, "c 3"]
-    """Indices into points."""
+    """Indices of the corners of each cell in the points."""
     sharp: Mask
     """Whether a point is a vertex of a mesh; all others lie between neighbors on a face or an edge."""
 
@@ -416,11 +422,11 @@ class _Assignment(NamedTuple):
     owner: Int[ndarray, "c"]
     """The sphere that covers the cell with the least excess."""
     owner_excess: Values
-    """Its excess radius for the cell [m]."""
+    """Excess radius of `owner` for the cell [m]."""
     runner_up: Int[ndarray, "c"]
     """The second best sphere; -1 if there is none."""
     second_excess: Values
-    """Its excess radius [m]."""
+    """Excess radius of `runner_up` for the cell [m]."""
 
 
 def _relax(

@@ -29,13 +29,13 @@ from robotdiffuse.robots.parsing.srdf import Srdf
 
 MOVABLE = ("hinge", "slide")
 DRAWN = ("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
-"""Geoms that a URDF can have."""
+"""Types of geoms that a URDF can contain."""
 WORLD = 0
-"""Body that does not move."""
+"""Index of the world body, which does not move."""
 EXCLUDED = "excluded by the model"
-"""Why a pair of links is not checked."""
+"""Reason for pairs of links that are not checked."""
 MIN_SHIFT = 1e-9
-"""Joints closer to the origin of their body than this count as being at it [m]."""
+"""A joint whose distance from the origin of its body is smaller counts as being at the origin [m]."""
 
 
 def imported_mujoco() -> Any:
@@ -131,7 +131,7 @@ class ConvertedModel:
         self.bodies = robot_bodies(model)
         self.held = placing_joints(model, self.bodies)
         self.masks = model.geom_contype | model.geom_conaffinity
-        """Not 0 for geoms that collide with anything."""
+        """Collision masks of the geoms: 0 for geoms that collide with nothing."""
         self.notes: list[str] = []
         self.links: set[str] = set()
         self.meshes: dict[str, str] = {}
@@ -148,7 +148,7 @@ class ConvertedModel:
         self._sites()
         ET.indent(self.root)
         self.semantics = Srdf(self.path, allowed=self._excluded(), poses=self._poses())
-        """Keyframes as named poses, and pairs of links that the model does not let collide."""
+        """Named poses (the keyframes), and the pairs of links that the model excludes from collision."""
         self.urdf = ET.tostring(self.root)
 
     def name(self, kind: str, index: int) -> str:

@@ -17,7 +17,7 @@ MAX_PACKAGES = 32
 NAMESPACE_PREFIX = re.compile(rb"""</?([A-Za-z_][\w.-]*):[\w.-]+|\s([A-Za-z_][\w.-]*):[\w.-]+\s*=\s*["']""")
 """Matches the namespace prefix of an element or attribute."""
 XACRO = Lock()
-"""Held while xacro compiles a file: it keeps its state in its modules."""
+"""Lock that is held while xacro compiles a file, because xacro keeps its state in module globals."""
 PACKAGE_NOT_FOUND = re.compile(r"Package not found: (\S+)")
 """Matches xacrodoc's error for an unknown package."""
 
