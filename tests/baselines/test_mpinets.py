@@ -135,15 +135,12 @@ def test_trained_weights_are_read_and_the_same_seed_gives_the_same_path(tmp_path
     assert len(paths[0].positions) > 2
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
+def test_bad_network_settings() -> None:
+    for values, message in (
         ({"scene_points": 0}, "scene_points is 0"),
         ({"target_points": 13}, "target_points is 13; it must be at most robot_points, 12"),
         ({"centers": (64, 65)}, "centers is"),
         ({"cloud_widths": (30, 16)}, "cloud_widths is"),
-    ],
-)
-def test_bad_network_settings(values: dict, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        mpinets.MPiNetsNetworkSettings(**values)
+    ):
+        with pytest.raises(InputError, match=message):
+            mpinets.MPiNetsNetworkSettings(**values)  # type: ignore[arg-type]

@@ -131,29 +131,22 @@ def test_files_keep_them(tmp_path: Path) -> None:
         np.testing.assert_allclose(T_world_frame[:3, 3], pose["xyz"])
 
 
-T = np.eye(4)
-WRONG: dict[str, tuple[Any, str]] = {
-    "twice": (lambda: rd.PosesGoal([rd.PoseGoal("a", T), rd.PoseGoal("a", T)]), "goal.poses names 'a' twice"),
-    "none": (lambda: rd.PosesGoal([]), r"goal.poses is \[\]; it must be a list of rd.PoseGoal"),
-    "unknown": (
-        lambda: asked("left_gripper", "middle_gripper"),
-        "unknown link in goal.poses: 'middle_gripper'",
-    ),
-    "still": (lambda: asked("left_gripper", "torso"), "goal.poses: no planned joint moves 'torso'"),
-    "one part": (
-        lambda: asked("left_gripper", "left_gripper_base_link"),
-        "goal.poses: left_gripper and left_gripper_base_link are one rigid part; give the pose of one",
-    ),
-}
-
-
 def asked(*links: str) -> rd.Problem:
-    return rd.Problem(baxter(), rd.Scene(), free()[0], rd.PosesGoal([rd.PoseGoal(link, T) for link in links]))
+    goal = rd.PosesGoal([rd.PoseGoal(link, np.eye(4)) for link in links])
+    return rd.Problem(baxter(), rd.Scene(), free()[0], goal)
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_what_makes_no_sense_is_one_line(case: str) -> None:
-    make, message = WRONG[case]
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: rd.PosesGoal([rd.PoseGoal("a", np.eye(4))] * 2), "goal.poses names 'a' twice"),
+        (lambda: rd.PosesGoal([]), r"goal.poses is \[\]; it must be a list of rd.PoseGoal"),
+        (lambda: asked("left_gripper", "middle"), "unknown link in goal.poses: 'middle'"),
+        (lambda: asked("left_gripper", "torso"), "goal.poses: no planned joint moves 'torso'"),
+        (lambda: asked("left_gripper", "left_gripper_base_link"), "one rigid part; give the pose of one"),
+    ],
+)
+def test_what_makes_no_sense_is_one_line(make: Any, message: str) -> None:
     with pytest.raises(rd.InputError, match=message) as refused:
         make()
     assert "\n" not in str(refused.value)
