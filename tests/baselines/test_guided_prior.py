@@ -81,10 +81,6 @@ def data_of(count: int, waypoints: int = WAYPOINTS) -> TrajectoryData:
     return TrajectoryData(q.astype(np.float32), scenes, np.arange(count) % 3 == 0, None, "x", 0)
 
 
-def stay(q: ndarray, _left: int) -> ndarray:
-    return q
-
-
 @pytest.mark.slow
 def test_the_loss_falls() -> None:
     torch.manual_seed(0)
@@ -113,7 +109,7 @@ def test_share_of_trivial_motions() -> None:
 def test_samples_have_the_mean_and_variance_of_the_data(gaussian: Gaussian) -> None:
     starts, goals = (np.repeat(end[None], 300, 0) for end in (LEFT, RIGHT))
     levels = gaussian.schedule.sampling_levels(100)[:-1]
-    q = guided_prior.sample(gaussian, starts, goals, levels, np.random.default_rng(0), stay)
+    q = guided_prior.sample(gaussian, starts, goals, levels, np.random.default_rng(0), lambda q, _: q)
     assert q is not None
     x = gaussian.normalizer.to_unit(q.astype(np.float64))
     t = np.linspace(0, 1, WAYPOINTS)[:, None]

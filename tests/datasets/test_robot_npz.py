@@ -21,17 +21,13 @@ START = np.array([-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 GOAL = np.array([1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 
 
-def two_spheres(count: int = 3) -> list[dict[str, np.ndarray]]:
-    rows = []
-    for i in range(count):
-        near = rd.Sphere([0.5 + i, 0.0, 0.5], 0.25)
-        scene = rd.Scene([near, rd.Sphere([-0.9, 0.1 * i, 0.4], 0.25)])
-        rows.append(record(PANDA, scene, line(START, GOAL, 254)))
-    return rows
-
-
 def made(folder: Path) -> Path:
-    write_motions(folder / "set", PANDA, two_spheres(), waypoints=254)
+    """Straight motions between two spheres, the first one through one of them."""
+    rows = []
+    for i in range(3):
+        spheres = rd.Sphere([0.5 + i, 0.0, 0.5], 0.25), rd.Sphere([-0.9, 0.1 * i, 0.4], 0.25)
+        rows.append(record(PANDA, rd.Scene(spheres), line(START, GOAL, 254)))
+    write_motions(folder / "set", PANDA, rows, waypoints=254)
     export_npz(folder / "set", folder / "robot.npz")
     return folder / "robot.npz"
 

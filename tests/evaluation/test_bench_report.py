@@ -160,17 +160,13 @@ def test_figures_of_a_small_run(small: Path) -> None:
     assert net.paired.ratio == pytest.approx(1.1)  # of 1.2 and 1
     assert net.figures.length == pytest.approx(3 * 2.2)
     assert rows(whole, 10.0)["mpnet"].figures.success == 50  # it ended by itself
-
-
-def test_comscore_of_a_small_run(small: Path) -> None:
-    whole, _ = bench_report.sections(bench_report.read_bench(small), [1.0])
-    of = rows(whole, 1.0)
     lengths = {"robotdiffuse": 6.0, "mpnet": 6.6, "ompl_rrt_star": 9.0}
     times = {"robotdiffuse": 0.05, "mpnet": 0.51, "ompl_rrt_star": 1.0}
     for name, success, collision in (("robotdiffuse", 1, 1), ("mpnet", 0, 0), ("ompl_rrt_star", 0, 1)):
         length = (9.0 - lengths[name]) / 3.0
         time = (1.0 - times[name]) / 0.95
-        assert of[name].comscore == pytest.approx((success + collision + length + time) / 4)
+        comscore = rows(whole, 1.0)[name].comscore
+        assert comscore == pytest.approx((success + collision + length + time) / 4)
 
 
 def test_compared_are_problems_that_all_planners_were_given_this_time_for(tmp_path: Path) -> None:

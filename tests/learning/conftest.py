@@ -5,11 +5,7 @@ import pytest
 from robotdiffuse.learning.motion_network import MotionNetwork
 
 
-def nothing(_: MotionNetwork) -> dict[str, bytes]:
-    return {}
-
-
 @pytest.fixture
 def no_export(monkeypatch: pytest.MonkeyPatch) -> None:
     """Weights are saved without the ONNX files, which take seconds: for tests that read them by PyTorch."""
-    monkeypatch.setattr(MotionNetwork, "exports", nothing)
+    monkeypatch.setattr(MotionNetwork, "exports", lambda _: {})

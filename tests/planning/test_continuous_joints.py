@@ -14,19 +14,9 @@ from robotdiffuse.robots.kinematic_tree import CONTINUOUS_LIMIT
 from robotdiffuse.robots.parsing.urdf import with_limits
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
 
-
-def turning_arm() -> rd.Robot:
-    arm = box_arm()
-    joints = tuple(
-        replace(joint, kind="continuous", lower=-CONTINUOUS_LIMIT, upper=CONTINUOUS_LIMIT)
-        if joint.name in ("j0", "j2")
-        else joint
-        for joint in arm.joints
-    )
-    return replace(arm, joints=joints)
-
-
-ARM = turning_arm()
+TURNING = {"kind": "continuous", "lower": -CONTINUOUS_LIMIT, "upper": CONTINUOUS_LIMIT}
+JOINTS = tuple(replace(j, **TURNING) if j.name in ("j0", "j2") else j for j in box_arm().joints)
+ARM = replace(box_arm(), joints=JOINTS)
 POST = rd.Scene([rd.Box([-0.7, 0.0, 0.0], [0.4, 0.05, 0.2], name="post")])
 """Where the stretched arm points at half a turn."""
 

@@ -13,7 +13,6 @@ import robotdiffuse as rd
 from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS, PLANNERS, planners_that_support
-from robotdiffuse.planning.planner import Planner
 
 PANDA = rd.load_robot("panda")
 START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
@@ -63,9 +62,7 @@ ASKED: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 """What the problem has, and what the call asks for."""
 
 
-@cache
-def planner_named(name: str) -> Planner:
-    return rd.load_planner(name)
+planner_named = cache(rd.load_planner)
 
 
 @cache
@@ -90,15 +87,11 @@ THROUGH = ("robotdiffuse", "rrt_connect")
 QUICK = ("pose", "any goal", "waypoints", "views", "clearance", "cone", "line", "moving", "start velocity")
 
 
-def marks_of(name: str, asked: str) -> list[pytest.MarkDecorator]:
-    """The pipeline is one for all planners: the quick suite takes two of them through every request."""
-    return [] if name in THROUGH or asked in QUICK else [pytest.mark.slow]
-
-
 @pytest.mark.parametrize(
     ("name", "asked"),
     [
-        pytest.param(name, asked, marks=marks_of(name, asked), id=f"{name}-{asked}")
+        # the pipeline is one for all planners: the quick suite takes two of them through every request
+        pytest.param(name, asked, marks=[pytest.mark.slow] * (name not in THROUGH and asked not in QUICK))
         for name, asked in product(PLANNERS, ASKED)
     ],
 )

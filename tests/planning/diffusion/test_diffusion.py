@@ -23,23 +23,17 @@ PROBLEM = rd.Problem(PANDA, rd.Scene([BALL]), LEFT, rd.JointGoal(RIGHT[None]))
 MODEL = Diffusion().network(PANDA)
 
 
-def samples_of(seed: int) -> list[rd.Path]:
+def test_the_answer_is_the_shortest_valid_sample_as_it_was_drawn() -> None:
     planner = Diffusion()
+    result = planner.plan(PROBLEM, time_limit=60.0, seed=5)
     checker = CollisionChecker(PANDA, PROBLEM.scene)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(5)
     code = encode(MODEL, checker, planner.settings.points, rng)
     ends = LEFT.astype(np.float32), RIGHT[None].astype(np.float32)
-    drawn = planner.draw(MODEL, checker, code, *ends, rng)
-    for q in drawn:
-        q[0] = LEFT
-        q[-1] = RIGHT
-    return [rd.Path(PANDA.joint_names, q) for q in drawn]
-
-
-def test_the_answer_is_the_shortest_valid_sample_as_it_was_drawn() -> None:
-    result = Diffusion().plan(PROBLEM, time_limit=60.0, seed=5)
-    samples = samples_of(5)
-    valid = [path for path in samples if rd.verify(PROBLEM, path).valid]
+    samples = planner.draw(MODEL, checker, code, *ends, rng)
+    samples[:, [0, -1]] = LEFT, RIGHT
+    paths = [rd.Path(PANDA.joint_names, q) for q in samples]
+    valid = [path for path in paths if rd.verify(PROBLEM, path).valid]
     assert valid and result.stage == "network"
     shortest = min(valid, key=lambda path: path.length)
     assert np.array_equal(result.path.positions, shortest.positions)

@@ -17,6 +17,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.random import random_state
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.planning.search import rrt_kernel, shared_tree
+from robotdiffuse.planning.search.shared_tree import SharedTreeSearch
 
 PANDA = rd.load_robot("panda")
 LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
@@ -58,20 +59,14 @@ def grid_optimum(checker: CollisionChecker, start: np.ndarray, goal: np.ndarray,
     return float(dijkstra(graph.tocsr(), indices=a)[b])
 
 
-@pytest.fixture(scope="module")
-def planar():
-    robot = two_joints()
+def test_rrt_star_alone_converges_to_the_optimum() -> None:
+    """Choose-parent and rewiring without RRT-Connect and shortcuts: what asymptotic optimality promises."""
     scene = rd.Scene([rd.Sphere([0.75, 0.0, 0.0], 0.2), rd.Sphere([-0.3, 0.7, 0.0], 0.15)])
-    checker = CollisionChecker(robot, scene)
+    checker = CollisionChecker(two_joints(), scene)
     axis = np.linspace(-2.8, 2.8, 281)
     start, goal = (np.array([axis[np.abs(axis - x).argmin()] for x in q]) for q in ((-0.9, 0.3), (0.9, -0.5)))
     assert checker.free(np.stack([start, goal])).all()
-    return checker, start, goal, grid_optimum(checker, start, goal, 281)
-
-
-def test_rrt_star_alone_converges_to_the_optimum(planar) -> None:
-    """Choose-parent and rewiring without RRT-Connect and shortcuts: what asymptotic optimality promises."""
-    checker, start, goal, optimum = planar
+    optimum = grid_optimum(checker, start, goal, 281)
     assert optimum > 1.1 * np.linalg.norm(goal - start), "the straight line must not do"
     space = search_space(checker, 0.01)
     start = start.astype(np.float32)
@@ -87,14 +82,23 @@ def test_rrt_star_alone_converges_to_the_optimum(planar) -> None:
     assert 0.985 < costs[2] < 1.01
     # rounds with both get there quickly
     settings = replace(TOUCHING, resolution=0.01)
-    search = shared_tree.SharedTreeSearch(checker, start, goal[None], settings, random_state(1))
+    search = SharedTreeSearch(checker, start, goal[None], settings, random_state(1))
     for _ in range(40):
         search.round()
     assert 0.985 < search.cost / optimum < 1.01
     assert all(a >= b for a, b in pairwise(search.costs))
 
 
-def consistent(trees: rrt_kernel.Trees) -> None:
+@pytest.mark.parametrize("capacity", [1_000, 200])
+def test_the_tree_stays_a_tree(capacity: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shared_tree, "CAPACITY", capacity)
+    checker = CollisionChecker(PANDA, WALL)
+    goals = RIGHT + np.pad([[0.0, 0.0, 0.0], [0.2, 0.2, 0.0], [0.1, -0.3, 0.3]], ((0, 0), (0, 4)))
+    search = SharedTreeSearch(checker, LEFT, goals, replace(TOUCHING, growth=200), random_state(2))
+    for _ in range(4):
+        search.round()
+    assert 64 < search.tree.sizes[0] <= capacity
+    trees = search.tree
     for node in range(1, int(trees.sizes[0])):
         parent = int(trees.parents[0, node])
         gap = np.linalg.norm(trees.nodes[0, node].astype(float) - trees.nodes[0, parent])
@@ -105,20 +109,6 @@ def consistent(trees: rrt_kernel.Trees) -> None:
             siblings.append(child)
             child = int(trees.siblings[0, child])
         assert siblings.count(node) == 1
-
-
-@pytest.mark.parametrize("capacity", [1_000, 200])
-def test_the_tree_stays_a_tree(capacity: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shared_tree, "CAPACITY", capacity)
-    checker = CollisionChecker(PANDA, WALL)
-    goals = RIGHT + np.pad([[0.0, 0.0, 0.0], [0.2, 0.2, 0.0], [0.1, -0.3, 0.3]], ((0, 0), (0, 4)))
-    search = shared_tree.SharedTreeSearch(
-        checker, LEFT, goals, replace(TOUCHING, growth=200), random_state(2)
-    )
-    for _ in range(4):
-        search.round()
-    assert 64 < search.tree.sizes[0] <= capacity
-    consistent(search.tree)
     for g, cost in enumerate(search.goal_costs):
         path = search.path(g)
         if path is not None:
@@ -171,16 +161,14 @@ def test_the_cheapest_goal_wins_and_every_goal_has_its_cost() -> None:
     goals[1:, :2] += [[0.2, 0.2], [0.1, 0.4]]
     checker = CollisionChecker(PANDA, WALL)
     assert checker.free(goals).all()
-    search = shared_tree.SharedTreeSearch(checker, LEFT, goals, TOUCHING, random_state(0))
+    search = SharedTreeSearch(checker, LEFT, goals, TOUCHING, random_state(0))
     assert search.best_goal == 2 and search.finished, "its straight line is free: nothing can be shorter"
-    search = shared_tree.SharedTreeSearch(checker, LEFT, goals[:2], TOUCHING, random_state(0))
+    search = SharedTreeSearch(checker, LEFT, goals[:2], TOUCHING, random_state(0))
     for _ in range(30):
         search.round()
     costs = search.goal_costs
     assert np.isfinite(costs[search.best_goal]) and search.cost == costs.min()
-    single = [
-        shared_tree.SharedTreeSearch(checker, LEFT, g[None], TOUCHING, random_state(1)) for g in goals[:2]
-    ]
+    single = [SharedTreeSearch(checker, LEFT, g[None], TOUCHING, random_state(1)) for g in goals[:2]]
     for other in single:
         for _ in range(30):
             other.round()
@@ -189,9 +177,9 @@ def test_the_cheapest_goal_wins_and_every_goal_has_its_cost() -> None:
 
 def searched(
     checker: CollisionChecker, start: np.ndarray, distance: float
-) -> tuple[shared_tree.SharedTreeSearch, np.ndarray]:
+) -> tuple[SharedTreeSearch, np.ndarray]:
     settings = replace(ENDLESS, safety_distance=distance, resolution=0.01)
-    search = shared_tree.SharedTreeSearch(checker, start, RIGHT[None], settings, random_state(0))
+    search = SharedTreeSearch(checker, start, RIGHT[None], settings, random_state(0))
     for _ in range(10):
         search.round()
     path = search.path()
@@ -235,7 +223,7 @@ def test_a_gap_too_narrow_for_the_distance_lowers_it() -> None:
     goal = np.array([0.9])
     least = checker.link_clearances(np.linspace(start, goal, 200)).min()
     assert 0.01 < least < 0.02
-    search = shared_tree.SharedTreeSearch(checker, start, goal[None], ENDLESS, random_state(0))
+    search = SharedTreeSearch(checker, start, goal[None], ENDLESS, random_state(0))
     search.run(lambda: search.cost < np.inf)
     assert search.safety_distance == pytest.approx(0.01) and search.cost == pytest.approx(1.8)
 

@@ -5,7 +5,6 @@ import pytest
 
 import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.kernels.motions import Space
 from robotdiffuse.planning.search.time_optimization import TimeOptimization
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.trajectories.speed_limits import TimingSettings
@@ -13,28 +12,20 @@ from robotdiffuse.trajectories.straight_line import straight_line_time
 
 ROBOT = rd.load_robot("panda")
 LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
-RIGHT = LEFT * [-1, 1, 1, 1, 1, 1, 1]
-WALL = rd.Scene([rd.Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.8])])
-AROUND = rd.Problem(ROBOT, WALL, LEFT, rd.JointGoal(RIGHT[None]))
+WALL = rd.Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.8])
+AROUND = rd.Problem(ROBOT, rd.Scene([WALL]), LEFT, LEFT * [-1, 1, 1, 1, 1, 1, 1])
 DETOUR = LEFT + np.array([[0, 0, 0, 0, 0, 0, 0], [0.6, 0.4, 0, 0, 0, 0, 0], [-1.5, 1.2, 0, 0, 0, 0, 0]])
 """Joint 1 is limited by its velocity, joint 2 by its acceleration."""
 
 
-def space(scene: rd.Scene, path: np.ndarray) -> Space:
-    return StartGoal(CollisionChecker(ROBOT, scene), path[0], path[-1:]).space(0.05, 0.0)
-
-
-def optimized(scene: rd.Scene, path: np.ndarray, turns: int) -> TimeOptimization:
-    found = TimeOptimization(ROBOT, TimingSettings(), path[0], path[-1:], seed=0)
-    found.offer(space(scene, path), path, "search")
-    for _ in range(turns):
-        found.improve(space(scene, path))
-    return found
-
-
 @pytest.mark.parametrize("path", [DETOUR, DETOUR[[0, 2]]], ids=["detour", "straight line"])
 def test_the_slowest_joint_is_the_bound(path: np.ndarray) -> None:
-    found = optimized(rd.Scene([]), path, 100)
+    ends = path[0], path[-1:]
+    space = StartGoal(CollisionChecker(ROBOT, rd.Scene()), *ends).space(0.05, 0.0)
+    found = TimeOptimization(ROBOT, TimingSettings(), *ends, seed=0)
+    found.offer(space, path, "search")
+    for _ in range(100):
+        found.improve(space)
     limits = ROBOT.velocity, ROBOT.acceleration
     alone = max(
         straight_line_time(path[0, [j]], path[-1, [j]], *(limit[[j]] for limit in limits))
@@ -51,8 +42,7 @@ def test_motions_take_less_time_and_keep_their_certificate(planner: str) -> None
     made = rd.load_planner(planner)
     by_length = made.plan(AROUND, 60.0, objective="length")
     result = made.plan(AROUND, 60.0)
-    assert result.trajectory is not None and result.stops == 0
-    assert result.duration is not None and by_length.duration is not None
+    assert result.stops == 0
     assert rd.verify(AROUND, result.trajectory).valid
     assert result.duration < 0.99 * by_length.duration
     if planner != "rrt_connect":  # which returns the shorter of two paths, not the shortest
