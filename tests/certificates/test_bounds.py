@@ -13,16 +13,7 @@ from hypothesis import strategies as st
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.example_robots import example_robot
-from robotdiffuse.certificates import bounds
-from robotdiffuse.certificates.bounds import (
-    CLEARANCE_CAP,
-    SCENE,
-    Obstacles,
-    Prover,
-    Rounded,
-    Stretches,
-    Surface,
-)
+from robotdiffuse.certificates import bounds as proofs
 from robotdiffuse.certificates.kinematics import Linkage
 from robotdiffuse.certificates.requirements import configurations, deviations
 from robotdiffuse.robots.kinematics import link_pose
@@ -78,10 +69,10 @@ def test_distances_are_those_of_coal() -> None:
     rng = np.random.default_rng(1)
     points = rng.uniform(-1, 1, (60, 3))
     scene = rd.Scene(shapes())
-    obstacles = Obstacles(scene)
+    obstacles = proofs.Obstacles(scene)
     found = obstacles.distances(points)
     for k, body in enumerate(obstacles.bodies):
-        if isinstance(body, Surface):
+        if isinstance(body, proofs.Surface):
             count = body.corners.shape[1]
             pieces = [_triangle(c) if count == 3 else coal.Sphere(1e-9) for c in body.corners]
             at = [np.zeros(3) if count == 3 else c[0] for c in body.corners]
@@ -94,8 +85,8 @@ def test_distances_are_those_of_coal() -> None:
                 geometry = coal.Capsule(body.rounding, z) if z else coal.Sphere(body.rounding)
             pieces = [geometry]
             at = [body.center]
-        R = body.R if isinstance(body, Rounded) else np.eye(3)
-        less = body.radius if isinstance(body, Surface) else 0.0
+        R = body.R if isinstance(body, proofs.Rounded) else np.eye(3)
+        less = body.radius if isinstance(body, proofs.Surface) else 0.0
         for point, distance in zip(points, found[:, k], strict=True):
             ball = coal.Sphere(1e-9)
             place = coal.Transform3s(np.eye(3), point)
@@ -104,10 +95,12 @@ def test_distances_are_those_of_coal() -> None:
                 coal.distance(ball, place, piece, coal.Transform3s(R, t), request, coal.DistanceResult())
                 for piece, t in zip(pieces, at, strict=True)
             )
-            if isinstance(body, Surface) and count == 3 and right > 0.1:  # of triangles far away, their balls
-                assert 0.6 * min(right, CLEARANCE_CAP) <= distance <= right + 1e-5
+            if (
+                isinstance(body, proofs.Surface) and count == 3 and right > 0.1
+            ):  # of triangles far away, their balls
+                assert 0.6 * min(right, proofs.CLEARANCE_CAP) <= distance <= right + 1e-5
             elif right - less > 1e-3:
-                assert distance == pytest.approx(min(right - less, CLEARANCE_CAP), abs=2e-5)
+                assert distance == pytest.approx(min(right - less, proofs.CLEARANCE_CAP), abs=2e-5)
             else:
                 assert distance < 2e-3
 
@@ -115,9 +108,9 @@ def test_distances_are_those_of_coal() -> None:
 def test_reach_is_the_greatest_of_points_on_the_surface() -> None:
     n = np.random.default_rng(2).normal(size=(20, 3))
     n /= np.linalg.norm(n, axis=1, keepdims=True)
-    for shape, body in zip(shapes(), Obstacles(rd.Scene(shapes())).bodies, strict=True):
-        T, meshes = shape.solid() if isinstance(body, Rounded) else (np.eye(4), ())
-        reach = body.reach(n) if isinstance(body, Rounded) else body.reach(n).max(axis=0)
+    for shape, body in zip(shapes(), proofs.Obstacles(rd.Scene(shapes())).bodies, strict=True):
+        T, meshes = shape.solid() if isinstance(body, proofs.Rounded) else (np.eye(4), ())
+        reach = body.reach(n) if isinstance(body, proofs.Rounded) else body.reach(n).max(axis=0)
         if isinstance(shape, rd.Mesh):
             np.testing.assert_allclose(reach, (shape.world_vertices @ n.T).max(axis=0))
         for mesh in meshes:  # polyhedra around round shapes, at most 2 % of the radius larger
@@ -132,16 +125,16 @@ def test_nothing_moves_further_than_its_displacement(seed: int) -> None:
     robot = rd.load_robot("panda")
     ends = rng.uniform(robot.lower, robot.upper, (2, robot.dof))
     ends[1] = ends[0] + (ends[1] - ends[0]) * rng.uniform(0, 0.5)
-    prover = Prover(robot, rd.Scene(), ends)
+    prover = proofs.Prover(robot, rd.Scene(), ends)
     claims = np.arange(len(prover.claims))
     ones = np.ones(len(prover.claims))
-    bounds = prover.bounds(Stretches(claims, 0 * ones, ones), ones < 0, [])
+    bounds = prover.bounds(proofs.Stretches(claims, 0 * ones, ones), ones < 0, [])
     middle = prover.at(np.array([0.5]))
     linkage = prover.linkage
     places = linkage.place(np.concatenate([middle, prover.at(rng.uniform(0, 1, 8))])).T
     for claim, displacement in zip(prover.claims, bounds.displacement, strict=True):
         link = linkage.links.index(claim.link)
-        base = 0 if claim.against == SCENE else linkage.links.index(claim.against)
+        base = 0 if claim.against == proofs.SCENE else linkage.links.index(claim.against)
         seen = np.linalg.inv(places[:, base]) @ places[:, link]
         balls = robot.spheres[claim.link]
         centers = balls[:, :3] @ np.swapaxes(seen[:, :3, :3], 1, 2) + seen[:, None, :3, 3]
@@ -184,14 +177,14 @@ def test_unknown_shapes_are_refused_by_name() -> None:
         area, bounds = 0.0, np.zeros((2, 3))  # type: ignore[assignment]
 
     with pytest.raises(rd.InputError, match="odd: a Strange cannot be certified"):
-        Obstacles(rd.Scene([Strange()]))
+        proofs.Obstacles(rd.Scene([Strange()]))
 
 
 def test_a_link_that_is_called_like_the_scene_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Claims against the link were taken for claims against the scene, so the pair was not proved."""
-    monkeypatch.setattr(bounds, "SCENE", "l2")
+    monkeypatch.setattr(proofs, "SCENE", "l2")
     with pytest.raises(rd.InputError, match="a link called 'l2'"):
-        Prover(box_arm(), rd.Scene(), np.zeros((2, 3)))
+        proofs.Prover(box_arm(), rd.Scene(), np.zeros((2, 3)))
 
 
 def test_bounds_hold_for_cubics_that_leave_the_straight_lines() -> None:
@@ -203,16 +196,18 @@ def test_bounds_hold_for_cubics_that_leave_the_straight_lines() -> None:
         motion = rd.Trajectory(robot.joint_names, 0.3 * np.arange(4.0), rows, v, 0 * v)
         scene = rd.Scene([rd.Sphere([*rng.uniform(-1, 1, 2), 0.0], 0.05)])
         between = np.sort(rng.uniform(0.0, 0.9, 5))
-        prover = Prover(robot, scene, configurations(motion, between), deviations(motion, between))
+        prover = proofs.Prover(robot, scene, configurations(motion, between), deviations(motion, between))
         times = np.sort(np.concatenate([motion.times, between]))
         count = len(prover.claims)
         start, stop = np.sort(rng.uniform(0, len(times) - 1, 2))
-        whole = Stretches(np.arange(count), np.full(count, start), np.full(count, stop))
+        whole = proofs.Stretches(np.arange(count), np.full(count, start), np.full(count, stop))
         found = prover.bounds(whole, np.zeros(count, bool), [])
         low, high = np.interp([start, stop], np.arange(len(times)), times)
         dense = motion.at(np.linspace(low, high, 40)).positions
-        exact = Prover(robot, scene, dense)
+        exact = proofs.Prover(robot, scene, dense)
         for place in range(40):
-            here = Stretches(np.arange(count), np.full(count, float(place)), np.full(count, float(place)))
+            here = proofs.Stretches(
+                np.arange(count), np.full(count, float(place)), np.full(count, float(place))
+            )
             there = exact.bounds(here, np.zeros(count, bool), [])
             assert (there.clearance >= found.clearance - found.displacement - 1e-9).all()

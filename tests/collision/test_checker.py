@@ -9,21 +9,8 @@ from hypothesis import strategies as st
 from numpy import ndarray
 
 import robotdiffuse as rd
+from helpers import sphere_oracles as oracles
 from helpers.box_arm import box_arm
-from helpers.sphere_oracles import (
-    ROBOTS,
-    TOLERANCE,
-    box_triangles,
-    distance,
-    least_clearance,
-    link_distances,
-    pair_distances,
-    random_shape,
-    rows,
-    solids,
-    sphere_centers,
-    with_spheres,
-)
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.kernel_arrays import robot_groups
@@ -37,97 +24,103 @@ from robotdiffuse.problems.families.rop import ROP, ROP_DENSE
 # -- distances -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", oracles.ROBOTS)
 def test_clearances_are_exact(name: str) -> None:
-    robot = with_spheres(name)
-    scene = solids()
+    robot = oracles.with_spheres(name)
+    scene = oracles.solids()
     checker = CollisionChecker(robot, scene)
-    q = rows(robot, 150)
-    right = link_distances(robot, scene, q)
+    q = oracles.rows(robot, 150)
+    right = oracles.link_distances(robot, scene, q)
     assert checker.link_clearances(q).shape == (150, len(checker.links))
-    np.testing.assert_allclose(checker.link_clearances(q), right, atol=TOLERANCE)
-    np.testing.assert_allclose(checker.link_clearances(q, limit=0.1), np.minimum(right, 0.1), atol=TOLERANCE)
+    np.testing.assert_allclose(checker.link_clearances(q), right, atol=oracles.TOLERANCE)
+    np.testing.assert_allclose(
+        checker.link_clearances(q, limit=0.1), np.minimum(right, 0.1), atol=oracles.TOLERANCE
+    )
     assert checker.pairs == robot.checked_pairs()
-    np.testing.assert_allclose(checker.pair_clearances(q), pair_distances(robot, q), atol=TOLERANCE)
+    np.testing.assert_allclose(
+        checker.pair_clearances(q), oracles.pair_distances(robot, q), atol=oracles.TOLERANCE
+    )
 
 
 def check_free(robot: rd.Robot, scene: rd.Scene, q: ndarray, padding: float = 0.0) -> None:
     """The check answers with the signs of the least distances by the oracles, which are of both kinds."""
-    to_scene = link_distances(robot, scene, q).min(axis=1) - padding
-    least = np.minimum(to_scene, pair_distances(robot, q).min(axis=1, initial=1))
-    clear = np.abs(least) > TOLERANCE
+    to_scene = oracles.link_distances(robot, scene, q).min(axis=1) - padding
+    least = np.minimum(to_scene, oracles.pair_distances(robot, q).min(axis=1, initial=1))
+    clear = np.abs(least) > oracles.TOLERANCE
     free = CollisionChecker(robot, scene, padding).free(q)
     np.testing.assert_array_equal(free[clear], (least > 0)[clear])
     assert 0 < free.mean() < 1
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", oracles.ROBOTS)
 @pytest.mark.parametrize("padding", [0.0, 0.05])
 def test_free_is_the_sign_of_the_clearance(name: str, padding: float) -> None:
-    robot = with_spheres(name)
-    check_free(robot, solids(), rows(robot, 500, seed=1), padding)
+    robot = oracles.with_spheres(name)
+    check_free(robot, oracles.solids(), oracles.rows(robot, 500, seed=1), padding)
 
 
 @given(kind=st.sampled_from(["sphere", "box", "cylinder", "capsule", "cloud"]), seed=st.integers(0, 2**32))
 def test_every_shape_at_any_pose(kind: str, seed: int) -> None:
-    robot = with_spheres("panda")
+    robot = oracles.with_spheres("panda")
     rng = np.random.default_rng(seed)
-    scene = rd.Scene([random_shape(kind, rng), random_shape(kind, rng)])
+    scene = rd.Scene([oracles.random_shape(kind, rng), oracles.random_shape(kind, rng)])
     q = rng.uniform(robot.lower, robot.upper, (33, robot.dof))
     checker = CollisionChecker(robot, scene)
-    right = link_distances(robot, scene, q)
+    right = oracles.link_distances(robot, scene, q)
     found = checker.link_clearances(q)
-    hit = (right < 0).any(axis=1) | (pair_distances(robot, q) < 0).any(axis=1)
+    hit = (right < 0).any(axis=1) | (oracles.pair_distances(robot, q) < 0).any(axis=1)
     if kind == "cloud":
         # joined points reach further, by less than the diagonal of a thinning voxel
         radius = max(shape.point_radius for shape in scene.shapes if isinstance(shape, rd.PointCloud))
         blur = np.sqrt(3) * THINNING * radius
         near = right < 0.1
-        assert (found <= right + TOLERANCE).all()
-        assert (found[near] >= right[near] - blur - TOLERANCE).all() and not checker.free(q)[hit].any()
+        assert (found <= right + oracles.TOLERANCE).all()
+        assert (found[near] >= right[near] - blur - oracles.TOLERANCE).all() and not checker.free(q)[
+            hit
+        ].any()
     else:
-        np.testing.assert_allclose(found, right, atol=TOLERANCE)
-        clear = np.abs(right).min(axis=1) > TOLERANCE
+        np.testing.assert_allclose(found, right, atol=oracles.TOLERANCE)
+        clear = np.abs(right).min(axis=1) > oracles.TOLERANCE
         np.testing.assert_array_equal(checker.free(q)[clear], np.logical_not(hit)[clear])
 
 
 @pytest.mark.parametrize("count", [15, 16, 17, 70])
 def test_any_number_of_obstacles(count: int) -> None:
     """Obstacles are processed in groups of sixteen."""
-    robot = with_spheres("panda")
+    robot = oracles.with_spheres("panda")
     rng = np.random.default_rng(count)
     kinds = ("sphere", "box", "cylinder", "capsule")
-    shapes = [random_shape(kinds[i % 4], rng) for i in range(count)]
+    shapes = [oracles.random_shape(kinds[i % 4], rng) for i in range(count)]
     far = [shape for shape in shapes if np.linalg.norm(shape.center) > 0.6]  # type: ignore[attr-defined]
-    check_free(robot, rd.Scene(far), rows(robot, 600))
+    check_free(robot, rd.Scene(far), oracles.rows(robot, 600))
 
 
 @pytest.mark.parametrize("count", [16, 17, 50])
 def test_links_with_any_number_of_spheres(count: int) -> None:
     """Links with many spheres are divided into rows, each with its own bounding sphere."""
-    arm = with_spheres("ur5")
+    arm = oracles.with_spheres("ur5")
     rng = np.random.default_rng(count)
     spheres = {
         link: np.column_stack([rng.uniform(-0.06, 0.06, (count, 3)), rng.uniform(0.002, 0.01, count)])
         for link in arm.spheres
     }
     robot = replace(arm, spheres=spheres)
-    check_free(robot, solids(), rows(robot, 200, seed=2))
-    check_free(robot, rd.Scene(), rows(robot, 200, seed=2))
+    check_free(robot, oracles.solids(), oracles.rows(robot, 200, seed=2))
+    check_free(robot, rd.Scene(), oracles.rows(robot, 200, seed=2))
 
 
 def test_configurations_beyond_the_limits() -> None:
     """The tables of close links do not cover these, so the spheres decide."""
-    robot = with_spheres("panda")
+    robot = oracles.with_spheres("panda")
     q = np.random.default_rng(0).uniform(2 * robot.lower, 2 * robot.upper, (4000, robot.dof))
     check_free(robot, rd.Scene(), q)
 
 
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 17])
 def test_any_number_of_configurations(count: int) -> None:
-    robot = with_spheres("panda")
-    checker = CollisionChecker(robot, solids())
-    q = rows(robot, 17)
+    robot = oracles.with_spheres("panda")
+    checker = CollisionChecker(robot, oracles.solids())
+    q = oracles.rows(robot, 17)
     np.testing.assert_array_equal(checker.free(q[:count]), checker.free(q)[:count])
     np.testing.assert_array_equal(checker.link_clearances(q[:count]), checker.link_clearances(q)[:count])
     assert checker.cost_gradients(q[:count], 0.05)[1].shape == (count, robot.dof)
@@ -138,10 +131,10 @@ def test_any_number_of_configurations(count: int) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_free_by_spheres_is_free_by_mesh(seed: int) -> None:
-    robot = with_spheres("panda")
+    robot = oracles.with_spheres("panda")
     rng = np.random.default_rng(seed)
     scene = (ROP if seed < 1 else ROP_DENSE).scene(rng, base_spheres(robot))
-    shapes = [random_shape(kind, rng) for kind in ("cylinder", "capsule", "box", "cloud")]
+    shapes = [oracles.random_shape(kind, rng) for kind in ("cylinder", "capsule", "box", "cloud")]
     scene = rd.Scene([*scene.shapes, *shapes[: seed % 5]])
     q = rng.uniform(robot.lower, robot.upper, (600, robot.dof))
     free = CollisionChecker(robot, scene).free(q)
@@ -151,36 +144,36 @@ def test_free_by_spheres_is_free_by_mesh(seed: int) -> None:
 
 
 def test_locked_fingers_change_the_result() -> None:
-    robot = with_spheres("panda")
+    robot = oracles.with_spheres("panda")
     wide = robot.with_locked({"panda_finger_joint1": 0.065, "panda_finger_joint2": 0.065})
-    scene = solids()
-    q = rows(robot, 5000)
+    scene = oracles.solids()
+    q = oracles.rows(robot, 5000)
     one, other = (CollisionChecker(r, scene) for r in (robot, wide))
     np.testing.assert_allclose(
-        other.link_clearances(q[:50]), link_distances(wide, scene, q[:50]), atol=TOLERANCE
+        other.link_clearances(q[:50]), oracles.link_distances(wide, scene, q[:50]), atol=oracles.TOLERANCE
     )
     assert (one.free(q) != other.free(q)).any()
 
 
 @pytest.mark.parametrize("size", [2.0, 1e3, 9.9e3])
 def test_a_huge_floor_is_as_exact_as_a_small_one(size: float) -> None:
-    robot = with_spheres("panda")
-    q = rows(robot, 400)
+    robot = oracles.with_spheres("panda")
+    q = oracles.rows(robot, 400)
     scene = rd.Scene([rd.Box((0.3, 0.1, -size / 2 - 0.05), (size + 4, size + 4, size))])
-    lowest = [(c[..., 2] - r).min(axis=1) for c, r in zip(*sphere_centers(robot, q), strict=True)]
+    lowest = [(c[..., 2] - r).min(axis=1) for c, r in zip(*oracles.sphere_centers(robot, q), strict=True)]
     right = np.stack(lowest[1:], axis=1) + 0.05
     found = CollisionChecker(robot, scene).link_clearances(q)
     np.testing.assert_allclose(found, np.minimum(right, 1), atol=3e-5)
 
 
 def test_long_poles_keep_their_precision() -> None:
-    robot = with_spheres("panda")
-    q = rows(robot, 200)
+    robot = oracles.with_spheres("panda")
+    q = oracles.rows(robot, 200)
     for make in (rd.Cylinder, rd.Capsule):
         short, long = (
             CollisionChecker(robot, rd.Scene([make((0.4, 0.3, 0.2), 0.05, h)])) for h in (6.0, 1e4)
         )
-        np.testing.assert_allclose(long.link_clearances(q), short.link_clearances(q), atol=TOLERANCE)
+        np.testing.assert_allclose(long.link_clearances(q), short.link_clearances(q), atol=oracles.TOLERANCE)
 
 
 # -- robots --------------------------------------------------------------------------------------------------
@@ -189,9 +182,9 @@ def test_long_poles_keep_their_precision() -> None:
 def test_a_robot_without_spheres_is_free() -> None:
     robot = replace(box_arm(), spheres={})
     checker = CollisionChecker(robot, rd.Scene([rd.Sphere((0, 0, 0), 5.0), rd.PointCloud([[0.0, 0, 0]])]))
-    q = rows(robot, 5)
+    q = oracles.rows(robot, 5)
     assert checker.links == checker.pairs == ()
-    assert checker.free(q).all() and (least_clearance(checker, q) == 1).all()
+    assert checker.free(q).all() and (oracles.least_clearance(checker, q) == 1).all()
     assert not any(found.any() for found in checker.cost_gradients(q, 0.05))
 
 
@@ -214,15 +207,15 @@ def test_wrong_configurations_are_refused() -> None:
 
 
 def test_adding_an_obstacle_compiles_nothing() -> None:
-    robot = with_spheres("panda")
-    q = rows(robot, 20)
+    robot = oracles.with_spheres("panda")
+    q = oracles.rows(robot, 20)
     compiled = []
-    mesh = rd.Mesh(*box_triangles((0.2, 0.2, 0.2)))
-    many = [shape for shape in solids().shapes for _ in range(3)]  # rows of several
-    for shapes in ([], many, [*solids().shapes, rd.PointCloud([[0.5, 0.5, 0.5]]), mesh]):
+    mesh = rd.Mesh(*oracles.box_triangles((0.2, 0.2, 0.2)))
+    many = [shape for shape in oracles.solids().shapes for _ in range(3)]  # rows of several
+    for shapes in ([], many, [*oracles.solids().shapes, rd.PointCloud([[0.5, 0.5, 0.5]]), mesh]):
         checker = CollisionChecker(robot, rd.Scene(shapes))
         checker.free(q)
-        least_clearance(checker, q)
+        oracles.least_clearance(checker, q)
         checker.cost_gradients(q, 0.05)
         compiled.append([len(f.signatures) for f in (free_many, block_hits, block_clearances, motion_free)])
     assert compiled[0] == compiled[1] == compiled[2]
@@ -234,11 +227,13 @@ def test_adding_an_obstacle_compiles_nothing() -> None:
 def cost(robot: rd.Robot, scene: rd.Scene, q: ndarray, margin: float, self_margin: float) -> ndarray:
     """The squared hinge loss over all spheres and pairs of spheres, by the oracles."""
     index = {link: i for i, link in enumerate(robot_groups(robot))}
-    centers, radii = sphere_centers(robot, q)
+    centers, radii = oracles.sphere_centers(robot, q)
     total = np.zeros(len(q))
     for link, i in index.items():
         if robot.link_frame(link) > 0:
-            nearest = np.min([distance(shape, centers[i]) for shape in scene.shapes], axis=0) - radii[i]
+            nearest = (
+                np.min([oracles.distance(shape, centers[i]) for shape in scene.shapes], axis=0) - radii[i]
+            )
             total += 0.5 * (np.maximum(margin - nearest, 0) ** 2).sum(axis=1)
     for a, b in ((index[a], index[b]) for a, b in robot.checked_pairs()):
         gap = np.linalg.norm(centers[a][:, :, None] - centers[b][:, None], axis=-1)
@@ -247,12 +242,12 @@ def cost(robot: rd.Robot, scene: rd.Scene, q: ndarray, margin: float, self_margi
     return total
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", oracles.ROBOTS)
 def test_cost_gradients_are_finite_differences(name: str) -> None:
-    robot = with_spheres(name)
-    scene = solids()
+    robot = oracles.with_spheres(name)
+    scene = oracles.solids()
     step = 1e-6
-    q = rows(robot, 60)
+    q = oracles.rows(robot, 60)
     costs, gradients = CollisionChecker(robot, scene).cost_gradients(q, 0.05, 0.02)
     np.testing.assert_allclose(costs, cost(robot, scene, q, 0.05, 0.02), rtol=1e-3, atol=1e-7)
     assert (costs > 0).any()

@@ -9,17 +9,9 @@ from helpers.sphere_oracles import solids
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.batched_clearances import packed_clearances_and_gradients, packed_link_clearances
 from robotdiffuse.collision.kernel_arrays import compile_robot
-from robotdiffuse.learning.denoisers import TransformerSettings
-from robotdiffuse.learning.motion_model import (
-    GRADIENT_MARGIN,
-    MAX_CLEARANCE,
-    MotionModelSettings,
-    link_clearances,
-)
-from robotdiffuse.learning.motion_network import MotionNetwork
+from robotdiffuse.learning import motion_model
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.losses import ArmDistance, ForwardKinematics
-from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.problems.families.rop import ROP, ROP_DENSE
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 
@@ -34,12 +26,6 @@ def configurations(*shape: int, seed: int = 0) -> np.ndarray:
     return q.astype(np.float32)
 
 
-def model_settings(**changes) -> MotionModelSettings:
-    return MotionModelSettings(
-        denoiser_settings=TransformerSettings(width=32, layers=1, heads=2, hidden=48, patch=8), **changes
-    )
-
-
 def test_inputs_are_the_same_in_training_and_planning() -> None:
     """In scenes of different size at once; clearances do not depend on the gradients beside them."""
     rng = np.random.default_rng(1)
@@ -47,15 +33,17 @@ def test_inputs_are_the_same_in_training_and_planning() -> None:
     scenes.append(rd.Scene(scenes[0].shapes[:1]))
     packed = PackedScenes.pack(scenes, 12, floor=True)
     q = configurations(len(packed), 60)
-    config = model_settings(clearance_gradients=True)
-    given = compile_robot(PANDA), packed, q, MAX_CLEARANCE
-    clearances, gradients = packed_clearances_and_gradients(*given, GRADIENT_MARGIN)
+    config = motion_model.MotionModelSettings(clearance_gradients=True)
+    given = compile_robot(PANDA), packed, q, motion_model.MAX_CLEARANCE
+    clearances, gradients = packed_clearances_and_gradients(*given, motion_model.GRADIENT_MARGIN)
     np.testing.assert_array_equal(clearances, packed_link_clearances(*given))
     told = np.concatenate([clearances, gradients], axis=-1)
     for i, scene in enumerate(scenes):
         checker = CollisionChecker(PANDA, scene)
-        np.testing.assert_allclose(link_clearances(checker, config)(q[i : i + 1])[0], told[i], atol=1e-4)
-        assert (gradients[i].any(axis=1) <= (clearances[i].min(axis=1) < GRADIENT_MARGIN)).all()
+        np.testing.assert_allclose(
+            motion_model.link_clearances(checker, config)(q[i : i + 1])[0], told[i], atol=1e-4
+        )
+        assert (gradients[i].any(axis=1) <= (clearances[i].min(axis=1) < motion_model.GRADIENT_MARGIN)).all()
     assert 0.3 < gradients.any(axis=-1).mean() < 0.9
 
 
@@ -100,35 +88,8 @@ def test_gradients_of_a_cloud_are_those_of_what_it_covers() -> None:
     assert close.mean() > 0.9
 
 
-def test_the_denoiser_s_inputs() -> None:
-    """Rows, joints, clearances, and then gradients of order 1, whose sign points into the obstacle."""
-    scene = rd.Scene([rd.Box((0.5, 0.0, 0.5), (0.4, 0.4, 0.4))])
-    seen = {}
-    q = configurations(2, 16, seed=6).astype(np.float64)
-    for with_gradients in (False, True):
-        torch.manual_seed(0)
-        model = MotionNetwork(
-            RobotIdentity.of(PANDA), model_settings(waypoints=16, clearance_gradients=with_gradients)
-        )
-        reference = model.reference(q[:, 0], q[:, -1])
-        clearances = link_clearances(CollisionChecker(PANDA, scene), model.settings)
-        seen[with_gradients] = model.features(
-            model.normalize(q.astype(np.float32), reference), reference, clearances
-        )
-    np.testing.assert_array_equal(seen[True][..., : seen[False].shape[-1]], seen[False])
-    gradients = seen[True][..., seen[False].shape[-1] :]
-    assert gradients.shape == q.shape and gradients.dtype == np.float32
-    assert np.abs(gradients).max() <= 1 and 0 < gradients.any(axis=-1).mean() < 1
-    checker = CollisionChecker(PANDA, scene)
-    flat = q.reshape(-1, 7)
-    hit = checker.link_clearances(flat).min(axis=1) < 0.05
-    inwards = flat + 0.01 * gradients.reshape(-1, 7)
-    costs = [checker.cost_gradients(at[hit], MARGIN, self_margin=-1.0)[0] for at in (flat, inwards)]
-    assert hit.sum() > 3 and (costs[1] > costs[0]).all()
-
-
 def test_gradients_need_clearances() -> None:
     with pytest.raises(rd.InputError, match="clearance_gradients is True and clearance_features is False"):
         PlannerTraining(data="data", encoder="encoder", clearance_features=False, clearance_gradients=True)
     with pytest.raises(rd.InputError, match="clearance_gradients"):
-        model_settings(clearance_features=False, clearance_gradients=True)
+        motion_model.MotionModelSettings(clearance_features=False, clearance_gradients=True)

@@ -7,15 +7,8 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 
 import robotdiffuse as rd
+from helpers import sphere_oracles as oracles
 from helpers.box_arm import box_arm
-from helpers.sphere_oracles import (
-    TOLERANCE,
-    box_triangles,
-    least_clearance,
-    link_distances,
-    rows,
-    with_spheres,
-)
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.kernels.nearest_voxels import nearest_voxels
@@ -24,42 +17,44 @@ from robotdiffuse.collision.point_cloud_grid import cover_triangles, thin_points
 
 def test_a_point_cloud_is_many_spheres() -> None:
     """Far enough apart that thinning joins none."""
-    robot = with_spheres("panda")
+    robot = oracles.with_spheres("panda")
     rng = np.random.default_rng(0)
     points = rng.uniform([-0.8, -0.8, 0.0], [0.8, 0.8, 1.2], (60, 3))
     cloud = CollisionChecker(robot, rd.Scene([rd.PointCloud(points, 0.02)]))
     spheres = CollisionChecker(robot, rd.Scene([rd.Sphere(point, 0.02) for point in points]))
-    q = rows(robot, 3000)
+    q = oracles.rows(robot, 3000)
     np.testing.assert_array_equal(cloud.free(q), spheres.free(q))
     assert 0.05 < cloud.free(q).mean() < 0.95
     found = cloud.link_clearances(q)
     right = spheres.link_clearances(q)
-    assert (found <= right + TOLERANCE).all()
+    assert (found <= right + oracles.TOLERANCE).all()
     near = right < 0.08
-    np.testing.assert_allclose(found[near], right[near], atol=TOLERANCE)
+    np.testing.assert_allclose(found[near], right[near], atol=oracles.TOLERANCE)
     # further out the grid alone answers: at most two voxels' diagonals of 2 cm less
     assert (found >= np.minimum(right, 0.2) - 0.08).all()
 
 
 def test_the_nearest_of_a_dense_cloud() -> None:
     """The search in cells must not miss a point that the grid promises."""
-    robot = with_spheres("box_arm")
+    robot = oracles.with_spheres("box_arm")
     rng = np.random.default_rng(3)
     points = rng.normal(size=(3000, 3))
     points = 0.4 * points / np.linalg.norm(points, axis=1, keepdims=True) + np.array([0.7, 0.5, 0])
     cloud = thin_points(points, 0.004, 2.0)
     scene = rd.Scene([rd.Sphere(c[:3], c[3]) for c in cloud])
-    q = rows(robot, 200)
+    q = oracles.rows(robot, 200)
     right = CollisionChecker(robot, scene)
     found = CollisionChecker(robot, rd.Scene([rd.PointCloud(points, 0.004)]))
     np.testing.assert_array_equal(found.free(q), right.free(q))
     near = right.link_clearances(q) < 0.08
-    np.testing.assert_allclose(found.link_clearances(q)[near], right.link_clearances(q)[near], atol=TOLERANCE)
+    np.testing.assert_allclose(
+        found.link_clearances(q)[near], right.link_clearances(q)[near], atol=oracles.TOLERANCE
+    )
 
 
 def test_empty_and_distant_clouds_are_empty_scenes() -> None:
-    robot = with_spheres("panda")
-    q = rows(robot, 200)
+    robot = oracles.with_spheres("panda")
+    q = oracles.rows(robot, 200)
     right = CollisionChecker(robot, rd.Scene()).free(q)
     for points in (np.zeros((0, 3)), np.full((5, 3), 50.0), np.array([[1e4, -1e4, 1e4], [-1e4, 0, 0]])):
         checker = CollisionChecker(robot, rd.Scene([rd.PointCloud(points, 0.01)]))
@@ -69,23 +64,25 @@ def test_empty_and_distant_clouds_are_empty_scenes() -> None:
 
 def test_points_just_beyond_the_reach_count() -> None:
     """They limit the clearance and, with padding, the freedom of an arm that is stretched out."""
-    robot = with_spheres("box_arm")
+    robot = oracles.with_spheres("box_arm")
     scene = rd.Scene([rd.PointCloud([[1.32, 0.0, 0.0]], 0.01)])
     q = np.zeros((1, 3))
-    right = link_distances(robot, scene, q).min()
+    right = oracles.link_distances(robot, scene, q).min()
     assert 0.02 < right < 0.1
-    assert least_clearance(CollisionChecker(robot, scene), q)[0] == pytest.approx(right, abs=TOLERANCE)
+    assert oracles.least_clearance(CollisionChecker(robot, scene), q)[0] == pytest.approx(
+        right, abs=oracles.TOLERANCE
+    )
     assert CollisionChecker(robot, scene, right - 0.001).free(q)[0]
     assert not CollisionChecker(robot, scene, right + 0.001).free(q)[0]
 
 
 @pytest.mark.parametrize("radius", [1e-9, 1e-4, 0.3])
 def test_tiny_and_large_points(radius: float) -> None:
-    robot = with_spheres("panda")
+    robot = oracles.with_spheres("panda")
     points = np.random.default_rng(0).uniform([-0.8, -0.8, 0.0], [0.8, 0.8, 1.2], (20, 3))
     scene = rd.Scene([rd.PointCloud(points, radius)])
-    q = rows(robot, 500)
-    hit = (link_distances(robot, scene, q) < -TOLERANCE).any(axis=1)
+    q = oracles.rows(robot, 500)
+    hit = (oracles.link_distances(robot, scene, q) < -oracles.TOLERANCE).any(axis=1)
     assert not CollisionChecker(robot, scene).free(q)[hit].any()
 
 
@@ -95,19 +92,19 @@ def test_links_with_spheres_larger_than_the_grids_band() -> None:
     points = rng.uniform(-1.6, 1.6, (40, 3)) * (1, 1, 0.2)
     cloud = CollisionChecker(robot, rd.Scene([rd.PointCloud(points, 0.02)]))
     spheres = CollisionChecker(robot, rd.Scene([rd.Sphere(point, 0.02) for point in points]))
-    q = rows(robot, 500)
+    q = oracles.rows(robot, 500)
     np.testing.assert_array_equal(cloud.free(q), spheres.free(q))
     free = cloud.free(q)
-    assert 0 < free.mean() < 1 and ((least_clearance(cloud, q) > 0) == free).all()
+    assert 0 < free.mean() < 1 and ((oracles.least_clearance(cloud, q) > 0) == free).all()
     # no cost from points that are further away than the margin
-    clear = least_clearance(spheres, q) > 0.05
+    clear = oracles.least_clearance(spheres, q) > 0.05
     assert (cloud.cost_gradients(q[clear], 0.04)[0] == 0).all()
 
 
 def test_mesh_obstacles_against_the_exact_surface() -> None:
-    robot = with_spheres("panda")
+    robot = oracles.with_spheres("panda")
     rng = np.random.default_rng(1)
-    vertices, faces = box_triangles((0.3, 0.4, 0.5))
+    vertices, faces = oracles.box_triangles((0.3, 0.4, 0.5))
     center = np.array([0.5, 0.1, 0.4])
     wxyz = np.array([0.9, 0.1, 0.2, 0.3])
     scene = rd.Scene([rd.Mesh(vertices, faces, center, wxyz)])

@@ -14,15 +14,7 @@ from scipy.spatial.transform import Rotation
 import robotdiffuse as rd
 from helpers.explorations import FLOOR, HOME, WALL
 from robotdiffuse.core.transforms import transform
-from robotdiffuse.interop import ros2
-from robotdiffuse.interop.depth_recording import (
-    CAMERA_INFO,
-    IMAGE,
-    TRANSFORMS,
-    StampedView,
-    TransformHistory,
-    write_depth_views,
-)
+from robotdiffuse.interop import depth_recording, ros2
 from robotdiffuse.interop.ros2 import JOINT_STATE, McapWriter, to_message, typestore
 from robotdiffuse.perception.occupancy_map import OccupancyMap
 from robotdiffuse.planning.exploration.simulated import RecordedExplorer, camera_beside, explore, wrist_camera
@@ -37,12 +29,12 @@ def test_a_recorded_exploration_is_read_again_and_gives_the_same_voxels(tmp_path
     explorer.observe(camera_beside(PROBLEM, None, 0))
     for _ in explore(PROBLEM, explorer):
         pass
-    views: dict[str, list[StampedView]] = {"wrist": [], "beside": []}
+    views: dict[str, list[depth_recording.StampedView]] = {"wrist": [], "beside": []}
     for one in explorer.views:
         name = "beside" if one.camera is None else "wrist"
-        views[name].append(StampedView(one.time, one.view))
+        views[name].append(depth_recording.StampedView(one.time, one.view))
     assert all(views.values())
-    write_depth_views(PANDA, views, tmp_path / "seen.mcap")
+    depth_recording.write_depth_views(PANDA, views, tmp_path / "seen.mcap")
     again = OccupancyMap(PANDA)
     read = list(rd.read_depth_views(tmp_path / "seen.mcap", PANDA))
     for stamp, view in read:
@@ -57,10 +49,10 @@ def test_a_recorded_exploration_is_read_again_and_gives_the_same_voxels(tmp_path
 
 KINDS = {
     "/joint_states": JOINT_STATE,
-    "/tf": TRANSFORMS,
-    "/tf_static": TRANSFORMS,
-    "/camera/camera_info": CAMERA_INFO,
-    "/camera/image_rect": IMAGE,
+    "/tf": depth_recording.TRANSFORMS,
+    "/tf_static": depth_recording.TRANSFORMS,
+    "/camera/camera_info": depth_recording.CAMERA_INFO,
+    "/camera/image_rect": depth_recording.IMAGE,
 }
 
 
@@ -118,7 +110,9 @@ def write_bag(bag: Writer1 | Writer2, messages: list[tuple[str, str, Any]]) -> N
     store = typestore()
     if isinstance(bag, Writer1):
         store = get_typestore(Stores.ROS1_NOETIC)
-        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
+        store.register(
+            get_types_from_msg("geometry_msgs/TransformStamped[] transforms", depth_recording.TRANSFORMS)
+        )
     with bag as writer, pytest.MonkeyPatch.context() as patch:
         patch.setattr(ros2, "typestore", lambda: store)
         connections = {
@@ -162,8 +156,8 @@ def realsense(file: Path, compression: Writer1.CompressionFormat | None = None, 
         bag.set_compression(compression)
     messages = [
         ("/device_0/sensor_0/option/Depth_Units/value", "std_msgs/msg/Float32", {"data": 1e-4}),
-        ("/device_0/sensor_0/Depth_0/info/camera_info", CAMERA_INFO, info),
-        ("/device_0/sensor_0/Depth_0/image/data", IMAGE, image),
+        ("/device_0/sensor_0/Depth_0/info/camera_info", depth_recording.CAMERA_INFO, info),
+        ("/device_0/sensor_0/Depth_0/image/data", depth_recording.IMAGE, image),
     ]
     write_bag(bag, messages)
     return file
@@ -279,12 +273,14 @@ def test_other_files_and_topics_are_refused(tmp_path: Path) -> None:
         list(rd.read_depth_views(recording(tmp_path / "r.mcap"), PANDA, ["/other"]))
     view = rd.DepthView(np.ones((2, 2)), (300, 300, 0.5, 0.5), np.eye(4))
     with pytest.raises(rd.InputError, match="the view of wrist at 0 s has no configuration"):
-        write_depth_views(PANDA, {"wrist": [StampedView(0.0, view)]}, tmp_path / "w.mcap")
+        depth_recording.write_depth_views(
+            PANDA, {"wrist": [depth_recording.StampedView(0.0, view)]}, tmp_path / "w.mcap"
+        )
 
 
-def history() -> TransformHistory:
+def history() -> depth_recording.TransformHistory:
     """A link that turns by 1 rad in 0.1 s, logged in the wrong order, and a camera fixed to it."""
-    out = TransformHistory()
+    out = depth_recording.TransformHistory()
     out.add(pose("base", "link", 5.1, 1.0), static=False)
     out.add(pose("base", "link", 5.0, 0.0), static=False)
     out.add(pose("/link", "/camera", 0.0, x=2.0), static=True)

@@ -57,15 +57,11 @@ def test_the_arm_is_its_covering_spheres() -> None:
 
 
 def test_cameras_look_where_they_are_told_and_stand_upright() -> None:
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        position, target = rng.normal(size=(2, 3))
-        T = looking_at(position, target)
-        np.testing.assert_allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), atol=1e-12)
-        assert np.linalg.det(T[:3, :3]) > 0 and T[2, 1] < 0 and abs(T[2, 0]) < 1e-12
-        along = T[:3, :3].T @ (target - position)
-        np.testing.assert_allclose(along[:2], 0, atol=1e-12)
-        assert along[2] > 0
+    position, target = np.random.default_rng(0).normal(size=(2, 3))
+    T = looking_at(position, target)
+    along = T[:3, :3].T @ (target - position)
+    np.testing.assert_allclose(along, [0.0, 0.0, float(np.linalg.norm(along))], atol=1e-12)
+    assert T[2, 1] < 0 and abs(T[2, 0]) < 1e-12
     down = looking_at(np.array([0.4, 0.0, 1.5]), np.array([0.4, 0.0, 0.0]))
     np.testing.assert_allclose(down[:3, :3], [[0, -1, 0], [-1, 0, 0], [0, 0, -1]], atol=1e-12)
 

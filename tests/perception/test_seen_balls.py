@@ -7,14 +7,8 @@ import pytest
 from scipy.spatial import KDTree
 
 import robotdiffuse as rd
+from robotdiffuse.perception import visibility
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
-from robotdiffuse.perception.visibility import (
-    BALL_RADIUS,
-    MAX_LOST_FRACTION,
-    see_through,
-    surface_balls,
-    within_voxels,
-)
 from robotdiffuse.perception.voxel_grid import VoxelGrid
 from robotdiffuse.robots.kinematics import link_pose
 
@@ -31,7 +25,7 @@ def seen_in(depth: np.ndarray, noise: float = 0.0, border: int = 0, radius: floa
     seen = np.zeros(len(BALLS), np.bool_)
     arguments = np.array(INTRINSICS, np.float32), T.astype(np.float32), BALLS, np.float32(radius)
     errors = np.array([0.0, 0.0, noise], np.float32)
-    see_through(depth.astype(np.float32), *arguments, errors, np.float32(border), seen)
+    visibility.see_through(depth.astype(np.float32), *arguments, errors, np.float32(border), seen)
     return seen
 
 
@@ -69,7 +63,9 @@ def test_balls_seen_through_are_those_with_nothing_in_any_of_their_pixels() -> N
     assert not (least & ~seen).any() and not (seen & ~most).any()
 
 
-@pytest.mark.parametrize(("lost", "seen"), [(0.6 * MAX_LOST_FRACTION, True), (0.6, False), (1.0, False)])
+@pytest.mark.parametrize(
+    ("lost", "seen"), [(0.6 * visibility.MAX_LOST_FRACTION, True), (0.6, False), (1.0, False)]
+)
 def test_pixels_without_a_return_show_nothing(lost: float, seen: bool) -> None:
     depth = np.where(RNG.random(SIZE[::-1]) < lost, 0.0, np.inf)
     inside = seen_in(np.full(SIZE[::-1], np.inf), radius=0.05)
@@ -93,7 +89,7 @@ def test_balls_lie_within_voxels_if_all_of_them_do() -> None:
     low = 0.2, -0.3, 0.2
     edge = 0.02
     radius = 0.008
-    within = within_voxels(BALLS, radius, marked, VoxelGrid(low, marked.shape, edge))
+    within = visibility.within_voxels(BALLS, radius, marked, VoxelGrid(low, marked.shape, edge))
     for ball, found in zip(BALLS[:500].astype(np.float64), within[:500], strict=True):
         corners = np.stack(np.meshgrid(*np.stack([ball - radius, ball + radius], axis=1)), -1).reshape(-1, 3)
         at = np.floor((corners - low) / edge).astype(int)
@@ -110,7 +106,7 @@ def test_balls_cover_the_surface_of_the_arm_and_of_what_it_holds() -> None:
         corners = corners[RNG.integers(len(corners), size=400)]
         points[link] = (RNG.dirichlet((1, 1, 1), 400)[:, None] @ corners)[:, 0]
     check_covered(held, points)
-    assert len(surface_balls(held, Q)) > len(surface_balls(PANDA, Q))
+    assert len(visibility.surface_balls(held, Q)) > len(visibility.surface_balls(PANDA, Q))
 
 
 def test_balls_cover_the_spheres_of_a_link_without_meshes() -> None:
@@ -124,7 +120,7 @@ def test_balls_cover_the_spheres_of_a_link_without_meshes() -> None:
 
 def check_covered(robot: rd.Robot, points: dict[str, np.ndarray]) -> None:
     """Points in frames of links are within the arm's balls at Q."""
-    tree = KDTree(surface_balls(robot, Q))
+    tree = KDTree(visibility.surface_balls(robot, Q))
     for link, of_link in points.items():
         T = link_pose(robot, Q, link)
-        assert tree.query(of_link @ T[:3, :3].T + T[:3, 3])[0].max() <= BALL_RADIUS
+        assert tree.query(of_link @ T[:3, :3].T + T[:3, 3])[0].max() <= visibility.BALL_RADIUS

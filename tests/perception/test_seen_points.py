@@ -11,17 +11,9 @@ import robotdiffuse as rd
 from helpers.sphere_oracles import depth_of_balls
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.transforms import transform
+from robotdiffuse.perception import seen_points as shown
 from robotdiffuse.perception.depth_filter import points_error
 from robotdiffuse.perception.depth_view import SeenPoints
-from robotdiffuse.perception.seen_points import (
-    ARM_DISTANCE,
-    CELL,
-    ERROR_STEP,
-    MIN_POINT_RADIUS,
-    POINT_RADIUS,
-    point_shapes,
-    seen_points,
-)
 from robotdiffuse.problems.files import problem_from_record, problem_record, save_problem
 from robotdiffuse.robots.kinematics import placed_spheres
 
@@ -48,30 +40,30 @@ def view(spheres: ndarray, configuration: ndarray | None = None) -> rd.DepthView
 
 def test_points_lie_on_what_was_seen_and_cover_it() -> None:
     seen = view(BALL_ROW)
-    points = seen_points([seen], PANDA, START)
+    points = shown.seen_points([seen], PANDA, START)
     assert np.abs(np.linalg.norm(points - BALL.center, axis=1) - BALL.radius).max() < 0.004
     gaps = np.linalg.norm(seen.points()[:, None] - points[None], axis=2).min(axis=1)
-    assert len(points) < len(seen.points()) and gaps.max() < CELL * np.sqrt(3)
+    assert len(points) < len(seen.points()) and gaps.max() < shown.CELL * np.sqrt(3)
 
 
 def test_the_arm_is_filtered_as_it_stood_then() -> None:
     for q, told in ((START, None), (GOAL, GOAL)):
         arm = placed_spheres(PANDA, q)
-        points = seen_points([view(np.concatenate([arm, BALL_ROW]), told)], PANDA, START)
+        points = shown.seen_points([view(np.concatenate([arm, BALL_ROW]), told)], PANDA, START)
         to_arm = np.linalg.norm(points[:, None] - arm[None, :, :3], axis=2) - arm[:, 3]
-        assert len(points) and to_arm.min() > ARM_DISTANCE - CELL
+        assert len(points) and to_arm.min() > shown.ARM_DISTANCE - shown.CELL
         assert np.abs(np.linalg.norm(points - BALL.center, axis=1) - BALL.radius).max() < 0.004
-    assert len(seen_points([view(placed_spheres(PANDA, GOAL), START)], PANDA, START)) > 100
+    assert len(shown.seen_points([view(placed_spheres(PANDA, GOAL), START)], PANDA, START)) > 100
 
 
 def test_clouds_and_several_views_add_up() -> None:
     seen = view(BALL_ROW)
     cloud = rd.DepthView.from_cloud(seen.points(), T)
-    one = seen_points([seen], PANDA, START)
-    both = seen_points([seen, cloud], PANDA, START)
+    one = shown.seen_points([seen], PANDA, START)
+    both = shown.seen_points([seen, cloud], PANDA, START)
     assert len(one) == len(both) and np.linalg.norm(one[:, None] - both, axis=2).min(axis=1).max() < 1e-5
     many = rd.DepthView.from_cloud(np.random.default_rng(0).uniform(-1, 1, (60_000, 3)), T)
-    assert len(seen_points([many], PANDA, START, 0.005)) > 40_000
+    assert len(shown.seen_points([many], PANDA, START, 0.005)) > 40_000
 
 
 def test_the_scene_is_what_is_known_and_what_was_seen() -> None:
@@ -90,7 +82,7 @@ def test_points_that_an_end_is_near_are_bare() -> None:
     near = np.array([[sphere[0] + sphere[3] + 0.105, *sphere[1:3], 0.1]])
     problem = rd.Problem(PANDA, rd.Scene(), START, GOAL, views=[view(near)])
     radii = {s.name: s.point_radius for s in problem.scene.shapes if isinstance(s, SeenPoints)}
-    assert radii == {"seen": POINT_RADIUS, "seen_at_ends": MIN_POINT_RADIUS}
+    assert radii == {"seen": shown.POINT_RADIUS, "seen_at_ends": shown.MIN_POINT_RADIUS}
 
 
 def test_files_keep_views_and_policy(tmp_path: Path) -> None:
@@ -121,8 +113,8 @@ def test_what_the_arm_holds_is_not_seen_as_an_obstacle() -> None:
     held = PANDA.attach(rd.Box([0, 0, 0.2], [0.1, 0.1, 0.15], name="parcel"), "panda_hand")
     spheres = placed_spheres(held, START)
     alone = rd.DepthView(picture(spheres), K, T)
-    assert not len(seen_points([alone], held, START))
-    assert len(seen_points([alone], PANDA, START)), "the bare arm sees the parcel"
+    assert not len(shown.seen_points([alone], held, START))
+    assert len(shown.seen_points([alone], PANDA, START)), "the bare arm sees the parcel"
 
 
 def test_points_of_a_pose_that_may_be_off_are_larger_and_leave_start_and_goals_free() -> None:
@@ -131,13 +123,16 @@ def test_points_of_a_pose_that_may_be_off_are_larger_and_leave_start_and_goals_f
     spheres = placed_spheres(PANDA, START)
     rng = np.random.default_rng(0)
     points = spheres[rng.integers(len(spheres), size=4000), :3] + rng.uniform(-0.3, 0.3, (4000, 3))
-    shapes = point_shapes(points, PANDA, rd.Scene([]), START, START[None], np.full(len(points), error))
+    shapes = shown.point_shapes(points, PANDA, rd.Scene([]), START, START[None], np.full(len(points), error))
     distances = np.linalg.norm(points[:, None] - spheres[None, :, :3], axis=2) - spheres[:, 3]
     kept = np.concatenate([shape.points for shape in shapes])
-    assert max(shape.point_radius for shape in shapes) == POINT_RADIUS + error
-    assert len(kept) == ((distances.min(axis=1) >= MIN_POINT_RADIUS) | (distances.min(axis=1) < -error)).sum()
+    assert max(shape.point_radius for shape in shapes) == shown.POINT_RADIUS + error
+    assert (
+        len(kept)
+        == ((distances.min(axis=1) >= shown.MIN_POINT_RADIUS) | (distances.min(axis=1) < -error)).sum()
+    )
     apart = points[distances.min(axis=1) > 0]
-    outside = point_shapes(apart, PANDA, rd.Scene([]), START, START[None], np.full(len(apart), error))
+    outside = shown.point_shapes(apart, PANDA, rd.Scene([]), START, START[None], np.full(len(apart), error))
     assert CollisionChecker(PANDA, rd.Scene(outside)).free(START[None])[0]
 
 
@@ -147,11 +142,11 @@ def test_each_point_is_larger_by_what_its_own_view_may_be_off() -> None:
     errors = points_error([replace(view(BALL_ROW), pose_deviation=(0.005, 0.02))], points)
     by_hand = 0.005 + 0.02 * np.linalg.norm(points - T[:3, 3], axis=1)
     np.testing.assert_allclose(errors, by_hand)
-    shapes = point_shapes(points, PANDA, rd.Scene([]), START, START[None], errors)
+    shapes = shown.point_shapes(points, PANDA, rd.Scene([]), START, START[None], errors)
     single = points.astype(np.float32)
     for shape in shapes:
         of_shape = np.isin(single, shape.points.astype(np.float32)).all(axis=1)
         own = errors[of_shape]
-        grown = shape.point_radius - POINT_RADIUS
+        grown = shape.point_radius - shown.POINT_RADIUS
         assert len(own) == len(shape.points)
-        assert grown - ERROR_STEP < own.min() and own.max() <= grown + 1e-9
+        assert grown - shown.ERROR_STEP < own.min() and own.max() <= grown + 1e-9

@@ -12,30 +12,22 @@ from helpers.browsers import CHROMIUM, opened
 from helpers.explorations import FLOOR, recorded
 from helpers.pages import page_data
 from robotdiffuse.perception.voxel_grid import MAP
-from robotdiffuse.visualization.exploration import (
-    GAP,
-    READING_TIME,
-    faces_between,
-    faces_surface,
-    moments,
-    write_exploration,
-    write_exploration_picture,
-)
+from robotdiffuse.visualization import exploration
 from robotdiffuse.visualization.picture import PictureSettings
 
 
 def test_a_cube_has_six_faces_around_it() -> None:
     inside = np.zeros((4, 5, 6), np.bool_)
     inside[1, 2, 3] = True
-    numbers, first = faces_between(inside, ~inside)
+    numbers, first = exploration.faces_between(inside, ~inside)
     size = inside.size
     at = (1 * 5 + 2) * 6 + 3
     assert numbers.tolist() == [at - 30, at, size + at - 6, size + at, 2 * size + at - 1, 2 * size + at]
     assert first.tolist() == [False, True] * 3
     outside = np.zeros_like(inside)
     outside[0, 2, 3] = True
-    assert faces_between(inside, outside)[0].tolist() == [at - 30], "between the two sets alone"
-    surface = faces_surface(inside, ~inside, (255, 0, 0))
+    assert exploration.faces_between(inside, outside)[0].tolist() == [at - 30], "between the two sets alone"
+    surface = exploration.faces_surface(inside, ~inside, (255, 0, 0))
     center = (np.array([1.5, 2.5, 3.5])) * MAP.edge + MAP.low
     away = surface.vertices - center
     np.testing.assert_allclose(np.abs(away), MAP.edge / 2)
@@ -48,17 +40,20 @@ SMALL = PictureSettings(width=240, height=150, ghosts=1)
 
 def test_each_moment_has_a_picture(tmp_path: Path) -> None:
     problem, explorer = recorded()
-    write_exploration_picture(explorer, problem.scene, tmp_path / "explore.png", SMALL)
-    count = len(moments(explorer))
+    exploration.write_exploration_picture(explorer, problem.scene, tmp_path / "explore.png", SMALL)
+    count = len(exploration.moments(explorer))
     columns = min(count, 3 if count > 4 else 2)
     with Image.open(tmp_path / "explore.png") as image:
-        width = columns * (240 + GAP) - GAP
-        height = -(-count // columns) * (150 + GAP) - GAP
+        width = columns * (240 + exploration.GAP) - exploration.GAP
+        height = -(-count // columns) * (150 + exploration.GAP) - exploration.GAP
         assert image.size == (width, height)
         first = np.asarray(image)[:100, :240].astype(int)
     blue = (first[..., 2] > first[..., 0] + 25).sum()
     assert blue > 50, "the wall was seen"
-    for write, ending in ((write_exploration_picture, "html"), (write_exploration, "png")):
+    for write, ending in (
+        (exploration.write_exploration_picture, "html"),
+        (exploration.write_exploration, "png"),
+    ):
         with pytest.raises(rd.InputError):
             write(explorer, problem.scene, tmp_path / f"explore.{ending}")
 
@@ -67,7 +62,7 @@ def test_each_moment_has_a_picture(tmp_path: Path) -> None:
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     problem, explorer = recorded()
     file = tmp_path_factory.mktemp("page") / "explore.html"
-    write_exploration(explorer, problem.scene, file)
+    exploration.write_exploration(explorer, problem.scene, file)
     return file
 
 
@@ -95,11 +90,11 @@ def test_the_page_holds_what_was_known_at_each_time(page: Path) -> None:
     assert [shape["name"] for shape in told["true_scene"]] == ["floor", "wall"]
     assert len(told["acts"]) == len(explorer.acts)
     for number, (act, one) in enumerate(zip(explorer.acts, told["acts"], strict=True)):
-        assert one["time"] == pytest.approx(act.begins + number * READING_TIME, abs=1e-3)
+        assert one["time"] == pytest.approx(act.begins + number * exploration.READING_TIME, abs=1e-3)
         assert one["title"].startswith(f"{number + 1}  ") and one["reason"] == act.step.reason
         assert bool(one["look"]) == (act.T_base_camera is not None) == (one["end"] is not None)
     assert data["times"][-1] == pytest.approx(
-        explorer.duration + READING_TIME * (len(explorer.acts) - 1), abs=1e-3
+        explorer.duration + exploration.READING_TIME * (len(explorer.acts) - 1), abs=1e-3
     )
     times = [known["time"] for known in told["known"]]
     assert times == sorted(times) and times[0] == 0.0
@@ -107,7 +102,7 @@ def test_the_page_holds_what_was_known_at_each_time(page: Path) -> None:
     for known in told["known"]:
         unknown ^= set(numbers(known["layers"][2]))
     last = explorer.views[-1]
-    assert unknown <= set(faces_between(last.unknown, last.free)[0].tolist())
+    assert unknown <= set(exploration.faces_between(last.unknown, last.free)[0].tolist())
     assert len(unknown) > 1000, "the boundary of unknown space, without that at the known floor"
 
 

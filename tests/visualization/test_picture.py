@@ -51,10 +51,3 @@ def test_several_motions_have_traces_of_their_own_colors(arm, motion, tmp_path):
     many = {str(i): motion for i in range(len(COMPARED) + 1)}
     with pytest.raises(InputError, match="5 motions; a picture shows 1 to 4"):
         write_comparison(arm, Scene(), many, tmp_path / "many.png")
-
-
-def test_the_shell_surrounds_the_arm(arm, motion):
-    bare, camera = render(arm, Scene(), motion, replace(SMALL, ghosts=0))
-    shell, _ = render(arm, Scene(), motion, replace(SMALL, ghosts=0, shell=0.1), camera)
-    changed = (np.abs(bare.astype(int) - shell).max(axis=2) > 3).sum()
-    assert changed > 100

@@ -10,7 +10,7 @@ from helpers.three_bars import CORNERS, CUBE
 from robotdiffuse.drawables import creased
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.visual_meshes import has_visual, load_visual
-from robotdiffuse.visualization.arm import DrawnArm, facts
+from robotdiffuse.visualization.arm import DrawnArm
 
 
 def test_trace_follows_the_outer_end_of_the_tip(arm, motion):
@@ -58,12 +58,6 @@ def test_bundled_visual_meshes_are_drawn(name):
         if len(robot.meshes.get(link, ())) and len(drawn[0].faces) == len(robot.meshes[link][0].faces)
     }
     assert plain <= {"ee_link"}, "these links are drawn by their collision geometry"
-
-
-def test_the_caption_says_that_collision_geometry_is_drawn():
-    motion = rd.Path(("a",), np.zeros((2, 1)))
-    assert ("drawn by", "collision geometry") in facts(motion, None, rd.load_robot("iiwa14"))
-    assert ("drawn by", "collision geometry") not in facts(motion, None, rd.load_robot("ur5e"))
 
 
 @pytest.mark.parametrize("flat", [[[1, 1, 1]] * 3, [[1, 1, 1], [2, 2, 2], [3, 3, 3]]])

@@ -13,12 +13,9 @@ import robotdiffuse as rd
 from helpers.box_arm import box_mesh
 from helpers.example_robots import example_robot
 from helpers.sphere_oracles import random_shape
-from robotdiffuse.collision.checker import CollisionChecker
-from robotdiffuse.collision.convex_geometry import checks_of, hulls_of, solid_arrays
+from robotdiffuse.collision.convex_geometry import hulls_of, solid_arrays
 from robotdiffuse.collision.exact_meshes import ExactCollision
-from robotdiffuse.collision.kernels import convex_bounds, motion_certificate, motion_pieces
-from robotdiffuse.collision.kernels.lane_clearance import make_clearance_workspace
-from robotdiffuse.collision.kernels.motion_pieces import Motion, Pieces
+from robotdiffuse.collision.kernels import convex_bounds
 from robotdiffuse.collision.motions import ContinuousCollision
 
 LINKS = {
@@ -74,48 +71,6 @@ seeds = st.integers(0, 2**31)
 
 
 robots = st.sampled_from(list(LINKS))
-
-
-@given(robots, seeds, st.sampled_from([0.01, 0.05, 0.2]), st.booleans())
-def test_bounds_hold_along_the_whole_piece(name: str, seed: int, width: float, cloud: bool) -> None:
-    rng = np.random.default_rng(seed)
-    robot = clad_arm(name)
-    scene = scene_of(rng, cloud)
-    q = curve(rng, robot, width)
-    validator = ContinuousCollision(robot, scene, 1e-4, 0.5)
-    checker = CollisionChecker(robot, scene)
-    exact = ExactCollision(robot, scene)
-    motion = Motion(q, motion_pieces.travel_along(q, validator.checks.motion_radii))
-    whole = Pieces(
-        np.zeros(1), np.full(1, motion.travel[-1]), np.ones((1, len(checks_of(robot))), dtype=np.bool_)
-    )
-    best = np.ones(2)
-    found = motion_certificate.bound_by_spheres(
-        validator.arm,
-        validator.scene_arrays,
-        motion,
-        validator.checks,
-        whole,
-        best,
-        make_clearance_workspace(validator.arm.spheres, len(validator.scene_arrays.solids)),
-    )
-    places = np.linspace(0, motion.travel[-1], 41)
-    dense = motion_pieces.configurations(motion, places)
-    apart = np.hstack([checker.link_clearances(dense), checker.pair_clearances(dense)])
-    # towards points the checker's clearances are themselves bounds, up to the size of a voxel
-    slack = 0.02 if cloud else 1e-6
-    assert (np.minimum(found.lower[0], 1) <= apart.min(axis=0) + slack).all()
-    assert (np.minimum(found.clearance[0], 1) <= apart[20] + slack).all()
-    posture = convex_bounds.make_posture(validator.arm.hulls, validator.solids, robot.dof)
-    found.clearance[:] = -np.inf
-    found.lower[:] = -np.inf
-    motion_certificate.bound_by_convex_parts(
-        validator.arm, validator.solids, motion, validator.checks, found, np.ones(2), 0.5, 1e-4, posture
-    )
-    rows = [(*exact.link_distances(row), *exact.pair_distances(row)) for row in dense[::4]]
-    distances = np.array([[d.distance for d in row] for row in rows])
-    assert (found.lower[0] <= distances.min(axis=0) + 1e-6).all()
-    assert (found.clearance[0] <= distances[5] + 1e-6).all()
 
 
 @given(robots, seeds)

@@ -15,19 +15,7 @@ from robotdiffuse.planning.exploration.steps import DONE, LOOK
 
 pytest.importorskip("viser", reason="the page needs viser: pip install 'robotdiffuse[live]'")
 
-from robotdiffuse.visualization.live import exploration as exploration_session
-from robotdiffuse.visualization.live.exploration import (
-    CHOOSING,
-    ENDED,
-    MOVING,
-    PAUSED,
-    RUNNING,
-    STEPPING,
-    WAITING,
-    ExplorationSession,
-    ExplorationState,
-    exploration_badge,
-)
+from robotdiffuse.visualization.live import exploration as live
 from robotdiffuse.visualization.live.session import NO_MOTION, VALID
 
 PATIENCE = 300.0
@@ -37,41 +25,41 @@ until = partial(waiting.state_when, patience=PATIENCE)
 
 
 @pytest.fixture
-def session() -> Iterator[ExplorationSession]:
+def session() -> Iterator[live.ExplorationSession]:
     problem = rd.Problem(rd.load_robot("panda"), rd.Scene([FLOOR, WALL]), HOME, BEYOND)
-    session = ExplorationSession(problem, SETTINGS, noise=False, seed=0, speed=1000.0)
+    session = live.ExplorationSession(problem, SETTINGS, noise=False, seed=0, speed=1000.0)
     yield session
     session.close()
 
 
-def test_it_goes_one_step_and_then_to_the_end(session: ExplorationSession) -> None:
-    seen: list[ExplorationState] = []
+def test_it_goes_one_step_and_then_to_the_end(session: live.ExplorationSession) -> None:
+    seen: list[live.ExplorationState] = []
     session.on_change = lambda: seen.append(session.state)
-    assert session.state.phase == WAITING and session.state.known is None
-    assert exploration_badge(session.state).headline == "not begun"
-    session.set_mode(STEPPING)
-    state = until(session, lambda state: state.acts and state.phase == WAITING)
+    assert session.state.phase == live.WAITING and session.state.known is None
+    assert live.exploration_badge(session.state).headline == "not begun"
+    session.set_mode(live.STEPPING)
+    state = until(session, lambda state: state.acts and state.phase == live.WAITING)
     [act] = state.acts
-    assert act.trajectory is not None and state.mode == PAUSED
+    assert act.trajectory is not None and state.mode == live.PAUSED
     np.testing.assert_allclose(state.configuration, act.trajectory.positions[-1], atol=1e-9)
     if act.step.kind == LOOK:
         assert act.step.wanted is not None and act.step.wanted.any()
-    badge = exploration_badge(replace(state, phase=MOVING))
+    badge = live.exploration_badge(replace(state, phase=live.MOVING))
     assert badge.headline.startswith("1. ") and badge.lines[0] == act.step.reason
     assert badge.lines[-1].startswith("of the map ")
-    session.set_mode(RUNNING)
-    state = until(session, lambda state: state.phase == ENDED)
-    assert exploration_badge(state).kind == (VALID if state.acts[-1].step.kind == DONE else NO_MOTION)
+    session.set_mode(live.RUNNING)
+    state = until(session, lambda state: state.phase == live.ENDED)
+    assert live.exploration_badge(state).kind == (VALID if state.acts[-1].step.kind == DONE else NO_MOTION)
     assert not state.failure and not state.violation and state.acts[-1].step.motion is None
-    assert {CHOOSING, MOVING} <= {one.phase for one in seen}
+    assert {live.CHOOSING, live.MOVING} <= {one.phase for one in seen}
     assert state.known is state.explorer.views[-1]  # type: ignore[union-attr]
 
 
-def test_a_pause_holds_the_arm_and_a_restart_begins_anew(session: ExplorationSession) -> None:
+def test_a_pause_holds_the_arm_and_a_restart_begins_anew(session: live.ExplorationSession) -> None:
     session.set_speed(0.2)
-    session.set_mode(RUNNING)
-    until(session, lambda state: state.phase == MOVING and (state.configuration != HOME).any())
-    session.set_mode(PAUSED)
+    session.set_mode(live.RUNNING)
+    until(session, lambda state: state.phase == live.MOVING and (state.configuration != HOME).any())
+    session.set_mode(live.PAUSED)
 
     def rests() -> bool:
         held = session.state.configuration
@@ -79,27 +67,27 @@ def test_a_pause_holds_the_arm_and_a_restart_begins_anew(session: ExplorationSes
         return session.state.configuration is held
 
     waiting.until(rests, PATIENCE)  # after the frame that was being computed
-    assert session.state.phase == MOVING
+    assert session.state.phase == live.MOVING
     with pytest.raises(rd.InputError, match=r"unknown explorer\.policy 'bold'"):
         session.restart(policy="bold")
     session.restart(policy="probabilistic", noise=True)
     assert session.state.configuration.tolist() == HOME.tolist() and not session.state.acts
     assert (session.state.settings.policy, session.state.noise) == ("probabilistic", True)
-    state = until(session, lambda state: state.explorer is not None and state.phase == WAITING)
+    state = until(session, lambda state: state.explorer is not None and state.phase == live.WAITING)
     assert state.explorer is not None and state.explorer.settings.policy == "probabilistic"
 
 
 def test_an_error_is_shown_and_a_restart_helps(
-    session: ExplorationSession, monkeypatch: pytest.MonkeyPatch
+    session: live.ExplorationSession, monkeypatch: pytest.MonkeyPatch
 ) -> None:
 
     def fails(*_: object) -> None:
         raise ValueError("no camera")
 
     with monkeypatch.context() as patch:
-        patch.setattr(exploration_session, "simulated_explorer", fails)
-        session.set_mode(RUNNING)
-        state = until(session, lambda state: state.phase == ENDED)
-        assert exploration_badge(state).lines == ("ValueError: no camera",)
+        patch.setattr(live, "simulated_explorer", fails)
+        session.set_mode(live.RUNNING)
+        state = until(session, lambda state: state.phase == live.ENDED)
+        assert live.exploration_badge(state).lines == ("ValueError: no camera",)
     session.restart()
     until(session, lambda state: state.acts)

@@ -14,13 +14,7 @@ from helpers import waiting
 from helpers.browsers import MARKS, PATIENCE, opened
 from robotdiffuse.core.transforms import rotation_from_quaternion, transform
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.visualization.live.session import (
-    PageOptions,
-    Session,
-    first_problem,
-    moved_to,
-    problem_text,
-)
+from robotdiffuse.visualization.live import session as live
 
 pytest.importorskip("viser", reason="the page needs viser: pip install 'robotdiffuse[live]'")
 
@@ -37,7 +31,7 @@ pytestmark = MARKS
 @pytest.fixture(scope="module")
 def page() -> Iterator[Page]:
     server = PageServer("127.0.0.1", free_port("127.0.0.1", 0))
-    page = Page(Session(first_problem(None, None), PageOptions("aorrtc", 10.0)), server)
+    page = Page(live.Session(live.first_problem(None, None), live.PageOptions("aorrtc", 10.0)), server)
     until(lambda: page.session.state.motion is not None)
     yield page
     page.close()
@@ -67,12 +61,14 @@ def test_an_obstacle_in_the_way_turns_it_red_and_the_next_plan_green(view: Any, 
     assert motion is not None and motion.trajectory is not None
     q = motion.trajectory.positions[len(motion.trajectory.times) // 2]
     hand = transform(link_pose(session.state.problem.robot, q, "panda_hand")[:3, 3])
-    session.change_obstacle("sphere", lambda shape: moved_to(shape, hand))
+    session.change_obstacle("sphere", lambda shape: live.moved_to(shape, hand))
     red = view.locator(INVALID)
     red.wait_for()
     assert "inside sphere" in red.inner_text() and "at 0." in red.inner_text()
     assert session.state.motion is motion
-    session.change_obstacle("sphere", lambda shape: moved_to(shape, transform(np.array([-0.5, 0.0, 1.2]))))
+    session.change_obstacle(
+        "sphere", lambda shape: live.moved_to(shape, transform(np.array([-0.5, 0.0, 1.2])))
+    )
     view.locator(VALID).wait_for()
     view.get_by_role("button", name="Delete").click()
     until(lambda: all(shape.name != "sphere" for shape in session.state.problem.scene.shapes))
@@ -157,7 +153,7 @@ def test_files_are_loaded_and_saved_and_broken_ones_are_a_note(view: Any, page: 
     view.get_by_role("tab", name="Files").click()
     with view.expect_download() as saved:
         view.get_by_role("button", name="Save problem").click()
-    assert Path(saved.value.path()).read_bytes() == problem_text(session.state.problem)
+    assert Path(saved.value.path()).read_bytes() == live.problem_text(session.state.problem)
     with view.expect_download() as saved:
         view.get_by_role("button", name="Save replay").click()
     assert b"shelf" not in Path(saved.value.path()).read_bytes()[:100]
@@ -168,7 +164,7 @@ def test_files_are_loaded_and_saved_and_broken_ones_are_a_note(view: Any, page: 
     upload.set_input_files(broken)
     view.get_by_text("broken.yaml: problem has no start").wait_for()
     assert session.state.problem is before
-    other = problem_text(first_problem(None, "ur5e"))
+    other = live.problem_text(live.first_problem(None, "ur5e"))
     upload.set_input_files({"name": "other.yaml", "mimeType": "text/yaml", "buffer": other})
     until(lambda: session.state.problem.robot.name == "ur5e" and session.state.answer is not None)
     view.locator(VALID).wait_for()
@@ -181,7 +177,7 @@ def test_it_comes_back_after_the_server_restarts(view: Any, page: Page) -> None:
     number = 0
     for planner in ("aorrtc", "rrt_connect"):
         server = PageServer("127.0.0.1", free_port("127.0.0.1", number))
-        page = Page(Session(problem, PageOptions(planner, 10.0)), server)
+        page = Page(live.Session(problem, live.PageOptions(planner, 10.0)), server)
         if not number:
             number = server.get_port()
             view.goto(server.url)

@@ -13,14 +13,7 @@ from helpers.explorations import BEYOND, FLOOR, HOME, WALL
 
 pytest.importorskip("viser", reason="the page needs viser: pip install 'robotdiffuse[live]'")
 
-from robotdiffuse.visualization.live.exploration import (
-    ENDED,
-    MOVING,
-    PAUSED,
-    RUNNING,
-    ExplorationPage,
-    ExplorationSession,
-)
+from robotdiffuse.visualization.live import exploration as live
 from robotdiffuse.visualization.live.server import PageServer, free_port
 
 until = partial(waiting.until, patience=PATIENCE)
@@ -28,11 +21,11 @@ pytestmark = MARKS
 
 
 @pytest.fixture
-def view() -> Iterator[tuple[Any, ExplorationSession, dict[str, Any]]]:
+def view() -> Iterator[tuple[Any, live.ExplorationSession, dict[str, Any]]]:
     """A browser at the page, the session, and what is drawn by name."""
     problem = rd.Problem(rd.load_robot("panda"), rd.Scene([FLOOR, WALL]), HOME, BEYOND)
-    session = ExplorationSession(problem, rd.ExplorerSettings(time_limit=5.0), False, 0, speed=0.1)
-    page = ExplorationPage(session, PageServer("127.0.0.1", free_port("127.0.0.1", 0)))
+    session = live.ExplorationSession(problem, rd.ExplorerSettings(time_limit=5.0), False, 0, speed=0.1)
+    page = live.ExplorationPage(session, PageServer("127.0.0.1", free_port("127.0.0.1", 0)))
     with opened(page.server.url) as view:
         yield view, session, page.server.scene._handle_from_node_name
     page.close()
@@ -40,8 +33,8 @@ def view() -> Iterator[tuple[Any, ExplorationSession, dict[str, Any]]]:
 
 def test_people_watch_pause_go_on_and_restart(view: Any) -> None:
     page, session, drawn = view
-    until(lambda: session.state.phase == MOVING)  # it runs since the page was opened
-    session.set_mode(PAUSED)
+    until(lambda: session.state.phase == live.MOVING)  # it runs since the page was opened
+    session.set_mode(live.PAUSED)
     [act] = session.state.acts
     page.get_by_text(f"1. {act.step.kind}").first.wait_for()
     page.get_by_text("of the map").wait_for()
@@ -54,13 +47,13 @@ def test_people_watch_pause_go_on_and_restart(view: Any) -> None:
     until(lambda: "/unknown" in drawn)
     page.get_by_role("button", name="Run").click()
     page.get_by_role("button", name="Pause").click()
-    until(lambda: session.state.mode == PAUSED)
+    until(lambda: session.state.mode == live.PAUSED)
     session.set_speed(10.0)
     page.get_by_role("button", name="Run").click()
-    until(lambda: session.state.phase == ENDED)
+    until(lambda: session.state.phase == live.ENDED)
     page.locator("[data-validity=valid], [data-validity=none]").wait_for()
     page.get_by_role("button", name="Restart").click()
-    until(lambda: session.state.phase != ENDED)
+    until(lambda: session.state.phase != live.ENDED)
     page.get_by_text("Noise", exact=True).locator(beside).check(force=True)
     until(lambda: session.state.noise and session.state.acts)  # a step of any kind
-    assert session.state.mode == RUNNING
+    assert session.state.mode == live.RUNNING
