@@ -104,15 +104,9 @@ def test_loss_falls_on_few_motions() -> None:
     assert all(parameter.grad is not None for parameter in network.parameters())
 
 
-@pytest.fixture
-def straight_weights(monkeypatch: pytest.MonkeyPatch) -> mpinets.MPiNetsNetwork:
+def test_a_path_in_collision_is_no_result(monkeypatch: pytest.MonkeyPatch) -> None:
     straight = Straight(RANGES, SMALL)
     monkeypatch.setattr(MPiNets, "network", lambda _self, _robot: straight)
-    return straight
-
-
-@pytest.mark.usefixtures("straight_weights")
-def test_a_path_in_collision_is_no_result() -> None:
     problem = Problem(PANDA, Scene([Box(WALL[:3], WALL[3:6])]), LEFT, RIGHT)
     MPiNets().plan(problem, 0.1, 1)  # compiles and loads
     result = MPiNets().plan(problem, 0.5, 1)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from helpers.waiting import until
 from robotdiffuse.processes.workers import Results
 
 HEARS_CTRL_C = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
@@ -46,12 +47,9 @@ def shards(out: Path) -> int:
     return len(list(out.glob("shard_*.zarr")))
 
 
-def wait_for_shards(run: subprocess.Popen[str], out: Path, count: int, seconds: float = 300.0) -> None:
+def wait_for_shards(run: subprocess.Popen[str], out: Path, count: int) -> None:
     """Until the folder holds so many shards, or the command has ended."""
-    end = time.monotonic() + seconds
-    while shards(out) < count and run.poll() is None:
-        assert time.monotonic() < end, f"no {count} shards in {seconds} s"
-        time.sleep(0.005)
+    until(lambda: shards(out) >= count or run.poll() is not None, 300.0)
 
 
 def group_ends(group: int, seconds: float = 120.0) -> bool:

@@ -53,9 +53,8 @@ def small(name, seed=0):
 
 def cloud(n, batch=1, seed=0):
     generator = torch.Generator().manual_seed(seed)
-    low = torch.tensor([-0.5, -0.5, 0.1])
-    high = torch.tensor([0.5, 0.5, 0.9])
-    return low + (high - low) * torch.rand(batch, n, 3, generator=generator)
+    low, size = torch.tensor([[-0.5, -0.5, 0.1], [1.0, 1.0, 0.8]])
+    return low + size * torch.rand(batch, n, 3, generator=generator)
 
 
 def denoiser_for(encoder: str) -> dict[str, Any]:
@@ -73,15 +72,13 @@ def test_every_encoder_is_tested():
 def test_any_number_of_obstacles(name):
     encoder = small(name)
     scenes = random_scenes(13, 12, np.random.default_rng(0))
-    kinds = scenes.kinds
     params = scenes.params
-    kinds[:] = np.where(np.arange(12) < np.arange(13)[:, None], SPHERE, 0)
+    scenes.kinds[:] = np.where(np.arange(12) < np.arange(13)[:, None], SPHERE, 0)
     params[..., :3] = np.random.default_rng(1).uniform([-0.5, -0.5, 0.2], [0.5, 0.5, 1.2], (13, 12, 3))
     params[..., 3] = 0.1
     clouds = scene_clouds(encoder, scenes, np.random.default_rng(0))
-    assert clouds.shape == (13, encoder.settings.cloud, 3)
     z = encoder(clouds)
-    assert z.isfinite().all()
+    assert clouds.shape == (13, encoder.settings.cloud, 3) and z.isfinite().all()
     torch.testing.assert_close(z[0], encoder(torch.zeros(1, 1, 3))[0], msg="no obstacle is no point")
     assert len(z.detach().round(decimals=6).unique(dim=0)) == 13
 
@@ -89,7 +86,7 @@ def test_any_number_of_obstacles(name):
 @every_encoder
 @settings(max_examples=10, deadline=None)
 @given(n=st.integers(1, 300), seed=st.integers(0, 1000))
-def test_any_number_of_points_in_any_order(name, n, seed):
+def test_any_number_of_points_in_any_order_and_repeated(name, n, seed):
     encoder = small(name)
     points = cloud(n, 2, seed)
     z = encoder(points)
@@ -97,15 +94,8 @@ def test_any_number_of_points_in_any_order(name, n, seed):
     assert torch.equal(encoder(points), z), "the same cloud has the same code"
     order = torch.randperm(n, generator=torch.Generator().manual_seed(seed))
     torch.testing.assert_close(encoder(points[:, order]), z, atol=2e-5, rtol=1e-5)
-
-
-@pytest.mark.parametrize("name", [name for name in encoders.ENCODERS if name != "dgcnn"])
-@pytest.mark.parametrize("n", [1, 2, 20])
-def test_repetition_does_not_matter(name, n):
-    """DGCNN is left out: repeated points are each other's nearest neighbors."""
-    encoder = small(name)
-    points = cloud(n)
-    torch.testing.assert_close(encoder(points.repeat(1, 3, 1)), encoder(points), atol=1e-5, rtol=1e-5)
+    if name != "dgcnn":  # for which repeated points are each other's nearest neighbors
+        torch.testing.assert_close(encoder(points.repeat(1, 3, 1)), z, atol=2e-5, rtol=1e-5)
 
 
 @every_encoder
