@@ -1,12 +1,26 @@
-"""The command line as a whole: bad calls, help, closed output and Ctrl-C."""
+"""The command line as a whole: bad calls, help, closed output, Ctrl-C; the smaller commands."""
 
+import json
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
+import rich.console
+import yaml
 
-from helpers.commands import Said, write_problem
+from helpers.code_blocks import PAGES, code_blocks
+from helpers.commands import PROBLEM, Said, run, write_problem
+from helpers.made_arms import chain, row, written
+from helpers.quick_preparation import QUICK, coarse_grids
+from robotdiffuse.cli import COMMANDS, console
+from robotdiffuse.core import registry
+from robotdiffuse.core.loading import compiled
+from robotdiffuse.planning import PLANNERS
+from robotdiffuse.problems.fields import problem_schema
+from robotdiffuse.robots import load_robot
 
 TRAIN = ["train", "planner", "--data", "d", "--encoder", "dgcnn", "--out", "o"]
 
@@ -99,3 +113,187 @@ sys.exit(main())
 """
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "robotdiffuse: stopped\n")
+
+
+def test_planner_list_shows_them_all_without_loading_them() -> None:
+    code = "from robotdiffuse.cli import *; main(['planner', 'list']); sys.exit('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert all(name in done.stdout for name in PLANNERS)
+
+
+def test_settings_of_a_planner_are_listed(said: Said) -> None:
+    printed = said(0, "planner", "info", "rrt_connect")
+    assert "range" in printed and "0.7" in printed and "Longest extension of a tree" in printed
+    assert "unknown planner 'teleport'" in said(2, "planner", "info", "teleport")
+    assert said(2, "planner", "info", "aorrt").endswith("did you mean aorrtc?\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"), [(("plna",), "plan"), (("plan", "x.yaml", "--tme-limit=3"), "--time-limit")]
+)
+def test_misspelled_words_get_a_suggestion(words: tuple[str, ...], meant: str, said: Said) -> None:
+    assert f"did you mean {meant}?" in said(2, *words)
+
+
+def test_help_lists_every_command_below_a_topic(said: Said) -> None:
+    printed = said(0, "--help")
+    topics = [line for line in printed.splitlines() if line.endswith(":") and not line.startswith(" ")]
+    assert topics[1:] == [f"{topic}:" for topic in COMMANDS]
+    assert "\n  plan         plan a motion" in printed
+
+
+def test_a_module_of_the_current_folder_adds_planners(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: Said
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setattr(registry, "imported", [])
+    (tmp_path / "added_planners.py").write_text(
+        "from dataclasses import replace\nfrom robotdiffuse.planning import PLANNERS\n"
+        "PLANNERS['mine'] = replace(PLANNERS['aorrtc'], description='my own')\n"
+    )
+    try:
+        assert "my own" in said(0, "planner", "list", "--import", "added_planners")
+        assert run("plan", write_problem(tmp_path), "--planner", "mine", "--import", "added_planners") == 0
+    finally:
+        PLANNERS.pop("mine", None)
+    assert "module 'no_such_module' cannot be imported: ModuleNotFoundError" in said(
+        2, "planner", "list", "--import", "no_such_module"
+    )
+
+
+def test_a_log_says_what_is_compiled(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    """Without a terminal, `demo` was silent for a minute and a half on a new machine."""
+    monkeypatch.setattr(console, "SPINNER_DELAY", 0.0)
+    monkeypatch.setattr(console, "LOG_INTERVAL", 0.01)
+    with console.Spinner("planning"):
+        compiled.append("search")
+        said = ""
+        while "\n" not in said:
+            time.sleep(0.01)
+            said += capsys.readouterr().err
+    assert said.splitlines()[0] == "planning: compiling, once on this machine; 1 functions so far (search)"
+
+
+def test_a_spinner_that_ends_as_it_appears_gives_stdout_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A plan of two seconds printed its result to standard error: rich had replaced sys.stdout for good."""
+    ending = threading.Event()
+    stop = console.Spinner.stop
+
+    class Terminal(rich.console.Console):
+        def __init__(self, **_: object) -> None:
+            ending.wait()
+            super().__init__(stderr=True, force_terminal=True)
+
+    def begin_to_stop(spinner: console.Spinner) -> None:
+        ending.set()
+        stop(spinner)
+
+    monkeypatch.setattr(console.Spinner, "stop", begin_to_stop)
+    monkeypatch.setattr(console, "SPINNER_DELAY", 0.0)
+    monkeypatch.setattr(rich.console, "Console", Terminal)
+    before = sys.stdout
+    with console.Spinner("planning"):
+        pass
+    assert sys.stdout is before
+
+
+def test_progress_without_a_terminal_is_a_line_at_once(capsys: pytest.CaptureFixture) -> None:
+    """`data check` of a few motions said nothing for 25 s."""
+    with console.progress("checking motions") as update:
+        update(0, 4)
+        assert capsys.readouterr().err == "checking motions: 0 of 4\n"
+        update(4, 4)
+    assert capsys.readouterr().err == ""
+
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_the_schema_accepts_the_problems_of_the_documentation() -> None:
+    jsonschema = pytest.importorskip("jsonschema")
+    validator = jsonschema.Draft202012Validator(problem_schema())
+    blocks = [block for page in PAGES for block in code_blocks(page) if block.language == "yaml"]
+    documented = [yaml.safe_load(block.code) for block in blocks]
+    problems = [one for one in documented if isinstance(one, dict) and {"robot", "scene"} <= one.keys()]
+    files = [yaml.safe_load(file.read_text()) for file in (ROOT / "examples").glob("*.yaml")]
+    assert len(problems) > 5 and len(files) > 2
+    for problem in problems + files:
+        assert [error.message for error in validator.iter_errors(problem)] == []
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"gaol": []},
+        {"scene": [{"ball": {}}]},
+        {"scene": [{"box": {"center": [0, 0, 0]}}]},
+        {"unknown": "free"},
+        {"clearance": 5},
+        {"goal": {"pose": {"xyz": [0, 0, 0]}}},
+    ],
+)
+def test_the_schema_refuses_what_files_may_not_hold(changes: dict[str, object]) -> None:
+    jsonschema = pytest.importorskip("jsonschema")
+    assert not jsonschema.Draft202012Validator(problem_schema()).is_valid(PROBLEM | changes)
+
+
+def test_the_schema_is_printed(said: Said) -> None:
+    assert json.loads(said(0, "schema")) == problem_schema()
+
+
+def completed(script: str, *words: str) -> list[str]:
+    """What bash proposes for the last of these words."""
+    line = " ".join(f'"{word}"' for word in words)
+    asks = f"COMP_WORDS=({line}); COMP_CWORD={len(words) - 1}; _robotdiffuse"
+    asks += "; printf '%s\\n' \"${COMPREPLY[@]}\""
+    ended = subprocess.run(["bash", "-c", f"{script}\n{asks}"], capture_output=True, text=True, check=True)
+    return ended.stdout.split()
+
+
+def test_bash_completes_commands_and_options(said: Said) -> None:
+    script = said(0, "completion", "bash")
+    assert completed(script, "robotdiffuse", "pl") == ["plan", "planner"]
+    assert completed(script, "robotdiffuse", "plan", "--cl") == ["--clearance"]
+    assert completed(script, "robotdiffuse", "data", "inf") == ["info"]
+    assert "--page" in completed(script, "robotdiffuse", "data", "info", "folder", "--")
+    assert completed(script, "robotdiffuse", "completion", "") == ["bash", "zsh"]
+    assert completed(script, "robotdiffuse", "plan", "prob") == []  # then bash completes names of files
+    assert "bashcompinit" in said(0, "completion", "zsh")
+
+
+def test_robot_add_with_srdf_and_robot_list(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], said: Said, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pairs that an SRDF or the command allows, the comparison with sampling, progress without a terminal."""
+    monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
+    monkeypatch.setattr("robotdiffuse.robots.fitting.preparation.PreparationSettings", lambda: QUICK)
+    file = written(tmp_path, chain("base", row("j", 4), xyz="0 0 0.07", limits='lower="-3" upper="3"'))
+    pairs = ("base", "j4_link", "User"), ("base", "j3_link", "Never"), ("base", "j1_link", "Adjacent")
+    rows = (f'<disable_collisions link1="{a}" link2="{b}" reason="{why}"/>' for a, b, why in pairs)
+    (tmp_path / "made.srdf").write_text(f"<robot name='made'>{''.join(rows)}</robot>")
+
+    with coarse_grids():
+        assert run("robot", "add", str(file), "--allow", "j1_link", "j4_link") == 0
+    told = capsys.readouterr()
+    assert "pairs that differ from made.srdf" in told.out and "User" in told.out and "named 1" in told.out
+    assert "5 of 11: spheres of base" in told.err and "11 of 11: done" in told.err
+    allowed = load_robot("made").allowed_collisions
+    assert frozenset(("j1_link", "j4_link")) in allowed
+    assert frozenset(("base", "j4_link")) not in allowed  # found beside: compared, not taken
+
+    given = ("--srdf", str(tmp_path / "made.srdf"), "--name", "by_srdf")
+    with coarse_grids():
+        assert run("robot", "add", str(file), *given) == 0
+    assert frozenset(("base", "j4_link")) in load_robot("by_srdf").allowed_collisions
+    assert "unknown link in allow 'moon'" in said(2, "robot", "add", str(file), "--allow", "base", "moon")
+
+    out = said(0, "robot", "list")
+    assert all(name in out for name in ("panda", "made", "by_srdf"))
+    assert len(str(load_robot("panda")).splitlines()) <= 10
+
+
+def test_robot_info(said: Said) -> None:
+    printed = said(0, "robot", "info", "panda")
+    assert "panda_joint7" in printed and "2.8973" in printed and "spheres on" in printed

@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from trimesh.exchange.gltf import export_gltf
 from trimesh.exchange.obj import export_obj
 from trimesh.exchange.ply import export_ply
 
-from robotdiffuse import InputError
+from robotdiffuse import Box, InputError, Scene
 from robotdiffuse.core.errors import distinct, joined, shown, unknown_name
 from robotdiffuse.core.input_files import (
     MAX_SHOWN_NAME,
@@ -32,6 +33,8 @@ from robotdiffuse.core.input_files import (
     read_text,
 )
 from robotdiffuse.core.mesh_files import read_triangles
+from robotdiffuse.core.types import check_motion_arrays
+from robotdiffuse.scenes.scene import MAX_CONTACT_LINKS
 
 SOURCE = Path(__file__).parents[2] / "src" / "robotdiffuse"
 DEEP = 100_000
@@ -277,3 +280,39 @@ def test_different_numbers_are_told_apart(values: list[float], digits: int) -> N
 def test_as_few_digits_as_needed() -> None:
     assert distinct(3.14, 9.0) == ["3.14", "9"]
     assert distinct(3.1400001049, 3.14) == ["3.1400001", "3.14"]
+
+
+COUNT = 2000
+
+
+class Name(str):
+    """A text that counts how often it is compared."""
+
+    compared: ClassVar[int] = 0
+
+    def __eq__(self, other: object) -> bool:
+        Name.compared += 1
+        return str.__eq__(self, str(other))
+
+    __hash__ = str.__hash__
+
+
+@pytest.fixture
+def names(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    monkeypatch.setattr(Name, "compared", 0)
+    return [Name(f"j{i}") for i in range(COUNT)]
+
+
+def test_joint_names_are_compared_a_few_times_each(names: list[str]) -> None:
+    with pytest.raises(InputError, match="joint_names has j7 more than once"):
+        check_motion_arrays([*names, Name("j7")], {"positions": [[0.0]]})
+    assert Name.compared < 5 * COUNT
+
+
+def test_links_that_may_touch_an_obstacle_are_compared_a_few_times_each(names: list[str]) -> None:
+    few = names[:MAX_CONTACT_LINKS]
+    scene = Scene([Box([1, 0, 0], [0.1, 0.1, 0.1])], [("box", [name]) for name in few])
+    assert Name.compared < 5 * COUNT
+    assert scene.allowed_contacts == (("box", tuple(few)),)
+    with pytest.raises(InputError, match=f"'box' has over {MAX_CONTACT_LINKS} links; write all"):
+        Scene(scene.shapes, [("box", names)])

@@ -1,36 +1,39 @@
-"""Result and trajectory files: round trips, and one-line errors for damaged files."""
+"""Result and trajectory files: round trips, one-line errors for damaged files; files are written whole."""
 
 import json
+import os
+import threading
 from dataclasses import fields, replace
-from pathlib import Path as FilePath
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from robotdiffuse import InputError, Path, PlanResult, Status, Trajectory, load_result
+import robotdiffuse as rd
 from robotdiffuse.core.errors import OutputError
+from robotdiffuse.core.output_files import JsonLines, write_atomically
 
 NAMES = ("shoulder", "elbow")
 
 
 @pytest.fixture
-def trajectory() -> Trajectory:
+def trajectory() -> rd.Trajectory:
     rng = np.random.default_rng(0)
     times = np.cumsum(np.array([0.0, 0.1, 0.1, 0.07]))
-    return Trajectory(NAMES, times, *(rng.normal(size=(4, 2)) for _ in range(3)))
+    return rd.Trajectory(NAMES, times, *(rng.normal(size=(4, 2)) for _ in range(3)))
 
 
 @pytest.fixture
-def solved(trajectory: Trajectory) -> PlanResult:
-    return PlanResult(
-        status=Status.SOLVED,
+def solved(trajectory: rd.Trajectory) -> rd.PlanResult:
+    return rd.PlanResult(
+        status=rd.Status.SOLVED,
         reason="found by a straight line",
         planner="rrt_connect",
         robot="panda",
         planning_time=0.01,
         seed=3,
         stage="straight line",
-        path=Path(NAMES, trajectory.positions[[0, 3]]),
+        path=rd.Path(NAMES, trajectory.positions[[0, 3]]),
         trajectory=trajectory,
         min_clearance=0.02,
         scene_clearance=0.02,
@@ -43,16 +46,16 @@ def solved(trajectory: Trajectory) -> PlanResult:
 
 
 @pytest.fixture
-def failed() -> PlanResult:
-    return PlanResult(Status.TIMEOUT, "no path in 1 s", "rrt_connect", "panda", 1.0, 0)
+def failed() -> rd.PlanResult:
+    return rd.PlanResult(rd.Status.TIMEOUT, "no path in 1 s", "rrt_connect", "panda", 1.0, 0)
 
 
-def test_solved_result_round_trip(solved: PlanResult, tmp_path: FilePath) -> None:
+def test_solved_result_round_trip(solved: rd.PlanResult, tmp_path: Path) -> None:
     file = tmp_path / "result.json"
     solved.save(file, {"robot": "panda", "scene": []})
-    read = load_result(file)
+    read = rd.load_result(file)
     assert read.problem == {"robot": "panda", "scene": []}
-    for field in fields(PlanResult):
+    for field in fields(rd.PlanResult):
         if field.name not in ("path", "trajectory"):
             assert getattr(read.result, field.name) == getattr(solved, field.name), field.name
     assert read.result.path_length == solved.path_length
@@ -62,7 +65,7 @@ def test_solved_result_round_trip(solved: PlanResult, tmp_path: FilePath) -> Non
         assert np.array_equal(getattr(read.result.trajectory, name), getattr(solved.trajectory, name))
 
 
-def test_fields_are_those_that_the_design_promises(solved: PlanResult, tmp_path: FilePath) -> None:
+def test_fields_are_those_that_the_design_promises(solved: rd.PlanResult, tmp_path: Path) -> None:
     solved.save(str(tmp_path / "r.json"))
     record = json.loads((tmp_path / "r.json").read_text())
     promised = (
@@ -74,38 +77,38 @@ def test_fields_are_those_that_the_design_promises(solved: PlanResult, tmp_path:
     assert len(record["times"]) == len(record["positions"]) == len(record["accelerations"]) == 4
 
 
-def test_results_of_earlier_versions_lack_fields(solved: PlanResult, tmp_path: FilePath) -> None:
+def test_results_of_earlier_versions_lack_fields(solved: rd.PlanResult, tmp_path: Path) -> None:
     file = tmp_path / "r.json"
     solved.save(file)
     record = json.loads(file.read_text())
     for name in ("scene_clearance", "self_clearance", "goal_index", "progress", "refused"):
         del record[name]
     file.write_text(json.dumps(record))
-    read = load_result(file).result
+    read = rd.load_result(file).result
     assert (read.min_clearance, read.scene_clearance, read.self_clearance) == (0.02, None, None)
     assert (read.progress, read.refused, read.goal_index) == ((), "", None)
 
 
-def test_failed_result_round_trip(failed: PlanResult, tmp_path: FilePath) -> None:
+def test_failed_result_round_trip(failed: rd.PlanResult, tmp_path: Path) -> None:
     file = tmp_path / "result.json"
     failed.save(str(file))
-    read = load_result(file).result
-    assert read.status is Status.TIMEOUT and read.path is None and read.trajectory is None
+    read = rd.load_result(file).result
+    assert read.status is rd.Status.TIMEOUT and read.path is None and read.trajectory is None
     assert json.loads(file.read_text())["verified"] is False
-    with pytest.raises(InputError, match=r"no trajectory to write \(timeout\)"):
+    with pytest.raises(rd.InputError, match=r"no trajectory to write \(timeout\)"):
         failed.save(str(tmp_path / "result.csv"))
 
 
-def test_unwritable(solved: PlanResult, tmp_path: FilePath) -> None:
-    with pytest.raises(InputError, match="nowhere does not exist"):
+def test_unwritable(solved: rd.PlanResult, tmp_path: Path) -> None:
+    with pytest.raises(rd.InputError, match="nowhere does not exist"):
         solved.save(tmp_path / "nowhere" / "r.json")
     (tmp_path / "folder.json").mkdir()
-    with pytest.raises(InputError, match="is a folder"):
+    with pytest.raises(rd.InputError, match="is a folder"):
         solved.save(tmp_path / "folder.json")
 
 
 def test_a_failed_write_keeps_the_old_file(
-    solved: PlanResult, tmp_path: FilePath, monkeypatch: pytest.MonkeyPatch
+    solved: rd.PlanResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = tmp_path / "r.json"
     file.write_text("old")
@@ -113,13 +116,13 @@ def test_a_failed_write_keeps_the_old_file(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(FilePath, "replace", full)
+    monkeypatch.setattr(Path, "replace", full)
     with pytest.raises(OutputError, match="No space left on device"):
         solved.save(file)
     assert file.read_text() == "old" and list(tmp_path.iterdir()) == [file]
 
 
-def test_not_finite_is_never_written(solved: PlanResult, tmp_path: FilePath) -> None:
+def test_not_finite_is_never_written(solved: rd.PlanResult, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="not JSON compliant"):
         replace(solved, min_clearance=float("nan")).save(tmp_path / "r.json")
     assert not list(tmp_path.iterdir())
@@ -146,14 +149,12 @@ DAMAGE = [
 
 
 @pytest.mark.parametrize(("change", "message"), DAMAGE)
-def test_damaged_result_is_refused(
-    change: dict, message: str, solved: PlanResult, tmp_path: FilePath
-) -> None:
+def test_damaged_result_is_refused(change: dict, message: str, solved: rd.PlanResult, tmp_path: Path) -> None:
     file = tmp_path / "r.json"
     solved.save(file)
     file.write_text(json.dumps(json.loads(file.read_text()) | change))
-    with pytest.raises(InputError, match=message) as caught:
-        load_result(file)
+    with pytest.raises(rd.InputError, match=message) as caught:
+        rd.load_result(file)
     assert str(caught.value).startswith(str(file)) and "\n" not in str(caught.value)
 
 
@@ -161,8 +162,57 @@ def test_damaged_result_is_refused(
     ("text", "message"),
     [("{", "is not valid JSON"), ("[]", "must hold one JSON object"), ("{}", "status, reason, planner")],
 )
-def test_not_a_result_file(text: str, message: str, tmp_path: FilePath) -> None:
+def test_not_a_result_file(text: str, message: str, tmp_path: Path) -> None:
     file = tmp_path / "r.json"
     file.write_text(text)
-    with pytest.raises(InputError, match=message):
-        load_result(file)
+    with pytest.raises(rd.InputError, match=message):
+        rd.load_result(file)
+
+
+def test_threads_that_write_one_file_leave_one_of_their_texts(tmp_path: Path) -> None:
+    """They shared a temporary file, which one moved away while another wrote it."""
+    file = tmp_path / "a.json"
+    errors = list[Exception]()
+    texts = [letter * 100_000 for letter in "ab"]
+
+    def write(text: str) -> None:
+        try:
+            for _ in range(50):
+                write_atomically(file, text)
+        except Exception as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=write, args=(text,)) for text in texts]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not errors and file.read_text() in texts and list(tmp_path.iterdir()) == [file]
+
+
+def test_an_interrupted_write_leaves_no_temporary_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "replace", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_atomically(tmp_path / "a.json", "a")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_row_that_is_not_written_whole_is_dropped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next row continued its line, which no reader understood then."""
+    lines = JsonLines(tmp_path / "a.jsonl")
+    lines.append({"a": 1})
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(OSError, match="No space"):
+            lines.append({"a": 2})
+    lines.append({"a": 3})
+    assert lines.rows == JsonLines(tmp_path / "a.jsonl").rows == [{"a": 1}, {"a": 3}]

@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 
-from helpers.urdfs import read_urdf
+from helpers.made_arms import read_urdf
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.robots.robot import Robot

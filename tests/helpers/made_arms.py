@@ -3,6 +3,10 @@
 from collections.abc import Iterable
 from pathlib import Path
 
+from robotdiffuse.robots.parsing.srdf import Srdf
+from robotdiffuse.robots.parsing.urdf import UrdfTree
+from robotdiffuse.robots.robot import Robot
+
 BALL = '<collision><geometry><sphere radius="0.04"/></geometry></collision>'
 
 
@@ -48,3 +52,15 @@ def row(prefix: str, count: int) -> list[str]:
 def written(folder: Path, *parts: str, file: str = "made.urdf", name: str = "made") -> Path:
     (folder / file).write_text(robot(*parts, name=name), encoding="utf-8")
     return folder / file
+
+
+def read_urdf(
+    path: str | Path,
+    base: str | None = None,
+    tip: str | None = None,
+    locked: dict[str, float] | None = None,
+    group: str | None = None,
+    srdf: Srdf | None = None,
+    packages: dict[str, str | Path] | None = None,
+) -> Robot:
+    return UrdfTree(Path(path), packages or {}, compile_xacro=True).robot(base, tip, locked, group, srdf)

@@ -13,8 +13,7 @@ import yaml
 from numpy import ndarray
 
 import robotdiffuse as rd
-from helpers.made_arms import chain, row, written
-from helpers.urdfs import read_urdf
+from helpers.made_arms import chain, read_urdf, row, written
 from robotdiffuse.certificates.checker import check
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.transforms import rotation_angle, rotation_from_rpy, transform

@@ -1,5 +1,7 @@
 """Problem.is_free and clearance_at; notes on numbers that look like millimeters."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -65,11 +67,17 @@ def test_the_least_distance_at_one_configuration_or_several() -> None:
 
 FROM = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
 TO = [0.4, -0.7, 0.0, -2.3, 0.0, 1.571, 0.785]
-VIEW = ray_cast(
-    rd.Scene([rd.Box([0.0, -0.8, 0.3], [0.2, 0.2, 0.6])]),
-    looking_at(np.array([1.7, 0.0, 0.6]), np.array([0.4, 0.0, 0.3])),
-    *((75.0, 75.0, 39.5, 29.5), (80, 60), PANDA, np.array(FROM)),
-)
+
+
+@cache
+def seen() -> rd.DepthView:
+    """A box beside the arm, by a camera in front of it."""
+    camera = looking_at(np.array([1.7, 0.0, 0.6]), np.array([0.4, 0.0, 0.3]))
+    lens = (75.0, 75.0, 39.5, 29.5)
+    box = rd.Box([0.0, -0.8, 0.3], [0.2, 0.2, 0.6])
+    return ray_cast(rd.Scene([box]), camera, lens, (80, 60), PANDA, np.array(FROM))
+
+
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
 FACES = [[0, 1, 3], [0, 3, 2], [4, 5, 7], [4, 7, 6], [0, 1, 5], [0, 5, 4]]
 
@@ -100,8 +108,8 @@ def test_scenes_in_meters_have_no_notes_on_units() -> None:
 
 
 def test_a_depth_image_in_millimeters_is_noted() -> None:
-    assert _notes(views=[VIEW]) == ()
-    wrong = [rd.DepthView(1000 * VIEW.depth, VIEW.intrinsics, VIEW.T_base_camera)]
+    assert _notes(views=[seen()]) == ()
+    wrong = [rd.DepthView(1000 * seen().depth, seen().intrinsics, seen().T_base_camera)]
     [note] = _notes(views=wrong)
     assert "depths of views[0] begin at" in note and "millimeters" in note
     problem = rd.Problem(PANDA, rd.Scene(), FROM, TO, views=wrong, unknown="padded")
@@ -110,7 +118,7 @@ def test_a_depth_image_in_millimeters_is_noted() -> None:
 
 def test_what_views_see_in_reach_is_no_scene_beyond_it() -> None:
     far = rd.Scene([rd.Sphere([0, 5, 0], 0.2)])
-    problem = rd.Problem(PANDA, far, FROM, TO, views=[VIEW], unknown="padded")
+    problem = rd.Problem(PANDA, far, FROM, TO, views=[seen()], unknown="padded")
     notes = rd.load_planner("aorrtc").plan(problem).notes
     assert all(note.startswith("compiled for") for note in notes), notes
 

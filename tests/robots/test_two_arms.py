@@ -10,8 +10,7 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.example_robots import example_robot
-from helpers.made_arms import chain, row, written
-from helpers.urdfs import read_urdf
+from helpers.made_arms import chain, read_urdf, row, written
 from robotdiffuse.certificates.requirements import constraint_bounds
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision

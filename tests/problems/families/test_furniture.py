@@ -1,4 +1,4 @@
-"""Furniture scenes: as their settings say, regions free, nothing in the base; hard problems for a Panda."""
+"""Furniture scenes: as their settings say, regions free, nothing in the base."""
 
 from dataclasses import replace
 
@@ -7,37 +7,22 @@ import pytest
 
 from robotdiffuse import Box, InputError, Sphere
 from robotdiffuse.problems.families import furniture
-from robotdiffuse.problems.families.furniture import (
-    CABINET,
-    CLUTTER,
-    CRATE,
-    FLOOR,
-    KITCHEN,
-    REGION_MARGIN,
-    SHELF,
-    SHOULDER,
-    TABLE,
-    FurnishedScene,
-    Furniture,
-    Region,
-    sample_target,
-)
 from robotdiffuse.scenes.scene_arrays import BOX, PackedScenes
 from robotdiffuse.scenes.shapes import Shape
 
 BASE = np.array([[0, 0, 0.1, 0.15], [-0.1, 0, 0.05, 0.1]])
-FURNITURE: dict[str, Furniture] = {
-    "shelf": SHELF,
-    "crate": CRATE,
-    "table": TABLE,
-    "clutter": CLUTTER,
-    "kitchen": KITCHEN,
-    "cabinet": CABINET,
+FURNITURE: dict[str, furniture.Furniture] = {
+    "shelf": furniture.SHELF,
+    "crate": furniture.CRATE,
+    "table": furniture.TABLE,
+    "clutter": furniture.CLUTTER,
+    "kitchen": furniture.KITCHEN,
+    "cabinet": furniture.CABINET,
 }
 every_family = pytest.mark.parametrize("name", FURNITURE)
 
 
-def named(furnished: FurnishedScene, name: str) -> list[Shape]:
+def named(furnished: furniture.FurnishedScene, name: str) -> list[Shape]:
     return [shape for shape in furnished.scene.shapes if shape.name.split("_")[0] == name]
 
 
@@ -60,7 +45,7 @@ def test_scenes_stand_on_the_ground_and_have_free_regions_in_reach(name: str) ->
     for _ in range(15):
         furnished = family.furnish(rng, BASE)
         floor, *shapes = furnished.scene.shapes
-        assert floor is FLOOR
+        assert floor is furniture.FLOOR
         packed = PackedScenes.pack([furnished.scene], family.max_obstacles, floor=True)
         assert (packed.kinds > 0).sum() == len(shapes)
         boxes = packed.params[packed.kinds == BOX]
@@ -70,7 +55,7 @@ def test_scenes_stand_on_the_ground_and_have_free_regions_in_reach(name: str) ->
         assert len(furnished.regions) >= 2
         for region in furnished.regions:
             assert (region.size > 0.08).all()
-            assert np.linalg.norm(region.center - SHOULDER) <= family.reach
+            assert np.linalg.norm(region.center - furniture.SHOULDER) <= family.reach
             assert np.linalg.norm(region.approach) == pytest.approx(1)
             points = region.center + rng.uniform(-0.5, 0.5, (200, 3)) * region.size @ turned(region.yaw).T
             assert min(gaps(shape, points).min() for shape in furnished.scene.shapes) > -1e-9
@@ -89,8 +74,8 @@ def test_furniture_is_as_its_settings_say(name: str) -> None:
         tops = [table.bounds[1, 2] for table in named(furnished, "table")]
         things = named(furnished, "ball") + named(furnished, "thing")
         if tops:
-            assert TABLE.height[0] <= tops[0] <= TABLE.height[1]
-            assert TABLE.objects[0] <= len(things) <= TABLE.objects[1]
+            assert furniture.TABLE.height[0] <= tops[0] <= furniture.TABLE.height[1]
+            assert furniture.TABLE.objects[0] <= len(things) <= furniture.TABLE.objects[1]
             assert all(thing.bounds[0, 2] == pytest.approx(tops[0]) for thing in things)
         boards = named(furnished, "board")
         assert (2 <= len(boards) <= 4) == (name == "shelf")
@@ -101,14 +86,16 @@ def test_furniture_is_as_its_settings_say(name: str) -> None:
 
 def test_targets_have_the_fingers_in_the_region() -> None:
     approach = np.array([0.6, 0.0, -0.8])
-    region = Region(np.array([0.5, 0.1, 0.3]), np.array([0.4, 0.2, 2 * REGION_MARGIN]), 0.7, approach)
+    region = furniture.Region(
+        np.array([0.5, 0.1, 0.3]), np.array([0.4, 0.2, 2 * furniture.REGION_MARGIN]), 0.7, approach
+    )
     rng = np.random.default_rng(5)
-    T = np.stack([sample_target(region, rng, spread=0.3, finger_length=0.1) for _ in range(1000)])
+    T = np.stack([furniture.sample_target(region, rng, spread=0.3, finger_length=0.1) for _ in range(1000)])
     products = T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1)
     np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), (1000, 3, 3)), atol=1e-12)
     local = (T[:, :3, 3] + 0.1 * T[:, :3, 2] - region.center) @ turned(0.7)
-    assert (np.abs(local) <= region.size / 2 - REGION_MARGIN + 1e-12).all()
-    assert (np.abs(local).max(axis=0) > 0.95 * (region.size / 2 - REGION_MARGIN) - 1e-12).all()
+    assert (np.abs(local) <= region.size / 2 - furniture.REGION_MARGIN + 1e-12).all()
+    assert (np.abs(local).max(axis=0) > 0.95 * (region.size / 2 - furniture.REGION_MARGIN) - 1e-12).all()
     cosines = T[:, :3, 2] @ approach
     assert cosines.min() > np.cos(0.3) - 1e-12
     # uniform on the cap: the cosine is uniform; mean of 1000 draws within five standard deviations
@@ -118,9 +105,9 @@ def test_targets_have_the_fingers_in_the_region() -> None:
 @pytest.mark.parametrize(
     ("settings", "change", "message"),
     [
-        (SHELF, {"boards": (1, 3)}, "boards is 1; it must be at least 2"),
-        (CRATE, {"thickness": (0.0, 0.02)}, "thickness is 0.0; it must be positive"),
-        (TABLE, {"wall_share": 0.8}, "wall_share is 0.8 and pillar_share 0.3"),
+        (furniture.SHELF, {"boards": (1, 3)}, "boards is 1; it must be at least 2"),
+        (furniture.CRATE, {"thickness": (0.0, 0.02)}, "thickness is 0.0; it must be positive"),
+        (furniture.TABLE, {"wall_share": 0.8}, "wall_share is 0.8 and pillar_share 0.3"),
     ],
 )
 def test_wrong_settings(settings: object, change: dict[str, object], message: str) -> None:

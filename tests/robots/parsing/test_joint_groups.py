@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 
 from helpers.example_robots import urdf_file
-from helpers.made_arms import chain, joint, link, row, written
-from helpers.urdfs import read_urdf
+from helpers.made_arms import chain, joint, link, read_urdf, row, written
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.parsing.srdf import read_srdf, srdf_beside
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder

@@ -7,8 +7,7 @@ import pytest
 import trimesh
 
 import robotdiffuse as rd
-from helpers.made_arms import BALL, chain, joint, link, row, written
-from helpers.urdfs import read_urdf
+from helpers.made_arms import BALL, chain, joint, link, read_urdf, row, written
 from robotdiffuse.robots.parsing.urdf import UrdfTree
 
 NAME = "package://some_arm/meshes/box.stl"

@@ -11,7 +11,7 @@ import trimesh
 import yaml
 
 import robotdiffuse as rd
-from helpers.urdfs import read_urdf
+from helpers.made_arms import read_urdf
 from robotdiffuse.core.input_files import read_yaml
 from robotdiffuse.core.transforms import (
     quaternion_from_rotation,
