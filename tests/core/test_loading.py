@@ -1,18 +1,25 @@
-"""Loading takes no time of a call: on a clock that only the tests move."""
+"""Loading takes no time of a call, and what is prepared does; Ctrl-C ends programs."""
 
 import subprocess
 import sys
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from numba import njit
 from numba.core.compiler_lock import global_compiler_lock
 
 import robotdiffuse as rd
 from helpers.clock import Clock, stop_clock
+from robotdiffuse.collision import exact_meshes, kernel_arrays
+from robotdiffuse.core.deadline import LONG, OutOfTimeError, check_time, check_timing, deadline
 from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.core.loading import compile_seconds, compiled, loading, loading_seconds
 from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.search.rrt import RRTConnect
 from robotdiffuse.robots.kinematic_tree import once_per_robot
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.trajectories import speed_limits
 
 FIRST_CALLS = """
 import sys, time
@@ -130,3 +137,146 @@ def test_python_cannot_call_an_inner_kernel() -> None:
     assert twice(3) == 8
     with pytest.raises(TypeError, match="plus_one is an inner kernel"):
         plus_one(3)
+
+
+PANDA = rd.load_robot("panda")
+LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+
+
+def wall(sides: int = 20) -> rd.Mesh:
+    """A wall across the straight path, of two triangles for each square."""
+    x, z = np.meshgrid(np.linspace(0.3, 0.6, sides), np.linspace(0.0, 0.5, sides))
+    vertices = np.stack([x.ravel(), 0 * x.ravel(), z.ravel()], axis=1)
+    at = (np.arange(sides - 1)[:, None] * sides + np.arange(sides - 1)).ravel()
+    faces = np.concatenate(
+        [np.stack([at, at + 1, at + sides], 1), np.stack([at + 1, at + sides + 1, at + sides], 1)]
+    )
+    return rd.Mesh(vertices, faces, name="wall")
+
+
+def problem(*shapes: rd.Mesh | rd.PointCloud) -> rd.Problem:
+    return rd.Problem(PANDA, rd.Scene(list(shapes)), LEFT, RIGHT)
+
+
+def test_steps_are_begun_while_there_is_time_and_long_ones_if_it_is_enough() -> None:
+    check_time("anything", 1e9)
+    with deadline(lambda: 1.0):
+        check_time("a short step")
+        check_time("a long step", 0.9)
+        with pytest.raises(OutOfTimeError, match=r"a longer step, which takes about 1\.1 s"):
+            check_time("a longer step", 1.1)
+    with deadline(lambda: 1e-3):
+        check_time("a short step", 0.1)
+    with deadline(lambda: -1e-3), pytest.raises(OutOfTimeError, match=r"^a short step$"):
+        check_time("a short step")
+    check_time("anything", 1e9)
+
+
+def test_timing_is_begun_a_little_late_too() -> None:
+    with deadline(lambda: -0.5 * LONG):
+        check_timing("a step")
+        with pytest.raises(OutOfTimeError, match=r"rows, which takes about 0\.3 s"):
+            check_timing("rows", 1.5 * LONG)
+    with deadline(lambda: -1.5 * LONG), pytest.raises(OutOfTimeError, match=r"^a step$"):
+        check_timing("a step")
+
+
+@pytest.mark.parametrize("more", [{}, {"jerk": 100.0}, {"velocity_scaling": 0.01}])
+def test_a_motion_whose_timing_takes_too_long_is_a_time_out(
+    more: dict, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(speed_limits, "SECONDS_PER_ROW", 1e3)
+    result = RRTConnect().plan(problem(), 20.0, **more)
+    assert result.status is rd.Status.TIMEOUT
+    assert "time limit of 20 s is too short for timing: there was no time for the" in result.reason
+    assert "rows of a motion of" in result.reason
+
+
+def test_a_motion_too_long_to_be_validated_ends_the_search() -> None:
+    """It went on until its time ran out, and did not say why."""
+    joints = tuple(replace(joint, velocity=1e-6) for joint in PANDA.joints)
+    slow = rd.Problem(replace(PANDA, joints=joints), rd.Scene(), LEFT, RIGHT)
+    result = RRTConnect().plan(slow, 600.0)
+    assert result.status is rd.Status.NO_PATH
+    assert "the motion takes 1.8" in result.reason
+
+
+def test_a_grid_of_too_many_points_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernel_arrays, "GRID_SECONDS_PER_POINT", 1e3)
+    result = RRTConnect().plan(problem(wall()), time_limit=20.0)
+    assert result.status is rd.Status.TIMEOUT
+    assert "time limit of 20 s is too short to prepare the scene" in result.reason
+    assert "the grid of" in result.reason
+
+
+def test_meshes_end_with_the_time() -> None:
+    meshes = [wall(sides) for sides in (3, 4, 5)]
+    with deadline(iter([1.0, 1.0, -1.0]).__next__), pytest.raises(OutOfTimeError, match="1 of 3 meshes"):
+        kernel_arrays.compile_scene_for(PANDA, rd.Scene(meshes))
+
+
+@pytest.mark.parametrize("cloud", [False, True])
+def test_a_tree_of_the_validator_that_takes_too_long_is_refused(
+    cloud: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The start collides, so the exact meshes are asked where."""
+    tip = link_pose(PANDA, LEFT, PANDA.tip)[:3, 3]
+    vertices = wall().vertices - wall().vertices.mean(axis=0) + tip
+    asked = problem(rd.PointCloud(vertices, 0.01) if cloud else rd.Mesh(vertices, wall().faces))
+    monkeypatch.setattr(exact_meshes, "TREE_SECONDS_PER_ELEMENT", 1e3)
+    refused = RRTConnect().plan(asked, time_limit=20.0)
+    assert refused.status is rd.Status.TIMEOUT
+    assert "the validator's tree over the" in refused.reason
+    monkeypatch.undo()
+    assert RRTConnect().plan(asked, time_limit=20.0).status is rd.Status.INVALID_START
+
+
+EXITS = """
+import atexit, sys, threading, time
+from robotdiffuse.core.interrupts import exit_fast
+def late():
+    time.sleep(0.2)
+    print("thread", flush=True)
+def run():
+    atexit.register(print, "handler", flush=True)
+    threading.Thread(target=late).start()
+    {}
+exit_fast(run)
+"""
+
+
+@pytest.mark.parametrize(
+    ("end", "status"), [("return 3", 3), ("sys.exit(4)", 4), ("raise ValueError", 1), ("sys.exit()", 0)]
+)
+def test_an_exit_waits_for_threads_and_handlers(end: str, status: int) -> None:
+    ended = subprocess.run([sys.executable, "-c", EXITS.format(end)], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout.split()) == (status, ["thread", "handler"])
+    assert ("ValueError" in ended.stderr) == (status == 1)
+
+
+SWALLOWING = """
+import ctypes, signal, time
+from robotdiffuse.core.interrupts import exit_on_interrupt
+with exit_on_interrupt(lambda: print("tidy", flush=True)):
+    try:
+        ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))()
+        time.sleep(0.1)
+    except BaseException:
+        pass
+    print("lives", flush=True)
+"""
+
+
+def test_ctrl_c_is_not_lost_in_callbacks() -> None:
+    """`robot add` ran on for minutes after Ctrl-C was pressed while compiled code was loaded."""
+    # background jobs of a shell ignore SIGINT
+    heard = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    ended = subprocess.run([sys.executable, "-c", heard + SWALLOWING], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "tidy\n", "robotdiffuse: stopped\n")
+
+
+def test_ctrl_c_that_is_ignored_stays_ignored() -> None:
+    code = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)" + SWALLOWING
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout) == (0, "lives\n")
