@@ -155,7 +155,7 @@ def library(data: str, robot: Robot) -> Trajectories:
     """Motions for training of a data set's first shards, those with a free straight line left out."""
     rows = islice(read_rows(data, robot, WAYPOINTS), LIBRARY_SHARDS)
     train = SPLITS.index("train")
-    return np.concatenate([of.q[(of.split == train) & ~of.shard["line_free"]] for of in rows])
+    return np.concatenate([part.q[(part.split == train) & ~part.shard["line_free"]] for part in rows])
 
 
 def bent(

@@ -203,8 +203,8 @@ def _shared_floor(scenes: Sequence[Scene]) -> Box | None:
     if not isinstance(floor, Box) or floor.name != "floor" or floor.wxyz[0] != 1:
         return None
     shared = (
-        isinstance(one, Box) and one.name == "floor" and np.array_equal(one.bounds, floor.bounds)
-        for one in firsts
+        isinstance(shape, Box) and shape.name == "floor" and np.array_equal(shape.bounds, floor.bounds)
+        for shape in firsts
     )
     return floor if all(shared) else None
 

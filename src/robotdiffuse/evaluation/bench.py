@@ -403,7 +403,7 @@ def run_bench(settings: BenchSettings, report: Progress, done: Done) -> int:
         _check_weights(settings, sessions.rows)
         cases = gather_cases(list(settings.problems), settings.count, settings.out, report)
         session = _note_session(settings, sessions)
-        labels = [label + of for label in specs for of in ("", RESTARTED)[: 1 + settings.equal_time]]
+        labels = [label + suffix for label in specs for suffix in ("", RESTARTED)[: 1 + settings.equal_time]]
         files = {label: RecordFile(record_path(settings.out, label)) for label in labels}
         todo = open_runs({label: file.records for label, file in files.items()}, cases, settings)
         total = len(cases) * settings.seeds * len(specs)

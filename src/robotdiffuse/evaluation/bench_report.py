@@ -342,7 +342,7 @@ def sections(bench: Bench, limits: Sequence[float] | None = None) -> list[Sectio
     results = []
     for problem_set in bench.problem_sets:
         calls = {name: calls_on(records, problem_set) for name, records in bench.records.items()}
-        records = [r for of in calls.values() for key in of for r in of[key]]
+        records = [r for by_problem in calls.values() for key in by_problem for r in by_problem[key]]
         names = list(dict.fromkeys(r.name for r in records))
         cases = [case.name for case in read_cases(bench.folder, problem_set)]
         places = {name: i for i, name in enumerate(dict.fromkeys([*cases, *names]))}
@@ -409,33 +409,39 @@ def _comparison(
     counted = {name: of for name, of in counted.items() if of}
     shared = set.intersection(*map(set, counted.values())) if counted else set()
     keys = sorted(shared, key=lambda key: (places[key[0]], key[1]))
-    outcomes = {name: [outcome(of[key], limit) for key in keys] for name, of in counted.items() if keys}
-    indicators = {name: _indicators(of) for name, of in outcomes.items() if not name.endswith(RESTARTED)}
+    outcomes = {
+        name: [outcome(by_key[key], limit) for key in keys] for name, by_key in counted.items() if keys
+    }
+    indicators = {
+        name: _indicators(results) for name, results in outcomes.items() if not name.endswith(RESTARTED)
+    }
     scores = dict(zip(indicators, comscores(list(indicators.values())).tolist(), strict=True))
-    lengths = {name: _problem_lengths(keys, of) for name, of in outcomes.items()}
+    lengths = {name: _problem_lengths(keys, results) for name, results in outcomes.items()}
     shortest = [
-        min((o.joint_length for o in of if o.solved), default=np.inf)
-        for of in zip(*outcomes.values(), strict=True)
+        min((o.joint_length for o in results if o.solved), default=np.inf)
+        for results in zip(*outcomes.values(), strict=True)
     ]
     reference = lengths.get(bench.reference)
     names = {name for name, _ in keys}
     rows = []
-    for planner, of in outcomes.items():
-        figures = _indicators(of)
-        timed = {f"run {o.record.run or '?'}, {o.record.workers or '?'} at once" for o in of}
+    for planner, results in outcomes.items():
+        figures = _indicators(results)
+        timed = {f"run {o.record.run or '?'}, {o.record.workers or '?'} at once" for o in results}
         row = Row(
             planner,
-            tuple(of),
+            tuple(results),
             figures,
             # the seeds of one problem are not independent, so trials are problems
             wilson_interval(round(figures.success / 100 * len(names)), len(names)),
             scores.get(planner, np.nan),
             None if planner == bench.reference or reference is None else compare(lengths[planner], reference),
-            all(o.full(limit, length) for o, length in zip(of, shortest, strict=True) if o.solved),
+            all(o.full(limit, length) for o, length in zip(results, shortest, strict=True) if o.solved),
             " or ".join(sorted(timed)),
         )
         rows.append(row)
-    loads = tuple(o.record.load for of in outcomes.values() for o in of if o.record.load is not None)
+    loads = tuple(
+        o.record.load for results in outcomes.values() for o in results if o.record.load is not None
+    )
     missing = tuple(name for name in calls if name not in outcomes)
     seeds = len({seed for _, seed in keys})
     return Comparison(limit, len(names), problems, seeds, tuple(rows), missing, tuple(keys), loads)
@@ -463,15 +469,15 @@ def _problem_lengths(keys: Sequence[Key], outcomes: Sequence[Outcome]) -> Values
 
 def curves(calls: dict[str, Calls]) -> tuple[Curve, ...]:
     """The curves on the problems that every planner was called on."""
-    with_calls = {name: of for name, of in calls.items() if of}
+    with_calls = {name: by_key for name, by_key in calls.items() if by_key}
     keys = sorted(set.intersection(*map(set, with_calls.values()))) if with_calls else []
     if not keys:
         return ()
-    lengths = {key: [r.joint_length for of in with_calls.values() for r in of[key]] for key in keys}
-    best = {key: min(filter(None, of), default=1.0) for key, of in lengths.items()}
-    records = {name: {key: of[key][-1] for key in keys} for name, of in with_calls.items()}
-    longest = max(r.time_limit for of in records.values() for r in of.values())
-    return tuple(_curve(name, of, best, longest) for name, of in records.items())
+    lengths = {key: [r.joint_length for by_key in with_calls.values() for r in by_key[key]] for key in keys}
+    best = {key: min(filter(None, values), default=1.0) for key, values in lengths.items()}
+    records = {name: {key: by_key[key][-1] for key in keys} for name, by_key in with_calls.items()}
+    longest = max(r.time_limit for by_key in records.values() for r in by_key.values())
+    return tuple(_curve(name, by_key, best, longest) for name, by_key in records.items())
 
 
 def _curve(planner: str, records: dict[Key, Record], best: dict[Key, float], longest: float) -> Curve:
@@ -553,10 +559,10 @@ def seconds(value: float) -> Cell:
 
 def title(section: Section, comparison: Comparison) -> str:
     """The title of a comparison: problem set, limit and number of problems."""
-    of = "" if comparison.problems == comparison.of else f" of {comparison.of}"
+    total = "" if comparison.problems == comparison.of else f" of {comparison.of}"
     plural = "problem" if comparison.problems == 1 else "problems"
     seeds = f", {comparison.seeds} seeds each" if comparison.seeds > 1 else ""
-    return f"{section.name}, {comparison.limit:g} s: {comparison.problems}{of} {plural}{seeds}"
+    return f"{section.name}, {comparison.limit:g} s: {comparison.problems}{total} {plural}{seeds}"
 
 
 def tables(section: Section, comparison: Comparison, reference: str) -> list[Table]:
@@ -685,15 +691,15 @@ def success_over_time(section: Section, planners: Sequence[str]) -> str:
 
 def length_over_time(section: Section, planners: Sequence[str]) -> str:
     """Draw the median length over time."""
-    of = "joint length / best known"
-    return _over_time(section.curves, planners, of, lambda curve: (curve.times, curve.ratios))
+    label = "joint length / best known"
+    return _over_time(section.curves, planners, label, lambda curve: (curve.times, curve.ratios))
 
 
 def _over_time(
     curves: Sequence[Curve],
     planners: Sequence[str],
     label: str,
-    of: Callable[[Curve], tuple[ndarray, ndarray]],
+    data: Callable[[Curve], tuple[ndarray, ndarray]],
 ) -> str:
     """Curves of planners, solid with a network and dashed for search; restarts have the planner's color."""
     names = list(dict.fromkeys(map(plain_name, planners)))
@@ -703,7 +709,7 @@ def _over_time(
         for curve in curves:
             entry = PLANNERS.get(base_name(curve.planner))
             axes.plot(
-                *of(curve),
+                *data(curve),
                 drawstyle="steps-post",
                 label=curve.planner,
                 color=f"C{names.index(plain_name(curve.planner))}",
@@ -781,7 +787,7 @@ def about(bench: Bench) -> list[str]:
 
 def facts(bench: Bench) -> list[str]:
     """How much was run."""
-    records = [record for of in bench.records.values() for record in of]
+    records = [record for of_planner in bench.records.values() for record in of_planner]
     problems = {(record.problem_set, record.name) for record in records}
     minutes = sum(record.time for record in records) / 60
     solved = sum(record.solved for record in records)
@@ -831,21 +837,23 @@ def motions_to_replay(bench: Bench, parts: Sequence[Section]) -> list[Replay]:
         for case in read_cases(bench.folder, section.problem_set):
             key = case.name, main.keys[0][1]
             if key in main.keys:
-                records = (deciding_record(of[key], main.limit) for of in calls)
+                records = (deciding_record(of_planner[key], main.limit) for of_planner in calls)
                 outcomes = [outcome(record, main.limit) for record in records if record is not None]
                 solved = [o.record for o in outcomes if o.solved]
                 solved.sort(key=lambda record: record.joint_length or 0.0)
                 failed = {o.record.planner: o.failure for o in outcomes if not o.solved}
                 tries.append((case, solved, failed))
-    tries.sort(key=lambda of: (len(of[1]) > 1, *map(_detour, of[1][:1])), reverse=True)
+    tries.sort(key=lambda attempt: (len(attempt[1]) > 1, *map(_detour, attempt[1][:1])), reverse=True)
     replays = []
     for case, solved, _ in tries[:SOLVED_PROBLEMS]:
         for record in solved[:1] + solved[1:][-1:]:
             extreme = "shortest" if record is solved[0] else "longest"
             caption = f"{record.joint_length:.2f} rad, {extreme}, in {seconds(record.time)} s"
             replays.append(Replay(f"{record.planner} · {case.name}", caption, case, record.waypoints))
-    rest = sorted(tries[SOLVED_PROBLEMS:], key=lambda of: (bench.reference not in of[2], len(of[1])))
-    replays += [replay for of in rest for replay in _failure(*of, bench.reference)]
+    rest = sorted(
+        tries[SOLVED_PROBLEMS:], key=lambda attempt: (bench.reference not in attempt[2], len(attempt[1]))
+    )
+    replays += [replay for attempt in rest for replay in _failure(*attempt, bench.reference)]
     return replays[:MAX_REPLAYS]
 
 

@@ -127,11 +127,11 @@ class DataCheck:
         """A table of the result, and one of the first examples of each kind."""
         planned = f" of {self.planned:,} planned" if self.motions < self.planned else ""
         rate = self.checked / max(self.seconds, 1e-9)
-        found = {kind: f"{self.counts[kind]:,}" for kind in KINDS if self.pybullet or kind != "pybullet"}
+        counts = {kind: f"{self.counts[kind]:,}" for kind in KINDS if self.pybullet or kind != "pybullet"}
         rows = [
             ("shards, motions", f"{self.shards:,}, {self.motions:,}{planned}"),
             ("validated", f"{self.checked:,} in {self.seconds:.1f} s ({rate:.0f}/s)"),
-            *((name, found.get(kind, "not checked")) for kind, name in KINDS.items()),
+            *((name, counts.get(kind, "not checked")) for kind, name in KINDS.items()),
             ("least clearance recorded", f"{1e3 * self.least_clearance + 0.0:.3f} mm"),
         ]
         tables = [Table.pairs(f"{self.robot}: {'violations found' if self.findings else 'clean'}", rows)]
@@ -346,7 +346,7 @@ def confirm(out: FilePath, count: int | None, progress: Callable[[int, int], Non
     """
     from robotdiffuse.simulation.validator import PyBulletOracle
 
-    records = [record for of in read_records(out).values() for record in of]
+    records = [record for of_planner in read_records(out).values() for record in of_planner]
     solved: dict[tuple[str, str], list[Record]] = {}
     for record in records:
         if record.solved:

@@ -89,8 +89,8 @@ class DataFigures:
     @cached_property
     def families(self) -> dict[str, Mask]:
         """The motions of each family that occurs."""
-        of = {name: self.all["family"] == i for i, name in enumerate(self.manifest.families)}
-        return {name: chosen for name, chosen in of.items() if chosen.any()}
+        masks = {name: self.all["family"] == i for i, name in enumerate(self.manifest.families)}
+        return {name: chosen for name, chosen in masks.items() if chosen.any()}
 
     @property
     def safety_distance(self) -> float:
@@ -177,8 +177,11 @@ def tables(data: DataFigures) -> list[Table]:
         (
             name,
             int(rows.sum()),
-            *(float(np.median(data.all[of][rows])) for of in QUANTITIES),
-            *(float(((low <= of[rows]) & (of[rows] < high)).mean()) for of, low, high in shares.values()),
+            *(float(np.median(data.all[quantity][rows])) for quantity in QUANTITIES),
+            *(
+                float(((low <= values[rows]) & (values[rows] < high)).mean())
+                for values, low, high in shares.values()
+            ),
         )
         for name, rows in data.families.items()
     ]

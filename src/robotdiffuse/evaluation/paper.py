@@ -121,7 +121,7 @@ def write_problems(out: FilePath, count: int, report: Progress) -> None:
             for name, problem in draw_problem(number).items():
                 if len(cases[name]) < count and not any(free_lines(problem, goal_configurations(problem))):
                     cases[name].append(Case(f"{name}/{number}", "rop", problem, False, None, name))
-            if all(len(found) == count for found in cases.values()):
+            if all(len(drawn_cases) == count for drawn_cases in cases.values()):
                 break
         for name, file in files.items():
             file.fill(cases[name])

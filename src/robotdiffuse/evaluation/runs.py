@@ -117,7 +117,7 @@ class Record:
 
     @property
     def restartable(self) -> bool:
-        """Whether time was left for a call with another seed."""
+        """Whether there was time for a call with another seed."""
         return self.ended_by_itself and self.status in RESTARTABLE
 
     @property
@@ -285,20 +285,20 @@ def keep_records(
     runs: Sequence[Run],
     results: Results,
     files: Mapping[str, RecordFile],
-    on_progress: Callable[[int], None] = lambda left: None,
+    on_progress: Callable[[int], None] = lambda remaining: None,
 ) -> int:
     """Keep the records of runs as they come; returns the number of runs made.
 
-    on_progress: called with the number of runs that are left.
+    on_progress: called with the number of remaining runs.
     """
-    left = len(runs)
+    remaining = len(runs)
     with closing(results):  # Ctrl-C ends the processes of runs too
         for _, records in results:
             for record in records:
                 files[record.planner].append(record)
-            left -= 1
-            on_progress(left)
-    return len(runs) - left
+            remaining -= 1
+            on_progress(remaining)
+    return len(runs) - remaining
 
 
 def in_this_process(methods: Mapping[str, Method], runs: Sequence[Run]) -> Results:

@@ -63,8 +63,12 @@ def write_depth_views(robot: Robot, views: Mapping[str, Sequence[StampedView]], 
     stream = io.BytesIO()
     out = McapWriter(stream)
     ordered = sorted(
-        ((one.stamp, name, one.view) for name, views_of_camera in views.items() for one in views_of_camera),
-        key=lambda one: one[0],
+        (
+            (recorded.stamp, name, recorded.view)
+            for name, views_of_camera in views.items()
+            for recorded in views_of_camera
+        ),
+        key=lambda recorded: recorded[0],
     )
     for stamp, name, view in ordered:
         at = round(1e9 * stamp)
@@ -183,8 +187,8 @@ def _read(
         elif kind == JOINT_STATE:
             states.add(_seconds(message, at), to_plain(message))
         elif kind == TRANSFORMS:
-            for one in message.transforms:
-                transforms.add(to_plain(one), static=topic.endswith("static"))
+            for stamped in message.transforms:
+                transforms.add(to_plain(stamped), static=topic.endswith("static"))
         else:
             units[topic.partition("/option/")[0]] = float(message.data)
     has_images = False

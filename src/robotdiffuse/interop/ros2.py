@@ -105,20 +105,22 @@ def to_message(kind: str, record: Mapping[str, Any]) -> Any:
     """A message from plain data; missing fields are empty or zero."""
     store = typestore()
     field_types = store.fielddefs[kind][1]
-    return store.types[kind](**{name: _value(of, record.get(name)) for name, of in field_types})
+    return store.types[kind](
+        **{name: _value(definition, record.get(name)) for name, definition in field_types}
+    )
 
 
 def _value(definition: Any, value: Any) -> Any:
     node = int(definition[0])
-    of = definition[1]
+    detail = definition[1]
     if node == 1:  # a base type
-        kind = of[0]
+        kind = detail[0]
         if kind == "string":
             return "" if value is None else str(value)
         return bool(value) if kind == "bool" else (value or 0.0 if kind.startswith("float") else value or 0)
     if node == 2:  # a message
-        return to_message(of, value or {})
-    element = of[0]
+        return to_message(detail, value or {})
+    element = detail[0]
     items = [] if value is None else value
     if int(element[0]) == 1 and element[1][0] not in ("string", "bool"):
         return np.asarray(items, dtype=element[1][0].replace("byte", "uint8"))
@@ -277,7 +279,11 @@ def write_mcap(problem: Problem, trajectory: Trajectory, file: Path) -> None:
     for i, t in enumerate(trajectory.times.tolist()):
         at = round(1e9 * t)
         frames = {link: T[i] for link, T in poses.items()}
-        frames |= {_frame(one, robot): one.frame(t) for one in obstacles if one.moving is not None}
+        frames |= {
+            _frame(obstacle, robot): obstacle.frame(t)
+            for obstacle in obstacles
+            if obstacle.moving is not None
+        }
         out.protobuf("/tf", _transforms(problem, frames, at), at)
         stamp = {"sec": at // 10**9, "nanosec": at % 10**9}
         values = [*trajectory.positions[i].tolist(), *robot.locked.values()]
@@ -551,10 +557,12 @@ def opened_recording(file: Path, largest: int = MAX_FILE_SIZE) -> Iterator[Recor
         with _opened_bag(file) as bag:
 
             def of_bag(topics: Sequence[str]) -> Iterator[Record]:
-                for of, at, raw in bag.messages([one for one in bag.connections if one.topic in topics]):
-                    yield of.topic, at, raw, partial(bag.deserialize, typ=of.msgtype)
+                for connection, at, raw in bag.messages(
+                    [connection for connection in bag.connections if connection.topic in topics]
+                ):
+                    yield connection.topic, at, raw, partial(bag.deserialize, typ=connection.msgtype)
 
-            yield Recording({one.topic: one.msgtype for one in bag.connections}, of_bag)
+            yield Recording({connection.topic: connection.msgtype for connection in bag.connections}, of_bag)
         return
     with input_file(file, largest=largest).open("rb") as stream:
         reader = make_reader(stream)

@@ -476,7 +476,7 @@ def _carriers(checker: CollisionChecker) -> tuple[int, list[int]]:
     def carrier(link: str) -> int:
         while link in fixed_to:
             link = fixed_to[link]
-        frames = [robot.link_frame(one) for one in arm]
+        frames = [robot.link_frame(arm_link) for arm_link in arm]
         before = [i for i, frame in enumerate(frames) if frame <= robot.link_frame(link)]
         return max(before, key=lambda i: (arm[i] == link, frames[i], i), default=len(arm) - 1)
 

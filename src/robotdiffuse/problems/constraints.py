@@ -165,5 +165,5 @@ class CartesianLine(FrameConstraint):
 
 Constraint = AxisCone | PositionBox | OnPlane | OnLine | CartesianLine
 CONSTRAINTS: dict[str, type[Constraint]] = {
-    one.kind: one for one in (AxisCone, PositionBox, OnPlane, OnLine, CartesianLine)
+    constraint.kind: constraint for constraint in (AxisCone, PositionBox, OnPlane, OnLine, CartesianLine)
 }

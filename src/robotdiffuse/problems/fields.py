@@ -241,8 +241,8 @@ def read_goal(where: str, data: object, setting: Setting) -> Goal:
     if isinstance(data, str):
         return JointGoal(named_pose(setting.robot, where, data))
     if isinstance(data, list):
-        several = "joint_set" if data and all(isinstance(one, list) for one in data) else "joints"
-        data = {"any" if any(isinstance(one, dict | str) for one in data) else several: data}
+        several = "joint_set" if data and all(isinstance(part, list) for part in data) else "joints"
+        data = {"any" if any(isinstance(part, dict | str) for part in data) else several: data}
     if not isinstance(data, dict) or len(data) != 1:
         raise InputError(
             f"{where} is {shown(data)}; it must be one of {', '.join(GOALS)}, or a configuration"
@@ -293,7 +293,7 @@ def _pose_goal(where: str, value: object, scene: Scene, frame: object = None) ->
 def goal_entry(goal: Goal) -> dict[str, Any]:
     """The entry of a goal, as `read_goal` reads it."""
     if isinstance(goal, AnyGoal):
-        return {"any": [goal_entry(one) for one in goal.goals]}
+        return {"any": [goal_entry(part) for part in goal.goals]}
     if isinstance(goal, JointGoal):
         rows = goal.positions.tolist()
         return {"joints": rows[0]} if len(rows) == 1 else {"joint_set": rows}
@@ -445,11 +445,11 @@ FIELDS = {
         with_request=False,
     ),
     "constraints": Field(
-        _array(_one_of({kind: _entry_schema(one) for kind, one in CONSTRAINTS.items()})),
+        _array(_one_of({kind: _entry_schema(constraint) for kind, constraint in CONSTRAINTS.items()})),
         lambda data, setting: [
             _constraint(*entry) for entry in entries_of("constraints", data, "constraints")
         ],
-        lambda constraints, folder: [constraint_entry(one) for one in constraints],
+        lambda constraints, folder: [constraint_entry(constraint) for constraint in constraints],
         in_world=True,
     ),
     "moving": Field(
@@ -457,7 +457,7 @@ FIELDS = {
         lambda data, setting: [
             _moving(*entry, setting) for entry in entries_of("moving", data, "shapes with their motions")
         ],
-        lambda moving, folder: [moving_entry(one, folder) for one in moving],
+        lambda moving, folder: [moving_entry(obstacle, folder) for obstacle in moving],
         in_world=True,
         with_request=False,
     ),

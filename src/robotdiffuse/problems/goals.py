@@ -126,8 +126,8 @@ class AnyGoal(Value):
     goals: "tuple[OneGoal, ...]"
 
     def __post_init__(self) -> None:
-        wanted = "rd.JointGoal, rd.PoseGoal and rd.PosesGoal"
-        check_list("goal.goals", self.goals, OneGoal, wanted, least=1)
+        types = "rd.JointGoal, rd.PoseGoal and rd.PosesGoal"
+        check_list("goal.goals", self.goals, OneGoal, types, least=1)
         object.__setattr__(self, "goals", tuple(self.goals))
 
     def moved(self, T: Pose) -> "AnyGoal":

@@ -225,11 +225,11 @@ def matrix_contacts(
     rows = [
         list_of(f"{MATRIX}.", row if isinstance(row, dict) else {"enabled": row}, "enabled") for row in rows
     ]
-    if any(len(one) != len(names) for one in (rows, *rows)):
+    if any(len(row) != len(names) for row in (rows, *rows)):
         raise InputError(f"{MATRIX} has {len(names)} entry_names; entry_values must be square, of this size")
     pairs = {
-        (str(one), str(partner)): bool(value)
-        for one, row in zip(names, rows, strict=True)
+        (str(name), str(partner)): bool(value)
+        for name, row in zip(names, rows, strict=True)
         for partner, value in zip(names, row, strict=True)
     }
     default = dict(zip(map(str, default_names), map(bool, defaults), strict=False))

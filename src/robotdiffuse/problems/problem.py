@@ -109,10 +109,10 @@ def check_contacts(robot: Robot, scene: Scene) -> None:
 def moving_obstacles(moving: Any, scene: Scene) -> tuple[MovingObstacle, ...]:
     """The obstacles, renamed where a shape of the scene has the same name."""
     check_list("moving", moving, MovingObstacle, "rd.MovingObstacle")
-    shapes = Scene([*scene.shapes, *(one.shape for one in moving)]).shapes[len(scene.shapes) :]
+    shapes = Scene([*scene.shapes, *(obstacle.shape for obstacle in moving)]).shapes[len(scene.shapes) :]
     return tuple(
-        one if one.shape is shape else replace(one, shape=shape)
-        for one, shape in zip(moving, shapes, strict=True)
+        obstacle if obstacle.shape is shape else replace(obstacle, shape=shape)
+        for obstacle, shape in zip(moving, shapes, strict=True)
     )
 
 
@@ -142,12 +142,14 @@ def velocity_at_start(robot: Robot, value: object, notes: list[str]) -> JointVal
 def checked_goal(robot: Robot, field: str, goal: object, notes: list[str]) -> Goal:
     """The goal as an object of its class, with its configurations within limits."""
     if isinstance(goal, list | tuple):
-        goal = [_values(robot, f"{field}[{i}]", one) for i, one in enumerate(goal)]
-        if any(isinstance(one, OneGoal) for one in goal):
-            goal = AnyGoal(tuple(one if isinstance(one, OneGoal) else JointGoal(one) for one in goal))
+        goal = [_values(robot, f"{field}[{i}]", each) for i, each in enumerate(goal)]
+        if any(isinstance(each, OneGoal) for each in goal):
+            goal = AnyGoal(tuple(each if isinstance(each, OneGoal) else JointGoal(each) for each in goal))
     if isinstance(goal, AnyGoal):
         fields = (f"{field}.goals[{i}]" for i in range(len(goal.goals)))
-        each = [checked_goal(robot, *of, notes) for of in zip(fields, goal.goals, strict=True)]
+        each = [
+            checked_goal(robot, *named_goal, notes) for named_goal in zip(fields, goal.goals, strict=True)
+        ]
         return AnyGoal(tuple(each))  # type: ignore[arg-type]
     if isinstance(goal, PoseGoal):
         robot.check_moved(f"{field}.frame", goal.frame)
@@ -424,7 +426,7 @@ class Problem(Value):
     def moving_in_world(self) -> tuple[MovingObstacle, ...]:
         """The moving obstacles in the world's frame, for pictures and simulators."""
         T = self.T_world_base
-        return self.moving if T is None else tuple(one.moved(T) for one in self.moving)
+        return self.moving if T is None else tuple(obstacle.moved(T) for obstacle in self.moving)
 
     def clearance_at(self, q: ArrayLike) -> float | Values:
         """Lower bound of the distance of the arm to obstacles and between its links.
@@ -532,13 +534,13 @@ def _check_combinations(checked: dict[str, Any]) -> None:
         given_fields.discard("blend")
     if any(isinstance(constraint, CartesianLine) for constraint in checked["constraints"]):
         given_fields.add("cartesian_line")
-    for one, excluded, advice in EXCLUSIVE_FIELDS:
-        if one in given_fields and excluded in given_fields:
-            raise InputError(f"{one} cannot be combined with {excluded}{advice}")
+    for field, excluded, advice in EXCLUSIVE_FIELDS:
+        if field in given_fields and excluded in given_fields:
+            raise InputError(f"{field} cannot be combined with {excluded}{advice}")
 
 
 def moved(value: Any, T: Pose) -> Any:
     """The value, or each of a list, after the rigid motion T; what has no pose is returned unchanged."""
     if isinstance(value, list | tuple):
-        return [moved(one, T) for one in value]
+        return [moved(part, T) for part in value]
     return value.moved(T) if hasattr(value, "moved") else value

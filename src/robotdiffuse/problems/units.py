@@ -27,7 +27,7 @@ def unit_notes(problem: Problem) -> tuple[str, ...]:
     """Notes on obstacles that are all out of reach or too large: they may be given in millimeters."""
     reach = reach_bound(problem.robot)
     shapes = [shape for shape in problem.scene.shapes if not isinstance(shape, (SeenPoints, AssumedPoints))]
-    seen = len(shapes) < len(problem.scene.shapes)
+    has_seen_points = len(shapes) < len(problem.scene.shapes)
     bounds = np.array([shape.bounds for shape in shapes]).reshape(-1, 2, 3)
     extents = bounds[:, 1] - bounds[:, 0]
     large = np.flatnonzero(extents.max(axis=1) > MAX_EXTENT)
@@ -36,7 +36,12 @@ def unit_notes(problem: Problem) -> tuple[str, ...]:
     messages = tuple(note for note in notes if note)
     solid = [not _is_empty(shape) for shape in shapes]
     away = _distances(bounds[solid])
-    if not messages and len(away) and away.min() > reach and not (seen or problem.views or problem.moving):
+    if (
+        not messages
+        and len(away)
+        and away.min() > reach
+        and not (has_seen_points or problem.views or problem.moving)
+    ):
         subject = f"all {len(away)} obstacles are" if len(away) > 1 else f"the obstacle {shapes[0].name} is"
         distance_text = f"beyond the arm's reach of {reach:.1f} m, at least {away.min():.1f} m from its base"
         messages = (f"check the units: {subject} {distance_text}; {ADVICE}",)

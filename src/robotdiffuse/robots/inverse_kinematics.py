@@ -138,11 +138,11 @@ def each_pose(
     arm, chain = ik_chain(robot, frame, LIMIT_MARGIN)
     seeds = np.clip(np.ascontiguousarray(seeds[:, arm]), chain.lower, chain.upper)
     for T in poses:
-        found = seeds[:0]
+        solutions = seeds[:0]
         if not _out_of_reach(chain, T):
-            found = solve_seeds(seeds, found, count, chain, for_kernels(T), PARAMETERS)[0]
-        q = np.tile(rest, (len(found), 1))
-        q[:, arm] = found
+            solutions = solve_seeds(seeds, solutions, count, chain, for_kernels(T), PARAMETERS)[0]
+        q = np.tile(rest, (len(solutions), 1))
+        q[:, arm] = solutions
         yield q
 
 

@@ -140,11 +140,11 @@ def _check_tree(robot: Robot) -> None:
         links.add(joint.child)
     leaders = {joint.name: joint.mimic.joint for joint in robot.joints if joint.mimic is not None}
     for name in leaders:
-        seen = set[str]()
+        visited = set[str]()
         while name in leaders:
-            if name in seen:
+            if name in visited:
                 raise ValueError(f"joint {name} mimics itself")
-            seen.add(name)
+            visited.add(name)
             name = leaders[name]
     of_tables = {link for table in robot.tables for link in table.links}
     if not {*robot.tips, *robot.meshes, *of_tables} <= links:

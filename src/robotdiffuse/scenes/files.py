@@ -93,7 +93,7 @@ def read_scene(
 
 def required_fields(kind: Any) -> list[str]:
     """The names of a dataclass's fields without a default."""
-    return [one.name for one in fields(kind) if one.default is one.default_factory is MISSING]
+    return [field.name for field in fields(kind) if field.default is field.default_factory is MISSING]
 
 
 def _shape(where: str, kind: type[Shape], values: object, folder: Path, notes: list[str]) -> Shape:

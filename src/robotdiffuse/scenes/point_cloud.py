@@ -236,8 +236,8 @@ def _read_pcd(file: Path) -> ndarray:
         rows = content[at:].decode("ascii").splitlines()
         return np.loadtxt(rows, usecols=columns, ndmin=2, max_rows=total) if total else np.zeros((0, 3))
     if storage not in ("binary", "binary_compressed"):
-        wanted = "it must be ascii, binary or binary_compressed"
-        raise InputError(f"point cloud file {file} is stored as {shown(storage)}; {wanted}")
+        advice = "it must be ascii, binary or binary_compressed"
+        raise InputError(f"point cloud file {file} is stored as {shown(storage)}; {advice}")
     kinds = [f"<{kind.lower()}{size}" for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]
     # Fields are named by position: PCL writes several padding fields that are all called "_".
     record = np.dtype([(str(i), kind, (n,)) for i, (kind, n) in enumerate(zip(kinds, counts, strict=True))])

@@ -141,9 +141,11 @@ def load_data(
         key = f"{rows.shard.fingerprint}-{encoder_fingerprint}" + (f"-turn{rows.turn}" if rows.turn else "")
         codes = _codes(FilePath(folder), rows.scenes, encoder, key)
         for name, collected in parts.items():
-            of = rows.split == SPLITS.index(name)
-            collected.append((rows.q[of], rows.scenes[of], rows.shard["line_free"][of], codes[of]))
-            count += int(of.sum())
+            chosen = rows.split == SPLITS.index(name)
+            collected.append(
+                (rows.q[chosen], rows.scenes[chosen], rows.shard["line_free"][chosen], codes[chosen])
+            )
+            count += int(chosen.sum())
         if rows.turn == turned_copies:
             report(f"data: {len(prints)} of {shards} shards, {count:,} trajectories")
     q, scenes, trivial, codes = zip(*parts["train"], *parts["validation"], strict=True)

@@ -162,14 +162,14 @@ class Furniture(Ranges, ABC):
         """
         for _ in range(MAX_TRIES):
             try:
-                pieces = self.build(rng)
+                furniture = self.build(rng)
             except NoRoomError:
                 continue
-            shapes = [shape for piece in pieces for shape in piece.shapes]
+            shapes = [shape for item in furniture for shape in item.shapes]
             regions = [
                 r
-                for piece in pieces
-                for r in piece.regions
+                for item in furniture
+                for r in item.regions
                 if np.linalg.norm(r.center - SHOULDER) <= self.reach
             ]
             if len(regions) >= 2 and all(is_clear_of(shape, keep_out) for shape in shapes):

@@ -304,7 +304,7 @@ def prepare(
             break
         robot = _refined(robot, links, false_collisions, k, settings, seed)
     _, _, robot, false_collisions = min(
-        attempts, key=lambda one: one[:2]
+        attempts, key=lambda attempt: attempt[:2]
     )  # refinement can add false collisions
     closer = with_finer_parts(robot, links, false_collisions, settings, seed)
     if closer is not None:

@@ -279,8 +279,8 @@ def measure_false_collisions(
                 places = coal_pose(poses[a][i]), coal_pose(poses[b][i])
                 result.clear()
                 meshes[i] = any(  # one inside the other is not detected
-                    coal.collide(one, places[0], second_mesh, places[1], request, result)
-                    for one in trees[a]
+                    coal.collide(first_mesh, places[0], second_mesh, places[1], request, result)
+                    for first_mesh in trees[a]
                     for second_mesh in trees[b]
                 )
         collisions.append((spheres, parts, meshes, middle))

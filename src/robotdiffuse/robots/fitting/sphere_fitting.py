@@ -89,8 +89,8 @@ class Bounds:
             normal, offset = self.floor
             np.minimum(allowed, np.maximum(points @ normal - offset, FLOOR_TOLERANCE), out=allowed)
         level = np.ceil(np.log(self.tight[:, 3]) / TOLERANCE_LEVEL)
-        for one in np.unique(level):
-            places = self.tight[level == one]
+        for group_level in np.unique(level):
+            places = self.tight[level == group_level]
             far = KDTree(places[:, :3]).query(
                 points, distance_upper_bound=TIGHT_RADIUS + self.tolerance / TIGHT_SLOPE
             )[0]

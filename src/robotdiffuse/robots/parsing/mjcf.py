@@ -186,10 +186,10 @@ class ConvertedModel:
             label = self.joint_name(joint)
             kind = self.joint_kind(joint)
             if kind == "free" or joint in self.held:
-                what = f"the free joint of {name}"
+                joint_text = f"the free joint of {name}"
                 if kind == "slide":
-                    what = f"slide joint {label}, which has no range,"
-                self.notes.append(f"{what} is held where the model places it")
+                    joint_text = f"slide joint {label}, which has no range,"
+                self.notes.append(f"{joint_text} is held where the model places it")
                 continue
             if kind == "ball":
                 raise InputError(f"{self.path}: joint {label} is a ball joint; use three hinges in its place")

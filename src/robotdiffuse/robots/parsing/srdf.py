@@ -122,7 +122,7 @@ def read_srdf(file: str | Path) -> Srdf:
         return value
 
     def names(element: ET.Element, tag: str) -> tuple[str, ...]:
-        return tuple(text(one, "name") for one in element.findall(tag))
+        return tuple(text(child, "name") for child in element.findall(tag))
 
     def number(element: ET.Element) -> float:
         try:
@@ -183,13 +183,13 @@ class Arm(NamedTuple):
 
     joints: tuple[str, ...]
     tip: str
-    own: int
+    own_joints: int
     """Number of joints after the last branching."""
 
     @property
     def name(self) -> str:
         """The common prefix of the names of the joints after the last branching, or else the tip."""
-        columns = zip(*self.joints[-self.own :], strict=False)
+        columns = zip(*self.joints[-self.own_joints :], strict=False)
         common_letters = takewhile(lambda letters: len({*letters}) == 1, columns)
         common = "".join(letters[0] for letters in common_letters).rstrip(SUFFIX_CHARACTERS)
         return common.removesuffix("joint").rstrip("_-/ ") or self.tip
@@ -224,39 +224,41 @@ class JointTree:
     def arms(self) -> list[Arm]:
         """The arms below the base, or else the longest chains of movable joints."""
         chains = self._arms_from(self.base, (), 0)
-        arms_with_joints = [arm for arm in chains if arm.own >= MIN_ARM_JOINTS]
+        arms_with_joints = [arm for arm in chains if arm.own_joints >= MIN_ARM_JOINTS]
         longest = max((len(arm.joints) for arm in chains), default=0)
         return arms_with_joints or [arm for arm in chains if len(arm.joints) == longest]
 
-    def _arms_from(self, link: str, chain: tuple[str, ...], own: int) -> list[Arm]:
-        """Arms that continue a chain of joints at a link; `own` of its joints come after the last
+    def _arms_from(self, link: str, chain: tuple[str, ...], own_joints: int) -> list[Arm]:
+        """Arms that continue a chain of joints at a link; `own_joints` of its joints come after the last
         branching."""
         while True:
-            ways = [j for j in self.below.get(link, []) if j.kind in MOVING_KINDS or j.child in self.moved]
-            if chain and self._begins_gripper(ways, own):
-                return [Arm(chain, link, own)]
-            if len(ways) > 1:
-                branches = [self._arms_from(j.child, *self._extended(j, chain, 0)) for j in ways]
+            next_joints = [
+                j for j in self.below.get(link, []) if j.kind in MOVING_KINDS or j.child in self.moved
+            ]
+            if chain and self._begins_gripper(next_joints, own_joints):
+                return [Arm(chain, link, own_joints)]
+            if len(next_joints) > 1:
+                branches = [self._arms_from(j.child, *self._extended(j, chain, 0)) for j in next_joints]
                 return [arm for branch in branches for arm in branch]
-            if not ways:
-                return [Arm(chain, self._deepest(link), own)] if own else []
-            chain, own = self._extended(ways[0], chain, own)
-            link = ways[0].child
+            if not next_joints:
+                return [Arm(chain, self._deepest(link), own_joints)] if own_joints else []
+            chain, own_joints = self._extended(next_joints[0], chain, own_joints)
+            link = next_joints[0].child
 
-    def _extended(self, joint: Joint, chain: tuple[str, ...], own: int) -> tuple[tuple[str, ...], int]:
+    def _extended(self, joint: Joint, chain: tuple[str, ...], own_joints: int) -> tuple[tuple[str, ...], int]:
         """A chain and its number of own joints, extended by a joint if that is movable."""
-        return ((*chain, joint.name), own + 1) if joint.kind in MOVING_KINDS else (chain, own)
+        return ((*chain, joint.name), own_joints + 1) if joint.kind in MOVING_KINDS else (chain, own_joints)
 
-    def _begins_gripper(self, ways: list[Joint], own: int) -> bool:
-        """Whether a gripper or a hand begins where these joints branch off, `own` joints after the last
-        branching."""
-        rows = [self._chain_length(joint) for joint in ways]
-        if len(ways) == 1:
-            jaw = ways[0].kind in MOVING_KINDS and GRIPPER.search(ways[0].name)
+    def _begins_gripper(self, branches: list[Joint], own_joints: int) -> bool:
+        """Whether a gripper or a hand begins where these joints branch off, `own_joints` joints after the
+        last branching."""
+        rows = [self._chain_length(joint) for joint in branches]
+        if len(branches) == 1:
+            jaw = branches[0].kind in MOVING_KINDS and GRIPPER.search(branches[0].name)
             return bool(jaw) and rows[0] <= MAX_HAND_FINGER_JOINTS
-        if len(ways) == 2:
+        if len(branches) == 2:
             return max(rows) <= MAX_FINGER_JOINTS
-        return len(ways) > 2 and (max(rows) <= MAX_HAND_FINGER_JOINTS or own >= MIN_ARM_JOINTS)
+        return len(branches) > 2 and (max(rows) <= MAX_HAND_FINGER_JOINTS or own_joints >= MIN_ARM_JOINTS)
 
     def _deepest(self, link: str) -> str:
         """The deepest link below a link."""

@@ -458,10 +458,10 @@ class UrdfTree:
             if element is None or mass is None or mass.get("value", "").strip() in ("0", "0.0"):
                 continue
             inertia = element.find("inertia")
-            of = {} if inertia is None else inertia.attrib
+            attributes = {} if inertia is None else inertia.attrib
             try:
                 T = self._origin(element, link)
-                texts = (mass.get("value", ""), *(of.get(name, "") for name in MOMENTS))
+                texts = (mass.get("value", ""), *(attributes.get(name, "") for name in MOMENTS))
                 value, xx, xy, xz, yy, yz, zz = (self._numbers(text, 1, link)[0] for text in texts)
                 R = T[:3, :3]
                 moments = R @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ R.T
