@@ -1,4 +1,4 @@
-"""Controls: motions that no network and no search has made, which every learned result stands beside."""
+"""Controls: motions from neither a network nor a search, with which every learned result is compared."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -152,7 +152,8 @@ def fixed_vias(robot: Robot) -> Configurations:
 
 @lru_cache(maxsize=2)
 def library(data: str, robot: Robot) -> Trajectories:
-    """Motions for training of a data set's first shards, those with a free straight line left out."""
+    """Motions of the training split from the first shards of a data set, without the trivial ones, whose
+    straight line is free."""
     rows = islice(read_rows(data, robot, WAYPOINTS), LIBRARY_SHARDS)
     train = SPLITS.index("train")
     return np.concatenate([part.q[(part.split == train) & ~part.shard["line_free"]] for part in rows])

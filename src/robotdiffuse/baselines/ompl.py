@@ -177,7 +177,7 @@ class OmplPlanner(Planner[OmplSettings]):
     """Whether OMPL searches from the goals to the start."""
 
     def __init__(self, settings: OmplSettings | None = None) -> None:
-        """Raises InputError for a range where the planner has none."""
+        """Raises InputError for a `range` if the planner has no such setting."""
         super().__init__(settings)
         if self.settings.range is not None and not hasattr(self.algorithm, "setRange"):
             raise InputError(

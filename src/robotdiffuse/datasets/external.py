@@ -78,8 +78,7 @@ def write_dataset(
 
     Args:
         paths: Joint values of each motion [n, dof], in the order of the robot's planned joints [rad] or [m];
-            or paths and trajectories, of which the positions are taken. They are resampled evenly in joint
-            space.
+            or paths and trajectories, whose positions are taken. They are resampled evenly in joint space.
         scenes: The scene of each motion, of spheres and boxes; or one for all. A first box named "floor" that
             all scenes share is what the arm stands on, not an obstacle.
         folder: An empty folder.
@@ -215,7 +214,7 @@ def _shared_floor(scenes: Sequence[Scene]) -> Box | None:
 def export_npz(folder: str | FilePath, file: str | FilePath) -> tuple[int, int]:
     """Write the trajectories of all scenes with exactly two spheres, atomically.
 
-    Returns their number, and the number of those that were left out.
+    Returns the number of written motions and the number of motions that were left out.
 
     Raises InputError if there is no data set, it has no such scene, other numbers of waypoints or joints, or
     the file cannot be written.

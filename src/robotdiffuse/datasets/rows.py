@@ -60,7 +60,7 @@ def row_of(
 
     clearances: of the waypoints [m].
     T_base_tip: the target.
-    most_goals: number of goals in a row of the data set; missing ones are NaN.
+    most_goals: number of goals in a row of the data set; values of missing entries are NaN.
 
     The other arguments are the values of the arrays with their names, see `shards.ARRAYS`.
     """

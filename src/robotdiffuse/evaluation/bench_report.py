@@ -177,7 +177,7 @@ def deciding_record(records: Sequence[Record], limit: float) -> Record | None:
     """The record that shows what a planner finds within a limit [s]: the one with the shortest time limit
     that is at least as long, else the last one that ended by itself.
 
-    records: those of one problem and seed, shorter limits first.
+    records: records of one problem and seed, shorter limits first.
     """
     for record in records:
         if record.time_limit >= limit:
@@ -278,7 +278,7 @@ class Comparison:
 
     limit: float
     problems: int
-    of: int
+    section_problems: int
     """Number of problems in the section."""
     seeds: int
     rows: tuple[Row, ...]
@@ -328,14 +328,15 @@ class Section:
 
     @property
     def main(self) -> Comparison:
-        """The comparison of most planners and problems, and of those with the longest limit."""
+        """The comparison with the most planners and problems; if there are several, the one with the longest
+        limit."""
         return max(self.comparisons, key=lambda c: (len(c.rows) * c.problems, c.limit))
 
 
 def sections(bench: Bench, limits: Sequence[float] | None = None) -> list[Section]:
-    """The results on all problem sets; sets of random problems also without their trivial ones.
+    """The results on all problem sets; for sets of random problems also without the trivial problems.
 
-    limits: time limits to report [s]; None: those of the records, and LIMITS below them.
+    limits: time limits to report [s]; None: the limits of the records, and those LIMITS that are below them.
 
     Raises InputError if no planner has results for any of these.
     """
@@ -448,7 +449,7 @@ def _comparison(
 
 
 def _indicators(outcomes: Sequence[Outcome]) -> Indicators:
-    """The paper's four indicators of all calls; the length is that of the solved ones."""
+    """The paper's four indicators of all calls; the length is over the solved problems."""
     return Indicators(
         success=100 * float(np.mean([o.solved for o in outcomes])),
         collision=100 * float(np.mean([o.record.in_collision for o in outcomes])),
@@ -458,8 +459,8 @@ def _indicators(outcomes: Sequence[Outcome]) -> Indicators:
 
 
 def _problem_lengths(keys: Sequence[Key], outcomes: Sequence[Outcome]) -> Values:
-    """The joint-space length of each problem [rad]: the median of its seeds, NaN if half or more of them
-    failed."""
+    """The joint-space length of each problem [rad]: the median over the seeds, NaN if the planner failed with
+    half or more of them."""
     lengths: dict[str, list[float]] = {}
     for (name, _), o in zip(keys, outcomes, strict=True):
         lengths.setdefault(name, []).append(o.joint_length)
@@ -559,7 +560,7 @@ def seconds(value: float) -> Cell:
 
 def title(section: Section, comparison: Comparison) -> str:
     """The title of a comparison: problem set, limit and number of problems."""
-    total = "" if comparison.problems == comparison.of else f" of {comparison.of}"
+    total = "" if comparison.problems == comparison.section_problems else f" of {comparison.section_problems}"
     plural = "problem" if comparison.problems == 1 else "problems"
     seeds = f", {comparison.seeds} seeds each" if comparison.seeds > 1 else ""
     return f"{section.name}, {comparison.limit:g} s: {comparison.problems}{total} {plural}{seeds}"
@@ -611,7 +612,8 @@ def _success_in(family: str, row: Row) -> Figure:
 
 
 def main_table(section: Section, comparison: Comparison, reference: str) -> Table:
-    """The paper's columns, with intervals and the ratio of lengths to those of the reference."""
+    """The table with the paper's columns, with intervals and with the ratio of lengths to the reference
+    planner's."""
     spec: Spec = (
         (Column("success", "%", better="more"), lambda row: row.success),
         (Column("collision", "%", ".1f", "less"), lambda row: row.figures.collision),
@@ -666,9 +668,9 @@ def _metric(metric: Metric) -> PlannerColumn:
     return column, lambda row: row.mean(metric)
 
 
-def _of_pair(heading: str, of: Callable[[Paired], Cell]) -> PlannerColumn:
+def _of_pair(heading: str, cell: Callable[[Paired], Cell]) -> PlannerColumn:
     """A column of comparisons with the reference on the same problems."""
-    return Column(heading), lambda row: row.paired and of(row.paired)
+    return Column(heading), lambda row: row.paired and cell(row.paired)
 
 
 def probability(p: float) -> str:
@@ -727,7 +729,7 @@ def _over_time(
 
 
 def bench_report(bench: Bench, parts: Sequence[Section], replays: str | None = None) -> Report:
-    """The report of a bench. `replays`: name of a page beside it.
+    """The report of a bench. `replays`: file name of a page with replays, in the same folder.
 
     Raises InputError without matplotlib.
     """
@@ -858,7 +860,7 @@ def motions_to_replay(bench: Bench, parts: Sequence[Section]) -> list[Replay]:
 
 
 def _detour(record: Record) -> float:
-    """Length of a motion over that of the straight line between its ends."""
+    """Length of a motion divided by the length of the straight line between its ends."""
     straight = float(np.linalg.norm(record.waypoints[-1] - record.waypoints[0]))
     return (record.joint_length or 0.0) / max(straight, 1e-6)
 

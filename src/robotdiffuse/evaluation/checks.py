@@ -162,7 +162,7 @@ def check_data(
     measured ones.
 
     robot: that of the data; None: found by the name in the manifest.
-    workers: processes; the motions and findings do not depend on them.
+    workers: processes; motions and findings do not depend on the number of workers.
     progress: called with the numbers of motions done and in all, first with 0.
 
     Raises InputError if there is no data set, for another robot than that of the data, and if PyBullet is

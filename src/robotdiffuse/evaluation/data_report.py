@@ -164,8 +164,8 @@ def facts(data: DataFigures) -> list[tuple[str, str]]:
     ]
 
 
-def _share(of: ndarray | float) -> str:
-    return f"{100 * np.mean(of):.1f} %"
+def _share(values: ndarray | float) -> str:
+    return f"{100 * np.mean(values):.1f} %"
 
 
 def tables(data: DataFigures) -> list[Table]:

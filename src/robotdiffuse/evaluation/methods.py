@@ -121,7 +121,7 @@ def restarted(
 
 
 def _length(result: PlanResult) -> float:
-    """Length of the path [rad]; infinite without one."""
+    """Length of the path [rad]; infinite if there is no motion."""
     return np.inf if result.path_length is None else result.path_length
 
 
@@ -217,7 +217,7 @@ def from_network(
     """Samples of the network: no refinement, no search, no shortcuts.
 
     encoded: the problem whose obstacles are encoded, in place of the run's own.
-    clearances: inputs of the denoiser in place of the true ones.
+    clearances: a function whose result replaces the true inputs of the denoiser.
     """
 
     def draw(run: Run, checker: CollisionChecker) -> ndarray:

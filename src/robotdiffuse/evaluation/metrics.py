@@ -84,7 +84,7 @@ class Metric:
     better: Literal["more", "less", ""]
     format: str
     """Format of numbers, such as `.2f`."""
-    of: Measure
+    measure: Measure
     scale: float = 1.0
     """Units of tables per SI unit."""
 
@@ -98,9 +98,9 @@ def _clearance(name: str) -> Measure:
     return lambda motion: getattr(motion.verdict, name, None)
 
 
-def _timed(of: Callable[[Trajectory, Robot], float | None]) -> Measure:
+def _timed(measure: Callable[[Trajectory, Robot], float | None]) -> Measure:
     """A metric of timed motions."""
-    return lambda motion: None if motion.trajectory is None else of(motion.trajectory, motion.robot)
+    return lambda motion: None if motion.trajectory is None else measure(motion.trajectory, motion.robot)
 
 
 def _over_straight_line(trajectory: Trajectory, robot: Robot) -> float | None:
@@ -113,16 +113,16 @@ def _over_straight_line(trajectory: Trajectory, robot: Robot) -> float | None:
     return trajectory.duration / straight_time if straight_time > 0 else None
 
 
-def _joint_jerk(of: Callable[[ndarray, ndarray], float]) -> Measure:
-    """A metric that `of` computes from two arrays: for each step between rows, the largest jerk of any joint
-    and the duration of the step."""
+def _joint_jerk(statistic: Callable[[ndarray, ndarray], float]) -> Measure:
+    """A metric that `statistic` computes from two arrays: for each step between rows, the largest jerk of any
+    joint and the duration of the step."""
 
     def value(trajectory: Trajectory, _: Robot) -> float | None:
         steps = np.diff(trajectory.times)
         if not len(steps):
             return None
         jerks = np.abs(np.diff(trajectory.accelerations, axis=0)) / steps[:, None]
-        return float(of(jerks.max(axis=1), steps))
+        return float(statistic(jerks.max(axis=1), steps))
 
     return _timed(value)
 
@@ -180,7 +180,7 @@ def measured(
     """Values of METRICS by name, without those that the motion does not have; lengths are 0 for a motion that
     stands still."""
     motion = Motion(robot, path, trajectory, verdict)
-    values = {name: metric.of(motion) for name, metric in METRICS.items()}
+    values = {name: metric.measure(motion) for name, metric in METRICS.items()}
     return {name: float(f"{x:.{DIGITS}g}") for name, x in values.items() if x is not None}
 
 

@@ -33,8 +33,8 @@ def validator(problem: Problem, path: Path) -> bool:
 
 
 def search(problem: Problem) -> float | None:
-    """The reference length of a problem, that of a short path [rad]; None if search does not solve it in
-    time."""
+    """The reference length of a problem, which is the length of a short path [rad]; None if search does not
+    solve it in time."""
     planner = AORRTC(AORRTCSettings(gain=0.001, patience=REFERENCE_ITERATIONS))
     return planner.plan(problem, SEARCH_TIME, seed=1, clearance=0.0, objective=LENGTH).path_length
 
@@ -47,7 +47,8 @@ def case_file(folder: FilePath | None, name: str) -> CaseFile:
 def hard_cases(
     family: str, count: int, folder: FilePath | None = None, report: Progress = lambda text: None
 ) -> list[Case]:
-    """The first hard held-out problems of a family; the folder keeps what is known of them."""
+    """The first hard held-out problems of a family; the folder keeps the problems with the results of
+    validator and search."""
     return case_file(folder, family).held_out(family, count, validator, search, report)
 
 
@@ -71,9 +72,9 @@ def problem_set_name(text: str) -> str:
 def gather_cases(names: list[str], count: int | None, out: FilePath, report: Progress) -> list[Case]:
     """The first `count` problems of each set (None: all of a file or folder, 100 of a family).
 
-    They are kept in `out`/problems, one file for each set, and read from there next time; a larger count adds
-    to them. `report` is called with lines on the progress. Raises InputError for unknown names and empty
-    sets.
+    They are kept in `out`/problems, one file for each set, and read from there next time; with a larger
+    `count`, problems are added. `report` is called with lines on the progress. Raises InputError for unknown
+    names and empty sets.
     """
     twice = repeated(problem_set_name(text) for text in names)
     if twice:

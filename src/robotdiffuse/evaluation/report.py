@@ -60,12 +60,12 @@ class Report:
         self.add("\n".join(markdown(table)))
 
     def plot(self, file: str, caption: str, svg: str) -> None:
-        """Add a plot, which `write` writes to a file beside the report."""
+        """Add a plot; `write` writes it to a file in the folder of the report."""
         self.plots[file] = svg
         self.picture(file, caption)
 
     def picture(self, file: str, caption: str) -> None:
-        """Add a picture in a file beside the report."""
+        """Add a picture that is in a file in the folder of the report."""
         self.add(plain(caption), f"![{FilePath(file).stem}]({file})")
 
     @property
@@ -74,7 +74,7 @@ class Report:
 
     @property
     def page(self) -> str:
-        """The report as HTML, with its plots in it and links to its parts."""
+        """The report as HTML, with the plots in the page and links to the sections."""
         from markdown_it import MarkdownIt
 
         body = MarkdownIt().enable("table").render(self.markdown)
@@ -95,7 +95,7 @@ class Report:
         return f"{head}{body}</body></html>\n"
 
     def write(self, file: FilePath) -> None:
-        """Write the report as Markdown, and its plots beside."""
+        """Write the report as Markdown, and the plots as files in the same folder."""
         write_atomically(file, self.markdown, make_folder=True)
         for name, svg in self.plots.items():
             # dark text needs a white background, also in a viewer with a dark one

@@ -92,7 +92,7 @@ class Record:
 
     @property
     def key(self) -> tuple[str, str, int, float]:
-        """Identifies the record among those of its planner."""
+        """Identifies the record among all records of its planner."""
         return *self.case, self.time_limit
 
     @property

@@ -92,7 +92,7 @@ class AORRTCSearch:
 
     @property
     def cost(self) -> float:
-        """Length of the best path [rad]; infinite without one."""
+        """Length of the best path [rad]; infinite if there is no path."""
         return float(self._search.length)
 
     @property
@@ -109,6 +109,6 @@ class AORRTCSearch:
         return self._search.clearance
 
     def path(self) -> Configurations | None:
-        """Waypoints of the best path; None without one."""
+        """Waypoints of the best path; None if there is no path."""
         best = self._search.best
         return None if best is None else self._ends.complete(best).astype(np.float32)

@@ -240,7 +240,7 @@ def _is_unit(topic: str) -> bool:
 
 
 def _seconds(message: Any, logged: int) -> float:
-    """The stamp of a message, or its log time if it has none [s]."""
+    """The stamp of a message; its log time if the message has no stamp [s]."""
     stamp = message.header.stamp
     return header_seconds({"sec": stamp.sec, "nanosec": stamp.nanosec}) or 1e-9 * logged
 
@@ -275,13 +275,13 @@ def _depth(where: str, image: Any, unit: float | None) -> Float[ndarray, "h w"]:
 
 
 def insert_by_time(history: list[Stamped], stamped: Stamped) -> None:
-    """Add an entry to a history, which may have later ones: messages may be logged in another order."""
+    """Add an entry to a history, which may contain later entries: messages may be logged in another order."""
     insort(history, stamped, key=itemgetter(0))
 
 
 def around(history: list[Stamped], stamp: float, gap: float) -> tuple[Any, Any, float] | None:
     """The entries before and after a time, or the same one twice, and which share of the way from the first
-    to the second the time is; None if none is within `gap` of it [s]."""
+    to the second the time is; None if no entry is within `gap` [s] of the time."""
     i = bisect_left(history, stamp, key=itemgetter(0))
     near = [history[k] for k in (i - 1, i) if 0 <= k < len(history) and abs(history[k][0] - stamp) <= gap]
     if not near:
@@ -320,8 +320,8 @@ class TransformHistory:
     def at(self, base: str, frame: str, stamp: float, gap: float, where: str) -> Pose:
         """T_base_frame at a time, interpolated between two transforms at most `gap` from it [s].
 
-        Raises InputError, naming `where`, if no chain of transforms leads from the base to the frame, or if
-        one of them is not near in time.
+        Raises InputError, naming `where`, if no chain of transforms leads from the base to the frame, or if a
+        transform of the chain is not near in time.
         """
         T = np.eye(4)
         at = frame.lstrip("/")

@@ -183,7 +183,7 @@ def choose_topic(topics: Mapping[str, str], requested: str | None, where: str) -
 def motion_from_messages(kind: str, messages: list[tuple[int, Any]], where: str) -> RecordedMotion:
     """The motion in messages with their log times [ns]: a single message, or a series of joint states.
 
-    Raises InputError, naming `where`, for no or several motions, and for damaged ones.
+    Raises InputError, naming `where`, if the file contains no motion or several, and for damaged motions.
     """
     if not messages:
         raise InputError(f"{where} holds no messages")
@@ -295,7 +295,7 @@ def write_mcap(problem: Problem, trajectory: Trajectory, file: Path) -> None:
 
 
 def _urdf(source: str | None) -> bytes | None:
-    """The URDF that the robot was read from; None if there is none any more."""
+    """The URDF that the robot was read from; None if there is no URDF any more."""
     if source is None or not source.endswith(".urdf"):
         return None
     try:

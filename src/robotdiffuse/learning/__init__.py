@@ -1,4 +1,4 @@
-"""Networks: their training, by PyTorch, and what planning needs of them, by NumPy and ONNX Runtime."""
+"""Networks: their training with PyTorch, and the parts that planning needs, with NumPy and ONNX Runtime."""
 
 from importlib.util import find_spec
 

@@ -1,4 +1,4 @@
-"""Trained networks in files, as training writes and reads them; `weight_files` says what they hold.
+"""Trained networks in files, as training writes and reads them; `weight_files` describes their content.
 
 All networks are written and read in the same way: the diffusion model, the baselines' networks, the encoder
 that is trained alone and the completion network; the last two belong to no robot. A file is written whole or
@@ -169,8 +169,7 @@ def load_model(folder: str | FilePath, robot: Robot | None = None) -> MotionNetw
 
 
 def export_weights(folder: str | FilePath) -> list[str]:
-    """Write the exported parts of all networks in a folder anew, from their weights. Returns the names of the
-    networks.
+    """Export all networks in a folder again from their weights. Returns the names of the networks.
 
     Raises InputError if the folder holds none, or one is damaged.
     """

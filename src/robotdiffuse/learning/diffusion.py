@@ -1,4 +1,4 @@
-"""Noise levels, what the network predicts at them, and the samplers that go down them.
+"""Noise levels, the quantity that the network predicts, and the samplers.
 
 The forward process: x_t = signal_t x_0 + noise_t n, with n a Gaussian trajectory.
 
@@ -69,7 +69,7 @@ class NoiseSchedule:
         """Weight of the loss on x_0 at level t: 1 + SNR, at most `limit`.
 
         With 1 + SNR the network's effective target has unit variance on every level (Karras et al. 2022,
-        table 1, for unit data variance); the limit is that of min-SNR weighting (Hang et al. 2023).
+        table 1, for unit data variance); the limit is the one of min-SNR weighting (Hang et al. 2023).
         """
         power = self.signal[t] ** 2 + self.noise[t] ** 2
         return power / np.maximum(self.noise[t] ** 2, power / limit)
@@ -87,7 +87,8 @@ class NoiseSchedule:
 def noise_factor(
     residuals: Float[ndarray, "n waypoints dof"], smooth: bool
 ) -> Float[ndarray, "waypoints waypoints"]:
-    """The matrix L that makes noise L e of white noise e: zero at both ends, of mean variance 1 between them.
+    """The matrix L that makes noise L e of white noise e: zero at both ends, and with a mean variance of 1
+    between them.
 
     smooth: L Lᵀ is the covariance of the residuals over the waypoints, plus a little white noise so that
     every direction has some; else L is `white_noise_factor`. residuals: scaled to unit variance.
@@ -119,9 +120,9 @@ class Objective:
     """What the network is trained to predict: the clean trajectory x_0 itself (paper, Method).
 
     Each objective is a linear function of the clean trajectory and the noise. So the clean trajectory can be
-    computed from any of them, and samplers work on clean trajectories only. The formulas are plain arithmetic
-    for NumPy arrays and PyTorch tensors alike; `signal` and `noise_level` are the schedule's values at the
-    levels of the trajectories, and broadcast against these.
+    computed from each of these outputs, and samplers work on clean trajectories only. The formulas are plain
+    arithmetic for NumPy arrays and PyTorch tensors alike; `signal` and `noise_level` are the schedule's
+    values at the levels of the trajectories, and broadcast against these.
     """
 
     def target(self, clean: Array, noise: Array, signal: Any, noise_level: Any) -> Array:

@@ -71,7 +71,8 @@ class Statistics(NamedTuple):
 
     @staticmethod
     def without_data(waypoints: int, dof: int) -> "Statistics":
-        """Statistics that scale nothing: those of the target `limits`, and of any target before training."""
+        """Statistics that scale nothing: statistics for the target `limits`, and for any target before
+        training."""
         white = white_noise_factor(waypoints).astype(np.float32)
         return Statistics(np.ones(dof, np.float32), np.zeros(dof, np.float32), white)
 
@@ -484,7 +485,7 @@ def _carriers(checker: CollisionChecker) -> tuple[int, list[int]]:
 
 
 def _of_bare_arm(links: ndarray, arm_links: int, carriers: list[int]) -> ndarray:
-    """Clearances [n, links] of the bare arm's links, the only ones that a network has inputs for: an attached
+    """Clearances [n, links] of the links of the bare arm, for which alone a network has inputs: an attached
     body counts as a part of the link that carries it."""
     of_arm = links[:, :arm_links].copy() if carriers else links
     for body, carrier in enumerate(carriers, start=arm_links):

@@ -31,8 +31,8 @@ from robotdiffuse.learning.weight_files import RobotIdentity
 def block_means(
     waypoints: int, block: int
 ) -> tuple[Float[Tensor, "blocks waypoints"], Float[Tensor, "waypoints blocks"], Float[ndarray, "blocks"]]:
-    """The matrix of the means of blocks of waypoints, that of linear interpolation between the middles of the
-    blocks, and these middles [waypoints]. The first and the last waypoint are alone."""
+    """The matrix that takes means of blocks of waypoints, the matrix that interpolates linearly between the
+    middles of the blocks, and these middles [waypoints]. The first and the last waypoint are alone."""
     index = np.r_[0, 1 + np.arange(waypoints - 2) // block, 1 + (waypoints - 2) // block]
     member = np.eye(index[-1] + 1)[:, index]
     means = member / member.sum(1, keepdims=True)
@@ -115,8 +115,9 @@ class MotionNetwork(Network, MotionModel):
         """Have the denoiser see the means of blocks of `block` waypoints; 1: single waypoints.
 
         For white noise and a transformer with a token per waypoint. The mean of white noise over a block is
-        white noise again, so that a token tells as much as all its waypoints. The denoiser's output is
-        interpolated to all waypoints.
+        white noise again, with less variance. Where the motion hardly changes within a block, the mean says
+        nearly as much about it as the single waypoints. The denoiser's output is interpolated to all
+        waypoints.
         """
         if block == self.block:
             return

@@ -23,7 +23,7 @@ Differences from the paper:
   input of the configuration encoder, and points are labeled by link, not only as scene, robot or target.
 - The floor, which is part of every scene, is in the collision loss but not in the cloud.
 - The collision loss is on the arm's covering spheres, which protrude a little, not on points.
-- The expert's motions are those of our data, of 48 waypoints (paper: 50), forwards or backwards, with one
+- The expert's motions come from our data and have 48 waypoints (paper: 50), forwards or backwards, with one
   step at rest at the end.
 - Displacements are output in units of the experts' mean step, and weights are initialized as in K. He et al.
   (ICCV 2015): with PyTorch's defaults signals fade over the many layers, and learning takes many times as

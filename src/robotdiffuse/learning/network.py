@@ -1,4 +1,4 @@
-"""The base classes of trained networks, so that one checkpoint format holds them all, and their export.
+"""The base classes of trained networks, which share a checkpoint format, and the export of networks.
 
 The export is ONNX, the form in which planning runs networks.
 """

@@ -219,7 +219,7 @@ def weights_for(name: str, robot: Robot) -> FilePath | None:
     """The folder with weights of a network (a name in NETWORKS) for exactly this robot; None if there is
     none.
 
-    The user's weights take precedence over those of the package. Raises InputError, naming the file, for a
+    The user's weights take precedence over the bundled weights. Raises InputError, naming the file, for a
     damaged description.
     """
     for place in (user_weights(robot), BUNDLED / robot.name):
@@ -279,6 +279,7 @@ def completion_folder(folder: str | FilePath | None) -> FilePath:
 
 
 def no_weights_error(name: str, what: str) -> InputError:
-    """The error for missing weights: `what` says what is missing, and the command that trains it follows."""
+    """The error for missing weights: `what` names the missing weights; the message ends with the command that
+    trains them."""
     command = NETWORKS[name].kind or f"baseline {name} --data FOLDER --out FOLDER"
     return InputError(f"{what}; train them: robotdiffuse train {command}")

@@ -1,4 +1,4 @@
-"""Planning problems: what they are, their files, and random ones."""
+"""Planning problems: their classes, their files, and families of random problems."""
 
 from robotdiffuse.problems.files import load_problem, problem_record
 from robotdiffuse.problems.problem import Problem

@@ -152,15 +152,15 @@ class PathConstraints:
         return np.all(self.values(q) <= self.limits(tolerance_fraction), axis=1)
 
     def projected(self, q: Configurations, tolerance_fraction: float, most: int = -1) -> Configurations:
-        """The configurations projected onto a fraction of the tolerances, at most `most` of them unless that
-        is -1; failed projections are left out."""
+        """The configurations projected onto a fraction of the tolerances, at most `most` of them unless
+        `most` is -1; failed projections are left out."""
         rows, satisfied = self.project(q, tolerance_fraction, most)
         return rows[satisfied]
 
     def project(
         self, q: Configurations, tolerance_fraction: float, most: int = -1
     ) -> tuple[Configurations, Bool[ndarray, "n"]]:
-        """As `projected`, but a row for each configuration, and which of them keep the tolerances."""
+        """Like `projected`, but returns a row for each configuration, and which rows keep the tolerances."""
         rows = np.array(q, np.float64, order="C")
         return rows, project_each(self.rows, self.limits(tolerance_fraction), rows, most)
 

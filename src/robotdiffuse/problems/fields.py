@@ -72,7 +72,7 @@ def _object(properties: Schema, *required: str) -> Schema:
 
 
 def _one_of(kinds: Schema) -> Schema:
-    """The schema of a mapping of exactly one of these names to what it may hold."""
+    """The schema of a mapping with exactly one of these names as its key."""
     return _object(kinds) | {"minProperties": 1, "maxProperties": 1}
 
 
@@ -109,7 +109,7 @@ WRITTEN_DECIMALS = 12
 
 
 def _fields_of(kind: type) -> tuple[dict[str, Schema], list[str]]:
-    """The fields of the entry of a shape or constraint, and those that it must have."""
+    """The fields of the entry of a shape or constraint, and its required fields."""
     schemas: dict[str, Schema] = {}
     for field in fields(kind):
         schemas |= (
@@ -494,8 +494,8 @@ SETUP: dict[str, Schema] = {
 def problem_schema() -> Schema:
     """The schema of a problem file, as JSON values, for editors that complete and check them.
 
-    It is made of the tables by which files are read. It says what fields there are; `load_problem` says what
-    is right.
+    It is made of the tables by which files are read. It says what fields there are; The messages of
+    `load_problem` say more.
     """
     shapes = {kind: _entry_schema(shape) for kind, shape in SHAPES.items()}
     goal = {"anyOf": [TEXT, _array({"anyOf": [NUMBER, GOAL]}), _one_of(GOALS)]}

@@ -94,7 +94,7 @@ the record of the problem."""
 
 
 class CaseFile:
-    """Cases by name, in the order of their addition, stored in a file or, without one, in memory."""
+    """Cases by name, in the order of their addition, stored in a file or, if no file is given, in memory."""
 
     def __init__(self, file: FilePath | None) -> None:
         """Reads the file. Raises InputError, which names file and line, if it is damaged."""
@@ -112,7 +112,7 @@ class CaseFile:
         return len(self._rows)
 
     def cases(self, hard: bool = False) -> list[Case]:
-        """All cases, or those that are known to be hard."""
+        """All cases, or only the cases that are known to be hard."""
         return [_case(row) for row in self._rows.values() if not hard or _is_hard(row)]
 
     def fill(self, cases: list[Case]) -> None:
@@ -131,7 +131,7 @@ class CaseFile:
         search: Search | None = None,
         report: Progress = lambda text: None,
     ) -> list[Case]:
-        """The first `count` held-out problems of a family; with a search, the first hard ones.
+        """The first `count` held-out problems of a family; with a search, the first `count` hard problems.
 
         Problems that are not in the file yet are generated, validated, searched and added.
         """

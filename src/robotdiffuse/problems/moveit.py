@@ -50,7 +50,7 @@ TYPE_NUMBERS = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone", 5: "prism"}
 
 
 def mapping_of(where: str, value: object, *names: str) -> dict[str, Any]:
-    """The mapping, or the one in nested fields of it; None counts as empty, as in the messages."""
+    """The mapping, or the mapping in nested fields of it; None counts as empty, as in the messages."""
     for name in names:
         value = mapping_of(where, value).get(name)
         where = name if where in (SCENE, REQUEST) else f"{where}.{name}"
@@ -191,7 +191,7 @@ def moveit_scene(
 ) -> Scene:
     """`read_moveit_scene` for a parsed file; names of mesh files are relative to `folder`.
 
-    links: names of the robot's links and held objects; contacts: allowed contacts besides those of the file,
+    links: names of the robot's links and held objects; contacts: allowed contacts in addition to the file's,
     as in `Scene`.
     """
     world = mapping_of(SCENE, data, "world")
@@ -353,7 +353,7 @@ def _plane(coefficients: Float[ndarray, "4"], name: str) -> Box:
 
 
 def moveit_model(data: object) -> str:
-    """The robot_model_name of a parsed planning scene; empty if it has none."""
+    """The robot_model_name of a parsed planning scene; empty if the file names no model."""
     return str((data.get("robot_model_name") if isinstance(data, dict) else None) or "")
 
 
@@ -450,7 +450,8 @@ class MoveItRequest:
 
 
 def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) -> MoveItRequest:
-    """Start, attached objects and goals of a parsed request; `frames` and `folder` are those of its scene.
+    """Start, attached objects and goals of a parsed request; `frames` and `folder` belong to the scene of the
+    request.
 
     Several joint goal constraints are alternative goals. A position and an orientation constraint of one link
     are a pose goal at the center of the region, whose size and tolerances are ignored. Raises InputError for

@@ -285,10 +285,10 @@ class StateValidity:
 class Problem(Value):
     """A planning problem. Lengths in [m], angles in [rad], poses in the frame of the robot's base.
 
-    `start` accepts a configuration, a dict of values by joint (those of joints that are not planned are
-    ignored), or the name of a pose of the robot (`robot.poses`), such as "ready".
-    `goal` accepts these, a list of configurations, a JointGoal, a PoseGoal, a PosesGoal, or a list
-    of goals, any of which may be reached. Each waypoint accepts the same.
+    `start` accepts a configuration, a dict of values by joint (values of joints that are not planned are
+    ignored), or the name of a pose of the robot (`robot.poses`), such as "ready". `goal` accepts these, a
+    list of configurations, a JointGoal, a PoseGoal, a PosesGoal, or a list of goals, any of which may be
+    reached. Each waypoint accepts the same.
 
     Values up to `LIMIT_SLACK` beyond a joint limit are clamped, with a note. Values of continuous joints are
     not changed; a goal may be reached at any number of their full turns. Raises InputError for everything

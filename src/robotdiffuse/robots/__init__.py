@@ -107,7 +107,7 @@ def _added() -> dict[str, Path]:
 
 
 def _from_urdf(urdf: Path) -> Robot:
-    """The added robot with the content of a URDF; prepared and added if there is none."""
+    """The added robot with the content of a URDF; if there is none, the URDF is prepared and added."""
     from robotdiffuse.robots.fitting.preparation import add_robot
     from robotdiffuse.robots.parsing.urdf import UrdfTree
 

@@ -1,4 +1,4 @@
-"""Bodies of links: convex meshes, surfaces, inertias, and what is attached to links."""
+"""Bodies of links: convex meshes, surfaces, inertias, and bodies that are attached to links."""
 
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple, Protocol, no_type_check, runtime_checkable

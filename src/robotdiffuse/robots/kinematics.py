@@ -47,7 +47,8 @@ def link_poses(robot: KinematicTree, q: Configurations, link: str) -> Poses:
 def link_jacobians(robot: KinematicTree, q: Configurations, link: str) -> Float[ndarray, "n 6 dof"]:
     """Geometric Jacobians of a link at a batch of configurations; raises InputError for an unknown link.
 
-    Rows are linear, then angular, in the axes of the base frame; the linear ones are of the link's origin.
+    Rows are linear, then angular, in the axes of the base frame; the linear velocities are of the link's
+    origin.
     """
     frames = _frames(robot, q, link)
     origins = (frames[-1] @ robot.T_frame_link(link))[:, :3, 3]

@@ -184,7 +184,7 @@ class Robot(KinematicTree):
         """Geometric Jacobian of a link.
 
         Its linear, then its angular velocity, for each unit of a joint's velocity. Both are in the axes of
-        the base; the linear velocity is that of the link's origin.
+        the base; the linear velocity is of the link's origin.
 
         Args:
             q: A configuration [dof], or several [n, dof], of the planned joints [rad] or [m].
@@ -504,9 +504,9 @@ def _moved(T: Pose, scale: float) -> Pose:
     return moved
 
 
-def moving_pairs(robot: Robot, of: Container[str]) -> list[tuple[str, str]]:
-    """Pairs of links on different frames that are both in `of`."""
-    links = [link for link in robot.link_names if link in of]
+def moving_pairs(robot: Robot, names: Container[str]) -> list[tuple[str, str]]:
+    """Pairs of links with these names that are on different frames."""
+    links = [link for link in robot.link_names if link in names]
     return [(a, b) for a, b in combinations(links, 2) if robot.link_frame(a) != robot.link_frame(b)]
 
 

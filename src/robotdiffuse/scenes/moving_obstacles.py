@@ -162,7 +162,7 @@ class MovingObstacle(Value):
 
     @property
     def top_speed(self) -> float:
-        """Speed that no point of it exceeds at any time [m/s]."""
+        """Speed that no point of the obstacle exceeds at any time [m/s]."""
         if self.max_speed is not None:
             return self.max_speed
         return float(track_speeds(*self.track, self.radius).max(initial=0.0))

@@ -300,5 +300,6 @@ READERS: dict[str, Callable[[Path], ndarray]] = {
 
 
 def default_radius(file: str | Path) -> float:
-    """Radius of the points of a file [m]: POINT_RADIUS, or that of the spheres around an octomap's voxels."""
+    """Radius of the points of a file [m]: POINT_RADIUS, or the radius of the spheres around the voxels of an
+    octomap."""
     return cover_radius(read_octomap(file)[1]) if Path(file).suffix.lower() == ".bt" else POINT_RADIUS

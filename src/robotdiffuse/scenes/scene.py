@@ -106,7 +106,8 @@ class Scene(Value):
         return self.with_shapes([shape.moved(T) for shape in self.shapes])
 
     def with_shapes(self, shapes: Iterable[Shape]) -> "Scene":
-        """A scene of other shapes, with the allowed contacts of those that have the name of one of these.
+        """A scene of other shapes. A shape with the same name as one of this scene keeps the contacts that
+        are allowed for it.
 
         Args:
             shapes: The obstacles.
@@ -199,7 +200,7 @@ def _contacts(
     allowed: object, given: dict[str, list[str]], names: set[str]
 ) -> tuple[tuple[str, tuple[str, ...] | str], ...]:
     """Checked `Scene.allowed_contacts`. `given` maps the names that shapes were given to their unique
-    ones."""
+    names."""
     try:
         entries = allowed.items() if isinstance(allowed, Mapping) else [(a, b) for a, b in allowed]  # type: ignore
     except (TypeError, ValueError):

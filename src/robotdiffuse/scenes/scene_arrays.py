@@ -75,7 +75,7 @@ class PackedScenes:
         return PackedScenes(kinds, params, np.concatenate(floors) if floors else None)
 
     def floor(self, i: int) -> Box | None:
-        """The floor of scene i; None if it has none."""
+        """The floor of scene i; None if the scene has no floor."""
         if self.floors is None or not self.floors[i].any():
             return None
         return Box(self.floors[i, :3], self.floors[i, 3:], name="floor")
@@ -108,7 +108,8 @@ class PackedScenes:
         return PackedScenes(self.kinds, params, self.floors)
 
     def distances(self, at: Float[ndarray, "points 3"]) -> Float[ndarray, "n points"]:
-        """Signed distance [m] of points to the nearest obstacle of each scene; infinite if it has none."""
+        """Signed distance [m] of points to the nearest obstacle of each scene; infinite if the scene has no
+        obstacles."""
         nearest = np.full((len(self), len(at)), np.inf)
         for kind, p in zip(self.kinds.T, self.params.transpose(1, 0, 2).astype(np.float64), strict=True):
             box = kind == BOX

@@ -62,7 +62,8 @@ class Shape(Value, ABC):
 
     @property
     def T_base_shape(self) -> Pose:
-        """Pose of the shape's own frame. Raises InputError for shapes without one, such as point clouds."""
+        """Pose of the shape's own frame. Raises InputError for shapes without a pose, such as point
+        clouds."""
         raise self._not_solid()
 
     def moved(self, T: Pose) -> "Shape":

@@ -39,8 +39,8 @@ class DenoiserSettings(Settings):
 class AttentionSettings(DenoiserSettings):
     """Settings of all transformers.
 
-    The paper states neither the number of heads nor the size of the hidden layer: `paper_size` has those of
-    the network that the paper follows, the motion diffusion model of Tevet et al. 2023.
+    The paper states neither the number of heads nor the size of the hidden layer: `paper_size` has the sizes
+    of the network that the paper follows, the motion diffusion model of Tevet et al. 2023.
     """
 
     causal: ClassVar[bool] = False

@@ -219,7 +219,7 @@ class TrajectoryTransformer(Denoiser):
         return nn.ModuleList(Block(*sizes, count, causal, cross) for _ in range(count))
 
     def set_positions(self, at: Float[ndarray, "tokens"]) -> None:
-        """Give the tokens other positions, in waypoints; there may be another number of them."""
+        """Give the tokens other positions, in waypoints; their number may change."""
         self.positions = positions(at, self.settings.width).to(self.positions.device)
 
     def forward(

@@ -60,7 +60,8 @@ class Encoder(SavedModule, ABC):
         return self(cloud)
 
     def near(self, cloud: Cloud) -> Near:
-        """The points that count: those in the region, without the zeros that `surface_clouds` pads with."""
+        """The points that count: which points are in the region and are not the zeros with which
+        `surface_clouds` pads."""
         region = self.settings.region
         inside = (cloud - self.center).square().sum(-1) < region.reach**2
         return inside & (cloud[..., 2] > region.floor) & (cloud != 0).any(-1)

@@ -76,7 +76,7 @@ class TrajectoryData:
         return len(self.q)
 
     def split(self, most: int) -> "tuple[TrajectoryData, TrajectoryData]":
-        """The rows for training, and at most `most` of those for validation."""
+        """The rows for training, and at most `most` rows for validation."""
         cut = len(self) - self.validation
         return self._rows(slice(None, cut), 0), self._rows(slice(cut, cut + most), min(most, self.validation))
 
@@ -86,7 +86,8 @@ class TrajectoryData:
         return np.flatnonzero(self.trivial), np.flatnonzero(~self.trivial)
 
     def draw(self, count: int, trivial_share: float, rng: Generator) -> Int[ndarray, "count"]:
-        """Indices of random rows, with this share of trivial ones if the data have both kinds."""
+        """Indices of random rows. If the data have trivial and other rows, `trivial_share` of the drawn rows
+        are trivial."""
         share = trivial_share if all(map(len, self.pools)) else float(len(self.pools[0]) > 0)
         easy = rng.random(count) < share
         rows = np.empty(count, np.int64)
@@ -165,7 +166,7 @@ def _codes(
     encoder: Encoder | None,
     key: str,
 ) -> Float[ndarray, "n code"]:
-    """Codes of scenes, cached in a file named by `key`; empty ones without an encoder."""
+    """Codes of scenes, cached in a file named by `key`; empty embeddings if there is no encoder."""
     if encoder is None:
         return np.zeros((len(scenes), 0), np.float16)
     cache = folder / "codes" / f"{key}.npy"
@@ -221,7 +222,7 @@ def fast_autocast() -> torch.autocast:
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Noisy trajectories and the clean ones they were made from; float32."""
+    """Noisy trajectories and the clean trajectories from which they were made; float32."""
 
     features: Float[ndarray, "n waypoints features"]
     level: Values

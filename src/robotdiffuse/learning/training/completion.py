@@ -274,7 +274,8 @@ def _split(samples: Samples) -> list[Samples]:
 
 
 def fitted_temperature(logits: Probabilities, truth: Truth) -> float:
-    """The temperature that minimizes the cross-entropy of logits divided by it (Guo et al. 2017)."""
+    """The temperature by which logits are divided so that their cross-entropy is smallest (Guo et al.
+    2017)."""
     from scipy.optimize import minimize_scalar
 
     sign = np.where(truth, -1.0, 1.0).astype(np.float32)

@@ -1,4 +1,5 @@
-"""Settings of training runs: the common ones, and those of encoders, the diffusion model and baselines."""
+"""Settings of training runs: settings that all trainings share, and settings of encoders, the diffusion model
+and baselines."""
 
 import math
 from dataclasses import dataclass, field

@@ -44,7 +44,8 @@ Module = TypeVar("Module", bound=nn.Module)
 
 
 class Processes:
-    """The processes of a training, as seen by one of them. All call the same methods in the same order."""
+    """The processes of a training, from the view of one process. All call the same methods in the same
+    order."""
 
     def __init__(self, device: str | None) -> None:
         """device: cpu, or cuda with a device for every process; None: cuda if there is one.
@@ -86,8 +87,8 @@ class Processes:
     def average(self, parameters: Iterable[nn.Parameter], loss: float) -> float:
         """Replace the gradients by their means over the processes; returns the mean of the losses.
 
-        A single process leaves them unchanged. Values that are not finite in one process are so in all
-        afterwards.
+        With a single process, the values stay unchanged. Values that are not finite in one process are so in
+        all afterwards.
         """
         if self.count == 1:
             return loss

@@ -53,7 +53,8 @@ def cover(mesh: ConvexMesh) -> Spheres:
 
 
 def _axes(vertices: Points) -> Rotation:
-    """Axes as rows: those of the mesh's frame, or the principal axes if a box along these is smaller."""
+    """Axes as rows: the axes of the mesh's frame, or the principal axes if a box along the latter is
+    smaller."""
     principal = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
     frame_volume = np.ptp(vertices, axis=0).prod()
     principal_volume = np.ptp(vertices @ principal.T, axis=0).prod()

@@ -65,7 +65,7 @@ Planes = tuple[Points, Values, ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Bounds:
-    """How far the spheres of a link may stick out of it."""
+    """How far spheres may stick out of a link."""
 
     tolerance: float
     """How far a sphere may stick out of the link [m]."""
@@ -464,7 +464,8 @@ def _farthest_apart(points: Points, excess: Values, count: int) -> Points:
 
 
 def _thin_out(sizes: SphereSizeGrid, cells: Cells, centers: Points, settings: SphereSettings) -> Points:
-    """Centers without the spheres whose cells the others can cover; the least needed ones are dropped first.
+    """Centers without the spheres whose cells the others can cover; the least needed spheres are dropped
+    first.
 
     Only the spheres that take over cells are moved.
     """
@@ -516,7 +517,7 @@ def _with_radii(sizes: SphereSizeGrid, cells: Cells, centers: Points) -> Spheres
 
 
 def _without_holes(solid: Solid, inside: Points, spheres: Spheres) -> Spheres:
-    """Spheres with more of them added in uncovered holes inside the solid, where a small obstacle could
+    """The spheres, and further ones in uncovered holes inside the solid, where a small obstacle could
     hide."""
     depth = solid.inscribed_sizes().at(inside)
     gap = gaps(inside, spheres)

@@ -67,8 +67,9 @@ def compiled_model(path: Path) -> Any:
 
 
 def robot_bodies(model: Any) -> list[int]:
-    """The bodies of the robot, parents before children. They are those of the kinematic trees that actuators
-    move; without actuators, those of all trees with hinges or slides and without a free joint."""
+    """The bodies of the robot, parents before children. They are the bodies of the kinematic trees that
+    actuators move; without actuators, the bodies of all trees with hinges or slides and without a free
+    joint."""
     trees: dict[int, list[int]] = {}
     for body in range(1, model.nbody):
         trees.setdefault(int(model.body_rootid[body]), []).append(body)
@@ -276,7 +277,7 @@ class ConvertedModel:
         return mimics
 
     def _geometry(self, link: ET.Element, body: int) -> None:
-        """The inertia and the geoms of a body; those that collide with nothing are visual."""
+        """The inertia and the geoms of a body; geoms that collide with nothing are visual."""
         model = self.model
         if model.body_mass[body] > 0:
             inertial = ET.SubElement(link, "inertial")

@@ -303,7 +303,7 @@ def planned_joints(
 
 
 def _ends(chosen: list[str], above: dict[str, Joint], written: list[str]) -> list[str]:
-    """Tips of a group: those of the chains that define it, or else the last links of its joints."""
+    """Tips of a group: the tips of the chains that define the group, or else the last links of its joints."""
     last = {joint.child: joint.child for joint in above.values() if joint.name in chosen}
     for link in [*last]:
         for joint in chain(above, link)[:-1]:
