@@ -182,7 +182,7 @@ def test_compared_are_problems_that_all_planners_were_given_this_time_for(tmp_pa
     (section,) = bench_report.sections(bench_report.read_bench(folder))
     whole = {c.limit: c for c in section.comparisons}
     assert whole[1.0].problems == 6 and whole[1.0].missing == ()
-    assert (whole[10.0].problems, whole[10.0].of) == (2, 6)
+    assert (whole[10.0].problems, whole[10.0].section_problems) == (2, 6)
     assert whole[10.0].missing == ("edmp",)
     assert rows(section, 10.0)["mpd"].figures.success == 0 and section.main.limit == 1.0
 
