@@ -5,7 +5,7 @@ import sys
 from typing import NoReturn
 
 GC_THRESHOLD = 10_000
-"""New objects between two garbage collections. Imports create half a million objects, none of them
+"""Number of new objects between two garbage collections. Imports create half a million objects, none of them
 garbage."""
 
 

@@ -36,7 +36,7 @@ FURNITURE_SIZE = 0.7
 CREASE_ANGLE = np.radians(38)
 """Edges with a larger angle between their faces are drawn sharp [rad]."""
 MAX_SIZE = 60_000
-"""Most points of a cloud, and most faces of a mesh, that are drawn."""
+"""Largest number of points of a cloud, and of faces of a mesh, that are drawn."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,10 +159,10 @@ class Drawable:
 
 def drawables(scene: Scene, moving: Sequence[MovingObstacle] = ()) -> list[Drawable]:
     """All obstacles, the moving ones last."""
-    shapes = [(shape, None) for shape in scene.shapes] + [(one.shape, one) for one in moving]
+    shapes = [(shape, None) for shape in scene.shapes] + [(obstacle.shape, obstacle) for obstacle in moving]
     return [
-        Drawable(shape, _color(shape, OBSTACLES[i % len(OBSTACLES)]), one)
-        for i, (shape, one) in enumerate(shapes)
+        Drawable(shape, _color(shape, OBSTACLES[i % len(OBSTACLES)]), obstacle)
+        for i, (shape, obstacle) in enumerate(shapes)
     ]
 
 

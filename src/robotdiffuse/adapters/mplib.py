@@ -284,11 +284,11 @@ class Planner:
             return np.append(T[:3, 3] - T_world_tip[:3, 3], TILT_WEIGHT * turn)
 
         robot = self.robot
-        found = least_squares(
+        solution = least_squares(
             off, np.clip(start, robot.lower, robot.upper), bounds=(robot.lower, robot.upper)
         )
-        near = np.linalg.norm(found.fun[:3]) < 1e-3
-        return TILT_MARGIN * found.fun[3:] / TILT_WEIGHT if near else np.full(3, np.inf)
+        near = np.linalg.norm(solution.fun[:3]) < 1e-3
+        return TILT_MARGIN * solution.fun[3:] / TILT_WEIGHT if near else np.full(3, np.inf)
 
     def _in_world(self, pose: Any, options: dict[str, Any]) -> ndarray:
         T = matrix(pose)
@@ -350,7 +350,7 @@ def _robot(urdf: str | Path, tip: str, srdf: str | Path, package: str) -> Robot:
         return load_robot(folder)
     packages: dict[str, str | Path] = {}
     if package:
-        packages = {one.name: one for one in Path(package).iterdir() if one.is_dir()}
+        packages = {entry.name: entry for entry in Path(package).iterdir() if entry.is_dir()}
     return add_robot(urdf, tip=tip, srdf=srdf or None, packages=packages, out=folder).robot
 
 

@@ -111,7 +111,11 @@ class MPiNets(LearnedPlanner[MPiNetsSettings]):
                 motion.try_to_arrive(space, settings.near)
             if any(motion.free for motion in motions):
                 break
-            rows = [i for i, one in enumerate(motions) if one.moving and (first or not one.collided)]
+            rows = [
+                i
+                for i, candidate in enumerate(motions)
+                if candidate.moving and (first or not candidate.collided)
+            ]
             if step == settings.steps or not rows or context.remaining <= 0:
                 break
             q = np.stack([motions[i].waypoints[-1] for i in rows])
@@ -153,7 +157,7 @@ class _Motion:
             self.moving = False
 
     def path(self, start_goal: StartGoal) -> Configurations:
-        """Its waypoints, with the exact start, and the exact goal if it was reached."""
+        """The waypoints of the motion, with the exact start, and the exact goal if it was reached."""
         if self.arrived:
             return start_goal.complete(np.stack(self.waypoints))
         return np.concatenate(

@@ -61,7 +61,7 @@ class Surface(NamedTuple):
     radius: float
 
     def reach(self, n: Float[ndarray, "k 3"]) -> Float[ndarray, "m k"]:
-        """The same for each of its elements."""
+        """The largest height of each element of the surface in each direction n."""
         return (self.corners @ n.T).max(axis=1) + self.radius
 
 
@@ -157,9 +157,9 @@ class _Index:
             counts = np.array([len(some) for some in within], int)
             for some in np.array_split(np.arange(len(near_points)), counts.sum() * 9 // MAX_ARRAY_SIZE + 1):
                 if len(some):
-                    of = np.repeat(near_points[some], counts[some])
+                    point_rows = np.repeat(near_points[some], counts[some])
                     triangles = self.surface.corners[rows[np.concatenate(within[some]).astype(int)]]
-                    np.minimum.at(nearest, of, _to_triangles(points[of], triangles))
+                    np.minimum.at(nearest, point_rows, _to_triangles(points[point_rows], triangles))
         return np.minimum(nearest - self.surface.radius, CLEARANCE_CAP)
 
     def near(self, center: Vector, reach: float) -> Surface:
@@ -615,13 +615,13 @@ class MovingProver(Prover):
     ) -> None:
         super().__init__(robot, Scene(), q, off)
         self.times, self.moving = times, tuple(moving)
-        self.obstacles = Obstacles(Scene([one.shape for one in moving]))
+        self.obstacles = Obstacles(Scene([obstacle.shape for obstacle in moving]))
 
     @cached_property
     def claims(self) -> tuple[Claim, ...]:
         """Each moving link against each obstacle."""
         links = [link for link in self.links if self._moved[self._of[link]].any()]
-        return tuple(Claim(link, one.name) for link in links for one in self.moving)
+        return tuple(Claim(link, obstacle.name) for link in links for obstacle in self.moving)
 
     def bounds(self, stretches: Stretches, by_planes: ndarray, planes: list[Plane]) -> Bounds:
         """Bounds of stretches by the spheres; planes are not used."""
@@ -631,23 +631,27 @@ class MovingProver(Prover):
         rows = np.arange(len(self.times))
         begin, at, end = (np.interp(s, rows, self.times) for s in (stretches.start, middle, stretches.stop))
         links = np.array([self._of[claim.link] for claim in self.claims])[stretches.claim]
-        number = {one.name: i for i, one in enumerate(self.moving)}
+        number = {moving_obstacle.name: i for i, moving_obstacle in enumerate(self.moving)}
         obstacle_indices = np.array([number[claim.against] for claim in self.claims])[stretches.claim]
-        speed, bounded, stands = (
+        speed, bounded, reference_pose = (
             np.array(values)[obstacle_indices]
             for values in zip(
-                *((one.top_speed, one.known, one.track[1][0]) for one in self.moving), strict=True
+                *(
+                    (moving_obstacle.top_speed, moving_obstacle.known, moving_obstacle.track[1][0])
+                    for moving_obstacle in self.moving
+                ),
+                strict=True,
             )
         )
-        obstacle = speed * np.where(bounded, np.maximum(at - begin, end - at), np.maximum(end, 0.0))
+        obstacle_motion = speed * np.where(bounded, np.maximum(at - begin, end - at), np.maximum(end, 0.0))
         T = np.array([self.moving[i].pose(time) for i, time in zip(obstacle_indices, at, strict=True)])
 
         def distances(row: ndarray, _: ndarray, centers: ndarray) -> Values:
             local = np.einsum("nji,nj->ni", T[row, :3, :3], centers - T[row, :3, 3])
-            obstacle_distances = self.obstacles.distances(_placed_points(stands[row], local))
+            obstacle_distances = self.obstacles.distances(_placed_points(reference_pose[row], local))
             return obstacle_distances[np.arange(len(row)), obstacle_indices[row]]
 
         posture = np.arange(len(obstacle_indices))
         moved = self._moved[links]
-        clearance, went = self._ball_bounds(links, moved, posture, postures, spans, distances)
-        return Bounds(clearance, went + obstacle)
+        clearance, arm_motion = self._ball_bounds(links, moved, posture, postures, spans, distances)
+        return Bounds(clearance, arm_motion + obstacle_motion)

@@ -188,7 +188,7 @@ def _tolerances(_: str, value: object) -> Tolerances:
     names = {f.name for f in fields(Tolerances)}
     if not isinstance(value, dict) or set(value) != names:
         raise InputError(f"tolerances must have the fields {', '.join(sorted(names))}")
-    return Tolerances(**{name: _number(name, one) for name, one in value.items()})
+    return Tolerances(**{name: _number(name, number) for name, number in value.items()})
 
 
 def _problem(_: str, value: object) -> dict[str, Any] | None:
@@ -231,4 +231,4 @@ FIELDS = {
     "jerks": Field(_named_bounds),
 }
 """Fields of files, in their order, besides the mark and the version."""
-REQUIRED = {one.name for one in fields(MotionProof) if one.default is one.default_factory is MISSING}
+REQUIRED = {f.name for f in fields(MotionProof) if f.default is f.default_factory is MISSING}

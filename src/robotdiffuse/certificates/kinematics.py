@@ -203,11 +203,11 @@ class Cubics(NamedTuple):
     """The cubics from each row to the next; their accelerations are linear in time, and 0 for a path."""
 
     times: Values
-    """When each begins [s]."""
+    """When each cubic begins [s]."""
     steps: Float[ndarray, "m 1"]
-    """Their durations [s]."""
+    """Durations of the steps [s]."""
     positions: Configurations
-    """At the start of each."""
+    """At the start of each cubic."""
     velocities: JointRows
     start: JointRows
     """Acceleration at the start of each."""

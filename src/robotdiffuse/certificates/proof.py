@@ -107,7 +107,7 @@ class MotionProof:
 
 
 HASH_LENGTH = 16
-"""Hexadecimal digits of the hash of a part."""
+"""Number of hexadecimal digits of the hash of a part."""
 LIMITS = ("lower", "upper", "velocity", "acceleration")
 
 

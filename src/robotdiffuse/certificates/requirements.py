@@ -283,11 +283,11 @@ Bound = Float[ndarray, "3 m"]
 intervals."""
 
 
-def _product(one: ndarray, other: ndarray) -> ndarray:
+def _product(factor: ndarray, other: ndarray) -> ndarray:
     """The `Bound` of a product, by the product rule."""
     size, first, second = other
-    twice = one[2] * size + 2 * one[1] * first + one[0] * second
-    return np.stack([one[0] * size, one[1] * size + one[0] * first, twice])
+    twice = factor[2] * size + 2 * factor[1] * first + factor[0] * second
+    return np.stack([factor[0] * size, factor[1] * size + factor[0] * first, twice])
 
 
 def torque_bounds(problem: Problem, motion: Path | Trajectory, samples: Values) -> JointRows:
@@ -444,7 +444,7 @@ def _rotating(length: float, rotation: Bound) -> Bound:
 def _link_inertias(problem: Problem) -> dict[str, list[Inertia]]:
     """The inertias of each link, with the payload's."""
     payload = problem.payload
-    inertias = {link: [of] for link, of in problem.robot.inertias.items()}
+    inertias = {link: [inertia] for link, inertia in problem.robot.inertias.items()}
     assert payload is not None
     if payload.mass > MIN_MASS:
         link = payload.link or problem.robot.tip
@@ -792,9 +792,9 @@ def at_goal(
     of its position tolerances if it has them.
     """
     if isinstance(goal, AnyGoal):
-        return np.any([at_goal(robot, one, q, tolerances, blend) for one in goal.goals], axis=0)
+        return np.any([at_goal(robot, part, q, tolerances, blend) for part in goal.goals], axis=0)
     if isinstance(goal, PosesGoal):
-        return np.all([at_goal(robot, one, q, tolerances, blend) for one in goal.poses], axis=0)
+        return np.all([at_goal(robot, part, q, tolerances, blend) for part in goal.poses], axis=0)
     if isinstance(goal, JointGoal):
         off = goal.positions - q[:, None]
         off = np.where(robot.continuous, np.arctan2(np.sin(off), np.cos(off)), off)

@@ -60,9 +60,9 @@ from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.validation.validator import DEFAULT, VerifySettings, check_motion, verify
 
 MAX_PLANES = 64
-"""Planes between a part and a surface at most; concave surfaces need several."""
+"""Largest number of planes between a part and a surface; concave surfaces need several."""
 NORMAL_DECIMALS = 10
-"""Decimals of normals in files, whose length must be 1 within 1e-9."""
+"""Number of decimals of normals in files, whose length must be 1 within 1e-9."""
 
 Normal = tuple[float, float, float]
 
@@ -70,7 +70,7 @@ Normal = tuple[float, float, float]
 class _Body(NamedTuple):
     geometry: coal.CollisionGeometry
     T: Pose
-    """Its pose in the frame of its link, or in the base frame."""
+    """Pose of the body in the frame of its link, or in the base frame."""
 
 
 class PlaneFinder:
@@ -170,14 +170,16 @@ def _hull(part: Part) -> _Body:
 
 
 CLEARANCE_SHARE = 0.5
-"""The proof shows this share of the clearances that the validator certifies; a larger one needs more
+"""The proof shows this fraction of the clearances that the validator certifies; a larger fraction needs more
 stretches."""
 CHORD_SHARE = 0.05
-"""Straight lines that stand for the cubics displace no point by more than this share of the clearance."""
+"""The straight lines that replace the cubics displace no point by more than this fraction of the
+clearance."""
 MAX_SPLIT = 8
 """A stretch is split into at most this many parts at a time."""
 PLANES_BELOW = 0.02
-"""Sphere clearance below which planes are tried: the spheres stick out by about as much [m]."""
+"""If the clearance of the spheres is below this, planes are tried: the spheres stick out by about as much
+[m]."""
 PLANES_DISPLACEMENT = 0.1
 """Largest displacement of stretches for which planes are tried [m]."""
 ROUNDING_RESERVE = 2e-6
@@ -185,7 +187,8 @@ ROUNDING_RESERVE = 2e-6
 MAX_STRETCHES = 200_000
 PLACE_DECIMALS = 7
 MAX_HALVINGS = 20
-"""Halvings of the way between two configurations at most, to prove path constraints or torques there."""
+"""Largest number of halvings of the step between two configurations, to prove path constraints or torques
+there."""
 
 
 class NotValidError(InputError):

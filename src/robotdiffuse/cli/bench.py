@@ -54,17 +54,19 @@ def _bench_settings(arguments: Namespace) -> list[BenchSettings]:
     """The settings of each pass: of the preset, or one from the options."""
     if arguments.cluster is not None and arguments.workers is not None:
         raise InputError("--workers sets the processes on this machine; --cluster always uses all its cores")
-    given: dict[str, Any] = {"workers": HALF_OF_CORES} | chosen(arguments, BenchSettings.__dataclass_fields__)
-    given["out"] = Path(arguments.out)
+    changes: dict[str, Any] = {"workers": HALF_OF_CORES} | chosen(
+        arguments, BenchSettings.__dataclass_fields__
+    )
+    changes["out"] = Path(arguments.out)
     if arguments.preset is not None:
         fixed = ("planners", "time_limit", "seeds", "equal_time")
-        options = [f"--{name.replace('_', '-')}" for name in fixed if given.pop(name, None)]
+        options = [f"--{name.replace('_', '-')}" for name in fixed if changes.pop(name, None)]
         if options:
             raise InputError(f"--preset cannot be combined with {', '.join(options)}: the preset fixes these")
-        return preset_settings(arguments.preset, **given)
+        return preset_settings(arguments.preset, **changes)
     if arguments.planners is None or not arguments.problems:
         raise InputError("name --planners and --problems, or a --preset")
-    return [BenchSettings(**given)]
+    return [BenchSettings(**changes)]
 
 
 def run_report(arguments: Namespace) -> None:
@@ -114,7 +116,7 @@ def run_confirm(arguments: Namespace) -> int:
 
 
 FIGURE_PROBLEMS = 60
-"""Most problems of the plot of success against denoising steps."""
+"""Largest number of problems for the plot of success over denoising steps."""
 FIGURE_AZIMUTH = -0.9
 """Azimuth of the camera of figure 1, the same for all noise levels [rad]."""
 
@@ -132,10 +134,10 @@ def _write(page: Report, file: Path) -> int:
 
 def _table1(arguments: Namespace) -> tuple[paper.Table1Settings, Bench]:
     """The settings of table 1, and its calls, of which the missing ones are made."""
-    given: dict[str, Any] = {"workers": HALF_OF_CORES}
-    given |= chosen(arguments, paper.Table1Settings.__dataclass_fields__)
-    given["out"] = Path(arguments.out)
-    settings = paper.Table1Settings(**given)
+    changes: dict[str, Any] = {"workers": HALF_OF_CORES}
+    changes |= chosen(arguments, paper.Table1Settings.__dataclass_fields__)
+    changes["out"] = Path(arguments.out)
+    settings = paper.Table1Settings(**changes)
     with progress("calls") as update:
         return settings, paper.run_table1(settings, _say, update)
 

@@ -47,7 +47,7 @@ class Command:
     """MODULE:FUNCTION of `robotdiffuse.cli`, which takes the arguments and returns the exit status, or None
     for 0; or the commands below it."""
     rows: Rows = ()
-    """Its options, and groups of them."""
+    """The options of the command, and groups of options."""
     below: str = "actions"
     """What the help calls the commands below it."""
 
@@ -61,8 +61,8 @@ class Command:
                 continue
             title, rows = row
             group = parser.add_argument_group(title) if title else parser.add_mutually_exclusive_group()
-            for one in rows:
-                option(group, *one)
+            for options in rows:
+                option(group, *options)
         if isinstance(self.run, tuple):
             actions = parser.add_subparsers(title=self.below, metavar=self.below[:-1].upper(), required=True)
             for command in self.run:

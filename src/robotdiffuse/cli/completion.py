@@ -13,13 +13,15 @@ from robotdiffuse.problems.fields import problem_schema
 
 
 def run_planner_list(arguments: Namespace) -> None:
-    rows = [(name, one.kind, one.description) for name, one in PLANNERS.load_installed().items()]
+    rows = [(name, entry.kind, entry.description) for name, entry in PLANNERS.load_installed().items()]
     show(Table.of("", ("planner", Column("kind", left=True), Column("description", left=True)), rows))
 
 
 def run_planner_info(arguments: Namespace) -> None:
     settings = planner_settings(arguments.planner, ())
-    rows = [(one.name, one.value, one.rule, one.description) for one in settings.describe()]
+    rows = [
+        (setting.name, setting.value, setting.rule, setting.description) for setting in settings.describe()
+    ]
     columns = ("setting", *(Column(name, left=True) for name in ("default", "values", "description")))
     show(Table.of(f"{arguments.planner}: {PLANNERS[arguments.planner].description}", columns, rows))
 

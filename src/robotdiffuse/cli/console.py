@@ -102,11 +102,11 @@ def progress(what: str) -> Iterator[Callable[[int, int], None]]:
         yield update
 
 
-def clearances(motion: "PlanResult | Report | Certificate", asked: float | None = None) -> str:
+def clearances(motion: "PlanResult | Report | Certificate", target: float | None = None) -> str:
     """The certified clearances to the scene, beside the requested one [m], and between links."""
     if motion.scene_clearance is None or motion.self_clearance is None:
         return _certified(getattr(motion, "min_clearance", None) or 0.0)
-    requested = "" if asked is None else f" (asked: {1e3 * asked:g} mm)"
+    requested = "" if target is None else f" (asked: {1e3 * target:g} mm)"
     between = f", {_certified(motion.self_clearance)} between links"
     return f"{_certified(motion.scene_clearance)} to the scene{requested}{between}"
 
@@ -117,7 +117,7 @@ def _certified(clearance: float) -> str:
     return f"> {CLEARANCE_CAP:g} m" if capped else f"at least {1e3 * clearance + 0.0:.1f} mm"
 
 
-def print_result(result: "PlanResult", asked: float | None = None) -> None:
+def print_result(result: "PlanResult", requested: float | None = None) -> None:
     """Print the result of plan() as a table; without a plan, its status and reason.
 
     asked: the requested clearance, or the default one [m]; None: the planner keeps none.
@@ -142,7 +142,7 @@ def print_result(result: "PlanResult", asked: float | None = None) -> None:
         low, high = (", ".join(f"{at:.2f}" for at in corner) for corner in result.unknown_region)
         rows.append(("crosses unknown", f"from ({low}) to ({high}) m"))
     if result.min_clearance is not None:
-        rows.append(("clearance", f"certified {clearances(result, asked)}"))
+        rows.append(("clearance", f"certified {clearances(result, requested)}"))
     if result.trajectory is not None:
         rows.append(("motion", f"{result.trajectory.duration:.2f} s, {len(result.trajectory.times)} rows"))
     rows.append(("seed", str(result.seed)))

@@ -88,8 +88,8 @@ def record(explorer: RecordedExplorer, file: Path) -> None:
     from robotdiffuse.interop.depth_recording import StampedView, write_depth_views
 
     views: dict[str, list[StampedView]] = {}
-    for one in explorer.views:
-        views.setdefault("beside" if one.camera is None else "wrist", []).append(
-            StampedView(one.time, one.view)
+    for taken_view in explorer.views:
+        views.setdefault("beside" if taken_view.camera is None else "wrist", []).append(
+            StampedView(taken_view.time, taken_view.view)
         )
     write_depth_views(explorer.robot, views, file)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from robotdiffuse.robots.fitting.preparation import AddReport
 
 MAX_PAIRS = 8
-"""Most pairs of links in the report of `robot add`."""
+"""Largest number of pairs of links in the report of `robot add`."""
 
 
 def run_list(arguments: Namespace) -> None:

@@ -128,22 +128,22 @@ def _print_report(figures: dict[str, float], out: str) -> None:
 
 
 MOTIONS = 60_000
-"""Motions to generate: about twenty minutes on two cores. With rotated copies they are 360,000, and the
-training sees each seven times."""
+"""Number of motions to generate: about twenty minutes on two cores. With rotated copies they are 360,000, and
+the training sees each seven times."""
 SAMPLES = 2_400_000
-"""Training samples, as for the bundled Panda weights: one to two hours on one core."""
+"""Number of training samples, as for the bundled Panda weights: one to two hours on one core."""
 MIX = {"rop": 0.2, "rop_dense": 0.3, "shelf": 0.2, "crate": 0.15, "table": 0.15}
 """Fractions of the problem families: more furniture than for the Panda's weights, where a network helps
 most."""
 WAYPOINTS = 96
-"""Waypoints of a motion, twice as many as the network's."""
+"""Number of waypoints of a motion, twice as many as the network's."""
 SAFETY_DISTANCE = 0.05
 """Distance of the motions to obstacles for an arm of the Panda's reach [m]; scaled with the reach."""
 BYTES_PER_MOTION = 8_000
 """Disk space reserved for each motion, including scene codes and rotated copies; about twice what it
 needs."""
 BYTES_PER_TRAINING = 100_000_000
-"""Disk space for checkpoints and weights."""
+"""Disk space reserved for checkpoints and weights."""
 
 
 def data_settings(source: str, robot: Robot, motions: int | None, seed: int | None) -> GenerationSettings:

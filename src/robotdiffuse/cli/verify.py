@@ -129,7 +129,7 @@ def _read(
 HOLDS = 0
 FAILS = 1
 MAX_CHANGES = 4
-"""Differences from the bundled robot in a line at most."""
+"""Largest number of differences from the bundled robot in a line."""
 
 
 def run_check(arguments: Namespace) -> int:

@@ -74,8 +74,8 @@ def _motion(result: PlanResult) -> PathOfJoints | Trajectory:
 def _shown(problem: Problem) -> tuple[Robot, Scene]:
     """The robot and the scene of a problem, with predicted obstacles if there are any."""
     if problem.views and policy_for(problem)[0] == PREDICTED:
-        seen = Scene([*problem.scene.shapes, predicted_obstacles(problem)])
-        problem = replace(problem, scene=seen, views=())
+        known_and_predicted = Scene([*problem.scene.shapes, predicted_obstacles(problem)])
+        problem = replace(problem, scene=known_and_predicted, views=())
     return problem.standing()
 
 
@@ -125,7 +125,7 @@ def _read_several(files: list[str]) -> tuple[Problem, dict[str, PlanResult]]:
             or other_problem.robot != problem.robot
         ):
             raise InputError(f"{name} is of another robot or scene than {names[0]}; results must share both")
-    return problem, dict(zip(names, (result, *(one for one, _ in further_results)), strict=True))
+    return problem, dict(zip(names, (result, *(solution for solution, _ in further_results)), strict=True))
 
 
 def run_simulate(arguments: Namespace) -> int:
@@ -137,7 +137,7 @@ def run_simulate(arguments: Namespace) -> int:
         raise InputError(f"{arguments.result} holds a path without times; a replay needs a trajectory")
     robot, scene = problem.standing()
     executed = replay(robot, scene, result.trajectory, moving=problem.moving_in_world)
-    for name in (one.name for one in problem.moving if not one.known):
+    for name in (entry.name for entry in problem.moving if not entry.known):
         print(f"note: the motion of {name} is not known; it stands still here")
     rms = float((executed.tip_errors**2).mean() ** 0.5)
     joints = zip(executed.joint_names, executed.max_errors, executed.rms_errors, strict=True)
@@ -152,12 +152,12 @@ def run_simulate(arguments: Namespace) -> int:
     if not executed.free:
         contacts = [
             (
-                one.link,
-                one.other,
-                f"{one.time:.2f} s",
-                f"{1e3 * one.depth:.1f} mm" if one.depth > 0 else "none: closer than 2 mm",
+                entry.link,
+                entry.other,
+                f"{entry.time:.2f} s",
+                f"{1e3 * entry.depth:.1f} mm" if entry.depth > 0 else "none: closer than 2 mm",
             )
-            for one in executed.contacts
+            for entry in executed.contacts
         ]
         show(Table.of("", ("link", Column("touches", left=True), "at", "depth"), contacts))
     rates = np.gradient(executed.positions, executed.times, axis=0)

@@ -14,7 +14,7 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
 MAX_CONFIGURATIONS = 5000
-"""Motion certificates at most in a search for contacts."""
+"""Largest number of motion certificates in a search for contacts."""
 
 
 def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: float) -> list[Contact]:
@@ -39,8 +39,8 @@ def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: fl
         # converts the place in `rest`, a row plus a share, to a place on the whole motion
         row = int(first.at)
         part = first.at - int(first.at)
-        ways = np.concatenate([[at], motion.travel[low + 1 :]])
-        at = float(ways[row] + part * (ways[min(row + 1, len(ways) - 1)] - ways[row]))
+        travel = np.concatenate([[at], motion.travel[low + 1 :]])
+        at = float(travel[row] + part * (travel[min(row + 1, len(travel) - 1)] - travel[row]))
         at = _follow(exact, motion, at, contact, first, contacts_in_order)
         if at >= end:
             break
@@ -50,7 +50,7 @@ def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: fl
 def _follow(
     exact: ExactCollision, motion: Motion, at: float, contact: float, first: Contact, found: list[Contact]
 ) -> float:
-    """Adds the contacts from the given one until the arm is free to `found`; returns the place where it is
+    """Appends to `found` the contacts from the given one until the arm is free; returns the place where it is
     free."""
     checks = {(check.link, check.other): check for check in checks_of(exact.robot)}
     open_ones: dict[tuple[str, str | None, str], int] = {}

@@ -20,7 +20,8 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated
 
 SURFACES_BELOW = 0.002
-"""Distance of the convex parts of two grazing links below which their surfaces decide [m]."""
+"""If the convex parts of two grazing links are nearer than this, their surfaces decide whether they collide
+[m]."""
 
 
 class Check(NamedTuple):
@@ -40,7 +41,7 @@ class Part(NamedTuple):
     frame: int
     vertices: Float[ndarray, "v 3"]
     faces: Int[ndarray, "f 3"]
-    """Empty for a ball, which has one vertex."""
+    """Triangles of the hull; empty for a ball, which has one vertex."""
     rounding: float
     center: Float[ndarray, "3"]
     """Center of a ball around the part."""
@@ -49,7 +50,7 @@ class Part(NamedTuple):
 
 class Solid(NamedTuple):
     """A scene shape as the Minkowski sum of a box, a disc around its z axis and a ball. With `bounds`, the
-    sum only bounds a surface or point cloud."""
+    sum only encloses a surface or point cloud."""
 
     shape: Shape
     T_base_box: Float[ndarray, "4 4"]

@@ -40,13 +40,14 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud, Sphere, Triangulated
 
 CHUNK_SIZE = 8192
-"""Configurations that `collides` processes at once; bounds its memory."""
+"""Number of configurations that `collides` processes at once, which limits its memory."""
 CLEAR_DISTANCE = 1e-6
 """`collides` does not compute distances beyond this [m]."""
 RESTING_DEPTH = 0.01
-"""Depth of contacts of held objects up to which messages say how to allow them [m]."""
+"""If a held object is no deeper than this in an obstacle, the message says how to allow the contact [m]."""
 MAX_CONTACTS = 200
-"""Triangles or points of one obstacle at which the depth of a link is computed; 1,000 take 5 ms."""
+"""Largest number of triangles or points of one obstacle at which the depth of a link is computed; 1,000 take
+5 ms."""
 
 
 class Distance(NamedTuple):
@@ -161,10 +162,10 @@ class _Candidates:
 
 
 class ExactCollision:
-    """Signed distances and collisions of a robot's exact meshes with a scene and with each other.
+    """Signed distances and collisions of a robot's exact meshes with a scene and among the links.
 
-    Links that no planned joint moves are checked only against moving links. Threads may share one: a call
-    changes nothing of it.
+    Links that no planned joint moves are checked only against moving links. Threads may share an object of
+    this class, since calls do not change it.
     """
 
     checks: tuple[Check, ...]
@@ -210,7 +211,9 @@ class ExactCollision:
                 surface_pairs(self.robot).get(check),
             )
         obstacle_indices = [
-            i for i, one in enumerate(self._obstacles) if not self.scene.may_touch(check.link, one.name)
+            i
+            for i, obstacle in enumerate(self._obstacles)
+            if not self.scene.may_touch(check.link, obstacle.name)
         ]
         if not obstacle_indices:
             return _Candidates(firsts, (), lambda frames: np.zeros((len(frames), 0)))

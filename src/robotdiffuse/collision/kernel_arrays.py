@@ -125,7 +125,9 @@ def compile_robot(robot: Robot) -> RobotArrays:
         spheres=np.concatenate(spheres).astype(np.float32) if spheres else np.zeros((0, 4), np.float32),
         first=np.cumsum([0] + [len(s) for s in spheres]).astype(np.int32),
         rows=np.concatenate([by_sixteen(row, row[-1:]) for row in [NO_SPHERES, *rows]]),
-        row_bounds=np.array([row for of in of_links for row in of.row_bounds], np.float32).reshape(-1, 4),
+        row_bounds=np.array(
+            [row for link_rows in of_links for row in link_rows.row_bounds], np.float32
+        ).reshape(-1, 4),
         row_sizes=np.array([len(row) for row in rows], np.int64),
         first_row=np.cumsum([0] + [len(of_group) for of_group in clusters]).astype(np.int32),
         frame=np.array([robot.link_frame(link) for link in groups], np.int32),

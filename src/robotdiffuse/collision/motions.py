@@ -87,8 +87,8 @@ def search_space(
 
 
 def finer_resolution(resolution: float) -> float:
-    """For after a path that the validator refused: it found contact between two checks, so look twice as
-    closely [m]."""
+    """The resolution for the search after the validator refused a path, because of a contact between two
+    checks: half as large [m]."""
     return max(resolution / 2, FINEST_RESOLUTION)
 
 
@@ -117,11 +117,13 @@ class Sweep(NamedTuple):
     """Lower bound on all clearances to the scene along the motion [m], at most 1 m; 0 if there is a
     contact."""
     self_clearance: float
-    """The same between links."""
+    """Lower bound on all clearances between links along the motion [m], at most 1 m; 0 if there is a
+    contact."""
 
 
 class ContinuousCollision:
-    """Certifies whole motions of a robot in a scene. Threads may share one: a call changes nothing of it."""
+    """Certifies whole motions of a robot in a scene. Threads may share an object of this class, since calls
+    do not change it."""
 
     def __init__(self, robot: Robot, scene: Scene, contact: float, tightness: float) -> None:
         """Meshes nearer than `contact` [m] count as touching. Pieces are split until each certified clearance
@@ -270,12 +272,12 @@ def _checks(robot: Robot) -> Checks:
         low = robot.link_frame(nearer)
         high = robot.link_frame(farther)
         shared = robot.moved_by[low] & robot.moved_by[high]
-        for one, joints in (
+        for member, joints in (
             (nearer, robot.moved_by[low] & ~shared),
             (farther, robot.moved_by[high] & ~shared),
         ):
             if joints.any():
-                of_checks[k, joints] = radii[links.index(one), joints]
+                of_checks[k, joints] = radii[links.index(member), joints]
         base.append(low)
         common.append(int(np.flatnonzero(shared).max(initial=-1)) + 1)
         second.append(int(np.flatnonzero(robot.moved_by[high] & ~shared)[0]) if common[-1] != low else 0)

@@ -64,8 +64,8 @@ class TimedSweep(NamedTuple):
 
 
 class MovingCollision:
-    """Certifies timed motions of a robot among moving obstacles. Threads may share one: a call changes
-    nothing of it."""
+    """Certifies timed motions of a robot among moving obstacles. Threads may share an object of this class,
+    since calls do not change it."""
 
     def __init__(
         self, robot: Robot, moving: Sequence[MovingObstacle], contact: float, tightness: float
@@ -153,10 +153,10 @@ class MovingCollision:
         return distance - self.tracks.growth[o] * max(time, 0.0)
 
     def _lost(self, link: int, o: int, times: ndarray, q: ndarray, start: float, stop: float) -> float:
-        """Upper bound on how far the link's and the obstacle's points move from the middle of an interval to
-        its ends, in sum [m]."""
-        ways = kernel.cumulative_motion(q)
-        a, m, b = (interpolated(time, times, ways) for time in (start, (start + stop) / 2, stop))
+        """Upper bound on the sum of how far points of the link and of the obstacle move from the middle of an
+        interval to either end [m]."""
+        travel = kernel.cumulative_motion(q)
+        a, m, b = (interpolated(time, times, travel) for time in (start, (start + stop) / 2, stop))
         speed = kernel.speed_between(self.tracks, o, start, stop) + self.tracks.growth[o]
         return float(self.links.motion_radii[link] @ np.maximum(m - a, b - m)) + speed * (stop - start) / 2
 

@@ -16,8 +16,8 @@ sphere."""
 THINNING = 0.5
 """Edge of the thinning voxels of a point cloud, as a multiple of its point radius."""
 MAX_POINTS = 400_000
-"""Spheres of a mesh obstacle at most, about; larger meshes are divided more coarsely, or their pieces
-merged."""
+"""Approximate largest number of spheres of a mesh obstacle; larger meshes are divided more coarsely, or their
+pieces merged."""
 # Edge of the voxels by which spheres of surfaces that links may touch are first joined [m], and the number
 # that is left at most: these spheres are not in the grid, but checked one by one.
 JOIN_VOXEL = 0.004
@@ -25,9 +25,9 @@ MAX_SOLIDS = 1000
 EXACT_RANGE = 0.1
 """Clearances to points are exact up to this [m], and lower bounds beyond."""
 VOXELS_PER_RANGE = 10
-"""Voxels in the range of distances that the grid knows."""
+"""Number of voxels in the range of distances that the grid knows."""
 MAX_VOXELS = 1e6
-"""A grid of 4 MB fits a processor's cache."""
+"""Largest number of voxels of a grid: 4 MB, which fits a processor's cache."""
 NO_SPHERES = np.zeros((0, 4))
 
 

@@ -18,11 +18,12 @@ from robotdiffuse.collision.kernels.lane_collision import TABLE_HEADER, TABLE_SI
 from robotdiffuse.robots.robot import LinkPairTable
 
 CELLS_PER_JOINT = TABLE_SIDE - 2
-"""Cells along each joint's range; a ring of cells around them stands for values beyond the range."""
+"""Number of cells along each joint's range; a ring of cells around them stands for values beyond the
+range."""
 MAX_PAIRS = 24
-"""Pairs per table at most: each has a bit of an integer that a float32 represents exactly."""
+"""Largest number of pairs per table: each has a bit of an integer that a float32 represents exactly."""
 ROUNDING_SLACK = 1e-5
-"""More than the rounding error of a distance [m]."""
+"""Upper bound on the rounding error of a distance [m]."""
 
 
 def no_tables() -> Float32[ndarray, "0 width"]:

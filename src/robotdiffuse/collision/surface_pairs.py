@@ -52,7 +52,7 @@ class _Body:
     def _crossed(self, point: Float[ndarray, "3"], ray: Float[ndarray, "3"]) -> Int[ndarray, "k"]:
         """Component of every triangle that a ray from a point crosses."""
         a, b, c = np.moveaxis(self.triangles - point, 1, 0)
-        sides = [np.cross(one, edge_end) @ ray for one, edge_end in ((a, b), (b, c), (c, a))]
+        sides = [np.cross(edge_start, edge_end) @ ray for edge_start, edge_end in ((a, b), (b, c), (c, a))]
         through = np.all([side >= 0 for side in sides], axis=0) | np.all([side < 0 for side in sides], axis=0)
         normal = np.cross(b - a, c - a)
         with np.errstate(divide="ignore", invalid="ignore"):

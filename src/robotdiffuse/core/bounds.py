@@ -20,7 +20,8 @@ MAX_RATE = 1e6
 MAX_DURATION = 1e6
 """Longest motion in files and requests [s]."""
 RIGID_SLACK = 1e-4
-"""Largest deviation of any entry: of the rotation from orthonormal, of the last row from 0 0 0 1."""
+"""Largest allowed error of any entry of a pose: of R R^T from the identity, and of the last row from 0 0 0
+1."""
 IDENTITY = np.eye(4)
 IDENTITY.setflags(write=False)
 
@@ -31,7 +32,7 @@ class Value:
     """Base of the dataclasses that are values: the arrays in their fields are read-only.
 
     Caches use the object's identity as the key, so its arrays must not change. An array that can be written
-    to is copied, so that whoever gave it keeps it as it was. Subclasses with a `__post_init__` of their own
+    to is copied, so that the caller's array stays writable. Subclasses with a `__post_init__` of their own
     call this one at its end.
     """
 
@@ -44,7 +45,7 @@ class Value:
         return one_line(self)
 
     def __dir__(self) -> list[str]:
-        """Without what is prepared for the value and kept in its `__dict__` under a module's name."""
+        """The attributes without what modules cache in the value's `__dict__` under their names."""
         return [name for name in super().__dir__() if "." not in name]
 
     def __post_init__(self) -> None:
@@ -69,18 +70,18 @@ def read_only(value: T) -> T:
         frozen.setflags(write=False)
         return frozen  # type: ignore[return-value]
     if isinstance(value, tuple):
-        frozen = [read_only(one) for one in value]
+        frozen = [read_only(entry) for entry in value]
         if all(a is b for a, b in zip(frozen, value, strict=True)):
             return value
         return value._make(frozen) if hasattr(value, "_make") else tuple(frozen)  # type: ignore
     if isinstance(value, dict):
-        frozen = {key: read_only(one) for key, one in value.items()}
+        frozen = {key: read_only(entry) for key, entry in value.items()}
         return value if all(frozen[key] is value[key] for key in value) else frozen  # type: ignore[return-value]
     return value
 
 
 def for_kernels(array: ndarray, dtype: type = np.float64) -> ndarray:
-    """The array as compiled code takes it, contiguous and not read-only: to Numba a read-only one is of
+    """The array as compiled code takes it, contiguous and not read-only: for Numba a read-only array has
     another type, for which it would compile everything once more."""
     array = np.ascontiguousarray(array, dtype)
     return array if array.flags.writeable else array.copy()

@@ -20,7 +20,7 @@ class OutOfTimeError(Exception):
     def __init__(self, step: str, what: str = PREPARING) -> None:
         super().__init__(step)
         self.what = what
-        """One of PREPARING and TIMING, which the step is part of."""
+        """what: PREPARING or TIMING, the work that the step is part of."""
 
 
 @contextmanager

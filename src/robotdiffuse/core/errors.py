@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 MAX_QUOTE = 60
-"""Longest quote of a given value in a message [characters]."""
+"""Longest quote of a value in a message [characters]."""
 MAX_WORD = 300
 """Longest word of a message, such as a file name [characters]."""
 MAX_NAMES = 100
@@ -74,7 +74,8 @@ def needs(package: str, extra: str) -> Iterator[None]:
 
 
 def check_type(what: str, value: object, kind: type | tuple[type, ...], wanted: str) -> None:
-    """Raises InputError unless the value is of one of these types; `wanted` says what it must be."""
+    """Raises InputError unless the value is of one of these types; `wanted` says in the message what the
+    value must be."""
     if not isinstance(value, kind):
         raise InputError(f"{what} is {shown(value)}; it must be {wanted}")
 
@@ -84,7 +85,7 @@ def check_list(
 ) -> None:
     """Raises InputError unless the value is a list of at least `least` instances of these types; `wanted`
     names them."""
-    of_kind = isinstance(value, list | tuple) and all(isinstance(one, kinds) for one in value)
+    of_kind = isinstance(value, list | tuple) and all(isinstance(entry, kinds) for entry in value)
     if not of_kind or len(value) < least:
         raise InputError(f"{what} is {shown(value)}; it must be a list of {wanted}")
 
@@ -143,5 +144,6 @@ def suggestion(name: object, known: Iterable[str]) -> str:
 
 
 def _printable(text: str) -> str:
-    """The text without terminal codes and lone surrogates, which cannot be printed."""
+    """The text with U+FFFD in place of every character, except white space, that cannot be printed, such as
+    escape characters and lone surrogates."""
     return "".join(c if c.isprintable() or c.isspace() else "\N{REPLACEMENT CHARACTER}" for c in text)

@@ -33,9 +33,9 @@ MAX_DEPTH = 64
 MAX_SHOWN_NAME = 300
 """Longest file name that a message shows in full [characters]."""
 MAX_VALUES = 2_000_000
-"""Most values in a YAML file after its aliases are expanded."""
+"""Largest number of values in a YAML file after its aliases are expanded."""
 MAX_DIGITS = 30
-"""Most digits of an integer."""
+"""Largest number of digits of an integer."""
 
 _STRING = re.compile(r'"(?:[^"\\]|\\.)*"?')
 _closed: ContextVar[bool] = ContextVar("closed", default=False)

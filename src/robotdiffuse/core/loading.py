@@ -1,5 +1,5 @@
-"""Time that loading takes: compiling code, reading it from the cache, importing, and building what a robot
-needs once. No call of a planner counts it as its time."""
+"""Loading time: compiling code, reading compiled code from the cache, importing modules, and building what is
+built once per robot. It is not counted in the time of a planning call."""
 
 import threading
 import time
@@ -12,11 +12,11 @@ class _Clock(threading.local):
 
     loading = compiling = began = 0.0
     depth = 0
-    """Number of blocks of `loading` around the thread's present step."""
+    """Number of blocks of `loading` that the thread is in."""
     compiles = False
     """Whether code was compiled in the outermost of these blocks."""
     noted = 0.0
-    """What `compile_note` has reported of `compiling`."""
+    """The value of `compiling` at the last `compile_note` [s]."""
 
 
 _clock = _Clock()
@@ -65,12 +65,13 @@ def compiles(name: str) -> None:
 
 
 def loading_seconds() -> float:
-    """Time that this thread has spent on loading so far [s], up to now within a block of `loading`."""
+    """Time that this thread has spent on loading so far [s], including the time in a block that has not ended
+    yet."""
     return _clock.loading + (time.perf_counter() - _clock.began if _clock.depth else 0.0)
 
 
 def compile_seconds() -> float:
-    """The part of it in which code was compiled [s]: type inference, LLVM and writing to the cache."""
+    """Time that this thread has spent in outermost blocks of `loading` in which code was compiled [s]."""
     return _clock.compiling
 
 
@@ -79,4 +80,6 @@ def compile_note() -> str:
     if _clock.compiling == _clock.noted:
         return ""
     _clock.noted = _clock.compiling
-    return f"compiled for {_clock.compiling:.1f} s, once on this machine, which does not count as time"
+    return (
+        f"compiled for {_clock.compiling:.1f} s, once on this machine; this is not part of the planning time"
+    )

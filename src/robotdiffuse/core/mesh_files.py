@@ -38,15 +38,17 @@ NO_GEOMETRY = frozenset(
     )
     for what in things
 )
-"""Elements of Collada without geometry. They are removed: trimesh drops the geometry beside a damaged one."""
+"""Elements of Collada that contain no geometry. They are removed before reading, since trimesh also drops
+geometry if one of them is damaged."""
 BYTES_PER_USE = 30_000
-"""Memory that a use of a part of a geometry in a Collada scene counts as, in addition to its indices
-[bytes]."""
+"""Memory that each use of a part of a geometry in a Collada scene is assumed to take, in addition to its
+indices [bytes]."""
 MAX_ACCESSED = 20_000_000
 """Maximum number of elements of all accessors of a glTF file: those without a buffer take no bytes in the
 file."""
 
-# trimesh logs a traceback of each error that it raises; without a handler that goes to standard error
+# trimesh logs a traceback of each error that it raises; without a handler, logging prints it on standard
+# error
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 

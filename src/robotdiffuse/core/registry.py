@@ -23,7 +23,7 @@ class Entry:
     location: str
     """module:name of a class, function or value; imported on first use."""
     description: str
-    """What it is or does, in one line."""
+    """What the entry is or does, in one line."""
     settings: str = ""
     """Name of its settings class in the same module, or module:name; empty for none."""
     kind: str = ""

@@ -41,7 +41,8 @@ class PlanResult:
 
     status: Status
     reason: str
-    """A sentence to act on; for SOLVED, where the solution came from."""
+    """A sentence that says why there is no motion and what to do; for SOLVED, which part of the planner found
+    it."""
     planner: str
     robot: str
     planning_time: float
@@ -52,7 +53,8 @@ class PlanResult:
     path: Path | Any = None
     trajectory: Trajectory | Any = None
     min_clearance: float | Any = None
-    """Lower bound on all distances along the motion [m]: the smaller of the two below."""
+    """Lower bound on all distances along the motion [m]: the smaller of `scene_clearance` and
+    `self_clearance`."""
     scene_clearance: float | Any = None
     """Lower bound on the distance to obstacles [m]."""
     self_clearance: float | Any = None
@@ -80,8 +82,8 @@ class PlanResult:
     """Lower and upper corner, in the base frame [m], of a box around the crossed unknown space that is most
     likely occupied; None if the motion crosses none."""
     fraction: float | None = None
-    """Problems with a Cartesian line: how much of it can be followed from the start, 1 with a motion;
-    `reason` says what ends it there."""
+    """Problems with a Cartesian line: what fraction of the line can be followed from the start, 1 if there is
+    a motion; `reason` says what stops it there."""
     corner_deviations: tuple[float, ...] | None = field(default=None, repr=False)
     """How far the motion may leave each waypoint of the path [rad, joint-space L2]; None: the default of
     timing. Files do not hold it."""
@@ -89,7 +91,7 @@ class PlanResult:
     """Search trees from the start and from the goals, when the shortest path was found or time ran out. Only
     if the planner's setting `keep_trees` is true; files do not hold them."""
     problem: Any = field(default=None, repr=False)
-    """The `Problem`, for files and `rd.show`; None in results read from files."""
+    """The `Problem`, which `save` and `rd.show` use; None in results read from files."""
 
     def __repr__(self) -> str:
         planned = f"{self.planner} in {1e3 * self.planning_time:.3g} ms"
@@ -237,7 +239,7 @@ READERS: dict[str, Callable[[str, Any], Any]] = {
     "fraction": _number,
 }
 """Fields that files hold as they are, in this order, and what reads them."""
-NONE_ALLOWED = {"progress"} | {one.name for one in fields(PlanResult) if one.default is None}
+NONE_ALLOWED = {"progress"} | {f.name for f in fields(PlanResult) if f.default is None}
 
 
 def _record(result: PlanResult, problem: dict[str, Any] | None) -> dict[str, Any]:
@@ -260,7 +262,7 @@ def _record(result: PlanResult, problem: dict[str, Any] | None) -> dict[str, Any
 
 
 def _plain(value: Any) -> Any:
-    return [_plain(one) for one in value] if isinstance(value, tuple) else value
+    return [_plain(entry) for entry in value] if isinstance(value, tuple) else value
 
 
 def _result(record: dict[str, Any]) -> PlanResult:

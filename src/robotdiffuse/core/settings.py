@@ -94,7 +94,7 @@ class Filled:
 class SettingsOf:
     """Settings of the registry entry that another field names, such as `denoiser_settings` for `denoiser`.
 
-    None if that field holds no name of the registry, e.g. a folder.
+    The value is None if the other field does not hold a name of the registry but, for example, a folder.
     """
 
     field: str

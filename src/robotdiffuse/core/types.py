@@ -27,7 +27,7 @@ Configurations = Float[ndarray, "_ dof"]
 JointValues = Float[ndarray, "dof"]
 """A number for each joint, such as its limit, velocity or effort."""
 JointRows = Float[ndarray, "_ dof"]
-"""The same in rows, such as velocities along a motion."""
+"""Numbers for each joint in rows, such as velocities along a motion."""
 Values = Float[ndarray, "_"]
 """A number for each of many things, such as times, places and distances."""
 Points = Float[ndarray, "_ 3"]
@@ -70,16 +70,17 @@ else:
 ROWS = ("positions", "velocities", "accelerations")
 """Arrays of a trajectory with a row for each time."""
 REST = 1e-3
-"""Speed, as a share of a motion's greatest one, at which the arm rests."""
+"""The arm counts as resting if its speed is at most this fraction of the greatest speed of the motion."""
 MAX_SAMPLE_RATE = 1e5
 """Largest rate at which trajectories are resampled [Hz]."""
 ACCELERATION_GAIN = 1.005
 """Factor by which resampling may raise the greatest acceleration of a joint."""
 ACCELERATION_SHARE = 0.25
-"""Share of the greatest acceleration of a joint by which those of resampled rows may differ from those of the
-cubics between them."""
+"""The accelerations of resampled rows may differ from those of the cubics between them by this fraction of
+the joint's greatest acceleration."""
 TIME_TOLERANCE = 1e-9
-"""Times this far outside of a trajectory [s] are taken as its ends; rows are no closer when resampled."""
+"""Times outside of a trajectory by at most this count as its ends; resampled rows are at least this far apart
+[s]."""
 
 
 class Status(Enum):
@@ -335,7 +336,8 @@ Rows = tuple[Float[ndarray, "n"], Float[ndarray, "n dof"], Float[ndarray, "n dof
 def interpolated(
     at: Float[ndarray, "*at"] | float, times: Values, rows: JointRows
 ) -> Float[ndarray, "*at dof"]:
-    """Rows between those of these times, linearly; the first and the last before and after them."""
+    """Rows at times between the given ones, by linear interpolation; before the first time the first row,
+    after the last time the last one."""
     return np.stack([np.interp(at, times, column) for column in rows.T], axis=-1)
 
 

@@ -74,12 +74,10 @@ class RopDataset(Dataset[dict[str, Tensor]]):
     ) -> None:
         """Open a data set.
 
-        split: train, validation or test; no scene is in two of them.
-        points: of each cloud.
-        sort_points: whether points are sorted by x, then y, then z.
-        seed: of clouds and order.
-        robot: the robot that the data are used for.
-        waypoints: resample to so many, evenly spaced along each path, in memory; None: the stored ones.
+        split: train, validation or test; no scene is in two of them. points: of each cloud. sort_points:
+        whether points are sorted by x, then y, then z. seed: of clouds and order. robot: the robot that the
+        data are used for. waypoints: number of waypoints to which trajectories are resampled in memory,
+        evenly spaced along each path; None: the stored waypoints.
 
         Raises InputError for unknown names, a folder without data or with damaged shards, and data of
         another robot.

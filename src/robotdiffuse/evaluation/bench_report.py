@@ -57,9 +57,10 @@ FAILURES = (
     *REFUSED.values(),
     *("other refusal", "ends refused", CRASHED, OVERRAN, RAISED),
 )
-"""Reasons of failures: no path by the end of the limit, ended without one long before, or found one after
-it; the last path hit an obstacle, the arm itself, or broke limits, missed the goal or twitched; start or goal
-were refused; the process died, or did not answer and was killed; an exception."""
+"""Reasons of failures, in this order. There was no path by the end of the limit, the planner ended without a
+path long before it, or found one after it. The last path hit an obstacle, or the arm itself, or it broke
+limits, missed the goal or twitched. Start or goal were refused. The process died, or did not answer and was
+killed. The planner raised an exception."""
 
 Key = tuple[str, int]
 """Name of a problem in its set, and a seed."""
@@ -117,7 +118,7 @@ def read_bench(folder: FilePath, planners: Sequence[str] | None = None) -> Bench
     )
     for name in names:
         if name.endswith(RESTARTED):
-            # calls that used up the limit were not repeated: those of the plain planner count
+            # calls that used up the limit were not repeated: for them the calls without restarts count
             repeated = {record.key for record in records[name]}
             plain = [record for record in records.get(plain_name(name), ()) if record.key not in repeated]
             records[name] = records[name] + [replace(record, planner=name) for record in plain]
@@ -140,14 +141,14 @@ class Outcome:
 
     record: Record
     found: float
-    """Time of the first path [s]; infinite if there was none by the limit."""
+    """Time of the first path [s]; infinite if there was no path by the limit."""
     returned: float
-    """Time at which the planner returns [s]; the limit for anytime planners and without a path."""
+    """Time at which the planner returns [s]; the time limit for anytime planners, and if there is no path."""
     joint_length: float
     """Length of the best path found by the time limit [rad]; NaN without a path."""
     link_length: float
-    """The paper's path length [m], scaled by the joint lengths if the path by then is not the returned one;
-    NaN without a path."""
+    """The paper's path length of this path [m]; NaN if there is none. If it is not the path that was returned
+    later, the length of that path, scaled by the ratio of their joint lengths."""
 
     @property
     def solved(self) -> bool:
@@ -174,8 +175,10 @@ class Outcome:
 
 
 def deciding_record(records: Sequence[Record], limit: float) -> Record | None:
-    """The record that shows what a planner finds within a limit [s]: the one with the shortest time limit
-    that is at least as long, else the last one that ended by itself.
+    """The record that shows what a planner finds within a limit [s]: the record with the shortest time limit
+    that is at least as long, else the last record of a call that ended by itself.
+
+    records: of one problem and seed, shorter limits first.
 
     records: records of one problem and seed, shorter limits first.
     """
@@ -198,7 +201,7 @@ def outcome(record: Record, limit: float) -> Outcome:
 
 
 def calls_on(records: Iterable[Record], problem_set: str) -> Calls:
-    """Those of a planner's records that are on a problem set, by problem and seed."""
+    """The records of a planner on one problem set, by problem and seed."""
     calls: Calls = {}
     for record in sorted(records, key=lambda record: record.time_limit):
         if record.problem_set == problem_set:
@@ -240,14 +243,15 @@ class Row:
     outcomes: tuple[Outcome, ...]
     """Outcomes of all problems and seeds of the table."""
     figures: Indicators
-    """The paper's four indicators. The length is that of the solved problems, NaN without any; the time is
-    the mean until the planner returns, the limit for an unsolved problem."""
+    """The paper's four indicators. The length is the mean over the solved problems, NaN if there are none;
+    the time is the mean until the planner returns, where an unsolved problem counts with the time limit."""
     interval: tuple[float, float]
     """The 95 % interval of the share of solved problems, by E. B. Wilson's method over problems."""
     comscore: float
     """ComScore, normalized over the rows of this table."""
     paired: Paired | None
-    """Comparison with the reference by joint-space lengths; None for the reference and without it."""
+    """Comparison with the reference planner by joint-space lengths; None for the reference itself, and if
+    there is none."""
     full: bool
     """Whether all solved calls used up the limit, with restarts or without."""
     timed: str
@@ -264,7 +268,7 @@ class Row:
 
     @property
     def failures(self) -> Counter[str]:
-        """Numbers of FAILURES."""
+        """How often each of FAILURES occurred."""
         return Counter(o.failure for o in self.outcomes if not o.solved)
 
     def mean(self, metric: Metric) -> Figure | None:
@@ -290,7 +294,7 @@ class Comparison:
 
     @property
     def alike(self) -> bool:
-        """Whether all rows were timed in the same sessions, with as many calls at a time."""
+        """Whether all rows were timed in the same sessions, with the same number of simultaneous calls."""
         return len({row.timed for row in self.rows}) < 2
 
     @property
@@ -312,8 +316,8 @@ class Curve:
     times: Values
     """Times at which the median ratio is computed: half of these problems are solved by then [s]."""
     ratios: Values
-    """Median at these times of joint-space length over the best known one, on the non-trivial problems that
-    the planner solves in the end; problems not solved yet count as infinite."""
+    """At each of `times`, the median ratio of joint-space length to the best known length, on the non-trivial
+    problems that the planner solves in the end; problems that are not solved yet count as infinite."""
 
 
 @dataclass(frozen=True)
@@ -432,7 +436,8 @@ def _comparison(
             planner,
             tuple(results),
             figures,
-            # the seeds of one problem are not independent, so trials are problems
+            # results with several seeds on one problem are not independent, so the number of trials is that
+            # of problems
             wilson_interval(round(figures.success / 100 * len(names)), len(names)),
             scores.get(planner, np.nan),
             None if planner == bench.reference or reference is None else compare(lengths[planner], reference),
@@ -645,8 +650,8 @@ def _table(heading: str, rows: Sequence[Row], spec: Spec) -> Table:
 
 
 def _ratio(comparison: Comparison, reference: str) -> PlannerColumn:
-    """A column with the ratio of lengths to those of the reference and its interval; empty for a planner
-    whose restarts have this ratio."""
+    """A column with the ratio of path lengths to those of the reference planner, and its interval; empty for
+    a planner whose row with restarts has this ratio."""
     full = {row.planner: row.full for row in comparison.rows}
 
     def ratio(row: Row) -> Cell:
@@ -830,7 +835,8 @@ def motions_to_replay(bench: Bench, parts: Sequence[Section]) -> list[Replay]:
     """The shortest and the longest motion for the problems with the longest detours, then motions for
     problems on which the reference, or else another planner, failed.
 
-    They are from the main time limit of their set, and only for problems that are stored in the folder.
+    The motions are those of the main time limit of their problem set; only problems that are stored in the
+    folder count.
     """
     tries: list[tuple[Case, list[Record], dict[str, str]]] = []
     for section in (section for section in parts if section.name == section.problem_set):

@@ -78,7 +78,7 @@ class Metric:
     """A number that is computed for each motion."""
 
     name: str
-    """Its name in records; in tables with spaces."""
+    """Name of the metric in records; in tables with spaces."""
     unit: str
     """Unit in tables."""
     better: Literal["more", "less", ""]

@@ -162,7 +162,7 @@ WITHOUT_CLEARANCES = "diffusion, no clearances, one sample"
 PAPER_PARTS = "compression_autoencoder", "transformer", 254
 """Encoder, denoiser and waypoints of the paper's method."""
 PAPER_SAMPLES = 1_600_000
-"""Samples of the paper's training: 25,000 batches of 64."""
+"""Number of samples of the paper's training: 25,000 batches of 64."""
 GUIDED_SAMPLE = ("samples=1", "repeat=false")
 """One sample, and no further batches if the validator refuses it."""
 ONE_SAMPLE = ("samples=1", "guidance_steps=0", "repeat=false")
@@ -266,7 +266,7 @@ class Table1Settings:
     out: FilePath
     """Folder of the bench."""
     problems: int = 60
-    """Problems of each kind of goal, none of them trivial."""
+    """Number of problems of each kind of goal, none of them trivial."""
     time_limit: float = 10.0
     """Time limit of a call [s]; RRT* uses all of it."""
     cpu_time: bool = False

@@ -31,7 +31,8 @@ RAISED = "exception"
 """Statuses of records in addition to `types.Status`: the process died (crashed), it did not answer (overran),
 or the planner raised an exception."""
 ENDED_EARLY = 0.9
-"""A call that took less than this share of its time limit ended by itself: a longer limit changes nothing."""
+"""A call that took less than this fraction of its time limit ended by itself: a longer limit would change
+nothing."""
 SHORTEST_FACTOR = 1 + 1e-6
 """A path counts as the shortest if it is at most this factor longer than the shortest known or possible
 one."""
@@ -215,7 +216,7 @@ class Run:
 
     @property
     def key(self) -> tuple[str, str, int, float]:
-        """That of its record."""
+        """The key of the run's record."""
         return self.case.problem_set, self.case.name, self.seed, self.limit
 
     def rng(self) -> np.random.Generator:
@@ -277,7 +278,7 @@ def runs_of(
 
 
 def load_average() -> float:
-    """That of the machine over the last minute."""
+    """Load average of the machine over the last minute."""
     return round(os.getloadavg()[0], 2)
 
 
@@ -320,7 +321,7 @@ def run_all(
 ) -> dict[str, list[Record]]:
     """Make all runs in this process; the records of each method in the order of the cases.
 
-    folder: keeps the records; the names of methods must then say all that these depend on.
+    folder: keeps the records; the names of methods must then contain everything that the records depend on.
     title: of the progress bar, which `bar` switches off.
     """
     files = {name: RecordFile(None if folder is None else record_path(folder, name)) for name in methods}

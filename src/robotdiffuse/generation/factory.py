@@ -128,7 +128,7 @@ class GenerationSettings(Settings):
 
     @property
     def slots(self) -> int:
-        """Most obstacles of a scene, without the floor."""
+        """Largest number of obstacles of a scene, without the floor."""
         return max(family.max_obstacles for family in self.families.values())
 
     @property

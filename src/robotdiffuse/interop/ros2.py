@@ -170,7 +170,7 @@ def choose_topic(topics: Mapping[str, str], requested: str | None, where: str) -
             raise InputError(f"{where}: topic {requested!r} holds no motion; topics: {listed}")
         return requested
     for kind in kinds:
-        candidates = [topic for topic, of in motions.items() if of == kind]
+        candidates = [topic for topic, motion_kind in motions.items() if motion_kind == kind]
         if len(candidates) > 1:
             raise InputError(
                 f"{where}: several topics hold motions: {', '.join(candidates)}; choose one with --topic"
@@ -326,11 +326,11 @@ def _scene(robot: Robot, obstacles: Sequence[Drawable]) -> SceneUpdate:
     def entity(name: str, frame: str) -> Any:
         return update.entities.add(id=name, frame_id=frame, frame_locked=True)
 
-    for one in obstacles:
-        if isinstance(one.shape, PointCloud):
+    for obstacle in obstacles:
+        if isinstance(obstacle.shape, PointCloud):
             continue
-        drawing = entity(one.name, _frame(one, robot))
-        shape = one.fixed.shape
+        drawing = entity(obstacle.name, _frame(obstacle, robot))
+        shape = obstacle.fixed.shape
         match shape:
             case Box():
                 size = shape.size.tolist()
@@ -342,12 +342,12 @@ def _scene(robot: Robot, obstacles: Sequence[Drawable]) -> SceneUpdate:
                 size = [2 * shape.radius, 2 * shape.radius, shape.height]
                 solid = drawing.cylinders.add(bottom_scale=1.0, top_scale=1.0)
             case _:
-                _add_triangles(drawing, one.fixed.surface, one.color, OBSTACLE_OPACITY)
+                _add_triangles(drawing, obstacle.fixed.surface, obstacle.color, OBSTACLE_OPACITY)
                 continue
         _set(solid.size, size)
         _set(solid.pose.position, shape.T_base_shape[:3, 3].tolist())
         _set(solid.pose.orientation, _turn(shape.T_base_shape))
-        _set_color(solid.color, one.color, OBSTACLE_OPACITY)
+        _set_color(solid.color, obstacle.color, OBSTACLE_OPACITY)
     for link, surface in link_surfaces(robot).items():
         for color, part in surface.by_color:
             _add_triangles(entity("{}/{:02x}{:02x}{:02x}".format(link, *color), link), part, color, 1.0)

@@ -39,14 +39,14 @@ from robotdiffuse.problems.projection_kernel import step
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
 OFF = -CLEARANCE_CAP
-"""The margin of a cost that is not enabled: nothing is ever within it."""
+"""The margin of a cost that is not enabled: no distance is ever below it."""
 
 
 class Steps(NamedTuple):
     """Parameters of one round of steps: `GuidanceSettings` in the types that compiled code takes."""
 
     margin: np.float32
-    """[m] here and below, or OFF."""
+    """Margin to obstacles [m], or OFF."""
     self_margin: np.float32
     push: np.float32
     """[rad]"""
@@ -137,8 +137,8 @@ def _spread(q, first, last, pushes, active, kernel, lower, upper):
 
 @allocation_free(fastmath=True)
 def _shorten(q, first, last, share):
-    """Moves each waypoint by a share of the way to the middle of its neighbors, which is Newton's step in
-    that waypoint alone. Every second waypoint at a time: these share no segment."""
+    """Moves each waypoint by a fraction of the way to the middle of its neighbors, which is Newton's step in
+    that waypoint alone. Every second waypoint is moved at a time, since these share no segment."""
     dof = q.shape[1]
     for parity in range(2):
         for i in range(first + parity, last, 2):
@@ -159,7 +159,7 @@ class GuidanceSettings(Settings, name="guidance"):
     push: Positive = 0.15
     """Longest push of a waypoint in one step [rad]."""
     width: Positive = 4.0
-    """Waypoints over which a push spreads: the standard deviation of the kernel."""
+    """Over how many waypoints a push spreads: the standard deviation of the kernel."""
     length: Share = 0.2
     """After the pushes, waypoints move by this fraction towards the middle of their neighbors; 0: no
     cost."""
@@ -175,8 +175,8 @@ class CollisionGuidance:
         constraints: PathConstraints | None = None,
         tolerance_share: float = 1.0,
     ) -> None:
-        """constraints: of the path, which are to hold within this share of their tolerances; a step down
-        their cost moves a waypoint by at most the setting `push`."""
+        """constraints: path constraints, and the fraction of their tolerances within which they are to hold;
+        a step down their cost moves a waypoint by at most the setting `push`."""
         self.checker = checker
         self.settings = settings or GuidanceSettings()
         self._constraints = None
@@ -186,9 +186,9 @@ class CollisionGuidance:
     def __call__(self, q: Trajectories, steps: int) -> tuple[Trajectories, Values]:
         """The trajectories [rad] after some steps, and the costs of the margins that the last step found.
 
-        The first and the last waypoint stay where they are, and have no cost. A cost of zero: no waypoint
-        between them is within a margin, or none was before the last step. Such a trajectory is left as it is;
-        the cost of length acts on every trajectory only where no margin is enabled.
+        The first and the last waypoint stay where they are, and have no cost. The cost is zero if no other
+        waypoint is within a margin, or if none was before the last step. Such a trajectory is left as it is;
+        the cost of length acts on every trajectory only if no margin is enabled.
         """
         settings = self.settings
         checker = self.checker
@@ -204,7 +204,7 @@ class CollisionGuidance:
             length=np.float32(settings.length),
         )
         costs = np.zeros(len(q), np.float32)
-        # one round at a time only between steps towards the constraints
+        # all rounds at once, unless steps towards the constraints come between them
         for rounds in [steps] if self._constraints is None else [1] * steps:
             arrays = checker.robot_arrays, checker.scene_arrays
             costs = descend(*arrays, moved, lower, upper, compiled, rounds)

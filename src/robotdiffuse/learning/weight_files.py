@@ -28,7 +28,8 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.robot_folder import user_robots
 
 DIMENSION_TOLERANCE = 1e-3
-"""Robots are the same if their dimensions [m] and entries of rotations differ by less than this."""
+"""Two robots count as the same if their dimensions [m] and the entries of their rotations differ by less than
+this."""
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 # Kinds of planners: without a network; only a network's motions, with or without guidance.
 SEARCH = "search"
 LEARNED = "learned"
-# What not every planner supports.
+# Features that not every planner supports.
 PATH_CONSTRAINTS = "path constraints"
 CLEARANCE = "a requested clearance"
 
@@ -128,7 +128,7 @@ PLANNERS = Registry(
 )
 DEFAULT_PLANNER = "robotdiffuse"
 MAX_LOADED = 8
-"""Planners with different settings that `plan` keeps loaded."""
+"""Largest number of planners with different settings that `plan` keeps loaded."""
 
 
 def load_planner(name: str, settings: object | None = None, weights: str | None = None) -> "Planner":
@@ -136,9 +136,10 @@ def load_planner(name: str, settings: object | None = None, weights: str | None 
 
     Args:
         name: A name that `robotdiffuse planner list` shows.
-        settings: Those that differ from the defaults, such as {"range": 0.5}, or the planner's own dataclass.
-        weights: Folder with weights for a learned planner, in place of the bundled ones. With settings, name
-            the folder there instead.
+        settings: The settings that differ from the defaults, such as {"range": 0.5}, or the planner's own
+            dataclass.
+        weights: Folder with weights for a learned planner, in place of the bundled ones. If you give
+            settings, name the folder in them instead.
 
     Raises:
         InputError: For an unknown name, settings of another planner, both settings and weights, weights that
@@ -203,10 +204,10 @@ def plan(
             improves it, "time_limit" until time runs out. Planners that cannot improve a path return their
             first.
         clearance: Distance to obstacles that aorrtc, rrt_connect and robotdiffuse keep wherever start, goal
-            and passages allow it, up to 0.5 m [m]; where they do not, it is smaller, and a note says so.
+            and passages allow it, at most 0.5 [m]. Elsewhere the distance is smaller, and a note says so.
             None: the problem's, or 1 cm. Other planners refuse a clearance.
         velocity_scaling: Fraction of the velocity limits that the motion uses, from 0.001 to 1.
-        acceleration_scaling: Fraction of the acceleration limits that it uses, from 0.001 to 1.
+        acceleration_scaling: Fraction of the acceleration limits that the motion uses, from 0.001 to 1.
         jerk: Largest jerk of any joint [rad/s³], at least 0.01. None: the robot's jerk limits, or 10 / s
             times the acceleration limit of joints without one; infinite: no limit.
         objective: What aorrtc, rrt_connect and robotdiffuse minimize: "time", the motion's duration, or

@@ -49,15 +49,16 @@ together."""
 EARLY_VALIDATION_FACTOR = 5.0
 """The first path is validated at once if at least this many validations still fit in the time left."""
 TOLERANCE_FRACTION = 0.95
-"""Planners keep this part of each tolerance of path constraints."""
+"""Planners use only this fraction of each tolerance of path constraints; the rest is a reserve."""
 MAX_RESERVED_FRACTION = 0.5
-"""Largest part of the time limit that is reserved for validation and timing."""
+"""Largest fraction of the time limit that is reserved for validation and timing."""
 RESERVED_FACTOR = 3.0
-"""Time that is reserved for validating and timing a path, by the longest that the call has taken for one."""
+"""Time that is reserved for validating and timing a path, as a multiple of the longest time that the call has
+taken for one path."""
 EXPECTED_VALIDATION_TIME = 0.003
 """Time that is reserved for validating and timing a path before the call has done so once [s]."""
 MIN_TIME_LIMIT = 1e-3
-"""Time limit of what remains to be done once time has run out [s]."""
+"""Time limit for the remaining work once time has run out [s]."""
 
 
 @dataclass(frozen=True)
@@ -80,8 +81,8 @@ def clock() -> float:
 
 
 def time_left(time_limit: float, began: float) -> float:
-    """What is left of the time limit of a call that began at a time of `clock`; at least MIN_TIME_LIMIT, or
-    the limit itself if that is less [s]."""
+    """The time left of the time limit of a call that began at the time `began` of `clock`; at least
+    MIN_TIME_LIMIT, or the limit itself if that is less [s]."""
     return min(time_limit, max(time_limit - (clock() - began), MIN_TIME_LIMIT))
 
 
@@ -157,7 +158,7 @@ class PlanningContext:
 
     def keeps_constraints(self, q: Configurations) -> bool:
         """Whether the polyline through configurations, such as a rounded corner, keeps the path constraints
-        as closely as planners do."""
+        within TOLERANCE_FRACTION of their tolerances."""
         constraints = self.validator.constraints
         rows = q if len(q) > 1 else np.repeat(q, 2, axis=0)
         return constraints is None or not constraints.first_violation(
@@ -177,7 +178,7 @@ class PlanningContext:
 
     @property
     def elapsed(self) -> float:
-        """Wall time since the call began, without that for loading; see `core/loading.py` [s]."""
+        """Wall time since the call began, without the time for loading (see `core/loading.py`) [s]."""
         check_cancelled()
         return clock() - self.started
 
@@ -189,7 +190,7 @@ class PlanningContext:
     @property
     def validates_early(self) -> bool:
         """Whether there is time to validate paths while the search goes on."""
-        if self.problem.constraints:  # each of their few paths is timed
+        if self.problem.constraints:  # the search finds few paths, and each is timed
             return self.remaining > self._reserved
         return self.remaining > EARLY_VALIDATION_FACTOR * self._reserved
 
@@ -243,7 +244,7 @@ class PlanningContext:
 
     @property
     def ended(self) -> bool:
-        """Whether no path can be finished in this call any more; `unsolved` gives the reason."""
+        """Whether too little time is left to finish a path; `unsolved` gives the reason."""
         return self._ended is not None
 
     def finish(
@@ -286,7 +287,8 @@ class PlanningContext:
         problem = self.problem
         waypoints = np.asarray(waypoints, dtype=np.float64)
         turns = np.flatnonzero(problem.robot.wraps(waypoints).any(axis=1))
-        if len(turns):  # a step of nearly a whole turn could be one of a wrapped value: two steps cannot
+        # a step of nearly a whole turn could be a small step of a wrapped angle; two steps cannot
+        if len(turns):
             middles = 0.5 * (waypoints[turns] + waypoints[turns + 1])
             waypoints = np.insert(waypoints, turns + 1, middles, axis=0)
             if deviations is not None:

@@ -34,7 +34,7 @@ class LearnedPlanner(Planner[LearnedPlannerSettings]):
     """A planner that needs the weights of a network."""
 
     network_name: ClassVar[str]
-    """Its name in `learning.NETWORKS`."""
+    """Name of the network in `learning.NETWORKS`."""
 
     def __init__(self, settings: LearnedPlannerSettings | None = None) -> None:
         """Raises InputError if the folder that the settings name holds no weights."""

@@ -1,7 +1,8 @@
 """Straight lines of the tool, followed from the start by inverse kinematics from pose to pose.
 
-That takes milliseconds and gives smooth motions; where it ends early, the search under the constraint
-(`search/constrained.py`) goes on, and the result says how far the line was followed, and why no further.
+This takes milliseconds and gives smooth motions. If it cannot follow the line to its end, the search under
+the constraint (`search/constrained.py`) continues, and the result says how far the line was followed, and
+what stopped it.
 """
 
 from collections.abc import Callable
@@ -42,36 +43,41 @@ TURN_STEP = 0.04
 MIN_STEPS = 6
 MAX_STEPS = 400
 MAX_JOINT_STEP = 0.25
-"""A joint that would move by more from one pose to the next has no way along the line [rad] or [m]."""
+"""If a joint would move by more than this from one pose to the next, the line cannot be followed [rad] or
+[m]."""
 LIMIT_MARGIN = 1e-3
-"""Distance that joints keep from their limits, for the curve between poses [rad] or [m]."""
+"""Distance that joints keep from their limits, because the curve between poses may leave them [rad] or
+[m]."""
 NEAR_LIMIT = 1e-2
 """A joint this close to its limit is named as the reason for the end of a line [rad] or [m]."""
 OTHER_ENDS = 4
-"""Configurations of the end pose that motions are steered to where following from the start ends early."""
+"""Number of configurations of the end pose to which motions are steered if following from the start ends
+early."""
 END_STEPS = np.array([0.1, 0.3, 0.7])
 """Steps of the joints, without a motion of the link, to other configurations of the end [rad, L2]."""
 LONGER = 1.08
-"""So much longer may the way to another end be in joint space than to the one that following leads to."""
+"""The path in joint space to another configuration of the end may be longer by this factor than the path that
+following gives."""
 HERE = 1e-5
-"""A link whose pose differs by less from the end of the line is there [m] and in entries of R."""
+"""The link counts as being at the end of the line if its pose differs from it by less than this [m], and in
+entries of R."""
 SAME = 1e-5
-"""Largest difference from the configuration that a line is followed to, of each joint [rad] or [m]."""
+"""Largest difference of any joint from the configuration to which a line is followed [rad] or [m]."""
 TOLERANCES = 1e-9, 1e-9
-"""Tolerances of the poses of a curve [m], [rad]: its second derivative takes them by the square of the
-steps."""
+"""Tolerances of the poses of a curve [m], [rad]; small, since the second derivative of the curve divides them
+by the square of the steps."""
 ROUND = InverseKinematicsSettings(max_rounds=1)
 
 
 def follow_line(context: PlanningContext) -> PlanResult | None:
-    """The fastest of several motions that follow the line from the start and pass the validator; else a
-    result whose `fraction` and `reason` say how far that goes. None where the goal is several, or another
-    configuration for where the link is."""
+    """The fastest of several motions that follow the line from the start and pass the validator. If there is
+    none, a result whose `fraction` and `reason` say how far the line can be followed. None if there are
+    several goals, or if the link is at the end of the line already but the goal is another configuration."""
     problem = context.problem
     robot = context.problem.robot
     if not isinstance(problem.goal, PoseGoal | JointGoal):
         return None
-    line = next(one for one in problem.constraints if isinstance(one, CartesianLine))
+    line = next(entry for entry in problem.constraints if isinstance(entry, CartesianLine))
     T_end = line_end(problem, line)
     T_start = link_pose(robot, problem.start, line.frame)
     off = np.abs(T_end - T_start)[:, 3 if line.angle is None else slice(None)]
@@ -128,7 +134,7 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
             tried(end)
     elif line.speed is None:
         candidates += faster_ends(problem, line, targets, *chain, *candidates[0], cost)
-    for _, rows in sorted(candidates, key=lambda one: one[0]):
+    for _, rows in sorted(candidates, key=lambda entry: entry[0]):
         trajectory = time_curve(robot, rows, context.timing, context.beside)
         context.improved(float(path_length(rows)))
         result = context.finish(rows, STAGE, "solved along the straight line", trajectory=trajectory)
@@ -146,14 +152,14 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
 
 def _poses(T_start: Float[ndarray, "4 4"], T_end: Float[ndarray, "4 4"]) -> Float[ndarray, "n 4 4"]:
     """Poses along the line, evenly spaced, without the first."""
-    way = T_end[:3, 3] - T_start[:3, 3]
+    displacement = T_end[:3, 3] - T_start[:3, 3]
     turn = rotation_vector(T_end[:3, :3] @ T_start[:3, :3].T)
     angle = float(np.linalg.norm(turn))
-    count = max(np.linalg.norm(way) / STEP, angle / TURN_STEP, MIN_STEPS)
+    count = max(np.linalg.norm(displacement) / STEP, angle / TURN_STEP, MIN_STEPS)
     shares = np.linspace(0, 1, min(int(np.ceil(count)), MAX_STEPS) + 1)[1:, None]
     axis = turn / angle if angle > 0 else np.eye(3)[2]
     poses = np.tile(T_end, (len(shares), 1, 1))
-    poses[:-1, :3, 3] = T_start[:3, 3] + shares[:-1] * way
+    poses[:-1, :3, 3] = T_start[:3, 3] + shares[:-1] * displacement
     poses[:-1, :3, :3] = rotation_about(axis, angle * shares[:-1, None]) @ T_start[:3, :3]
     return poses
 
@@ -164,12 +170,12 @@ def faster_ends(
     targets: Float[ndarray, "n 4 4"],
     arm: Int[ndarray, "j"],
     joints: IKChain,
-    least: float,
+    best_cost: float,
     rows: Float[ndarray, "k dof"],
     cost: Callable[[Float[ndarray, "k dof"]], float],
 ) -> list[tuple[float, Float[ndarray, "k dof"]]]:
-    """Costs and motions along the line to other configurations of its end than these rows lead to, each of
-    less cost than those before and not much longer than these rows."""
+    """Costs and motions along the line that end in other configurations than these rows do. Each has a lower
+    cost than those before it and is not much longer than these rows."""
     end = rows[-1]
     max_length = LONGER * path_length(rows)
     constrained = 3 if line.angle is None else 6
@@ -177,23 +183,23 @@ def faster_ends(
     jacobian = link_jacobians(problem.robot, end[None], line.frame)[0][:constrained, arm]
     faster = list[tuple[float, Float[ndarray, "k dof"]]]()
     redundant = np.linalg.svd(jacobian)[2][constrained:]
-    # first the same end once more, now steered to
+    # first the same end once more, but steered to
     offsets = [
         0 * redundant[:1],
         *(np.outer(steps, direction) for direction in redundant for steps in (END_STEPS, -END_STEPS)),
     ]
     for offset in offsets:
         for seed in np.clip(end[arm] + offset, joints.lower, joints.upper):
-            found = solve_seeds(seed[None], seed[None][:0], 1, joints, targets[-1], parameters)[0]
+            solutions = solve_seeds(seed[None], seed[None][:0], 1, joints, targets[-1], parameters)[0]
             moved = end.copy()
-            moved[arm] = found[0] if len(found) else seed
+            moved[arm] = solutions[0] if len(solutions) else seed
             rows = _followed(problem, line, targets, arm, joints, moved)
-            there = len(rows) > len(targets) and np.abs(rows[-1] - moved).max() < SAME
-            estimated = cost(rows) if there and path_length(rows) <= max_length else np.inf
-            if estimated >= least:
+            arrived = len(rows) > len(targets) and np.abs(rows[-1] - moved).max() < SAME
+            estimated = cost(rows) if arrived and path_length(rows) <= max_length else np.inf
+            if estimated >= best_cost:
                 break
-            least = estimated
-            faster.append((least, rows))
+            best_cost = estimated
+            faster.append((best_cost, rows))
     return faster
 
 
@@ -205,8 +211,8 @@ def _followed(
     joints: IKChain,
     end: Float[ndarray, "dof"] | None,
 ) -> Float[ndarray, "k dof"]:
-    """Configurations at the start and at these poses, as far as joints can follow; joints that do not move
-    the link go straight to the end, or stay."""
+    """Configurations at the start and at these poses, as far as joints can follow. Joints that do not move
+    the link move straight to their values at the end, or stay."""
     start = problem.start
     steer = end is not None
     goal = start if end is None else end
@@ -222,7 +228,7 @@ def _followed(
 
 
 def _obstruction(robot: Robot, q: Float[ndarray, "dof"]) -> str:
-    """Why no configuration follows this one along a line."""
+    """Why a line cannot be followed beyond this configuration."""
     room = np.where(robot.continuous, np.inf, np.minimum(q - robot.lower, robot.upper - q))
     j = int(room.argmin())
     if room[j] < NEAR_LIMIT:

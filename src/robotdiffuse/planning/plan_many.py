@@ -30,7 +30,7 @@ from robotdiffuse.robots.robot import Robot
 PlannerArguments = tuple[str, Settings | Mapping[str, object] | None, str | None]
 """Arguments of `load_planner`: name, settings, weights."""
 PROBLEMS_PER_TASK = 20
-"""Problems that a node of a cluster plans with one loaded planner."""
+"""Number of problems that a node of a cluster plans with one loaded planner."""
 
 
 def plan_many(
@@ -47,8 +47,8 @@ def plan_many(
 
     A problem that raises an error, or kills its process, has a result with status ERROR; the others continue.
     On a cluster, a problem that kills its process ends the call. Each process loads its compiled code before
-    its first problem, outside the time limit. Processes import the main script: without the line
-    `if __name__ == "__main__":` above what it does, all results have status ERROR.
+    its first problem, outside the time limit. Processes import the main script: without the line `if __name__
+    == "__main__":` above its statements, all results have status ERROR.
 
     Args:
         problems: The problems.
@@ -58,11 +58,12 @@ def plan_many(
         workers: Number of processes; None: one for each core.
         cluster: "ray": the Ray cluster that RAY_ADDRESS names, or one started here, in place of processes.
             Problems of a lost node are planned again on another.
-        progress: Called after each problem, in the order in which they end, with the numbers done and in all.
+        progress: Called after each problem, in the order in which problems end, with the number of finished
+            problems and the number of all.
         request: Arguments of `rd.plan`, the same for all problems: time_limit, seed, until, ...
 
-    Returns:
-        An iterator over the results in the order of the problems, each as soon as those before it are there.
+    Returns: An iterator over the results in the order of the problems. Each is returned as soon as it and all
+        results before it are finished.
 
     Raises:
         InputError: At once, for an unknown planner, settings or weights that do not fit it, unknown arguments

@@ -23,7 +23,7 @@ from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape, Sphere
 from robotdiffuse.validation.tolerances import goal_index
 
 PlannerSettings = TypeVar("PlannerSettings", bound=Settings)
-# Time limits of the calls of `warm_up` [s]: for easy problems, and for the one whose search need not end.
+# Time limits of the calls of `warm_up` [s]: for easy problems, and for the problem whose search need not end.
 EASY_TIME_LIMIT = 1.0
 SHORT_TIME_LIMIT = 0.02
 WARM_UP_RADIUS = 0.08
@@ -36,8 +36,8 @@ class Planner(ABC, Generic[PlannerSettings]):
     name: ClassVar[str]
     settings_class: type[PlannerSettings]
     supports: ClassVar[frozenset[str]] = frozenset()
-    """PATH_CONSTRAINTS, CLEARANCE, both or none; requests for what it does not support are refused. `plan`
-    handles everything else that a problem or a request may contain, for every planner."""
+    """PATH_CONSTRAINTS, CLEARANCE, both or none; a request for a feature that the planner does not support is
+    refused. `plan` handles everything else that a problem or a request may contain, for every planner."""
 
     follows_lines: ClassVar[bool] = False
     """Whether problems with a Cartesian line are first solved by `line_following.py`, without a search."""
@@ -65,7 +65,7 @@ class Planner(ABC, Generic[PlannerSettings]):
         and diffusion.
 
         Raises InputError for arguments out of bounds, for a clearance or constraints that the planner does
-        not support, and where `prepare` does.
+        not support, and if `prepare` raises it.
         """
         check_problem(problem)
         result = self._plan(problem, PlanRequest(*values, **request))
@@ -115,8 +115,8 @@ class Planner(ABC, Generic[PlannerSettings]):
         return [*results, call(kinds, SHORT_TIME_LIMIT)]
 
     def prepare(self, robot: Robot) -> None:
-        """Do what does not count as planning time: learned planners load their weights for the robot, and
-        raise InputError if there are none."""
+        """Preparation that does not count as planning time: learned planners load their weights for the
+        robot, and raise InputError if there are none."""
 
     @abstractmethod
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:

@@ -22,18 +22,18 @@ from robotdiffuse.robots.inverse_kinematics import (
 GOAL_COUNT = 10
 """Number of configurations to find for a pose (the paper's k)."""
 SEEDS = 64
-"""Seeds of a round."""
+"""Number of seeds of a round."""
 ROUND = InverseKinematicsSettings(seeds_per_round=SEEDS, max_rounds=1)
 """Settings of one round of inverse kinematics for a pose without tolerances."""
-# Most rounds, most rounds in a row without a new configuration once there is one, and rounds after which a
-# pose that none reached is given up.
+# Largest number of rounds; largest number of rounds in a row without a new configuration, once there is one;
+# and number of rounds after which a pose is given up if no configuration reached it.
 MAX_ROUNDS = 64
 PATIENCE = 2
 REACH_ROUNDS = 16
 TOLERANCE_FRACTION = 0.9
 """Fraction of the tolerances of path constraints that goals keep."""
 MIN_DIFFERENCE = 0.1
-"""Configurations differ by more than this in at least one joint [rad] or [m]."""
+"""Two configurations count as different if at least one joint differs by more than this [rad] or [m]."""
 # To bring a configuration nearer to the start, it is moved by a fraction PULL of the way there and projected
 # onto the goal again, at most MAX_PULLS times, as long as its distance falls by the fraction MIN_PULL_GAIN.
 PULL = 0.5
@@ -61,9 +61,8 @@ def pose_configurations(
     constraints and several poses by damped Newton steps for all of them together. Configurations are then
     drawn towards the start, as far as the goal allows. Other arms of the robot stay at the start.
 
-    accept: which configurations are acceptable, such as those free of collision.
-    rounds: most rounds of seeds.
-    exact: tolerances of poses that give none [m], [rad].
+    accept: which configurations are acceptable, such as those free of collision. rounds: largest number of
+    rounds of seeds. exact: tolerances of poses that give none [m], [rad].
     """
     robot = problem.robot
     start = problem.start
@@ -76,7 +75,8 @@ def pose_configurations(
     for k in range(rounds):
         check_time("configurations of the goal pose")
         seed_count = count if k == 0 else SEEDS
-        # projection ends at the edges of the tolerances, so every other round keeps only a part of them
+        # projection ends at the edges of the tolerances, so every other round uses only a part of the
+        # tolerances
         aims = poses
         if k % 2:
             part = rng.uniform()
@@ -131,12 +131,12 @@ def at_poses(
     seeds = random_seeds(robot, robot.lower, robot.upper, SEEDS, rng, start)
     seeds[0] = start
     targets = [pose.T_base_frame for pose in poses]
-    for found in each_pose(robot, poses[0].frame, targets, count, seeds, start):
-        yield robot.nearest_turns(found, start)
+    for configurations in each_pose(robot, poses[0].frame, targets, count, seeds, start):
+        yield robot.nearest_turns(configurations, start)
 
 
 def _within(pose: PoseGoal, part: float) -> PoseGoal:
-    """The pose with a part of its tolerances; angles that are free stay so."""
+    """The pose with its tolerances multiplied by `part`; angles that are free stay free."""
     xyz = pose.xyz_tolerance
     rpy = pose.rpy_tolerance
     return replace(
@@ -179,7 +179,7 @@ def _accepted(q: Configurations, accept: Accept | None) -> Configurations:
 
 
 def _distinct(q: Configurations) -> Configurations:
-    """The configurations without those close to one before them."""
+    """The configurations without those that are close to an earlier one."""
     unique = q[:0]
     for row in q:
         if (np.abs(unique - row).max(axis=1, initial=0.0) > MIN_DIFFERENCE).all():

@@ -27,24 +27,25 @@ if TYPE_CHECKING:
     from robotdiffuse.problems.compiled_constraints import PathConstraints
 
 GOAL_TIME_FRACTION = 0.5
-"""Fraction of the time limit after which no more of several goals are tried, once one is free or none was at
-the first try."""
+"""If there are several goals: after this fraction of the time limit no more goals are tried, if one is free
+or if none was free at the first try."""
 NEAR_POSE_FRACTIONS = (0.1, 0.3, 0.9)
-"""Where a pose cannot be reached exactly, parts of the validator's tolerances to reach it within, in turn."""
+"""If a pose cannot be reached exactly, it is to be reached within these fractions of the validator's
+tolerances, tried in turn."""
 # Rounds of seeds for that, and number of configurations for each of several poses.
 NEAR_POSE_ROUNDS = 2
 FIRST_TRY_COUNT = 3
 MANY_GOALS = 8
-"""The first try for at least so many poses of a link is one from the same seeds for all."""
+"""If there are at least this many poses of a link, the first try uses the same seeds for all of them."""
 # Number of configurations of a pose whose exact meshes are checked where the covering spheres collide, and
 # number of those that become goals.
 MAX_EXACT_GOALS = 20
 MAX_GRAZING_GOALS = 3
 END_MARGIN = 0.0005
-"""Near a start or goal with less than the requested clearance, paths keep its clearance less this margin
-[m]."""
+"""Near a start or goal with less than the requested clearance, paths keep the clearance of this
+configuration, minus this margin [m]."""
 CLEARANCE_STEPS = 5
-"""Steps of `falling_clearances`."""
+"""Number of steps of `falling_clearances`."""
 RETREAT_STEP = 0.01
 """Step length out of contact of the covering spheres [rad]."""
 RETREAT_STEPS = 100
@@ -70,14 +71,14 @@ class StartGoal:
         self.checker = checker
         self._turns = robot.whole_turns(start)
         self.start = start - self._turns
-        ways = [image for goal in goals for image in images(robot, self.start, goal)]
-        every = [self.start, *ways]
+        goal_images = [image for goal in goals for image in images(robot, self.start, goal)]
+        every = [self.start, *goal_images]
         free = checker.free(np.stack(every))  # in one batch: most are free
         self.start_lead, *leads = (
             q.copy() if at_once and constraints is None else retreat(checker, q, constraints)
             for q, at_once in zip(every, free, strict=True)
         )
-        self.goals = [goal for goal, lead in zip(ways, leads, strict=True) if lead is not None]
+        self.goals = [goal for goal, lead in zip(goal_images, leads, strict=True) if lead is not None]
         self.goal_leads = [lead for lead in leads if lead is not None]
 
     def rows(self) -> tuple[Configuration, Configurations]:
@@ -110,8 +111,8 @@ class StartGoal:
         return space._replace(lower=lower.astype(np.float32), upper=upper.astype(np.float32))
 
     def complete(self, path: Configurations, direct: bool = False) -> Configurations:
-        """The path of a search in float64, with the exact start and goal in place of its ends, or added to
-        them; `direct`: always in place of them."""
+        """The path of a search in float64, with the exact start and goal in place of its ends, or added
+        before and after them. `direct`: always in place of them."""
         assert self.start_lead is not None
         path = path.astype(np.float64)
         errors = [np.abs(path[-1] - lead).max() for lead in self.goal_leads]
@@ -137,8 +138,8 @@ def padded_space(
 
 
 def falling_clearances(most: float, checker: CollisionChecker, states: Configurations) -> list[float]:
-    """Clearances for a search to try, falling to zero in CLEARANCE_STEPS steps [m]; those of the start,
-    states[0], and of the goal farthest from obstacles are two more."""
+    """Clearances for a search to try, falling to zero in CLEARANCE_STEPS steps [m]. Two more are the
+    clearance of the start, states[0], and that of the goal that is farthest from obstacles."""
     has = checker.link_clearances(states).min(axis=1, initial=1.0)
     at_ends = {max(float(end) - END_MARGIN, 0.0) for end in (has[0], has[1:].max()) if end < most}
     return sorted(
@@ -276,14 +277,14 @@ def _any_goals(
     exact = [goal for goal in goals if isinstance(goal, PoseGoal) and not goal.tolerant]
     many = MANY_GOALS <= len(goals) == len(exact) and len({goal.frame for goal in exact}) == 1
     if many and not context.problem.constraints:
-        found = list[ndarray]()
+        batches = list[ndarray]()
         for configurations in _pose_goals_module().at_poses(
             context.problem, exact, FIRST_TRY_COUNT, context.rng
         ):
-            found.append(configurations)
-            if context.elapsed > until and checker.free(np.concatenate(found)).any():
+            batches.append(configurations)
+            if context.elapsed > until and checker.free(np.concatenate(batches)).any():
                 break
-        every = np.concatenate(found)
+        every = np.concatenate(batches)
         every = every[checker.free(every)]
         free = [_with_turns(context, every)] if len(every) else []
     else:

@@ -171,7 +171,7 @@ def plan_steps(
     for i, step in enumerate(steps):
         check_type(f"steps[{i}]", step, Step.__args__, "rd.MoveTo, MoveRelative, Attach or Detach")
     furthest = StepsResult((), (), space, "", 0.0)
-    others = 0
+    retried_ends = 0
 
     def motions(k: int, space: Any, q: Configuration) -> Iterator[PlanResult]:
         """Motions of a step, each with another end; the last may be a failure."""
@@ -179,17 +179,17 @@ def plan_steps(
         assert isinstance(step, MoveTo | MoveRelative)
         space = copy(space)
         space.scene = Scene(space.scene.shapes, [*space.scene.allowed_contacts, *step.contacts.items()])
-        left = time_left(time_limit, began)
-        left /= sum(isinstance(one, MoveTo | MoveRelative) for one in steps[k:])
+        seconds_left = time_left(time_limit, began)
+        seconds_left /= sum(isinstance(later, MoveTo | MoveRelative) for later in steps[k:])
         if isinstance(step, MoveRelative):
             T = space.pose(q)
             end = pose(step.xyz) @ T if step.frame == WORLD else T @ pose(step.xyz)
-            if any(isinstance(one, MoveTo) for one in steps[:k]):
-                left = min(left, LINE_TIME_LIMIT)
-            yield space.plan_line(end, q, step.tolerance, time_limit=left, **request)
+            if any(isinstance(earlier, MoveTo) for earlier in steps[:k]):
+                seconds_left = min(seconds_left, LINE_TIME_LIMIT)
+            yield space.plan_line(end, q, step.tolerance, time_limit=seconds_left, **request)
             return
         space.tip = step.link or space.tip
-        options = {"constraints": step.constraints, "time_limit": left, **request}
+        options = {"constraints": step.constraints, "time_limit": seconds_left, **request}
         result = space.plan(step.goal, q, **options)
         yield result
         if result.solved:
@@ -197,12 +197,12 @@ def plan_steps(
             indices = [result.goal_index]
         while result.solved:
             ends = [(i, end) for i, end in ends if np.abs(end - result.path.positions[-1]).max() > SAME_END]
-            tried = [(i, end) for i, end in ends if i not in indices] or ends
-            if not tried:
+            untried = [(i, end) for i, end in ends if i not in indices] or ends
+            if not untried:
                 return
-            result = space.plan(JointGoal(np.array([end for _, end in tried])), q, **options)
+            result = space.plan(JointGoal(np.array([end for _, end in untried])), q, **options)
             if result.solved:
-                index = tried[result.goal_index or 0][0]
+                index = untried[result.goal_index or 0][0]
                 indices.append(index)
                 yield replace(result, goal_index=index)
 
@@ -211,7 +211,7 @@ def plan_steps(
     ) -> StepsResult | None:
         """A result for all steps, of which the first k are planned already; None if one of the others
         fails."""
-        nonlocal furthest, others
+        nonlocal furthest, retried_ends
         if k == len(steps):
             return StepsResult(tuple(steps), results, space, f"solved in {k} steps", clock() - began)
         step = steps[k]
@@ -236,18 +236,18 @@ def plan_steps(
                     reason = f"{where}: {result.reason}"
                     furthest = StepsResult(tuple(steps), (*results, result), space, reason, 0.0)
                 return None
-            found = planned(k + 1, space, result.path.positions[-1], (*results, result))
-            if found is not None or clock() - began > time_limit:
-                return found
-            others += 1
+            outcome = planned(k + 1, space, result.path.positions[-1], (*results, result))
+            if outcome is not None or clock() - began > time_limit:
+                return outcome
+            retried_ends += 1
 
     with located("start"):
         q = Problem(space.robot, Scene(), start, start).start
-    found = planned(0, space, q, ())
-    if found is None:
-        tried = f"; {others} ends of earlier steps were tried" if others > 1 else ""
-        found = replace(furthest, reason=furthest.reason + tried, planning_time=clock() - began)
-    return found
+    outcome = planned(0, space, q, ())
+    if outcome is None:
+        tried = f"; {retried_ends} ends of earlier steps were tried" if retried_ends > 1 else ""
+        outcome = replace(furthest, reason=furthest.reason + tried, planning_time=clock() - began)
+    return outcome
 
 
 def _other_ends(problem: Problem) -> list[tuple[int, Configuration]]:

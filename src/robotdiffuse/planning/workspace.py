@@ -98,7 +98,9 @@ class Workspace:
         shape = self._obstacle(name)
         T = self._T_base_world @ rigid_transform("T_world_shape", T_world_shape)
         moved = shape.moved(T @ inverse(shape.T_base_shape))
-        self.scene = self.scene.with_shapes([moved if one is shape else one for one in self.scene.shapes])
+        self.scene = self.scene.with_shapes(
+            [moved if obstacle is shape else obstacle for obstacle in self.scene.shapes]
+        )
 
     def remove(self, *names: str) -> None:
         """Remove obstacles.
@@ -110,7 +112,9 @@ class Workspace:
             InputError: For an unknown name.
         """
         removed = {self._obstacle(name).name for name in names} or set(self.obstacles)
-        self.scene = self.scene.with_shapes([one for one in self.scene.shapes if one.name not in removed])
+        self.scene = self.scene.with_shapes(
+            [shape for shape in self.scene.shapes if shape.name not in removed]
+        )
 
     def allow(self, obstacle: str, links: Sequence[str] | str) -> None:
         """Allow links to touch an obstacle, as fingers what they grasp.
@@ -216,7 +220,7 @@ class Workspace:
 
         Args:
             goal: A pose of the tip [4, 4] in the frame of the world, or several [n, 4, 4], any of which may
-                be reached; or a goal as of `rd.Problem` in the frame of the base.
+                be reached; or a goal that `rd.Problem` takes, in the frame of the base.
             start: Start configuration [dof], values by joint, or the name of a pose.
             constraints: Path constraints, in the frame of the base.
             time_limit: Wall time of the call, with what it takes to read many goals [s].
@@ -299,15 +303,15 @@ class Workspace:
             q = start
             ends = [*waypoints, pose]
             for k, end in enumerate(ends):
-                left = time_left(time_limit, began) / (len(ends) - k)
-                result = self.plan_line(end, q, tolerance, angle, speed, left, **request)
+                seconds_left = time_left(time_limit, began) / (len(ends) - k)
+                result = self.plan_line(end, q, tolerance, angle, speed, seconds_left, **request)
                 if not result.solved:
                     reason = f"line {k + 1} of {len(ends)}: {result.reason}"
                     return replace(result, reason=reason, fraction=(k + (result.fraction or 0.0)) / len(ends))
                 q = result.path.positions[-1]
                 lines.append(result)
-            whole = join(lines, time_limit=time_limit)
-            return replace(whole, fraction=1.0, goal_index=lines[-1].goal_index) if whole.solved else whole
+            joined = join(lines, time_limit=time_limit)
+            return replace(joined, fraction=1.0, goal_index=lines[-1].goal_index) if joined.solved else joined
         several = isinstance(pose, AnyGoal)
         matrices = numbers(pose)
         if matrices is not None and matrices.ndim == 3:
@@ -324,11 +328,11 @@ class Workspace:
         T_start = self._T_base_world @ self.pose(start)
         off = [np.linalg.norm((line_end(problem, line) - T_start)[:3, 3]) for problem in problems]
         best = None
-        for tried, i in enumerate(np.argsort(off, kind="stable")):
+        for attempt, i in enumerate(np.argsort(off, kind="stable")):
             if best is not None and clock() - began >= time_limit:
                 break
-            left = time_left(time_limit, began) / (len(goals) - tried)
-            result = plan(problems[i], left, **request)
+            seconds_left = time_left(time_limit, began) / (len(goals) - attempt)
+            result = plan(problems[i], seconds_left, **request)
             if result.solved:
                 return replace(result, goal_index=int(i)) if several else result
             if several:

@@ -233,13 +233,13 @@ class PathConstraints:
         """The maximum value of a row from a place on the motion until it is satisfied again."""
         following = min(segment + 1, len(q) - 1)
         at = q[segment] + fraction * (q[following] - q[segment])
-        way = np.concatenate([at[None], q[following:]])
-        lengths = np.linalg.norm(np.diff(way, axis=0), axis=1)
+        remaining = np.concatenate([at[None], q[following:]])
+        lengths = np.linalg.norm(np.diff(remaining, axis=0), axis=1)
         knots = np.concatenate([[0.0], np.cumsum(lengths)])
         near = np.geomspace(MIN_SEGMENT_FRACTION, VIOLATION_STEP, 64)
         s = np.unique(np.concatenate([near, VIOLATION_STEP * np.arange(VIOLATION_STEPS), knots]))
         s = s[s <= min(knots[-1], VIOLATION_STEP * VIOLATION_STEPS)]
-        places = interpolated(s, knots, way)
+        places = interpolated(s, knots, remaining)
         values = self.values(places)[:, row]
         over = values > self.rows.limit[row]
         start = int(over.argmax())
@@ -276,9 +276,12 @@ def _rows(problem: Problem, constraint: Constraint) -> list[_Row]:
 def _line_rows(problem: Problem, line: CartesianLine) -> list[_Row]:
     T_start = link_pose(problem.robot, problem.start, line.frame)
     T_goal = line_end(problem, line)
-    way = T_goal[:3, 3] - T_start[:3, 3]
-    length = float(np.linalg.norm(way))
-    place = transform(T_start[:3, 3] + way / 2, rotation_z_to(way / length if length > 0 else np.eye(3)[2]))
+    displacement = T_goal[:3, 3] - T_start[:3, 3]
+    length = float(np.linalg.norm(displacement))
+    place = transform(
+        T_start[:3, 3] + displacement / 2,
+        rotation_z_to(displacement / length if length > 0 else np.eye(3)[2]),
+    )
     half = np.array([0.0, 0.0, length / 2])
     rows = [_Row(DISTANCE, line.tolerance, line.tolerance, place, half, half)]
     if line.angle is None:
@@ -295,7 +298,7 @@ def _line_rows(problem: Problem, line: CartesianLine) -> list[_Row]:
             limit = min(spread + line.angle, np.pi)
             rows.append(_Row(CONE, limit, line.angle, a=T_start[:3, :3].T @ link_axis, b=direction))
     else:
-        share = way / length**2 if length > 0 else way
+        share = displacement / length**2 if length > 0 else displacement
         rows.append(_Row(TURN, line.angle, line.angle, T_start, a=turn, b=share))
     return rows
 

@@ -261,7 +261,7 @@ def read_goal(where: str, data: object, setting: Setting) -> Goal:
         if not isinstance(value, dict) or not value:
             raise InputError(f"{where} is {shown(value)}; it must map link names to poses")
         return PosesGoal(
-            [_pose_goal(f"{where}.{frame}", one, setting.scene, frame) for frame, one in value.items()]
+            [_pose_goal(f"{where}.{frame}", part, setting.scene, frame) for frame, part in value.items()]
         )
     if kind == "joints" and isinstance(value, str):
         value = named_pose(setting.robot, where, value)

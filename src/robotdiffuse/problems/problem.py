@@ -63,8 +63,8 @@ def depth_views(robot: Robot, views: Any) -> tuple[DepthView, ...]:
 def path_constraints(robot: Robot, constraints: Any) -> tuple[Constraint, ...]:
     kinds = tuple(CONSTRAINTS.values())
     check_list("constraints", constraints, kinds, ", ".join(f"rd.{kind.__name__}" for kind in kinds))
-    for i, one in enumerate(constraints):
-        robot.check_moved(f"constraints[{i}].frame", one.frame)
+    for i, constraint in enumerate(constraints):
+        robot.check_moved(f"constraints[{i}].frame", constraint.frame)
     return tuple(constraints)
 
 

@@ -426,7 +426,7 @@ class _Process:
         self.connection, self.sending = connection, threading.Lock()
         self.calls: queue.SimpleQueue[tuple[int, bytes]] = queue.SimpleQueue()
         self.running = self.cancelled = 0
-        """Numbers of the running call and of the last one that was cancelled."""
+        """Numbers that identify the running call, and the last call that was cancelled."""
         self.renew = False
 
     def send(self, answer: bytes | float) -> None:

@@ -104,7 +104,7 @@ class Inertia(NamedTuple):
 
     @property
     def values(self) -> list[float]:
-        """The ten numbers that `inertia_of` takes."""
+        """Mass, center of mass and moments as the ten numbers that `inertia_of` takes."""
         upper = self.moments[np.triu_indices(3)]
         return [self.mass, *self.com.tolist(), *upper.tolist()]
 

@@ -25,7 +25,7 @@ MAX_DAMPING = 1e3
 DAMPING_DECREASE = 0.3
 DAMPING_INCREASE = 4.0
 CHECK_EVERY = 8
-"""Iterations between checks of the progress."""
+"""Number of iterations between two checks of the progress."""
 REQUIRED_PROGRESS = 0.5
 """A seed whose error has not dropped to this fraction since the last check is given up."""
 

@@ -134,7 +134,7 @@ def each_pose(
     rest: Configuration,
 ) -> Iterator[Configurations]:
     """Up to `count` distinct configurations for each of several poses of a link, all from these seeds; joints
-    that are on another arm have their values of `rest`."""
+    that are on another arm have the values that `rest` gives."""
     arm, chain = ik_chain(robot, frame, LIMIT_MARGIN)
     seeds = np.clip(np.ascontiguousarray(seeds[:, arm]), chain.lower, chain.upper)
     for T in poses:

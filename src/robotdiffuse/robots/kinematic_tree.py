@@ -83,7 +83,7 @@ def with_mimics(joints: tuple[Joint, ...], locked: dict[str, Any]) -> dict[str, 
 
 
 MAX_WRAPPED_STEP = 0.5
-"""Largest distance of a step of a continuous joint from a whole turn at which its values count as wrapped
+"""If a step of a continuous joint differs from a whole turn by at most this, its values count as wrapped
 [rad]."""
 
 

@@ -69,8 +69,8 @@ class LinkPairTable(Value):
         return inside & self.apart[tuple(index)]
 
     def throughout(self, *intervals: tuple[Values, Values]) -> Bool[ndarray, "*intervals"]:
-        """Whether the links are known to be apart throughout intervals [low, high] of the joints between
-        them.
+        """Whether the links are known to be apart at all values in intervals [low, high] of the joints
+        between them.
 
         With two joints, the result holds every combination of an interval of the first and one of the second.
         """

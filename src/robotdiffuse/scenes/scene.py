@@ -84,7 +84,7 @@ class Scene(Value):
         """The obstacles of a MuJoCo model: all geoms that collide and are no part of the robot.
 
         Args:
-            model: A compiled model, as of `mujoco.MjModel.from_xml_path`.
+            model: A compiled model, such as `mujoco.MjModel.from_xml_path` returns.
             data: State of the model, which says where free bodies are; None: as the model places them.
             base: The body that is the base of the robot; scenes are in its frame. A robot that
                 `load_robot` reads from a model has the base "world".

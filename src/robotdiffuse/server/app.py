@@ -430,8 +430,10 @@ def _add_lists(app: FastAPI, pool: WorkerPool, robots: dict[str, Robot]) -> None
     @app.get("/planners", summary="List the planners that requests may name", responses=errors)
     async def list_planners() -> list[PlannerInfo]:
         return [
-            PlannerInfo(name=name, kind=of.kind, description=of.description, default=name == DEFAULT_PLANNER)
-            for name, of in PLANNERS.load_installed().items()
+            PlannerInfo(
+                name=name, kind=entry.kind, description=entry.description, default=name == DEFAULT_PLANNER
+            )
+            for name, entry in PLANNERS.load_installed().items()
         ]
 
     @app.get(

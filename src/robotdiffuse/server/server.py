@@ -17,7 +17,7 @@ from robotdiffuse.server.settings import GRACE_TIME, KEEP_ALIVE_TIMEOUT, ServeSe
 from robotdiffuse.server.worker_pool import WorkerPool
 
 BACKLOG = 128
-"""Connections that may wait to be accepted."""
+"""Number of connections that may wait to be accepted."""
 SIGNALS = signal.SIGINT, signal.SIGTERM
 
 

@@ -20,7 +20,7 @@ WRITE_TIMEOUT = 60.0
 KEEP_ALIVE_TIMEOUT = 5
 """Time that an idle connection stays open [s]."""
 MAX_ARRIVING = 64
-"""Most data of incomplete requests, as a multiple of the largest request."""
+"""Largest amount of data of incomplete requests, as a multiple of the largest request."""
 MAX_ENTRIES = {
     "scene": 10_000,
     "goal": 1000,
@@ -30,7 +30,7 @@ MAX_ENTRIES = {
     "views": 20,
     "attached": 50,
 }
-"""Most entries of the lists of a problem."""
+"""Largest number of entries of the lists of a problem."""
 # Most rows of a motion in a request, and in an answer at its rate.
 MAX_ROWS = 100_000
 MAX_ANSWER_ROWS = 20_000
@@ -55,7 +55,7 @@ class ServeSettings(Settings):
     max_request_size: Count = 8 * 2**20
     """Largest body of a request [bytes]."""
     max_batch: Count = 1000
-    """Most lines of a batch."""
+    """Largest number of lines of a batch."""
     max_worker_memory: Annotated[int, Bound(least=512.0 * 2**20)] = 2 * 2**30
     """Memory that a worker may use [bytes]: a request that needs more is refused. A worker that holds more
     than half of it after an answer is replaced before its next request."""

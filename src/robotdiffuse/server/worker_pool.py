@@ -136,11 +136,11 @@ class WorkerPool:
     @property
     def ready(self) -> int:
         """Workers that can take requests."""
-        return sum(one.ready for one in self._workers.workers)
+        return sum(worker.ready for worker in self._workers.workers)
 
     def state(self) -> dict[str, int]:
         """The numbers of workers and waiting requests now, for /health."""
-        busy = sum(one.busy for one in self._workers.workers)
+        busy = sum(worker.busy for worker in self._workers.workers)
         return {
             "workers": self.settings.workers,
             "workers_ready": self.ready,

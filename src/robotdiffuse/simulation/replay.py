@@ -25,8 +25,8 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.simulation.world import World
 
 SOLVER_ITERATIONS = 500
-"""Iterations of Bullet's constraint solver in a time step. With its default of 50, motors miss their targets
-by up to 0.6 mm at the tip for any motion; with 500 by a few micrometers."""
+"""Number of iterations of Bullet's constraint solver in a time step. With its default of 50, motors miss
+their targets by up to 0.6 mm at the tip for any motion; with 500 by a few micrometers."""
 # Fractions of a position and a velocity error that a motor corrects in one time step.
 POSITION_GAIN = 0.3
 VELOCITY_GAIN = 1.0

@@ -125,8 +125,8 @@ class World:
             self.bullet.removeBody(body)
         self.scene = scene
         scene_drawables = drawables(scene, moving)
-        self._moving = [one for one in scene_drawables if one.moving is not None]
-        self.obstacles = {one.name: self._add(one) for one in scene_drawables}
+        self._moving = [drawable for drawable in scene_drawables if drawable.moving is not None]
+        self.obstacles = {drawable.name: self._add(drawable) for drawable in scene_drawables}
         for link, index in self.links.items():
             for name, body in self.obstacles.items():
                 if self.robot.link_frame(link) == 0 or scene.may_touch(link, name):
@@ -138,8 +138,10 @@ class World:
 
     def move(self, time: float) -> None:
         """Place the moving obstacles where they are at a time [s]; one of unknown motion stays."""
-        for one in self._moving:
-            self.bullet.resetBasePositionAndOrientation(self.obstacles[one.name], *_pose(one.frame(time)))
+        for obstacle in self._moving:
+            self.bullet.resetBasePositionAndOrientation(
+                self.obstacles[obstacle.name], *_pose(obstacle.frame(time))
+            )
 
     def touching(self) -> list[tuple[str, str, float]]:
         """Contacts of the last step: link, obstacle or other link, signed distance [m]."""

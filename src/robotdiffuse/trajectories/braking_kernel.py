@@ -1,8 +1,9 @@
-"""Compiled speeds along a path from the arm's place on it: towards the end for a while, then to rest.
+"""Compiled code for the speeds of a motion along a path, from the arm's present place and speed: as fast as
+possible towards the end for a given time, then braking to rest.
 
-s̈ is constant in each grid interval, and limits hold at both ends of the interval, also where the motion
-covers only a part of it. So an acceleration that was possible at the beginning of an interval stays possible
-in it.
+The path has the parameter s, its speed is ṡ, and s̈ is constant in each grid interval. The limits are applied
+at both ends of the interval, even if the motion covers only a part of it, so an acceleration that is allowed
+at the beginning of an interval is allowed all through it.
 """
 
 import numpy as np
@@ -17,30 +18,31 @@ STILL_SPEED_SQUARED = 1e-12
 
 
 @kernel()
-def _acceleration_bounds(one, two, grid, i, s, x, most, acceleration):
-    """Bounds of s̈ in interval i from s on, where ṡ² is x, such that ṡ² is at most `most` at the interval's
-    end."""
+def _acceleration_bounds(first_derivative, second_derivative, grid, i, s, x, greatest, acceleration):
+    """Lower and upper bound of s̈ in interval i, for a motion that is at s with ṡ² = x, so that ṡ² is at most
+    `greatest` at the end of the interval."""
     low = -np.inf
-    high = (most - x) / (2 * (grid[i + 1] - s))
+    high = (greatest - x) / (2 * (grid[i + 1] - s))
     for k in range(i, i + 2):
-        for j in range(one.shape[1]):
-            a = one[k, j] + 2 * (grid[k] - s) * two[k, j]
+        for j in range(first_derivative.shape[1]):
+            a = first_derivative[k, j] + 2 * (grid[k] - s) * second_derivative[k, j]
             if abs(a) < NEGLIGIBLE_DERIVATIVE:
                 continue
             limit = acceleration[j] / abs(a)
-            middle = -two[k, j] * x / a
+            middle = -second_derivative[k, j] * x / a
             low = max(low, middle - limit)
             high = min(high, middle + limit)
     return low, max(high, low)
 
 
 @kernel()
-def advance_then_brake(one, two, grid, most, s, speed, time, acceleration):
-    """Values of s and speeds [n each] of a motion as fast as possible for some time [s], then braking to
-    rest.
+def advance_then_brake(first_derivative, second_derivative, grid, greatest, s, speed, time, acceleration):
+    """Values of s and of ṡ, [n] each, of a motion that is as fast as possible for some time [s] and then
+    brakes to rest.
 
-    one, two: first and second derivative of the path at the grid, [m, dof]; `most` [m]: the greatest ṡ² from
-    which the end can be reached within the limits; s, speed: where the motion begins; acceleration [dof].
+    first_derivative[k, dof], second_derivative[k, dof]: of the path, at the values grid[k] of s. greatest[k]:
+    the greatest ṡ² at which the end can still be reached within the limits. s, speed: s and ṡ at the
+    beginning. acceleration[dof]: the limit of each joint.
     """
     n = len(grid)
     out = np.empty((2, n + 2))
@@ -53,22 +55,25 @@ def advance_then_brake(one, two, grid, most, s, speed, time, acceleration):
     out[0, 0] = s
     out[1, 0] = speed
     while i < n - 1 and (x >= STILL_SPEED_SQUARED or time_left > 0):
-        low, high = _acceleration_bounds(one, two, grid, i, s, x, most[i + 1], acceleration)
-        pull = high if time_left > 0 else low
+        low, high = _acceleration_bounds(
+            first_derivative, second_derivative, grid, i, s, x, greatest[i + 1], acceleration
+        )
+        path_acceleration = high if time_left > 0 else low
         width = grid[i + 1] - s
-        beyond = max(x + 2 * pull * width, 0.0)
-        both = np.sqrt(x) + np.sqrt(beyond)
-        lasts = 2 * width / both if both > 0 else np.inf
-        if 0 < time_left < lasts:
-            s = min(s + (np.sqrt(x) + 0.5 * pull * time_left) * time_left, grid[i + 1] - MIN_INTERVAL)
-            x = max((np.sqrt(x) + pull * time_left) ** 2, 0.0)
+        next_speed_squared = max(x + 2 * path_acceleration * width, 0.0)
+        speed_sum = np.sqrt(x) + np.sqrt(next_speed_squared)
+        duration = 2 * width / speed_sum if speed_sum > 0 else np.inf
+        if 0 < time_left < duration:
+            travel = (np.sqrt(x) + 0.5 * path_acceleration * time_left) * time_left
+            s = min(s + travel, grid[i + 1] - MIN_INTERVAL)
+            x = max((np.sqrt(x) + path_acceleration * time_left) ** 2, 0.0)
             time_left = 0.0
-        elif time_left <= 0 and x + 2 * pull * width < 0:
-            s = s - x / (2 * pull)
+        elif time_left <= 0 and x + 2 * path_acceleration * width < 0:
+            s = s - x / (2 * path_acceleration)
             x = 0.0
         else:
-            time_left -= lasts
-            i, s, x = i + 1, grid[i + 1], beyond
+            time_left -= duration
+            i, s, x = i + 1, grid[i + 1], next_speed_squared
         count += 1
         out[0, count], out[1, count] = s, np.sqrt(x)
     out[1, count] = 0.0
@@ -76,17 +81,19 @@ def advance_then_brake(one, two, grid, most, s, speed, time, acceleration):
 
 
 @kernel()
-def state_after(ahead, speeds, time):
-    """s and speed some time [s] after the beginning; at rest at the end once the motion is over."""
+def state_after(path_values, speeds, time):
+    """The path parameter s and its speed at a time [s] after the beginning; after the motion, those at its
+    end."""
     time_left = time
-    for i in range(len(ahead) - 1):
-        width = ahead[i + 1] - ahead[i]
-        both = speeds[i] + speeds[i + 1]
-        if both <= 0:
-            return ahead[i], 0.0
-        lasts = 2 * width / both
-        if time_left < lasts:
-            pull = (speeds[i + 1] - speeds[i]) / lasts
-            return ahead[i] + (speeds[i] + 0.5 * pull * time_left) * time_left, speeds[i] + pull * time_left
-        time_left -= lasts
-    return ahead[-1], 0.0
+    for i in range(len(path_values) - 1):
+        width = path_values[i + 1] - path_values[i]
+        speed_sum = speeds[i] + speeds[i + 1]
+        if speed_sum <= 0:
+            return path_values[i], 0.0
+        duration = 2 * width / speed_sum
+        if time_left < duration:
+            path_acceleration = (speeds[i + 1] - speeds[i]) / duration
+            travel = (speeds[i] + 0.5 * path_acceleration * time_left) * time_left
+            return path_values[i] + travel, speeds[i] + path_acceleration * time_left
+        time_left -= duration
+    return path_values[-1], 0.0

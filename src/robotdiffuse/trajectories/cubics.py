@@ -34,14 +34,14 @@ class Extremes(NamedTuple):
     velocity: JointRows
     """The largest absolute velocity in each step."""
     acceleration: JointRows
-    """The same of the acceleration."""
+    """The largest absolute acceleration in each step."""
     jerk: JointValues
     """The largest absolute jerk within any step."""
     chord: Values
-    """How far each cubic may leave the straight line between its rows, for the joint that does most [rad] or
-    [m]."""
+    """For each step, an upper bound on how far the cubic leaves the straight line between its two rows, for
+    the joint with the largest bound [rad] or [m]."""
     chords: JointValues
-    """The same for each joint, in any step."""
+    """The same bound for each joint: the largest over all steps."""
     lower: Configuration
     """The least position of each joint."""
     upper: Configuration
@@ -57,7 +57,8 @@ class Cubics:
         self.extremes = Extremes(*_extremes(*map(for_kernels, rows)))
 
     def states(self, step: Int[ndarray, "n"], share: Values) -> CubicStates:
-        """States at shares of steps."""
+        """Positions, velocities and accelerations within steps; `share`, from 0 to 1, is the fraction of the
+        step's duration that has passed."""
         u = share[:, None]
         h = self.steps[step]
         start = self.extremes.start[step]
@@ -72,8 +73,8 @@ class Cubics:
         )
 
     def turns(self) -> tuple[Values, Configurations]:
-        """Times at which any joint turns round within a step, where its position is extreme, and positions of
-        all joints there."""
+        """Times within steps at which some joint reverses its direction, so that its position is extreme, and
+        positions of all joints at these times."""
         start = self.extremes.start
         v = self.trajectory.velocities[:-1] / self.steps
         curve = self.extremes.end - start
@@ -91,8 +92,9 @@ class Cubics:
         return times, self.states(steps, shares).positions
 
     def sampled(self, chord: float) -> tuple[Values, Configurations, JointValues]:
-        """Times and positions of the rows and of added rows on the cubics, such that straight lines between
-        them leave the cubics by at most `chord`; and by how much they do, for each joint [rad] or [m]."""
+        """Times and positions of the rows and of rows added between them, so that straight lines through all
+        of them are within `chord` of the cubics; and a bound on how far they are, for each joint [rad] or
+        [m]."""
         times = self.trajectory.times
         q = self.trajectory.positions
         bends = self.extremes.chord
@@ -153,8 +155,9 @@ def _extremes(times, q, v):
 
 @inner_kernel()
 def _range(q, v, a, b, h, low, high):
-    """The least and the greatest position of a cubic between `low` and `high` at its ends: also where its
-    velocity v + h (a u + (b - a) u² / 2) is 0."""
+    """The least and the greatest position of a cubic. `low` and `high` are the smaller and the larger
+    position of its two ends. Inside, extremes are where the velocity v + h (a u + (b - a) u² / 2) is 0, with
+    u from 0 to 1."""
     square = a * a - 2 * (b - a) * v / h
     if square < 0:
         return low, high

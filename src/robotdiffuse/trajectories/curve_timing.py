@@ -1,4 +1,5 @@
-"""The fastest motions along smooth curves, such as those that a straight line of the tool asks of the joints.
+"""The fastest motions along smooth curves, such as the curves in joint space on which the tool follows a
+straight line.
 
 Where `timing.py` rounds the corners of polylines, the motion here stays on the curve: its place on the curve
 is averaged over time to keep the jerk limits, not its configurations.
@@ -26,7 +27,7 @@ from robotdiffuse.trajectories.timing_kernel import ROUNDING_MARGIN, fastest_spe
 
 GRID_INTERVALS = 128
 ACCELERATION_SHARES = (1.0, 0.7, 0.5, 0.35)
-"""Parts of the acceleration limits that are tried in turn, until lower ones make the motion longer."""
+"""Fractions of the acceleration limits that are tried in turn, until lower ones make the motion longer."""
 
 
 class SmoothCurve:

@@ -14,11 +14,13 @@ from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
 
 _ONE, _HALF = np.float32(1.0), np.float32(0.5)
 MAX_SUBDIVISIONS = 5
-"""Subdivisions in a round of corner smoothing; then waypoints that can be skipped are removed again."""
+"""Number of subdivisions in a round of corner smoothing; then waypoints that can be skipped are removed
+again."""
 MIN_MOVE = np.float32(0.005)
-"""Smoothing leaves a corner that it would move by less; tightening makes no shorter segments [rad]."""
+"""Smoothing leaves a corner alone that it would move by less than this, and tightening makes no segment
+shorter than this [rad]."""
 MIN_GAIN = np.float32(1e-3)
-"""Simplification ends after a round that shortens the path by a smaller share of its length."""
+"""Simplification ends after a round that shortens the path by less than this fraction of its length."""
 REMOVE_SHARE, PULL_SHARE = np.float32(0.1), np.float32(0.35)
 """Tightening removes a waypoint in REMOVE_SHARE of its attempts, and between REMOVE_SHARE and PULL_SHARE
 pulls one straight towards its neighbors' chord. All others pull and also move it at random."""

@@ -18,13 +18,13 @@ from robotdiffuse.trajectories.corner_rounding import BlendedPolyline
 from robotdiffuse.trajectories.timing_kernel import fastest_speeds, sample_positions, slowdown
 
 MAX_ROWS = 200_000
-"""Rows of a motion between two stops at most, before a jerk limit makes it longer; longer motions have larger
-steps."""
+"""Largest number of rows of a motion between two stops, before a jerk limit makes the motion longer; longer
+motions have larger steps."""
 SECONDS_PER_ROW = 5e-6
 """Time for sampling and validating a row [s]."""
 MIN_STEPS = 4
-"""Steps of a motion between two stops at least: with fewer, its rows would miss that it speeds up and
-brakes."""
+"""Smallest number of steps of a motion between two stops: with fewer, its rows would miss that it speeds up
+and brakes."""
 ACCELERATION_FACTOR = 0.7
 """Factor of the accelerations that are tried next for a motion that its jerk limits slow down."""
 WINDOW_FRACTIONS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
@@ -40,15 +40,15 @@ MIN_JERK = 0.01
 Scaling = Annotated[float, Bound(least=MIN_SCALING, most=1.0)]
 Jerk = Annotated[float, Bound(least=MIN_JERK, infinite=True)]
 CHECKS_PER_INTERVAL = 8
-"""Parts of a grid interval at whose ends frame speeds and torques are checked."""
+"""Number of parts of a grid interval at whose ends frame speeds and torques are checked."""
 MIN_TORQUE_SHARE = 2e-3
-"""Share of a torque limit that is left to motion where gravity takes all of it."""
+"""Fraction of a torque limit that remains for motion where gravity takes all of the limit."""
 LIMIT_TOLERANCE = 1e-6
-"""Share by which a motion with a start speed may exceed the limits."""
+"""Fraction by which a motion with a start speed may exceed the limits."""
 START_SHARES = tuple(ACCELERATION_FACTOR**k for k in range(16))
-"""Shares of the acceleration limits that are tried for a motion with a start speed."""
+"""Fractions of the acceleration limits that are tried for a motion with a start speed."""
 MAX_SHARES = 12
-"""Times that the limits of a motion with a start speed are lowered, until they hold between grid points
+"""How often the limits of a motion with a start speed are lowered, until they hold between grid points
 too."""
 BRAKING_FRACTION = 0.9
 """Fraction of the acceleration with which `stopping_distance` brakes; the rest lets corners be rounded."""
@@ -66,8 +66,8 @@ class TimingSettings(Settings, name="timing"):
     """Settings of the timing of paths."""
 
     sample_time: Annotated[float, Bound(least=1e-4, most=1.0)] = 0.004
-    """Time between the rows of a trajectory at most [s], unless it would have more than MAX_ROWS rows. Each
-    motion from stop to stop takes two of these steps longer than the fastest one without a jerk limit."""
+    """Largest time between the rows of a trajectory [s], unless it would have more than MAX_ROWS rows. Each
+    motion from stop to stop takes two of these steps longer than the fastest motion without a jerk limit."""
     velocity_scale: Scaling = 1.0
     """Scale of the robot's velocity limits, in (0, 1]."""
     acceleration_scale: Scaling = 1.0
@@ -78,10 +78,10 @@ class TimingSettings(Settings, name="timing"):
     corner_deviation: NotNegative = 0.3
     """How far a rounded corner may leave the path where it stays valid [rad, joint-space L2]."""
     corner_intervals: Count = 8
-    """Grid intervals in a rounded corner at least; wide ones have as many as a straight part of their
-    length."""
+    """Smallest number of grid intervals in a rounded corner; a wide corner has as many as a straight part of
+    its length."""
     line_intervals: Count = 64
-    """Grid intervals of the whole motion, distributed by length."""
+    """Number of grid intervals of the whole motion, distributed by length."""
 
 
 DEFAULT = TimingSettings()
@@ -138,7 +138,7 @@ def time_line(
         speeds = _fastest_speeds(line, grid, *limits, extra=extra)
         speeds = _slow_to_extra_limits(line, grid, speeds, extra)
         duration = _duration(grid, speeds)
-        if 2 * (limits[1] / jerk).max() > duration:  # then lower accelerations make a shorter motion
+        if 2 * (limits[1] / jerk).max() > duration:  # lower accelerations may then give a shorter motion
             share *= ACCELERATION_FACTOR
             continue
         count = row_count(duration, settings)
@@ -225,8 +225,8 @@ def stopping_distance(robot: Robot, settings: TimingSettings, velocity: JointVal
 
 
 def jerk_windows(step: float, acceleration: JointValues, jerk: JointValues) -> list[int]:
-    """Numbers of configurations over which `spline_rows` may average to keep the jerk limits, in the order
-    tried; the last keeps them in any case."""
+    """Numbers of configurations over which `spline_rows` may average, in the order in which they are tried.
+    With the last number, the jerk limits are kept in any case."""
     jerk_window = max(int(np.ceil(2 * (acceleration / jerk).max() / step)), 1)
     return sorted({1, *(int(np.ceil(fraction * jerk_window)) for fraction in WINDOW_FRACTIONS), jerk_window})
 
@@ -270,7 +270,7 @@ def _fastest_speeds(
     at_start = start_speed * np.abs(line(grid[:1], 1)[0])
     for _ in range(MAX_SHARES):
         check_timing("the fastest speeds")
-        # at the start the velocity is given: less than it cannot be asked for
+        # the velocity at the start is given, so the limit there cannot be lower
         limits = np.minimum(velocity, np.maximum(share * velocity, at_start)), share**2 * acceleration
         speeds = fastest_speeds(*derivatives_and_limits(line, grid, *limits, extra), start_speed)
         if start_speed and np.isnan(speeds).any():

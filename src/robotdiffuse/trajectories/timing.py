@@ -1,5 +1,5 @@
-"""Time-optimal timing of a path within velocity, acceleration and jerk limits; stops along a path and the
-timed motions between them, forwards and back, for timings that wait or retreat."""
+"""Time-optimal timing of a path within velocity, acceleration and jerk limits. Also stops along a path and
+the timed motions between them, forwards and back, for motions that wait or retreat."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -32,13 +32,14 @@ SHRINK_FACTOR = 0.5
 MIN_DEVIATION = 2e-4
 """A corner that cannot be rounded with this deviation is a stop [rad, joint-space L2]."""
 MAX_TIMINGS = 8
-"""Times that a motion is timed and validated before it stops at every corner."""
+"""How often a motion is timed and validated; after that it stops at every corner."""
 MAX_SLOWER_TIMINGS = 4
-"""Number of these timings that may use lower accelerations if each corner alone is free."""
+"""How many of these timings may lower the accelerations, if each corner is free by itself but the motion as a
+whole is refused."""
 CORNER_SAMPLES = 17
 """Number of configurations of a rounded corner that are checked."""
 CORNER_PLACES = np.linspace(-1, 1, CORNER_SAMPLES)
-"""Their places, in half widths from its middle."""
+"""The places of these configurations, in half widths of the corner from its middle."""
 SAME_WAYPOINT_DISTANCE = 1e-6
 """Consecutive waypoints closer than this are merged [rad]."""
 
@@ -58,16 +59,16 @@ def time_parameterize(
 
     Corners of the path are rounded so that the motion need not stop there. If `valid` rejects the whole
     motion, `free` checks the corners one by one, and each that fails is rounded half as far until it is free.
-    Only a corner that is not free with a deviation of MIN_DEVIATION becomes a stop. With stops at all corners
-    the rows lie on the path itself, so a free path always has a trajectory; that one is returned without
-    validation.
+    A corner becomes a stop if it is not free with a deviation of MIN_DEVIATION, or if the motion as a whole
+    is still refused after MAX_TIMINGS timings. With stops at all corners the rows lie on the path itself, so
+    a free path always has a trajectory; that one is returned without validation.
 
     `valid`: validates the whole motion. `free`: whether a path is free of collision. `keeps`: whether
     configurations [n, dof] along a rounded corner keep what the path keeps, such as a clearance; corners that
     do not are rounded less from the start, but at least by MIN_DEVIATION. `start_speed` [rad/s, joint-space
     L2]: the speed at the beginning, along the first straight line, which must be long enough to stop on.
-    `extra`: further limits, of motions that begin at rest. `deviations`: how far the motion may leave each
-    waypoint [rad], instead of `settings.corner_deviation`.
+    `extra`: further limits (speeds of frames, torques), which are applied only if the motion begins at rest.
+    `deviations`: how far the motion may leave each waypoint [rad], instead of `settings.corner_deviation`.
 
     Motions from rest have constant jerk between rows, within the limits of `jerk_limits`. A low jerk limit
     costs time at both ends of the motion and at each stop, and cuts corners slightly more.
@@ -123,7 +124,8 @@ def rounded_corners(
         if (less < deviations).any():
             deviations = less
         elif attempt < MAX_SLOWER_TIMINGS and not start_speed:
-            # Averaging for the jerk limits cuts corners, by an eighth with half of the accelerations.
+            # Averaging for the jerk limits cuts corners; with half the accelerations it cuts them an eighth
+            # as much.
             scale = max(SHRINK_FACTOR * slower.acceleration_scale, MIN_SCALING)
             slower = replace(slower, acceleration_scale=scale)
         else:  # the motion as a whole is refused: every corner is in doubt
@@ -150,7 +152,7 @@ def _shrunk(
     `least`."""
     deviations, accepted = deviations.copy(), np.zeros(len(deviations))
     while True:
-        # a corner becomes wider where its neighbor leaves it more of their segment
+        # Two corners share a segment: if one shrinks, the other becomes wider and must be checked again.
         line = rounded_line(waypoints, deviations)
         widths = line[3]
         doubtful = np.flatnonzero((deviations > 0) & (widths > accepted * (1 + 1e-9)))
@@ -199,7 +201,8 @@ def _time_segments(
     start_speed: float,
     extra: ExtraLimits = NO_EXTRA_LIMITS,
 ) -> Trajectory:
-    """The motion as one piece per part between stops; it stops where a deviation is zero."""
+    """The motion, timed separately from each stop to the next. It stops at corners whose deviation is
+    zero."""
     stops = [0, *(np.flatnonzero(deviations == 0) + 1), len(waypoints) - 1]
     segments = []
     for a, b in pairwise(stops):
@@ -210,7 +213,7 @@ def _time_segments(
 
 
 def _joined(pieces: Sequence[tuple[ndarray, ...]]) -> tuple[ndarray, ...]:
-    """Motions one after the other, each of which begins with the last row of the one before."""
+    """Joins motions, each of which begins with the last row of the one before."""
     start = 0.0
     parts = []
     for times, *more in pieces:
@@ -259,7 +262,8 @@ class StopGraph:
         """Every motion lasts a whole number of time steps `step` [s].
 
         Corners are rounded as in `time_parameterize`, with its arguments `valid`, `free`, `keeps`, `extra`
-        and `deviations`. Every motion ends at the path's rows `required_stops`; none passes through them.
+        and `deviations`. The path's rows `required_stops` are always stops: motions begin or end there, and
+        none passes through them.
         """
         self.joint_names = path.joint_names
         self.step = step
@@ -269,7 +273,7 @@ class StopGraph:
         )
         self.line = BlendedPolyline(waypoints, half_widths(waypoints, rounded))
         self.stops = self._find_stops(rounded)
-        """Their values of s along the path, in order."""
+        """The values of s along the path at which motions may stop, in order."""
         sharp = self.line.knots[1:-1][rounded == 0]
         self.motions: list[Motion] = []
         for (i, low), (j, high) in combinations(enumerate(self.stops), 2):
@@ -317,8 +321,8 @@ class StopGraph:
         parts = []
         for low, high in zip(self.stops[:-1], self.stops[1:], strict=True):
             samples = self.line(np.linspace(low, high, 33), 0)
-            way = float((np.abs(np.diff(samples, axis=0)) @ radii).sum())
-            parts.append(np.linspace(low, high, max(int(np.ceil(way / travel)), 1) + 1)[:-1])
+            travel_length = float((np.abs(np.diff(samples, axis=0)) @ radii).sum())
+            parts.append(np.linspace(low, high, max(int(np.ceil(travel_length / travel)), 1) + 1)[:-1])
         s = np.concatenate([*parts, self.stops[-1:]])
         return s, self.line(s, 0)
 
@@ -329,12 +333,12 @@ class StopGraph:
         at = interpolated(ticks, times, q)
         return ((configurations**2).sum(axis=1) - 2 * at @ configurations.T).argmin(axis=1)
 
-    def trajectory(self, way: list[Motion | int]) -> Trajectory:
+    def trajectory(self, motions: list[Motion | int]) -> Trajectory:
         """Motions one after the other; an integer in `way` is a wait of one time step."""
         q = self.line(self.stops[:1], 0)
-        a = way[0].rows[3][:1] if way and not isinstance(way[0], int) else 0 * q
+        a = motions[0].rows[3][:1] if motions and not isinstance(motions[0], int) else 0 * q
         segments = [(np.zeros(1), q, 0 * q, a)]
-        for part in way:
+        for part in motions:
             if isinstance(part, int):
                 q = np.repeat(segments[-1][1][-1:], 2, axis=0)
                 segments.append((np.array([0.0, self.step]), q, 0 * q, 0 * q))

@@ -13,7 +13,8 @@ import numpy as np
 from robotdiffuse.core.kernels import inner_kernel, kernel
 
 SLOWDOWN_CHECKS_PER_INTERVAL = 16
-"""Parts of a grid interval at whose ends `slowdown` checks limits; with 4, a reversal was 1.8 % too fast."""
+"""Number of parts of a grid interval at whose ends `slowdown` checks limits; with 4, a reversal was 1.8 % too
+fast."""
 # Factors on rates before they are compared with limits: on curves, where rates between the checked places
 # were up to 0.025 % greater, and on straight lines.
 CURVE_MARGIN = 1.0002
@@ -21,7 +22,7 @@ ROUNDING_MARGIN = 1 + 1e-9
 NEGLIGIBLE_DERIVATIVE = 1e-7
 """Smaller components of the first derivative by s, whose norm is one on straight lines, count as zero."""
 NEGLIGIBLE_SHARE = 1e-8
-"""If the next speed contributes less than this share of an acceleration limit, its contribution is
+"""If the next speed contributes less than this fraction of an acceleration limit, its contribution is
 ignored."""
 BLEND_DEVIATION = 3.0 / 16.0
 """b(0) of `BlendedPolyline`: the distance from corner to blend, divided by the half width times the change of
@@ -30,7 +31,7 @@ direction."""
 CORNER_INTERVALS = 8
 LINE_INTERVALS = 32
 MIN_SPEED_RATIO = 0.01
-"""Each ṡ² is at least this share of the previous one and of the greatest possible one. Where a joint's q'
+"""Each ṡ² is at least this fraction of the previous one and of the greatest possible one. Where a joint's q'
 changes sign, the limits would otherwise allow a speed that only a stop can follow."""
 
 
@@ -109,8 +110,8 @@ def rounded_line(waypoints, deviations):
     for i in range(n - 2):
         turn = np.sqrt(((directions[i + 1] - directions[i]) ** 2).sum())
         blend_widths[i] = deviations[i] / max(BLEND_DEVIATION * turn, 1e-12)
-    # A segment between two corners is shared: each gets half, or what the other does not want. A segment at
-    # an end belongs to its only corner.
+    # Two corners share the segment between them: each gets half of it, or more if the other needs less. A
+    # segment at an end belongs to its only corner.
     for i in range(n - 2):
         before = lengths[i]
         after = lengths[i + 1]
@@ -225,9 +226,9 @@ def _greatest_pull(first, second, i, x, sign, acceleration):
 def _bounds_of_next(first, second, i, width, x, most, weakest, strongest):
     """Bounds of the next x after x in interval i, as linear functions of x; `most` is the greatest next x.
 
-    Returns value at 0 and slope of the lower bound, the same of the upper bound (at x itself the two parts
-    may cancel), and the greatest x that those limits allow which do not depend on the next x. With u = (y -
-    x) / (2 width), the acceleration of a joint is alpha x + beta y at both ends of the interval.
+    Returns the value at 0 and the slope of the lower bound, then of the upper bound (at x itself the two
+    parts may cancel), and the greatest x that those limits allow which do not depend on the next x. With u =
+    (y - x) / (2 width), the acceleration of a joint is alpha x + beta y at both ends of the interval.
     """
     high = most
     high_slope = 0.0
@@ -304,7 +305,7 @@ def fastest_speeds(first, second, grid, velocity, weakest, strongest, start_spee
         speeds[i] = np.sqrt(now)
         width = grid[i + 1] - grid[i]
         high, slope = _bounds_of_next(first, second, i, width, now, x[i + 1], weakest, strongest)[2:4]
-        # at least this much is possible from x[i], and proportionally less from a smaller x
+        # from x[i] at least this speed is possible, and proportionally less from a smaller x
         floor_speed = MIN_SPEED_RATIO * now * min(1.0, x[i + 1] / x[i])
         now = min(max(high + slope * now, floor_speed), x[i + 1])
     return speeds

@@ -12,7 +12,8 @@ class Violation:
     """not_finite, start, limits, scene_collision, self_collision, constraint, torque, twitch, jump,
     waypoint or goal; for trajectories also time, rest, velocity, acceleration, rates and speed."""
     time: float
-    """Its place: for a path, waypoint index plus fraction of the segment; for a trajectory, time [s]."""
+    """Where the violation is: for a path, waypoint index plus fraction of the segment; for a trajectory, time
+    [s]."""
     message: str
     """One line."""
     subject: str | None = None
@@ -41,7 +42,7 @@ class Report:
     """Certified lower bound on the distance of all moving links to all obstacles over the whole motion [m],
     at most 1 m. None for an invalid motion."""
     self_clearance: float | None
-    """The same between links that are checked against each other [m]."""
+    """Lower bound on the distance between links that are checked against each other [m]."""
     jerk_share: float | None = None
     """The largest jerk of a valid trajectory as a share of the joint's limit (`jerk_limits`); infinite if
     accelerations jump at the ends. Not a requirement: above 1 the motion is valid, but some controllers

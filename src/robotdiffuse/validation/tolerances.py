@@ -50,7 +50,8 @@ class VerifySettings(Settings, name="verify"):
     velocities, which controllers follow, leaves them by more than this [rad] or [m], rows on the cubic are
     added; more where the clearance is so small that the rest matters."""
     constraint_chord: Positive = 1e-6
-    """The same for path constraints. This distance is subtracted from their tolerances."""
+    """Like `chord`, for motions with path constraints. This distance is subtracted from the tolerances of the
+    constraints."""
     reversal_angle: NotNegative = float(np.radians(150))
     """A change of direction in joint space by more than this [rad] is a sharp reversal."""
     reversal_step: NotNegative = 0.05
@@ -58,15 +59,16 @@ class VerifySettings(Settings, name="verify"):
     reversals: Natural = 3
     """A motion with more sharp reversals than this twitches."""
     tightness: Annotated[float, Bound(above=0.0, below=1.0)] = 0.5
-    """The certified clearances of a `Report` are at least this share of the smallest measured one, in (0,
-    1)."""
+    """The certified clearances of a `Report` are at least this fraction of the smallest clearance that was
+    measured, in (0, 1)."""
 
 
 DEFAULT = VerifySettings()
 EXACT = VerifySettings(goal_distance=1e-4, goal_angle=1e-4)
-"""For telling goals close to each other apart."""
+"""Tight tolerances, with which goals close to each other can be distinguished."""
 BLEND_SAMPLE_SHARE = 0.25
-"""A blend is tested at configurations at most this share of its radius apart [joint-space L2]."""
+"""A blend is tested at configurations that are apart by at most this fraction of its radius [joint-space
+L2]."""
 
 
 class GoalError(NamedTuple):
@@ -97,14 +99,14 @@ def goal_error(
     poses = {} if poses is None else poses
     if isinstance(goal, AnyGoal):
         errors = list[GoalError]()
-        for one in goal.goals:
-            error = goal_error(robot, one, q, settings, blend, poses)
+        for part in goal.goals:
+            error = goal_error(robot, part, q, settings, blend, poses)
             if error is None:
                 return None
             errors.append(error)
         return min(errors, key=lambda error: error.excess)
     if isinstance(goal, PosesGoal):
-        errors = [goal_error(robot, one, q, settings, blend, poses) for one in goal.poses]
+        errors = [goal_error(robot, part, q, settings, blend, poses) for part in goal.poses]
         return max((error for error in errors if error), key=lambda error: error.excess, default=None)
     if isinstance(goal, JointGoal):
         differences = goal.positions - q
@@ -145,8 +147,8 @@ def goal_index(robot: Robot, goal: Goal, q: Configuration) -> int | None:
         goals = [JointGoal(row) for row in goal.positions]
     poses = dict[str, Pose]()
     for settings in (EXACT, DEFAULT):
-        for i, one in enumerate(goals):
-            if goal_error(robot, one, q, settings, poses=poses) is None:
+        for i, single_goal in enumerate(goals):
+            if goal_error(robot, single_goal, q, settings, poses=poses) is None:
                 return i
     return None
 
@@ -191,9 +193,9 @@ def _near(
 ) -> Bool[ndarray, "n"]:
     """Marks configurations that may be within `blend` of a goal, by position alone."""
     if isinstance(goal, AnyGoal):
-        return np.any([_near(robot, one, q, blend, settings) for one in goal.goals], axis=0)
+        return np.any([_near(robot, part, q, blend, settings) for part in goal.goals], axis=0)
     if isinstance(goal, PosesGoal):
-        return np.all([_near(robot, one, q, blend, settings) for one in goal.poses], axis=0)
+        return np.all([_near(robot, part, q, blend, settings) for part in goal.poses], axis=0)
     if isinstance(goal, JointGoal):
         differences = goal.positions[:, None] - q
         differences -= robot.whole_turns(differences)
@@ -209,5 +211,5 @@ def _turned(rotation: ndarray, tolerance: ndarray, slack: float) -> bool:
     """Whether roll, pitch and yaw are within the tolerance, in either of their two representations."""
     roll, pitch, yaw = rpy_from_rotation(rotation)
     alternative = np.array([roll + np.pi, np.pi - pitch, yaw + np.pi])
-    ways = np.array([roll, pitch, yaw]), (alternative + np.pi) % (2 * np.pi) - np.pi
-    return any((np.abs(way) <= tolerance + slack).all() for way in ways)
+    representations = np.array([roll, pitch, yaw]), (alternative + np.pi) % (2 * np.pi) - np.pi
+    return any((np.abs(angles) <= tolerance + slack).all() for angles in representations)

@@ -23,7 +23,7 @@ MAX_OPEN_PIECES = 100_000
 """Maximum number of open pieces; if there are more, as in motions with very many turns, they count as beyond
 the limit."""
 PLACE_RESOLUTION = 1 / 64
-"""The place where a value first exceeds its limit is located to this share of a piece."""
+"""The place where a value first exceeds its limit is located to this fraction of a piece."""
 States = tuple[JointRows, JointRows, JointRows]
 """Positions, velocities and accelerations."""
 
@@ -47,7 +47,7 @@ class Excess(NamedTuple):
     torque: float
     """[N m] or [N]; of a frame its speed [m/s]."""
     excess: float
-    """Its largest excess along the motion, in the same unit."""
+    """Largest excess along the motion, in the same unit."""
 
 
 def trajectory_pieces(trajectory: Trajectory) -> Pieces:

@@ -40,7 +40,8 @@ if TYPE_CHECKING:  # what most problems do not need is imported where one does
 MAX_DURATION = 1e5
 """Longest motion that is validated, about a day [s]."""
 CHORD_SHARE = 0.1
-"""The certified clearances of a trajectory are reduced by at most this share for its cubics."""
+"""The certified clearances of a trajectory are reduced by at most this fraction because its cubics leave the
+straight lines."""
 CHORD_MARGIN = 0.9
 """Factor on the chords tried next, so that one trial suffices."""
 
@@ -318,8 +319,8 @@ class Verifier:
         if wrong is None:
             return None
         at = float(np.interp(wrong.at, np.arange(len(clock)), clock))
-        one = wrong.constraint
-        return Violation("constraint", at, wrong.message, one.frame, one.kind, wrong.excess)
+        constraint = wrong.constraint
+        return Violation("constraint", at, wrong.message, constraint.frame, constraint.kind, wrong.excess)
 
     def _limits_between(self, cubics: Cubics) -> list[Violation]:
         """The first place between rows where a cubic leaves the joint limits."""
@@ -351,11 +352,11 @@ class Verifier:
         if beyond is None:
             return []
         at = float(np.interp(beyond.place, np.arange(len(trajectory.times)), trajectory.times))
-        one = self.constraints.speed_limited[beyond.joint]
+        constraint = self.constraints.speed_limited[beyond.joint]
         speed_limit = limits[beyond.joint]
         speed, limit = distinct(beyond.torque, speed_limit, digits=4)
-        message = f"{one.frame} moves at {speed} m/s; {one.kind} allows {limit} m/s"
-        return [Violation("speed", at, message, one.frame, one.kind, beyond.excess)]
+        message = f"{constraint.frame} moves at {speed} m/s; {constraint.kind} allows {limit} m/s"
+        return [Violation("speed", at, message, constraint.frame, constraint.kind, beyond.excess)]
 
     def _torques(self, clock: ndarray, pieces: Pieces, what: str) -> list[Violation]:
         """The first place where a joint's torque with the payload is not proved to be within its effort

@@ -50,7 +50,7 @@ READING_TIME = 1.5
 MAX_MOMENTS = 6
 TILE = PictureSettings(width=720, height=450, ghosts=2)
 GAP = 6
-"""Between moments [pixels]."""
+"""Space between two moments [pixels]."""
 GAP_COLOR = (0xFF, 0xFF, 0xFF)
 UNKNOWN_ALPHA = 0.27
 PREDICTED_ALPHA = 0.55
@@ -180,8 +180,8 @@ def faces_surface(inside: Voxels, outside: Voxels, color: Color) -> Surface:
     corner = at + along
     vertices = np.stack([corner, corner + across, corner + across + up, corner + up], axis=1)
     normals = np.where(first[:, None], along, -along)
-    one = np.array([[0, 1, 2], [0, 2, 3]])
-    wound = np.where(first[:, None, None], one, one[:, ::-1])
+    triangles = np.array([[0, 1, 2], [0, 2, 3]])
+    wound = np.where(first[:, None, None], triangles, triangles[:, ::-1])
     faces = (4 * np.arange(len(numbers))[:, None, None] + wound).reshape(-1, 3)
     vertices = vertices.reshape(-1, 3) * MAP.edge + MAP.low
     return Surface(vertices, normals.repeat(4, axis=0), painted(color, len(vertices)), faces)

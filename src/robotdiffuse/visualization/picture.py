@@ -153,7 +153,7 @@ def view_of_motion(
     """The best view of a motion among obstacles."""
     q = dense(q, TRACE_POINTS)
     ghosts = join([arm.posed(row) for row in (q[0], q[len(q) // 2])])
-    surfaces = join([one.surface for one in obstacles])
+    surfaces = join([obstacle.surface for obstacle in obstacles])
     return best_view(arm.posed(q[-1]), ghosts, arm.tool_points(q), surfaces, size, free)
 
 
@@ -170,13 +170,13 @@ def _score(camera: Camera, arm: Surface, ghosts: Surface, trace: Points, obstacl
     inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     column = column.clip(0, camera.width - 1)
     row = row.clip(0, camera.height - 1)
-    seen = inside & (pixels[:, 2] > hidden[row, column])
+    visible = inside & (pixels[:, 2] > hidden[row, column])
     steps = np.linalg.norm(np.diff(pixels[:, :2], axis=0), axis=1)
-    return score + float(steps[seen[1:]].sum()) / camera.height
+    return score + float(steps[visible[1:]].sum()) / camera.height
 
 
 SUPERSAMPLING = 2
-"""Rendered pixels per pixel along each side."""
+"""Number of rendered pixels per pixel along each side."""
 SKY_LIGHTS = 60
 SKY_MAP = 320
 # Number of lights of the sky and of the main light, and edge length of the shadow map of each [pixels].
@@ -187,7 +187,7 @@ KEY_DIRECTION = np.array([0.35, -0.45, 0.82])
 KEY_SPREAD = 0.075
 """Angular radius of the main light [rad], for soft shadows."""
 TUBE_SIDES = 10
-"""Corners of the cross-section of the trace."""
+"""Number of corners of the cross-section of the trace."""
 TUBE_RADIUS = 0.006
 """Radius of the trace [m]."""
 CAPTION_COLOR = (0xF2, 0xF4, 0xF6)
@@ -197,7 +197,7 @@ COMPARED = ((0xE3, 0xA8, 0x12), (0xCF, 0x33, 0x3B), (0x2F, 0x6F, 0xD0), (0x8B, 0
 MOVED_ALPHA = 0.22
 """Opacity of moving obstacles along their way."""
 TRACE_STEPS = 240
-"""Configurations along a motion of which the trace is drawn."""
+"""Number of configurations along a motion of which the trace is drawn."""
 WHITE = (0xFF, 0xFF, 0xFF)
 SHELL_COLOR = (0x35, 0xB8, 0x5C)
 SHELL_ALPHA = 0.2
@@ -274,8 +274,10 @@ def write_comparison(
     path = check_output(file, (".png",))
     if not 0 < len(motions) <= len(COMPARED):
         raise InputError(f"{len(motions)} motions; a picture shows 1 to {len(COMPARED)}")
-    first, *further = motions.values()
-    pixels, _ = render(robot, scene, first, settings or PictureSettings(), others=further, moving=moving)
+    first, *other_motions = motions.values()
+    pixels, _ = render(
+        robot, scene, first, settings or PictureSettings(), others=other_motions, moving=moving
+    )
     figures = [", ".join(v for k, v in facts(m, None) if v != "untimed") for m in motions.values()]
     captions = list(zip(motions, figures, strict=True))
     write_captioned(pixels, path, title or robot.name, captions, COMPARED)
@@ -322,11 +324,11 @@ def render(
     arm = DrawnArm(robot)
     obstacles = drawables(scene, moving)
     q = dense(motion.positions, TRACE_STEPS)
-    surroundings = join([one.surface for one in obstacles])
+    surroundings = join([item.surface for item in obstacles])
     goal = arm.posed(q[-1])
     steps = np.linspace(0, len(q) - 1, settings.ghosts + 1).round().astype(int)[:-1] if len(q) > 1 else []
     ghosts = [(arm.posed(q[i], 1), i / (len(q) - 1)) for i in steps]
-    traces = [arm.trace(one.positions, TRACE_STEPS) for one in (motion, *others)]
+    traces = [arm.trace(item.positions, TRACE_STEPS) for item in (motion, *others)]
     if camera is None:
         size = settings.width, settings.height
         faint = join([ghost for ghost, _ in ghosts])
@@ -335,13 +337,13 @@ def render(
         camera.eye, camera.target, SUPERSAMPLING * settings.width, SUPERSAMPLING * settings.height
     )
     colors = [(color, color) for color in COMPARED] if others else [(START, GOAL)]
-    tubes = [tube(points, *of) for points, of in zip(traces, colors, strict=False)]
+    tubes = [tube(points, *ends) for points, ends in zip(traces, colors, strict=False)]
     over = []
     if isinstance(motion, Trajectory):
         times = np.linspace(0.0, motion.duration, settings.ghosts + 1)[1:]
         # the first obstacle is drawn over the others
-        for one in reversed([one for one in obstacles if one.moving is not None and one.moving.known]):
-            over += [ClearSurface(one.surface_at(time), linear(one.color), MOVED_ALPHA) for time in times]
+        for item in reversed([item for item in obstacles if item.moving is not None and item.moving.known]):
+            over += [ClearSurface(item.surface_at(time), linear(item.color), MOVED_ALPHA) for time in times]
     ghosts.sort(key=lambda ghost: -float(np.linalg.norm(ghost[0].vertices.mean(0) - large_camera.eye)))
     for ghost, share in ghosts:
         color = linear(START) * (1 - share) + linear(GOAL) * share
@@ -357,7 +359,7 @@ def render(
 def _shell(arm: DrawnArm, q: Configuration, thickness: float) -> Surface:
     """The covering spheres of the arm, enlarged by the thickness of the shell [m]."""
     spheres = placed_spheres(arm.robot, q)
-    return join([_ball(one[:3], one[3] + thickness, WHITE, 3) for one in spheres])
+    return join([_ball(sphere[:3], sphere[3] + thickness, WHITE, 3) for sphere in spheres])
 
 
 def _ball(center: Vector, radius: float, color: Color, subdivisions: int) -> Surface:
@@ -378,12 +380,12 @@ def _paint(camera: Camera, solid: Surface, clear: Sequence[ClearSurface]) -> Flo
     toward = _key_direction(camera)
     sky = _light_maps(solid, _hemisphere(SKY_LIGHTS), SKY_MAP)
     key = _light_maps(solid, _cone(toward, KEY_LIGHTS), KEY_MAP)
-    seen = (ident, screen, solid.faces, solid.normals, _linear_array(solid.colors))
-    shade(image, near, seen, view, height - 1e-4, sky, key)
-    for one in clear:
-        nearness, *shown = drawn_by(camera, one.surface)
-        arrays = one.surface.faces, one.surface.normals, _linear_array(one.surface.colors)
-        blend_ghost(image, near, nearness, (*shown, *arrays), view, toward, one.tint, one.alpha)
+    visible_triangles = (ident, screen, solid.faces, solid.normals, _linear_array(solid.colors))
+    shade(image, near, visible_triangles, view, height - 1e-4, sky, key)
+    for surface in clear:
+        nearness, *shown = drawn_by(camera, surface.surface)
+        arrays = surface.surface.faces, surface.surface.normals, _linear_array(surface.surface.colors)
+        blend_ghost(image, near, nearness, (*shown, *arrays), view, toward, surface.tint, surface.alpha)
     return image
 
 

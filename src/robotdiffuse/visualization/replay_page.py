@@ -64,11 +64,11 @@ from robotdiffuse.visualization.picture import (
 )
 
 MAX_ROW_RATE = 60.0
-"""Most rows of the motion per second; the page interpolates between them."""
+"""Largest number of rows of the motion per second; the page interpolates between them."""
 TRACK_RATE = 30.0
 """Poses of moving obstacles per second."""
 MAX_ROWS = 3000
-"""Most rows of the motion."""
+"""Largest number of rows of the motion."""
 VIEW_SIZE = (1600, 1000)
 """Window size for which the first view is chosen [pixels]."""
 VIEW_MARGINS = (0.09, 0.15)
@@ -140,14 +140,15 @@ def page_data(
             "spheres": _spheres(robot),
             "tool": {"frame": arm.tool_frame, "point": _rounded(arm.tool_point, 5)},
         },
-        "scene": [_shape(one) for one in obstacles if one.moving is None],
+        "scene": [_shape(obstacle) for obstacle in obstacles if obstacle.moving is None],
         "moving": [
-            {"shape": _shape(one), "track": _track(one, motion)}
-            for one in obstacles
-            if one.moving is not None
+            {"shape": _shape(obstacle), "track": _track(obstacle, motion)}
+            for obstacle in obstacles
+            if obstacle.moving is not None
         ],
         "ground": round(
-            float(min([one.surface.vertices[:, 2].min(initial=0.0) for one in obstacles] + [0.0])), 4
+            float(min([obstacle.surface.vertices[:, 2].min(initial=0.0) for obstacle in obstacles] + [0.0])),
+            4,
         ),
         "timed": isinstance(motion, Trajectory),
         "times": _rounded(times, 4),
@@ -202,7 +203,7 @@ def _spheres(robot: Robot) -> list[list[float | int]]:
 
 def page_shapes(scene: Scene) -> list[dict[str, Any]]:
     """The obstacles for the page."""
-    return [_shape(one) for one in drawables(scene)]
+    return [_shape(obstacle) for obstacle in drawables(scene)]
 
 
 def _shape(obstacle: Drawable) -> dict[str, Any]:
@@ -513,7 +514,7 @@ def show(result: PlanResult | ResultFile, problem: Problem | None = None, height
     Raises:
         InputError: Outside a notebook, and if the problem is unknown.
     """
-    check_type("result", result, (PlanResult, ResultFile), "a result, as of rd.plan or rd.load_result")
+    check_type("result", result, (PlanResult, ResultFile), "a result of rd.plan or rd.load_result")
     if problem is not None:
         check_problem(problem)
     if isinstance(result, ResultFile):

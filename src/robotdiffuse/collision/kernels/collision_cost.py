@@ -23,7 +23,7 @@ from robotdiffuse.collision.kernels.simd import W, first_lane, lane, load, maxim
 from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
 
 CLEARANCE_CAP = np.float32(1.0)
-"""Clearances beyond this [m] are reported as this."""
+"""Larger clearances are reported as this [m]."""
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _TINY = np.float32(1e-9)
 

@@ -1,10 +1,11 @@
 """Compiled lower bounds of the distances between convex meshes and shapes along short motions.
 
 A plane that separates two convex bodies proves that they do not touch, whatever algorithm found it. The
-algorithm of Gilbert, Johnson and Keerthi (GJK, 1988) finds the best plane in the middle of a motion, starting
-from the one that was found last. The bound follows from the plane alone: the distance that remains between
-all vertices of one body and the other body while they move by t v + r (see `lane_clearance.py`), t in
-[-1, 1]. All computations are in float64.
+algorithm of Gilbert, Johnson and Keerthi (GJK, 1988) finds the best plane for the poses in the middle of the
+motion, starting from the plane that was found last. The bound needs only this plane: it is the smallest gap
+along the plane's normal between the vertices of one body and the other body, while each vertex moves from its
+place in the middle by t v + r, t in [-1, 1]. Here v is the vertex's velocity and r a small remainder of
+second order (see `lane_clearance.py`). All computations are in float64.
 """
 
 from typing import NamedTuple
@@ -16,11 +17,11 @@ from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.robots.frame_kernel import step
 
 MAX_GJK_STEPS = 32
-"""Iterations of GJK at most; usually it takes three to eight."""
+"""Largest number of iterations of GJK; usually it takes three to eight."""
 GJK_RELATIVE_TOLERANCE = 0.02
-"""GJK ends when the distance is known up to this share, ..."""
+"""GJK ends when the error of the distance is below this fraction of the distance."""
 GJK_ABSOLUTE_TOLERANCE = 1e-7
-"""... or up to this [m]."""
+"""GJK also ends when the error of the distance is below this [m]."""
 
 
 class Hulls(NamedTuple):
@@ -52,21 +53,23 @@ class Solids(NamedTuple):
     rounding: np.ndarray
     """[n] radius of the ball."""
     bounds: np.ndarray
-    """[n] whether the sum only bounds a surface or point cloud, whose exact distance only Coal computes."""
+    """[n] whether the solid only encloses a surface or a point cloud; then only Coal computes the exact
+    distance."""
     may_touch: np.ndarray
     """[checks, n] whether the link of a check may touch the obstacle; [0, 0] without allowed contacts."""
 
 
 class Posture(NamedTuple):
-    """Scratch memory for one motion: the robot in its middle, and the memory of GJK."""
+    """Scratch memory of one thread: the robot's frames in the middle of the current motion, and what GJK
+    keeps from one motion to the next."""
 
     frames: np.ndarray
     """[dof + 1, 3, 4]"""
     twists: np.ndarray
     """[dof + 1, 6] as in `lane_clearance.py`."""
     planes: np.ndarray
-    """[parts, solids + parts, 3] normals of the planes that were found last, towards the first part;
-    initially zero."""
+    """[parts, solids + parts, 3] for each pair of a part (first index) and a solid or another part, the
+    normal of the plane that was found last. It points towards the first part; zero if none was found yet."""
     simplex: np.ndarray
     """[4, 3]"""
     edges: np.ndarray
@@ -77,7 +80,7 @@ class Posture(NamedTuple):
 
 @kernel()
 def make_posture(hulls, solids, dof):
-    """Scratch memory for one thread."""
+    """Scratch memory of one thread."""
     frames = np.zeros((dof + 1, 3, 4))
     for k in range(3):
         frames[0, k, k] = 1.0
@@ -111,8 +114,8 @@ def pose(offsets, parents, slides, q, dq, posture):
 
 @inner_kernel()
 def part_speed(hulls, p, base, posture):
-    """Upper bound on how far any point of a part moves from the middle to an end, seen from frame `base` [m],
-    without the remainder."""
+    """Upper bound on how far any point of a part moves, relative to frame `base`, from the middle of the
+    motion to either of its ends [m]; the remainder r (see the module's docstring) is not included."""
     frame = hulls.frame[p]
     ball = hulls.balls[p]
     twist = posture.twists[frame]
@@ -132,7 +135,8 @@ def part_speed(hulls, p, base, posture):
 
 @inner_kernel()
 def ball_to_solid(hulls, p, solids, o, posture):
-    """Lower bound of the distance of a part to an obstacle in the middle, from the part's ball [m]."""
+    """Lower bound of the distance of a part to an obstacle in the middle of the motion, computed from the
+    ball around the part [m]."""
     T = posture.frames[hulls.frame[p]]
     ball = hulls.balls[p]
     x = placed(T, ball, 0)
@@ -144,7 +148,8 @@ def ball_to_solid(hulls, p, solids, o, posture):
 
 @inner_kernel()
 def ball_to_ball(hulls, p, q, posture):
-    """Lower bound of the distance of two parts in the middle, from their balls [m]."""
+    """Lower bound of the distance of two parts in the middle of the motion, computed from the balls around
+    them [m]."""
     S = posture.frames[hulls.frame[p]]
     T = posture.frames[hulls.frame[q]]
     total = 0.0
@@ -181,7 +186,7 @@ def _furthest(vertices, first, last, x, y, z):
 
 @inner_kernel()
 def _support_of_part(hulls, p, posture, sign, row):
-    """Writes the vertex of a part that is furthest along sign * points[0] to points[row]."""
+    """Writes to points[row] the vertex of a part that is furthest in the direction sign * points[0]."""
     T = posture.frames[hulls.frame[p]]
     points = posture.points
     x = sign * points[0, 0]
@@ -201,8 +206,8 @@ def _support_of_part(hulls, p, posture, sign, row):
 
 @inner_kernel()
 def _support_of_solid(solids, o, posture):
-    """Writes the point of an obstacle, without its rounding, that is furthest along points[0] to
-    points[2]."""
+    """Writes to points[2] the point of an obstacle (without its rounding) that is furthest in the direction
+    points[0]."""
     R = solids.rotation[o]
     points = posture.points
     x = points[0, 0]
@@ -221,12 +226,12 @@ def _support_of_solid(solids, o, posture):
 
 @inner_kernel()
 def _least_along(hulls, p, base, sign, posture):
-    """Minimum height of a part along sign * points[0] at the two ends of the motion, without the remainder,
-    with velocities seen from frame `base`."""
+    """Minimum height of a part in the direction sign * points[0] at the start and at the end of the motion,
+    without the remainder r, with velocities relative to frame `base`."""
     n = posture.points[0]
     T = posture.frames[hulls.frame[p]]
     twist = posture.twists[hulls.frame[p]]
-    seen = posture.twists[base]
+    base_twist = posture.twists[base]
     at_start = np.inf
     at_stop = np.inf
     for i in range(hulls.first[p], hulls.first[p + 1]):
@@ -234,12 +239,12 @@ def _least_along(hulls, p, base, sign, posture):
         x = placed(T, vertex, 0)
         y = placed(T, vertex, 1)
         z = placed(T, vertex, 2)
-        a = twist[0] - seen[0]
-        b = twist[1] - seen[1]
-        c = twist[2] - seen[2]
-        u = b * z - c * y + twist[3] - seen[3]
-        v = c * x - a * z + twist[4] - seen[4]
-        w = a * y - b * x + twist[5] - seen[5]
+        a = twist[0] - base_twist[0]
+        b = twist[1] - base_twist[1]
+        c = twist[2] - base_twist[2]
+        u = b * z - c * y + twist[3] - base_twist[3]
+        v = c * x - a * z + twist[4] - base_twist[4]
+        w = a * y - b * x + twist[5] - base_twist[5]
         height = sign * (n[0] * x + n[1] * y + n[2] * z)
         speed = sign * (n[0] * u + n[1] * v + n[2] * w)
         at_start = min(at_start, height - speed)
@@ -251,8 +256,10 @@ def _least_along(hulls, p, base, sign, posture):
 def separation(hulls, p, solids, other, base, posture):
     """Widths of the gap between two bodies along the unit normal points[0] [m].
 
-    The first is that in the middle, the second the minimum along the motion, without the remainder, seen from
-    frame `base`. A negative `other` stands for part -1 - other, which moves too if its frame is not `base`.
+    Returns the gap in the middle of the motion, and the smallest gap along the motion. The latter leaves out
+    the remainder r (see the module's docstring) and uses velocities relative to frame `base`. `other` is the
+    index of an obstacle or, if negative, -1 minus the index of a part; if that part is not on frame `base`,
+    its own motion counts too.
     """
     x = posture.points[0, 0]
     y = posture.points[0, 1]
@@ -260,16 +267,16 @@ def separation(hulls, p, solids, other, base, posture):
     frame = hulls.frame[p]
     T = posture.frames[frame]
     twist = posture.twists[frame]
-    seen = posture.twists[base]
-    a = twist[0] - seen[0]
-    b = twist[1] - seen[1]
-    c = twist[2] - seen[2]
+    base_twist = posture.twists[base]
+    a = twist[0] - base_twist[0]
+    b = twist[1] - base_twist[1]
+    c = twist[2] - base_twist[2]
     # n . (w x p) = (n x w) . p
     u = y * c - z * b
     v = z * a - x * c
     w = x * b - y * a
     speed = u * T[0, 3] + v * T[1, 3] + w * T[2, 3]
-    speed += x * (twist[3] - seen[3]) + y * (twist[4] - seen[4]) + z * (twist[5] - seen[5])
+    speed += x * (twist[3] - base_twist[3]) + y * (twist[4] - base_twist[4]) + z * (twist[5] - base_twist[5])
     offset = x * T[0, 3] + y * T[1, 3] + z * T[2, 3] - hulls.rounding[p]
     lx = T[0, 0] * x + T[1, 0] * y + T[2, 0] * z
     ly = T[0, 1] * x + T[1, 1] * y + T[2, 1] * z
@@ -294,7 +301,8 @@ def separation(hulls, p, solids, other, base, posture):
         start, stop = _least_along(hulls, p, base, 1.0, posture)
         other_start, other_stop = _least_along(hulls, -1 - other, base, -1.0, posture)
         return middle - reach - 1e-9, min(start + other_start, stop + other_stop) - 1e-9
-    # 1e-9 covers the rounding of the normal's length, whose error is multiplied by the extent of the bodies
+    # 1e-9 covers floating-point errors in the length of the normal, which are multiplied by the size of the
+    # bodies
     return middle - reach - 1e-9, along - reach - 1e-9
 
 
@@ -325,8 +333,8 @@ def _holds_origin(e, new):
 
 @inner_kernel()
 def _nearest(simplex, count, edges, nearest):
-    """Writes the point of a simplex nearest to the origin to `nearest`; it is known to depend on the last
-    vertex.
+    """Writes to `nearest` the point of a simplex that is nearest to the origin. The smallest face that
+    contains this point always has the last vertex, which GJK has just added.
 
     The simplex is reduced to the smallest face that contains the point. Returns the number of its vertices,
     or 0 if the origin is inside.
@@ -379,8 +387,8 @@ def _nearest(simplex, count, edges, nearest):
 
 @inner_kernel()
 def find_plane(hulls, p, solids, other, posture):
-    """Replaces the normal points[0], an initial guess, by that of the plane with the widest gap between two
-    bodies in the middle of the motion. False if they touch, or nearly."""
+    """Replaces points[0], an initial guess, by the normal of the plane with the widest gap between two bodies
+    in the middle of the motion. Returns False if they touch, or nearly."""
     points = posture.points
     simplex = posture.simplex
     rounding = hulls.rounding[p] + (solids.rounding[other] if other >= 0 else hulls.rounding[-1 - other])
@@ -427,8 +435,9 @@ def best_plane(hulls, p, solids, other, base, enough, plane, posture):
     """Gaps between two bodies by a separating plane, and whether GJK computed it.
 
     The gaps are those in the middle and along the motion, without the remainder; if GJK computed the plane,
-    the first is the distance. GJK runs only if `plane`, the one that was found last, shows less than `enough`
-    along the motion; then it replaces `plane`.
+    the first is a lower bound at most about 2 % below the distance (-inf if the bodies touch, or nearly). GJK
+    runs only if `plane`, the one that was found last, shows less than `enough` along the motion; then it
+    replaces `plane`.
     """
     n = posture.points[0]
     cached = False

@@ -66,7 +66,7 @@ class ClearanceWorkspace(NamedTuple):
 
 @kernel()
 def make_clearance_workspace(robot, solids):
-    """Scratch memory for one thread and at most so many solids."""
+    """Scratch memory for one thread and at most `solids` solids."""
     joints = len(robot.offsets)
     groups = len(robot.frame)
     frames = np.zeros((joints + 1, 12 * W), np.float32)
@@ -224,8 +224,8 @@ def _mark_near(robot, scene, g, speed, work):
 
 @allocation_free(forceinline=True)
 def group_along(robot, scene, g, moving, work):
-    """Writes clearances of a group to the scene, at most `work.need`, and their bounds along the motions to
-    `work`. Without `moving` the twists are taken for zero."""
+    """Writes to `work` the clearances of a group to the scene, at most `work.need`, and their bounds along
+    the motions. Without `moving` the twists count as zero."""
     frame = robot.frame[g]
     solids = len(scene.solids)
     x, y, z = _at(work.centers, g)
@@ -244,7 +244,8 @@ def group_along(robot, scene, g, moving, work):
                 distance, towards = to_solid(x, y, z, u, v, w, scene.solids[k])
                 _lower_to(distance - radius, towards, work)
         if len(scene.points) and work.near[solids]:
-            # the nearest point changes along the motion, so the sphere's whole speed counts
+            # the nearest point changes along the motion, so the sphere's whole speed counts, not its part
+            # towards that point
             speed = _length(u, v, w)
             for i in range(W):
                 limit = min(work.clearance[0, i] + lane(speed, i), POINT_RANGE) + radius
@@ -255,7 +256,7 @@ def group_along(robot, scene, g, moving, work):
 
 @allocation_free(forceinline=True)
 def pair_along(robot, p, moving, work):
-    """As `group_along`, between the links of a checked pair."""
+    """Like `group_along`, for the clearance between the links of a checked pair."""
     a = robot.pairs[p, 0]
     b = robot.pairs[p, 1]
     spheres = robot.spheres

@@ -1,10 +1,10 @@
 """The compiled collision check of 16 configurations at once.
 
-It goes from coarse to fine, and SIMD lanes stand for different things at each step:
-frames and bounding spheres are computed with a lane per configuration;
-the obstacles that a link may touch in any configuration, from their bounding boxes, with a lane per obstacle;
-the configurations in which the bounding sphere touches such an obstacle, with a lane per configuration;
-and whether the link itself does, for one configuration after the other, with a lane per sphere.
+The check goes from coarse to fine, and SIMD lanes stand for different things at each step: frames and
+bounding spheres are computed with a lane per configuration; the obstacles that a link may touch in any
+configuration, from their bounding boxes, with a lane per obstacle; the configurations in which the bounding
+sphere touches such an obstacle, with a lane per configuration; and whether the link itself does, for one
+configuration after the other, with a lane per sphere.
 """
 
 from typing import NamedTuple
@@ -35,7 +35,8 @@ from robotdiffuse.core.kernels import allocation_free, kernel
 _INV_TAU = np.float32(0.15915494309189535)
 _QUARTER = np.float32(0.25)
 _HALF = np.float32(0.5)
-# Numbers before the cells, and cells along each side, in a table of `sphere_pair_tables.py`.
+# In a table of `sphere_pair_tables.py`: how many numbers precede the cells, and the number of cells along
+# each side.
 TABLE_HEADER = 6
 TABLE_SIDE = 130
 ALL_LANES = (1 << W) - 1
@@ -196,7 +197,7 @@ def _place_row(robot, row, frames, f, i):
 
 @allocation_free(forceinline=True)
 def _touching_group(robot, g, frames, near, padding, solids, k, stop_at_first):
-    """Those of the lanes `near` in which a group touches obstacle k."""
+    """Mask of the lanes, of those in `near`, in which a group touches obstacle k."""
     hits = 0
     f = robot.frame[g]
     first = robot.first_row[g]
@@ -219,7 +220,7 @@ def _touching_group(robot, g, frames, near, padding, solids, k, stop_at_first):
 
 @allocation_free(forceinline=True)
 def _touching_points(robot, g, frames, near, padding, scene, stop_at_first):
-    """Those of the lanes `near` in which a group touches a point of the scene."""
+    """Mask of the lanes, of those in `near`, in which a group touches a point of the scene."""
     hits = 0
     f = robot.frame[g]
     first = robot.first_row[g]
@@ -252,7 +253,7 @@ def _touching_balls(x, y, z, radius, u, v, w, other):
 
 @allocation_free(forceinline=True)
 def _touching_each_other(robot, a, b, near, stop_at_first, work):
-    """Those of the lanes `near` in which two groups touch each other."""
+    """Mask of the lanes, of those in `near`, in which two groups touch each other."""
     hits = 0
     frames = work.frames
     bounds = robot.row_bounds

@@ -1,9 +1,9 @@
 """The compiled part of the motion certificate; see `collision/motions.py`.
 
 A check is a link against the scene, or a pair of links. A piece of a motion is settled for a check when the
-lower bound of the clearance along the piece is at least the share `tightness` of the smallest measured
-clearance of its kind. Bounds come from the covering spheres, and from the convex meshes where the spheres are
-too coarse.
+lower bound of the clearance along the piece is at least the fraction `tightness` of the smallest clearance
+that was measured to the scene, or between links. Bounds come from the covering spheres, and from the convex
+meshes where the spheres are too coarse.
 
 A piece reaches from its middle q to both ends. Any of its configurations is q + d with |d_j| <= D_j, and for
 some t in [-1, 1] |d_j - t dq_j| <= e_j; on a straight line e is zero. Twice differentiating a point's place
@@ -36,10 +36,11 @@ CLEARANCE_CAP = 1.0
 FLOAT32_SLACK = 1e-5
 """Upper bound of the rounding error in the clearances of the float32 kernels [m]."""
 CONVEX_PARTS_BELOW = 0.01
-"""Sphere clearance below which the convex meshes are used before a piece is split further: the spheres stick
-out by about as much [m]."""
+"""If the clearance of the spheres is below this, the convex meshes are used before a piece is split further:
+the spheres stick out by about as much [m]."""
 COAL_BELOW = 0.002
-"""The same for distances that only Coal computes, which take fifty times as long [m]."""
+"""If the clearance of the spheres is below this, distances that only Coal computes, which take fifty times as
+long, are used before a piece is split further [m]."""
 MAX_SPLIT = 4
 """A piece is split into at most this many parts at a time."""
 SCENE = 0

@@ -85,13 +85,13 @@ def _cut(ends, start, stop, travel):
 def first_pieces(motion, checks, travel):
     """The initial pieces: one of length zero at the start, then pieces with a motion bound of about `travel`
     [m] that change their direction little."""
-    q, way = motion
+    q, travelled = motion
     n, dof = q.shape
     ends = [0.0]
     last = 0.0
     before = -1
     for i in range(1, n):
-        if way[i] <= way[i - 1]:
+        if travelled[i] <= travelled[i - 1]:
             continue
         dot = 1.0
         a = 1.0
@@ -107,11 +107,11 @@ def first_pieces(motion, checks, travel):
                 a = a + u * u
                 b = b + v * v
         if dot < STRAIGHT_COSINE * np.sqrt(a * b):
-            _cut(ends, last, way[i - 1], travel)
-            last = way[i - 1]
+            _cut(ends, last, travelled[i - 1], travel)
+            last = travelled[i - 1]
         before = i - 1
-    if way[n - 1] > last:
-        _cut(ends, last, way[n - 1], travel)
+    if travelled[n - 1] > last:
+        _cut(ends, last, travelled[n - 1], travel)
     start = np.empty(len(ends))
     stop = np.empty(len(ends))
     for k in range(len(ends)):

@@ -1,4 +1,5 @@
-"""Compiled checks of straight motions in joint space at configurations close enough to each other."""
+"""Compiled checks of straight motions in joint space, at configurations so close to each other that no point
+of the arm moves further than a resolution between two of them."""
 
 from typing import NamedTuple
 
@@ -10,9 +11,10 @@ from robotdiffuse.core.kernels import allocation_free, kernel
 
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 RELAXATION_SLOPE = np.float32(0.1)
-"""Growth of the padding with the distance from a start or goal that is closer to the scene [m/rad]."""
+"""If a start or goal is closer to the scene than the padding, the padding is reduced there, and grows by this
+per radian of distance from that configuration [m/rad]."""
 RELAXATION_STEP = np.float32(0.1)
-"""Near such a start or goal the padding changes in steps of this length [rad]."""
+"""There the padding changes in steps of this length [rad]."""
 
 
 class Space(NamedTuple):
@@ -27,12 +29,12 @@ class Space(NamedTuple):
     motion_radii: np.ndarray
     """[dof] largest distance of any point of the arm from each joint's axis [m]; 1 for prismatic joints."""
     resolution: np.float32
-    """No point of the arm moves further than this between two checks [m]."""
+    """No point of the arm moves further than this between two checked configurations [m]."""
     padding: np.float32
     """Added to the radii of the spheres for checks against the scene [m]."""
     near_ends: np.ndarray
-    """[m, dof + 1] starts and goals that are closer to the scene than `padding`, and the padding that they
-    allow [m]."""
+    """[m, dof + 1] starts and goals that are closer to the scene than `padding`, each with the padding that
+    it allows [m]."""
 
 
 @allocation_free(fastmath=True)
@@ -85,10 +87,11 @@ def motion_free(space, a, b, block, work):
 
 @allocation_free()
 def padding_near(space, a, b, share, around):
-    """The padding [m] required within `around` [rad] of the configuration at a share of the way from a to b.
+    """The least padding [m] that is required at configurations at most `around` [rad] from a + share * (b -
+    a).
 
-    Near a start or goal that is closer to the scene, it is the padding which that allows, plus
-    RELAXATION_SLOPE per radian of distance from it.
+    Near a start or goal that is closer to the scene than `space.padding`, the required padding is what this
+    start or goal allows, plus RELAXATION_SLOPE per radian of distance from it.
     """
     padding = space.padding
     dof = len(a)
@@ -105,7 +108,8 @@ def padding_near(space, a, b, share, around):
 
 @allocation_free()
 def _stretch_free(space, a, b, s, t, padding, block, work):
-    """Whether the part of the motion after share s and up to share t is free of collision."""
+    """Whether the part of the motion from a to b between a + s (b - a), exclusive, and a + t (b - a),
+    inclusive, is free of collision."""
     dof = len(a)
     travel = np.float32(0.0)
     for j in range(dof):

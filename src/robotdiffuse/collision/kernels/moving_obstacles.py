@@ -1,9 +1,10 @@
 """The compiled part of the motion certificate among moving obstacles; see `collision/moving_obstacles.py`.
 
-A task is an interval of a timed motion with the pairs of a link and an obstacle that are open there. A pair
-is settled when its clearance in the middle exceeds the motion of the link's and the obstacle's points until
-either end by the required clearance; otherwise the interval is halved. Clearances are those of the covering
-spheres. Where these touch, the pair is left to the exact meshes.
+A task is an interval of a timed motion with the pairs of a link and an obstacle that are open there. The
+clearance of a pair is computed in the middle of the interval, from the covering spheres. The pair is settled
+if this clearance, minus how far points of the link and of the obstacle can move from there to either end, is
+at least the required clearance; otherwise the interval is halved. If the spheres touch, the pair is left to
+the exact meshes.
 """
 
 from typing import NamedTuple
@@ -15,9 +16,9 @@ from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.robots.frame_kernel import step
 
 CLEARANCE_CAP = 1.0
-"""Clearances beyond this [m] are reported as this."""
+"""Larger clearances are reported as this [m]."""
 MAX_HALVINGS = 48
-"""Halvings of an interval at most."""
+"""Largest number of halvings of an interval."""
 
 
 class Links(NamedTuple):
@@ -192,11 +193,11 @@ def _interpolated(rows, low, share, j):
 @kernel()
 def cumulative_motion(q):
     """[n, dof] total motion of each joint, forwards and backwards, from the first row to each row."""
-    ways = np.zeros_like(q)
+    travel = np.zeros_like(q)
     for i in range(1, len(q)):
         for j in range(q.shape[1]):
-            ways[i, j] = ways[i - 1, j] + abs(q[i, j] - q[i - 1, j])
-    return ways
+            travel[i, j] = travel[i - 1, j] + abs(q[i, j] - q[i - 1, j])
+    return travel
 
 
 @kernel(nogil=True)
@@ -204,15 +205,16 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
     """Settles the tasks, in order, as far as the spheres can.
 
     The motion is on straight lines between the rows q[n, dof] at times[n], at rest before and after. A pair
-    is settled when its bound is at least `least` [m] and at least the share `tightness` of the smallest
-    clearance measured so far, best[1], which is lowered. Returns the smallest bound that settled a pair, and
-    the tasks that are left to the exact meshes, one pair each, as (start, stop, link, obstacle): in their
-    middles the spheres are within `least`.
+    is settled if its bound is at least `least` [m] and at least the fraction `tightness` of the smallest
+    clearance measured so far. That is `best`, an array of one number, which this function updates in place.
+    Returns the smallest bound that settled a pair, and the tasks that are left to the exact meshes, one pair
+    each, as (start, stop, link, obstacle). In the middle of such an interval the link's spheres are at most
+    `least` from the obstacle, or the interval was halved MAX_HALVINGS times.
     """
     dof = q.shape[1]
     count = len(links.frame)
     obstacles = len(tracks.growth)
-    ways = cumulative_motion(q)
+    joint_travel = cumulative_motion(q)
     frames = np.zeros((dof + 1, 4, 4))
     for i in range(dof + 1):
         frames[i, 3, 3] = 1.0
@@ -247,9 +249,9 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
             last, last_share = _row_at(times, stop)
             for j in range(dof):
                 middle[j] = _interpolated(q, row, share, j)
-                way = _interpolated(ways, row, share, j)
-                before = way - _interpolated(ways, first, first_share, j)
-                moved[j] = max(before, _interpolated(ways, last, last_share, j) - way)
+                joint_travel_middle = _interpolated(joint_travel, row, share, j)
+                before = joint_travel_middle - _interpolated(joint_travel, first, first_share, j)
+                moved[j] = max(before, _interpolated(joint_travel, last, last_share, j) - joint_travel_middle)
             _pose_arm(links, middle, frames)
             for link in range(count):
                 travel[link] = 0.0
@@ -258,16 +260,16 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
             split_needed = False
             for o in range(obstacles):
                 posed = False
-                speed = 0.0
+                obstacle_travel = 0.0
                 for link in range(count):
                     if not pairs[size, link, o]:
                         continue
                     if not posed:
                         pose_at(tracks, o, time, rotation, xyz)
-                        speed = speed_between(tracks, o, start, stop) * half
+                        obstacle_travel = speed_between(tracks, o, start, stop) * half
                         posed = True
                     grown = tracks.growth[o] * max(time, 0.0)
-                    lost = travel[link] + speed + tracks.growth[o] * half
+                    lost = travel[link] + obstacle_travel + tracks.growth[o] * half
                     required = max(least, tightness * best[0])
                     cutoff = grown + lost + max(required, best[0] if tightness > 0 else 0.0)
                     clear = _clearance(links, frames, link, tracks, o, rotation, xyz, cutoff) - grown
@@ -329,7 +331,7 @@ def free_at_times(links, tracks, q, times, least):
                     )
                     out[i, k] = spare >= 0
                     until = times[k] + max(spare, 0.0) / max(speeds[o], 1e-9)
-                    k += 1  # nothing can be near before the obstacle has covered the spare distance
+                    k += 1  # the obstacle cannot be too near before it has covered the spare distance
                     while k < len(times) and times[k] < until:
                         k += 1
     return out

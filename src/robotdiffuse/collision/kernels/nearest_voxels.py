@@ -25,9 +25,9 @@ def nearest_voxels(run):
     holders = run.copy()
     for i in range(nx):
         for j in range(ny):
-            for way in (1, -1):
+            for direction in (1, -1):
                 last = -1
-                for k in range(nz) if way == 1 else range(nz - 1, -1, -1):
+                for k in range(nz) if direction == 1 else range(nz - 1, -1, -1):
                     last = k if run[i, j, k] >= 0 else last
                     square = (k - last) ** 2
                     if last >= 0 and square < squares[i, j, k]:

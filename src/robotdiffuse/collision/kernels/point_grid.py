@@ -30,7 +30,7 @@ _ONE = np.float32(1.0)
 _HALF = np.float32(0.5)
 _TINY = np.float32(1e-9)
 _SLACK = np.float32(1e-5)
-"""More than the rounding error of a distance within the grid [m]."""
+"""Upper bound on the rounding error of a distance within the grid [m]."""
 
 
 @kernel(fastmath=True)

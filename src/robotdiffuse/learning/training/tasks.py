@@ -398,7 +398,7 @@ class BaselineNetwork(Network, ABC):
         """The loss of `count` samples drawn from the data; `fraction` of the training is done, 0 to 1."""
 
 
-def baseline_training(name: str, given: dict[str, Any]) -> BaselineTraining:
+def baseline_training(name: str, changes: dict[str, Any]) -> BaselineTraining:
     """The training settings of a baseline's network, with the given changes.
 
     Raises InputError for an unknown name, listing the known ones, and for a network that is no baseline.
@@ -406,9 +406,9 @@ def baseline_training(name: str, given: dict[str, Any]) -> BaselineTraining:
     kind = NETWORKS.load(name)
     if not issubclass(kind, BaselineNetwork):
         raise InputError(f"{name} is no baseline; train it: robotdiffuse train {NETWORKS[name].kind}")
-    if given.get("samples") is not None:
-        given = given | {"minutes": None}
-    return BaselineTraining(name=name, **(kind.training_defaults | given))
+    if changes.get("samples") is not None:
+        changes = changes | {"minutes": None}
+    return BaselineTraining(name=name, **(kind.training_defaults | changes))
 
 
 def train_baseline(settings: BaselineTraining, out: str) -> dict[str, float]:

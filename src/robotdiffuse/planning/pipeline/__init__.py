@@ -1,5 +1,6 @@
-"""What surrounds any planner: moving obstacles, waypoints, a start velocity, unknown space. Each takes the
-planner as an argument, and makes one or several attempts with it at a problem in its scene as it is."""
+"""What surrounds any planner: moving obstacles, waypoints, a start velocity, unknown space. Each part takes
+the planner as an argument, and calls it once or several times for problems that the planner can solve by
+itself."""
 
 from dataclasses import replace
 from typing import ClassVar, Protocol, runtime_checkable
@@ -30,7 +31,7 @@ def attempt(solver: Solver, problem: Problem, request: PlanRequest) -> PlanResul
     unknown space, which the pipeline handles."""
     context = PlanningContext(solver.name, problem, request)
     followed = None
-    lines = any(isinstance(one, CartesianLine) for one in problem.constraints)
+    lines = any(isinstance(constraint, CartesianLine) for constraint in problem.constraints)
     with context.deadline():
         try:
             if solver.follows_lines and lines:

@@ -36,7 +36,7 @@ from robotdiffuse.validation.validator import verifier
 UNREACHED = -2
 WAITED = -1
 CELLS_PER_CLOCK_CHECK = 10_000_000
-"""Cells of motions that are visited between two readings of the clock."""
+"""Number of cells of motions that are visited between two readings of the clock."""
 
 
 def earliest(
@@ -102,17 +102,17 @@ def _reached(came, clear, cell, source, target, first, cells, begin, count):
 def _way_to(end, came, source, first):
     """The numbers of the motions that reach the last place at tick `end`, in order; -1 for each tick of
     waiting."""
-    way = [0 for _ in range(0)]
+    motion_numbers = [0 for _ in range(0)]
     place = came.shape[1] - 1
     while end > 0:
         m = came[end, place]
-        way.append(m)
+        motion_numbers.append(m)
         if m == WAITED:
             end -= 1
         else:
             end -= first[m + 1] - first[m] - 1
             place = source[m]
-    return way[::-1]
+    return motion_numbers[::-1]
 
 
 GRID_STEP = 0.02
@@ -125,7 +125,7 @@ GRID_TRAVEL = 0.02
 EXTRA_TIME = 5.0
 DURATION_FACTOR = 3.0
 PATH_TIME_FRACTION = 0.5
-"""Part of the time left that planning each path gets."""
+"""Fraction of the remaining time that planning each path gets."""
 
 
 def plan_among_moving_obstacles(solver: Solver, problem: Problem, request: PlanRequest) -> PlanResult:
@@ -151,7 +151,7 @@ def plan_among_moving_obstacles(solver: Solver, problem: Problem, request: PlanR
         scene = problem.scene
         if attempts % 2:  # paths around the obstacles where they are at some time
             time = float(rng.uniform(0.0, horizon))
-            standing = (one.at(time) for one in problem.moving if one.known)
+            standing = (obstacle.at(time) for obstacle in problem.moving if obstacle.known)
             scene = scene.with_shapes([*scene.shapes, *standing])
         limit = max(PATH_TIME_FRACTION * (request.time_limit - context.elapsed), 1e-3)
         of_path = replace(request, time_limit=limit, seed=request.seed + attempts // 2)
@@ -252,14 +252,14 @@ def _timed(
     count = int(DURATION_FACTOR * longest + EXTRA_TIME / GRID_STEP)
     check_timing(f"a grid of {count} times", CELL_SECONDS * count * len(configurations))
     times = GRID_STEP * np.arange(count)
-    speed = max(one.top_speed for one in problem.moving)
+    speed = max(obstacle.top_speed for obstacle in problem.moving)
     needed = clearance + (GRID_TRAVEL + speed * GRID_STEP) / 2
     clear = free_at_times(links, collision.tracks, configurations, times, needed)
     cells = list[ndarray]()
     for motion in graph.motions:
         check_timing("the grid of times")
         cells.append(graph.nearest_samples(motion, configurations))
-    way, reached = earliest(
+    motion_numbers, reached = earliest(
         clear,
         np.searchsorted(s, graph.stops),
         np.array([motion.source for motion in graph.motions]),
@@ -267,4 +267,4 @@ def _timed(
         np.cumsum([0] + [len(of_motion) for of_motion in cells]),
         np.concatenate(cells),
     )
-    return graph.trajectory([graph.motions[m] if m >= 0 else m for m in way]) if reached else None
+    return graph.trajectory([graph.motions[m] if m >= 0 else m for m in motion_numbers]) if reached else None

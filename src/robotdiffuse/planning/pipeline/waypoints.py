@@ -37,7 +37,7 @@ from robotdiffuse.validation.tolerances import DEFAULT, goal_error
 from robotdiffuse.validation.validator import verifier
 
 BLEND_FRACTION = 0.9
-"""Part of a blend that is used; the rest covers what lies between the places that are validated."""
+"""Fraction of a blend that is used; the rest covers the motion between the places that are validated."""
 MAX_DEVIATION_PER_BLEND = 10.0
 """First corner deviation that is tried, per meter of blend [rad/m]: some joints move the frame only a
 little."""
@@ -251,11 +251,18 @@ def join(
         raise InputError(f"results has {len(results)} results; it takes two to join")
     problems = [result.problem for result in results]
     first = problems[0]
-    shared = [one for one in first.constraints if all(one in problem.constraints for problem in problems)]
-    shared = [one for one in shared if not isinstance(one, CartesianLine)]
+    shared = [
+        constraint
+        for constraint in first.constraints
+        if all(constraint in problem.constraints for problem in problems)
+    ]
+    shared = [constraint for constraint in shared if not isinstance(constraint, CartesianLine)]
     for i, (before, after) in enumerate(pairwise(results), 1):
-        of = after.problem
-        if of.robot is not first.robot or (of.scene.shapes, of.scene.allowed_contacts) != (
+        problem_after = after.problem
+        if problem_after.robot is not first.robot or (
+            problem_after.scene.shapes,
+            problem_after.scene.allowed_contacts,
+        ) != (
             first.scene.shapes,
             first.scene.allowed_contacts,
         ):

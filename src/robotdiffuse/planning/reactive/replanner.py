@@ -79,9 +79,9 @@ class ObservedObstacle:
             moved = np.linalg.norm(T[:3, 3] - T_before[:3, 3])
             moved += self.obstacle.radius * rotation_angle(T_before[:3, :3].T @ T[:3, :3])
             if moved > max_speed * passed + OBSERVATION_ERROR:
-                way, allowed = distinct(float(moved), max_speed * passed, digits=3)
+                distance, allowed = distinct(float(moved), max_speed * passed, digits=3)
                 raise InputError(
-                    f"observation[{name!r}] is {way} m from where it was {passed:.3g} s ago; its "
+                    f"observation[{name!r}] is {distance} m from where it was {passed:.3g} s ago; its "
                     f"maximum speed {max_speed:g} m/s allows {allowed} m"
                 )
             velocity = (T[:3, 3] - T_before[:3, 3]) / passed
@@ -117,7 +117,7 @@ class PredictedObstacles:
 
     def shapes(self, time: float) -> list[Shape]:
         """The obstacles at a time [s]."""
-        return [one.at(time - self._since) for one in self._moving]
+        return [obstacle.at(time - self._since) for obstacle in self._moving]
 
     def near(self, motion: Trajectory, begins: float, clearance: float) -> float | None:
         """When an obstacle first comes nearer to the motion than the clearance [s]; None if none does."""
@@ -171,9 +171,10 @@ SAFETY_MARGIN = 0.2
 """Predictions keep the distance to obstacles that these can go at their maximum speed in this time [s], where
 possible: nearer to one, hardly any motion can be certified to stop in time."""
 ITERATIONS = 600
-"""Most iterations of a search for a path; there is at most one search per step."""
+"""Largest number of iterations of a search for a path; there is at most one search per step."""
 EVASIONS = 24
-"""Random directions that are tried for an evasion, when the arm rests where an obstacle is predicted."""
+"""Number of random directions that are tried for an evasion, if the arm rests where an obstacle is
+predicted."""
 EVASION_RADIUS = 0.8
 """Length of evasions [rad, joint-space L2]."""
 AT_REST = SpeedProfile(np.zeros(2), np.zeros(2))
@@ -239,7 +240,7 @@ class Replanner:
         self._robot, self._still = problem.robot, replace(problem, moving=())
         self._validator = verifier(self._still)
         self._rng = np.random.default_rng(seed)
-        self._seen = {one.name: ObservedObstacle(one) for one in problem.moving}
+        self._seen = {obstacle.name: ObservedObstacle(obstacle) for obstacle in problem.moving}
         self._now = -np.inf
         self._searches = 0
         self._next: TimedPath | None = None
@@ -311,9 +312,11 @@ class Replanner:
         if np.isfinite(self._since):
             self._motion = self._motion.rest(begins - self._since)
         self._since = begins
-        oldest = min(seen.time for seen in self._seen.values())
+        oldest = min(observed.time for observed in self._seen.values())
         predicted = self._predict()
-        grown = PredictedObstacles(self._robot, [seen.anywhere() for seen in self._seen.values()], oldest)
+        grown = PredictedObstacles(
+            self._robot, [observed.anywhere() for observed in self._seen.values()], oldest
+        )
         clear = self._choose_path(predicted)
         self._change_path()
         renewed = self._next is None and self._extend(predicted, grown, clear)
@@ -359,17 +362,17 @@ class Replanner:
         for name in observation:
             if name not in self._seen:
                 raise unknown_name("obstacle in observation:", str(name), self._seen)
-        seen = {name: self._seen[name].again(value, now) for name, value in observation.items()}
-        self._seen |= seen
+        observations = {name: self._seen[name].again(value, now) for name, value in observation.items()}
+        self._seen |= observations
         self._now = now
-        for name, one in self._seen.items():
-            if not np.isfinite(one.time):
-                self._seen[name] = replace(one, time=now)  # not seen yet: where the problem says
+        for name, observed in self._seen.items():
+            if not np.isfinite(observed.time):
+                self._seen[name] = replace(observed, time=now)  # not seen yet: where the problem says
 
     def _predict(self) -> PredictedObstacles:
         """The predicted obstacles, with the largest safety margin that the arm keeps now."""
-        moving = [seen.straight_on(self._now) for seen in self._seen.values()]
-        speeds = np.array([seen.obstacle.top_speed for seen in self._seen.values()])
+        moving = [observed.straight_on(self._now) for observed in self._seen.values()]
+        speeds = np.array([observed.obstacle.top_speed for observed in self._seen.values()])
         position = self._path.at(float(self._motion.s[0]))
         predicted = PredictedObstacles(self._robot, moving, self._now)
         for share in MARGIN_FRACTIONS:

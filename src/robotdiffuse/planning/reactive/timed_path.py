@@ -38,7 +38,7 @@ MIN_LENGTH = 1e-4
 LINE_INTERVAL = 0.03
 """Approximate length of the grid intervals on straight pieces [rad, joint-space L2]."""
 CORNER_INTERVALS = 16
-"""Grid intervals in a rounded corner."""
+"""Number of grid intervals in a rounded corner."""
 
 
 class SpeedProfile(NamedTuple):
@@ -120,15 +120,15 @@ class TimedPath:
         """The path's first and second derivatives on the grid, the grid of s, and the largest ṡ² on it."""
         count = max(int(self.line.length / LINE_INTERVAL), 8)
         grid = timing_grid(self.line, TimingSettings(line_intervals=count, corner_intervals=CORNER_INTERVALS))
-        one = self.line(grid, 1)
-        two = self.line(grid, 2)
+        first_derivative = self.line(grid, 1)
+        second_derivative = self.line(grid, 2)
         return (
-            one,
-            two,
+            first_derivative,
+            second_derivative,
             grid,
             controllable(
-                one,
-                two,
+                first_derivative,
+                second_derivative,
                 grid,
                 VELOCITY_FRACTION * self.robot.velocity,
                 *symmetric_bounds(self.acceleration, len(grid)),

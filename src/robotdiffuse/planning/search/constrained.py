@@ -27,13 +27,14 @@ MIN_PIECE = 0.004
 """Shortest piece [rad]."""
 MAX_PIECES = 512
 MAX_GROWTH = 0.2
-"""Along a straight piece a row's value may exceed those at its ends by this part of the row's tolerance."""
+"""Along a straight piece, the value of a constraint row may exceed its values at both ends by this fraction
+of the row's tolerance."""
 MIN_PROOF_PIECE = 1 / 16
-"""The proof of a piece splits it down to this part of its length."""
+"""A proof splits a piece into parts no shorter than this fraction of its length."""
 MAX_DRIFT = 0.85
-"""A projected middle is no further from either end than this part of the piece's length."""
+"""A projected middle is no further from either end than this fraction of the piece's length."""
 MIN_APPROACH = 0.95
-"""A step must bring the distance to its target down to this part or less."""
+"""After a step, the distance to its target must be at most this fraction of the distance before."""
 MAX_STEP_FACTOR = 2.0
 """A step is at most this many times as long as the straight line that it replaces."""
 # A shortcut counts if it leaves at most this part of the length; after this many in a row that do not, no

@@ -515,9 +515,9 @@ class _Validation:
         self._timed.append(path)
         paths = [self.search.start_goal.complete(path, direct) for direct in (True, False)]
         result = None
-        if len(paths[0]) < len(
-            paths[1]
-        ):  # shorter without a configuration beside the start or goal, where spheres collide
+        # If covering spheres collide at the start or goal, the search began beside it; the exact meshes may
+        # be free on the direct way.
+        if len(paths[0]) < len(paths[1]):
             result = self._finished(paths[0], stage, None)
         if result is None:
             result = self._finished(paths[1], stage, None)

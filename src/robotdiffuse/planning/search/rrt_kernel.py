@@ -28,9 +28,10 @@ _NOWHERE = np.float32(1e15)
 _FAR = np.float32(1e29)
 """Less than the square of a distance to _NOWHERE, and more than any other."""
 LINE_SHARE = np.float32(0.5)
-"""Share of the samples about the straight line while there is no path; the others are uniform."""
+"""While there is no path, fraction of the samples that are drawn about the straight line; the others are
+uniform."""
 LINE_SPREAD = np.float32(0.3)
-"""Their standard deviation, as a fraction of a joint's range."""
+"""Standard deviation of the samples about the straight line, as a fraction of a joint's range."""
 
 
 class Trees(NamedTuple):

@@ -46,19 +46,20 @@ from robotdiffuse.trajectories.simplification import shortcut
 
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 CAPACITY = 500_000
-"""Most nodes of the tree; the system allocates their memory as it is used."""
+"""Largest number of nodes of the tree; the system allocates their memory as it is used."""
 GOAL_BIAS = np.float32(0.1)
-"""Part of the samples that are at a goal, while it is not reached."""
+"""Fraction of the samples that are at a goal, while it is not reached."""
 GAIN = np.float32(1e-4)
-"""A cost must fall by more than this part to count; less is rounding."""
+"""A cost must fall by more than this fraction to count as lower; smaller differences are rounding errors."""
 NEIGHBORS = 64
 """Largest number of near neighbors; e (1 + 1 / dof) ln n is below it up to 10^8 nodes of 7 joints."""
 REMAINING_EXCESS = np.float32(0.5)
-"""Part of a goal's present excess over the straight line that is expected to remain."""
+"""Fraction of the excess of a goal's present cost over the straight line that is expected to remain."""
 MIN_PROMISE = np.float32(0.03)
-"""Smallest promise of a goal that may still have the shortest path, so that none is left out forever."""
+"""Smallest promise (see `draw_goal`) of a goal that may still have the shortest path, so that no goal is left
+out forever."""
 SHORTCUTS = 20
-"""Attempts to shorten a path."""
+"""Number of attempts to shorten a path."""
 
 
 class Goals(NamedTuple):
@@ -71,7 +72,7 @@ class Goals(NamedTuple):
     bound: np.ndarray
     """[k] the straight distance from the start: no path to the goal is shorter [rad]."""
     failures: np.ndarray
-    """[k] failed searches for this goal alone."""
+    """[k] number of failed searches for this goal alone."""
 
 
 def make_goals(start: Configuration, goals: Configurations) -> Goals:
@@ -146,7 +147,7 @@ def _draw(space, trees, goals, g, state, out):
 
 @allocation_free()
 def _remaining(trees, goals, q, best):
-    """A lower bound of the way from q to any goal that may still improve."""
+    """A lower bound of the cost from q to any goal whose path may still become shorter."""
     h_hat = INFINITE
     for g in range(len(goals.at)):
         if _is_open(trees, goals, g, best):
@@ -156,8 +157,9 @@ def _remaining(trees, goals, q, best):
 
 @allocation_free()
 def add_node(space, trees, goals, q, scratch, index, gaps):
-    """RRT*'s extension to q: the cheapest free way from the near nodes; then those near nodes that q reaches
-    more cheaply are hung under it. Returns the node; -1 if q is of no use or cannot be reached.
+    """RRT*'s extension to q: q becomes a child of the near node that gives it the lowest cost; then q becomes
+    the parent of near nodes whose cost it lowers. Returns the node; -1 if q cannot improve any path, or
+    cannot be reached.
 
     Extend of RRT* (Karaman and Frazzoli, IJRR 2011, algorithm 6) with q as x_new.
 
@@ -274,19 +276,19 @@ class SharedTreeSettings(Settings, name="shared_tree_rrt_star"):
     safety_distance: NotNegative = 0.05
     """Distance to obstacles that nodes and edges keep [m]; the default is what the authors' scenes imply."""
     step_rounds: Count = 4
-    """Rounds without a path before the safety distance is lowered."""
+    """Number of rounds without a path before the safety distance is lowered."""
     range: Positive = 1.0
     """Longest extension of a tree [rad, joint-space L2]."""
     resolution: Positive = 0.05
     """No point of the arm moves further than this between two checks of a motion [m]."""
     growth: Count = 150
-    """Iterations of RRT* in a round."""
+    """Number of iterations of RRT* in a round."""
     connect_iterations: Count = 1_000
-    """Most iterations of RRT-Connect in a round."""
+    """Largest number of iterations of RRT-Connect in a round."""
     rounds: Count = 100_000
-    """Most rounds."""
+    """Largest number of rounds."""
     improvement: NotNegative = 0.005
-    """The search ends when the best cost fell by less than this part in `patience` rounds; 0: never."""
+    """The search ends when the best cost fell by less than this fraction in `patience` rounds; 0: never."""
     patience: Count = 20
     """See `improvement`."""
 
@@ -341,7 +343,8 @@ class SharedTreeSearch:
 
     @property
     def finished(self) -> bool:
-        """Whether it is enough by the settings: no path can be shorter, or it hardly improves any more."""
+        """Whether the search has reached what the settings ask for: no path can be shorter, or paths hardly
+        improve any more."""
         settings = self.settings
         costs = self.costs
         if self.cost < np.inf:

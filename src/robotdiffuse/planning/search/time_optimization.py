@@ -178,23 +178,24 @@ def free_deviations(space, path, deviation):
 
 
 MAX_CANDIDATES = 6
-"""Candidates that are kept."""
+"""Largest number of candidates that are kept."""
 # Attempts to make a candidate faster when it is offered, and later in turn.
 FIRST_ATTEMPTS = 32
 ATTEMPTS = 16
 BEST_TURNS = 3
 """The fastest candidate has this many turns before another one has its own."""
 OPTIMALITY_TOLERANCE = 2e-3
-"""A motion that takes longer than one joint by itself by no more than this part is optimal."""
+"""A motion is optimal if it takes longer than its slowest joint would alone by no more than this fraction."""
 ESTIMATE_ERROR = 1.02
-"""Estimated times are greater than exact ones by no more than about this factor."""
+"""Estimated times are at most about this factor times the exact ones."""
 
 
 def still_improves(
     history: Sequence[tuple[int, float]], work: int, now: float, gain: float, patience: int
 ) -> bool:
-    """Whether the last doubling of the work reduced a cost to `now` by at least the part `gain`, or there was
-    less work than `patience`. history: the work after which the cost fell, and the cost then."""
+    """Whether the last doubling of the work reduced a cost to `now` by at least the fraction `gain`, or there
+    was less work than `patience`. history: for each time that the cost fell, the work until then and the
+    cost."""
     half = [cost for after, cost in history if after <= work / 2]
     if work < patience or not half:
         return True
@@ -244,10 +245,10 @@ class TimeOptimization:
         seed: int,
         longest: float = np.inf,
     ) -> None:
-        """longest: candidates that are no longer than this stay so, and once there is one, only such are kept
+        """longest: once there is a candidate that is no longer than this, only such candidates are kept
         [rad]."""
         self._limits = scaled_limits(robot, settings)
-        # no motion is faster than the joint that needs most time is by itself
+        # no motion is faster than its slowest joint alone
         alone = [
             straight_line_time(start[[j]], goals[:, [j]], *(limits[[j]] for limits in self._limits))
             for j in range(len(start))
@@ -261,7 +262,7 @@ class TimeOptimization:
         self.candidates = list[Candidate]()
         """Fastest first."""
         self.attempts = 0
-        """Attempts so far."""
+        """Number of attempts so far."""
         self.times = list[tuple[int, float]]()
         """The attempts after which the least time fell, and the least time [s]."""
 
@@ -305,8 +306,8 @@ class TimeOptimization:
         self._sort()
 
     def improves(self, gain: float, patience: int) -> bool:
-        """Whether to go on: the last doubling of the attempts reduced the least time by at least the part
-        `gain`, or there were fewer than `patience` attempts."""
+        """Whether to go on: the last doubling of the number of attempts reduced the least time by at least
+        the fraction `gain`, or there were fewer than `patience` attempts."""
         return still_improves(self.times, self.attempts, self.times[-1][1], gain, patience)
 
     def _least_time(self, candidate: Candidate) -> float:

@@ -1,10 +1,11 @@
 """Approximate convex decomposition: convex parts that cover a collision mesh, for exact distances by Coal.
 
 Planes cut a mesh until no part's hull sticks out of it too far. Then parts are merged as long as their common
-hull does not stick out too far. The hull of the part of a closed surface on one side of a plane contains the
-solid on that side, so the parts cover mesh and solid by construction, whatever the mesh looks like. A voxel
-grid measures how far a hull sticks out. Voxels that cannot be reached from outside without crossing the
-surface count as solid, so holes smaller than a voxel, inner walls and overlapping triangles do no harm.
+hull does not stick out too far. If a plane cuts a closed surface, the convex hull of the surface's piece on
+one side contains the whole solid on that side. So the parts always cover both the mesh and the solid that it
+encloses. A voxel grid measures how far a hull sticks out. Voxels that cannot be reached from outside without
+crossing the surface count as solid, so holes smaller than a voxel, inner walls and overlapping triangles do
+no harm.
 """
 
 from dataclasses import dataclass, replace
@@ -73,8 +74,9 @@ def hull_volume(points: Points) -> float:
 
 MAX_SPLITS = 60
 """Largest number of times that a triangle is halved."""
-# At a tight place, parts may stick out by this fraction of the usual distance; the allowance grows by this
-# slope with the distance from there.
+# Tight places are points where two links pass close to each other. There, parts may stick out by
+# TIGHT_FRACTION of `concavity`. Beyond a distance of 2 `concavity` from the place, the allowance grows with
+# slope TIGHT_SLOPE.
 TIGHT_FRACTION = 0.125
 TIGHT_SLOPE = 0.3
 
@@ -89,7 +91,7 @@ class DistanceGrid:
 
     @staticmethod
     def around(soups: list[Triangles], voxels: int, finest: float) -> "DistanceGrid":
-        """The grid around triangles, with about this many voxels of at least the `finest` size [m]."""
+        """A grid around triangles with about `voxels` voxels, whose edge is at least `finest` [m]."""
         corners = np.concatenate(soups).reshape(-1, 3)
         low = corners.min(0)
         high = corners.max(0)
@@ -106,9 +108,10 @@ class DistanceGrid:
         return DistanceGrid(origin, pitch, ndimage.distance_transform_edt(free) * pitch)
 
     def near_tight(self, tight: Points, concavity: float) -> tuple["DistanceGrid", "DistanceGrid"]:
-        """Two copies with distances enlarged near `tight` places, so that sticking out there counts more.
+        """Two copies in which distances near `tight` places are enlarged, so that it counts more if a part
+        sticks out there.
 
-        The first is zero elsewhere; the second keeps the other distances.
+        The first copy is zero at all other places; the second keeps the distances there.
         """
         near = np.argwhere((self.distance > 0) & (self.distance < 3 * concavity))
         far = KDTree(tight).query(self.origin + (near + 0.5) * self.pitch)[0]
@@ -200,7 +203,8 @@ CUT_FRACTIONS = np.arange(1, 10) / 10
 WALL_OFFSET = 1e-4
 """Distance between a surface and a cut beside it [m]."""
 IMPROVEMENT = 0.999
-"""A later candidate cut must reduce the volume of the hulls below this fraction of the best so far."""
+"""A later candidate cut replaces the best one so far only if the volume of its hulls is below this fraction
+of the best volume."""
 MAX_WALLS = 6
 """Largest number of surfaces perpendicular to an axis at which further cuts are tried."""
 MAX_CUT_POINTS = 1200
@@ -230,7 +234,8 @@ class PartSettings(Settings, name="convex parts"):
     faces: int = 400
     """Hulls with more triangles are simplified; they only grow."""
     rounding: float = 5e-4
-    """How far a simplified hull may stick out of the hull [m], if 120 planes suffice for that."""
+    """How far a simplified hull may stick out of the original hull [m]; with MAX_PLANES planes it may be
+    more."""
 
 
 def convex_parts(
@@ -309,7 +314,8 @@ class Part:
     @staticmethod
     def of(triangles: ndarray, points: ndarray, space: DistanceGrid, settings: PartSettings) -> "Part":
         hull = simplified(convex_hull(triangles.reshape(-1, 3)), settings)
-        if not len(points):  # the other side of a thin sheet has them
+        # all sampled points of a thin sheet may lie on the other side of the cut: sample this side anew
+        if not len(points):
             points = _spread(triangles, space.pitch)
         return Part(triangles, points, hull, space.concavity(hull))
 
@@ -398,7 +404,8 @@ def _sides(
 
 
 def _merged(hulls: list[ConvexMesh], space: DistanceGrid, settings: PartSettings) -> list[ConvexMesh]:
-    """Hulls merged pairwise, least common concavity first, while it is within `settings.concavity`."""
+    """Merges pairs of hulls: in each step the pair whose common hull sticks out least, as long as it sticks
+    out by at most `settings.concavity`."""
     hulls = list(hulls)
     merged: dict[tuple[int, int], tuple[float, ConvexMesh]] = {}
     while len(hulls) > 1:
@@ -420,7 +427,7 @@ def _merged(hulls: list[ConvexMesh], space: DistanceGrid, settings: PartSettings
 
 
 def _without_contained(hulls: list[ConvexMesh]) -> list[ConvexMesh]:
-    """Hulls without those contained in another one."""
+    """The hulls that no other hull contains."""
     remaining = sorted(hulls, key=lambda hull: float(np.prod(np.ptp(hull.vertices, axis=0))))
     for hull in tuple(remaining):
         other_planes = [planes_of(neighbor) for neighbor in remaining if neighbor is not hull]

@@ -514,19 +514,19 @@ class AddReport:
     def warnings(self) -> tuple[str, ...]:
         """Problems that will limit planning, and allowed pairs of links whose meshes collide."""
         warnings = []
-        of = self.false_collisions
-        worst_text = "; ".join(f"{' against '.join(p.links)} {p.by_spheres:.1%}" for p in of.pairs[:3])
-        if of.free < MIN_FREE:
-            often = sorted(of.pairs, key=lambda pair: -pair.colliding)[:3]
+        rates = self.false_collisions
+        worst_text = "; ".join(f"{' against '.join(p.links)} {p.by_spheres:.1%}" for p in rates.pairs[:3])
+        if rates.free < MIN_FREE:
+            often = sorted(rates.pairs, key=lambda pair: -pair.colliding)[:3]
             names = "; ".join(f"{' against '.join(pair.links)} {pair.colliding:.1%}" for pair in often)
             warnings.append(
-                f"only {of.free:.1%} of the configurations are free of self-collision by the URDF's meshes "
-                f"({names}); allow pairs that may touch with --allow"
+                f"only {rates.free:.1%} of the configurations are free of self-collision by the meshes "
+                f"of the URDF ({names}); allow pairs that may touch with --allow"
             )
-        if of.by_spheres > MAX_FALSE_COLLISIONS:
+        if rates.by_spheres > MAX_FALSE_COLLISIONS:
             warnings.append(
-                f"covering spheres collide falsely in {of.by_spheres:.1%} of the free configurations, more "
-                f"than {MAX_FALSE_COLLISIONS:.0%} ({worst_text}); planning cannot use these"
+                f"covering spheres collide falsely in {rates.by_spheres:.1%} of the free configurations, "
+                f"more than {MAX_FALSE_COLLISIONS:.0%} ({worst_text}); planning cannot use these"
             )
         warnings += [
             f"{' against '.join(pair.links)} is not checked, though the URDF's meshes collide in "

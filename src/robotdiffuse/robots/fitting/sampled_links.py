@@ -106,7 +106,7 @@ class Links:
         """The last common ancestor of links, and the joints from there to them."""
         if links not in self._joints_between:
             chains = [self.robot.joints_above(link) for link in links]
-            common = [first for first, *others in zip(*chains, strict=False) if {*others} <= {first}]
+            common = [first for first, *partners in zip(*chains, strict=False) if {*partners} <= {first}]
             needed = {joint.child for chain in chains for joint in chain[len(common) :]}
             joints = [joint for joint in self.robot.joints if joint.child in needed]
             self._joints_between[links] = common[-1].child if common else self.robot.base, joints

@@ -293,18 +293,18 @@ def move_center(center, own, count, step, grid, origin, spacing, directions):
     min_radius = excess_radius(center, own, count, grid, origin, spacing)
     while step > MIN_STEP:
         best = min_radius - MIN_GAIN
-        way = -1
+        direction = -1
         for k in range(len(directions)):
             trial = center + step * directions[k]
             value = excess_radius(trial, own, count, grid, origin, spacing)
             if value < best:
                 best = value
-                way = k
-        if way < 0:
+                direction = k
+        if direction < 0:
             step /= 2
         else:
             min_radius = best
-            center += step * directions[way]
+            center += step * directions[direction]
 
 
 @kernel(fastmath=True)

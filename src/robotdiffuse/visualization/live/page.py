@@ -426,9 +426,11 @@ class Panel:
             for widget in self._sizes.values():
                 widget.remove()
             with self._sizes_box:
-                self._sizes = {of: self._size_slider(name, of, value) for of, value in sizes.items()}
-        for of, value in sizes.items():
-            set_value(self._sizes[of], value)
+                self._sizes = {
+                    size_name: self._size_slider(name, size_name, value) for size_name, value in sizes.items()
+                }
+        for size_name, value in sizes.items():
+            set_value(self._sizes[size_name], value)
 
     def _size_slider(self, name: str, dimension: str, value: float) -> Any:
         max_size = max(MAX_DIMENSION, value)
@@ -643,17 +645,17 @@ class Obstacles:
 
     def show(self, obstacles: Sequence[Drawable], selected: str = "", time: float = 0.0) -> None:
         """Update to obstacles where they are at a time [s], and highlight the selected one."""
-        names = {one.name for one in obstacles}
+        names = {obstacle.name for obstacle in obstacles}
         for name in [name for name in self._nodes if name not in names]:
             self._nodes.pop(name)[1].remove()
-        for one in obstacles:
-            key = _appearance(one.shape), one.color, one.name == selected
-            drawn_node = self._nodes.get(one.name)
+        for obstacle in obstacles:
+            key = _appearance(obstacle.shape), obstacle.color, obstacle.name == selected
+            drawn_node = self._nodes.get(obstacle.name)
             if drawn_node is None or drawn_node[0] != key:
                 if drawn_node is not None:
                     drawn_node[1].remove()
-                self._nodes[one.name] = key, self._draw(one, one.name == selected)
-            place(self._nodes[one.name][1], one.frame(time))
+                self._nodes[obstacle.name] = key, self._draw(obstacle, obstacle.name == selected)
+            place(self._nodes[obstacle.name][1], obstacle.frame(time))
 
     def _draw(self, obstacle: Drawable, selected: bool) -> Any:
         """A node in the obstacle's own frame."""

@@ -68,7 +68,7 @@ MAX_UPLOAD_SIZE = 5_000_000
 FILE_FIELDS = ("file", "request", "views")
 """Fields of a problem that name files on the server."""
 MAX_SAMPLES = 1000
-"""Most random configurations that are tried for a free start and goal."""
+"""Largest number of random configurations that are tried for a free start and goal."""
 NO_FILES = "the page reads no other files; open this problem with `robotdiffuse live PROBLEM`"
 # Kinds of badges: green, red, no motion, not validated yet.
 VALID = "valid"
@@ -370,8 +370,13 @@ def _posed(goal: Goal, frame: str, T_base_frame: Pose) -> PoseGoal | PosesGoal:
     if isinstance(goal, PoseGoal):
         return replace(goal, T_base_frame=T_base_frame)
     if isinstance(goal, PosesGoal):
-        moved = replace(next(one for one in goal.poses if one.frame == frame), T_base_frame=T_base_frame)
-        return PosesGoal([moved if one.frame == frame else one for one in goal.poses])
+        moved = replace(
+            next(link_pose_goal for link_pose_goal in goal.poses if link_pose_goal.frame == frame),
+            T_base_frame=T_base_frame,
+        )
+        return PosesGoal(
+            [moved if link_pose_goal.frame == frame else link_pose_goal for link_pose_goal in goal.poses]
+        )
     return PoseGoal(frame, T_base_frame)
 
 
