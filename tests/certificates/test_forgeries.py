@@ -57,15 +57,12 @@ def true(tmp_path_factory: pytest.TempPathFactory) -> tuple[FilePath, rd.Problem
     return file, problem
 
 
-def motion_of(record: Record) -> rd.Path | rd.Trajectory:
-    motion = record["motion"]
-    rows = {name: np.array(motion[name], float) for name in motion if name != "joint_names"}
-    return (rd.Trajectory if "times" in rows else rd.Path)(tuple(motion["joint_names"]), **rows)
-
-
 def sealed(record: Record) -> None:
     """Recompute all hashes of the motion and the problem, as a forger does."""
-    record["motion_hash"] = hash_of(motion_of(record))
+    motion = record["motion"]
+    rows = {name: np.array(motion[name], float) for name in motion if name != "joint_names"}
+    made = rd.Trajectory if "times" in rows else rd.Path
+    record["motion_hash"] = hash_of(made(tuple(motion["joint_names"]), **rows))
     problem = problem_from_record(record["problem"])
     record["scene_parts"], record["request_parts"] = scene_parts(problem.scene), request_parts(problem)
 

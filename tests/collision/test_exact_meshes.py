@@ -11,15 +11,11 @@ from hypothesis import strategies as st
 import robotdiffuse as rd
 from helpers.box_arm import HALF_WIDTH, box_arm
 from helpers.example_robots import example_robot
-from helpers.sphere_oracles import solids
+from helpers.sphere_oracles import distance, solids
 from robotdiffuse.collision.exact_meshes import ExactCollision, explain_collision, forward_frames
 from robotdiffuse.robots.kinematics import link_pose
 
 Q0 = np.zeros(3)
-
-
-def vector(*values: float) -> np.ndarray:
-    return np.array(values, float)
 
 
 coordinate = st.floats(-1.5, 1.5)
@@ -29,18 +25,13 @@ def least(exact: ExactCollision, q: np.ndarray) -> float:
     return min(d.distance for d in (*exact.link_distances(q), *exact.pair_distances(q)))
 
 
-def box_distance(point: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
-    outside = np.maximum(low - point, point - high)
-    return float(np.linalg.norm(np.maximum(outside, 0)) + min(outside.max(), 0))
-
-
 @given(coordinate, coordinate, st.floats(-0.5, 0.5), st.floats(0.01, 0.4))
 def test_box_links_against_a_sphere_in_closed_form(x: float, y: float, z: float, radius: float) -> None:
-    exact = ExactCollision(box_arm(), rd.Scene([rd.Sphere(vector(x, y, z), radius)]))
+    exact = ExactCollision(box_arm(), rd.Scene([rd.Sphere((x, y, z), radius)]))
     lows = np.array([[start, -HALF_WIDTH, -HALF_WIDTH] for start in (0, 0.5, 0.9)])
     highs = np.array([[end, HALF_WIDTH, HALF_WIDTH] for end in (0.5, 0.9, 1.2)])
     for found, low, high in zip(exact.link_distances(Q0), lows, highs, strict=True):
-        right = box_distance(np.array([x, y, z]), low, high) - radius
+        right = float(distance(rd.Box((low + high) / 2, high - low), np.array([x, y, z]))) - radius
         # 1e-5: EPA, which finds the depth in an iteration, is left at Coal's own tolerance.
         assert found.distance == pytest.approx(right, abs=1e-6 if right > 0 else 1e-5)
 
@@ -49,9 +40,9 @@ def test_links_without_meshes_are_their_spheres() -> None:
     """The arm with one sphere at each link's origin in place of meshes."""
     spheres = {f"l{i}": np.array([[0.0, 0.0, 0.0, 0.04]]) for i in (1, 2, 3)}
     obstacles = [
-        rd.Box(vector(0.5, 0.5, 0), vector(0.2, 0.3, 2)),
-        rd.Capsule(vector(0.9, -0.4, 0), 0.1, 0.6),
-        rd.Cylinder(vector(-0.6, 0, 0), 0.2, 1.0, vector(np.sqrt(0.5), np.sqrt(0.5), 0, 0)),
+        rd.Box((0.5, 0.5, 0), (0.2, 0.3, 2)),
+        rd.Capsule((0.9, -0.4, 0), 0.1, 0.6),
+        rd.Cylinder((-0.6, 0, 0), 0.2, 1.0, (np.sqrt(0.5), np.sqrt(0.5), 0, 0)),
     ]
     exact = ExactCollision(replace(box_arm(), meshes={}, spheres=spheres), rd.Scene(obstacles))
     found = exact.link_distances(Q0)
@@ -113,7 +104,7 @@ def test_an_empty_point_cloud_is_an_empty_scene() -> None:
 
 def test_a_mesh_is_its_surface() -> None:
     mesh = trimesh.creation.box((0.2, 0.3, 0.4)).subdivide()
-    solid = rd.Box(vector(0.6, 0.6, 0.1), vector(0.2, 0.3, 0.4), vector(0.9, 0.1, 0.3, 0.2))
+    solid = rd.Box((0.6, 0.6, 0.1), (0.2, 0.3, 0.4), (0.9, 0.1, 0.3, 0.2))
     q = np.array([0.2, 0.1, 0.3])
     surface = rd.Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), solid.center, solid.wxyz)
     a, b = (ExactCollision(box_arm(), rd.Scene([shape])) for shape in (solid, surface))
@@ -124,7 +115,7 @@ def test_a_mesh_is_its_surface() -> None:
 
 
 def test_nearest_honors_cutoffs_and_stops() -> None:
-    exact = ExactCollision(box_arm(), rd.Scene([rd.Sphere(vector(0.2, 0.5, 0), 0.1)]))
+    exact = ExactCollision(box_arm(), rd.Scene([rd.Sphere((0.2, 0.5, 0), 0.1)]))
     q = np.zeros((4, 3))
     checks = np.array([0, 0, 2, 0])
     distances, names = exact.nearest(q, checks, np.array([1.0, 0.2, 1.0, 1.0]), stop=0.3)
@@ -163,5 +154,5 @@ def test_collisions_are_explained() -> None:
 
 def test_fixed_links_do_not_count_against_the_scene() -> None:
     robot = box_arm().with_locked({"j0": 0.0})
-    exact = ExactCollision(robot, rd.Scene([rd.Sphere(vector(0.2, 0, 0), 0.1)]))
+    exact = ExactCollision(robot, rd.Scene([rd.Sphere((0.2, 0, 0), 0.1)]))
     assert exact.links == ("l2", "l3") and not exact.collides(np.zeros((1, 2)))[0]

@@ -21,11 +21,6 @@ MOVED = 0.02
 AXIS = np.array([0.0, 0.6, 0.8])
 
 
-def swing(duration: float) -> tuple[np.ndarray, np.ndarray]:
-    """A motion there and back at constant speed."""
-    return np.linspace(0.0, duration, 3), np.stack([START, END, START])
-
-
 def obstacle(k: int, rng: np.random.Generator) -> rd.MovingObstacle:
     """Obstacles of every shape and every kind of motion in turn."""
     at = rng.uniform([-0.2, -0.8, 0.2], [0.9, 0.8, 1.0])
@@ -64,7 +59,10 @@ def as_coal_sees(moves: rd.MovingObstacle, times: np.ndarray, q: np.ndarray) -> 
 
 
 def test_certificate_is_coals_verdict() -> None:
-    rng, (times, q) = np.random.default_rng(3), swing(3.0)
+    """Of a motion there and back at constant speed."""
+    rng = np.random.default_rng(3)
+    times = np.linspace(0.0, 3.0, 3)
+    q = np.stack([START, END, START])
     found = []
     for k in range(30):
         moves = obstacle(k, rng)

@@ -14,7 +14,6 @@ from robotdiffuse.collision.exact_meshes import ExactCollision, explain_collisio
 from robotdiffuse.robots.bodies import Surface
 from robotdiffuse.robots.fitting.convex_parts import convex_hull
 from robotdiffuse.robots.fitting.covering_spheres import cover
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot_folder import SURFACE_FILE, read_robot_folder, write_robot_folder
 
 TURN = 0.6
@@ -167,7 +166,7 @@ def test_baxters_torso_and_arms_graze_as_trimesh_finds_too() -> None:
     [found] = [d for d in ExactCollision(robot, EMPTY).pair_distances(q) if {d.link, d.other} == {*links}]
     meshes = []
     for each in links:
-        T = link_pose(robot, q, each)
+        T = robot.fk(q, each)
         surface = robot.surfaces[each]
         meshes.append(
             trimesh.Trimesh(surface.vertices @ T[:3, :3].T + T[:3, 3], surface.faces, process=False)

@@ -30,7 +30,6 @@ from robotdiffuse.interop.recorded_motion import (
     problem_of_motion,
     publish,
 )
-from robotdiffuse.validation.validator import verify_trajectory
 
 START = [-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
 GOAL = [1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
@@ -79,7 +78,7 @@ def test_what_is_exported_is_read_again_and_validated_the_same(
     np.testing.assert_array_equal(found.motion.positions, trajectory.positions)
     np.testing.assert_array_equal(found.motion.velocities, trajectory.velocities)
     np.testing.assert_allclose(found.motion.times, trajectory.times, atol=1e-9)  # messages count nanoseconds
-    here, there = (verify_trajectory(problem, motion) for motion in (trajectory, found.motion))
+    here, there = (rd.verify(problem, motion) for motion in (trajectory, found.motion))
     assert (here.valid, here.violation) == (there.valid, there.violation)
     assert there.min_clearance == pytest.approx(here.min_clearance, rel=1e-6)
     assert [path.name for path in tmp_path.iterdir()] == [file.name]
@@ -125,7 +124,7 @@ def test_mcap_holds_scene_urdf_frames_and_joint_states(planned: Planned, tmp_pat
     raised = replace(problem, T_world_base=transform(np.array([1.0, 2.0, 3.0])))
     write_motion(raised, trajectory, tmp_path / "m.mcap")
     again = ros2.problem_in(tmp_path / "m.mcap")
-    assert again is not None and verify_trajectory(again, trajectory).valid
+    assert again is not None and rd.verify(again, trajectory).valid
 
 
 def test_a_urdf_goes_along(tmp_path: Path) -> None:
@@ -255,11 +254,11 @@ def test_positions_and_times_alone_are_validated_on_the_smoothest_curve() -> Non
     q = np.outer(s, [0.5, -0.4, 0.3])
     found = motion_of_robot(checked_motion(robot.joint_names, q, t), robot)
     assert isinstance(found.motion, Trajectory)
-    report = verify_trajectory(Problem(robot, Scene(), q[0], q[-1]), found.motion)
+    report = rd.verify(Problem(robot, Scene(), q[0], q[-1]), found.motion)
     assert report.valid, report.violation
     hasty = motion_of_robot(checked_motion(robot.joint_names, q, t / 10), robot).motion
     assert isinstance(hasty, Trajectory)
-    refused = verify_trajectory(Problem(robot, Scene(), q[0], q[-1]), hasty).violation
+    refused = rd.verify(Problem(robot, Scene(), q[0], q[-1]), hasty).violation
     assert refused is not None and refused.kind in ("velocity", "acceleration", "jump")
 
 

@@ -7,7 +7,7 @@ import robotdiffuse as rd
 from helpers.sphere_oracles import depth_of_balls
 from robotdiffuse.perception.observed_volume import ObservedVolume, observe
 from robotdiffuse.perception.voxel_grid import LOW, SHAPE, VOXEL
-from robotdiffuse.robots.kinematics import link_pose, placed_spheres
+from robotdiffuse.robots.kinematics import placed_spheres
 
 PANDA = rd.load_robot("panda")
 HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
@@ -117,7 +117,7 @@ def test_the_arm_is_no_obstacle_and_casts_a_shadow() -> None:
     assert {*np.nonzero(seen.occupied)[0]} == {int((1.6 - 2.2 - LOW[0]) / VOXEL)}, "the wall behind alone"
     elsewhere = observe([view(depth.astype(np.float32), q=AWAY)], PANDA, AWAY)
     assert elsewhere.occupied.sum() > 50, "with the arm elsewhere, the points are an obstacle's"
-    hand = link_pose(PANDA, HOME, "panda_hand")[:3, 3]
+    hand = PANDA.fk(HOME, "panda_hand")[:3, 3]
     along = (hand - T[:3, 3]) * 1.4 + T[:3, 3]
     assert seen.shadow[tuple(((along - LOW) / VOXEL).astype(int))]
     assert not (seen.shadow & (seen.free | seen.occupied)).any()

@@ -10,7 +10,6 @@ import robotdiffuse as rd
 from robotdiffuse.perception import visibility
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.perception.voxel_grid import VoxelGrid
-from robotdiffuse.robots.kinematics import link_pose
 
 PANDA = rd.load_robot("panda")
 Q = np.array([0.3, -0.5, 0.2, -2.0, 0.4, 1.7, 0.5])
@@ -122,5 +121,5 @@ def check_covered(robot: rd.Robot, points: dict[str, np.ndarray]) -> None:
     """Points in frames of links are within the arm's balls at Q."""
     tree = KDTree(visibility.surface_balls(robot, Q))
     for link, of_link in points.items():
-        T = link_pose(robot, Q, link)
+        T = robot.fk(Q, link)
         assert tree.query(of_link @ T[:3, :3].T + T[:3, 3])[0].max() <= visibility.BALL_RADIUS

@@ -13,7 +13,6 @@ from robotdiffuse.collision.checker import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.problems.files import problem_from_record, problem_record, save_problem
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.scene import contact_notes
 from robotdiffuse.scenes.shapes import Shape
 
@@ -24,23 +23,19 @@ HOME = np.array([0.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 AWAY = np.array([1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 
 
-def solid(kind: str, at: np.ndarray) -> Shape:
-    """An object around a place, between the fingers."""
+def grasp(kind: str, contacts: dict[str, object]) -> rd.Problem:
+    """A Panda whose fingers are around an object, before it moves away past a ball."""
+    robot = rd.load_robot("panda")
+    T = robot.fk(HOME, "panda_hand")
+    at = T[:3, 3] + 0.09 * T[:3, 2]
     made = trimesh.creation.cylinder(0.03, 0.1)
     shapes: dict[str, Shape] = {
         "box": rd.Box(at, [0.05, 0.05, 0.05], name="mug"),
         "mesh": rd.Mesh(made.vertices, made.faces, at, name="mug"),
         "point_cloud": rd.PointCloud(made.vertices + at, 0.02, name="mug"),
     }
-    return shapes[kind]
-
-
-def grasp(kind: str, contacts: dict[str, object]) -> rd.Problem:
-    """A Panda whose fingers are around an object, before it moves away past a ball."""
-    robot = rd.load_robot("panda")
-    T = link_pose(robot, HOME, "panda_hand")
-    shapes = [solid(kind, T[:3, 3] + 0.09 * T[:3, 2]), rd.Sphere([0.62, 0.33, 0.5], 0.1, "ball")]
-    return rd.Problem(robot, rd.Scene(shapes, contacts), HOME, AWAY)  # type: ignore[arg-type]
+    scene = rd.Scene([shapes[kind], rd.Sphere([0.62, 0.33, 0.5], 0.1, "ball")], contacts)  # type: ignore[arg-type]
+    return rd.Problem(robot, scene, HOME, AWAY)
 
 
 @pytest.mark.parametrize("kind", ["box", "mesh", "point_cloud"])

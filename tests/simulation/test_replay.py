@@ -16,12 +16,10 @@ from helpers.box_arm import box_arm, box_mesh
 from helpers.example_robots import example_robot
 from robotdiffuse.cli import main
 from robotdiffuse.problems.files import problem_record
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import ConvexMesh
 from robotdiffuse.simulation import PyBulletOracle, ReplaySettings, replay, world
 from robotdiffuse.simulation.world import mass_and_center
 from robotdiffuse.trajectories.timing import time_parameterize
-from robotdiffuse.validation.validator import verify_trajectory
 
 pytestmark = pytest.mark.sim
 
@@ -55,7 +53,7 @@ def test_a_panda_tracks_a_timed_motion_the_better_the_finer_the_step() -> None:
     assert coarse.positions[-1] == pytest.approx(trajectory.positions[-1], abs=1e-4)
     # the error of the tip against our own kinematics
     k = int(coarse.tip_errors.argmax())
-    ends = [link_pose(robot, q[k], robot.tip)[:3, 3] for q in (coarse.positions, coarse.reference)]
+    ends = [robot.fk(q[k])[:3, 3] for q in (coarse.positions, coarse.reference)]
     assert np.linalg.norm(ends[0] - ends[1]) == pytest.approx(coarse.tip_errors[k], abs=1e-6)
 
 
@@ -151,7 +149,7 @@ def test_command(tmp_path: FilePath, capsys: pytest.CaptureFixture[str]) -> None
     assert "known: .html, .png" in capsys.readouterr().err
     assert main(["simulate", file, "--out", str(tmp_path / "page.html")]) == 0
     assert "panda_joint7" in (tmp_path / "page.html").read_text("utf-8")
-    end = link_pose(rd.load_robot("panda"), PANDA_START + 0.2, "panda_hand")[:3, 3]
+    end = rd.load_robot("panda").fk(PANDA_START + 0.2, "panda_hand")[:3, 3]
     file = result_file(tmp_path, rd.Scene([rd.Sphere(end, 0.05)]))
     assert main(["simulate", file]) == 1
     printed = capsys.readouterr().out
@@ -179,7 +177,7 @@ def test_moving_obstacles_are_contacts_where_the_validator_refuses_the_motion() 
             rd.Sphere([0.55, side * 0.45, 0.5], 0.12, name="ball"), velocity=[0, -0.3, 0]
         )
         problem = rd.Problem(robot, rd.Scene(), PANDA_START, end, moving=[ball])
-        report = verify_trajectory(problem, trajectory)
+        report = rd.verify(problem, trajectory)
         run = replay(robot, rd.Scene(), trajectory, moving=problem.moving)
         assert run.free == report.valid
         if report.violation is not None:

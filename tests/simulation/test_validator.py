@@ -22,10 +22,6 @@ TOLERANCE = 7e-4
 """Most distances agree to 5e-6 m; Bullet rounds the edges of its boxes and cylinders by up to 0.6 mm."""
 
 
-def vector(*values: float) -> np.ndarray:
-    return np.array(values, float)
-
-
 def every_shape() -> rd.Scene:
     torus = trimesh.creation.torus(0.2, 0.05, major_sections=16, minor_sections=8)
     mesh = rd.Mesh(torus.vertices.view(np.ndarray), torus.faces, (-0.3, 0.4, 0.7), (0.5, 0.1, 0.2, 0.9))
@@ -70,9 +66,7 @@ def test_collisions_agree_with_coal_meshes_included() -> None:
 def test_paths_that_the_validator_accepts_or_refuses() -> None:
     robot = box_arm()
     rng = np.random.default_rng(5)
-    scene = rd.Scene(
-        [rd.Sphere(vector(0.7, 0.5, 0), 0.15), rd.Box(vector(-0.5, -0.4, 0), vector(0.1, 0.2, 0.3))]
-    )
+    scene = rd.Scene([rd.Sphere((0.7, 0.5, 0), 0.15), rd.Box((-0.5, -0.4, 0), (0.1, 0.2, 0.3))])
     verdicts = []
     with PyBulletOracle(robot, scene) as oracle:
         for _ in range(30):
@@ -95,7 +89,7 @@ def test_paths_that_the_validator_accepts_or_refuses() -> None:
 
 def test_a_single_waypoint_is_checked() -> None:
     robot = box_arm()
-    with PyBulletOracle(robot, rd.Scene([rd.Sphere(vector(1.2, 0, 0), 0.1)])) as oracle:
+    with PyBulletOracle(robot, rd.Scene([rd.Sphere((1.2, 0, 0), 0.1)])) as oracle:
         found = oracle.check_path(rd.Path(robot.joint_names, np.zeros((1, 3))))
         with pytest.raises(rd.InputError, match=r"tolerance is -0\.1; it must not be negative"):
             oracle.check_frames(np.zeros((1, 3)), -0.1)
@@ -104,9 +98,9 @@ def test_a_single_waypoint_is_checked() -> None:
 
 
 def test_scenes_are_replaced_and_the_robot_stays() -> None:
-    ball = rd.Sphere(vector(1.2, 0, 0), 0.1)
-    clouds = [rd.PointCloud(np.zeros((0, 3))), rd.PointCloud(vector(1.2, 0, 0)[None])]
-    with PyBulletOracle(box_arm(), rd.Scene([rd.Box(vector(0, 1, 0), vector(1, 0.1, 1))])) as oracle:
+    ball = rd.Sphere((1.2, 0, 0), 0.1)
+    clouds = [rd.PointCloud(np.zeros((0, 3))), rd.PointCloud(np.array([[1.2, 0, 0]]))]
+    with PyBulletOracle(box_arm(), rd.Scene([rd.Box((0, 1, 0), (1, 0.1, 1))])) as oracle:
         for shapes, hit in ([ball], "sphere"), ([], None), ([ball], "sphere"), (clouds, "point_cloud_2"):
             oracle.set_scene(rd.Scene(shapes))
             found = oracle.check_frames(np.zeros((1, 3)))
@@ -116,9 +110,7 @@ def test_scenes_are_replaced_and_the_robot_stays() -> None:
 def test_obstacles_at_links_that_do_not_move_are_nothing() -> None:
     robot = far_pairs_only(example_robot("panda"))
     q = np.array([[0, -0.785, 0, -2.356, 0, 1.571, 0.785]])
-    with PyBulletOracle(
-        robot, rd.Scene([rd.Box(vector(0, 0, -0.05), vector(2, 2, 0.12), name="floor")])
-    ) as oracle:
+    with PyBulletOracle(robot, rd.Scene([rd.Box((0, 0, -0.05), (2, 2, 0.12), name="floor")])) as oracle:
         assert oracle.check_frames(q) is None and oracle.nearest(q[0], 0.0) is None
 
 
@@ -126,7 +118,7 @@ def test_point_clouds_agree_with_coal() -> None:
     robot = far_pairs_only(example_robot("panda"))
     rng = np.random.default_rng(4)
     ball = rng.normal(size=(400, 3))
-    points = vector(0.4, 0.2, 0.5) + 0.25 * ball / np.linalg.norm(ball, axis=1, keepdims=True)
+    points = (0.4, 0.2, 0.5) + 0.25 * ball / np.linalg.norm(ball, axis=1, keepdims=True)
     scene = rd.Scene([rd.PointCloud(points, 0.02)])
     exact = ExactCollision(robot, scene)
     q = rng.uniform(robot.lower, robot.upper, (40, robot.dof))

@@ -14,7 +14,6 @@ import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.sphere_oracles import random_shape
 from robotdiffuse.collision.exact_meshes import ExactCollision
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.shapes import Shape
 from robotdiffuse.trajectories.cubics import Cubics
 from robotdiffuse.trajectories.speed_limits import TimingSettings
@@ -507,7 +506,7 @@ def test_a_frame_keeps_its_speed_between_rows(factor: float, valid: bool, count:
     start = np.array([0.0, 0.2, 0.0, -1.9, 0.0, 2.1, 0.785])
     rows = start + np.outer(np.linspace(0, 0.3, count), np.eye(7)[0])
     motion = between_rest(rows, [0.0, 1.0, 2.0][:count], robot=panda)
-    radius = np.linalg.norm(link_pose(panda, start, "panda_hand")[:2, 3])
+    radius = np.linalg.norm(panda.fk(start, "panda_hand")[:2, 3])
     speed = float(factor * 1.5 * radius * 0.3 / (count - 1))
     line = rd.CartesianLine("panda_hand", 0.1, None, speed)
     problem = rd.Problem(panda, rd.Scene(), rows[0], rows[-1], constraints=[line])

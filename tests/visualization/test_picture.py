@@ -7,7 +7,6 @@ import pytest
 from PIL import Image
 
 from robotdiffuse import InputError, Path, Scene
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.visualization import PictureSettings, write_comparison, write_picture
 from robotdiffuse.visualization.picture import COMPARED, render
 
@@ -16,7 +15,7 @@ SMALL = PictureSettings(width=320, height=200, ghosts=2)
 
 def test_picture_shows_the_tip_where_kinematics_puts_it(arm, motion, tmp_path):
     pixels, camera = render(arm, Scene(), motion, SMALL)
-    middle_of_tip = link_pose(arm, motion.positions[-1], "tip") @ [0, 0, 0.1, 1]
+    middle_of_tip = arm.fk(motion.positions[-1], "tip") @ [0, 0, 0.1, 1]
     column, row, _ = camera.project(middle_of_tip[None, :3])[0].astype(int)
     away, _ = render(arm, Scene(), Path(arm.joint_names, motion.positions[:1]), replace(SMALL, ghosts=0))
     assert away.shape == (200, 320, 3) and 0 < column < 320 and 0 < row < 200

@@ -7,13 +7,12 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.pages import page_data
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.visualization.replay_page import COLLIDING, write_problem
 
 PANDA = rd.load_robot("panda")
 START = np.array([-1.0, 0.3, 0, -1.8, 0, 2.1, 0.8])
 END = START * [-1, 1, 1, 1, 1, 1, 1]
-AT_START = rd.Sphere(link_pose(PANDA, START, "panda_hand")[:3, 3], 0.05, "ball")
+AT_START = rd.Sphere(PANDA.fk(START, "panda_hand")[:3, 3], 0.05, "ball")
 FAR = np.eye(4)
 FAR[0, 3] = 1.5
 

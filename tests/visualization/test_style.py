@@ -8,7 +8,6 @@ import pytest
 import robotdiffuse as rd
 from helpers.three_bars import CORNERS, CUBE
 from robotdiffuse.drawables import creased
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.visual_meshes import has_visual, load_visual
 from robotdiffuse.visualization.arm import DrawnArm
 
@@ -16,7 +15,7 @@ from robotdiffuse.visualization.arm import DrawnArm
 def test_trace_follows_the_outer_end_of_the_tip(arm, motion):
     points = DrawnArm(arm).tool_points(motion.positions[::100])
     for q, point in zip(motion.positions[::100], points, strict=True):
-        np.testing.assert_allclose(point, (link_pose(arm, q, "tip") @ [0, 0, 0.2, 1])[:3], atol=1e-12)
+        np.testing.assert_allclose(point, (arm.fk(q, "tip") @ [0, 0, 0.2, 1])[:3], atol=1e-12)
 
 
 def test_creases_keep_edges_of_a_box_and_smooth_a_ball():

@@ -13,7 +13,6 @@ import robotdiffuse as rd
 from helpers import waiting
 from helpers.browsers import MARKS, PATIENCE, opened
 from robotdiffuse.core.transforms import rotation_from_quaternion, transform
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.visualization.live import session as live
 
 pytest.importorskip("viser", reason="the page needs viser: pip install 'robotdiffuse[live]'")
@@ -60,7 +59,7 @@ def test_an_obstacle_in_the_way_turns_it_red_and_the_next_plan_green(view: Any, 
     motion = session.state.motion
     assert motion is not None and motion.trajectory is not None
     q = motion.trajectory.positions[len(motion.trajectory.times) // 2]
-    hand = transform(link_pose(session.state.problem.robot, q, "panda_hand")[:3, 3])
+    hand = transform(session.state.problem.robot.fk(q, "panda_hand")[:3, 3])
     session.change_obstacle("sphere", lambda shape: live.moved_to(shape, hand))
     red = view.locator(INVALID)
     red.wait_for()

@@ -16,8 +16,6 @@ from robotdiffuse.core.registry import Entry
 from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.drawables import own_frame
 from robotdiffuse.planning import PLANNERS
-from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.validation.validator import verify_trajectory
 from robotdiffuse.visualization.live import session as live
 
 START = np.array([0.0, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8])
@@ -63,7 +61,7 @@ def test_the_badge_turns_red_at_once_and_green_with_the_new_plan(session: live.S
     assert [stage for stage, _ in state.seconds] == ["first path", "planning", "timing", "validating again"]
     session.set_options(follow=False)
     q = first.trajectory.positions[len(first.trajectory.times) // 2]
-    hand = transform(link_pose(state.problem.robot, q, "panda_hand")[:3, 3])
+    hand = transform(state.problem.robot.fk(q, "panda_hand")[:3, 3])
     session.change_obstacle("lamp", lambda shape: live.moved_to(shape, hand))
     state = until(session, settled)
     assert state.motion is first and state.answer is None
@@ -74,11 +72,11 @@ def test_the_badge_turns_red_at_once_and_green_with_the_new_plan(session: live.S
     state = until(session, lambda state: settled(state) and state.motion is not first)
     assert live.validity(state).kind == live.VALID
     assert state.motion is not None and state.motion.trajectory is not None
-    assert verify_trajectory(state.problem, state.motion.trajectory).valid
+    assert rd.verify(state.problem, state.motion.trajectory).valid
 
 
 def test_why_there_is_no_plan(session: live.Session) -> None:
-    hand = link_pose(session.state.problem.robot, END, "panda_hand")
+    hand = session.state.problem.robot.fk(END, "panda_hand")
     session.change_obstacle("lamp", lambda shape: live.moved_to(shape, transform(hand[:3, 3])))
     state = until(session, settled)
     assert state.answer is not None and state.answer.status is rd.Status.INVALID_GOAL
@@ -97,7 +95,7 @@ def test_the_target_is_dragged(session: live.Session) -> None:
     def stands(state: live.State) -> bool:
         q = state.goal_configuration
         robot = state.problem.robot
-        return q is not None and np.allclose(link_pose(robot, q, state.goal_frame), T, atol=1e-5)
+        return q is not None and np.allclose(robot.fk(q, state.goal_frame), T, atol=1e-5)
 
     state = until(session, lambda state: settled(state) and stands(state))
     assert state.answer is not None and state.answer.solved and live.validity(state).kind == live.VALID
@@ -105,12 +103,12 @@ def test_the_target_is_dragged(session: live.Session) -> None:
 
 def test_the_start_is_dragged_by_its_tip_and_stays_near(session: live.Session) -> None:
     robot = session.state.problem.robot
-    T = link_pose(robot, START, robot.tip)
+    T = robot.fk(START)
     T[0, 3] -= 0.02
     session.move_start(T)
     state = until(session, lambda state: not np.array_equal(state.problem.start, START))
     assert np.abs(state.problem.start - START).max() < 0.3
-    np.testing.assert_allclose(link_pose(robot, state.problem.start, robot.tip), T, atol=1e-5)
+    np.testing.assert_allclose(robot.fk(state.problem.start), T, atol=1e-5)
     assert live.validity(until(session, settled)).kind == live.VALID
 
 
@@ -162,7 +160,7 @@ def test_the_latest_request_wins(slow: live.Session) -> None:
 
 
 def test_an_overtaken_plan_is_dropped_if_it_is_no_longer_free(slow: live.Session) -> None:
-    middle = link_pose(slow.state.problem.robot, 0.5 * (START + END), "panda_hand")
+    middle = slow.state.problem.robot.fk(0.5 * (START + END), "panda_hand")
     slow.change_obstacle("lamp", lambda shape: live.moved_to(shape, transform(middle[:3, 3])))
     SlowPlanner.go.release()
 
