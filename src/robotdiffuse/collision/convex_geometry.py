@@ -49,7 +49,7 @@ class Part(NamedTuple):
 
 
 class Solid(NamedTuple):
-    """A scene shape as the Minkowski sum of a box, a disc around its z axis and a ball. With `bounds`, the
+    """A scene shape as the Minkowski sum of a box, a disc around its z axis and a ball. With `is_bound`, the
     sum only encloses a surface or point cloud."""
 
     shape: Shape
@@ -57,7 +57,7 @@ class Solid(NamedTuple):
     half: Float[ndarray, "3"]
     disc: float
     rounding: float
-    bounds: bool
+    is_bound: bool
 
 
 @once_per_robot
@@ -143,7 +143,7 @@ def solid_arrays(robot: Robot, scene: Scene) -> Solids:
         np.array([solid.half for solid in solids], np.float64).reshape(-1, 3),
         np.array([solid.disc for solid in solids], np.float64),
         np.array([solid.rounding for solid in solids], np.float64),
-        np.array([solid.bounds for solid in solids], np.bool_),
+        np.array([solid.is_bound for solid in solids], np.bool_),
         allowed_contacts(scene, [check.link for check in checks_of(robot)], solids),
     )
 

@@ -45,14 +45,14 @@ class Solids(NamedTuple):
     rotation: np.ndarray
     """[n, 3, 3] R_box_base"""
     middle: np.ndarray
-    """[n, 3]"""
+    """[n, 3] center of the box in the base frame."""
     half: np.ndarray
-    """[n, 3] half edges."""
+    """[n, 3] half edges of the box."""
     disc: np.ndarray
-    """[n] radius."""
+    """[n] radius of the disc."""
     rounding: np.ndarray
     """[n] radius of the ball."""
-    bounds: np.ndarray
+    is_bound: np.ndarray
     """[n] whether the solid only encloses a surface or a point cloud; then only Coal computes the exact
     distance."""
     may_touch: np.ndarray
@@ -113,7 +113,7 @@ def pose(offsets, parents, slides, q, dq, posture):
 
 
 @inner_kernel()
-def part_speed(hulls, p, base, posture):
+def part_travel(hulls, p, base, posture):
     """Upper bound on how far any point of a part moves, relative to frame `base`, from the middle of the
     motion to either of its ends [m]; the remainder r (see the module's docstring) is not included."""
     frame = hulls.frame[p]

@@ -249,7 +249,7 @@ def bound_by_convex_parts(arm, solids, motion, checks, bounds, best, tightness, 
             elif touching or unresolved:
                 speed = 0.0
                 for p in range(checks.parts[c, 0], checks.parts[c, 1]):
-                    speed = max(speed, meshes.part_speed(arm.hulls, p, checks.base[c], posture))
+                    speed = max(speed, meshes.part_travel(arm.hulls, p, checks.base[c], posture))
                 bounds.travel[row, c] = speed + rest
                 open_count += 1
     return open_count
@@ -273,7 +273,7 @@ def _parted(hulls, solids, checks, c, rest, best, tightness, contact, posture):
     touching = False
     partners = range(len(solids.disc)) if against_scene else range(checks.parts[c, 2], checks.parts[c, 3])
     for p in range(checks.parts[c, 0], checks.parts[c, 1]):
-        speed = meshes.part_speed(hulls, p, base, posture)
+        speed = meshes.part_travel(hulls, p, base, posture)
         for o in partners:
             if against_scene and len(solids.may_touch) and solids.may_touch[c, o]:
                 continue
@@ -282,7 +282,7 @@ def _parted(hulls, solids, checks, c, rest, best, tightness, contact, posture):
             else:
                 middle = meshes.ball_to_ball(hulls, p, o, posture)
             along = middle - speed
-            if against_scene and solids.bounds[o]:
+            if against_scene and solids.is_bound[o]:
                 if along - rest < tightness * best:
                     unresolved = True
                     continue
