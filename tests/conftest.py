@@ -90,6 +90,7 @@ def cpu_clock(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -
 @pytest.fixture
 def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Light and ghosts take seconds to draw; a small picture tells as much to a test."""
+    import robotdiffuse.visualization.exploration  # noqa: F401  with the settings' class in its annotations
     from robotdiffuse.visualization import picture, replay_page
 
     small = picture.PictureSettings(width=240, height=150, ghosts=1)
