@@ -168,17 +168,13 @@ class PoseRefinement:
         for number, camera in enumerate(self._cameras):
             if camera.link is None and np.allclose(T, camera.T):
                 return number
-            if camera.link is not None and self._is_on(camera.link, camera.T, T, q):
+            if camera.link is not None and is_on(self._robot, camera.link, camera.T, T, q):
                 return number
         sizes = np.repeat(np.maximum(view.pose_deviation, 1e-5), 3) / PRIOR_DEVIATIONS
-        link, nominal = next((one for one in self._on_arm if self._is_on(*one, T, q)), (None, T))
+        link, nominal = next((one for one in self._on_arm if is_on(self._robot, *one, T, q)), (None, T))
         camera = _Camera(link, nominal, view.pose_deviation, np.zeros(6), np.diag(sizes**2))
         self._cameras.append(camera)
         return len(self._cameras) - 1
-
-    def _is_on(self, link: str, nominal: Pose, T: Pose, q: Configuration) -> bool:
-        expected = link_poses(self._robot, q[None], link)[0] @ nominal
-        return bool(np.abs(T - expected).max() < SAME_CAMERA)
 
     def _sight(self, view: DepthView, q: Configuration, camera: int, shows_scene: bool) -> _Sight:
         T = view.T_base_camera
@@ -277,6 +273,11 @@ class PoseRefinement:
                 found.noise[of] = np.hypot(found.noise[of], there.noise)
                 found.limits[of] += there.limits
             yield _some(found, (n * normals[mine][ok]).sum(axis=1) > ALIKE)
+
+
+def is_on(robot: Robot, link: str, nominal: Pose, T: Pose, q: Configuration) -> bool:
+    """Whether a camera at T_base_camera is one on a link of the arm with a nominal T_link_camera."""
+    return bool(np.abs(T - link_poses(robot, q[None], link)[0] @ nominal).max() < SAME_CAMERA)
 
 
 @kernel(nogil=True)

@@ -31,7 +31,7 @@ from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import FIRST, Configuration, Configurations, Path, Status, Trajectory
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.occupancy_map import Corners, OccupancyMap, ViewMemory
-from robotdiffuse.perception.pose_refinement import PoseRefinement
+from robotdiffuse.perception.pose_refinement import PoseRefinement, is_on
 from robotdiffuse.perception.seen_points import point_shapes
 from robotdiffuse.perception.unknown_space import UnknownSpace, explored_confidence
 from robotdiffuse.perception.voxel_grid import LAYERS_BELOW, MAP, Probabilities, Voxels, refined, surface
@@ -131,6 +131,8 @@ class Explorer:
         """Waypoints of the latest motion that was returned."""
         self._news: list[DepthView] = []
         """Views since the latest step."""
+        self._beside: DepthView | None = None
+        """The latest one of a camera that is not on the arm, before the latest step."""
         self._free = self.map.free
         """Voxels that were free then."""
 
@@ -181,6 +183,8 @@ class Explorer:
         if self._goal is None:
             raise InputError("there is no goal; call set_goal first")
         q = vector("explorer", "configuration", configuration, self.robot.dof)
+        standing = [view for view in self._news if not self._is_on_arm(view)]
+        self._beside = standing[-1] if standing else None
         self._news = []
         if goal_error(self.robot, self._goal, q, ARRIVED) is None:
             return Step(DONE, "the arm is at the goal")
@@ -346,7 +350,8 @@ class Explorer:
         hemmed_in = way_in is None or bool(moved(self.robot, way_in[:1], [problem.start])[0] < CONFINED)
         taken = self._goal_seen.taken
         for camera in self.cameras:
-            ways = best_looks(self.map, tree, camera, wanted, predicted, self._rng, taken, hemmed_in)
+            of = wanted, predicted, self._rng, taken, hemmed_in, self._beside
+            ways = best_looks(self.map, tree, camera, *of)
             for waypoints in islice(ways, self.settings.look_attempts):
                 if policy == STRICT:
                     way = self._along(allowed, waypoints, "look")
@@ -356,6 +361,13 @@ class Explorer:
                 if way is not None and self._good(way, policy):
                     return way
         return None
+
+    def _is_on_arm(self, view: DepthView) -> bool:
+        q = view.configuration
+        assert q is not None  # the map takes no other views
+        return any(
+            is_on(self.robot, one.link, one.T_link_camera, view.T_base_camera, q) for one in self.cameras
+        )
 
     def _way_in_to(self, q: Configuration) -> Configurations | None:
         """The latest motion that was returned, if it ended here."""

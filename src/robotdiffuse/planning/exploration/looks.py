@@ -16,6 +16,7 @@ from robotdiffuse.core.bounds import Value, rigid_transform
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Configuration, Configurations, Path, Pose, interpolated
+from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.occupancy_map import COVER_RADIUS, OccupancyMap
 from robotdiffuse.perception.ray_caster import looking_at
@@ -143,6 +144,7 @@ def best_looks(
     rng: np.random.Generator,
     taken: Sequence[Configuration] = (),
     hemmed_in: bool = False,
+    beside: DepthView | None = None,
 ) -> Iterator[Configurations]:
     """Ways to configurations from which the camera sees wanted voxels, the best first: weighted by the
     prediction if there is one, against the way to get there.
@@ -151,6 +153,7 @@ def best_looks(
     nothing hides it: neither the arm, nor what is occupied or predicted.
     taken: configurations of earlier images that did not show the wanted voxels; looks from nearby count
     less, once for each of them.
+    beside: the latest image of a camera that does not move, which sees what the arm no longer hides.
     hemmed_in: whether there is no way back. At last, and first for an arm that is CONFINED, there is a way to
     where the arm is farthest from where images were taken.
     """
@@ -169,23 +172,40 @@ def best_looks(
         weights = weights[chosen]
     start, (width, height) = tree.configurations[0], camera.size
 
+    def seen_by(
+        intrinsics: tuple[float, float, float, float],
+        size: tuple[int, ...],
+        reach: float,
+        q: Configurations,
+        poses: Float[ndarray, "n 4 4"],
+    ) -> Float[ndarray, "n"]:
+        """The part of the weight that a camera sees at each pose, with the arm in each configuration."""
+        sums = seen_weights(
+            compile_robot(robot),
+            q.astype(np.float32),
+            poses.astype(np.float32),
+            np.array(intrinsics, np.float32),
+            size,
+            np.float32(reach),
+            at,
+            weights,
+            filled,
+            *MAP.frame,
+        )
+        return sums / weights.sum()
+
+    seen_at_start = 0.0
+    if beside is not None:
+        pose = beside.T_base_camera[None]
+        [seen_at_start] = seen_by(beside.intrinsics, beside.depth.shape, np.inf, start[None], pose)
+
     def scored(q: Configurations) -> Float[ndarray, "n"]:
         """The scores of configurations; 0 for those that see too little."""
-        seen = (
-            seen_weights(
-                compile_robot(robot),
-                q.astype(np.float32),
-                camera.poses(robot, q).astype(np.float32),
-                np.array(camera.intrinsics, np.float32),
-                (height, width),
-                np.float32(camera.range),
-                at,
-                weights,
-                filled,
-                *MAP.frame,
-            )
-            / weights.sum()
-        )
+        seen = seen_by(camera.intrinsics, (height, width), camera.range, q, camera.poses(robot, q))
+        if beside is not None:
+            poses = np.tile(beside.T_base_camera, (len(q), 1, 1))
+            others = seen_by(beside.intrinsics, beside.depth.shape, np.inf, q, poses)
+            seen = seen + np.maximum(others - seen_at_start, 0.0)
         score = seen / (1 + np.linalg.norm(q - start, axis=1) / FULL_COST_LENGTH)
         for earlier in taken:
             score *= np.minimum(np.abs(q - earlier).max(axis=1) / SIMILAR_LOOK, 1.0)
