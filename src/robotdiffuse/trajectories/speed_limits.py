@@ -76,8 +76,8 @@ class TimingSettings(Settings, name="timing"):
     """Jerk limit of every joint [rad/s³] or [m/s³]; None: the robot's own limits, see `jerk_limits`;
     infinite: none."""
     corner_deviation: NotNegative = 0.3
-    """How far a rounded corner may leave the path where it stays valid [rad, joint-space L2]. A jerk limit cuts
-    corners by up to 0.03 more, with the default limits of the Panda."""
+    """How far a rounded corner may leave the path where it stays valid [rad, joint-space L2]. The jerk limit
+    cuts corners by up to 0.03 more (the Panda's limits)."""
     corner_intervals: Count = 8
     """Smallest number of grid intervals in a rounded corner; a wide corner has as many as a straight part of
     its length."""
