@@ -22,7 +22,7 @@ from trimesh.exchange.obj import export_obj
 from trimesh.exchange.ply import export_ply
 
 from robotdiffuse import Box, InputError, Scene
-from robotdiffuse.core.errors import distinct, joined, shown, unknown_name
+from robotdiffuse.core.errors import OutputError, distinct, joined, located, shown, unknown_name
 from robotdiffuse.core.input_files import (
     MAX_SHOWN_NAME,
     input_file,
@@ -422,3 +422,9 @@ def test_gltf_cannot_ask_for_memory_without_bytes(tmp_path: Path) -> None:
     (tmp_path / "a.gltf").write_text(json.dumps({"asset": {"version": "2.0"}, "accessors": [accessor]}))
     with pytest.raises(InputError, match="20,000,000 elements"):
         read_triangles(tmp_path / "a.gltf")
+
+
+def test_a_located_error_keeps_its_kind_and_its_lines() -> None:
+    with pytest.raises(OutputError) as caught, located("a.json"):
+        raise OutputError("is full", ["first", "second"])
+    assert str(caught.value) == "a.json: is full\n  first\n  second"

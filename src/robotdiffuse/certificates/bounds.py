@@ -3,8 +3,8 @@
 A stretch is free for a claim (a link against the scene, or two links) if the clearance in the middle of the
 stretch exceeds the largest displacement of any point of the link from there to anywhere on the stretch.
 Clearances are those of the robot's spheres, or of its convex meshes by planes that separate them from what is
-near. Only the joints between two links count: motion is seen from the last common joint, so these are the
-joints of the link further from the base, and for links on two arms those of both.
+near. For two links, only joints that move one of them and not the other count: those after the last joint
+that both have in common.
 
 The geometry is the checker's own: distances of points to obstacles, and how far these reach in a direction.
 """
@@ -287,7 +287,7 @@ class Prover:
             [[scene.may_touch(link, name) for name in self.obstacles.names] for link in self.linkage.links],
             bool,
         ).reshape(len(self.linkage.links), len(self.obstacles.names))
-        """[links, obstacles] allowed contacts, which are checked nowhere."""
+        """[links, obstacles] whether contact is allowed; such pairs are not checked."""
         balls = [_balls(robot, link) for link in self.linkage.links]
         self._balls = np.concatenate([np.zeros((0, 4)), *balls])
         counts = [len(rows) for rows in balls]
@@ -459,9 +459,9 @@ class Prover:
     ) -> tuple[ndarray, ndarray]:
         """Clearance and displacement of the `marked` stretches by planes.
 
-        For each part and each obstacle, or part of the other link, it takes the clearance of the balls around
-        them, or the widest gap that a plane shows, and what remains of it along the stretch; then the minimum
-        of each.
+        For each pair of a part and an obstacle (or a part of the other link), the clearance is the greater of
+        two: that of the balls around the parts, and the widest gap that a plane shows. What remains of it
+        along the stretch is bounded likewise. The results are the minima over the pairs.
         """
         normals: dict[tuple[int, int, int], list[tuple[float, float, float]]] = {}
         for plane in planes:

@@ -226,7 +226,7 @@ FIELDS = {
     "request_parts": Field(_hashes),
     "moving": Field(_proof, _proof_record),
     "constraints": Field(_named_bounds),
-    "looks": NUMBERS._replace(attribute="torque_samples"),
+    "looks": NUMBERS._replace(attribute="torque_samples"),  # the name in files of this version
     "torques": Field(_named_bounds),
     "jerks": Field(_named_bounds),
 }

@@ -1,4 +1,4 @@
-"""Compiles a part of what a first plan needs in a second process.
+"""Compiles, in a second process, a part of the code that a first plan needs.
 
 Numba compiles one function at a time. On a new machine, a second process about halves the wait: it compiles
 what a plan needs last while the plan itself compiles what it needs first. Both share Numba's cache.
@@ -29,7 +29,7 @@ BALL = Sphere([0.0, 0.0, -5.0], 0.1)
 
 @contextmanager
 def compiling_ahead(picture: bool) -> Iterator[None]:
-    """While the block runs, the first compilation in this process starts the second one.
+    """While the block runs, the first compilation in this process starts the second process.
 
     picture: whether it compiles the code that draws pictures, too.
     """

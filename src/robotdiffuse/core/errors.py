@@ -46,8 +46,9 @@ def located(where: object) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        at = "" if str(error).startswith(str(where)) else f"{where}: "
-        raise InputError(f"{at}{error}") from None
+        kind, (line, listed) = error.__reduce__()
+        at = "" if line.startswith(str(where)) else f"{where}: "
+        raise kind(f"{at}{line}", listed) from None
 
 
 @contextmanager

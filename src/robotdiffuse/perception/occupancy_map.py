@@ -43,11 +43,11 @@ COVER_RADIUS = MAP.edge * 3**0.5 / 2
 
 
 class OccupancyMap:
-    """Voxels seen free, occupied, and unknown ones, from many views, each taken into account once.
+    """Which voxels are free, occupied or unknown, from many views, each taken into account once.
 
     A view counts as free what it sees through, and as occupied what holds points. Noisy images are filtered
     first, so that a stray pixel neither blocks nor fills a voxel; pixels without a return say nothing; of the
-    arm, and of what it holds, nothing is kept. Where views contradict each other, their number decides.
+    arm, and of what it holds, nothing is kept. Where views contradict each other, the majority decides.
 
     The voxels are those of `MAP`.
     """
@@ -110,8 +110,9 @@ class OccupancyMap:
 
     @locked
     def doubt(self, points: Points, errors: Values) -> None:
-        """Until the next view, voxels that obstacles may reach count as unknown: those within the errors of
-        points, unless they are declared free or a view saw them so by a margin of all of its own error.
+        """Until the next view, free voxels within the error of an observed point count as unknown, since an
+        obstacle may be there, unless they are declared free or a view sees them free even if its pose is off
+        by its largest error.
 
         points: observed points [m]; errors: how far off each may be [m].
         """
@@ -224,14 +225,14 @@ class ViewMemory:
 
     def add(self, view: DepthView, new_voxels: int, stated: DepthView) -> None:
         """Keep a view with a configuration. new_voxels: the number of voxels that it showed first. stated:
-        the view with the pose that is stated of it."""
+        the same view with the pose as the caller gave it."""
         if len(self) >= self._most:
             self._kept.remove(min(self._kept, key=lambda kept: kept.new_voxels))
         self._kept.append(_Kept(view, self._robot, new_voxels, stated))
 
     def refine(self, refined: Callable[[DepthView], DepthView]) -> None:
-        """Give the kept views refined poses where they are much better. refined: a view with its pose as it
-        is known now, from one with the stated pose."""
+        """Give the kept views refined poses where they are much better. refined: takes a view with the
+        pose as the caller gave it, and returns it with the pose as it is known now."""
         for at, kept in enumerate(self._kept):
             view = refined(kept.stated)
             if sum(view.pose_deviation) < MUCH_BETTER * sum(kept.view.pose_deviation):
@@ -250,8 +251,8 @@ class ViewMemory:
         """The mean of the points that the kept views observed in each cell of a grid [m], see `seen_points`,
         and how far off each may be [m].
 
-        Stray points are left out: those in the free voxels of a map, since more views see through them, and
-        with noise those of one view that have no other point near: surfaces show more.
+        Stray points are left out: those in the free voxels of a map, which more views see through, and, if
+        images are noisy, points of a single view with no other point near, since a surface gives several.
         """
         every = np.concatenate([memory.points for memory in self._kept]).astype(np.float64)
         _, cell, counts = np.unique(_cells(every), return_inverse=True, return_counts=True)

@@ -18,8 +18,8 @@ from robotdiffuse.core.types import Configuration, Configurations, JointValues, 
 MOVING_KINDS = ("revolute", "continuous", "prismatic")
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 CONTINUOUS_LIMIT = 3 * np.pi
-"""Position limits of continuous joints in planning, plus and minus [rad]: a start lies within half a turn,
-and a goal at most one turn from the start. The joints themselves have no limits."""
+"""Position limits of continuous joints in planning, plus and minus [rad]: a start is within pi of 0,
+and a goal within 2 pi of the start. The joints themselves have no limits."""
 MIMIC_SLACK = 1e-6
 """Largest difference between a value given for a mimic joint and the value that its leader implies."""
 
@@ -52,7 +52,7 @@ class Joint(Value):
     acceleration: float = 0.0
     jerk: float = 0.0
     mimic: Mimic | None = None
-    """The joint that this joint follows, if any. The two are locked together."""
+    """The joint that this joint follows, if any. If one is locked, so is the other."""
     effort: float = 0.0
     """Largest torque [N m] or force [N]; 0 if the URDF gives none."""
 
@@ -200,8 +200,8 @@ class KinematicTree(Value):
         return np.where(self.continuous, TURN * np.round(q / TURN), 0.0)
 
     def wraps(self, q: Configurations) -> Configurations:
-        """The whole turns in steps from row to row that are nearly whole turns, as where values of a
-        continuous joint are wrapped to [-pi, pi]; 0 in all others."""
+        """For each step from row to row, its whole turns if it is nearly a multiple of a turn, as where
+        values of a continuous joint are wrapped to [-pi, pi]; else 0."""
         steps = np.diff(q, axis=0)
         turns = self.whole_turns(steps)
         return np.where(np.abs(steps - turns) < MAX_WRAPPED_STEP, turns, 0.0)
@@ -210,7 +210,7 @@ class KinematicTree(Value):
         """Equivalent configurations in which joints with a range above one turn are within half a turn of the
         middle of their limits."""
         middle = 0.5 * (self.lower + self.upper)
-        return np.where(self._turns_twice, q - TURN * np.round((q - middle) / TURN), q)
+        return np.where(self._more_than_a_turn, q - TURN * np.round((q - middle) / TURN), q)
 
     def equivalent_configurations(self, q: Configuration, start: Configuration) -> Configurations:
         """Configurations within the limits that differ from `q` by whole turns of joints that have limits and
@@ -219,7 +219,7 @@ class KinematicTree(Value):
         In the first one, all of these joints are as close to `start` as possible. In each further one, one
         joint turns the other way, since obstacles may block the short way.
         """
-        many = self._turns_twice & ~self.continuous
+        many = self._more_than_a_turn & ~self.continuous
         nearest = self._turned(q, start, many)
         rows = [nearest]
         for j in np.flatnonzero(many):
@@ -232,7 +232,7 @@ class KinematicTree(Value):
     def nearest_turns(self, q: Configurations, start: Configuration) -> Configurations:
         """The configurations with continuous joints and joints with a range above one turn turned by whole
         turns, to be as close to `start` as the limits allow."""
-        return self._turned(q, start, self._turns_twice | self.continuous)
+        return self._turned(q, start, self._more_than_a_turn | self.continuous)
 
     def _turned(self, q: ndarray, start: ndarray, joints: JointMask) -> ndarray:
         """The configurations with whole turns added to these joints, to be as close to `start` as the limits
@@ -245,7 +245,8 @@ class KinematicTree(Value):
         return np.where(limited & (nearest < self.lower), nearest + TURN, nearest)
 
     @cached_property
-    def _turns_twice(self) -> JointMask:
+    def _more_than_a_turn(self) -> JointMask:
+        """Whether the range of a joint is more than one turn."""
         return read_only((self.upper - self.lower > TURN) & ~np.array(self.prismatic, dtype=bool))
 
     @cached_property

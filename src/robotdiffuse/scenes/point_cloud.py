@@ -29,8 +29,8 @@ MAX_VOXELS = 5_000_000
 def read_octomap(file: str | Path) -> tuple[Points, float]:
     """The centers of a .bt file's occupied voxels [m], and their edge [m].
 
-    Of occupied leaves above the lowest level, the voxels at their surface. Raises InputError for a file that
-    is not of this format, or damaged.
+    An occupied leaf above the lowest level is a cube of voxels; only those at its surface are returned.
+    Raises InputError for a file that is not of this format, or damaged.
     """
     content = read_bytes(file, "octomap")
     header, separator, data = content.partition(b"\ndata\n")
@@ -155,7 +155,8 @@ def read_points(file: str | Path) -> tuple[Points, tuple[str, ...]]:
     """The points of a .ply, .pcd, .xyz, .csv, .npy, .npz or .bt file [m], and notes on removed points.
 
     Points that are not finite (missing returns of a depth camera) are removed, with a note. Columns after the
-    third are ignored. Raises InputError if the file is missing, empty or does not contain points.
+    third are ignored. A file without points gives an empty array and a note. Raises InputError if the file is
+    missing, has no bytes, or is not a point cloud.
     """
     file = Path(file)
     reader = READERS.get(file.suffix.lower())
@@ -261,8 +262,8 @@ def _read_pcd(file: Path) -> ndarray:
 def lzf_unpacked(packed: bytes, size: int) -> bytes:
     """Data that LibLZF packed, of a size [bytes]: https://oldhome.schmorp.de/marc/liblzf.html
 
-    Raises ValueError for data of another size, of which no more is unpacked, and IndexError for data that end
-    too soon.
+    Raises ValueError if the data unpack to another size (unpacking stops once it is exceeded), and IndexError
+    if they end too soon.
     """
     out = bytearray()
     at = 0
