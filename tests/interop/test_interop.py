@@ -287,7 +287,7 @@ REFUSED: dict[str, tuple[Callable[..., object], tuple[Any, ...], str]] = {
         ([*NAMES, FINGERS[0]], [[*START, 0.04], [*START, 0.0]]),
         "moves panda_finger_joint1 from 0 to 0.04, which the problem locks at 0.04",
     ),
-    "no points": (motion_from_record, (panda_record(points=[]), "it"), "it: points is empty"),
+    "no points": (motion_from_record, (panda_record(points=[]), "it"), r"it: points is \[\]"),
     "no time": (
         motion_from_record,
         (panda_record(points=[{"positions": START, "time_from_start": "soon"}]), "it"),

@@ -214,9 +214,9 @@ the differences is unknown. These explanations were tried:
   would explain all differences.
 - Columns normalized otherwise (shares of the maximum, logarithms, ranks; all combinations): the largest
   difference stays at 0.025 or more.
-- Other weights: with the best weights that sum to 1, the largest difference is 0.011. With (0.24, 0.19, 0.29,
-  0.22), which sum to 0.94, it is 0.002; four free numbers for five scores prove little, and the paper says
-  that its weights are equal.
+- Other weights: with the best weights that sum to 1, the largest difference is 0.011. With (0.2418, 0.1870,
+  0.2929, 0.2196), which sum to 0.94, it is 0.002 (0.005 if they are rounded to two decimals); four free
+  numbers for five scores prove little, and the paper says that its weights are equal.
 - Other numbers than the printed ones, as from an earlier state of the table: with any change of a single
   cell, the largest difference is at least 0.012. With RRT*'s length 15.6 in place of 15.037, and MPiNets'
   success 88.0 in place of 87.4, it is 0.004. RRT* is worst in success and time (0) and best in collision (1),
@@ -273,7 +273,7 @@ class Table1Settings:
     """See `BenchSettings`."""
     paper_weights: str | None = None
     """Folder with weights of config `paper`, `points` or another one without clearances as inputs. They get
-    two rows of single samples: one with guidance, which stands for the paper's method, and one without."""
+    two rows of single samples: one with guidance and one without."""
     data: str | None = None
     """Folder of a data set, for a row of its nearest motions."""
     workers: int = 1

@@ -275,7 +275,7 @@ def _only(trajectories: Any) -> RecordedMotion:
 def _joint_trajectory(record: Mapping[str, Any]) -> RecordedMotion:
     points = record["points"]
     if not isinstance(points, list) or not points:
-        raise InputError("points is empty: a motion has at least one row")
+        raise InputError(f"points is {shown(points)}; it must be a list of at least one row")
     rows: dict[str, list[Any]] = {"positions": [], "velocities": [], "accelerations": []}
     for i, point in enumerate(points):
         if not isinstance(point, Mapping):

@@ -21,7 +21,7 @@ VOXEL = 0.04
 """Edge length of a voxel [m]."""
 LOW = (-1.12, -1.12, -0.1)
 """Lower corner of the volume, in the frame of the base [m]. A floor at z = 0 is in the middle of a layer of
-voxels, not between two layers."""
+these voxels."""
 SHAPE = (56, 56, 32)
 """Number of voxels along x, y and z: the space around an arm with a reach of 1.1 m on a table."""
 JOINT_STEP = np.float32(0.05)

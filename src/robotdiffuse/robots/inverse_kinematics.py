@@ -74,7 +74,7 @@ def inverse_kinematics(
         rng: Source of the seeds.
         accept: Called with batches of solutions; returns which to keep, e.g. those free of collision. A
             rejected solution does not block solutions close to it.
-        settings: Tolerances and effort.
+        settings: Whether the orientation counts, and effort.
         near: A configuration, used as the first seed: if the pose moves slightly, so does the first solution.
             The results are sorted by their distance from it; joints that can turn more than once take the
             turn nearest to it.
