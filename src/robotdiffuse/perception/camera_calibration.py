@@ -144,9 +144,16 @@ def arm_surface(robot: Robot, q: Configuration) -> tuple[KDTree, Points, Points]
     balls = surface_balls(robot, q).astype(np.float64)
     points = balls[np.unique(np.floor(balls / MODEL_CELL), axis=0, return_index=True)[1]]
     tree = KDTree(points)
-    around = points[tree.query(points, k=NEIGHBORS)[1]]
+    return tree, points, neighborhoods(points, tree, NEIGHBORS)[1][:, :, 0]
+
+
+def neighborhoods(points: Points, tree: KDTree, count: int) -> tuple[Points, Float[ndarray, "n 3 3"]]:
+    """Squared sizes of the `count` points nearest to each point, along their principal axes, the smallest
+    first; and these axes as columns, of which the first is the normal of a surface."""
+    around = points[tree.query(points, k=count)[1]]
     off = around - around.mean(axis=1, keepdims=True)
-    return tree, points, np.linalg.eigh(np.einsum("nki,nkj->nij", off, off))[1][:, :, 0]
+    sizes, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", off, off))
+    return sizes, axes
 
 
 def _near_arm(view: DepthView, T: Pose, tree: KDTree) -> Points:

@@ -21,7 +21,7 @@ from robotdiffuse.collision.kernels.collision_cost import scene_distance
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.transforms import placed, transform
 from robotdiffuse.core.types import Configuration, Points, Pose, Values
-from robotdiffuse.perception.camera_calibration import arm_surface
+from robotdiffuse.perception.camera_calibration import arm_surface, neighborhoods
 from robotdiffuse.perception.depth_filter import filtered, grown_for_errors, pose_error
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.seen_points import ARM_DISTANCE, sphere_distances
@@ -96,7 +96,8 @@ class _Camera:
     link: str | None
     T: Pose
     """In the frame of its link, or of the base: nominal."""
-    deviation: tuple[float, float]
+    stated: Float[ndarray, "6"]
+    """Standard deviations of its error, as stated."""
     error: Float[ndarray, "6"]
     """Position [m] and rotation vector [rad], in the camera's frame."""
     covariance: Float[ndarray, "6 6"]
@@ -121,7 +122,8 @@ class _Sight:
     """How far off the pose may displace the points [m]."""
     arm: Bool[ndarray, "n"]
     """Points on the arm, which are matched with its surface."""
-    surface: tuple[KDTree, Points, Points]
+    surface: tuple[KDTree, Points, Points] | None
+    """Of the arm; None without points on it."""
 
 
 class PoseRefinement:
@@ -170,9 +172,9 @@ class PoseRefinement:
                 return number
             if camera.link is not None and is_on(self._robot, camera.link, camera.T, T, q):
                 return number
-        sizes = np.repeat(np.maximum(view.pose_deviation, 1e-5), 3) / PRIOR_DEVIATIONS
+        stated = np.repeat(np.maximum(view.pose_deviation, 1e-5), 3) / PRIOR_DEVIATIONS
         link, nominal = next((one for one in self._on_arm if is_on(self._robot, *one, T, q)), (None, T))
-        camera = _Camera(link, nominal, view.pose_deviation, np.zeros(6), np.diag(sizes**2))
+        camera = _Camera(link, nominal, stated, np.zeros(6), np.diag(stated**2))
         self._cameras.append(camera)
         return len(self._cameras) - 1
 
@@ -192,13 +194,12 @@ class PoseRefinement:
         points = points[use]
         noise = spread * points[:, 2] ** 2
         stated = pose_error(view, np.linalg.norm(points, axis=1))
-        surface = arm_surface(self._robot, q)
+        surface = arm_surface(self._robot, q) if arm.any() else None
         return _Sight(camera, T, q, shows_scene, points, normals[use], noise, stated, arm[use], surface)
 
     def _fit(self) -> None:
         """Estimate the errors of all poses by all images."""
-        prior = np.concatenate([np.repeat(np.maximum(c.deviation, 1e-5), 3) for c in self._cameras])
-        prior = np.append((prior / PRIOR_DEVIATIONS) ** -2, ARM_OFFSET**-2)
+        prior = np.concatenate([*(camera.stated for camera in self._cameras), [ARM_OFFSET]]) ** -2
         unknowns = np.concatenate([*(camera.error for camera in self._cameras), np.zeros(1)])
         hessian = np.diag(prior)
         for gate in GATES:
@@ -238,12 +239,13 @@ class PoseRefinement:
             return _Match(rows, r, noise, gate * sight.stated[use] + NOISES * noise)
 
         for i, (sight, T) in enumerate(zip(self._sights, poses, strict=True)):
-            use = np.flatnonzero(sight.arm)
-            if len(use):
+            if sight.surface is not None:
+                use = np.flatnonzero(sight.arm)
                 at = placed(T, sight.points[use])
-                near = np.asarray(sight.surface[0].query(at)[1])
-                n = sight.surface[2][near]
-                off = at - sight.surface[1][near]
+                tree_of_arm, surface, surface_normals = sight.surface
+                near = np.asarray(tree_of_arm.query(at)[1])
+                n = surface_normals[near]
+                off = at - surface[near]
                 ray = T[:3, 3] - at
                 facing = (ray * n).sum(axis=1) / np.linalg.norm(ray, axis=1)
                 n = n * np.sign(facing)[:, None]
@@ -341,9 +343,7 @@ def _normals(points: Points) -> tuple[Points, Bool[ndarray, "n"]]:
     """Normals towards the camera, and which points lie on a flat surface."""
     if len(points) <= NEIGHBORS:
         return np.zeros((len(points), 3)), np.zeros(len(points), np.bool_)
-    around = points[KDTree(points).query(points, k=NEIGHBORS)[1]]
-    off = around - around.mean(axis=1, keepdims=True)
-    sizes, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", off, off))
+    sizes, axes = neighborhoods(points, KDTree(points), NEIGHBORS)
     normals = axes[:, :, 0]
     normals = normals * -np.sign((normals * points).sum(axis=1))[:, None]
     return normals, sizes[:, 0] < MAX_THICKNESS**2 * sizes[:, 1]

@@ -217,8 +217,8 @@ class AnytimeSearch:
         return self._near_straight(OPTIMALITY_TOLERANCE)
 
     def _near_straight(self, fraction: float) -> bool:
-        """Whether the length of the best path exceeds that of the straight line by no more than the fraction
-        `part`."""
+        """Whether the length of the best path exceeds that of the straight line by no more than a
+        fraction of it."""
         straight = np.linalg.norm(self.goals - self.start, axis=1).min()
         return bool(self.length <= straight * (1 + fraction))
 
