@@ -33,9 +33,7 @@ SLOW = {"settings", "socket"}
 
 
 @pytest.mark.parametrize("every", [5, pytest.param(1, marks=pytest.mark.slow)])
-@pytest.mark.parametrize(
-    "kind", [pytest.param(kind, marks=pytest.mark.slow if kind in SLOW else ()) for kind in KINDS]
-)
+@pytest.mark.parametrize("kind", [pytest.param(kind, marks=pytest.mark.slow if kind in SLOW else ()) for kind in KINDS])
 def test_damaged_inputs(kind: str, every: int, tmp_path: Path) -> None:
     faults = []
     for seed in range(0, COUNTS[kind], every):

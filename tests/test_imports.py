@@ -104,9 +104,7 @@ def test_no_module_imports_itself_through_others() -> None:
     paths = {file: ".".join(file.relative_to(SOURCE.parent).with_suffix("").parts) for file in MODULES}
     names = {path.removesuffix(".__init__"): file for file, path in paths.items()}
     del names["robotdiffuse"]  # it lists the public names of all packages
-    graph = {
-        name: {n for full in imported(file) if (n := _module(full, names))} for name, file in names.items()
-    }
+    graph = {name: {n for full in imported(file) if (n := _module(full, names))} for name, file in names.items()}
     # the table of planners names their class in types alone
     graph["robotdiffuse.planning"].discard("robotdiffuse.planning.planner")
     TopologicalSorter({name: of - {name} for name, of in graph.items()}).prepare()  # raises CycleError
@@ -135,9 +133,7 @@ def used_names(tree: ast.AST) -> Iterator[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom):
             yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.Attribute) and not (
-            isinstance(node.value, ast.Name) and node.value.id == "self"
-        ):
+        elif isinstance(node, ast.Attribute) and not (isinstance(node.value, ast.Name) and node.value.id == "self"):
             yield node.attr
         if isinstance(node, ast.Call):
             texts = [arg.value for arg in node.args if isinstance(arg, ast.Constant)]
@@ -146,9 +142,7 @@ def used_names(tree: ast.AST) -> Iterator[str]:
 
 
 def test_tests_benchmarks_and_examples_use_no_private_names() -> None:
-    private = {
-        name for file in MODULES for name in defined_names(tree_of(file)) if name[0] == "_" != name[-1]
-    }
+    private = {name for file in MODULES for name in defined_names(tree_of(file)) if name[0] == "_" != name[-1]}
     private -= {"_replace"}  # a public method of named tuples
     root = SOURCE.parents[1]
     folders = (root / folder for folder in ("tests", "benchmarks", "examples"))

@@ -13,14 +13,7 @@ ROOT = Path(__file__).parents[1]
 SOURCE = Path(robotdiffuse.__file__).parent
 SLACK = 1.02
 # what a compiler does not see, and brackets and commas, which follow from the layout
-NOT_COUNTED = {
-    tokenize.COMMENT,
-    tokenize.NL,
-    tokenize.NEWLINE,
-    tokenize.INDENT,
-    tokenize.DEDENT,
-    tokenize.ENDMARKER,
-}
+NOT_COUNTED = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 
 
 def token_count(text: str) -> int:
@@ -28,9 +21,7 @@ def token_count(text: str) -> int:
     texts = {
         line
         for node in ast.walk(ast.parse(text))
-        if isinstance(node, ast.Expr)
-        and isinstance(node.value, ast.Constant)
-        and isinstance(node.value.value, str)
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
         for line in range(node.lineno, (node.end_lineno or node.lineno) + 1)
     }
     return sum(

@@ -50,9 +50,7 @@ def test_the_nearest_motions_are_bent_to_start_and_goal(monkeypatch: pytest.Monk
     np.testing.assert_allclose(first, np.stack([start, [1.5, 0.55], goal]))
     np.testing.assert_allclose(second[[0, -1]], [start, goal])
     monkeypatch.setattr(controls, "library", lambda data, robot: np.stack([[START, GOAL]] * 2))
-    control = controls.Control(
-        controls.ControlSettings(source=controls.NEAREST, data="data", samples=1, guidance_steps=0)
-    )
+    control = controls.Control(controls.ControlSettings(source=controls.NEAREST, data="data", samples=1, guidance_steps=0))
     q = control.candidates(START, GOAL[None], CollisionChecker(PANDA, WALL), np.random.default_rng(0))
     np.testing.assert_allclose(q, [[START, GOAL]])
 

@@ -31,9 +31,7 @@ BALL = Sphere([0.5, 0.0, 0.4], 0.15, name="ball")
 PROBLEM = Problem(PANDA, Scene([BALL]), LEFT, JointGoal(RIGHT[None]))
 CHECKER = CollisionChecker(PANDA, PROBLEM.scene)
 TRAINING = planner_training("trajectory_prior", {"data": "", "batch": 16, "samples": 640})
-SMALL = replace(
-    model_settings(TRAINING, None), denoiser_settings=UNetSettings(16, (1, 2), condition_width=16)
-)
+SMALL = replace(model_settings(TRAINING, None), denoiser_settings=UNetSettings(16, (1, 2), condition_width=16))
 WAYPOINTS = 48
 
 
@@ -146,13 +144,9 @@ def test_the_guide_gets_the_number_of_steps_to_come(gaussian: Gaussian) -> None:
         return q
 
     ends = LEFT[None], RIGHT[None]
-    guided_prior.sample(
-        gaussian, *ends, np.array([255, 90, 1]), np.random.default_rng(0), guide, quiet_steps=2
-    )
+    guided_prior.sample(gaussian, *ends, np.array([255, 90, 1]), np.random.default_rng(0), guide, quiet_steps=2)
     assert told == [2, 1, 0, 0, 0]
-    stopped = guided_prior.sample(
-        gaussian, *ends, np.array([255, 1]), np.random.default_rng(0), guide, stop=lambda: True
-    )
+    stopped = guided_prior.sample(gaussian, *ends, np.array([255, 1]), np.random.default_rng(0), guide, stop=lambda: True)
     assert stopped is None and len(told) == 5
 
 
@@ -239,9 +233,7 @@ def test_each_guide_moves_only_its_rows() -> None:
         assert not any(np.array_equal(one, other) for other in first[:i])
     # before any guide begins
     late = guided_prior.EDMP(
-        guided_prior.EDMPSettings(
-            guides=tuple(replace(guide, guided_share=0.4) for guide in guided_prior.ENSEMBLE)
-        )
+        guided_prior.EDMPSettings(guides=tuple(replace(guide, guided_share=0.4) for guide in guided_prior.ENSEMBLE))
     )
     assert np.array_equal(late.guided(CHECKER, same[:24], 12), same[:24])
 

@@ -10,14 +10,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from helpers.box_arm import box_arm
 from robotdiffuse import Box, InputError, JointGoal, Problem, Scene, Sphere, Status, load_robot
-from robotdiffuse.baselines.lattice import (
-    AStar,
-    AStarSettings,
-    DStarLite,
-    DStarLiteSettings,
-    LatticeSearch,
-    Outcome,
-)
+from robotdiffuse.baselines.lattice import AStar, AStarSettings, DStarLite, DStarLiteSettings, LatticeSearch, Outcome
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
@@ -181,8 +174,7 @@ def test_start_buried_and_freed_again():
 
 
 @pytest.mark.parametrize(
-    ("planner", "settings"),
-    [(AStar, AStarSettings(spacing=0.1, max_nodes=300)), (DStarLite, DStarLiteSettings(max_nodes=300))],
+    ("planner", "settings"), [(AStar, AStarSettings(spacing=0.1, max_nodes=300)), (DStarLite, DStarLiteSettings(max_nodes=300))]
 )
 def test_full_memory_and_the_time_limit_are_reported(planner, settings):
     result = planner(settings).plan(AROUND, time_limit=5.0)
@@ -220,10 +212,7 @@ def test_too_many_nodes_or_edges_other_robots_and_places_off_the_lattice_are_ref
     checker, start, goals, _ = arm_problem(0)
     search = LatticeSearch(checker, start, goals, DStarLiteSettings())
     for call, message in (
-        (
-            lambda: AStar(AStarSettings(spacing=0.001)).plan(AROUND),
-            r"spacing is 0.001.*a spacing of 0.0",
-        ),
+        (lambda: AStar(AStarSettings(spacing=0.001)).plan(AROUND), r"spacing is 0.001.*a spacing of 0.0"),
         (
             lambda: LatticeSearch(baxter, ends[0], ends[1:], AStarSettings(joints_per_move=14)),
             r"joints_per_move is 14; on baxter .* 4782968 edges.* at most 5",

@@ -25,9 +25,7 @@ LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 UP = np.array([0.0, -0.9, 0.0, -1.9, 0.0, 2.2, 0.785])
 WALL = Scene([Box([0.5, 0.0, 0.2], [0.3, 0.05, 0.4], name="wall")])
-SMALL = MPNetSettings(
-    points=40, encoder_layers=(32, 16), code=8, decoder_layer=16, layers=(64, 64, 32), steady_layers=1
-)
+SMALL = MPNetSettings(points=40, encoder_layers=(32, 16), code=8, decoder_layer=16, layers=(64, 64, 32), steady_layers=1)
 
 
 def network(settings: MPNetSettings = SMALL, seed: int = 0) -> MPNetNetwork:
@@ -73,9 +71,7 @@ def wall_problem(scene: Scene = WALL) -> Problem:
     return Problem(PANDA, scene, LEFT, JointGoal(RIGHT[None]))
 
 
-@pytest.mark.parametrize(
-    ("fraction", "most"), [(0.0, np.inf), (1.0, 0.8)], ids=["auto-encoder", "end to end"]
-)
+@pytest.mark.parametrize(("fraction", "most"), [(0.0, np.inf), (1.0, 0.8)], ids=["auto-encoder", "end to end"])
 def test_the_loss_falls(fraction: float, most: float) -> None:
     """Straight steps have a loss of 1."""
     net = network()

@@ -28,9 +28,7 @@ def problem(*goals: np.ndarray, scene: rd.Scene = WALL) -> rd.Problem:
     return rd.Problem(PANDA, scene, LEFT, rd.JointGoal(np.stack(goals)))
 
 
-def plan(
-    planner: type[ompl.OmplPlanner], problem: rd.Problem, seed: int = 1, limit: float = 0.5
-) -> rd.PlanResult:
+def plan(planner: type[ompl.OmplPlanner], problem: rd.Problem, seed: int = 1, limit: float = 0.5) -> rd.PlanResult:
     """Plan with a short time limit for anytime planners, which use all of it, and a longer one where a busy
     machine finds no path in it."""
     if not planner.anytime:

@@ -35,11 +35,7 @@ def shapes() -> list[Shape]:
     ]
 
 
-ROBOTS = {
-    "panda": lambda: rd.load_robot("panda"),
-    "box arm": box_arm,
-    "two arms": lambda: example_robot("two_arms"),
-}
+ROBOTS = {"panda": lambda: rd.load_robot("panda"), "box arm": box_arm, "two arms": lambda: example_robot("two_arms")}
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -95,9 +91,7 @@ def test_distances_are_those_of_coal() -> None:
                 coal.distance(ball, place, piece, coal.Transform3s(R, t), request, coal.DistanceResult())
                 for piece, t in zip(pieces, at, strict=True)
             )
-            if (
-                isinstance(body, proofs.Surface) and count == 3 and right > 0.1
-            ):  # of triangles far away, their balls
+            if isinstance(body, proofs.Surface) and count == 3 and right > 0.1:  # of triangles far away, their balls
                 assert 0.6 * min(right, proofs.CLEARANCE_CAP) <= distance <= right + 1e-5
             elif right - less > 1e-3:
                 assert distance == pytest.approx(min(right - less, proofs.CLEARANCE_CAP), abs=2e-5)
@@ -206,8 +200,6 @@ def test_bounds_hold_for_cubics_that_leave_the_straight_lines() -> None:
         dense = motion.at(np.linspace(low, high, 40)).positions
         exact = proofs.Prover(robot, scene, dense)
         for place in range(40):
-            here = proofs.Stretches(
-                np.arange(count), np.full(count, float(place)), np.full(count, float(place))
-            )
+            here = proofs.Stretches(np.arange(count), np.full(count, float(place)), np.full(count, float(place)))
             there = exact.bounds(here, np.zeros(count, bool), [])
             assert (there.clearance >= found.clearance - found.displacement - 1e-9).all()

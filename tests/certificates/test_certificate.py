@@ -25,9 +25,7 @@ SWING = np.array([[-0.6, 0.2, 0.3], [0.6, 0.2, 0.3], [0.6, 0.9, 0.3]])
 
 def problem_of(rows: np.ndarray, *shapes: Shape, robot: rd.Robot | None = None) -> tuple[rd.Problem, rd.Path]:
     robot = robot or box_arm()
-    return rd.Problem(robot, rd.Scene(shapes), rows[0], rd.JointGoal(rows[-1:])), rd.Path(
-        robot.joint_names, rows
-    )
+    return rd.Problem(robot, rd.Scene(shapes), rows[0], rd.JointGoal(rows[-1:])), rd.Path(robot.joint_names, rows)
 
 
 def near_things() -> dict[str, tuple[Shape, ...]]:

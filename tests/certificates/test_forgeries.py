@@ -281,10 +281,7 @@ FORGED: dict[str, tuple[Callable[[Record], object], str]] = {
     # the problem, judged by itself
     "closed fingers": (set_to("problem", "locked", to=CLOSED), "joint panda_finger_joint1 has changed"),
     "a faster ball": (set_to("problem", "moving", 0, "velocity", to=[0, -1, 0]), "shown to be free|proof: "),
-    "a ball of unknown motion": (
-        lambda record: record["problem"]["moving"][0].update(velocity=None, max_speed=1.0),
-        "proof: ",
-    ),
+    "a ball of unknown motion": (lambda record: record["problem"]["moving"][0].update(velocity=None, max_speed=1.0), "proof: "),
     "an obstacle in the way": (
         lambda record: record["problem"]["scene"].append({"sphere": {"center": [0, 0, 0.6], "radius": 0.3}}),
         "is not shown to be free",
@@ -298,9 +295,7 @@ PLAIN = [*FORGED][-2:]
 
 
 @pytest.mark.parametrize("name", FORGED)
-def test_forgeries_are_refused_with_the_reason(
-    name: str, true: tuple[FilePath, rd.Problem], tmp_path: FilePath
-) -> None:
+def test_forgeries_are_refused_with_the_reason(name: str, true: tuple[FilePath, rd.Problem], tmp_path: FilePath) -> None:
     forge, wanted = FORGED[name]
     record = json.loads(true[0].read_text())
     forge(record)
@@ -334,21 +329,15 @@ def test_thin_spheres_are_refused() -> None:
     problem = rd.Problem(replace(panda, spheres=thin), rd.Scene(), START, GOAL)
     certificate = rd.certify(problem, rd.Path(panda.joint_names, np.array([START, GOAL])))
     found = certificate.check(problem).differences
-    assert any(
-        re.match("robot: the meshes of panda_link5 stick out of its spheres by 0.0", line) for line in found
-    )
+    assert any(re.match("robot: the meshes of panda_link5 stick out of its spheres by 0.0", line) for line in found)
 
 
 def test_the_robot_is_described() -> None:
     panda = rd.load_robot("panda", {"panda_finger_joint1": 0.01})
     assert described(panda) == "panda, the bundled one"
-    small = {
-        link: tuple(replace(m, vertices=0.5 * m.vertices) for m in of) for link, of in panda.meshes.items()
-    }
+    small = {link: tuple(replace(m, vertices=0.5 * m.vertices) for m in of) for link, of in panda.meshes.items()}
     shrunk = described(replace(panda, meshes=small, source="/robots/panda"))
-    assert shrunk.startswith(
-        "panda from /robots/panda, not the bundled one: meshes of panda_link0 has changed"
-    )
+    assert shrunk.startswith("panda from /robots/panda, not the bundled one: meshes of panda_link0 has changed")
     assert "not bundled" in described(replace(panda, name="mine"))
 
 

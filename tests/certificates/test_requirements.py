@@ -84,9 +84,7 @@ def test_bounds_in_time_are_bounds() -> None:
     poses[:, :3, 3] = [[0.5, 0.5, 0.5], [0.5, 0.0, 0.6], [0.3, -0.4, 0.4]]
     poses[1, :3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
     poses[2, :3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
-    bar = rd.MovingObstacle(
-        rd.Box(poses[0, :3, 3], [0.4, 0.1, 0.1], name="bar"), times=[0, 0.4, 1], poses=poses
-    )
+    bar = rd.MovingObstacle(rd.Box(poses[0, :3, 3], [0.4, 0.1, 0.1], name="bar"), times=[0, 0.4, 1], poses=poses)
     ways = (bar, ACROSS, rd.MovingObstacle(rd.Sphere([0.7, 0.3, 0.5], 0.1, "ball"), max_speed=0.0))
     q = np.array(START) + 0.2 * rng.normal(size=(6, 7)).cumsum(axis=0)
     prover = MovingProver(PANDA, ways, q, times)

@@ -65,9 +65,7 @@ def test_bounds_are_bounds(name: str, step: float) -> None:
             assert (dense <= few[piece] + 1e-9).all()
 
 
-def test_a_payload_is_proved_and_its_file_holds_without_pinocchio(
-    tmp_path: FilePath, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_payload_is_proved_and_its_file_holds_without_pinocchio(tmp_path: FilePath, monkeypatch: pytest.MonkeyPatch) -> None:
     problem, certificate = certified()
     certificate.save(tmp_path / "certificate.json")
     monkeypatch.setitem(sys.modules, "pinocchio", None)

@@ -129,9 +129,7 @@ def test_settings_of_a_planner_are_listed(said: Said) -> None:
     assert said(2, "planner", "info", "aorrt").endswith("did you mean aorrtc?\n")
 
 
-@pytest.mark.parametrize(
-    ("words", "meant"), [(("plna",), "plan"), (("plan", "x.yaml", "--tme-limit=3"), "--time-limit")]
-)
+@pytest.mark.parametrize(("words", "meant"), [(("plna",), "plan"), (("plan", "x.yaml", "--tme-limit=3"), "--time-limit")])
 def test_misspelled_words_get_a_suggestion(words: tuple[str, ...], meant: str, said: Said) -> None:
     assert f"did you mean {meant}?" in said(2, *words)
 
@@ -143,9 +141,7 @@ def test_help_lists_every_command_below_a_topic(said: Said) -> None:
     assert "\n  plan         plan a motion" in printed
 
 
-def test_a_module_of_the_current_folder_adds_planners(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: Said
-) -> None:
+def test_a_module_of_the_current_folder_adds_planners(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: Said) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.setattr(registry, "imported", [])

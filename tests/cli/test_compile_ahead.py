@@ -31,9 +31,7 @@ def test_the_first_compilation_starts_one_process(started: list[list[str]]) -> N
     assert started == [[sys.executable, "-m", "robotdiffuse.cli.compile_ahead", "picture"]]
 
 
-def test_a_warm_start_or_a_single_core_starts_none(
-    started: list[list[str]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_warm_start_or_a_single_core_starts_none(started: list[list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
     with compiling_ahead(picture=False):
         pass
     loading.compiles("after the block")

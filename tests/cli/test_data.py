@@ -58,9 +58,7 @@ def test_view_shows_samples_in_one_page(folder, said: Said):
     assert f"wrote {out}" in printed.replace("\n", "")
     page = out.read_text("utf-8")
     titles = re.findall("<b>(.*?)</b>", page)
-    assert len(titles) == 2 and all(
-        re.fullmatch(r"rop(_dense)? · shard \d, row \d", title) for title in titles
-    )
+    assert len(titles) == 2 and all(re.fullmatch(r"rop(_dense)? · shard \d, row \d", title) for title in titles)
     stored = json.loads(page.split('id="replays">')[1].split("</script>")[0])
     replays = ["".join(stored["parts"][i] for i in parts) for parts in stored["pages"]]
     assert len(replays) == 2
@@ -82,14 +80,10 @@ def test_export(folder, said: Said):
     assert run("data", "check", again, "--no-pybullet", "--workers", 1) == 0
 
 
-def test_info_on_motions_that_are_all_straight_warns_of_nothing(
-    tmp_path: Path, recwarn: pytest.WarningsRecorder
-) -> None:
+def test_info_on_motions_that_are_all_straight_warns_of_nothing(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
     start = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
     line = start + np.linspace(0, 0.3, 5)[:, None]
-    rd.write_dataset(
-        [line] * 20, [rd.Scene([rd.Sphere([-2, 0.1 * i, 1], 0.1)]) for i in range(20)], tmp_path / "d"
-    )
+    rd.write_dataset([line] * 20, [rd.Scene([rd.Sphere([-2, 0.1 * i, 1], 0.1)]) for i in range(20)], tmp_path / "d")
     assert run("data", "info", tmp_path / "d", "--page", tmp_path / "page.html") == 0
     assert (tmp_path / "page.html").is_file() and not (tmp_path / "d" / "report.html").exists()
     assert not [str(warning.message) for warning in recwarn if warning.category is UserWarning]

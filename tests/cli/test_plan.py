@@ -39,9 +39,7 @@ def test_plan_writes_files_that_view_and_verify_read(tmp_path: Path, said: Said)
     assert (tmp_path / "again.html").stat().st_size > 10_000
 
 
-def test_files_are_written_though_nobody_reads_what_is_printed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_are_written_though_nobody_reads_what_is_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """`plan problem.yaml --out r.json | head -1` wrote nothing."""
     problem = write_problem(tmp_path)
     read, write = os.pipe()
@@ -74,9 +72,7 @@ NO_PLAN = {
 @pytest.mark.parametrize("case", NO_PLAN)
 def test_no_plan_is_status_1_with_the_reason(case: str, tmp_path: Path, said: Said) -> None:
     changes, status, named = NO_PLAN[case]
-    printed = said(
-        1, "plan", write_problem(tmp_path, **changes), "--planner", "rrt_connect", "--out", "r.json"
-    )
+    printed = said(1, "plan", write_problem(tmp_path, **changes), "--planner", "rrt_connect", "--out", "r.json")
     assert status in printed and named in printed
     saved = rd.load_result("r.json")
     assert saved.result.status.value == status and saved.result.path is None
@@ -87,9 +83,7 @@ def test_what_has_no_motion_is_drawn(tmp_path: Path, said: Said) -> None:
     """`view problem.yaml` was refused, and `plan --out bad.html` wrote nothing and said so neither."""
     problem = write_problem(tmp_path, **NO_PLAN["goal in collision"][0])
     outs = ("--out", "bad.html", "--out", "bad.json", "--out", "bad.csv")
-    assert "not written: bad.csv: there is no motion" in said(
-        1, "plan", problem, "--planner", "rrt_connect", *outs
-    )
+    assert "not written: bad.csv: there is no motion" in said(1, "plan", problem, "--planner", "rrt_connect", *outs)
     assert not (tmp_path / "bad.csv").exists()
     assert "invalid goal" in (tmp_path / "bad.html").read_text()
     assert run("view", problem, "--out", "again.html") == 0

@@ -62,9 +62,7 @@ def test_the_bundled_encoder_is_taken_where_none_is_named(trained: list[PlannerT
 
 
 @pytest.mark.parametrize("data", [("--data", "d"), ("--robot", "ur5e")])
-def test_cross_attention_without_points_is_refused_before_anything_is_made(
-    data: tuple[str, str], said: Said
-) -> None:
+def test_cross_attention_without_points_is_refused_before_anything_is_made(data: tuple[str, str], said: Said) -> None:
     assert "denoiser cross_attention need each other" in said(
         2, "train", "planner", *data, "--out", "o", "--denoiser", "cross_attention"
     )

@@ -45,16 +45,11 @@ def test_a_certificate_is_written_and_checked(planned: Path, said: Said) -> None
     assert lines[0].startswith("robot: panda, ") and lines[1] == "problem: the one in the certificate"
     assert lines[2].startswith("not checked: ") and lines[3].startswith("holds: at least")
     assert run("certificate", "check", "c.json", "--problem", planned / "problem.json") == 0
-    assert "scene: new was added" in said(
-        1, "certificate", "check", "c.json", "--problem", planned / "other.json"
-    )
+    assert "scene: new was added" in said(1, "certificate", "check", "c.json", "--problem", planned / "other.json")
     assert "is not a certificate" in said(2, "certificate", "check", planned / "r.json")
 
 
-@pytest.mark.parametrize(
-    "command",
-    ["export {} --out m.csv", "export {} --out m.rosbag2", "verify {} --certificate c.json"],
-)
+@pytest.mark.parametrize("command", ["export {} --out m.csv", "export {} --out m.rosbag2", "verify {} --certificate c.json"])
 def test_a_full_disk_is_status_3(command: str, planned: Path, said: Said) -> None:
     """It was 2, as bad input, and scripts could not tell them apart."""
     with full_disk():
@@ -69,9 +64,7 @@ def test_motions_from_other_programs(planned: Path, said: Said) -> None:
     assert run("export", planned / "r.json", "--out", "m.mcap") == 0
     assert run("verify", "m.mcap") == 0  # the problem is in it
     assert "holds no problem; give --problem FILE, or --scene FILE" in said(2, "verify", planned / "m.yaml")
-    assert "--scene and --robot belong together" in said(
-        2, "verify", planned / "m.yaml", "--scene", planned / "scene.yaml"
-    )
+    assert "--scene and --robot belong together" in said(2, "verify", planned / "m.yaml", "--scene", planned / "scene.yaml")
 
 
 def test_all_violations_are_listed(planned: Path, said: Said) -> None:
@@ -98,6 +91,4 @@ def test_only_valid_motions_are_exported(planned: Path, said: Said) -> None:
     assert run("export", planned / "r.json", "--out", "fine.csv", "--rate", "1000") == 0
     assert Path("fine.csv").read_text().splitlines()[2].startswith("0.001,")
     assert run("export", planned / "r.json", "--out", "fine.csv", "--rate", "-1") == 2
-    assert "known: .json, .csv, .mcap, .rosbag2, .rrd, .yaml" in said(
-        2, "export", planned / "r.json", "--out", "a.foo"
-    )
+    assert "known: .json, .csv, .mcap, .rosbag2, .rrd, .yaml" in said(2, "export", planned / "r.json", "--out", "a.foo")

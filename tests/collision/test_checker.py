@@ -33,13 +33,9 @@ def test_clearances_are_exact(name: str) -> None:
     right = oracles.link_distances(robot, scene, q)
     assert checker.link_clearances(q).shape == (150, len(checker.links))
     np.testing.assert_allclose(checker.link_clearances(q), right, atol=oracles.TOLERANCE)
-    np.testing.assert_allclose(
-        checker.link_clearances(q, limit=0.1), np.minimum(right, 0.1), atol=oracles.TOLERANCE
-    )
+    np.testing.assert_allclose(checker.link_clearances(q, limit=0.1), np.minimum(right, 0.1), atol=oracles.TOLERANCE)
     assert checker.pairs == robot.checked_pairs()
-    np.testing.assert_allclose(
-        checker.pair_clearances(q), oracles.pair_distances(robot, q), atol=oracles.TOLERANCE
-    )
+    np.testing.assert_allclose(checker.pair_clearances(q), oracles.pair_distances(robot, q), atol=oracles.TOLERANCE)
 
 
 def check_free(robot: rd.Robot, scene: rd.Scene, q: ndarray, padding: float = 0.0) -> None:
@@ -75,9 +71,7 @@ def test_every_shape_at_any_pose(kind: str, seed: int) -> None:
         blur = np.sqrt(3) * THINNING * radius
         near = right < 0.1
         assert (found <= right + oracles.TOLERANCE).all()
-        assert (found[near] >= right[near] - blur - oracles.TOLERANCE).all() and not checker.free(q)[
-            hit
-        ].any()
+        assert (found[near] >= right[near] - blur - oracles.TOLERANCE).all() and not checker.free(q)[hit].any()
     else:
         np.testing.assert_allclose(found, right, atol=oracles.TOLERANCE)
         clear = np.abs(right).min(axis=1) > oracles.TOLERANCE
@@ -101,8 +95,7 @@ def test_links_with_any_number_of_spheres(count: int) -> None:
     arm = oracles.with_spheres("ur5")
     rng = np.random.default_rng(count)
     spheres = {
-        link: np.column_stack([rng.uniform(-0.06, 0.06, (count, 3)), rng.uniform(0.002, 0.01, count)])
-        for link in arm.spheres
+        link: np.column_stack([rng.uniform(-0.06, 0.06, (count, 3)), rng.uniform(0.002, 0.01, count)]) for link in arm.spheres
     }
     robot = replace(arm, spheres=spheres)
     check_free(robot, oracles.solids(), oracles.rows(robot, 200, seed=2))
@@ -170,9 +163,7 @@ def test_long_poles_keep_their_precision() -> None:
     robot = oracles.with_spheres("panda")
     q = oracles.rows(robot, 200)
     for make in (rd.Cylinder, rd.Capsule):
-        short, long = (
-            CollisionChecker(robot, rd.Scene([make((0.4, 0.3, 0.2), 0.05, h)])) for h in (6.0, 1e4)
-        )
+        short, long = (CollisionChecker(robot, rd.Scene([make((0.4, 0.3, 0.2), 0.05, h)])) for h in (6.0, 1e4))
         np.testing.assert_allclose(long.link_clearances(q), short.link_clearances(q), atol=oracles.TOLERANCE)
 
 
@@ -231,9 +222,7 @@ def cost(robot: rd.Robot, scene: rd.Scene, q: ndarray, margin: float, self_margi
     total = np.zeros(len(q))
     for link, i in index.items():
         if robot.link_frame(link) > 0:
-            nearest = (
-                np.min([oracles.distance(shape, centers[i]) for shape in scene.shapes], axis=0) - radii[i]
-            )
+            nearest = np.min([oracles.distance(shape, centers[i]) for shape in scene.shapes], axis=0) - radii[i]
             total += 0.5 * (np.maximum(margin - nearest, 0) ** 2).sum(axis=1)
     for a, b in ((index[a], index[b]) for a, b in robot.checked_pairs()):
         gap = np.linalg.norm(centers[a][:, :, None] - centers[b][:, None], axis=-1)

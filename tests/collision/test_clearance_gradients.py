@@ -40,9 +40,7 @@ def test_inputs_are_the_same_in_training_and_planning() -> None:
     told = np.concatenate([clearances, gradients], axis=-1)
     for i, scene in enumerate(scenes):
         checker = CollisionChecker(PANDA, scene)
-        np.testing.assert_allclose(
-            motion_model.link_clearances(checker, config)(q[i : i + 1])[0], told[i], atol=1e-4
-        )
+        np.testing.assert_allclose(motion_model.link_clearances(checker, config)(q[i : i + 1])[0], told[i], atol=1e-4)
         assert (gradients[i].any(axis=1) <= (clearances[i].min(axis=1) < motion_model.GRADIENT_MARGIN)).all()
     assert 0.3 < gradients.any(axis=-1).mean() < 0.9
 
@@ -74,9 +72,7 @@ def test_gradients_are_those_of_the_clearances() -> None:
 def test_gradients_of_a_cloud_are_those_of_what_it_covers() -> None:
     rng = np.random.default_rng(4)
     directions = rng.standard_normal((20_000, 3))
-    surface = np.array([0.5, 0.1, 0.5]) + 0.195 * directions / np.linalg.norm(
-        directions, axis=1, keepdims=True
-    )
+    surface = np.array([0.5, 0.1, 0.5]) + 0.195 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
     solid = CollisionChecker(PANDA, rd.Scene([rd.Sphere((0.5, 0.1, 0.5), 0.2)]))
     cloud = CollisionChecker(PANDA, rd.Scene([rd.PointCloud(surface, 0.005)]))
     q = configurations(600).astype(np.float64)

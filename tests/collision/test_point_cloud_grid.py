@@ -47,9 +47,7 @@ def test_the_nearest_of_a_dense_cloud() -> None:
     found = CollisionChecker(robot, rd.Scene([rd.PointCloud(points, 0.004)]))
     np.testing.assert_array_equal(found.free(q), right.free(q))
     near = right.link_clearances(q) < 0.08
-    np.testing.assert_allclose(
-        found.link_clearances(q)[near], right.link_clearances(q)[near], atol=oracles.TOLERANCE
-    )
+    np.testing.assert_allclose(found.link_clearances(q)[near], right.link_clearances(q)[near], atol=oracles.TOLERANCE)
 
 
 def test_empty_and_distant_clouds_are_empty_scenes() -> None:
@@ -69,9 +67,7 @@ def test_points_just_beyond_the_reach_count() -> None:
     q = np.zeros((1, 3))
     right = oracles.link_distances(robot, scene, q).min()
     assert 0.02 < right < 0.1
-    assert oracles.least_clearance(CollisionChecker(robot, scene), q)[0] == pytest.approx(
-        right, abs=oracles.TOLERANCE
-    )
+    assert oracles.least_clearance(CollisionChecker(robot, scene), q)[0] == pytest.approx(right, abs=oracles.TOLERANCE)
     assert CollisionChecker(robot, scene, right - 0.001).free(q)[0]
     assert not CollisionChecker(robot, scene, right + 0.001).free(q)[0]
 
@@ -125,9 +121,7 @@ def test_a_ground_of_huge_triangles_is_as_fine_as_a_small_one() -> None:
     assert (gap.min(axis=1) <= 0).all()
 
 
-@pytest.mark.parametrize(
-    ("shape", "count"), [((9, 12, 7), 4), ((1, 1, 30), 2), ((30, 1, 1), 1), ((20, 17, 13), 900)]
-)
+@pytest.mark.parametrize(("shape", "count"), [((9, 12, 7), 4), ((1, 1, 30), 2), ((30, 1, 1), 1), ((20, 17, 13), 900)])
 def test_nearest_voxels_are_those_of_a_distance_transform(shape, count) -> None:
     rng = np.random.default_rng(0)
     run = np.full(shape, -1, np.int32)

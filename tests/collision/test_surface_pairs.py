@@ -168,9 +168,7 @@ def test_baxters_torso_and_arms_graze_as_trimesh_finds_too() -> None:
     for each in links:
         T = robot.fk(q, each)
         surface = robot.surfaces[each]
-        meshes.append(
-            trimesh.Trimesh(surface.vertices @ T[:3, :3].T + T[:3, 3], surface.faces, process=False)
-        )
+        meshes.append(trimesh.Trimesh(surface.vertices @ T[:3, :3].T + T[:3, 3], surface.faces, process=False))
     nearest = []
     for one, other in (meshes, meshes[::-1]):
         points = np.concatenate([one.vertices, trimesh.sample.sample_surface(one, 3000, seed=0)[0]])

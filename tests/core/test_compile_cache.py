@@ -34,9 +34,7 @@ def test_compiled_code_has_a_folder_of_its_own(tmp_path: Path, monkeypatch: pyte
     assert kernels.cache_folder() == tmp_path / "robotdiffuse"
 
 
-def test_a_temporary_folder_is_used_if_nothing_else_is_writable(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_temporary_folder_is_used_if_nothing_else_is_writable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Numba raised RuntimeError in a read-only installation without a home."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(kernels, "is_writable", lambda folder: False)

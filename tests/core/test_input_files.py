@@ -324,12 +324,7 @@ USE = '<node><instance_geometry url="#g"/></node>'
 
 
 def collada(
-    folder: Path,
-    unit: str = "1",
-    up: str = "Z_UP",
-    mesh: str = TRIANGLES.format(""),
-    more: str = "",
-    scene: str = USE,
+    folder: Path, unit: str = "1", up: str = "Z_UP", mesh: str = TRIANGLES.format(""), more: str = "", scene: str = USE
 ) -> Path:
     """A triangle with the corners (1, 0, 0), (0, 2, 0) and (0, 0, 3) in a Collada file."""
     (folder / "part.dae").write_text(
@@ -400,19 +395,14 @@ def test_a_pointer_of_git_lfs_says_so(tmp_path: Path) -> None:
 def test_small_collada_files_cannot_fill_the_memory(tmp_path: Path) -> None:
     """2^40 uses of a triangle, in 6 kB, took more than a minute; a polygon of a billion corners 8 GB."""
     twice = '<node id="n{0}"><instance_node url="#n{1}"/><instance_node url="#n{1}"/></node>'
-    nodes = (
-        "".join(twice.format(i, i + 1) for i in range(40))
-        + '<node id="n40"><instance_geometry url="#g"/></node>'
-    )
+    nodes = "".join(twice.format(i, i + 1) for i in range(40)) + '<node id="n40"><instance_geometry url="#g"/></node>'
     scene = '<node><instance_node url="#n0"/></node>'
     with pytest.raises(InputError, match="too often"):
         read_triangles(collada(tmp_path, more=f"<library_nodes>{nodes}</library_nodes>", scene=scene))
     itself = '<library_nodes><node id="n0"><instance_node url="#n0"/></node></library_nodes>'
     with pytest.raises(InputError, match="contains itself"):
         read_triangles(collada(tmp_path, more=itself, scene=scene))
-    polygon = (
-        TRIANGLES.format("").replace("triangles", "polylist").replace("<p>", "<vcount>1000000000</vcount><p>")
-    )
+    polygon = TRIANGLES.format("").replace("triangles", "polylist").replace("<p>", "<vcount>1000000000</vcount><p>")
     with pytest.raises(InputError, match="more corners than the file has bytes"):
         read_triangles(collada(tmp_path, mesh=polygon))
 

@@ -149,9 +149,7 @@ def wall(sides: int = 20) -> rd.Mesh:
     x, z = np.meshgrid(np.linspace(0.3, 0.6, sides), np.linspace(0.0, 0.5, sides))
     vertices = np.stack([x.ravel(), 0 * x.ravel(), z.ravel()], axis=1)
     at = (np.arange(sides - 1)[:, None] * sides + np.arange(sides - 1)).ravel()
-    faces = np.concatenate(
-        [np.stack([at, at + 1, at + sides], 1), np.stack([at + 1, at + sides + 1, at + sides], 1)]
-    )
+    faces = np.concatenate([np.stack([at, at + 1, at + sides], 1), np.stack([at + 1, at + sides + 1, at + sides], 1)])
     return rd.Mesh(vertices, faces, name="wall")
 
 
@@ -183,9 +181,7 @@ def test_timing_is_begun_a_little_late_too() -> None:
 
 
 @pytest.mark.parametrize("more", [{}, {"jerk": 100.0}, {"velocity_scaling": 0.01}])
-def test_a_motion_whose_timing_takes_too_long_is_a_time_out(
-    more: dict, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_motion_whose_timing_takes_too_long_is_a_time_out(more: dict, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(speed_limits, "SECONDS_PER_ROW", 1e3)
     result = RRTConnect().plan(problem(), 20.0, **more)
     assert result.status is rd.Status.TIMEOUT
@@ -217,9 +213,7 @@ def test_meshes_end_with_the_time() -> None:
 
 
 @pytest.mark.parametrize("cloud", [False, True])
-def test_a_tree_of_the_validator_that_takes_too_long_is_refused(
-    cloud: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_tree_of_the_validator_that_takes_too_long_is_refused(cloud: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """The start collides, so the exact meshes are asked where."""
     tip = link_pose(PANDA, LEFT, PANDA.tip)[:3, 3]
     vertices = wall().vertices - wall().vertices.mean(axis=0) + tip
@@ -246,9 +240,7 @@ exit_fast(run)
 """
 
 
-@pytest.mark.parametrize(
-    ("end", "status"), [("return 3", 3), ("sys.exit(4)", 4), ("raise ValueError", 1), ("sys.exit()", 0)]
-)
+@pytest.mark.parametrize(("end", "status"), [("return 3", 3), ("sys.exit(4)", 4), ("raise ValueError", 1), ("sys.exit()", 0)])
 def test_an_exit_waits_for_threads_and_handlers(end: str, status: int) -> None:
     ended = subprocess.run([sys.executable, "-c", EXITS.format(end)], capture_output=True, text=True)
     assert (ended.returncode, ended.stdout.split()) == (status, ["thread", "handler"])

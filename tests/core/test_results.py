@@ -107,9 +107,7 @@ def test_unwritable(solved: rd.PlanResult, tmp_path: Path) -> None:
         solved.save(tmp_path / "folder.json")
 
 
-def test_a_failed_write_keeps_the_old_file(
-    solved: rd.PlanResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_write_keeps_the_old_file(solved: rd.PlanResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "r.json"
     file.write_text("old")
 
@@ -159,8 +157,7 @@ def test_damaged_result_is_refused(change: dict, message: str, solved: rd.PlanRe
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
-    [("{", "is not valid JSON"), ("[]", "must hold one JSON object"), ("{}", "status, reason, planner")],
+    ("text", "message"), [("{", "is not valid JSON"), ("[]", "must hold one JSON object"), ("{}", "status, reason, planner")]
 )
 def test_not_a_result_file(text: str, message: str, tmp_path: Path) -> None:
     file = tmp_path / "r.json"
@@ -190,9 +187,7 @@ def test_threads_that_write_one_file_leave_one_of_their_texts(tmp_path: Path) ->
     assert not errors and file.read_text() in texts and list(tmp_path.iterdir()) == [file]
 
 
-def test_an_interrupted_write_leaves_no_temporary_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_write_leaves_no_temporary_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 

@@ -28,9 +28,7 @@ class Fine(Settings):
     width: Positive = 0.1
 
 
-GRIDS = Registry(
-    "grid", {name.lower(): Entry(f"{__name__}:{name}", "a grid", name) for name in ("Coarse", "Fine")}
-)
+GRIDS = Registry("grid", {name.lower(): Entry(f"{__name__}:{name}", "a grid", name) for name in ("Coarse", "Fine")})
 
 
 @dataclass(frozen=True)
@@ -89,9 +87,7 @@ def test_values_of_another_type_are_refused(values: dict[str, Any], message: str
 
 
 def test_json_and_back() -> None:
-    settings = Search(
-        step=2.0, range=0.5, levels=(1.0,), grid="fine", grid_settings=Fine(0.3), inner=Coarse(7)
-    )
+    settings = Search(step=2.0, range=0.5, levels=(1.0,), grid="fine", grid_settings=Fine(0.3), inner=Coarse(7))
     assert Search.from_json(settings.to_json(), "file") == settings
     assert Search.from_json({"step": 2}, "file") == Search(step=2.0)
 
@@ -216,9 +212,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Registry:
     (package / "entry_points.txt").write_text(
         "[test.fruits]\nplum = orchard:PLUM\nstone = orchard:STONE\ngone = no_such_module:GONE\n"
     )
-    entry = (
-        "from robotdiffuse.core.registry import Entry\nPLUM = Entry('pathlib:Path', 'a plum')\nSTONE = 1\n"
-    )
+    entry = "from robotdiffuse.core.registry import Entry\nPLUM = Entry('pathlib:Path', 'a plum')\nSTONE = 1\n"
     (tmp_path / "orchard.py").write_text(entry)
     monkeypatch.syspath_prepend(str(tmp_path))
     return Registry("drupe", {"pear": Entry("pathlib:PurePath", "a pear")}, group="test.fruits")

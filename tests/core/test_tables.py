@@ -41,12 +41,7 @@ def test_markdown() -> None:
 
 def test_pairs_are_printed_without_rich_in_lines_that_fit() -> None:
     table = Table.pairs("panda: solved", [("reason", "solved by [b]aorrtc[/b] more"), ("seed", "0")])
-    assert tables.pair_lines(table, 31) == [
-        "panda: solved",
-        "reason  solved by [b]aorrtc[/b]",
-        "        more",
-        "seed    0",
-    ]
+    assert tables.pair_lines(table, 31) == ["panda: solved", "reason  solved by [b]aorrtc[/b]", "        more", "seed    0"]
     assert max(map(len, tables.pair_lines(table, 1))) <= len("reason  ") + tables.MIN_TEXT_WIDTH
 
 

@@ -131,9 +131,7 @@ def test_the_text_of_a_value_is_one_line(kind: type[Value]) -> None:
 def test_large_arrays_are_shown_by_their_shape_and_defaults_not_at_all() -> None:
     assert repr(rd.Box(HALF, HALF)) == "Box(center=[0.5, 0.5, 0.5], size=[0.5, 0.5, 0.5])"
     assert repr(rd.PointCloud(np.zeros((5000, 3)))) == "PointCloud(points=<5000 x 3 array>)"
-    assert "solved" in repr(
-        rd.PlanResult(rd.Status.SOLVED, "", "aorrtc", "arm", 0.1, 0, path=VALUES[rd.Path]())
-    )  # type: ignore[arg-type]
+    assert "solved" in repr(rd.PlanResult(rd.Status.SOLVED, "", "aorrtc", "arm", 0.1, 0, path=VALUES[rd.Path]()))  # type: ignore[arg-type]
     assert repr(rd.PlanResult(rd.Status.TIMEOUT, "no path", "aorrtc", "arm", 0.1, 0)) == (
         "PlanResult(timeout, aorrtc in 100 ms: no path)"
     )

@@ -70,7 +70,5 @@ def test_arguments_of_the_wrong_type_are_one_line() -> None:
     rightly = ["plan_many []", *(f"load_planner: {what} None" for what in ("settings", "weights"))]
     at = "trajectory.at []", "trajectory.at array([0., 0.])"
     taken = [f"{call} is taken" for call in (*rightly, "load_robot: locked -1.5", *at)]
-    right = (
-        "problem is 'shelf.yaml'; it must be a Problem: rd.load_problem('shelf.yaml') reads one from a file"
-    )
+    right = "problem is 'shelf.yaml'; it must be a Problem: rd.load_problem('shelf.yaml') reads one from a file"
     assert (ended.stdout.splitlines(), ended.stderr) == ([*taken, right], "")

@@ -20,9 +20,7 @@ def test_turned_motions_have_the_same_clearances():
     q = np.linspace(start, goal, 20, axis=1).astype(np.float32)
     q_turned, packed_turned, clear = turned(robot, q, packed, rng)
     np.testing.assert_array_equal(q_turned[..., 1:], q[..., 1:])
-    assert (q_turned >= robot.lower.astype(np.float32)).all() and (
-        q_turned <= robot.upper.astype(np.float32)
-    ).all()
+    assert (q_turned >= robot.lower.astype(np.float32)).all() and (q_turned <= robot.upper.astype(np.float32)).all()
     angle = q_turned[:, :, 0] - q[:, :, 0]
     assert np.ptp(angle, axis=1).max() < 1e-5 and np.abs(angle).max() > 0.1
     for i in range(len(packed)):

@@ -78,10 +78,7 @@ def test_same_arrays_same_bytes_or_none_where_arrays_do_not_fit(tmp_path, arrays
     shards.write_shard(tmp_path / "a", 0, arrays, counts)
     shards.write_shard(tmp_path / "b", 0, dict(reversed(arrays.items())), dict(reversed(counts.items())))
     shards.write_shard(tmp_path / "b", 0, arrays, counts)  # once more in its place
-    for wrong, message in (
-        ({"costs": arrays["cost"]}, "'costs'"),
-        ({"cost": arrays["cost"][:3]}, "unequal rows"),
-    ):
+    for wrong, message in (({"costs": arrays["cost"]}, "'costs'"), ({"cost": arrays["cost"][:3]}, "unequal rows")):
         with pytest.raises(InputError, match=message):
             shards.write_shard(tmp_path / "b", 1, arrays | wrong, {})
     assert files(tmp_path / "a") == files(tmp_path / "b")
@@ -140,9 +137,7 @@ ENDLESS = {"name": "regular", "configuration": {"chunk_shape": [10**15]}}
 DAMAGE = [
     (
         "array trajectories holds numbers that are not finite",
-        lambda store: shards.write_shard(
-            store, 0, random(7) | {"trajectories": np.full((7, 12, 3), np.nan)}, {}
-        ),
+        lambda store: shards.write_shard(store, 0, random(7) | {"trajectories": np.full((7, 12, 3), np.nan)}, {}),
     ),
     ("array goals: missing", lambda store: shutil.rmtree(shards.shard_path(store, 0) / "goals")),
     (
@@ -154,10 +149,7 @@ DAMAGE = [
     ("array seed is damaged", lambda store: about(store).write_text("{")),
     ("array seed is damaged", lambda store: about(store).unlink()),
     (r"shard .*shard_00000\.zarr is damaged", lambda store: about(store, "").write_text("{")),
-    (
-        "is damaged: its arrays have unequal numbers of rows",
-        lambda store: rewrite(store, "detour", lambda a: a[:-1]),
-    ),
+    ("is damaged: its arrays have unequal numbers of rows", lambda store: rewrite(store, "detour", lambda a: a[:-1])),
     (
         "array detour is <f8 with 1 axes; it must be <f4 with 1",
         lambda store: rewrite(store, "detour", lambda a: a.astype(np.float64)),

@@ -15,10 +15,7 @@ SLOW = {"01_own_robot", "05_depth_camera", "09_two_arms", "12_train_on_own_data"
 
 
 def cases() -> list[object]:
-    return [
-        pytest.param(file, id=file.stem, marks=[pytest.mark.slow] if file.stem in SLOW else [])
-        for file in EXAMPLES
-    ]
+    return [pytest.param(file, id=file.stem, marks=[pytest.mark.slow] if file.stem in SLOW else []) for file in EXAMPLES]
 
 
 @pytest.mark.usefixtures("small_pictures")

@@ -25,10 +25,7 @@ from robotdiffuse.simulation import PyBulletOracle
 from robotdiffuse.visualization.replay_page import write_replay
 
 pytestmark = pytest.mark.slow
-TABLES: tuple[dict[str, Any], ...] = (
-    *(PLANNERS, FAMILIES, METRICS, SHAPES),
-    *(DENOISERS, ENCODERS, SAMPLERS),
-)
+TABLES: tuple[dict[str, Any], ...] = (*(PLANNERS, FAMILIES, METRICS, SHAPES), *(DENOISERS, ENCODERS, SAMPLERS))
 
 
 @pytest.fixture(scope="module")

@@ -52,12 +52,7 @@ def test_the_mean_of_two_trainings_leaves_unsolved_problems_out() -> None:
         return ablation.Evaluation(each, each, each, np.array(length, float), each)
 
     nan = float("nan")
-    mean = ablation.Evaluation.mean(
-        [evaluation([0, 1, 0], [nan, 4, nan]), evaluation([1, 1, 0], [3, 6, nan])]
-    )
+    mean = ablation.Evaluation.mean([evaluation([0, 1, 0], [nan, 4, nan]), evaluation([1, 1, 0], [3, 6, nan])])
     np.testing.assert_array_equal(mean.single, [0.5, 1, 0])
     np.testing.assert_array_equal(mean.length, [3, 5, nan])
-    assert [ablation.Training("table2_jpc", seed).folder for seed in (0, 1)] == [
-        "table2_jpc",
-        "table2_jpc_seed1",
-    ]
+    assert [ablation.Training("table2_jpc", seed).folder for seed in (0, 1)] == ["table2_jpc", "table2_jpc_seed1"]

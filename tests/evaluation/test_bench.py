@@ -30,17 +30,13 @@ from robotdiffuse.planning.search.rrt import AORRTCSettings, RRTConnect
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.held_out import held_out_problem, line_length
 
-RECORD = Record(
-    "rrt_connect", "rop", "rop/0", "rop", False, 0, 1.0, "solved", "", 0.01, progress=((0.01, 2.0),)
-)
+RECORD = Record("rrt_connect", "rop", "rop/0", "rop", False, 0, 1.0, "solved", "", 0.01, progress=((0.01, 2.0),))
 
 
 def quiet(*_: object) -> None: ...
 
 
-def settings(
-    out: Path, planners: str = "rrt_connect", problem: str = "rop", count: int = 3
-) -> bench.BenchSettings:
+def settings(out: Path, planners: str = "rrt_connect", problem: str = "rop", count: int = 3) -> bench.BenchSettings:
     return bench.BenchSettings(tuple(planners.split(",")), (problem,), out, time_limit=20.0, count=count)
 
 
@@ -290,9 +286,7 @@ def test_other_problems_of_the_same_name_are_refused(tmp_path: Path) -> None:
     other = str(tmp_path / "b" / "mine.jsonl")
     for _ in range(2):
         assert len(gather_cases([first], None, tmp_path / "out", quiet)) == 1
-    with pytest.raises(
-        rd.InputError, match=r"problems called mine that were read from .*; those in .* others"
-    ):
+    with pytest.raises(rd.InputError, match=r"problems called mine that were read from .*; those in .* others"):
         gather_cases([other], None, tmp_path / "out", quiet)
     (tmp_path / "rop.jsonl").write_text(lines[0])
     with pytest.raises(rd.InputError, match="have the name of the family rop"):

@@ -40,12 +40,7 @@ def record(planner: str, name: str, limit: float, **fields: object) -> Record:
 
 
 def solved(
-    planner: str,
-    name: str,
-    limit: float,
-    progress: list[tuple[float, float]],
-    time: float | None = None,
-    **fields: object,
+    planner: str, name: str, limit: float, progress: list[tuple[float, float]], time: float | None = None, **fields: object
 ) -> Record:
     """A record of a motion of which the links go three times as far [m] as the joints [rad]."""
     length = progress[-1][1]
@@ -88,9 +83,7 @@ def keep_problems(folder: Path, names: list[str]) -> None:
 def small(tmp_path: Path) -> Path:
     names = ["rop/0", "rop/1", "rop/2", "rop/3"]
     trivial = [False, False, False, True]
-    records = [
-        solved("robotdiffuse", n, 1.0, [(0.05, 2.0)], trivial=t) for n, t in zip(names, trivial, strict=True)
-    ]
+    records = [solved("robotdiffuse", n, 1.0, [(0.05, 2.0)], trivial=t) for n, t in zip(names, trivial, strict=True)]
     # the first path after 0.05, 0.5 and 5 s; the last problem beyond the limit of 10 s
     for name, t, first in zip(names[:3], trivial, (0.05, 0.5, 5.0), strict=False):
         progress = [(first, 4.0), (first * 1.5, 3.0)]
@@ -254,10 +247,7 @@ def test_lengths_are_compared_at_equal_time(tmp_path: Path) -> None:
     alone = replace(plain, records={n: r for n, r in plain.records.items() if RESTARTED not in n})
     section = bench_report.sections(alone)[-1]
     table = bench_report.main_table(section, section.main, alone.reference)
-    assert cells(table, "joint length / robotdiffuse") == {
-        "robotdiffuse": "1",
-        "rrt_connect": "1.200 (1.200 to 1.200) †",
-    }
+    assert cells(table, "joint length / robotdiffuse") == {"robotdiffuse": "1", "rrt_connect": "1.200 (1.200 to 1.200) †"}
     assert bench_report.UNEQUAL_NOTE in table.notes
 
 

@@ -244,7 +244,5 @@ def test_where_all_are_equal_all_are_best() -> None:
     # unknown figures count as the worst
     nothing = statistics.Indicators(0.0, 0.0, np.nan, 10.0)
     rows = [statistics.Indicators(90.0, 2.0, 5.0, 1.0), statistics.Indicators(95.0, 1.0, 7.0, 3.0), nothing]
-    np.testing.assert_allclose(
-        statistics.normalized(rows), [[90 / 95, 0, 1, 1], [1, 0.5, 0, 7 / 9], [0, 1, 0, 0]]
-    )
+    np.testing.assert_allclose(statistics.normalized(rows), [[90 / 95, 0, 1, 1], [1, 0.5, 0, 7 / 9], [0, 1, 0, 0]])
     np.testing.assert_array_equal(statistics.normalized([nothing, nothing])[:, 2], [0, 0])

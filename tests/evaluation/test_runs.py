@@ -44,9 +44,7 @@ def test_methods_take_turns_on_each_case_with_the_same_random_numbers() -> None:
     assert found["x"][0].reference == LENGTH_OF_LINE and found["x"][0].workers == 1
 
 
-def test_what_is_kept_is_not_made_again_but_for_other_limits(
-    tmp_path: Path,
-) -> None:
+def test_what_is_kept_is_not_made_again_but_for_other_limits(tmp_path: Path) -> None:
     calls: list[tuple[str, str, int]] = []
 
     def stopping(run: Run) -> Iterator[Fields]:

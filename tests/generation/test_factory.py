@@ -214,10 +214,7 @@ def test_other_settings_are_refused_by_name(folder: Path) -> None:
         (replace(SETTINGS, seed=4), "seed 3, not 4"),
         (replace(SETTINGS, mix={"rop": 1.0}), r'mix .*"rop_dense".*, not {"rop": 1.0}'),
         (replace(SETTINGS, mix=dict(reversed(SETTINGS.mix.items()))), r"mix .*, not "),
-        (
-            replace(SETTINGS, planner="aorrtc", search=AORRTC.search),
-            r'begun with planner "shared_tree_rrt_star", not "aorrtc"',
-        ),
+        (replace(SETTINGS, planner="aorrtc", search=AORRTC.search), r'begun with planner "shared_tree_rrt_star", not "aorrtc"'),
         (replace(SETTINGS, search=search), r"search\.safety_distance 0\.05, not 0\.02"),
     ):
         before = factory_runs.contents(folder)
@@ -280,12 +277,7 @@ def test_furniture_among_the_families(tmp_path: Path) -> None:
 
 
 AORRTC = GenerationSettings(
-    mix={"rop_dense": 1.0},
-    goals=4,
-    waypoints=32,
-    trivial_share=0.0,
-    planner="aorrtc",
-    search=AORRTCSearchSettings(),
+    mix={"rop_dense": 1.0}, goals=4, waypoints=32, trivial_share=0.0, planner="aorrtc", search=AORRTCSearchSettings()
 )
 
 
@@ -348,9 +340,7 @@ def test_killed_at_a_random_moment_it_ends_in_the_same_data(undisturbed, tmp_pat
     run = factory_runs.start(tmp_path, TRAJECTORIES, SHARD, WAYPOINTS, 2)
     factory_runs.wait_for_shards(run, tmp_path, 1)
     time.sleep(random.uniform(0, 0.1))
-    assert len(factory_runs.members(run.pid)) >= 2, (
-        "the command and a worker; the other may be at its start or end"
-    )
+    assert len(factory_runs.members(run.pid)) >= 2, "the command and a worker; the other may be at its start or end"
     run.kill()
     run.communicate(timeout=500)
     assert run.returncode == -signal.SIGKILL and factory_runs.shards(tmp_path) < SHARDS

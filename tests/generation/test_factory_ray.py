@@ -37,9 +37,7 @@ default, get their share of a machine that others use, too."""
 @pytest.fixture(scope="module")
 def head() -> Iterator[Any]:
     of_head = {"num_cpus": 1, "include_dashboard": False, "_system_config": SYSTEM}
-    made = cluster_utils.Cluster(
-        initialize_head=True, head_node_args=of_head | {"object_store_memory": STORE}
-    )
+    made = cluster_utils.Cluster(initialize_head=True, head_node_args=of_head | {"object_store_memory": STORE})
     yield made
     made.shutdown()
 

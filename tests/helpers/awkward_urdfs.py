@@ -73,10 +73,7 @@ WORKS: dict[str, tuple[Callable[[Path], Path], int]] = {
         3,
     ),
     "continuous joints alone": (arm(chain("base", row("j", 5), kind="continuous", limits="")), 5),
-    "names in other scripts": (
-        arm(chain("base", ["Gelenk_ß", "关节二", "сустав", "مفصل"]), name="机器人 Ä"),
-        4,
-    ),
+    "names in other scripts": (arm(chain("base", ["Gelenk_ß", "关节二", "сустав", "مفصل"]), name="机器人 Ä"), 4),
     "names with slashes and spaces": (arm(chain("base", ["arm/joint 1", "arm/joint 2", "arm/joint 3"])), 3),
     "a joint that cannot move": (arm(chain("base", row("j", 4)).replace('upper="2"', 'upper="-2"', 1)), 3),
     "no upper limits": (arm(chain("base", row("j", 3), limits='lower="-2"')), 3),
@@ -90,15 +87,9 @@ WORKS: dict[str, tuple[Callable[[Path], Path], int]] = {
     "a mesh with degenerate triangles": (solid(degenerate(), "part.obj"), 5),
     "a mirrored mesh": (solid(box(), more='scale="1 -1 1"'), 5),
     "a mesh with an ending in capitals": (solid(box(), "PART.STL"), 5),
-    "another encoding": (
-        text(b'<?xml version="1.0" encoding="latin-1"?>' + robot(ARM, name="Ärmchen").encode("latin-1")),
-        4,
-    ),
+    "another encoding": (text(b'<?xml version="1.0" encoding="latin-1"?>' + robot(ARM, name="Ärmchen").encode("latin-1")), 4),
     "a byte order mark and comments": (text(b"\xef\xbb\xbf" + f"<!-- made -->{robot(ARM)}".encode()), 4),
-    "an old base frame above": (
-        text(robot(ARM, link("world", ""), joint("stand", "world", "base", "fixed", xyz="1 2 3"))),
-        4,
-    ),
+    "an old base frame above": (text(robot(ARM, link("world", ""), joint("stand", "world", "base", "fixed", xyz="1 2 3"))), 4),
     "xacro": (text(XACRO.format(robot(ARM).split(">", 1)[1][: -len("</robot>")]), "made.urdf.xacro"), 4),
 }
 """What is made, and how many joints are planned."""
@@ -131,20 +122,14 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
     "a folder": (lambda folder: folder, "cannot be read: it is a folder"),
     "an axis of zero length": (arm(chain("base", row("j", 3), axis="0 0 0")), "its axis is zero"),
     "limits that are no numbers": (arm(chain("base", ["j"], limits='lower="nan" upper="1"')), "is 'nan'"),
-    "a triangle": (
-        solid(trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])),
-        "has no triangle mesh",
-    ),
+    "a triangle": (solid(trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])), "has no triangle mesh"),
     "a mesh with corners that are no numbers": (
         solid(b"v nan 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 2 3 4\n", "part.obj"),
         "has no triangle mesh",
     ),
     "a damaged mesh": (solid(b"this is no mesh", "part.dae"), "cannot be read"),
     "two links of one name": (arm(ARM, link("j4_link")), "two links have the name 'j4_link'"),
-    "two joints of one name": (
-        arm(ARM, link("end"), joint("j4", "j4_link", "end")),
-        "two joints have the name 'j4'",
-    ),
+    "two joints of one name": (arm(ARM, link("end"), joint("j4", "j4_link", "end")), "two joints have the name 'j4'"),
     "two rotations": (
         text(robot(ARM).replace('<origin xyz="0 0 0.1"/>', '<origin rpy="0 0 0" quat_xyzw="0 0 0 1"/>')),
         "must have one of them",
@@ -153,14 +138,8 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
         arm(ARM, chain("j4_link", ["finger"], limits='lower="0" upper="-0.03"')),
         "lower limit 0.0 is above upper -0.03; exchange them",
     ),
-    "joints without a range": (
-        arm(chain("base", ["j"], limits='lower="0" upper="0"')),
-        "limits of j leave no",
-    ),
-    "a floating body": (
-        arm(ARM, link("ball"), joint("free", "base", "ball", "floating")),
-        "remove it with what it carries",
-    ),
+    "joints without a range": (arm(chain("base", ["j"], limits='lower="0" upper="0"')), "limits of j leave no"),
+    "a floating body": (arm(ARM, link("ball"), joint("free", "base", "ball", "floating")), "remove it with what it carries"),
     "a hand in millimeters": (
         solid(trimesh.creation.box([50, 100, 300])),
         'link end is 300 m long; .* scale="0.001 0.001 0.001"',

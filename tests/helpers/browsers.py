@@ -19,11 +19,7 @@ FLAGS = [
     "--enable-unsafe-swiftshader",
 ]
 """WebGL without a graphics card."""
-MARKS = [
-    pytest.mark.browser,
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium"),
-]
+MARKS = [pytest.mark.browser, pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")]
 """Of tests that need it."""
 PATIENCE = 300.0
 """A new machine compiles first, and WebGL without a graphics card is slow [s]."""

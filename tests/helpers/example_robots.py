@@ -115,9 +115,7 @@ def planar_arm(*lengths: float) -> Robot:
     """Links of these lengths along x, joints about z."""
     xs = (0.0, *lengths)
     joints = [
-        Joint(
-            f"j{i}", "revolute", f"l{i}", f"l{i + 1}", transform(np.array([x, 0, 0])), np.array([0, 0, 1.0])
-        )
+        Joint(f"j{i}", "revolute", f"l{i}", f"l{i + 1}", transform(np.array([x, 0, 0])), np.array([0, 0, 1.0]))
         for i, x in enumerate(xs[:-1])
     ]
     last = len(lengths)

@@ -29,11 +29,7 @@ def sliding() -> Robot:
     for k, (kind, axis) in enumerate(zip(kinds, axes, strict=True)):
         limits = (-1.0, 1.0, 2.0, 8.0, 80.0)
         offset = transform(np.array([0.1, 0.2, 0.1 * k]), rotation_about(axes[(k + 1) % 4], 0.5 * k))
-        joints.append(
-            Joint(
-                f"j{k}", kind, "base" if k == 0 else f"l{k}", f"l{k + 1}", offset, axis, *limits, effort=50.0
-            )
-        )
+        joints.append(Joint(f"j{k}", kind, "base" if k == 0 else f"l{k}", f"l{k + 1}", offset, axis, *limits, effort=50.0))
         inertias[f"l{k + 1}"] = inertia_of([2.0 - 0.4 * k, 0.05, -0.1, 0.1, 0.02, 0.001, 0, 0.01, 0, 0.03])
     return Robot("sliding", "base", "l4", tuple(joints), inertias=inertias)
 
@@ -44,8 +40,5 @@ ROBOTS = {"panda": lambda: rd.load_robot("panda"), "ur5": lambda: rd.load_robot(
 def wild(robot: Robot, rng: np.random.Generator, step: float) -> Trajectory:
     """Random rows, as far apart as they are fast; accelerations are whatever they say."""
     v, a = rng.uniform(-1, 1, (2, 6, robot.dof)) * np.stack([robot.velocity, robot.acceleration])[:, None]
-    q = (
-        rng.uniform(-1, 1, robot.dof)
-        + np.concatenate([np.zeros((1, robot.dof)), np.cumsum((v[1:] + v[:-1]) / 2, 0)]) * step
-    )
+    q = rng.uniform(-1, 1, robot.dof) + np.concatenate([np.zeros((1, robot.dof)), np.cumsum((v[1:] + v[:-1]) / 2, 0)]) * step
     return Trajectory(robot.joint_names, step * np.arange(6.0), q, v, a)

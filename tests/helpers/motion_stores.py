@@ -22,9 +22,7 @@ def line(start: ndarray, goal: ndarray, waypoints: int = WAYPOINTS) -> ndarray:
     return ((1 - s) * start + s * goal).astype(np.float32)
 
 
-def record(
-    robot: Robot, scene: Scene, q: ndarray, family: int = 0, line_free: bool = True
-) -> dict[str, ndarray]:
+def record(robot: Robot, scene: Scene, q: ndarray, family: int = 0, line_free: bool = True) -> dict[str, ndarray]:
     """The row of a motion; the last goal is missing, the second one was not reached."""
     goals = np.full((GOALS, robot.dof), np.nan)
     costs = np.full(GOALS, np.nan)

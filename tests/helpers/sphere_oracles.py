@@ -92,9 +92,7 @@ def with_spheres(name: str) -> Robot:
     robot = example_robot(name)
     rng = np.random.default_rng(0)
     links = [link for link in robot.link_names if robot.link_frame(link) > 0 or link == robot.base]
-    spheres = {
-        link: np.column_stack([rng.uniform(-0.1, 0.1, (4, 3)), rng.uniform(0.01, 0.06, 4)]) for link in links
-    }
+    spheres = {link: np.column_stack([rng.uniform(-0.1, 0.1, (4, 3)), rng.uniform(0.01, 0.06, 4)]) for link in links}
     near = [pair for pair in combinations(links, 2) if _nearby(robot, *pair)]
     return replace(robot, spheres=spheres, meshes={}, allowed_collisions=frozenset(map(frozenset, near)))
 
@@ -147,9 +145,7 @@ def box_triangles(size: tuple[float, float, float]) -> tuple[ndarray, ndarray]:
     return corners, np.array(faces)
 
 
-def depth_of_balls(
-    balls: ndarray, T: ndarray, intrinsics: tuple[float, ...], size: tuple[int, int]
-) -> ndarray:
+def depth_of_balls(balls: ndarray, T: ndarray, intrinsics: tuple[float, ...], size: tuple[int, int]) -> ndarray:
     """A depth image of balls (x, y, z, radius), by hand: |depth ray - center| = radius; inf elsewhere."""
     v, u = np.mgrid[: size[1], : size[0]]
     fx, fy, cx, cy = intrinsics

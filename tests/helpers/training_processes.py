@@ -68,9 +68,7 @@ def two(settings: PlannerTraining, out: Path) -> None:
 def bad_step_in_one(out: str) -> dict[str, float]:
     settings = EncoderTraining(minutes=None, samples=20, batch=2, average=0.9, bad_steps=3)
     index = Processes("cpu").index
-    run = TrainingRun(
-        ToyTask(settings, lambda call: float("nan") if call == 2 and index else 1.0 + index), out
-    )
+    run = TrainingRun(ToyTask(settings, lambda call: float("nan") if call == 2 and index else 1.0 + index), out)
     run.loop()
     weight = run.module.get_parameter("weight").sum().item()
     return {"skipped": run.at.skipped, "samples": run.at.samples, "weight": weight}

@@ -85,8 +85,7 @@ def recording(file: Path, change: Callable[[dict[str, Any]], object] = lambda me
     names = list(reversed(PANDA.joint_names))
     messages: dict[str, Any] = {
         "/joint_states": [
-            {"header": {"stamp": stamp(at)}, "name": names, "position": (HOME[::-1] + at).tolist()}
-            for at in (1.0, 1.1)
+            {"header": {"stamp": stamp(at)}, "name": names, "position": (HOME[::-1] + at).tolist()} for at in (1.0, 1.1)
         ],
         "/tf": [{"transforms": [pose("panda_link0", "panda_hand", at, x=at)]} for at in (1.0, 1.1)],
         "/tf_static": [{"transforms": [pose("panda_hand", "camera_optical", 0.0, x=0.5)]}],
@@ -110,9 +109,7 @@ def write_bag(bag: Writer1 | Writer2, messages: list[tuple[str, str, Any]]) -> N
     store = typestore()
     if isinstance(bag, Writer1):
         store = get_typestore(Stores.ROS1_NOETIC)
-        store.register(
-            get_types_from_msg("geometry_msgs/TransformStamped[] transforms", depth_recording.TRANSFORMS)
-        )
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", depth_recording.TRANSFORMS))
     with bag as writer, pytest.MonkeyPatch.context() as patch:
         patch.setattr(ros2, "typestore", lambda: store)
         connections = {
@@ -201,10 +198,7 @@ def with_velocities_alone(messages: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize(
     ("change", "at"),
-    [
-        (lambda messages: messages["/joint_states"][1]["header"]["stamp"].update(sec=100), 1.0),
-        (with_velocities_alone, 1.05),
-    ],
+    [(lambda messages: messages["/joint_states"][1]["header"]["stamp"].update(sec=100), 1.0), (with_velocities_alone, 1.05)],
 )
 def test_only_joint_states_near_in_time_and_with_positions_count(
     change: Callable[[dict[str, Any]], object], at: float, tmp_path: Path
@@ -257,9 +251,7 @@ def test_an_image_without_a_joint_state_leaves_the_rest(tmp_path: Path) -> None:
         (lambda of: of["/camera/camera_info"][0].update(width=3), "2 x 2 pixels; their CameraInfo has 3 x 2"),
     ],
 )
-def test_what_is_missing_is_said(
-    change: Callable[[dict[str, Any]], object], message: str, tmp_path: Path
-) -> None:
+def test_what_is_missing_is_said(change: Callable[[dict[str, Any]], object], message: str, tmp_path: Path) -> None:
     with pytest.raises(rd.InputError, match=message) as error:
         list(rd.read_depth_views(recording(tmp_path / "r.mcap", change), PANDA))
     assert "\n" not in str(error.value)
@@ -273,9 +265,7 @@ def test_other_files_and_topics_are_refused(tmp_path: Path) -> None:
         list(rd.read_depth_views(recording(tmp_path / "r.mcap"), PANDA, ["/other"]))
     view = rd.DepthView(np.ones((2, 2)), (300, 300, 0.5, 0.5), np.eye(4))
     with pytest.raises(rd.InputError, match="the view of wrist at 0 s has no configuration"):
-        depth_recording.write_depth_views(
-            PANDA, {"wrist": [depth_recording.StampedView(0.0, view)]}, tmp_path / "w.mcap"
-        )
+        depth_recording.write_depth_views(PANDA, {"wrist": [depth_recording.StampedView(0.0, view)]}, tmp_path / "w.mcap")
 
 
 def history() -> depth_recording.TransformHistory:
@@ -288,9 +278,7 @@ def history() -> depth_recording.TransformHistory:
 
 
 @pytest.mark.parametrize(("at", "share"), [(5.0, 0.0), (5.025, 0.25), (5.1, 1.0), (5.15, 1.0)])
-def test_chains_are_followed_and_interpolated_and_at_the_ends_the_nearest_counts(
-    at: float, share: float
-) -> None:
+def test_chains_are_followed_and_interpolated_and_at_the_ends_the_nearest_counts(at: float, share: float) -> None:
     T = history().at("base", "camera", at, 0.1, "the image")
     np.testing.assert_allclose(T[:3, :3], Rotation.from_rotvec([0, 0, share]).as_matrix(), atol=1e-6)
     np.testing.assert_allclose(T[:3, 3], [2 * np.cos(share), 2 * np.sin(share), 0.0], atol=1e-6)

@@ -41,9 +41,7 @@ ROWS = np.zeros((2, 3))
 MOTION = Trajectory(ARM.joint_names, np.array([0.0, 2.0]), ROWS, ROWS, ROWS)
 CART = rd.MovingObstacle(rd.Box([2.0, 0.0, 0.0], [0.2, 0.2, 0.2], name="cart"), velocity=[0.5, 0.0, 0.0])
 PERSON = rd.MovingObstacle(rd.Sphere([0.0, 3.0, 0.0], 0.3, "person"), max_speed=0.1)
-PROBLEM = Problem(
-    ARM, Scene(), ROWS[0], ROWS[0], moving=[CART, PERSON], T_world_base=transform(np.array([0.0, 0.0, 1.0]))
-)
+PROBLEM = Problem(ARM, Scene(), ROWS[0], ROWS[0], moving=[CART, PERSON], T_world_base=transform(np.array([0.0, 0.0, 1.0])))
 
 
 Planned = tuple[Problem, Trajectory]
@@ -66,9 +64,7 @@ def planned() -> Planned:
 
 
 @pytest.mark.parametrize("ending", [ending for ending in (*WRITERS, ".csv", ".json") if ending in READERS])
-def test_what_is_exported_is_read_again_and_validated_the_same(
-    ending: str, planned: Planned, tmp_path: Path
-) -> None:
+def test_what_is_exported_is_read_again_and_validated_the_same(ending: str, planned: Planned, tmp_path: Path) -> None:
     problem, trajectory = planned
     file = tmp_path / f"motion{ending}"
     for _ in range(2):  # a file that is there is replaced
@@ -184,9 +180,7 @@ def test_a_recording_that_unpacks_to_gigabytes_is_refused(
     refuse(tmp_path / name, r"m\.mcap has a chunk of 150,\d+ bytes; 100,000 are allowed")
 
 
-def test_a_motion_of_too_many_messages_is_refused(
-    planned: Planned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_motion_of_too_many_messages_is_refused(planned: Planned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_motion(*planned, tmp_path / "m.mcap")
     write_motion(*planned, tmp_path / "bag.rosbag2")
     monkeypatch.setattr(ros2, "check_chunks", lambda *given: None)
@@ -206,10 +200,7 @@ def test_a_disk_that_fills_up_is_one_line(planned: Planned, tmp_path: Path, endi
 
 
 def panda_record(**changes: Any) -> dict[str, Any]:
-    points = [
-        {"positions": START, "velocities": [0.0] * 7, "time_from_start": {"sec": t, "nanosec": 0}}
-        for t in (0, 1)
-    ]
+    points = [{"positions": START, "velocities": [0.0] * 7, "time_from_start": {"sec": t, "nanosec": 0}} for t in (0, 1)]
     return {"joint_names": [*NAMES], "points": points} | changes
 
 
@@ -471,9 +462,7 @@ def test_a_bag_that_cannot_be_replaced_stays(tmp_path: Path, monkeypatch: pytest
     assert read_motion(bag).joint_names == ARM.joint_names and [*tmp_path.iterdir()] == [bag]
 
 
-def test_two_exports_to_one_bag_do_not_share_a_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_exports_to_one_bag_do_not_share_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each deleted the half-written bag of the other."""
     bag = tmp_path / "m.rosbag2"
     to_message = ros2.to_message

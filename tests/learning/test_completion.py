@@ -93,9 +93,7 @@ def test_the_network_s_inputs() -> None:
     network = CompletionNetwork(SMALL)
     inputs = network.features(seen, behind)[0].reshape(7, 8, 28, 28, 16).permute(0, 2, 3, 4, 1)
     planes = [unfolded(plane[None])[0, ..., 0].numpy() for plane in inputs]
-    for plane, of in zip(
-        planes, (volume.occupied, volume.free, volume.shadow, volume.out_of_view), strict=False
-    ):
+    for plane, of in zip(planes, (volume.occupied, volume.free, volume.shadow, volume.out_of_view), strict=False):
         assert (plane == of).all() and of.any()
     np.testing.assert_allclose(planes[4], volume.behind / 0.5, atol=0.011)
     np.testing.assert_allclose(planes[5], voxel_centers()[..., 2], atol=1e-6)
@@ -165,9 +163,9 @@ def test_temperature_and_calibration() -> None:
     p = 1 / (1 + np.exp(-logits))
     assert completion.calibration_error(p, truth) < 0.01 < 0.1 < completion.calibration_error(p**3, truth)
     assert completion.average_precision(p, truth) == pytest.approx(completion.average_precision(p**3, truth))
-    assert completion.average_precision(
-        np.array([0.9, 0.8, 0.1], np.float32), np.array([True, False, True])
-    ) == (pytest.approx((1 + 2 / 3) / 2))
+    assert completion.average_precision(np.array([0.9, 0.8, 0.1], np.float32), np.array([True, False, True])) == (
+        pytest.approx((1 + 2 / 3) / 2)
+    )
 
 
 def test_nothing_is_predicted_beyond_reach() -> None:

@@ -32,10 +32,7 @@ SMALL = {
     "cross_attention": denoisers.CrossAttentionSettings(32, 2, 2, 48, 1),
     "unet": denoisers.UNetSettings(16, (1, 2, 2), 3, 32),
 }
-SMALL_ENCODERS = {
-    "points": PointsSettings(CODE, CODE // 3),
-    "point_autoencoder": replace(SMALL_ENCODER, code=CODE),
-}
+SMALL_ENCODERS = {"points": PointsSettings(CODE, CODE // 3), "point_autoencoder": replace(SMALL_ENCODER, code=CODE)}
 
 
 def denoiser(name: str, waypoints: int = 12, settings: object = None) -> Denoiser:
@@ -122,9 +119,7 @@ def test_unet_pads_and_crops():
         longer = denoiser("unet", waypoints + padding)
         longer.load_state_dict(network.state_dict())
         added = torch.cat([features, features[:, -1:].expand(-1, padding, -1)], 1)
-        torch.testing.assert_close(
-            network(features, level, condition), longer(added, level, condition)[:, :waypoints]
-        )
+        torch.testing.assert_close(network(features, level, condition), longer(added, level, condition)[:, :waypoints])
 
 
 @pytest.mark.parametrize(

@@ -115,14 +115,8 @@ def _described(folder: Path, field: str, change: dict) -> None:
         (lambda at: (at / "model.onnx").write_bytes(b"ONNX"), r"model\.onnx is damaged"),
         (lambda at: (at / "model.encoder.onnx").unlink(), r"model\.encoder\.onnx does not exist"),
         (lambda at: (at / "model.safetensors").unlink(), r"model\.safetensors does not exist"),
-        (
-            lambda at: _described(at, "onnx_sha256", {}),
-            "without the ONNX files .* train export",
-        ),
-        (
-            lambda at: _described(at, "settings", {"waypoints": 20}),
-            r"model\.json does not fit its ONNX",
-        ),
+        (lambda at: _described(at, "onnx_sha256", {}), "without the ONNX files .* train export"),
+        (lambda at: _described(at, "settings", {"waypoints": 20}), r"model\.json does not fit its ONNX"),
     ],
 )
 def test_damaged_files_give_one_line(folder: Path, tmp_path: Path, damage: Any, message: str) -> None:

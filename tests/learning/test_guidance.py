@@ -66,10 +66,7 @@ ALONE = {
 """Each cost as the only one, in steps of moderate size."""
 PANDA = load_robot("panda")
 CROWDED = CollisionChecker(
-    PANDA,
-    Scene(
-        [Sphere([0.45, 0.1, 0.5], 0.2), Box([0.0, 0.5, 0.4], [0.3, 0.2, 0.3]), Sphere([-0.4, -0.3, 0.4], 0.2)]
-    ),
+    PANDA, Scene([Sphere([0.45, 0.1, 0.5], 0.2), Box([0.0, 0.5, 0.4], [0.3, 0.2, 0.3]), Sphere([-0.4, -0.3, 0.4], 0.2)])
 )
 
 

@@ -17,13 +17,7 @@ from robotdiffuse.learning.denoisers import TransformerSettings
 from robotdiffuse.learning.denoisers.networks import MAX_UNFUSED_TOKENS, attend
 from robotdiffuse.learning.diffusion import SAMPLERS, NoiseSchedule, ScheduleSettings, noise_factor
 from robotdiffuse.learning.encoders.networks import chamfer, nearest
-from robotdiffuse.learning.motion_model import (
-    MAX_CLEARANCE,
-    GuideFn,
-    MotionModelSettings,
-    SamplingSettings,
-    link_clearances,
-)
+from robotdiffuse.learning.motion_model import MAX_CLEARANCE, GuideFn, MotionModelSettings, SamplingSettings, link_clearances
 from robotdiffuse.learning.motion_network import MotionNetwork, block_means
 from robotdiffuse.learning.training.config import STAGES, PlannerTraining
 from robotdiffuse.learning.weight_files import RobotIdentity
@@ -201,9 +195,7 @@ def test_means_of_white_noise_are_white():
 
 
 def test_a_denoiser_on_blocks_learns_all_waypoints():
-    settings = MotionModelSettings(
-        waypoints=38, target="absolute", clearance_features=False, denoiser_settings=SMALL
-    )
+    settings = MotionModelSettings(waypoints=38, target="absolute", clearance_features=False, denoiser_settings=SMALL)
     model = MotionNetwork(RobotIdentity.of(rd.load_robot("panda")), settings)
     torch.nn.init.normal_(model.denoiser.out.weight, std=0.1)
     inputs = torch.randn(3, 38, model.feature_count), torch.ones(3), torch.zeros(3, model.condition_count)

@@ -28,9 +28,7 @@ def best_predictor(schedule: NoiseSchedule) -> Callable[[np.ndarray, int], np.nd
     return predict
 
 
-def exact_moments(
-    name: str, schedule: NoiseSchedule, steps: int, eta: float
-) -> tuple[np.ndarray, np.ndarray]:
+def exact_moments(name: str, schedule: NoiseSchedule, steps: int, eta: float) -> tuple[np.ndarray, np.ndarray]:
     """Exact mean and covariance of the samples. A sample is affine in the noises that are drawn, so one
     sample without noise and one with a unit in each component of each draw determine both."""
     draws = 0
@@ -73,9 +71,7 @@ def test_calls_of_the_predictor(name, steps):
         predictions.append(rng.uniform(-1, 1, x.shape).astype(np.float32))
         return predictions[-1]
 
-    x = SAMPLERS.load(name)(
-        predict, schedule, lambda: rng.standard_normal((2, 3), dtype=np.float32), steps, 0.5
-    )
+    x = SAMPLERS.load(name)(predict, schedule, lambda: rng.standard_normal((2, 3), dtype=np.float32), steps, 0.5)
     assert x is predictions[-1] and x.dtype == np.float32
     assert levels == schedule.sampling_levels(steps)[:-1].tolist()
     assert np.isfinite(x).all()
@@ -118,8 +114,7 @@ def their_steps(levels: list[int], scheduler, variance_noise: bool, **settings) 
 
 
 @pytest.mark.parametrize(
-    ("name", "steps", "eta"),
-    [("ddpm", 200, 1.0), ("ddpm", 7, 1.0), ("ddim", 20, 0.0), ("ddim", 20, 1.0), ("ddim", 8, 0.5)],
+    ("name", "steps", "eta"), [("ddpm", 200, 1.0), ("ddpm", 7, 1.0), ("ddim", 20, 0.0), ("ddim", 20, 1.0), ("ddim", 8, 0.5)]
 )
 def test_against_diffusers(name, steps, eta):
     diffusers = pytest.importorskip("diffusers")

@@ -19,10 +19,7 @@ def test_a_pipe_and_a_link_to_a_device_are_not_read(name: str, tmp_path: Path) -
             os.mkfifo(tmp_path / file)
         else:
             (tmp_path / file).symlink_to("/dev/zero")
-    for read in (
-        lambda: read_description(tmp_path, "model"),
-        lambda: checked_bytes(tmp_path / "model.onnx", "", "model.json"),
-    ):
+    for read in (lambda: read_description(tmp_path, "model"), lambda: checked_bytes(tmp_path / "model.onnx", "", "model.json")):
         with pytest.raises(InputError, match="it is a device or a pipe"):
             read()
 
@@ -39,9 +36,7 @@ def test_a_network_reads_no_other_file(tmp_path: Path, monkeypatch: pytest.Monke
     number = onnx.TensorProto.FLOAT
     weights = onnx.numpy_helper.from_array(np.ones(4, np.float32), "w")
     x, y = (onnx.helper.make_tensor_value_info(name, number, [4]) for name in "xy")
-    graph = onnx.helper.make_graph(
-        [onnx.helper.make_node("Add", ["x", "w"], ["y"])], "g", [x], [y], [weights]
-    )
+    graph = onnx.helper.make_graph([onnx.helper.make_node("Add", ["x", "w"], ["y"])], "g", [x], [y], [weights])
     model = onnx.helper.make_model(graph, ir_version=10, opset_imports=[onnx.helper.make_opsetid("", 17)])
     assert OnnxNetwork(model.SerializeToString(), "inside.onnx").inputs == ("x",)
     onnx.external_data_helper.set_external_data(model.graph.initializer[0], "w.bin")

@@ -84,9 +84,7 @@ def test_a_calibration_that_is_off_is_named() -> None:
 
 
 def test_the_pose_is_estimated_from_views_of_the_arm() -> None:
-    configurations = [
-        HOME + turn for turn in ([0.0] * 7, [0.5, 0.2, 0, 0.4, 0, 0, 0], [-0.6, 0.4, 0, 0.5, 0, 0, 0])
-    ]
+    configurations = [HOME + turn for turn in ([0.0] * 7, [0.5, 0.2, 0, 0.4, 0, 0, 0], [-0.6, 0.4, 0, 0.5, 0, 0, 0])]
     off = T.copy()
     off[:3, 3] += [0.02, -0.015, 0.01]
     off[:3, :3] = Rotation.from_rotvec([0.02, -0.03, 0.02]).as_matrix() @ T[:3, :3]

@@ -28,9 +28,7 @@ def view_from(distance: float) -> rd.DepthView:
 @pytest.mark.parametrize("spread", (0.001, 0.0015, 0.004))
 @pytest.mark.parametrize("distance", (1.2, 2.5))
 @pytest.mark.parametrize("correlation", (0.0, 1.5, 2.5))
-def test_the_estimated_noise_is_that_of_the_sensor(
-    spread: float, distance: float, correlation: float
-) -> None:
+def test_the_estimated_noise_is_that_of_the_sensor(spread: float, distance: float, correlation: float) -> None:
     """Differences of neighboring pixels showed an eighth of noise that is correlated as recorded."""
     noise = DepthNoise(spread=spread, correlation=correlation)
     noisy = noise.applied(view_from(distance), np.random.default_rng(0))
@@ -69,9 +67,7 @@ def test_zeros_are_told_from_nothing_in_range() -> None:
     empty = empty_regions(hole, 2.0)
     assert empty is not None
     assert not (empty & (clean.depth < 1.9))[150:190, 100:160].any(), "surrounded: a hole"
-    assert empty_regions(np.where(np.arange(320) < 160, view.depth, 0.0), 2.0) is None, (
-        "half an image is lost"
-    )
+    assert empty_regions(np.where(np.arange(320) < 160, view.depth, 0.0), 2.0) is None, "half an image is lost"
     near = np.where(nothing, 0.0, 0.2 * clean.depth)
     assert empty_regions(near, 2.0) is None, "a surface too near to be measured"
     stated, silent = view, replace(view, range=None)

@@ -23,12 +23,7 @@ STATED = (0.005, float(np.radians(1.0)))
 K = (460.0, 460.0, 319.5, 239.5)
 BESIDE = looking_at(np.array([1.2, 1.0, 0.9]), np.array([0.2, 0.0, 0.4]))
 CAMERA = wrist_camera(PANDA)
-TURNS = [
-    [0.0] * 7,
-    [0.3, 0.2, 0, 0, 0, 0.3, 0],
-    [-0.4, 0.3, 0.2, 0.2, 0, -0.3, 0.5],
-    [0, 0.4, 0, 0.3, 0.4, 0.2, 0],
-]
+TURNS = [[0.0] * 7, [0.3, 0.2, 0, 0, 0, 0.3, 0], [-0.4, 0.3, 0.2, 0.2, 0, -0.3, 0.5], [0, 0.4, 0, 0.3, 0.4, 0.2, 0]]
 POINTS = np.stack(np.meshgrid((-0.5, 0.0, 0.5), (-0.5, 0.0, 0.5), (0.1, 0.8)), axis=-1).reshape(-1, 3)
 
 
@@ -64,9 +59,7 @@ def test_errors_of_poses_are_found_again(seed: int) -> None:
     first = poses.observe(off(standing, 10 + seed))
     error, stated = displaced(first, standing)
     before = displaced(off(standing, 10 + seed), standing)[1]
-    assert (error < stated).all() and stated.max() < 0.7 * before.max(), (
-        "by the arm and the floor in one image"
-    )
+    assert (error < stated).all() and stated.max() < 0.7 * before.max(), "by the arm and the floor in one image"
     for turn in TURNS:
         true = taken(PROBLEM, CAMERA, HOME + turn, NOISE, rng)
         error, stated = displaced(poses.observe(off(true, 20 + seed)), true)

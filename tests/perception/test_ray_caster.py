@@ -99,9 +99,7 @@ def test_pybullets_camera_sees_the_same(tmp_path: Path) -> None:
     focal = height / 2 / np.tan(field / 2)
     # PyBullet samples at the lower left corner of its pixels
     intrinsics = (focal, focal, width / 2, height / 2 - 1)
-    view = ray_cast(
-        rd.Scene([box, ball]), looking_at(np.array(eye), np.array(target)), intrinsics, (width, height)
-    )
+    view = ray_cast(rd.Scene([box, ball]), looking_at(np.array(eye), np.array(target)), intrinsics, (width, height))
     both = found & np.isfinite(view.depth)
     off = np.abs(image[both] - view.depth[both])
     assert both.sum() > 1500 and np.median(off) < 1e-3 and np.mean(off > 0.01) < 0.02, "but at edges"

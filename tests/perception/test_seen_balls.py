@@ -62,9 +62,7 @@ def test_balls_seen_through_are_those_with_nothing_in_any_of_their_pixels() -> N
     assert not (least & ~seen).any() and not (seen & ~most).any()
 
 
-@pytest.mark.parametrize(
-    ("lost", "seen"), [(0.6 * visibility.MAX_LOST_FRACTION, True), (0.6, False), (1.0, False)]
-)
+@pytest.mark.parametrize(("lost", "seen"), [(0.6 * visibility.MAX_LOST_FRACTION, True), (0.6, False), (1.0, False)])
 def test_pixels_without_a_return_show_nothing(lost: float, seen: bool) -> None:
     depth = np.where(RNG.random(SIZE[::-1]) < lost, 0.0, np.inf)
     inside = seen_in(np.full(SIZE[::-1], np.inf), radius=0.05)

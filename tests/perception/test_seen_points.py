@@ -127,10 +127,7 @@ def test_points_of_a_pose_that_may_be_off_are_larger_and_leave_start_and_goals_f
     distances = np.linalg.norm(points[:, None] - spheres[None, :, :3], axis=2) - spheres[:, 3]
     kept = np.concatenate([shape.points for shape in shapes])
     assert max(shape.point_radius for shape in shapes) == shown.POINT_RADIUS + error
-    assert (
-        len(kept)
-        == ((distances.min(axis=1) >= shown.MIN_POINT_RADIUS) | (distances.min(axis=1) < -error)).sum()
-    )
+    assert len(kept) == ((distances.min(axis=1) >= shown.MIN_POINT_RADIUS) | (distances.min(axis=1) < -error)).sum()
     apart = points[distances.min(axis=1) > 0]
     outside = shown.point_shapes(apart, PANDA, rd.Scene([]), START, START[None], np.full(len(apart), error))
     assert CollisionChecker(PANDA, rd.Scene(outside)).free(START[None])[0]

@@ -17,16 +17,7 @@ from robotdiffuse.perception.unknown_space import (
     explored_confidence,
     free_share,
 )
-from robotdiffuse.perception.voxel_grid import (
-    FINE,
-    FINE_SHAPE,
-    LOW,
-    SHAPE,
-    VOXEL,
-    heaviest_part,
-    surface,
-    sweep,
-)
+from robotdiffuse.perception.voxel_grid import FINE, FINE_SHAPE, LOW, SHAPE, VOXEL, heaviest_part, surface, sweep
 from robotdiffuse.robots.kinematics import placed_spheres
 
 PANDA = rd.load_robot("panda")

@@ -21,9 +21,7 @@ POST = rd.Scene([rd.Box([-0.7, 0.0, 0.0], [0.4, 0.05, 0.2], name="post")])
 """Where the stretched arm points at half a turn."""
 
 
-def planned(
-    planner: str, start: list[float], goal: object, scene: rd.Scene | None = None, **more: object
-) -> rd.Path:
+def planned(planner: str, start: list[float], goal: object, scene: rd.Scene | None = None, **more: object) -> rd.Path:
     problem = rd.Problem(ARM, scene or rd.Scene(), start, goal)  # type: ignore[arg-type]
     result = rd.load_planner(planner).plan(problem, time_limit=60.0, **more)  # type: ignore[arg-type]
     assert result.solved, result.reason
@@ -35,8 +33,7 @@ def planned(
 
 
 @pytest.mark.parametrize(
-    ("planner", "turns"),
-    [("rrt_connect", 0), ("aorrtc", -5), ("robotdiffuse", 1), ("shared_tree_rrt_star", 1)],
+    ("planner", "turns"), [("rrt_connect", 0), ("aorrtc", -5), ("robotdiffuse", 1), ("shared_tree_rrt_star", 1)]
 )
 def test_from_3_to_minus_3_is_a_short_way(planner: str, turns: int) -> None:
     """0.28 rad across half a turn, from wherever the joint really is; it was 6 rad."""

@@ -18,9 +18,7 @@ GOAL = np.array([0.9, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 WALL = Scene([Box([0.75, 0.0, 0.35], [0.05, 1.2, 0.7])])
 """Ahead of the arm: a camera beyond sees nothing of what the arm crosses."""
 INTRINSICS = (150.0, 150.0, 79.5, 59.5)
-BEYOND, ABOVE = (
-    looking_at(np.array(at), np.array([0.3, 0.0, 0.3])) for at in ([1.9, 0.0, 0.35], [0.3, 0.0, 1.9])
-)
+BEYOND, ABOVE = (looking_at(np.array(at), np.array([0.3, 0.0, 0.3])) for at in ([1.9, 0.0, 0.35], [0.3, 0.0, 1.9]))
 
 
 @pytest.fixture(scope="module")
@@ -73,10 +71,7 @@ def test_the_arm_hides_what_is_behind_it() -> None:
     seen = []
     expected = []
     for i in np.flatnonzero((abs(rows - 240) < 239) & (abs(columns - 320) < 319)):
-        around = np.s_[
-            max(rows[i] - ARM_CELL, 0) : rows[i] + ARM_CELL,
-            max(columns[i] - ARM_CELL, 0) : columns[i] + ARM_CELL,
-        ]
+        around = np.s_[max(rows[i] - ARM_CELL, 0) : rows[i] + ARM_CELL, max(columns[i] - ARM_CELL, 0) : columns[i] + ARM_CELL]
         behind = arm[around] < z[i] - 0.2
         if behind.all() or np.isinf(arm[around]).all():
             one = voxels[i : i + 1], np.ones(1, np.float32), filled, low, edge

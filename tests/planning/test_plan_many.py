@@ -82,9 +82,7 @@ for result in rd.plan_many(problems, "rrt_connect", workers=2):
 """
 
 
-@pytest.mark.parametrize(
-    "others", ["", "raise SystemExit", pytest.param("import os; os._exit(0)", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("others", ["", "raise SystemExit", pytest.param("import os; os._exit(0)", marks=pytest.mark.slow)])
 def test_a_script_that_processes_cannot_import_is_an_error(others: str, tmp_path: Path) -> None:
     """It hung: what a process is given as it starts, robots, does not fit a pipe that nobody reads."""
     script = tmp_path / "script.py"

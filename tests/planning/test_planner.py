@@ -56,9 +56,7 @@ def test_a_goal_in_collision_is_reported_and_time_limit_and_seed_are_checked(nam
 def test_weights_are_for_learned_planners_alone(name: str) -> None:
     learned = PLANNERS[name].kind != SEARCH
     with pytest.raises(rd.InputError, match="nowhere" if learned else "has no weights"):
-        rd.load_planner(name, weights="nowhere").plan(
-            rd.Problem(rd.load_robot("panda"), rd.Scene([]), START, GOAL)
-        )
+        rd.load_planner(name, weights="nowhere").plan(rd.Problem(rd.load_robot("panda"), rd.Scene([]), START, GOAL))
 
 
 def test_plan_takes_the_fields_of_a_request() -> None:

@@ -326,11 +326,7 @@ def test_of_several_goals_no_more_are_tried_late(monkeypatch: pytest.MonkeyPatch
 def test_the_goal_index_names_the_goal_that_is_reached() -> None:
     robot = rd.load_robot("panda")
     start, near, far = apart(robot, 3)
-    for goal, index in (
-        ([far, start], 1),
-        (rd.AnyGoal((rd.JointGoal([far, near]), rd.JointGoal(start))), 1),
-        (start, 0),
-    ):
+    for goal, index in (([far, start], 1), (rd.AnyGoal((rd.JointGoal([far, near]), rd.JointGoal(start))), 1), (start, 0)):
         assert rd.plan(rd.Problem(robot, FREE, start, goal)).goal_index == index
     # poses 2 mm apart: both are within the validator's centimeter
     T = link_pose(robot, near, robot.tip)

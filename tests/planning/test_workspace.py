@@ -119,9 +119,7 @@ def test_a_line_to_a_goal_with_tolerances_turns_no_more_than_it_must() -> None:
     assert rd.verify(problem, less.trajectory).valid
 
 
-@pytest.mark.parametrize(
-    ("way", "turn", "angle"), [(0.0, 0.0, None), (0.0, 0.5, 0.05), (0.0, 0.5, None), (0.0005, 0.0, 0.05)]
-)
+@pytest.mark.parametrize(("way", "turn", "angle"), [(0.0, 0.0, None), (0.0, 0.5, 0.05), (0.0, 0.5, None), (0.0005, 0.0, 0.05)])
 def test_short_lines_and_turns_about_the_tool_point(way: float, turn: float, angle: float | None) -> None:
     space = panda()
     end = space.pose(READY) @ rd.pose([0.0, 0.0, way], rpy=[0.0, 0.0, turn])

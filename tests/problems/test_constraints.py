@@ -26,9 +26,7 @@ HAND = "panda_hand"
 AT = link_pose(PANDA, START, HAND)[:3, 3]
 EACH: list[Constraint] = [
     rd.AxisCone(HAND, [0, 0.1, 1], [0, 0, -2], 0.3),
-    rd.PositionBox(
-        HAND, [-0.2, -0.2, -0.3], [0.3, 0.2, 0.3], transform(AT, rotation_about(AT / np.linalg.norm(AT), 0.3))
-    ),
+    rd.PositionBox(HAND, [-0.2, -0.2, -0.3], [0.3, 0.2, 0.3], transform(AT, rotation_about(AT / np.linalg.norm(AT), 0.3))),
     rd.OnPlane("panda_link6", [0.1, 0.2, 0.6], [0.1, 0.2, 1.0], 0.05),
     rd.OnLine(HAND, AT, [0.2, 1, 0.1], 0.04),
     rd.CartesianLine("panda_link7", 0.05, 0.2, 0.3),
@@ -166,14 +164,9 @@ BAD: list[tuple[Callable[[], object], str]] = [
     (lambda: problem(rd.OnPlane("panda_link0", [0, 0, 0], [0, 0, 1], 0.1)), "no planned joint moves"),
     (lambda: replace(problem(), constraints="upright"), "constraints is 'upright'"),  # type: ignore[arg-type]
     (lambda: replace(problem(EACH[4]), waypoints=(GOAL,)), "cartesian_line cannot be combined"),  # type: ignore[arg-type]
+    (lambda: PathConstraints(replace(problem(EACH[4]), goal=[START, GOAL])), "2 goal configurations .* differ"),  # type: ignore[arg-type]
     (
-        lambda: PathConstraints(replace(problem(EACH[4]), goal=[START, GOAL])),
-        "2 goal configurations .* differ",
-    ),  # type: ignore[arg-type]
-    (
-        lambda: PathConstraints(
-            replace(problem(EACH[4]), goal=rd.PoseGoal(HAND, link_pose(PANDA, GOAL, HAND), [0.1, 0, 0]))
-        ),
+        lambda: PathConstraints(replace(problem(EACH[4]), goal=rd.PoseGoal(HAND, link_pose(PANDA, GOAL, HAND), [0.1, 0, 0]))),
         "the goal must determine the pose of this link, but the goal has tolerances",
     ),
 ]

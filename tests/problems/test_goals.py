@@ -23,9 +23,7 @@ START = [-0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]
 MIDDLE = [0, -0.9, 0, -2.6, 0, 1.8, 0.2]
 END = [0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]
 POST = rd.Cylinder([0.5, 0.0, 0.3], 0.04, 0.6, name="post")
-TABLE = {
-    "box": {"center": [0.55, 0, 0.1], "size": [0.5, 1.0, 0.2], "wxyz": [0.9, 0, 0, 0.2], "name": "table"}
-}
+TABLE = {"box": {"center": [0.55, 0, 0.1], "size": [0.5, 1.0, 0.2], "wxyz": [0.9, 0, 0, 0.2], "name": "table"}}
 DOWN = transform(np.array([0.45, 0.3, 0.35]), rotation_from_rpy(np.pi, 0.0, 0.0))
 
 
@@ -39,9 +37,7 @@ def test_rpy_of_a_rotation_is_scipys() -> None:
 def off(goal: rd.PoseGoal, xyz: Any, rpy: Any) -> bool:
     """Whether a pose that far from the goal's is off, told by a goal that is as far the other way."""
     q = np.array(START)
-    T = link_pose(ROBOT, q, goal.frame) @ inverse(
-        transform(np.array(xyz, float), rotation_from_rpy(*map(float, rpy)))
-    )
+    T = link_pose(ROBOT, q, goal.frame) @ inverse(transform(np.array(xyz, float), rotation_from_rpy(*map(float, rpy))))
     moved = rd.PoseGoal(goal.frame, T, goal.xyz_tolerance, goal.rpy_tolerance)
     return goal_error(ROBOT, moved, q) is not None
 
@@ -131,15 +127,11 @@ def test_blended_waypoints_are_passed_within_their_blend_without_a_stop(blend: f
         found = verify_trajectory(replace(problem, blend=closer), one).violation
         assert found is not None and found.message.startswith("the motion does not pass within ")
     found = verify_trajectory(stopped, one).violation
-    assert found is not None and found.message == (
-        "the motion does not stop at waypoints[0] after those before it"
-    )
+    assert found is not None and found.message == ("the motion does not stop at waypoints[0] after those before it")
 
 
 def test_each_waypoint_has_its_own_blend() -> None:
-    problem = rd.Problem(
-        ROBOT, rd.Scene([POST]), START, END, waypoints=[MIDDLE, START, MIDDLE], blend=[0, 0.1, 0]
-    )
+    problem = rd.Problem(ROBOT, rd.Scene([POST]), START, END, waypoints=[MIDDLE, START, MIDDLE], blend=[0, 0.1, 0])
     result = rd.plan(problem, time_limit=10.0)
     assert result.trajectory is not None and verify_trajectory(problem, result.trajectory).valid
     assert stops(result.trajectory, np.array(MIDDLE)) and "4 segments" in result.reason
@@ -158,9 +150,7 @@ def test_a_waypoint_between_obstacles_is_blended_no_further_than_is_free() -> No
 
 
 def test_the_leg_that_fails_is_named() -> None:
-    blocked = rd.PoseGoal(
-        "panda_hand", transform(np.array([0.5, 0.0, 0.35]), rotation_from_rpy(np.pi, 0.0, 0.0))
-    )
+    blocked = rd.PoseGoal("panda_hand", transform(np.array([0.5, 0.0, 0.35]), rotation_from_rpy(np.pi, 0.0, 0.0)))
     problem = rd.Problem(ROBOT, rd.Scene([POST]), START, END, waypoints=[MIDDLE, blocked])
     result = rd.plan(problem, time_limit=10.0)
     assert result.status is rd.Status.INVALID_GOAL and result.reason.startswith("segment 2 of 3: all")
@@ -172,9 +162,7 @@ def test_files_keep_goals_and_waypoints(tmp_path: Path) -> None:
         "robot": "panda",
         "scene": [TABLE],
         "start": START,
-        "goal": {
-            "any": [{"pose": pose | {"relative_to": "table", "rpy_tolerance": [0, 0, 3.1]}}, {"joints": END}]
-        },
+        "goal": {"any": [{"pose": pose | {"relative_to": "table", "rpy_tolerance": [0, 0, 3.1]}}, {"joints": END}]},
         "waypoints": [{"joints": MIDDLE}, {"pose": pose | {"xyz_tolerance": [0.1, 0.1, 0.0]}}],
         "blend": [0.0, 0.05],
     }
@@ -204,10 +192,7 @@ WRONG = {
     "any": ({"goal": {"any": [{"pose": POSE}, {"joint": END}]}}, r"unknown field of goal.any\[1\]: 'joint'"),
     "waypoints": ({"waypoints": {"joints": END}}, "waypoints is .*; it must be a list of goals"),
     "blend": ({"blend": 0.1}, "blend is 0.1; there are no waypoints"),
-    "blends": (
-        {"waypoints": [{"joints": END}], "blend": [0.1, 0.1]},
-        r"blend is \[0.1, 0.1\]; it must be one",
-    ),
+    "blends": ({"waypoints": [{"joints": END}], "blend": [0.1, 0.1]}, r"blend is \[0.1, 0.1\]; it must be one"),
     "little blend": ({"waypoints": [{"joints": END}], "blend": 1e-9}, "blend is 1e-09; .*from 0.001 to 10"),
 }
 

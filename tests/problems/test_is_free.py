@@ -101,9 +101,7 @@ def test_obstacles_in_millimeters_are_noted(shape: rd.Box, text: str) -> None:
 
 def test_scenes_in_meters_have_no_notes_on_units() -> None:
     floor = rd.Box([0, 0, -0.6], [30, 30, 1], name="floor")
-    assert (
-        _notes() == _notes(floor) == _notes(rd.Sphere([0.5, 0.3, 0.6], 0.1), rd.Sphere([0, 9, 0], 0.1)) == ()
-    )
+    assert _notes() == _notes(floor) == _notes(rd.Sphere([0.5, 0.3, 0.6], 0.1), rd.Sphere([0, 9, 0], 0.1)) == ()
     assert _notes(rd.PointCloud(CUBE), rd.PointCloud(np.zeros((0, 3)))) == ()
 
 

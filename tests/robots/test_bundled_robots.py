@@ -58,9 +58,7 @@ def test_joints_that_turn_twice_are_drawn_without_needless_turns() -> None:
     least = robot.unwound(q)
     assert (np.abs(least) <= np.pi + 1e-9).all() and (least != q).any()
     for one, other in zip(q[:5], least[:5], strict=True):
-        np.testing.assert_allclose(
-            link_pose(robot, one, "tool0"), link_pose(robot, other, "tool0"), atol=1e-9
-        )
+        np.testing.assert_allclose(link_pose(robot, one, "tool0"), link_pose(robot, other, "tool0"), atol=1e-9)
     panda = load_robot("panda")
     middle = 0.5 * (panda.lower + panda.upper)
     assert np.array_equal(panda.unwound(middle), middle)

@@ -87,14 +87,10 @@ def test_position_only(seed: int, x: float, y: float, z: float) -> None:
     assert errors(robot, "panda_link8", T, q)[0] <= 2e-6
 
 
-@pytest.mark.parametrize(
-    "xyz", [(5.0, 0.0, 0.5), (0.85, 0.0, 0.6), (0.0, 0.0, -0.9)], ids=["far", "just too far", "below"]
-)
+@pytest.mark.parametrize("xyz", [(5.0, 0.0, 0.5), (0.85, 0.0, 0.6), (0.0, 0.0, -0.9)], ids=["far", "just too far", "below"])
 def test_unreachable_poses_give_nothing(xyz: tuple[float, float, float]) -> None:
     T = transform(np.array(xyz))
-    assert inverse_kinematics(
-        example_robot("panda"), "panda_hand", T, rng=np.random.default_rng(0)
-    ).shape == (0, 7)
+    assert inverse_kinematics(example_robot("panda"), "panda_hand", T, rng=np.random.default_rng(0)).shape == (0, 7)
 
 
 def test_a_narrow_range_of_acceptance_is_found() -> None:

@@ -34,9 +34,7 @@ class PinocchioArm:
         for name, value in values.items():
             joint = self.model.joints[self.model.getJointId(name)]
             # Pinocchio describes a continuous joint by the cosine and sine of its angle.
-            full[joint.idx_q : joint.idx_q + joint.nq] = (
-                value if joint.nq == 1 else [np.cos(value), np.sin(value)]
-            )
+            full[joint.idx_q : joint.idx_q + joint.nq] = value if joint.nq == 1 else [np.cos(value), np.sin(value)]
         self.pin.computeJointJacobians(self.model, self.data, full)
         self.pin.updateFramePlacements(self.model, self.data)
         self.T_base_world = self.frame(self.robot.base).inverse()
@@ -65,9 +63,7 @@ def test_planar_arm_by_hand() -> None:
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
 @pytest.mark.parametrize("name", TIPS)
-def test_frames_of_the_networks_are_those_of_the_robot(
-    name: str, dtype: torch.dtype, tolerance: float
-) -> None:
+def test_frames_of_the_networks_are_those_of_the_robot(name: str, dtype: torch.dtype, tolerance: float) -> None:
     robot = example_robot(name)
     q = configurations(robot, 20)
     T_base_frame = ForwardKinematics(robot, dtype)(q).numpy()
@@ -100,9 +96,7 @@ def test_jacobian_matches_finite_differences(name: str) -> None:
     q = configurations(robot, 3).numpy()
     step = 1e-6
     for link in robot.link_names:
-        before, after = (
-            np.stack([robot.fk(row + sign * step * np.eye(robot.dof), link) for row in q]) for sign in (-1, 1)
-        )
+        before, after = (np.stack([robot.fk(row + sign * step * np.eye(robot.dof), link) for row in q]) for sign in (-1, 1))
         linear = (after - before)[..., :3, 3] / (2 * step)
         turn = (after[..., :3, :3] @ before[..., :3, :3].swapaxes(-1, -2)) / (4 * step)
         skew = turn - turn.swapaxes(-1, -2)
@@ -137,9 +131,7 @@ def with_spheres(robot: Robot) -> Robot:
     """The robot with three random spheres on each link but the second, which has none."""
     rng = np.random.default_rng(5)
     links = [link for link in robot.link_names if link != robot.link_names[1]]
-    spheres = {
-        link: np.hstack([rng.uniform(-0.1, 0.1, (3, 3)), rng.uniform(0, 0.05, (3, 1))]) for link in links
-    }
+    spheres = {link: np.hstack([rng.uniform(-0.1, 0.1, (3, 3)), rng.uniform(0, 0.05, (3, 1))]) for link in links}
     return replace(robot, spheres=spheres)
 
 
@@ -154,9 +146,7 @@ def sampled_radii(robot: Robot, count: int) -> np.ndarray:
         last = robot.link_frame(link)
         T_base_link = frames[:, last] @ robot.T_frame_link(link)
         spheres = robot.spheres[link]
-        points = (
-            np.einsum("nik,sk->nsi", T_base_link[:, :3, :3], spheres[:, :3]) + T_base_link[:, None, :3, 3]
-        )
+        points = np.einsum("nik,sk->nsi", T_base_link[:, :3, :3], spheres[:, :3]) + T_base_link[:, None, :3, 3]
         for j in robot.chain(link):
             axis = frames[:, j + 1, :3, 2]
             origin = frames[:, j + 1, :3, 3]

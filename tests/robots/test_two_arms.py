@@ -68,9 +68,7 @@ def test_groups_of_an_srdf_may_have_several_chains(tmp_path: Path) -> None:
     assert robot.tips == ("left_4_link", "right_3_link") and robot.locked == {"right_4": 0.0}
     robot = read_urdf(written(tmp_path, *PARTS), group="some", srdf=srdf)
     assert robot.joint_names == ("left_1", "left_3", "right_2") and robot.parents.tolist() == [0, 1, 0]
-    with pytest.raises(
-        rd.InputError, match=r"right_1, right_2, right_3 of group both_arms do not lead to left_4_link"
-    ):
+    with pytest.raises(rd.InputError, match=r"right_1, right_2, right_3 of group both_arms do not lead to left_4_link"):
         read_urdf(written(tmp_path, *PARTS), group="both_arms", srdf=srdf, tip="left_4_link")
 
 
@@ -113,9 +111,7 @@ def test_the_other_arm_keeps_its_values_in_inverse_kinematics() -> None:
     assert len({*found[:, 6]}) == len(found)  # the joint after the link is random
 
 
-@pytest.mark.parametrize(
-    "planner", [pytest.param("rrt_connect", marks=pytest.mark.slow), "aorrtc", "robotdiffuse"]
-)
+@pytest.mark.parametrize("planner", [pytest.param("rrt_connect", marks=pytest.mark.slow), "aorrtc", "robotdiffuse"])
 def test_planners_move_both_arms_past_each_other(planner: str) -> None:
     robot = two_arms()
     start, goal = _crossing(robot)
@@ -144,9 +140,7 @@ def test_what_one_arm_keeps_is_not_loosened_by_the_other() -> None:
     plane = rd.OnPlane("right_hand", point=[0.0, 0.0, 0.5], normal=[0.0, 0.6, 0.8], tolerance=5.0)
     ends = rng.uniform(robot.lower, robot.upper, (2, robot.dof))
     q = np.linspace(ends[0], ends[1], 12)
-    problem = rd.Problem(
-        robot=robot, scene=rd.Scene(), start=q[0], goal=rd.JointGoal(q[-1:]), constraints=[plane]
-    )
+    problem = rd.Problem(robot=robot, scene=rd.Scene(), start=q[0], goal=rd.JointGoal(q[-1:]), constraints=[plane])
     (bounds,) = (found.bounds for found in constraint_bounds(problem, q, 0.0))
     heights = [
         abs((link_pose(robot, a + share * (b - a), "right_hand")[:3, 3] - plane.point) @ plane.normal)

@@ -103,13 +103,9 @@ def test_held_objects_are_links() -> None:
 
 
 def test_unknown_names_are_errors_with_the_known_ones() -> None:
-    with pytest.raises(
-        rd.InputError, match=r"unknown obstacle in allowed_contacts: 'cup'; known: ball, wall"
-    ):
+    with pytest.raises(rd.InputError, match=r"unknown obstacle in allowed_contacts: 'cup'; known: ball, wall"):
         rd.Scene([BALL, WALL], {"cup": "all"})
-    with pytest.raises(
-        rd.InputError, match=r"unknown link in allowed_contacts of ball: 'l9'; known: .*l1, l2"
-    ):
+    with pytest.raises(rd.InputError, match=r"unknown link in allowed_contacts of ball: 'l9'; known: .*l1, l2"):
         rd.Problem(box_arm(), rd.Scene([BALL], {"ball": ["l9"]}), [0, 0, 1.0], [0, 0, -1.0])
     for wrong in ([["ball"]], "ball", 3, {"ball": "l3"}, {"ball": 3}, {"ball": [3]}, {3: "all"}):
         with pytest.raises(rd.InputError, match="allowed_contacts"):
@@ -137,9 +133,7 @@ def test_moved_attached_and_detached_scenes_keep_what_remains() -> None:
 
 def test_allowed_contacts_come_back_from_files(tmp_path: Path) -> None:
     problem = grasp("box", {"mug": FINGERS, "ball": "all"})
-    assert (
-        problem_from_record(problem_record(problem)).scene.allowed_contacts == problem.scene.allowed_contacts
-    )
+    assert problem_from_record(problem_record(problem)).scene.allowed_contacts == problem.scene.allowed_contacts
     save_problem(problem, tmp_path / "grasp.yaml")
     text = (tmp_path / "grasp.yaml").read_text()
     assert "ball: all" in text

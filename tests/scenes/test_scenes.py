@@ -148,18 +148,13 @@ def test_wrong_shapes(make: Callable[[], object], message: str) -> None:
     assert "\n" not in str(raised.value)
 
 
-@given(
-    arrays(np.float64, st.tuples(st.integers(0, 30), st.just(3)), elements=st.sampled_from([-0.0, 0.0, 1.5]))
-)
+@given(arrays(np.float64, st.tuples(st.integers(0, 30), st.just(3)), elements=st.sampled_from([-0.0, 0.0, 1.5])))
 def test_distinct_points_are_the_first_of_each_in_the_old_order(points: np.ndarray) -> None:
     first = [row for i, row in enumerate(points) if not (points[:i] == row).all(axis=1).any()]
     assert np.array_equal(distinct(points), np.array(first).reshape(-1, 3))
 
 
-@given(
-    st.lists(st.tuples(*[st.floats(-3, 3, width=32)] * 3), max_size=60),
-    st.sampled_from([1e-6, 0.01, 0.5, 10.0]),
-)
+@given(st.lists(st.tuples(*[st.floats(-3, 3, width=32)] * 3), max_size=60), st.sampled_from([1e-6, 0.01, 0.5, 10.0]))
 def test_thinning_keeps_one_point_of_each_cell(rows: list[tuple[float, float, float]], voxel: float) -> None:
     points = np.array(rows, np.float64).reshape(-1, 3)
     kept = voxel_thin(points, voxel)
@@ -320,11 +315,7 @@ PACKED = PCD.format(n=10**9, data="binary_compressed").encode() + struct.pack("<
         ("cloud.xyz", b"1 2 3\n4 five 6\n", "cannot be read"),
         ("cloud.pcd", PCD.format(n=1, data="zipped").encode(), "stored as 'zipped'"),
         ("cloud.pcd", PACKED, "unpacks to 40 bytes, not to 1,000,000,000 points"),
-        (
-            "cloud.pcd",
-            PCD.replace("x y z", "i j k").format(n=1, data="ascii").encode(),
-            "must have x, y and z",
-        ),
+        ("cloud.pcd", PCD.replace("x y z", "i j k").format(n=1, data="ascii").encode(), "must have x, y and z"),
     ],
 )
 def test_wrong_point_files(name: str, content: bytes | None, message: str, tmp_path: Path) -> None:
@@ -360,10 +351,7 @@ def test_scene_entries_are_read_back_exactly(tmp_path: Path) -> None:
 def test_shapes_from_files_are_written_as_names_of_files(tmp_path: Path) -> None:
     trimesh.creation.box([1, 2, 3]).export(tmp_path / "box.stl")
     np.save(tmp_path / "cloud.npy", [[0.1, 0.2, np.nan], [1, 2, 3]])
-    entries = [
-        {"mesh": {"file": "box.stl", "xyz": [0, 0, 1]}},
-        {"point_cloud": {"file": "cloud.npy", "point_radius": 0.02}},
-    ]
+    entries = [{"mesh": {"file": "box.stl", "xyz": [0, 0, 1]}}, {"point_cloud": {"file": "cloud.npy", "point_radius": 0.02}}]
     scene, notes = read_scene(entries, tmp_path)
     assert len(notes) == 1 and "1 of 2 points" in notes[0]
     written = scene_entries(scene, tmp_path)

@@ -45,9 +45,7 @@ CASES = {
     "a huge head": (b"GET / HTTP/1.1\r\n" + RIGHT + b"X: " + b"y" * 100_000, 400, "head is too large"),
     "a slash more": (b"GET /robots/ HTTP/1.1\r\n" + RIGHT + b"\r\n", 404, "there is no '/robots/'"),
     "a damaged chunk": (
-        b"POST /plan HTTP/1.1\r\n"
-        + RIGHT
-        + b"Content-Type: application/json\r\nTransfer-Encoding: chunked\r\n\r\n"
+        b"POST /plan HTTP/1.1\r\n" + RIGHT + b"Content-Type: application/json\r\nTransfer-Encoding: chunked\r\n\r\n"
         b"0x5\r\n{}\r\n",
         400,
         "not an HTTP/1.1 request",
@@ -165,9 +163,7 @@ def test_bytes_after_the_last_request_do_not_cut_its_answer_off(head: bytes) -> 
     assert written.startswith(b"HTTP/1.1 200") and b"late" in written and closed
 
 
-def test_a_cancelled_call_is_left_before_it_begins_and_when_it_checks_its_time(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_cancelled_call_is_left_before_it_begins_and_when_it_checks_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """A call cancelled while its worker was still reading it went on planning, and the worker was killed. A
     signal handler raised the exception anywhere in the call; inside a callback of compiled code it killed the
     worker."""

@@ -138,21 +138,14 @@ def test_a_batch_is_answered_line_by_line_in_order(server: httpx.Client) -> None
         ("/verify", {"problem": problem(), "path": {"joint_names": JOINTS}}, 400, "path has no positions"),
         ("/verify", {"problem": problem(), "path": FAR}, 400, "its numbers must be finite and within"),
         ("/plan", b" " * (2**21 + 1), 413, "it may have 2097152 bytes"),
-        (
-            "/plan",
-            {"problem": problem(constraints=[CONE] * 5000)},
-            400,
-            "constraints has 5000 entries; .* 50$",
-        ),
+        ("/plan", {"problem": problem(constraints=[CONE] * 5000)}, 400, "constraints has 5000 entries; .* 50$"),
         ("/plan", {"problem": problem(waypoints=[GOAL] * 1000)}, 400, "waypoints has 1000 entries; .* 200$"),
         ("/plan", {"problem": problem(goal={"any": [GOAL] * 2000})}, 400, "goal has 2000 entries; .* 1000$"),
         ("/verify", {"problem": problem(), "path": LONG}, 400, "positions has 100001 rows; .* 100000$"),
         ("/plan", asked(3, rate=1e5), 400, "an answer may have 20000 rows"),
     ],
 )
-def test_wrong_requests_are_one_line(
-    server: httpx.Client, path: str, body: Any, code: int, message: str
-) -> None:
+def test_wrong_requests_are_one_line(server: httpx.Client, path: str, body: Any, code: int, message: str) -> None:
     """5,000 constraints kept a worker busy for 29 s."""
     content = body if isinstance(body, bytes) else json.dumps(body)
     answer = server.post(path, content=content, headers=JSON)
@@ -237,19 +230,13 @@ def test_a_request_beyond_its_time_limit_is_stopped(server: httpx.Client) -> Non
 
 def test_large_requests_take_little_time(server: httpx.Client) -> None:
     keys = ", ".join(f'"k{i}": 0' for i in range(60_000))
-    for body in (
-        f'{{{keys}, "k0": 1}}',
-        '"' + "[{" * 500_000,
-        '{"problem": {"goal": "' + "\\u00e9" * 150_000,
-    ):
+    for body in (f'{{{keys}, "k0": 1}}', '"' + "[{" * 500_000, '{"problem": {"goal": "' + "\\u00e9" * 150_000):
         assert server.post("/plan", content=body, headers=JSON, timeout=PROMPT).status_code == 400
 
 
 def test_slow_bodies_take_no_place_in_the_queue(server: httpx.Client) -> None:
     """Twenty clients that sent a byte a second filled the queue."""
-    head = (
-        b"POST /plan HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 99\r\n"
-    )
+    head = b"POST /plan HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 99\r\n"
     address = server.base_url.host, server.base_url.port or 0
     with ExitStack() as stack:
         slow = [stack.enter_context(socket.create_connection(address, 60.0)) for _ in range(20)]
@@ -274,12 +261,8 @@ def test_each_request_is_logged() -> None:
     assert re.search(r" 127\.0\.0\.1:\d+ GET /nothing%0Ahere 404 \d+\.\d{3} s -$", nothing)
 
 
-@pytest.mark.parametrize(
-    ("seed", "line"), [(RAISES, "ValueError: no such thing"), (EXITS, "SystemExit: no license")]
-)
-def test_a_planner_that_fails_stops_neither_server_nor_worker(
-    server: httpx.Client, seed: int, line: str
-) -> None:
+@pytest.mark.parametrize(("seed", "line"), [(RAISES, "ValueError: no such thing"), (EXITS, "SystemExit: no license")])
+def test_a_planner_that_fails_stops_neither_server_nor_worker(server: httpx.Client, seed: int, line: str) -> None:
     """Its SystemExit reached the server's event loop and stopped it."""
     lost = gauge(server, "workers_lost_total")
     answer = server.post("/plan", json=asked(seed, "faulty"))
@@ -351,10 +334,7 @@ def test_a_worker_that_holds_too_much_memory_is_replaced_between_requests() -> N
 
 @pytest.mark.slow
 def test_it_stops_gracefully_and_leaves_no_worker() -> None:
-    with (
-        serving("--workers", "1", "--max-time-limit", "60") as (client, process),
-        ThreadPoolExecutor(2) as threads,
-    ):
+    with serving("--workers", "1", "--max-time-limit", "60") as (client, process), ThreadPoolExecutor(2) as threads:
         workers = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True).stdout
         slow = asked(planner="aorrtc", time_limit=2.0, until="time_limit")
         first = threads.submit(client.post, "/plan", json=slow)

@@ -115,9 +115,7 @@ def result_file(folder: FilePath, scene: rd.Scene) -> str:
     goal = PANDA_START + 0.2
     rows = rd.Path(robot.joint_names, np.stack([PANDA_START, goal]))
     trajectory = motion(robot, PANDA_START, goal)
-    result = rd.PlanResult(
-        rd.Status.SOLVED, "by hand", "none", "panda", 0.0, 0, path=rows, trajectory=trajectory
-    )
+    result = rd.PlanResult(rd.Status.SOLVED, "by hand", "none", "panda", 0.0, 0, path=rows, trajectory=trajectory)
     result.save(folder / "result.json", problem_record(rd.Problem(robot, scene, PANDA_START, goal)))
     return str(folder / "result.json")
 
@@ -173,9 +171,7 @@ def test_moving_obstacles_are_contacts_where_the_validator_refuses_the_motion() 
     trajectory = motion(robot, PANDA_START, end)
     free = []
     for side in (1, -1):  # meets the arm, and keeps away from it
-        ball = rd.MovingObstacle(
-            rd.Sphere([0.55, side * 0.45, 0.5], 0.12, name="ball"), velocity=[0, -0.3, 0]
-        )
+        ball = rd.MovingObstacle(rd.Sphere([0.55, side * 0.45, 0.5], 0.12, name="ball"), velocity=[0, -0.3, 0])
         problem = rd.Problem(robot, rd.Scene(), PANDA_START, end, moving=[ball])
         report = rd.verify(problem, trajectory)
         run = replay(robot, rd.Scene(), trajectory, moving=problem.moving)

@@ -36,8 +36,7 @@ def far_pairs_only(robot: rd.Robot) -> rd.Robot:
 
 
 @pytest.mark.parametrize(
-    ("name", "locked"),
-    [("panda", {}), ("xarm7", {}), ("panda", {"panda_joint2": 0.7, "panda_finger_joint1": 0.065})],
+    ("name", "locked"), [("panda", {}), ("xarm7", {}), ("panda", {"panda_joint2": 0.7, "panda_finger_joint1": 0.065})]
 )
 def test_distances_agree_with_coal(name: str, locked: dict[str, float]) -> None:
     robot = far_pairs_only(example_robot(name).with_locked(locked))

@@ -29,9 +29,7 @@ NO_JERK_LIMIT = TimingSettings(jerk=np.inf, sample_time=1e-4)
 def arm(velocity: tuple[float, ...] = VELOCITY, acceleration: tuple[float, ...] = ACCELERATION) -> rd.Robot:
     """A chain of revolute joints; timing uses only its limits."""
     joints = tuple(
-        Joint(
-            f"j{i}", "revolute", f"l{i}", f"l{i + 1}", np.eye(4), np.array([0.0, 0.0, 1.0]), -3.0, 3.0, v, a
-        )
+        Joint(f"j{i}", "revolute", f"l{i}", f"l{i + 1}", np.eye(4), np.array([0.0, 0.0, 1.0]), -3.0, 3.0, v, a)
         for i, (v, a) in enumerate(zip(velocity, acceleration, strict=True))
     )
     return rd.Robot("arm", "l0", f"l{len(joints)}", joints)
@@ -97,20 +95,12 @@ def check(q: np.ndarray, t: rd.Trajectory, settings: TimingSettings, robot: rd.R
         corner_deviation=st.sampled_from([0.0, 1e-4, 0.01, 0.1, 1.0]),
         jerk=st.sampled_from([None, np.inf]),
     ),
-    kind=st.sampled_from(
-        ["random", "there and back", "nearly straight", "repeated", "one joint", "steps of all sizes"]
-    ),
+    kind=st.sampled_from(["random", "there and back", "nearly straight", "repeated", "one joint", "steps of all sizes"]),
 )
 @example(  # the path velocity of a rounded reversal peaks between grid points: it was 1.8 % too fast there
-    seed=0,
-    count=3,
-    scale=0.0,
-    settings=TimingSettings(velocity_scale=0.0625, corner_deviation=1.0),
-    kind="there and back",
+    seed=0, count=3, scale=0.0, settings=TimingSettings(velocity_scale=0.0625, corner_deviation=1.0), kind="there and back"
 )
-def test_limits_rest_and_geometry(
-    seed: int, count: int, scale: float, settings: TimingSettings, kind: str
-) -> None:
+def test_limits_rest_and_geometry(seed: int, count: int, scale: float, settings: TimingSettings, kind: str) -> None:
     rng = np.random.default_rng(seed)
     q = 10**scale * rng.uniform(-1, 1, (count, 7))
     if kind == "there and back":
@@ -194,9 +184,7 @@ def test_blend_reaches_the_deviation_and_is_twice_differentiable() -> None:
     sample_time=st.sampled_from([0.002, 0.004, 0.01]),
     stops=st.booleans(),
 )
-def test_a_limit_of_jerk_is_kept_with_the_others(
-    seed: int, count: int, jerk: float, sample_time: float, stops: bool
-) -> None:
+def test_a_limit_of_jerk_is_kept_with_the_others(seed: int, count: int, jerk: float, sample_time: float, stops: bool) -> None:
     q = np.cumsum(np.random.default_rng(seed).normal(0, 0.3, (count, 7)), axis=0)
     t = timed(q, never if stops else always, settings=TimingSettings(jerk=jerk, sample_time=sample_time))
     steps = np.diff(t.times)[:, None]
@@ -258,9 +246,7 @@ def test_a_limit_of_jerk_costs_what_it_must() -> None:
     assert slight == pytest.approx(free, abs=0.004)
 
 
-def toppra_speeds(
-    line: BlendedPolyline, grid: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
-) -> np.ndarray | None:
+def toppra_speeds(line: BlendedPolyline, grid: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray) -> np.ndarray | None:
     """toppra's fastest speeds at the grid points of a line; None if it finds none."""
 
     class Geometry(toppra.interpolator.AbstractGeometricPath):
@@ -342,9 +328,7 @@ def test_a_slow_torso_has_a_timing() -> None:
     kind=st.sampled_from(["random", "there and back", "few joints", "steps of all sizes"]),
 )
 @example(seed=930, dof=8, count=7, scale=0.0, decades=4.0, kind="random")
-def test_every_path_has_a_timing(
-    seed: int, dof: int, count: int, scale: float, decades: float, kind: str
-) -> None:
+def test_every_path_has_a_timing(seed: int, dof: int, count: int, scale: float, decades: float, kind: str) -> None:
     """Whatever the limits: speeds within them at the grid points, above 0 but at the ends, and no slower than
     toppra's where these do not fall to nearly 0 on the way."""
     rng = np.random.default_rng(seed)
@@ -360,9 +344,7 @@ def test_every_path_has_a_timing(
     grid = timing_grid(line, TimingSettings())
     first = line(grid, 1)
     second = line(grid, 2)
-    found = timing_kernel.fastest_speeds(
-        first, second, grid, velocity, *symmetric_bounds(acceleration, len(grid))
-    )
+    found = timing_kernel.fastest_speeds(first, second, grid, velocity, *symmetric_bounds(acceleration, len(grid)))
     assert (found[1:-1] > 0).all() and np.isfinite(found).all()
     assert (np.abs(first) * found[:, None] <= velocity * (1 + 1e-9)).all()
     pull = (np.diff(found**2) / (2 * np.diff(grid)))[:, None]
@@ -459,10 +441,7 @@ def test_a_corner_that_its_neighbor_leaves_more_room_is_checked_again() -> None:
 
     def keeps(corner: np.ndarray) -> bool:
         near = corner[np.linalg.norm(corner - q[1], axis=1) < 0.3]
-        return (
-            distance_to_polyline(corner, q).max() < 0.12
-            and distance_to_polyline(near, q).max(initial=0) < 0.01
-        )
+        return distance_to_polyline(corner, q).max() < 0.12 and distance_to_polyline(near, q).max(initial=0) < 0.01
 
     t = timed(q, keeps=keeps)
     assert keeps(t.positions)

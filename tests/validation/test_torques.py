@@ -66,9 +66,7 @@ def test_torques_are_those_of_the_cubics() -> None:
 
 
 def test_a_motion_that_winds_on_and_on_is_refused_in_bounded_time() -> None:
-    winds = rd.Trajectory(
-        ("hinge",), np.array([0.0, 1e5]), np.zeros((2, 1)), np.full((2, 1), 2.0), np.zeros((2, 1))
-    )
+    winds = rd.Trajectory(("hinge",), np.array([0.0, 1e5]), np.zeros((2, 1)), np.full((2, 1), 2.0), np.zeros((2, 1)))
     assert beyond(9.9, trajectory_pieces(winds))
 
 

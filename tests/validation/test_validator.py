@@ -59,10 +59,7 @@ def test_a_free_motion_is_accepted_with_a_certified_clearance() -> None:
     report = validator(SWING, *shapes)
     assert report.valid and report.violation is None
     exact = ExactCollision(box_arm(), rd.Scene(shapes))
-    for found, distances in (
-        (report.scene_clearance, exact.link_distances),
-        (report.self_clearance, exact.pair_distances),
-    ):
+    for found, distances in ((report.scene_clearance, exact.link_distances), (report.self_clearance, exact.pair_distances)):
         least = min(d.distance for q in dense(SWING, 0.01)[0] for d in distances(q))
         assert found is not None
         # Spheres stick out of the boxes by 2 cm, towards each other by 4; the certificate may give away half.
@@ -131,17 +128,13 @@ def test_the_certificate_agrees_with_dense_sampling(seed: int, count: int) -> No
         return
     # The first contact is located to 1 mm of motion, and counts from a gap of 0.1 mm on.
     here = np.stack([np.interp(found.time, np.arange(count), column) for column in rows.T])
-    distances = [
-        d for d in (*exact.link_distances(here), *exact.pair_distances(here)) if d.link == found.subject
-    ]
+    distances = [d for d in (*exact.link_distances(here), *exact.pair_distances(here)) if d.link == found.subject]
     assert min(d.distance for d in distances) <= 1.001e-4 and not hits[at < found.time - 0.02].any()
     assert found.time <= at[hits].min() + 1e-6 + 0.01
 
 
 def test_the_first_of_two_collisions_is_reported() -> None:
-    early, late = (
-        rd.Sphere(1.1 * vector(np.cos(a), np.sin(a), 0), 0.05, name) for a, name in ((0.1, "b"), (0.5, "a"))
-    )
+    early, late = (rd.Sphere(1.1 * vector(np.cos(a), np.sin(a), 0), 0.05, name) for a, name in ((0.1, "b"), (0.5, "a")))
     rows = np.array([[-0.6, 0, 0], [0.2, 0, 0], [1.0, 0, 0]])
     forward = validator(rows, early, late)
     backward = validator(rows[::-1].copy(), early, late)
@@ -422,10 +415,7 @@ def test_jerk_is_reported_and_not_required() -> None:
     rows = np.array([[0.0, -1.5, 1.5, -1.5, -1.5, 0.0], [1.0, -1.2, 1.0, -1.5, -1.0, 0.0]])
     problem = rd.Problem(robot, rd.Scene(), rows[0], rd.JointGoal(rows[-1:]))
     reports = [
-        rd.verify(
-            problem,
-            time_parameterize(robot, rd.Path(robot.joint_names, rows), yes, yes, TimingSettings(jerk=jerk)),
-        )
+        rd.verify(problem, time_parameterize(robot, rd.Path(robot.joint_names, rows), yes, yes, TimingSettings(jerk=jerk)))
         for jerk in (None, np.inf)
     ]
     limited, free = [report.jerk_share for report in reports]

@@ -50,10 +50,7 @@ def test_each_moment_has_a_picture(tmp_path: Path) -> None:
         first = np.asarray(image)[:100, :240].astype(int)
     blue = (first[..., 2] > first[..., 0] + 25).sum()
     assert blue > 50, "the wall was seen"
-    for write, ending in (
-        (exploration.write_exploration_picture, "html"),
-        (exploration.write_exploration, "png"),
-    ):
+    for write, ending in ((exploration.write_exploration_picture, "html"), (exploration.write_exploration, "png")):
         with pytest.raises(rd.InputError):
             write(explorer, problem.scene, tmp_path / f"explore.{ending}")
 
@@ -93,9 +90,7 @@ def test_the_page_holds_what_was_known_at_each_time(page: Path) -> None:
         assert one["time"] == pytest.approx(act.begins + number * exploration.READING_TIME, abs=1e-3)
         assert one["title"].startswith(f"{number + 1}  ") and one["reason"] == act.step.reason
         assert bool(one["look"]) == (act.T_base_camera is not None) == (one["end"] is not None)
-    assert data["times"][-1] == pytest.approx(
-        explorer.duration + exploration.READING_TIME * (len(explorer.acts) - 1), abs=1e-3
-    )
+    assert data["times"][-1] == pytest.approx(explorer.duration + exploration.READING_TIME * (len(explorer.acts) - 1), abs=1e-3)
     times = [known["time"] for known in told["known"]]
     assert times == sorted(times) and times[0] == 0.0
     unknown: set[int] = set()

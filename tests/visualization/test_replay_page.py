@@ -21,9 +21,7 @@ def test_replay_holds_everything(arm, scene, motion, tmp_path):
     told = Status.SOLVED, "", "robotdiffuse", arm.name, 0.0123, 0, "refinement", path, motion
     result = PlanResult(*told, min_clearance=0.042)
     file = tmp_path / "replay.html"
-    write_replay(
-        arm, scene, motion, file, result=result, title="a < b </script> {{data}}", candidates=(path, path)
-    )
+    write_replay(arm, scene, motion, file, result=result, title="a < b </script> {{data}}", candidates=(path, path))
     text = file.read_text("utf-8")
     data = page_data(file)
     assert "a &lt; b &lt;/script&gt; {{data}}" in text
@@ -81,9 +79,7 @@ def test_large_input_stays_small(arm, tmp_path):
     np.testing.assert_allclose(np.ptp(fewer, axis=0), np.ptp(vertices, axis=0), atol=0.02)
 
 
-@pytest.mark.parametrize(
-    "name", ["motion.jpg", "motion", "missing/motion.{}", "folder.{}", "folder.{}/motion.{}x"]
-)
+@pytest.mark.parametrize("name", ["motion.jpg", "motion", "missing/motion.{}", "folder.{}", "folder.{}/motion.{}x"])
 @pytest.mark.parametrize(("write", "ending"), [(write_picture, "png"), (write_replay, "html")])
 def test_bad_output_is_one_line(arm, motion, write, ending, name, tmp_path):
     (tmp_path / f"folder.{ending}").mkdir()

@@ -24,9 +24,7 @@ def test_creases_keep_edges_of_a_box_and_smooth_a_ball():
     box = creased(CORNERS, CUBE, np.ones((12, 3)))
     assert len(box.vertices) == 24 and np.sort(np.abs(box.normals), axis=1)[:, :2].max() < 1e-12
     ball = trimesh.creation.icosphere(subdivisions=3)
-    smooth = creased(
-        ball.vertices.view(np.ndarray), ball.faces.view(np.ndarray), np.ones((len(ball.faces), 3))
-    )
+    smooth = creased(ball.vertices.view(np.ndarray), ball.faces.view(np.ndarray), np.ones((len(ball.faces), 3)))
     assert len(smooth.vertices) == len(ball.vertices)
     assert (smooth.normals * smooth.vertices).sum(axis=1).min() > 0.999
 
@@ -39,9 +37,7 @@ def test_without_meshes_the_spheres_are_drawn(arm):
 
 def test_visual_meshes_that_are_elsewhere_than_the_collision_meshes_are_not_drawn():
     panda = rd.load_robot("panda")
-    moved = {
-        link: tuple(replace(m, vertices=m.vertices + 0.1) for m in of) for link, of in panda.meshes.items()
-    }
+    moved = {link: tuple(replace(m, vertices=m.vertices + 0.1) for m in of) for link, of in panda.meshes.items()}
     drawn = load_visual(replace(panda, meshes=moved))
     for link in ("panda_link5", "panda_hand"):
         np.testing.assert_array_equal(drawn[link][0].vertices, moved[link][0].vertices)

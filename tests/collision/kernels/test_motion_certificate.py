@@ -20,10 +20,7 @@ from robotdiffuse.collision.motions import ContinuousCollision
 
 LINKS = {
     "awkward": (("turret", "arm", "wrist", "flange", "tool"),),
-    "two_arms": (
-        ("torso", "left_upper", "left_lower", "left_hand"),
-        ("torso", "right_upper", "right_lower", "right_hand"),
-    ),
+    "two_arms": (("torso", "left_upper", "left_lower", "left_hand"), ("torso", "right_upper", "right_lower", "right_hand")),
 }
 """The links of each arm."""
 

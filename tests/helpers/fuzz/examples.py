@@ -27,9 +27,7 @@ EQUIPPED: dict[str, Any] = {
         "xyz": [0, 0, 0.14],
         "shapes": [{"cylinder": {"center": [0, 0, 0.09], "radius": 0.012, "height": 0.1}}],
     },
-    "attached": [
-        {"link": "sucker", "box": {"center": [0, 0, 0.06], "size": [0.1, 0.1, 0.1], "name": "parcel"}}
-    ],
+    "attached": [{"link": "sucker", "box": {"center": [0, 0, 0.06], "size": [0.1, 0.1, 0.1], "name": "parcel"}}],
     "goal": {"pose": {"frame": "parcel", "xyz": [0.45, 0.3, 1.0], "wxyz": [0, 1, 0, 0]}},
     "waypoints": [{"joints": [0.2, -0.785, 0, -2.356, 0, 1.571, 0.785]}],
 }
@@ -70,10 +68,7 @@ MOVEIT = {
             {
                 "header": {"frame_id": "world"},
                 "id": "Can",
-                "primitives": [
-                    {"type": "cylinder", "dimensions": [0.2, 0.03]},
-                    {"type": 1, "dimensions": [1, 1, 1]},
-                ],
+                "primitives": [{"type": "cylinder", "dimensions": [0.2, 0.03]}, {"type": 1, "dimensions": [1, 1, 1]}],
                 "primitive_poses": [{"position": [1, 1, 1], "orientation": [0, 0, 0, 1]}] * 2,
                 "meshes": [{"vertices": [[1, 1, 0], [1, 2, 0], [2, 1, 0]], "triangles": [[0, 1, 2]]}],
                 "mesh_poses": [{"position": {"x": 0, "y": 0, "z": 0}, "orientation": [0, 0, 0, 1]}],
@@ -95,11 +90,7 @@ HELD = {
 REQUEST: dict[str, Any] = {
     "start_state": {"joint_state": {"name": JOINTS, "position": PROBLEM["start"]}},
     "goal_constraints": [
-        {
-            "joint_constraints": [
-                {"joint_name": n, "position": p} for n, p in zip(JOINTS, PROBLEM["start"], strict=True)
-            ]
-        }
+        {"joint_constraints": [{"joint_name": n, "position": p} for n, p in zip(JOINTS, PROBLEM["start"], strict=True)]}
     ],
 }
 URDF = b"""<?xml version="1.0"?>
@@ -123,8 +114,6 @@ SRDF = b"""<robot name="two">
 <group_state name="home" group="arm"><joint name="elbow" value="0.3"/></group_state>
 <passive_joint name="grip"/><disable_collisions link1="base" link2="upper" reason="Adjacent"/>
 </robot>"""
-LIMITS = {
-    "joint_limits": {"shoulder": {"max_velocity": 2.0, "max_acceleration": 3.0, "has_jerk_limits": False}}
-}
+LIMITS = {"joint_limits": {"shoulder": {"max_velocity": 2.0, "max_acceleration": 3.0, "has_jerk_limits": False}}}
 MESHES = ("stl", "obj", "ply", "off", "glb", "dae")
 CLOUDS = ("ply", "pcd", "xyz", "csv", "npy", "npz")

@@ -29,12 +29,7 @@ from robotdiffuse.core.results import load_result
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.interop import read_motion, write_motion
 from robotdiffuse.interop.recorded_motion import joint_trajectory, motion_of_robot
-from robotdiffuse.problems.files import (
-    load_motion_bench_maker,
-    load_problem,
-    problem_from_record,
-    problem_record,
-)
+from robotdiffuse.problems.files import load_motion_bench_maker, load_problem, problem_from_record, problem_record
 from robotdiffuse.problems.problem import JointGoal
 from robotdiffuse.robots import DATA, load_robot, read_robot_folder
 from robotdiffuse.robots.kinematics import link_pose
@@ -173,9 +168,7 @@ def _problem(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]
         data["views"] = [examples.VIEW]
         data["unknown"] = "optimistic"
     else:
-        data |= (*({},) * 3, examples.EQUIPPED, examples.CONSTRAINED, examples.MOVING, examples.IN_MOTION)[
-            rng.integers(7)
-        ]
+        data |= (*({},) * 3, examples.EQUIPPED, examples.CONSTRAINED, examples.MOVING, examples.IN_MOTION)[rng.integers(7)]
     ending = (".yaml", ".json", ".jsonl")[rng.integers(3)]
     file = folder / f"problem{ending}"
     file.write_bytes(text_of(rng, data, ending))
@@ -345,11 +338,7 @@ def asked(rng: np.random.Generator, right: float = 0.0) -> tuple[str, bytes]:
     plan |= {"velocity_scaling": 0.5, "acceleration_scaling": 0.5, "clearance": 0.01}
     motion = {"joint_names": examples.JOINTS, "positions": rows}
     rates = {"velocities": [[0.0] * 7] * 3, "accelerations": [[0.0] * 7] * 3}
-    validated = {
-        "problem": problem,
-        "path": motion,
-        "trajectory": motion | {"times": [0.0, 1.0, 2.0]} | rates,
-    }
+    validated = {"problem": problem, "path": motion, "trajectory": motion | {"times": [0.0, 1.0, 2.0]} | rates}
     what = "verify" if rng.random() < 0.5 else "plan"
     body = validated if what == "verify" else plan
     if right and rng.random() < right:
@@ -403,11 +392,7 @@ def _motion(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
         trajectory.save(file)
         file.write_bytes(text_of(rng, json.loads(file.read_text()), ending))
     elif ending in (".json", ".yaml"):
-        forms = (
-            lambda r: r,
-            lambda r: {"joint_trajectory": r},
-            lambda r: {"trajectory": [{"joint_trajectory": r}]},
-        )
+        forms = (lambda r: r, lambda r: {"joint_trajectory": r}, lambda r: {"trajectory": [{"joint_trajectory": r}]})
         record = forms[rng.integers(3)](joint_trajectory(trajectory.joint_names, trajectory))
         file.write_bytes(text_of(rng, record, ending))
     else:
@@ -453,11 +438,7 @@ def _depth(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
         file.write_bytes(damaged(rng, file.read_bytes()))
     view = examples.VIEW | {"depth": file.name, "intrinsics": [6.0, 6.0, 4, 3], "scale": 0.001}
     del view["cloud"]
-    problem = examples.PROBLEM | {
-        "scene": examples.PROBLEM["scene"][:1],
-        "views": [view],
-        "unknown": "padded",
-    }
+    problem = examples.PROBLEM | {"scene": examples.PROBLEM["scene"][:1], "views": [view], "unknown": "padded"}
     (folder / "problem.json").write_bytes(
         text_of(rng, problem, ".json") if rng.random() < 0.5 else json.dumps(problem).encode()
     )
@@ -468,9 +449,7 @@ def _upload(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     """Problem files that browsers send to the live page."""
     from robotdiffuse.visualization.live.session import Session, problem_text, uploaded_problem
 
-    problem = (
-        examples.PROBLEM | ({}, examples.EQUIPPED, examples.CONSTRAINED, examples.MOVING)[rng.integers(4)]
-    )
+    problem = examples.PROBLEM | ({}, examples.EQUIPPED, examples.CONSTRAINED, examples.MOVING)[rng.integers(4)]
     ending = (".yaml", ".json")[rng.integers(2)]
     content = text_of(rng, problem, ending)
 

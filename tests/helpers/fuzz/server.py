@@ -141,14 +141,8 @@ def damage(rng: np.random.Generator, one: Draft) -> None:
         one.headers = [h for h in one.headers if h[0] != b"Content-Length" or rng.random() < 0.2]
         one.headers.append((b"Content-Length", b"%d" % length))
     elif action == 8:
-        one.headers += [
-            (b"Connection", b"Upgrade"),
-            (b"Upgrade", (b"websocket", b"h2c", b"TLS/1.2")[rng.integers(3)]),
-        ]
-        one.headers += [
-            (b"Sec-WebSocket-Key", b"AAAAAAAAAAAAAAAAAAAAAA=="),
-            (b"Sec-WebSocket-Version", b"13"),
-        ]
+        one.headers += [(b"Connection", b"Upgrade"), (b"Upgrade", (b"websocket", b"h2c", b"TLS/1.2")[rng.integers(3)])]
+        one.headers += [(b"Sec-WebSocket-Key", b"AAAAAAAAAAAAAAAAAAAAAA=="), (b"Sec-WebSocket-Version", b"13")]
     else:
         _chunk(rng, one)
 
@@ -404,11 +398,7 @@ def main() -> None:
         os._exit(0)
 
     threading.Thread(target=ended, daemon=True).start()
-    sys.exit(
-        command(
-            ["serve", "--port", "0", "--workers", "1", "--max-time-limit", "1", "--max-request-size", "1"]
-        )
-    )
+    sys.exit(command(["serve", "--port", "0", "--workers", "1", "--max-time-limit", "1", "--max-request-size", "1"]))
 
 
 if __name__ == "__main__":

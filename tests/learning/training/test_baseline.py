@@ -55,13 +55,9 @@ def test_training_learns(data: str, tmp_path: Path) -> None:
 
 def test_weights_of_another_robot_or_none_are_refused(data: str, tmp_path: Path) -> None:
     panda = rd.load_robot("panda")
-    with pytest.raises(
-        rd.InputError, match="no weights of the network reversal come with the package for panda; train them"
-    ):
+    with pytest.raises(rd.InputError, match="no weights of the network reversal come with the package for panda; train them"):
         load_network("reversal", None, panda)
-    with pytest.raises(
-        rd.InputError, match="holds no reversal; train them: robotdiffuse train baseline reversal"
-    ):
+    with pytest.raises(rd.InputError, match="holds no reversal; train them: robotdiffuse train baseline reversal"):
         load_network("reversal", str(tmp_path), panda)
     settings = baseline_training("reversal", {"data": data, "samples": 160})
     train_baseline(settings, str(tmp_path / "out"))

@@ -120,9 +120,7 @@ def test_two_processes_are_one_run(tmp_path, data, monkeypatch):
 
     def step(self):
         original(self)
-        gradients.update(
-            {str(i): p.grad.clone() for i, p in enumerate(self.parameters)} if not gradients else {}
-        )
+        gradients.update({str(i): p.grad.clone() for i, p in enumerate(self.parameters)} if not gradients else {})
 
     original = TrainingRun.step
     monkeypatch.setattr(Batches, "draw", both)
@@ -140,9 +138,7 @@ def test_losses_are_computed_where_the_model_is(denoiser, data, arm):
     """On the meta device, which holds no numbers but refuses tensors of other devices as a GPU does."""
     losses = LossSettings(point=1.0, collision=1.0)
     changes = {"encoder": "points"} if denoiser == "cross_attention" else {}
-    settings = planner_settings(
-        data, denoiser=denoiser, denoiser_settings=None, losses=losses, condition_drop=0.5, **changes
-    )
+    settings = planner_settings(data, denoiser=denoiser, denoiser_settings=None, losses=losses, condition_drop=0.5, **changes)
     encoder = make_encoder("points") if changes else load_encoder(data.parent / "encoder")
     model = MotionNetwork(RobotIdentity.of(arm), training.model_settings(settings, encoder))
     loaded = load_data(str(data), arm, encoder, WAYPOINTS, lambda text: None)

@@ -117,9 +117,7 @@ def test_corners_are_rounded_as_far_as_the_planner_certified() -> None:
     path = rd.Path(PANDA.joint_names, np.stack([START, middle, END]))
     shortest = []
     for deviations in (None, np.zeros(3), np.full(3, 0.02)):
-        graph = StopGraph(
-            PANDA, path, lambda _: True, lambda _: True, TimingSettings(), GRID_STEP, deviations=deviations
-        )
+        graph = StopGraph(PANDA, path, lambda _: True, lambda _: True, TimingSettings(), GRID_STEP, deviations=deviations)
         ends = 0, len(graph.stops) - 1
         shortest.append(min((m.ticks for m in graph.motions if (m.source, m.target) == ends), default=0))
     assert shortest[1] == 0 < shortest[0] < shortest[2]

@@ -170,8 +170,7 @@ def test_simplification_and_shortcuts_keep_ends_and_freedom_and_do_not_lengthen(
         trees = rrt_kernel.make_trees(*ends(), 5_000)
         path = rrt_kernel.search(space, None, trees, rrt_kernel.INFINITE, np.float32(1.0), 100_000, state)
         simplified = [
-            tighten(space, simplify(space, path, rounds), tries, state)
-            for rounds, tries in ((0, 0), (1, 0), (4, 10), (1, 300))
+            tighten(space, simplify(space, path, rounds), tries, state) for rounds, tries in ((0, 0), (1, 0), (4, 10), (1, 300))
         ]
         for short in (*simplified, shortcut(space, path, 50, state)):
             assert np.array_equal(short[[0, -1]], path[[0, -1]])

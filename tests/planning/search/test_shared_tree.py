@@ -175,9 +175,7 @@ def test_the_cheapest_goal_wins_and_every_goal_has_its_cost() -> None:
     assert search.cost < 1.02 * min(other.cost for other in single)
 
 
-def searched(
-    checker: CollisionChecker, start: np.ndarray, distance: float
-) -> tuple[SharedTreeSearch, np.ndarray]:
+def searched(checker: CollisionChecker, start: np.ndarray, distance: float) -> tuple[SharedTreeSearch, np.ndarray]:
     settings = replace(ENDLESS, safety_distance=distance, resolution=0.01)
     search = SharedTreeSearch(checker, start, RIGHT[None], settings, random_state(0))
     for _ in range(10):

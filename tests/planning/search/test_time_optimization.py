@@ -27,10 +27,7 @@ def test_the_slowest_joint_is_the_bound(path: np.ndarray) -> None:
     for _ in range(100):
         found.improve(space)
     limits = ROBOT.velocity, ROBOT.acceleration
-    alone = max(
-        straight_line_time(path[0, [j]], path[-1, [j]], *(limit[[j]] for limit in limits))
-        for j in range(ROBOT.dof)
-    )
+    alone = max(straight_line_time(path[0, [j]], path[-1, [j]], *(limit[[j]] for limit in limits)) for j in range(ROBOT.dof))
     best = found.best
     assert best is not None and best.time == pytest.approx(alone, rel=0.03)
     assert best.time < 0.94 * straight_line_time(path[0], path[-1], *limits)

@@ -86,9 +86,7 @@ def test_furniture_is_as_its_settings_say(name: str) -> None:
 
 def test_targets_have_the_fingers_in_the_region() -> None:
     approach = np.array([0.6, 0.0, -0.8])
-    region = furniture.Region(
-        np.array([0.5, 0.1, 0.3]), np.array([0.4, 0.2, 2 * furniture.REGION_MARGIN]), 0.7, approach
-    )
+    region = furniture.Region(np.array([0.5, 0.1, 0.3]), np.array([0.4, 0.2, 2 * furniture.REGION_MARGIN]), 0.7, approach)
     rng = np.random.default_rng(5)
     T = np.stack([furniture.sample_target(region, rng, spread=0.3, finger_length=0.1) for _ in range(1000)])
     products = T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1)

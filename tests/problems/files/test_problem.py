@@ -41,11 +41,7 @@ def test_forms_of_goals() -> None:
     one = problem([0, 0, 0], [1, 1, 0.1])
     assert one.start.dtype == np.float64 and one.start.tolist() == [0, 0, 0]
     assert isinstance(one.goal, rd.JointGoal) and one.goal.positions.tolist() == [[1, 1, 0.1]]
-    for two in (
-        [[1, 1, 0], [0, 1, 0]],
-        np.array([[1, 1, 0], [0, 1, 0]]),
-        rd.JointGoal([[1, 1, 0], [0, 1, 0]]),
-    ):
+    for two in ([[1, 1, 0], [0, 1, 0]], np.array([[1, 1, 0], [0, 1, 0]]), rd.JointGoal([[1, 1, 0], [0, 1, 0]])):
         goal = problem(goal=two).goal
         assert isinstance(goal, rd.JointGoal) and goal.positions.tolist() == [[1, 1, 0], [0, 1, 0]]
     pose = rd.PoseGoal("hook", transform(Z, rotation_about(Z, 0.4)))
@@ -157,10 +153,7 @@ WRONG: dict[str, tuple[object, str]] = {
     "missing mesh": (shape(mesh={"file": "none.stl"}), r"scene\[1\].mesh: .*none.stl does not exist"),
     "unknown goal": (GOOD | {"goal": {"place": []}}, "unknown field of goal: 'place'; known:"),
     "two goals": (GOOD | {"goal": {"joints": READY, "pose": {}}}, "it must be one of joints, joint_set"),
-    "pose without a frame": (
-        GOOD | {"goal": {"pose": {"xyz": [0, 0, 1], "wxyz": [1, 0, 0, 0]}}},
-        "has no frame",
-    ),
+    "pose without a frame": (GOOD | {"goal": {"pose": {"xyz": [0, 0, 1], "wxyz": [1, 0, 0, 0]}}}, "has no frame"),
     "zero quaternion": (
         GOOD | {"goal": {"pose": {"frame": "panda_hand", "xyz": [0, 0, 1], "wxyz": [0, 0, 0, 0]}}},
         "goal.pose.wxyz .* must not be zero",
@@ -311,8 +304,7 @@ BASIC = {"robot": "panda", "scene": [], "start": "ready", "goal": [0.0] * 3 + [-
 
 
 @pytest.mark.parametrize(
-    ("goal", "rows"),
-    [(NAMED, [NAMED]), ([NAMED, NAMED], [NAMED, NAMED]), ("ready", [NAMED]), ({"joints": "ready"}, [NAMED])],
+    ("goal", "rows"), [(NAMED, [NAMED]), ([NAMED, NAMED], [NAMED, NAMED]), ("ready", [NAMED]), ({"joints": "ready"}, [NAMED])]
 )
 def test_goals_are_given_as_in_python(goal: object, rows: list[list[float]]) -> None:
     problem = problem_from_record(BASIC | {"goal": goal})

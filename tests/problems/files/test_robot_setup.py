@@ -17,10 +17,7 @@ from robotdiffuse.scenes.shapes import Shape
 START = [-0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2]
 GOAL = [0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2]
 WALL = {"box": {"center": [0.5, 0.0, 0.25], "size": [0.3, 0.06, 0.3], "name": "wall"}}
-CUP = {
-    "link": "panda_hand",
-    "cylinder": {"center": [0, 0, 0.16], "radius": 0.03, "height": 0.12, "name": "cup"},
-}
+CUP = {"link": "panda_hand", "cylinder": {"center": [0, 0, 0.16], "radius": 0.03, "height": 0.12, "name": "cup"}}
 PLAIN: dict[str, Any] = {"robot": "panda", "scene": [WALL], "start": START, "goal": {"joints": GOAL}}
 TOOL = {
     "link": "panda_hand",
@@ -34,11 +31,7 @@ SHAPES: list[Shape] = [
     rd.Box([0.4, 0.0, 0.1], [0.3, 0.2, 0.1], [0.9, 0.1, 0.2, 0.3]),
     rd.Cylinder([0.3, -0.5, 0.2], 0.05, 0.4, [0.5, 0.5, 0.5, -0.5]),
     rd.Capsule([-0.5, 0.2, 0.5], 0.05, 0.3, [0.9, 0.1, 0.0, 0.0]),
-    rd.Mesh(
-        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]],
-        [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]],
-        [0.5, 0.6, 0],
-    ),
+    rd.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], [0.5, 0.6, 0]),
     rd.PointCloud([[0.5, 0.1, 0.9], [0.4, 0.2, 0.8]]),
 ]
 
@@ -49,17 +42,13 @@ def written(folder: Path, record: dict[str, Any]) -> Path:
     return file
 
 
-@pytest.mark.parametrize(
-    "extra", [{"attached": [CUP]}, {"tool": TOOL}, {"tool": TOOL, "attached": [CUP | {"link": "tool"}]}]
-)
+@pytest.mark.parametrize("extra", [{"attached": [CUP]}, {"tool": TOOL}, {"tool": TOOL, "attached": [CUP | {"link": "tool"}]}])
 def test_files_keep_tools_and_objects(extra: dict[str, Any], tmp_path: Path) -> None:
     problem = rd.load_problem(written(tmp_path, PLAIN | extra))
     save_problem(problem, tmp_path / "again.json")
     again = rd.load_problem(tmp_path / "again.json")
     assert again.robot is problem.robot, "the same content is the same robot"
-    assert {key: problem_record(again)[key] for key in extra} == {
-        key: problem_record(problem)[key] for key in extra
-    }
+    assert {key: problem_record(again)[key] for key in extra} == {key: problem_record(problem)[key] for key in extra}
 
 
 def test_a_goal_may_name_the_tool_and_what_is_held(tmp_path: Path) -> None:
@@ -95,9 +84,7 @@ def test_distances_are_the_same_in_the_world() -> None:
     q = np.array(START)
     here = ExactCollision(robot, scene).link_distances(q)
     for there in (ExactCollision(robot, problem.scene), ExactCollision(standing, world)):
-        assert np.allclose(
-            [d.distance for d in here], [d.distance for d in there.link_distances(q)], atol=1e-6
-        )
+        assert np.allclose([d.distance for d in here], [d.distance for d in there.link_distances(q)], atol=1e-6)
     T = inverse(link_pose(standing, q, "panda_hand")) @ T_WORLD_BASE @ link_pose(robot, q, "panda_hand")
     assert np.allclose(T, np.eye(4), atol=1e-12)
 
@@ -115,8 +102,7 @@ def test_files_in_the_world_come_back_as_they_were_read(tmp_path: Path) -> None:
     assert again["base"] == base and again["goal"] == record["goal"]
     assert again["scene"][1] == record["scene"][1]  # type: ignore[index]
     assert np.allclose(
-        problem.scene.shapes[1].bounds.mean(0),
-        [-0.2, 0.4, 0.7] @ np.array([[0.28, -0.96, 0], [0.96, 0.28, 0], [0, 0, 1]]),
+        problem.scene.shapes[1].bounds.mean(0), [-0.2, 0.4, 0.7] @ np.array([[0.28, -0.96, 0], [0.96, 0.28, 0], [0, 0, 1]])
     )
 
 

@@ -65,8 +65,7 @@ def with_middle(robot: Robot) -> Robot:
     return replace(
         robot,
         meshes=robot.meshes | {"b": far, "m": far},
-        spheres=robot.spheres
-        | {"b": np.array([[1.05, 1.05, 1.05, 0.1]]), "m": np.array([[1.05] * 3 + [0.1]])},
+        spheres=robot.spheres | {"b": np.array([[1.05, 1.05, 1.05, 0.1]]), "m": np.array([[1.05] * 3 + [0.1]])},
     )
 
 
@@ -99,9 +98,7 @@ def thick(bound: float) -> Robot:
     joints = tuple(replace(j, lower=-0.2, upper=0.2) if j.name == last else j for j in wide.joints)
     (box,) = wide.meshes["l1"]
     meshes = wide.meshes | {"l1": (ConvexMesh(box.vertices * (1, 16, 1), box.faces),)}
-    return replace(
-        wide, joints=joints, meshes=meshes, spheres=wide.spheres | {"l1": np.array([[0.25, 0, 0, 0.6]])}
-    )
+    return replace(wide, joints=joints, meshes=meshes, spheres=wide.spheres | {"l1": np.array([[0.25, 0, 0, 0.6]])})
 
 
 def always() -> Robot:
@@ -144,9 +141,7 @@ def test_pairs_that_meet_and_are_not_checked_are_told() -> None:
 
 def test_share_of_collisions_by_hand() -> None:
     robot = with_middle(overlapping(0.02))
-    (pair,) = (
-        r for r in find_allowed_collisions(robot, QUICK, np.random.default_rng(0)) if r.links == ("a", "c")
-    )
+    (pair,) = (r for r in find_allowed_collisions(robot, QUICK, np.random.default_rng(0)) if r.links == ("a", "c"))
     # the cubes overlap up to joint 2 = 0.05, of 0.02 to 1; the spheres, which do not count, up to 0.1234
     assert pair.colliding == pytest.approx(0.03 / 0.98, abs=0.015)
 
@@ -159,10 +154,7 @@ def test_false_collisions_of_parts_after_true_ones_are_counted() -> None:
         link: tuple(Surface(np.array(mesh.vertices), np.array(mesh.faces)) for mesh in meshes)
         for link, meshes in {"plates": plates, "box": [box]}.items()
     }
-    parts = {
-        link: (convex_hull(np.concatenate([one.vertices for one in pieces])),)
-        for link, pieces in surfaces.items()
-    }
+    parts = {link: (convex_hull(np.concatenate([one.vertices for one in pieces])),) for link, pieces in surfaces.items()}
     slide = Joint("slide", "prismatic", "plates", "box", np.eye(4), np.array([1.0, 0, 0]), -0.1, 0.4)
     spheres = {link: cover(part) for link, (part,) in parts.items()}
     robot = Robot("slider", "plates", "box", (slide,), spheres, parts)

@@ -51,9 +51,7 @@ def fork() -> tuple[Robot, dict[str, tuple[Surface, ...]]]:
     rates = (2.0, 8.0, 80.0)
     joints = (
         Joint("bend", "revolute", "fork", "wrist", np.eye(4), y, -3.0, 3.0, *rates),
-        Joint(
-            "spin", "continuous", "wrist", "flange", transform(np.array([0.09, 0, 0])), x, -9.0, 9.0, *rates
-        ),
+        Joint("spin", "continuous", "wrist", "flange", transform(np.array([0.09, 0, 0])), x, -9.0, 9.0, *rates),
     )
     prongs = (box((0.4, 0.04, 0.1), (0, 0.07, 0)), box((0.4, 0.04, 0.1), (0, -0.07, 0)))
     surfaces = {

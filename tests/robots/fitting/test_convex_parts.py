@@ -33,8 +33,7 @@ def boxes(*corners: tuple[tuple[float, ...], tuple[float, ...]]) -> trimesh.Trim
     """Axis-aligned boxes [low, high] concatenated to one mesh, with inner walls where they meet."""
     made = [
         trimesh.creation.box(
-            np.subtract(high, low),
-            transform=trimesh.transformations.translation_matrix(np.add(low, high) / 2),
+            np.subtract(high, low), transform=trimesh.transformations.translation_matrix(np.add(low, high) / 2)
         )
         for low, high in corners
     ]

@@ -10,15 +10,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.robots.fitting.convex_parts import convex_hull
 from robotdiffuse.robots.fitting.preparation import hidden_by_neighbors, neighbors
-from robotdiffuse.robots.fitting.sphere_fitting import (
-    Bounds,
-    Cells,
-    Solid,
-    SphereSettings,
-    covered,
-    fit_spheres,
-    stick_out,
-)
+from robotdiffuse.robots.fitting.sphere_fitting import Bounds, Cells, Solid, SphereSettings, covered, fit_spheres, stick_out
 from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.robots.robot import ConvexMesh, Robot
 
@@ -127,12 +119,8 @@ def test_covered_finds_a_small_gap() -> None:
 
 def two_cylinders() -> Robot:
     """Two upright cylinders; the upper one rotates on the lower one."""
-    can = convex_hull(
-        np.array(trimesh.creation.cylinder(0.05, 0.2, sections=48).vertices) + np.array([0, 0, 0.1])
-    )
-    turn = Joint(
-        "turn", "revolute", "low", "high", transform(np.array([0, 0, 0.2])), np.array([0, 0, 1.0]), -3.0, 3.0
-    )
+    can = convex_hull(np.array(trimesh.creation.cylinder(0.05, 0.2, sections=48).vertices) + np.array([0, 0, 0.1]))
+    turn = Joint("turn", "revolute", "low", "high", transform(np.array([0, 0, 0.2])), np.array([0, 0, 1.0]), -3.0, 3.0)
     return Robot("cans", "low", "high", (turn,), meshes={"low": (can,), "high": (can,)})
 
 

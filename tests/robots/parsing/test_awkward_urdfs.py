@@ -31,9 +31,7 @@ def test_awkward_arms_are_read(name: str, tmp_path: Path) -> None:
     assert made.dof == dof and made.meshes and all(tree.surfaces(part) for part in made.meshes)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name in PREPARED else [pytest.mark.slow]) for name in WORKS]
-)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[] if name in PREPARED else [pytest.mark.slow]) for name in WORKS])
 def test_awkward_arms_are_prepared_and_plan(name: str, tmp_path: Path) -> None:
     if name == "xacro":
         pytest.importorskip("xacrodoc")
@@ -63,9 +61,7 @@ def test_what_cannot_work_is_refused_by_one_line_that_says_what_to_do(name: str,
 
 def on_a_lift(folder: Path) -> Path:
     """An arm on a lift, with bellows on two held joints that always overlap the column behind it."""
-    column = (
-        '<collision><origin xyz="-0.2 0 0.2"/><geometry><box size="0.05 0.05 0.6"/></geometry></collision>'
-    )
+    column = '<collision><origin xyz="-0.2 0 0.2"/><geometry><box size="0.05 0.05 0.6"/></geometry></collision>'
     lift = joint("lift", "base", "lift_link", "prismatic", axis="0 0 1", limits='lower="0" upper="0.2"')
     short = {"kind": "prismatic", "axis": "0 0 1", "limits": 'lower="0" upper="0.6"'}
     names = row("bellows", 2)

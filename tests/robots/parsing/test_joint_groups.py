@@ -30,8 +30,7 @@ END = {
     "a gripper of one joint that five follow": (
         chain("j6_link", ["drive"])
         + "".join(
-            link(f"m{i}")
-            + joint(f"m{i}_joint", "j6_link", f"m{i}", more='<mimic joint="drive" multiplier="-1"/>')
+            link(f"m{i}") + joint(f"m{i}_joint", "j6_link", f"m{i}", more='<mimic joint="drive" multiplier="-1"/>')
             for i in range(5)
         ),
         "j6_link",
@@ -208,10 +207,7 @@ def test_groups_poses_and_passive_joints_of_an_srdf(tmp_path: Path) -> None:
         ("<robot", "well-formed"),
         ("<mujoco/>", "not an SRDF"),
         ("<robot><disable_collisions link1='a'/></robot>", "has no link2"),
-        (
-            "<robot><group_state name='s'><joint name='j' value='x'/></group_state></robot>",
-            "value is 'x'; it must be a number",
-        ),
+        ("<robot><group_state name='s'><joint name='j' value='x'/></group_state></robot>", "value is 'x'; it must be a number"),
     ],
 )
 def test_damaged_srdf(text: str, message: str, tmp_path: Path) -> None:

@@ -111,9 +111,7 @@ def test_bad_arguments_give_one_clear_line(tmp_path: Path) -> None:
 def same(a: rd.Robot, b: rd.Robot) -> None:
     assert (a.name, a.base, a.tip, a.locked, a.notes) == (b.name, b.base, b.tip, b.locked, b.notes)
     assert a.allowed_collisions == b.allowed_collisions
-    assert [(j.name, j.kind, j.lower, j.jerk) for j in a.joints] == [
-        (j.name, j.kind, j.lower, j.jerk) for j in b.joints
-    ]
+    assert [(j.name, j.kind, j.lower, j.jerk) for j in a.joints] == [(j.name, j.kind, j.lower, j.jerk) for j in b.joints]
     np.testing.assert_allclose(a.frame_offsets, b.frame_offsets, atol=1e-12)
     assert a.meshes.keys() == b.meshes.keys() and a.spheres.keys() == b.spheres.keys()
     for name in a.meshes:
@@ -252,19 +250,13 @@ def test_soft_limits_are_noted(tmp_path: Path) -> None:
 
 
 def test_a_mesh_without_volume_is_noted(tmp_path: Path) -> None:
-    trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.1, 0.1, 0]], [[0, 1, 2], [1, 3, 2]]).export(
-        tmp_path / "plate.stl"
-    )
+    trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.1, 0.1, 0]], [[0, 1, 2], [1, 3, 2]]).export(tmp_path / "plate.stl")
     plate = '<collision><geometry><mesh filename="plate.stl"/></geometry></collision>'
-    robot = read_urdf(
-        written(tmp_path, chain("base", ["j"]), link("end", plate), joint("k", "j_link", "end"))
-    )
+    robot = read_urdf(written(tmp_path, chain("base", ["j"]), link("end", plate), joint("k", "j_link", "end")))
     assert "link end has collision geometry without volume, made 1 mm thick" in robot.notes
 
 
-def test_preparations_of_one_urdf_that_differ_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_preparations_of_one_urdf_that_differ_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first in the alphabet counted: a motion through the arm itself was called valid."""
     monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
     file = written(tmp_path, chain("base", row("j", 3)))
@@ -295,9 +287,7 @@ def surfaces(file: Path, shape: str, origin: str = "") -> tuple[Surface, ...]:
         ('<capsule radius="0.1" length="0.5"/>', np.pi * (5e-3 + 4 / 3 * 1e-3), [0.2, 0.2, 0.7]),
     ],
 )
-def test_polyhedra_lie_closely_around_primitives(
-    tmp_path: Path, shape: str, volume: float, extents: list[float]
-) -> None:
+def test_polyhedra_lie_closely_around_primitives(tmp_path: Path, shape: str, volume: float, extents: list[float]) -> None:
     [surface] = surfaces(tmp_path / "arm.urdf", shape)
     solid = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
     assert solid.is_watertight and -1e-9 < solid.volume / volume - 1 < 0.06
@@ -411,9 +401,7 @@ def test_prefixes_of_simulators_need_no_declaration(tmp_path: Path) -> None:
     assert read_urdf(file).dof == 3
 
 
-def test_xacro_that_cannot_be_compiled_says_what_helps(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_xacro_that_cannot_be_compiled_says_what_helps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("xacrodoc")
     for content, message in (
         ('<xacro:include filename="$(find lost)/a.xacro"/>', "'lost' is not found; .*--package lost="),
@@ -441,9 +429,7 @@ def test_only_robot_add_compiles_xacro(tmp_path: Path, monkeypatch: pytest.Monke
         ("argument.urdf", PARTS.replace('name="j1"', 'name="$(arg prefix)"')),
     ):
         file = xacro(tmp_path, link("base") + content, name)
-        with pytest.raises(
-            rd.InputError, match=r"is a xacro file.* robotdiffuse robot add .*--name"
-        ) as raised:
+        with pytest.raises(rd.InputError, match=r"is a xacro file.* robotdiffuse robot add .*--name") as raised:
             rd.load_robot(file)
         assert "\n" not in str(raised.value)
 

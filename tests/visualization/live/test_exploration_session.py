@@ -77,9 +77,7 @@ def test_a_pause_holds_the_arm_and_a_restart_begins_anew(session: live.Explorati
     assert state.explorer is not None and state.explorer.settings.policy == "probabilistic"
 
 
-def test_an_error_is_shown_and_a_restart_helps(
-    session: live.ExplorationSession, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_error_is_shown_and_a_restart_helps(session: live.ExplorationSession, monkeypatch: pytest.MonkeyPatch) -> None:
 
     def fails(*_: object) -> None:
         raise ValueError("no camera")

@@ -65,9 +65,7 @@ def test_an_obstacle_in_the_way_turns_it_red_and_the_next_plan_green(view: Any, 
     red.wait_for()
     assert "inside sphere" in red.inner_text() and "at 0." in red.inner_text()
     assert session.state.motion is motion
-    session.change_obstacle(
-        "sphere", lambda shape: live.moved_to(shape, transform(np.array([-0.5, 0.0, 1.2])))
-    )
+    session.change_obstacle("sphere", lambda shape: live.moved_to(shape, transform(np.array([-0.5, 0.0, 1.2]))))
     view.locator(VALID).wait_for()
     view.get_by_role("button", name="Delete").click()
     until(lambda: all(shape.name != "sphere" for shape in session.state.problem.scene.shapes))

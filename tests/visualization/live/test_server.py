@@ -15,9 +15,7 @@ from robotdiffuse.visualization.live import server as module
 from robotdiffuse.visualization.live.server import free_port, is_loopback, may_connect
 
 
-def test_viser_is_silent_and_other_threads_print(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_viser_is_silent_and_other_threads_print(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """While viser started or stopped, sys.stdout was replaced for all threads: others' output was lost."""
     during = []
     for name in ("__init__", "stop"):

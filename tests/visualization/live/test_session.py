@@ -26,9 +26,7 @@ until = partial(waiting.state_when, patience=PATIENCE)
 
 
 def settled(state: live.State) -> bool:
-    validated = state.motion is None or (
-        state.validation is not None and state.validation.version == state.version
-    )
+    validated = state.motion is None or (state.validation is not None and state.validation.version == state.version)
     return validated and not state.planning
 
 
@@ -36,9 +34,7 @@ def settled(state: live.State) -> bool:
 def started(planner: str, name: str = "lamp") -> Iterator[live.Session]:
     """A session with a ball above the arm."""
     scene = rd.Scene([rd.Sphere([0.0, 0.0, 1.5], 0.05, name)])
-    session = live.Session(
-        rd.Problem(rd.load_robot("panda"), scene, START, rd.JointGoal(END)), live.PageOptions(planner, 20.0)
-    )
+    session = live.Session(rd.Problem(rd.load_robot("panda"), scene, START, rd.JointGoal(END)), live.PageOptions(planner, 20.0))
     session.start()
     yield session
     session.close()
@@ -212,10 +208,7 @@ CORNERS = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
 @pytest.mark.parametrize(
     "shape",
     [
-        *(
-            live.NEW_OBSTACLES[kind](np.array([0.1, 0.2, 0.3]), 0.08)
-            for kind in ("sphere", "box", "cylinder", "capsule")
-        ),
+        *(live.NEW_OBSTACLES[kind](np.array([0.1, 0.2, 0.3]), 0.08) for kind in ("sphere", "box", "cylinder", "capsule")),
         rd.Mesh(CORNERS, [[0, 1, 2], [0, 1, 3]], xyz=(0.1, 0, 0)),
         rd.PointCloud(CORNERS),
     ],
@@ -227,9 +220,6 @@ def test_shapes_go_where_their_handles_are_put(shape) -> None:
     turned = shape.kind not in ("sphere", "point_cloud")
     np.testing.assert_allclose(at, T if turned else transform(T[:3, 3]), atol=1e-12)
     for name, value in live.dimensions(shape).items():
-        assert live.dimensions(live.resized(shape, name, value + 0.1)) == {
-            **live.dimensions(shape),
-            name: value + 0.1,
-        }
+        assert live.dimensions(live.resized(shape, name, value + 0.1)) == {**live.dimensions(shape), name: value + 0.1}
         with pytest.raises(rd.InputError, match=f"{name} of {shape.name} is 0 m; it must be 0.01 to 2 m"):
             live.resized(shape, name, 0.0)

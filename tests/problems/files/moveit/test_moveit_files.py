@@ -13,12 +13,7 @@ import yaml
 import robotdiffuse as rd
 from helpers.made_arms import read_urdf
 from robotdiffuse.core.input_files import read_yaml
-from robotdiffuse.core.transforms import (
-    quaternion_from_rotation,
-    rotation_about,
-    rotation_from_quaternion,
-    transform,
-)
+from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_about, rotation_from_quaternion, transform
 from robotdiffuse.problems.files import ProblemEntry, load_motion_bench_maker, load_problems, problem_record
 from robotdiffuse.problems.moveit import (
     MoveItFrames,
@@ -57,12 +52,7 @@ def scene_data(**world: object) -> dict[str, Any]:
 
 def ball(**more: object) -> dict[str, Any]:
     at = [{"position": [1, 0, 0], "orientation": [0, 0, 0, 1]}]
-    return {
-        "id": "ball",
-        "primitives": [{"type": "sphere", "dimensions": [0.2]}],
-        "primitive_poses": at,
-        **more,
-    }
+    return {"id": "ball", "primitives": [{"type": "sphere", "dimensions": [0.2]}], "primitive_poses": at, **more}
 
 
 def request_data() -> dict[str, Any]:
@@ -98,9 +88,7 @@ def test_folder() -> None:
     assert problem.robot.locked == {"panda_finger_joint1": 0.065, "panda_finger_joint2": 0.065}
     assert [shape.name for shape in problem.scene.shapes] == ["can", "board"]
     assert bad.problem is None
-    with pytest.raises(
-        rd.InputError, match=r"request0002.yaml: goal: panda_joint1 is 3.1 rad; its limits are -2.8"
-    ):
+    with pytest.raises(rd.InputError, match=r"request0002.yaml: goal: panda_joint1 is 3.1 rad; its limits are -2.8"):
         bad.load()
     assert [entry.name for entry in load_problems(MOTION_BENCH_MAKER)] == [good.name, bad.name]
     robot = rd.load_robot("panda")
@@ -126,9 +114,7 @@ def test_vectors_as_mappings_types_as_numbers_and_poses_of_the_object_alone() ->
     data = scene_data(
         id=3,
         primitives=[{"type": 3, "dimensions": [0.4, 0.1]}],
-        primitive_poses=[
-            {"position": {"x": 1, "y": 2, "z": 3}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
-        ],
+        primitive_poses=[{"position": {"x": 1, "y": 2, "z": 3}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}],
     )
     [shape] = moveit_scene(data, moveit_frames(data), Path()).shapes
     assert isinstance(shape, rd.Cylinder) and shape.center.tolist() == [1, 2, 3]
@@ -229,9 +215,7 @@ def matrix(names: list[str], pairs: list[tuple[str, str]], **defaults: bool) -> 
 
 def test_pairs_of_links_and_objects_count() -> None:
     names = ["hand", "finger", "can", "stale"]
-    found = matrix_contacts(
-        matrix(names, [("hand", "can"), ("hand", "finger"), ("stale", "can")]), ["can", "board"], LINKS
-    )
+    found = matrix_contacts(matrix(names, [("hand", "can"), ("hand", "finger"), ("stale", "can")]), ["can", "board"], LINKS)
     assert found == {"can": ("hand",)}
 
 
@@ -295,9 +279,7 @@ def test_files_of_another_robot_are_refused_by_its_joints(tmp_path: Path) -> Non
     with pytest.raises(rd.InputError) as raised:
         rd.load_problem(file)
     text = str(raised.value)
-    assert (
-        "robot_state.joint_state has values of gripper_finger1_joint, movable joints that ur5 lacks" in text
-    )
+    assert "robot_state.joint_state has values of gripper_finger1_joint, movable joints that ur5 lacks" in text
     assert "robot_model_name is ur5_robotiq85" in text and "its own are shoulder_pan_joint, " in text
     with pytest.raises(rd.InputError, match=r"scene0001.yaml: .* gripper_finger1_joint"):
         read_moveit_scene(tmp_path / "scene0001.yaml", rd.load_robot("ur5"))
@@ -441,10 +423,7 @@ def test_scaling_factors_padding_and_the_velocity_of_a_start_state_are_noted() -
 
 WRONG_REQUESTS: dict[str, tuple[object, str]] = {
     "no goal": (request_data() | {"goal_constraints": []}, "goal_constraints is empty"),
-    "path constraints": (
-        request_data() | {"path_constraints": {"joint_constraints": [1]}},
-        "path_constraints",
-    ),
+    "path constraints": (request_data() | {"path_constraints": {"joint_constraints": [1]}}, "path_constraints"),
     "scaling": (request_data() | {"max_velocity_scaling_factor": 2}, "is 2; it must be a number from 0 to 1"),
     "attached": (
         change(request_data(), ["start_state", "attached_collision_objects"], [1]),
@@ -519,12 +498,8 @@ def mounted(folder: Path, kind: str) -> rd.Robot:
 
 def test_poses_compose_from_the_base_outwards() -> None:
     """The base stands at [1, 0, 0] and is turned; a frame, the object and its part are offset and turned."""
-    data = scene_data(
-        **ball(header={"frame_id": "table"}, pose={"position": [0, 2, 0], "orientation": QUARTER})
-    )
-    data["robot_state"] = {
-        "multi_dof_joint_state": {"transforms": [{"translation": [1, 0, 0], "rotation": QUARTER}]}
-    }
+    data = scene_data(**ball(header={"frame_id": "table"}, pose={"position": [0, 2, 0], "orientation": QUARTER}))
+    data["robot_state"] = {"multi_dof_joint_state": {"transforms": [{"translation": [1, 0, 0], "rotation": QUARTER}]}}
     table = {"translation": [0, 0, 5], "rotation": QUARTER}
     data["fixed_frame_transforms"] = [
         {"transform": {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1]}, "child_frame_id": "world"},
