@@ -1,5 +1,5 @@
-"""Link clearances and their gradients for batches of configurations, each batch entry in a packed scene of
-its own: network inputs of the denoiser in training."""
+"""Link clearances and their gradients for batches of configurations. Each entry of a batch has its own packed
+scene. In training, both are inputs of the denoiser network."""
 
 import numpy as np
 from jaxtyping import Float32
@@ -20,8 +20,8 @@ _ONE, _NO_BOX_CORNER = np.float32(1.0), np.float32(EMPTY_BOX[0, 0])
 
 @inner_kernel()
 def _scene(empty, floors, floor, kinds, params, solids, around):
-    """The SceneArrays of a packed scene, in the memory `solids` and `around`; its floor, one of `floors`, is
-    the first solid."""
+    """Writes a packed scene to the buffers `solids` and `around` and returns its SceneArrays. The first solid
+    is row `floor` of `floors`; with `floor` = -1 there is none."""
     n = 0
     if floor >= 0:
         solids[0] = floors[floor]
@@ -40,6 +40,8 @@ def _scene(empty, floors, floor, kinds, params, solids, around):
             # the inverse of the rotation
             write_rotation(p[6], -p[7], -p[8], -p[9], solid[3:12].reshape(3, 3))
         n += 1
+    # axis-aligned boxes around the solids, W to a row as in `SceneArrays.solid_boxes`; unused places are
+    # empty
     around[:, : 3 * W] = _NO_BOX_CORNER
     around[:, 3 * W :] = -_NO_BOX_CORNER
     for k in range(n):
@@ -82,8 +84,8 @@ def _packed_gradients(robot, empty, floors, floor, kinds, params, q, limit, marg
 def packed_link_clearances(
     robot: RobotArrays, scenes: PackedScenes, q: Float32[ndarray, "batch frames dof"], limit: float
 ) -> Float32[ndarray, "batch frames links"]:
-    """Signed distances of the moving links to obstacles and floor of each sample's own scene [m], at most
-    `limit`.
+    """Signed distances of the moving links to the obstacles and floor of the scene with the same batch index
+    [m], at most `limit`.
 
     `robot` comes from `compile_robot`.
     """
@@ -97,16 +99,18 @@ def packed_clearances_and_gradients(
     limit: float,
     margin: float,
 ) -> tuple[Float32[ndarray, "batch frames links"], Float32[ndarray, "batch frames dof"]]:
-    """`packed_link_clearances` and the gradients of `CollisionChecker.clearances_and_gradients` [m/rad]."""
+    """`packed_link_clearances`, and the gradients that `CollisionChecker.clearances_and_gradients` returns
+    [m/rad]."""
     return _packed_gradients(robot, *_arrays(scenes), q, np.float32(limit), np.float32(margin))
 
 
 def _arrays(scenes: PackedScenes) -> tuple[SceneArrays, ndarray, ndarray, ndarray, ndarray]:
-    """An empty scene, the distinct floors, the index of each scene's floor or -1, kinds and parameters."""
+    """An empty scene, the distinct floors, the index of each scene's floor (-1 without a floor), and the
+    scenes' kinds and parameters."""
     kinds, params = (np.ascontiguousarray(array) for array in (scenes.kinds, scenes.params))
     floors = np.zeros((len(scenes), 6)) if scenes.floors is None else scenes.floors
-    different, floor = np.unique(floors, axis=0, return_inverse=True)
-    has_floor = different.any(axis=1)
-    boxes = compile_scene(Scene([Box(row[:3], row[3:]) for row in different[has_floor]])).solids
-    place = np.where(has_floor, np.cumsum(has_floor) - 1, -1)
-    return compile_scene(Scene([])), boxes, place[floor.reshape(-1)], kinds, params
+    distinct, floor = np.unique(floors, axis=0, return_inverse=True)
+    has_floor = distinct.any(axis=1)
+    boxes = compile_scene(Scene([Box(row[:3], row[3:]) for row in distinct[has_floor]])).solids
+    floor_index = np.where(has_floor, np.cumsum(has_floor) - 1, -1)
+    return compile_scene(Scene([])), boxes, floor_index[floor.reshape(-1)], kinds, params

@@ -19,8 +19,8 @@ class CollisionChecker:
 
     The spheres cover the robot's meshes, so a configuration that is reported free is free. Links that no
     planned joint moves are checked only against other links, since no motion changes their pose in the scene.
-    Of a mesh obstacle only the surface counts: the arm is connected and starts outside, so it cannot get
-    inside.
+    A mesh obstacle is represented by its surface. The arm is connected and starts outside, so no link can get
+    inside without touching the surface.
     """
 
     def __init__(self, robot: Robot, scene: Scene, padding: float = 0.0) -> None:
@@ -45,9 +45,9 @@ class CollisionChecker:
         return lane_collision.free_many(self.robot_arrays, self.scene_arrays, self._rows(q), self.padding)
 
     def link_clearances(self, q: Float[ndarray, "n dof"], limit: float = 1.0) -> Float[ndarray, "n links"]:
-        """Signed distance of each moving link to the scene [m], at most `limit`; a lower limit is faster.
+        """Signed distance of each moving link to the scene [m], at most `limit`; a smaller `limit` is faster.
 
-        Distances to point clouds and meshes are at most 0.3 m, and lower bounds beyond 0.1 m.
+        Distances to point clouds and meshes are capped at 0.3 m; values above 0.1 m are lower bounds.
         """
         arrays = self.robot_arrays, self.scene_arrays
         return lane_clearance.link_clearances(*arrays, self._rows(q), np.float32(limit)) - self.padding
@@ -55,10 +55,11 @@ class CollisionChecker:
     def clearances_and_gradients(
         self, q: Float[ndarray, "n dof"], limit: float, margin: float
     ) -> tuple[Float[ndarray, "n links"], Float[ndarray, "n dof"]]:
-        """`link_clearances`, and the gradient by the joints of the arm's violation of the margin [m/rad].
+        """`link_clearances`, and the gradient of the arm's margin violation by the joints [m/rad].
 
-        The violation is the root of the sum of h² over the covering spheres, with the hinge h = max(0, margin
-        - D) on their signed distances D to the scene; it is 0 where no link is within the margin [m].
+        The violation is sqrt(sum of h²) over the covering spheres. A sphere at signed distance D from the
+        scene contributes h = max(0, margin - D). Violation and gradient are 0 where no sphere is within
+        `margin` [m].
         """
         links, gradients = collision_cost.clearances_and_gradients(
             self.robot_arrays,
@@ -78,7 +79,8 @@ class CollisionChecker:
     ) -> tuple[Float[ndarray, "n"], Float[ndarray, "n dof"]]:
         """Collision cost of each configuration and its gradient: the paper's hinge loss, squared.
 
-        `margin` and `self_margin` [m]: distances to obstacles and between links below which there is a cost.
+        `margin` is the distance to obstacles and `self_margin` that between links below which the cost is
+        positive [m].
         """
         return collision_cost.cost_gradients(
             self.robot_arrays,
@@ -89,8 +91,8 @@ class CollisionChecker:
         )
 
     def _rows(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:
-        """Configurations as the kernels take them. Compiled code does not check its arguments, so this
-        does."""
+        """Configurations as float32 for the kernels. They are checked here because compiled code does not
+        check its arguments."""
         if q.shape[1] != self.robot.dof:
             raise InputError(f"q has {q.shape[1]} columns; it must have the {self.robot.dof} planned joints")
         if not np.isfinite(q).all():

@@ -14,14 +14,16 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
 MAX_CONFIGURATIONS = 5000
-"""Largest number of motion certificates in a search for contacts."""
+"""Largest number of times that `contacts` certifies the remaining motion; each time it resumes at one
+configuration."""
 
 
 def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: float) -> list[Contact]:
     """All contacts along straight lines through waypoints, in order.
 
     A contact begins where two bodies come nearer than `contact` [m] and lasts until they separate. The motion
-    certificate finds the next contact; while there is one, distances are computed every 1 cm of motion.
+    certificate finds the next contact. From there, exact distances are computed every 1 cm of motion until no
+    bodies are in contact.
     """
     validator = ContinuousCollision(robot, scene, contact, 0.5)
     exact = ExactCollision(robot, scene)
@@ -32,15 +34,16 @@ def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: fl
     for _ in range(MAX_CONFIGURATIONS):
         low = motion_pieces.segment_at(motion.travel, at)[0]
         contact_configuration = motion_pieces.configurations(motion, np.array([at]))
-        rest = np.concatenate([contact_configuration, q[low + 1 :]])
-        first = validator.sweep(rest).contact
+        remaining_q = np.concatenate([contact_configuration, q[low + 1 :]])
+        first = validator.sweep(remaining_q).contact
         if first is None:
             break
-        # converts the place in `rest`, a row plus a share, to a place on the whole motion
+        # converts the contact's place in `remaining_q`, a row plus a fraction, to the travel along the whole
+        # motion
         row = int(first.at)
-        part = first.at - int(first.at)
+        fraction = first.at - int(first.at)
         travel = np.concatenate([[at], motion.travel[low + 1 :]])
-        at = float(travel[row] + part * (travel[min(row + 1, len(travel) - 1)] - travel[row]))
+        at = float(travel[row] + fraction * (travel[min(row + 1, len(travel) - 1)] - travel[row]))
         at = _follow(exact, motion, at, contact, first, contacts_in_order)
         if at >= end:
             break
@@ -48,32 +51,37 @@ def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: fl
 
 
 def _follow(
-    exact: ExactCollision, motion: Motion, at: float, contact: float, first: Contact, found: list[Contact]
+    exact: ExactCollision,
+    motion: Motion,
+    at: float,
+    contact: float,
+    first: Contact,
+    contact_list: list[Contact],
 ) -> float:
-    """Appends to `found` the contacts from the given one until the arm is free; returns the place where it is
-    free."""
+    """Appends to `contact_list` the contact `first` at travel `at`, and those that begin before the arm is
+    free again. Returns the travel at which it is free, or the end of the motion."""
     checks = {(check.link, check.other): check for check in checks_of(exact.robot)}
-    open_ones: dict[tuple[str, str | None, str], int] = {}
-    begun = _place(motion, at)
-    open_ones[first.check.link, first.check.other, first.other] = len(found)
-    found.append(first._replace(at=begun))
+    open_contacts: dict[tuple[str, str | None, str], int] = {}
+    first_place = _place(motion, at)
+    open_contacts[first.check.link, first.check.other, first.other] = len(contact_list)
+    contact_list.append(first._replace(at=first_place))
     end = float(motion.travel[-1])
     while at < end:
         at = min(at + DEPTH_SAMPLE_TRAVEL, end)
         q = motion_pieces.configurations(motion, np.array([at]))[0]
         near = [d for d in (*exact.link_distances(q), *exact.pair_distances(q)) if d.distance <= contact]
-        now = {_key(d, checks): d for d in near}
-        for key in [key for key in open_ones if key not in now]:
-            del open_ones[key]
-        for key, distance in now.items():
+        touching = {_key(d, checks): d for d in near}
+        for key in [key for key in open_contacts if key not in touching]:
+            del open_contacts[key]
+        for key, distance in touching.items():
             depth = max(0.0, -distance.distance)
-            if key in open_ones:
-                k = open_ones[key]
-                found[k] = found[k]._replace(depth=max(found[k].depth, depth))
+            if key in open_contacts:
+                k = open_contacts[key]
+                contact_list[k] = contact_list[k]._replace(depth=max(contact_list[k].depth, depth))
             else:
-                open_ones[key] = len(found)
-                found.append(Contact(checks[key[:2]], key[2], _place(motion, at), depth))
-        if not now:
+                open_contacts[key] = len(contact_list)
+                contact_list.append(Contact(checks[key[:2]], key[2], _place(motion, at), depth))
+        if not touching:
             return at
     return end
 
@@ -84,6 +92,6 @@ def _key(distance: Distance, checks: dict) -> tuple[str, str | None, str]:
 
 
 def _place(motion: Motion, at: float) -> float:
-    """Waypoint index plus fraction of the segment."""
+    """The waypoint index plus the fraction of the segment at travel `at`."""
     low, share = motion_pieces.segment_at(motion.travel, at)
     return low + share

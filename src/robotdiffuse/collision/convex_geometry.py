@@ -1,7 +1,7 @@
 """The exact geometry of robots and scenes: convex parts of links, solids, and the pairs that are checked.
 
-It does not use the covering spheres, so they can be tested against it. Only a link without meshes is
-represented by its spheres.
+This geometry does not depend on the covering spheres, so the spheres can be tested against it. Only a link
+without meshes is represented by its spheres.
 """
 
 from collections.abc import Sequence
@@ -20,8 +20,8 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated
 
 SURFACES_BELOW = 0.002
-"""If the convex parts of two grazing links are nearer than this, their surfaces decide whether they collide
-[m]."""
+"""Distance between the convex parts of two grazing links (see `Robot.grazing`) below which their mesh
+surfaces decide whether they collide [m]."""
 
 
 class Check(NamedTuple):
@@ -49,15 +49,18 @@ class Part(NamedTuple):
 
 
 class Solid(NamedTuple):
-    """A scene shape as the Minkowski sum of a box, a disc around its z axis and a ball. With `is_bound`, the
-    sum only encloses a surface or point cloud."""
+    """A scene shape as the Minkowski sum of a box, a disc around its z axis and a ball."""
 
     shape: Shape
     T_base_box: Float[ndarray, "4 4"]
     half: Float[ndarray, "3"]
+    """Half edge lengths of the box [m]."""
     disc: float
+    """Radius of the disc [m]."""
     rounding: float
+    """Radius of the ball [m]."""
     is_bound: bool
+    """Whether the sum only encloses the shape, which is a surface or a point cloud."""
 
 
 @once_per_robot
@@ -95,27 +98,28 @@ def checks_of(robot: Robot) -> tuple[Check, ...]:
 
 
 def surfaces_decide(robot: Robot, check: Check) -> bool:
-    """Whether the surfaces of two links decide where their convex parts touch; see `Robot.grazing`."""
+    """Whether the mesh surfaces of two links decide if they collide when their convex parts touch; see
+    `Robot.grazing`."""
     return check.other is not None and frozenset(check) in robot.grazing
 
 
 @once_per_robot
 def hulls_of(robot: Robot) -> tuple[Hulls, dict[str, range]]:
-    """The arrays of all parts for compiled code, and the range of each link's parts."""
-    of_links = {}
-    every = list[Part]()
+    """The arrays of all links' convex parts for compiled code, and the index range of each link's parts."""
+    part_ranges = {}
+    all_parts = list[Part]()
     for link, parts in parts_of(robot).items():
-        of_links[link] = range(len(every), len(every) + len(parts))
-        every += parts
-    vertices = np.concatenate([part.vertices for part in every]) if every else np.zeros((0, 3))
+        part_ranges[link] = range(len(all_parts), len(all_parts) + len(parts))
+        all_parts += parts
+    vertices = np.concatenate([part.vertices for part in all_parts]) if all_parts else np.zeros((0, 3))
     hulls = Hulls(
         np.ascontiguousarray(vertices.T),
-        np.cumsum([0] + [len(part.vertices) for part in every]),
-        np.array([part.frame for part in every], np.int64),
-        np.array([[*part.center, part.radius] for part in every]).reshape(-1, 4),
-        np.array([part.rounding for part in every], np.float64),
+        np.cumsum([0] + [len(part.vertices) for part in all_parts]),
+        np.array([part.frame for part in all_parts], np.int64),
+        np.array([[*part.center, part.radius] for part in all_parts]).reshape(-1, 4),
+        np.array([part.rounding for part in all_parts], np.float64),
     )
-    return hulls, of_links
+    return hulls, part_ranges
 
 
 @lru_cache(maxsize=16)
@@ -125,7 +129,7 @@ def solids_of(scene: Scene) -> tuple[Solid, ...]:
 
 
 def allowed_contacts(scene: Scene, links: Sequence[str], solids: Sequence[Solid]) -> Bool[ndarray, "l s"]:
-    """Whether each link may touch each solid; without rows and columns if the scene allows no contact."""
+    """Whether each link may touch each solid; of shape [0, 0] if the scene allows no contact."""
     if not scene.allowed_contacts:
         return np.zeros((0, 0), np.bool_)
     names = [solid.shape.name for solid in solids]
@@ -175,8 +179,8 @@ def _bounded(shape: Shape, points: Float[ndarray, "n 3"], inflation: float) -> S
 
 
 def describe_contact(link: str, other: str, depth: float, itself: bool) -> str:
-    """A contact in words: 'panda_link5 is 3.2 cm inside sphere_2'; two links (`itself`) 'overlap by' a depth
-    [m]."""
+    """A contact of penetration `depth` [m] in words: 'panda_link5 is 3.2 cm inside sphere_2'. With `itself`,
+    both bodies are links and 'overlap by 3.2 cm'."""
     length = f"{depth * 100:.1f} cm" if depth >= 0.01 else f"{depth * 1000:.1f} mm"
     if depth < 5e-5:
         return f"{link} touches {other}"

@@ -1,8 +1,9 @@
 """Exact distances between the robot's convex meshes and the scene, by Coal: the validator's geometry.
 
-It does not use the covering spheres, so they can be tested against it. Only a link without meshes is
-represented by its spheres. Where convex parts of two grazing links touch, their surfaces decide
-(`collision/surface_pairs.py`). Distances are signed [m]: negative inside, by penetration depth.
+This geometry does not depend on the covering spheres, so the spheres can be tested against it. Only a link
+without meshes is represented by its spheres. Where the convex parts of two grazing links (`Robot.grazing`)
+touch, their mesh surfaces decide whether the links collide (`collision/surface_pairs.py`). Distances are
+signed [m]: the negative penetration depth inside.
 """
 
 # Coal's Python module has no type information.
@@ -44,15 +45,15 @@ CHUNK_SIZE = 8192
 CLEAR_DISTANCE = 1e-6
 """`collides` does not compute distances beyond this [m]."""
 RESTING_DEPTH = 0.01
-"""If a held object is no deeper than this in an obstacle, the message says how to allow the contact [m]."""
+"""Penetration of a held object in an obstacle below which the message says how to allow the contact [m]."""
 MAX_CONTACTS = 200
-"""Largest number of triangles or points of one obstacle at which the depth of a link is computed; 1,000 take
-5 ms."""
+"""Largest number of triangles or points of one obstacle from which the penetration of a link is computed;
+1,000 would take 5 ms."""
 
 
 class Distance(NamedTuple):
-    """Signed distance [m] of a link to the nearest obstacle or to another link; `other` is None if there is
-    none."""
+    """Signed distance [m] of a link to the nearest obstacle or to another link. `other` is its name, None in
+    an empty scene."""
 
     link: str
     other: str | None
@@ -69,7 +70,7 @@ class _Piece(NamedTuple):
 
 
 TREE_SECONDS_PER_ELEMENT = 4e-6
-"""Approximate time in which Coal adds a point or triangle to its tree [s]."""
+"""Approximate time in which Coal adds one point or triangle to its bounding volume tree [s]."""
 
 
 class _Obstacle(NamedTuple):
@@ -121,8 +122,8 @@ def _obstacle(solid: Solid) -> _Obstacle:
 
 @lru_cache(maxsize=16)
 def _tree(shape: Triangulated | PointCloud) -> coal.BVHModelOBBRSS:
-    """Coal's tree over a surface or a point cloud, cached because scenes share shapes: building it over
-    100,000 points takes half a second."""
+    """Coal's bounding volume tree over a surface or a point cloud. It is cached because scenes share shapes,
+    and 100,000 points take half a second."""
     if isinstance(shape, PointCloud):
         # Each point is a triangle of zero size: Coal's tree then prunes 100,000 points in about 0.1 ms.
         vertices = shape.distinct_points
@@ -147,15 +148,16 @@ def _obstacles(scene: Scene) -> tuple[_Obstacle, ...]:
 
 @dataclass(frozen=True)
 class _Candidates:
-    """The pairs of a check: pieces with obstacles, or pieces of two links."""
+    """The pairs of geometries that a check compares: each convex part of `firsts` with each obstacle, or
+    convex part of another link, of `seconds`."""
 
     firsts: tuple[_Piece, ...]
     seconds: tuple[_Piece | _Obstacle, ...]
     lower: Callable[[ndarray], ndarray]
-    """Lower bounds [n, firsts * seconds] of the signed distances, from frames [n, dof + 1, 4, 4]."""
+    """Lower bounds [n, firsts * seconds] of the signed distances [m], from frames [n, dof + 1, 4, 4]."""
 
     surfaces: SurfacePair | None = None
-    """Surfaces of two grazing links; None if the convex parts decide alone."""
+    """Mesh surfaces of two grazing links; None if only the convex parts are compared."""
 
     def pair(self, index: int) -> tuple[_Piece, _Piece | _Obstacle]:
         return self.firsts[index // len(self.seconds)], self.seconds[index % len(self.seconds)]
@@ -228,8 +230,8 @@ class ExactCollision:
     def _signed(
         self, piece: _Piece, other: _Piece | _Obstacle, frames: ndarray, cutoff: float, depth: bool
     ) -> float:
-        """Signed distance of two geometries [m]; for a surface beyond `cutoff`, any value of at least
-        `cutoff`.
+        """Signed distance of two geometries [m]. For a surface farther than `cutoff` it is some value of at
+        least `cutoff`.
 
         Without `depth`, the penetration of a surface may be too small, but the sign is right.
         """
@@ -240,8 +242,8 @@ class ExactCollision:
             return coal.distance(piece.geometry, T_piece, other.geometry, T_other, self._request, result)
         if not other.surface:
             return coal.distance(piece.geometry, T_piece, other.geometry, other.T, self._request, result)
-        # Coal's distance to a surface that is penetrated is slow and uses any one triangle, so contacts come
-        # first.
+        # For a penetrated surface, Coal's distance query is slow and returns the depth at an arbitrary
+        # triangle, so the contacts are computed first.
         request = self._contacts if depth else self._first_contact
         hits = coal.CollisionResult()
         coal.collide(piece.geometry, T_piece, other.geometry, other.T, request, hits)
@@ -260,11 +262,12 @@ class ExactCollision:
         cutoffs: Float[ndarray, "n"],
         stop: float = -np.inf,
     ) -> tuple[Float[ndarray, "n"], list[str | None]]:
-        """Signed distance of one check, an index into `checks`, at each configuration, at most its cutoff
-        [m].
+        """Signed distance of the check `self.checks[checks[i]]` at each configuration q[i], at most
+        cutoffs[i] [m].
 
         Also returns the name of the nearest obstacle or link, None beyond the cutoff. Rows are processed in
-        order. If a distance is at most `stop`, all later ones are NaN, and its own depth may be too small.
+        order up to the first distance of at most `stop`. The depth of that row may be too small, and later
+        distances are NaN.
         """
         frames = forward_frames(self.robot, q)
         distances = np.full(len(q), np.nan)
@@ -295,10 +298,12 @@ class ExactCollision:
     def _grazing_distance(
         self, candidates: _Candidates, frames: ndarray, cutoff: float, depth: bool
     ) -> float:
-        """Signed distance of two grazing links [m], at most `cutoff`: of their convex parts, or of their
-        surfaces where the parts are nearly apart and neither surface touches or encloses the other.
+        """Signed distance of two grazing links [m], at most `cutoff`.
 
-        Without `depth`, the penetration may be too small, but the sign is right.
+        It is the distance of their convex parts. Where these overlap by at most MAX_OVERLAP or are nearer
+        than SURFACES_BELOW, the distance of the mesh surfaces is used if it is larger, unless the surfaces
+        touch or one encloses a piece of the other. Without `depth`, the penetration may be too small, but the
+        sign is right.
         """
         assert candidates.surfaces is not None
         best = cutoff
@@ -323,8 +328,8 @@ class ExactCollision:
     def distance_from_moved_base(
         self, link: str, q: Float[ndarray, "dof"], T: Float[ndarray, "4 4"]
     ) -> float:
-        """Signed distance of a link to the nearest obstacle [m] if the whole robot, with its base, is moved
-        by T; that equals the distance to obstacles that move by the inverse of T."""
+        """Signed distance of a link to the nearest obstacle [m] after the whole robot, base included, is
+        moved by T. This equals the distance to obstacles that are moved by the inverse of T."""
         frames = T @ forward_frames(self.robot, q[None])[0]
         obstacles = self._obstacles
         return min(
@@ -377,7 +382,8 @@ class ExactCollision:
 
 @once_per_robot
 def warm_up(robot: Robot) -> None:
-    """Load Coal and build its objects of a robot now, so that no call with a short time limit has to."""
+    """Load Coal and build the robot's Coal objects now, so that later calls do not spend their time limit on
+    it."""
     explain_collision(robot, Scene([Sphere([0.0, 0.0, 100.0], 1.0)]), (robot.lower + robot.upper) / 2)
 
 

@@ -1,6 +1,6 @@
 """Robots and scenes as flat float32 arrays, the arguments of the compiled kernels.
 
-The arrays of a scene have the same types whatever it contains, so that no obstacle causes a compilation.
+The arrays of all scenes have the same types, so that no kind of obstacle causes another compilation.
 """
 
 from collections.abc import Sequence
@@ -31,28 +31,30 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud, Triangulated
 
 FLOAT32_ROUNDING = 4e-7
-"""Obstacles grow by this fraction of their coordinates, which is more than the rounding errors of float32."""
+"""Obstacles are enlarged by this fraction of their coordinates, more than the rounding errors of float32."""
 
 BOX_SLACK = 1e-6
-"""Boxes around obstacles grow by this length [m] and by this fraction, which is more than rounding errors."""
+"""Boxes around obstacles are enlarged by this length [m] plus this fraction of their coordinates, more than
+rounding errors."""
 
 EMPTY_BOX = np.repeat([[1e18, -1e18]], 3, axis=1)
 """Lower and upper corner of a box that is far from everything [m]."""
 
 
 class RobotArrays(NamedTuple):
-    """Frames, spheres and pairs of a robot. A group is a link with spheres; fixed links come first."""
+    """Frames, spheres and pairs of a robot. A group is a link with spheres; links fixed to the base come
+    first."""
 
     offsets: ndarray
-    """[dof, 13] rotation (row-major) and translation of `Robot.frame_offsets`, and 1 for a prismatic joint,
-    else 0."""
+    """[dof, 13] rotation (row-major) and translation of `Robot.frame_offsets`; the last column is 1 for a
+    prismatic joint, else 0."""
     spheres: ndarray
     """[n, 4] x y z radius in the frame of the group."""
     first: ndarray
     """[groups + 1] first sphere of each group."""
     rows: ndarray
-    """[rows, 4 * 16] the spheres of each group in rows of sixteen: x of all, then y, z and radius. The last
-    sphere is repeated to fill a row."""
+    """[rows, 4 * 16] the spheres of each group in rows of sixteen spheres: 16 times x, then y, z and radius.
+    The last sphere is repeated to fill a row."""
     row_bounds: ndarray
     """[rows, 4] a sphere around all spheres of the row."""
     row_sizes: ndarray
@@ -64,8 +66,8 @@ class RobotArrays(NamedTuple):
     bounds: ndarray
     """[groups, 4] a sphere around all spheres of the group."""
     pairs: ndarray
-    """[pairs, 4] two groups that are checked against each other, their row of `pair_tables` or -1, and their
-    bit."""
+    """[pairs, 4] two groups that are checked against each other, the row of `pair_tables` for this pair or
+    -1, and the pair's bit in the cells of that table."""
     pair_tables: ndarray
     """[tables, ...] joint values at which pairs may touch: see `sphere_pair_tables.py`."""
     parents: ndarray | None
@@ -78,27 +80,30 @@ class SceneArrays(NamedTuple):
     solids: ndarray
     """[n, 17] Minkowski sums of a box, a disc about its z axis and a ball: center, world-to-shape rotation
     (row-major), half edges, radius of the ball, and 1 for a cylinder, else 0. The first two half edges of a
-    cylinder are its radius. Surfaces that links may touch are balls among the solids."""
+    cylinder are its radius. Point clouds and meshes that links may touch are covered by balls, which are
+    solids here."""
     solid_boxes: ndarray
-    """[rows, 6 * 16] axis-aligned boxes around the solids in rows of sixteen: low x of all, then low y, low
-    z, high x, high y and high z."""
+    """[rows, 6 * 16] axis-aligned boxes around the solids in rows of sixteen boxes: 16 times the lower x,
+    then lower y, lower z, upper x, upper y and upper z."""
     points: ndarray
     """[n, 4] center, radius; sorted by cell."""
     point_rows: ndarray
-    """[rows, 4 * 16] the points in rows of sixteen: x of all, then y, z and radius. The last one is
-    repeated."""
+    """[rows, 4 * 16] the points in rows of sixteen points: 16 times x, then y, z and radius. The last point
+    is repeated to fill the last row."""
     cell_first: ndarray
     """[cells + 1] first point of each cell."""
     grid: ndarray
-    """[nx * ny * nz] distance from each voxel's center to the nearest point's center; beyond the band a lower
-    bound."""
+    """[nx * ny * nz] distance from each voxel's center to the nearest point's center [m]. Values beyond the
+    band are lower bounds."""
     nearest: ndarray
-    """[nx * ny * nz] index of the point that is nearest to each voxel's center, -1 far beyond the band."""
+    """[nx * ny * nz] index of the point that is nearest to each voxel's center. Beyond the band it is a point
+    near the nearest one; far beyond, it is -1."""
     grid_frame: ndarray
-    """[14] origin x y z; edges of voxel and cell; largest and smallest radius of a point; band; numbers of
-    voxels nx, ny, nz; numbers of cells."""
+    """[14] origin x y z; edge lengths of a voxel and of a cell; largest and smallest radius of a point; the
+    band, within which distances are exact; numbers of voxels nx, ny, nz; numbers of cells along x, y, z."""
     may_touch: ndarray
-    """[groups, solids] whether a group of the robot may touch a solid; [0, 0] without allowed contacts."""
+    """[groups, solids] whether a group of the robot may touch a solid; shape [0, 0] without allowed
+    contacts."""
 
 
 def robot_groups(robot: Robot) -> tuple[str, ...]:
@@ -111,9 +116,9 @@ def robot_groups(robot: Robot) -> tuple[str, ...]:
 def compile_robot(robot: Robot) -> RobotArrays:
     """The arrays of a robot, with its locked joints at their values."""
     groups = robot_groups(robot)
-    of_links = [_placed_groups(robot)[link] for link in groups]
-    spheres = [group.spheres for group in of_links]
-    clusters = [group.rows for group in of_links]
+    placed_groups = [_placed_groups(robot)[link] for link in groups]
+    spheres = [group.spheres for group in placed_groups]
+    clusters = [group.rows for group in placed_groups]
     rows = [row for of_group in clusters for row in of_group]
     index = {link: i for i, link in enumerate(groups)}
     T = robot.frame_offsets
@@ -126,12 +131,12 @@ def compile_robot(robot: Robot) -> RobotArrays:
         first=np.cumsum([0] + [len(s) for s in spheres]).astype(np.int32),
         rows=np.concatenate([by_sixteen(row, row[-1:]) for row in [NO_SPHERES, *rows]]),
         row_bounds=np.array(
-            [row for link_rows in of_links for row in link_rows.row_bounds], np.float32
+            [row for link_rows in placed_groups for row in link_rows.row_bounds], np.float32
         ).reshape(-1, 4),
         row_sizes=np.array([len(row) for row in rows], np.int64),
         first_row=np.cumsum([0] + [len(of_group) for of_group in clusters]).astype(np.int32),
         frame=np.array([robot.link_frame(link) for link in groups], np.int32),
-        bounds=np.array([group.bounds for group in of_links], np.float32).reshape(-1, 4),
+        bounds=np.array([group.bounds for group in placed_groups], np.float32).reshape(-1, 4),
         pairs=np.array([(a, b, -1, 0) for a, b in pairs], np.int32).reshape(-1, 4),
         pair_tables=no_tables(),
         parents=robot.kernel_parents,
@@ -146,8 +151,8 @@ def compile_robot(robot: Robot) -> RobotArrays:
 def _known_tables(
     robot: Robot, pairs: list[tuple[int, int]], groups: tuple[str, ...]
 ) -> dict[int, LinkPairTable]:
-    """The robot's tables by index of the pair, for pairs that still have exactly the table's joints between
-    them."""
+    """The tables of `Robot.tables` by index of the pair. Tables are left out if the joints between the pair's
+    links are not exactly those of the table, as after locking a joint."""
     number = {frozenset((groups[a], groups[b])): p for p, (a, b) in enumerate(pairs)}
     tables_by_pair = {}
     for table in robot.tables:
@@ -158,29 +163,32 @@ def _known_tables(
 
 
 class _Group(NamedTuple):
-    """The spheres of a link in its frame, all together and in rows, and spheres around both."""
+    """The spheres [x, y, z, radius] of a link, in the frame that it is fixed to."""
 
     spheres: ndarray
     rows: list[ndarray]
+    """The spheres in rows of at most sixteen."""
     bounds: ndarray
+    """A sphere around all spheres."""
     row_bounds: list[ndarray]
+    """A sphere around each row."""
 
 
 @once_per_robot
 def _placed_groups(robot: Robot) -> dict[str, _Group]:
-    """The groups by link. A robot that holds something reuses those of the bare arm."""
-    of_link = {} if robot.bare is None else dict(_placed_groups(robot.bare))
-    links = [link for link in robot_groups(robot) if link not in of_link]
+    """The groups by link. A robot with an attached object reuses the groups of the bare arm."""
+    group_of_link = {} if robot.bare is None else dict(_placed_groups(robot.bare))
+    links = [link for link in robot_groups(robot) if link not in group_of_link]
     link_spheres = []
     parts = []
     for link in links:
         link_spheres.append(moved_spheres(robot.T_frame_link(link), robot.spheres[link]))
         parts.append(_clusters(link_spheres[-1]))
     bounds = _bounding_spheres([*link_spheres, *(part for group in parts for part in group)])
-    of_parts = iter(bounds[len(link_spheres) :])
-    for link, spheres, rows, around in zip(links, link_spheres, parts, bounds, strict=False):
-        of_link[link] = _Group(spheres, rows, around, list(islice(of_parts, len(rows))))
-    return of_link
+    part_bounds = iter(bounds[len(link_spheres) :])
+    for link, spheres, rows, bound in zip(links, link_spheres, parts, bounds, strict=False):
+        group_of_link[link] = _Group(spheres, rows, bound, list(islice(part_bounds, len(rows))))
+    return group_of_link
 
 
 @once_per_robot
@@ -196,8 +204,9 @@ def reach_bound(robot: Robot) -> float:
 
 @once_per_robot
 def reach_ball(robot: Robot) -> tuple[ndarray, float]:
-    """Center [3] and radius of a ball around all spheres of moving links [m]. The center is at the first
-    joint if that moves all of them, which makes the ball smaller, else at the base's origin."""
+    """Center [3] and radius of a ball around all spheres of moving links [m]. If the first joint moves all
+    these links, the center is at this joint, which makes the ball smaller; else it is at the base's
+    origin."""
     first = robot.frame_offsets[0, :3, 3]
     reach = reach_bound(robot)
     return (
@@ -206,7 +215,7 @@ def reach_ball(robot: Robot) -> tuple[ndarray, float]:
 
 
 def _clusters(spheres: ndarray) -> list[ndarray]:
-    """Spheres in parts of at most sixteen, by halving along the direction of largest extent."""
+    """Divides spheres into sets of at most sixteen, by halving along the direction of largest extent."""
     if len(spheres) <= W:
         return [spheres]
     centered = spheres[:, :3] - spheres[:, :3].mean(axis=0)
@@ -216,8 +225,8 @@ def _clusters(spheres: ndarray) -> list[ndarray]:
 
 
 def _bounding_spheres(sets: Sequence[ndarray]) -> list[ndarray]:
-    """A nearly minimal sphere around each set of spheres (Badoiu and Clarkson: the center repeatedly moves
-    towards the farthest one)."""
+    """A nearly minimal sphere around each set of spheres. The center repeatedly moves towards the farthest
+    sphere of the set (Badoiu and Clarkson)."""
     if not sets:
         return []
     max_count = max(map(len, sets))
@@ -235,13 +244,13 @@ def _bounding_spheres(sets: Sequence[ndarray]) -> list[ndarray]:
 
 
 GRID_SECONDS_PER_POINT = 7e-7
-"""Approximate time in which the grid is built, per point of meshes and clouds [s]."""
+"""Approximate time to build the grid, per covering sphere of the meshes and clouds [s]."""
 
 
 @lru_cache(maxsize=8)
 def compile_scene_for(robot: Robot, scene: Scene) -> SceneArrays:
-    """The arrays of the part of a scene that the robot can come near. The last few are cached, since a search
-    and the validator share them."""
+    """The arrays of the part of a scene that the robot can come near. They are cached, since a search and the
+    validator use the same ones."""
     largest = float(compile_robot(robot).spheres[:, 3].max(initial=0.0))
     return compile_scene(scene, reach_bound(robot), largest, robot_groups(robot))
 
@@ -249,19 +258,19 @@ def compile_scene_for(robot: Robot, scene: Scene) -> SceneArrays:
 def compile_scene(
     scene: Scene, reach: float = np.inf, radius: float = 0.0, groups: tuple[str, ...] = ()
 ) -> SceneArrays:
-    """The arrays of a scene around a robot that reaches `reach` far from its base's origin [m].
+    """The arrays of a scene for a robot that stays within `reach` of its base's origin [m].
 
-    Points well beyond that are left out. `radius` is that of the robot's largest sphere [m]; `groups` are its
-    links with spheres, for allowed contacts.
+    Points well beyond the reach are left out. `radius` is the radius of the robot's largest sphere [m];
+    `groups` are its links with spheres, for allowed contacts.
     """
-    touched = {name for name, _ in scene.allowed_contacts}
+    touchable = {name for name, _ in scene.allowed_contacts}
     solids = list[Solid]()
     points = list[PointCloud | Triangulated]()
     for solid in solids_of(scene):
         shape = solid.shape
         if not isinstance(shape, PointCloud | Triangulated):
             solids.append(solid)
-        elif shape.name in touched:
+        elif shape.name in touchable:
             for ball in join_to_few(_cover(shape, reach)):
                 solids.append(Solid(shape, transform(ball[:3]), np.zeros(3), 0.0, ball[3], False))
         else:
@@ -276,11 +285,11 @@ def compile_scene(
 
 
 def _rows(solids: Sequence[Solid], reach: float) -> ndarray:
-    """`SceneArrays.solids`, cropped along straight edges to the part that the robot can come near, and then
-    enlarged by more than the rounding to float32.
+    """`SceneArrays.solids`: each solid is cropped along its straight edges to the part that the robot can
+    come near, then enlarged by more than the rounding to float32.
 
-    Cropping does not change the distance to points within reach, and keeps the precision of a floor of 1 km
-    in float32.
+    Cropping does not change the distance to points within reach. It keeps float32 precise for a floor that is
+    1 km wide.
     """
     T = np.array([solid.T_base_box for solid in solids]).reshape(-1, 4, 4)
     sizes = np.array([[*solid.half, solid.disc, solid.rounding] for solid in solids]).reshape(-1, 5)
@@ -293,11 +302,13 @@ def _rows(solids: Sequence[Solid], reach: float) -> ndarray:
     nonempty = low < high
     half[nonempty] = ((high - low) / 2)[nonempty]
     center = T[:, :3, 3] + np.einsum("nij,nj->ni", R, np.where(nonempty, (low + high) / 2, 0.0))
-    grown = FLOAT32_ROUNDING * (np.abs(center).max(axis=1) + sizes.max(axis=1))
-    sizes += grown[:, None] * (sizes > 0)
+    growth = FLOAT32_ROUNDING * (np.abs(center).max(axis=1) + sizes.max(axis=1))
+    sizes += growth[:, None] * (sizes > 0)
     half[:, :2] += sizes[:, 3:4]
-    turned = R.transpose(0, 2, 1).reshape(-1, 9)
-    return np.concatenate([center, turned, half, sizes[:, 4:], sizes[:, 3:4] > 0], axis=1).astype(np.float32)
+    R_box_base = R.transpose(0, 2, 1).reshape(-1, 9)
+    return np.concatenate([center, R_box_base, half, sizes[:, 4:], sizes[:, 3:4] > 0], axis=1).astype(
+        np.float32
+    )
 
 
 def _boxes_around(rows: ndarray) -> ndarray:

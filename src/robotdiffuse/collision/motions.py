@@ -1,14 +1,14 @@
 """Collision of motions: the arguments of compiled searches, and the motion certificate of the validator.
 
-The motion certificate proves that a motion is free between its waypoints too, or finds its first contact. A
-piece of the motion is free for a link if a lower bound of its clearance along the piece is positive;
-otherwise the piece is split. The bound is computed from the clearance in the piece's middle, the velocity
-there towards what is near, and a bound on the curvature of the motion (`kernels/motion_certificate.py`).
-Between two links only the joints between them count, because motion is seen from the nearer one. Clearances
-are those of the covering spheres, for many configurations at once (`kernels/lane_clearance.py`). Where the
-spheres are too coarse, separating planes between the convex meshes give the bound
-(`kernels/convex_bounds.py`). Coal computes distances to surfaces and point clouds, and decides whether bodies
-touch.
+The motion certificate proves that a whole motion is free of collision, not only its waypoints, or finds its
+first contact. A piece of the motion is free for a link if a lower bound of the link's clearance along the
+piece is positive; otherwise the piece is split. The bound is computed from the clearance in the middle of the
+piece, the link's velocity there towards the nearest bodies, and a bound on the curvature of the motion
+(`kernels/motion_certificate.py`). For two links, motion is measured relative to the link nearer to the base,
+so only the joints between the links contribute. Clearances are first computed from the covering spheres, for
+many configurations at once (`kernels/lane_clearance.py`). Where the spheres are too coarse, separating planes
+between the convex meshes give the bound (`kernels/convex_bounds.py`). Coal computes distances to surfaces and
+point clouds, and decides whether bodies touch.
 """
 
 from dataclasses import replace
@@ -55,13 +55,14 @@ if TYPE_CHECKING:
 FINEST_RESOLUTION = 0.002
 """Smallest resolution of motion checks in a search [m]."""
 INITIAL_TRAVEL = 0.16
-"""Motion bound of the pieces into which a motion is first split [m]; half and twice as much are about as
+"""Motion bound of the pieces into which a motion is first split [m]. Half or twice this value is about as
 fast."""
 CONTACT_TRAVEL_TOLERANCE = 1e-3
 """The first contact is located to within this motion bound [m]."""
-# Step [m] and number of the configurations at which the depth of a contact is computed.
 DEPTH_SAMPLE_TRAVEL = 0.01
+"""Motion bound between the configurations at which the depth of a contact is computed [m]."""
 DEPTH_SAMPLES = 64
+"""Largest number of these configurations for one contact."""
 
 
 def search_space(
@@ -87,8 +88,8 @@ def search_space(
 
 
 def finer_resolution(resolution: float) -> float:
-    """The resolution for the search after the validator refused a path, because of a contact between two
-    checks: half as large [m]."""
+    """Half the resolution, at least FINEST_RESOLUTION [m]: for the next search after the validator found a
+    contact between two configurations that a search had checked."""
     return max(resolution / 2, FINEST_RESOLUTION)
 
 
@@ -114,10 +115,10 @@ class Sweep(NamedTuple):
 
     contact: Contact | None
     scene_clearance: float
-    """Lower bound on all clearances to the scene along the motion [m], at most 1 m; 0 if there is a
+    """Lower bound on the clearance to the scene along the motion [m], at most 1 m; 0 if there is a
     contact."""
     self_clearance: float
-    """Lower bound on all clearances between links along the motion [m], at most 1 m; 0 if there is a
+    """Lower bound on the clearance between links along the motion [m], at most 1 m; 0 if there is a
     contact."""
 
 
@@ -126,9 +127,9 @@ class ContinuousCollision:
     do not change it."""
 
     def __init__(self, robot: Robot, scene: Scene, contact: float, tightness: float) -> None:
-        """Meshes nearer than `contact` [m] count as touching. Pieces are split until each certified clearance
-        is at least the share `tightness`, in (0, 1), of the smallest measured one of its kind: to the scene,
-        or between links."""
+        """Meshes nearer than `contact` [m] count as touching. Pieces are split until the certified clearance
+        to the scene is at least the fraction `tightness`, in (0, 1), of the smallest measured clearance to
+        the scene. The same is done for the clearance between links."""
         self.robot = robot
         self.scene = scene
         self.contact = contact
@@ -171,10 +172,10 @@ class ContinuousCollision:
     def _ask(
         self, motion: Motion, bounds: Round, rows: ndarray, columns: ndarray, best: ndarray
     ) -> tuple[tuple[float, int], Round] | None:
-        """Let Coal compute the distances that the round leaves to it.
+        """Let Coal compute the distances that the other bounds left open.
 
-        If there is a contact, returns its place and check, and the part of the round before it: an earlier
-        contact may still be found there, and what follows no longer matters. Else returns None.
+        If there is a contact, returns its place and check, and the part of the round before the contact: an
+        earlier contact may still be found there, and later pieces no longer matter. Else returns None.
         """
         todo = bounds.pieces
         clearance = bounds.clearance
@@ -195,12 +196,14 @@ class ContinuousCollision:
         if not touched:
             return None
         row = int(rows[computed])
-        keep = row + int(todo.stop[row] - todo.start[row] > 2 * CONTACT_TRAVEL_TOLERANCE)
+        kept_rows = row + int(todo.stop[row] - todo.start[row] > 2 * CONTACT_TRAVEL_TOLERANCE)
         todo.stop[row] = middle[row]
         clearance[row:] = lower[row:] = -np.inf
-        parts = (todo.start, todo.stop, todo.undecided)
-        rest = Round(Pieces(*(part[:keep] for part in parts)), *(part[:keep] for part in bounds[1:]))
-        return (float(middle[row]), int(columns[computed])), rest
+        piece_arrays = (todo.start, todo.stop, todo.undecided)
+        earlier = Round(
+            Pieces(*(part[:kept_rows] for part in piece_arrays)), *(part[:kept_rows] for part in bounds[1:])
+        )
+        return (float(middle[row]), int(columns[computed])), earlier
 
     @cached_property
     def _exact(self) -> "ExactCollision":
@@ -212,8 +215,7 @@ class ContinuousCollision:
         return ExactCollision(self.robot, self.scene)
 
     def _contact(self, motion: Motion, at: float, check: int) -> Contact:
-        """The contact of a check at a place, with its greatest depth until the check is free of that
-        obstacle."""
+        """The contact of a check at travel `at`, with its greatest depth until link and obstacle separate."""
         steps = at + DEPTH_SAMPLE_TRAVEL * np.arange(DEPTH_SAMPLES)
         steps = steps[steps <= max(motion.travel[-1], at)]
         checks = np.full(len(steps), check)
@@ -249,8 +251,8 @@ def _arm(robot: Robot) -> Arm:
 
 @once_per_robot
 def _checks(robot: Robot) -> Checks:
-    """The checks as arrays for compiled code. Motion radii of a pair are seen from the frame where the chains
-    of both links part, which is the nearer link if both are on one chain."""
+    """The checks as arrays for compiled code. Motion radii of a pair are relative to the last frame that
+    moves both links: the frame of the nearer link if both are on one chain."""
     groups, pairs = _groups(robot)
     covered = with_covering_spheres(robot)
     parts = hulls_of(robot)[1]
@@ -259,11 +261,11 @@ def _checks(robot: Robot) -> Checks:
     checks = checks_of(robot)
     kind = []
     group_indices = []
-    of_parts = []
+    part_ranges = []
     base = []
     common = []
     second = []
-    of_checks = np.zeros((len(checks), robot.dof))
+    check_radii = np.zeros((len(checks), robot.dof))
     for k, (link, partner) in enumerate(checks):
         kind.append(SCENE if partner is None else PAIR)
         group_index = groups.get(link, -1) if partner is None else pairs.get(frozenset((link, partner)), -1)
@@ -277,20 +279,22 @@ def _checks(robot: Robot) -> Checks:
             (farther, robot.moved_by[high] & ~shared),
         ):
             if joints.any():
-                of_checks[k, joints] = radii[links.index(member), joints]
+                check_radii[k, joints] = radii[links.index(member), joints]
         base.append(low)
         common.append(int(np.flatnonzero(shared).max(initial=-1)) + 1)
         second.append(int(np.flatnonzero(robot.moved_by[high] & ~shared)[0]) if common[-1] != low else 0)
         partner_parts = range(0) if partner is None else parts[nearer]
-        of_parts.append((parts[farther].start, parts[farther].stop, partner_parts.start, partner_parts.stop))
+        part_ranges.append(
+            (parts[farther].start, parts[farther].stop, partner_parts.start, partner_parts.stop)
+        )
     return Checks(
         np.array(kind, np.int64),
         np.array(group_indices, np.int64),
-        np.array(of_parts, np.int64).reshape(-1, 4),
+        np.array(part_ranges, np.int64).reshape(-1, 4),
         np.array(base, np.int64),
         np.array(common, np.int64),
         np.array(second, np.int64),
-        of_checks,
+        check_radii,
         np.array([SURFACES_BELOW if surfaces_decide(robot, check) else 0.0 for check in checks]),
     )
 

@@ -1,11 +1,12 @@
 """The motion certificate among moving obstacles: proves a timed motion free of them, or finds the first
 contact.
 
-An interval of time is proved for a link and an obstacle if their clearance in its middle exceeds the distance
-that points of the link (`robots/motion_bounds.py`) and of the obstacle can move in half of the interval;
-otherwise it is halved. An obstacle of which only the maximum speed is known may be anywhere that it can have
-reached since time 0. Clearances are those of the covering spheres (`kernels/moving_obstacles.py`); where
-these touch, Coal computes those of the meshes. The result is a proof and does not depend on sampling.
+A time interval is proved free for a link and an obstacle if their clearance at the middle of the interval
+exceeds the sum of two distances: how far points of the link (`robots/motion_bounds.py`) and points of the
+obstacle can move in half of the interval. Otherwise the interval is halved. If only the maximum speed of an
+obstacle is known, the obstacle may be anywhere that it can have reached since time 0. Clearances are computed
+from the covering spheres (`kernels/moving_obstacles.py`), or from the meshes, by Coal, where the spheres
+touch. The result is a proof and does not depend on sampling.
 """
 
 from collections.abc import Sequence
@@ -38,10 +39,11 @@ if TYPE_CHECKING:
 CONTACT_TIME_TOLERANCE = 1e-3
 """The first contact is located to within this time [s]."""
 MIN_INTERVAL = 1e-7
-"""Intervals are halved down to this length [s]; what is not proved then counts as contact."""
-# Step [s] and number of the times at which the depth of a contact is computed.
+"""Intervals are halved down to this length [s]; a shorter interval that is not proved counts as a contact."""
 DEPTH_SAMPLE_TIME = 0.005
+"""Time between the samples at which the depth of a contact is computed [s]."""
 DEPTH_SAMPLES = 200
+"""Largest number of these samples for one contact."""
 
 
 class TimedContact(NamedTuple):
@@ -70,8 +72,8 @@ class MovingCollision:
     def __init__(
         self, robot: Robot, moving: Sequence[MovingObstacle], contact: float, tightness: float
     ) -> None:
-        """Meshes nearer than `contact` [m] count as touching. Intervals are halved until each bound is at
-        least the share `tightness`, in [0, 1), of the smallest clearance measured."""
+        """Meshes nearer than `contact` [m] count as touching. Intervals are halved until each lower bound is
+        at least the fraction `tightness`, in [0, 1), of the smallest clearance measured."""
         self.robot, self.moving, self.contact, self.tightness = robot, tuple(moving), contact, tightness
         self.link_names, self.links = compile_links(robot)
         self.tracks = compile_tracks(self.moving)
@@ -82,9 +84,9 @@ class MovingCollision:
         q = for_kernels(q)
         best = np.array([CLEARANCE_CAP])
         certified = CLEARANCE_CAP
-        every = np.ones((1, len(self.link_names), len(self.moving)), np.bool_)
+        all_pairs = np.ones((1, len(self.link_names), len(self.moving)), np.bool_)
         ends = times[[0, -1]]
-        tasks = Tasks(ends[:1], ends[1:], every)
+        tasks = Tasks(ends[:1], ends[1:], all_pairs)
         hit = None
         while len(tasks.start):
             bound, open_tasks = kernel.settle_tasks(
@@ -115,7 +117,8 @@ class MovingCollision:
         return TimedSweep(None, float(certified))
 
     def inflated(self, by: Float[ndarray, "obstacles"]) -> "MovingCollision":
-        """A copy in which each obstacle is inflated by a distance [m], for `first_unproved_time`."""
+        """A copy for `first_unproved_time` in which each obstacle is inflated by a distance [m]. Only the
+        covering spheres' bounds use it, not the exact meshes."""
         inflated = copy(self)
         inflated.tracks = self.tracks._replace(rounding=self.tracks.rounding + by)
         return inflated
@@ -124,12 +127,12 @@ class MovingCollision:
         self, times: Float[ndarray, "n"], q: Float[ndarray, "n dof"], least: float
     ) -> float | None:
         """The first time [s] at which the covering spheres do not prove a clearance of `least` [m]; None if
-        they prove it all along. It is fast, for searches and control loops, because it never uses the exact
-        meshes."""
-        every = np.ones((1, len(self.link_names), len(self.moving)), np.bool_)
+        they prove it for the whole motion. It never uses the exact meshes, so it is fast enough for searches
+        and control loops."""
+        all_pairs = np.ones((1, len(self.link_names), len(self.moving)), np.bool_)
         times = for_kernels(times)
         q = for_kernels(q)
-        tasks = Tasks(times[:1], times[-1:], every)
+        tasks = Tasks(times[:1], times[-1:], all_pairs)
         open_tasks = kernel.settle_tasks(
             self.links, self.tracks, times, q, tasks, least, 0.0, np.array([CLEARANCE_CAP])
         )[1]
@@ -153,8 +156,8 @@ class MovingCollision:
         return distance - self.tracks.growth[o] * max(time, 0.0)
 
     def _lost(self, link: int, o: int, times: ndarray, q: ndarray, start: float, stop: float) -> float:
-        """Upper bound on the sum of how far points of the link and of the obstacle move from the middle of an
-        interval to either end [m]."""
+        """Upper bound on how much clearance is lost from the middle of an interval to either end [m]: how far
+        points of the link move, plus how far points of the obstacle move."""
         travel = kernel.cumulative_motion(q)
         a, m, b = (interpolated(time, times, travel) for time in (start, (start + stop) / 2, stop))
         speed = kernel.speed_between(self.tracks, o, start, stop) + self.tracks.growth[o]
@@ -183,26 +186,26 @@ class MovingCollision:
 
 @once_per_robot
 def compile_links(robot: Robot) -> tuple[tuple[str, ...], Links]:
-    """Names of the moving links with geometry, and their arrays for compiled code."""
+    """Names of the moving links with geometry, and the links' arrays for compiled code."""
     covered = with_covering_spheres(robot)
     names = tuple(link for link in robot_groups(covered) if covered.link_frame(link) > 0)
     spheres = []
     for link in names:
         spheres.append(moved_spheres(covered.T_frame_link(link), covered.spheres[link]))
     bounds = np.zeros((len(names), 4))
-    for i, of_link in enumerate(spheres):
-        low = (of_link[:, :3] - of_link[:, 3:]).min(axis=0)
-        high = (of_link[:, :3] + of_link[:, 3:]).max(axis=0)
+    for i, link_spheres in enumerate(spheres):
+        low = (link_spheres[:, :3] - link_spheres[:, 3:]).min(axis=0)
+        high = (link_spheres[:, :3] + link_spheres[:, 3:]).max(axis=0)
         bounds[i, :3] = (low + high) / 2
-        far = np.linalg.norm(of_link[:, :3] - bounds[i, :3], axis=1) + of_link[:, 3]
-        bounds[i, 3] = far.max()
+        reach = np.linalg.norm(link_spheres[:, :3] - bounds[i, :3], axis=1) + link_spheres[:, 3]
+        bounds[i, 3] = reach.max()
     links = Links(
         for_kernels(robot.frame_offsets),
         robot.kernel_parents,
         np.array(robot.prismatic, np.bool_),
         np.array([covered.link_frame(link) for link in names], np.int64),
         bounds,
-        np.cumsum([0] + [len(of_link) for of_link in spheres]),
+        np.cumsum([0] + [len(link_spheres) for link_spheres in spheres]),
         np.concatenate(spheres) if spheres else np.zeros((0, 4)),
         radii_of(covered, names),
     )
@@ -210,7 +213,7 @@ def compile_links(robot: Robot) -> tuple[tuple[str, ...], Links]:
 
 
 def compile_tracks(moving: Sequence[MovingObstacle]) -> Tracks:
-    """The arrays of moving obstacles for compiled code; a mesh is represented by the box around it."""
+    """The arrays of moving obstacles for compiled code. A mesh is represented by its bounding box."""
     times = []
     xyz = []
     wxyz = []
@@ -230,7 +233,8 @@ def compile_tracks(moving: Sequence[MovingObstacle]) -> Tracks:
         inverse(obstacle.shape.T_base_shape) @ solid.T_base_box
         for obstacle, solid in zip(moving, solids, strict=True)
     ]
-    # A surface's box is aligned with the base frame, so it is rotated in the obstacle's own frame.
+    # The bounding box of a surface is aligned with the base frame, so in the obstacle's frame it is rotated;
+    # the extents are those of a box around it.
     extents = [np.abs(T[:3, :3]) @ solid.half for T, solid in zip(boxes, solids, strict=True)]
     return Tracks(
         np.cumsum([0] + [len(at) for at in times]),

@@ -1,5 +1,5 @@
-"""Covering spheres of point clouds and meshes, and the grid over them that `kernels/point_grid.py`
-queries."""
+"""Covering spheres of point clouds and meshes, and the grid over these spheres, which
+`kernels/point_grid.py` queries."""
 
 from typing import NamedTuple
 
@@ -11,23 +11,25 @@ from robotdiffuse.collision.kernels.point_grid import POINT_RANGE, make_grid
 from robotdiffuse.collision.kernels.simd import by_sixteen
 
 MESH_SPACING = 0.02
-"""Triangles of mesh obstacles are divided until no edge is longer than this [m]; each piece becomes a
+"""Triangles of mesh obstacles are divided until no edge is longer than this [m]; each piece is covered by one
 sphere."""
 THINNING = 0.5
 """Edge of the thinning voxels of a point cloud, as a multiple of its point radius."""
 MAX_POINTS = 400_000
 """Approximate largest number of spheres of a mesh obstacle; larger meshes are divided more coarsely, or their
 pieces merged."""
-# Edge of the voxels by which spheres of surfaces that links may touch are first joined [m], and the number
-# that is left at most: these spheres are not in the grid, but checked one by one.
-JOIN_VOXEL = 0.004
 MAX_SOLIDS = 1000
+"""Largest number of spheres of a surface that links may touch. These spheres are not in the grid but checked
+one by one; more are merged by `join_to_few`."""
+JOIN_VOXEL = 0.004
+"""Edge of the voxels by which `join_to_few` first merges spheres [m]; it grows until few enough are left."""
 EXACT_RANGE = 0.1
 """Clearances to points are exact up to this [m], and lower bounds beyond."""
 VOXELS_PER_RANGE = 10
-"""Number of voxels in the range of distances that the grid knows."""
+"""Number of voxels per distance up to which the grid stores a nearest point, unless MAX_VOXELS needs larger
+voxels."""
 MAX_VOXELS = 1e6
-"""Largest number of voxels of a grid: 4 MB, which fits a processor's cache."""
+"""Approximate largest number of voxels of a grid: 4 MB, which fits a processor's cache."""
 NO_SPHERES = np.zeros((0, 4))
 
 
@@ -43,7 +45,7 @@ class PointGrid(NamedTuple):
 
 
 def thin_points(points: Float[ndarray, "n 3"], radius: float, reach: float) -> Float[ndarray, "m 4"]:
-    """One sphere per occupied voxel, large enough to contain the spheres of all points of the voxel [m].
+    """One sphere per occupied voxel, large enough to contain the spheres of all the voxel's points [m].
 
     Points more than POINT_RANGE beyond `reach` [m] are left out.
     """
@@ -53,11 +55,11 @@ def thin_points(points: Float[ndarray, "n 3"], radius: float, reach: float) -> F
 
 
 def _join(spheres: Float[ndarray, "n 4"], voxel: float) -> Float[ndarray, "m 4"]:
-    """One sphere per voxel around all spheres with centers in it."""
+    """One sphere per occupied voxel: it contains all spheres with centers in the voxel."""
     if not len(spheres):
         return NO_SPHERES
     offsets = spheres[:, :3] - spheres[:, :3].min(axis=0)
-    # Three voxel indices and a sphere's index are packed into one integer, which sorts faster than an
+    # Three voxel indices and a sphere's index are packed into one integer: sorting these is faster than
     # argsort.
     bits = len(spheres).bit_length()
     axis = (62 - bits) // 3
@@ -70,13 +72,15 @@ def _join(spheres: Float[ndarray, "n 4"], voxel: float) -> Float[ndarray, "m 4"]
     spheres = spheres[packed & ((1 << bits) - 1)]
     counts = np.diff(starts, append=len(spheres))
     centers = np.add.reduceat(spheres[:, :3], starts) / counts[:, None]
-    away = spheres[:, :3] - np.repeat(centers, counts, axis=0)
-    radii = np.maximum.reduceat(np.sqrt(np.einsum("ij,ij->i", away, away)) + spheres[:, 3], starts)
+    offsets_from_center = spheres[:, :3] - np.repeat(centers, counts, axis=0)
+    radii = np.maximum.reduceat(
+        np.sqrt(np.einsum("ij,ij->i", offsets_from_center, offsets_from_center)) + spheres[:, 3], starts
+    )
     return np.column_stack([centers, radii])
 
 
 def join_to_few(spheres: Float[ndarray, "n 4"]) -> Float[ndarray, "m 4"]:
-    """At most MAX_SOLIDS spheres that contain all of these."""
+    """At most MAX_SOLIDS spheres that together contain all given spheres."""
     voxel = JOIN_VOXEL
     while len(spheres) > MAX_SOLIDS:
         spheres = _join(spheres, voxel)
@@ -97,7 +101,7 @@ def cover_triangles(triangles: Float[ndarray, "n 3 3"], reach: float) -> Float[n
 
 
 def _divide(triangles: Float[ndarray, "n 3 3"], spacing: float, reach: float) -> Float[ndarray, "m 3 3"]:
-    """Pieces of the triangles near the robot with no edge longer than `spacing` [m], by halving longest
+    """Divides the triangles near the robot until no edge is longer than `spacing` [m], by halving the longest
     edges."""
     finished = [np.zeros((0, 3, 3))]
     while len(triangles):
@@ -126,7 +130,8 @@ def _area(triangles: Float[ndarray, "n 3 3"]) -> float:
 
 
 def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
-    """The grid over covering spheres of obstacles, for a robot whose spheres have at most this radius [m]."""
+    """The grid over the covering spheres `cloud` of obstacles. `radius` is that of the robot's largest sphere
+    [m]."""
     if not len(cloud):
         return PointGrid(
             NO_SPHERES.astype(np.float32),
@@ -136,6 +141,7 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
             np.zeros(0, np.int32),
             np.ones(14, np.float32),
         )
+    # the grid's box and voxels; a cell has 2 x 2 x 2 voxels
     cloud = cloud.astype(np.float32)
     radii = cloud[:, 3]
     exact_distance = EXACT_RANGE + radius + float(radii.max())
@@ -144,6 +150,7 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
     voxel = np.float32(max(exact_distance / VOXELS_PER_RANGE, (extent.prod() / MAX_VOXELS) ** (1 / 3)))
     shape = np.ceil(extent / voxel).astype(np.int32) + 1
     cells = (shape + 1) // 2
+    # points sorted by cell, then by voxel within the cell
     index = ((cloud[:, :3] - low) / voxel).astype(np.int64)
     cell = _flat(index // 2, cells)
     order = np.argsort(cell * 8 + (index % 2) @ np.array([4, 2, 1]))
@@ -153,6 +160,7 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
     first = np.asarray(np.searchsorted(cell, np.arange(int(np.prod(cells)) + 1)), np.int32)
     # The band is wide enough to decide about the robot's largest sphere.
     band = np.float32(max(radius + float(radii.max()) + 1e-3, 2 * float(voxel)))
+    # runs of points in the same voxel
     voxels = _flat(index, shape)
     starts = np.flatnonzero(np.diff(voxels, prepend=-1))
     run = np.full(int(np.prod(shape)), -1, np.int32)
@@ -167,4 +175,5 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
 
 
 def _flat(index: Int[ndarray, "n 3"], shape: Int32[ndarray, "3"]) -> Int[ndarray, "n"]:
+    """Row-major index of each voxel."""
     return (index[:, 0] * int(shape[1]) + index[:, 1]) * int(shape[2]) + index[:, 2]

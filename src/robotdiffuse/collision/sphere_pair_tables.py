@@ -1,9 +1,10 @@
 """Tables of the joint values at which two links close to each other along the arm may touch.
 
-The relative pose of two links depends only on the joints between them. For pairs with one or two such joints,
-such as forearm and hand, bounding spheres overlap almost always. A table over the two joints says where the
-links may touch at all: one look-up replaces hundreds of distances. Tables are computed from spheres, or from
-convex parts if the robot has such a table (`robots/fitting/sampled_links.py`).
+The relative pose of two links depends only on the joints between them. For links with one or two joints
+between them, such as forearm and hand, bounding spheres overlap almost always. A table over these joints says
+at which joint values the links may touch: one look-up replaces hundreds of distances. Tables are computed
+from the spheres. If the robot has a table of the links' convex parts (`robots/fitting/sampled_links.py`),
+cells that it proves free are free here too.
 """
 
 from collections.abc import Mapping
@@ -18,10 +19,10 @@ from robotdiffuse.collision.kernels.lane_collision import TABLE_HEADER, TABLE_SI
 from robotdiffuse.robots.robot import LinkPairTable
 
 CELLS_PER_JOINT = TABLE_SIDE - 2
-"""Number of cells along each joint's range; a ring of cells around them stands for values beyond the
-range."""
+"""Number of cells along each joint's range; one more cell at each end stands for values beyond the range."""
 MAX_PAIRS = 24
-"""Largest number of pairs per table: each has a bit of an integer that a float32 represents exactly."""
+"""Largest number of pairs per table: each pair is a bit of an integer, and float32 represents integers of up
+to 24 bits exactly."""
 ROUNDING_SLACK = 1e-5
 """Upper bound on the rounding error of a distance [m]."""
 
@@ -38,31 +39,41 @@ def build_pair_tables(
     radii: Float[ndarray, "groups dof"],
     known: Mapping[int, LinkPairTable],
 ) -> tuple[Int32[ndarray, "pairs 4"], Float32[ndarray, "tables width"]]:
-    """The rows of `RobotArrays.pairs`, with table and bit of pairs that depend on one or two joints, and the
-    tables.
+    """The tables, and the rows of `RobotArrays.pairs` with table and bit filled in for pairs that depend on
+    one or two joints.
 
-    A table consists of the first joint, its low end and cells per unit, the same of the second joint, and the
-    cells: sums of the bits of the pairs that may touch there. `arrays`: the RobotArrays without tables.
-    `radii`: upper bounds on how far a point of each group moves per unit of each joint [m]. `known`: tables
-    of convex parts for some of the pairs, by index.
+    A table is a row of numbers: index, lower end and cells per unit of the first joint, then of the second
+    joint, then the cells. A cell is the sum of the bits of the pairs that may touch there.
+
+    Args:
+        arrays: The RobotArrays without tables.
+        lower: Lower joint limits.
+        upper: Upper joint limits.
+        radii: Upper bounds on how far a point of each group moves per unit of each joint [m].
+        known: Tables of convex parts for some of the pairs, by index of the pair.
+
+    Returns:
+        The rows of `RobotArrays.pairs` and the tables.
     """
     parents = np.arange(len(lower)) if arrays.parents is None else arrays.parents
-    pairs_found = arrays.pairs.copy()
+    pair_rows = arrays.pairs.copy()
     tables = [no_tables()]
-    by_joint: dict[int, list[int]] = {}
+    pairs_by_joint: dict[int, list[int]] = {}
     for p, (a, b) in enumerate(arrays.pairs[:, :2].tolist()):
         near, far = sorted((int(arrays.frame[a]), int(arrays.frame[b])))
-        pairs = by_joint.setdefault(far - 1, [])
+        pairs = pairs_by_joint.setdefault(far - 1, [])
         before = int(parents[far - 1])
         if near in (before, parents[before - 1] if before else 0) and len(pairs) < MAX_PAIRS:
             pairs.append(p)
-    for last, pairs in by_joint.items():
+    # one table per last joint of a pair; the other axis is the joint before it
+    for last, pairs in pairs_by_joint.items():
         before = int(parents[last]) - 1
         joints = np.array([before if before >= 0 else last, last])
         if not pairs or not (upper[joints] > lower[joints]).all():
             continue
         width = (upper[joints] - lower[joints]) / CELLS_PER_JOINT
         far_groups = [max(arrays.pairs[p, :2], key=lambda g: arrays.frame[g]) for p in pairs]
+        # a pair is free in a whole cell if its clearance at the cell's center is at least `travel`
         travel = radii[far_groups][:, joints] @ width / 2 + ROUNDING_SLACK
         q = np.tile(((lower + upper) / 2).astype(np.float32), (CELLS_PER_JOINT**2, 1))
         i, j = np.divmod(np.arange(CELLS_PER_JOINT**2), CELLS_PER_JOINT)
@@ -80,7 +91,7 @@ def build_pair_tables(
         bits = 1 << np.arange(len(pairs))
         table = np.full((TABLE_SIDE, TABLE_SIDE), bits.sum())
         table[1:-1, 1:-1] = touch @ bits
-        pairs_found[pairs, 2:] = np.column_stack([np.full(len(pairs), len(tables) - 1), bits])
-        head = np.column_stack([joints, lower[joints] - width, 1 / width]).ravel()
-        tables.append(np.concatenate([head, table.ravel()])[None].astype(np.float32))
-    return pairs_found, np.concatenate(tables)
+        pair_rows[pairs, 2:] = np.column_stack([np.full(len(pairs), len(tables) - 1), bits])
+        header = np.column_stack([joints, lower[joints] - width, 1 / width]).ravel()
+        tables.append(np.concatenate([header, table.ravel()])[None].astype(np.float32))
+    return pair_rows, np.concatenate(tables)

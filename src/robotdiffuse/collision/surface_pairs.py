@@ -1,8 +1,10 @@
-"""Distances between the surfaces of two grazing links, whose convex parts can overlap where the links do not.
+"""Distances between the mesh surfaces of two grazing links: links whose convex parts can overlap although the
+links do not touch.
 
-Convex parts fill hollows of a mesh. Where the parts of two links overlap only a little, the triangles that
-the URDF gives decide: they must not touch, and no piece of one link may lie inside the other. The distance of
-the surfaces then bounds motion as that of the parts does: a piece cannot get inside without touching.
+Convex parts fill hollows of a mesh. Where the parts of two links overlap only a little, the triangles of the
+URDF's meshes decide whether the links collide: the triangles must not touch, and no piece of one link may lie
+inside the other. The distance of the surfaces then bounds how far the links can move without contact, since a
+piece cannot get inside without touching the surface.
 """
 
 # Coal's Python module has no type information.
@@ -22,9 +24,10 @@ from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot
 
 MAX_OVERLAP = 0.005
-"""Overlap of convex parts beyond which links collide even if their surfaces do not [m]."""
+"""Overlap of convex parts beyond which links count as colliding whatever their surfaces do [m]."""
 RAYS = np.array([[0.6137, 0.5291, 0.5861], [-0.7313, 0.3917, -0.5583], [0.1723, -0.8839, 0.4348]])
-"""Directions of the rays that tell whether a point is inside; along no common edge or face."""
+"""Directions of the rays that tell whether a point is inside a surface; oblique, so that few rays run along
+an edge or a face."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +43,8 @@ class _Body:
     """One point of each component."""
 
     def inside(self, points: Float[ndarray, "n 3"]) -> Bool[ndarray, "n"]:
-        """Whether each point may be inside a component: one of several rays crosses it an odd number of
-        times. Points in front of an open component can count as inside."""
+        """Whether each point may be inside a connected component: one of several rays from the point crosses
+        the component an odd number of times. Points in front of an open component can count as inside."""
         low = self.triangles.min(axis=(0, 1))
         high = self.triangles.max(axis=(0, 1))
         enclosed = ((points >= low) & (points <= high)).all(axis=1)
@@ -68,8 +71,8 @@ class SurfacePair:
     second: _Body
 
     def distance(self, frames: Float[ndarray, "frames 4 4"], cutoff: float = np.inf) -> float | None:
-        """Distance of the surfaces [m]; any value of at least `cutoff` beyond it. None if they touch, or a
-        piece of one is inside the other."""
+        """Distance of the surfaces [m], or some value of at least `cutoff` if it is larger than `cutoff`.
+        None if the surfaces touch, or a piece of one is inside the other."""
         a = self.first
         b = self.second
         T_a = frames[a.frame]
@@ -110,9 +113,9 @@ def _body(robot: Robot, link: str) -> _Body:
     surface = robot.surfaces[link]
     vertices = placed(T, surface.vertices)
     faces = surface.faces
-    ends = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
-    edges = coo_array((np.ones(len(ends[0]), bool), ends), (len(vertices),) * 2)
-    _, of_vertices = connected_components(edges, directed=False)
-    _, first, component = np.unique(of_vertices[faces[:, 0]], return_index=True, return_inverse=True)
+    edge_ends = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
+    edges = coo_array((np.ones(len(edge_ends[0]), bool), edge_ends), (len(vertices),) * 2)
+    _, vertex_component = connected_components(edges, directed=False)
+    _, first, component = np.unique(vertex_component[faces[:, 0]], return_index=True, return_inverse=True)
     points = vertices[faces[first, 0]]
     return _Body(robot.link_frame(link), coal_surface(vertices, faces), vertices[faces], component, points)

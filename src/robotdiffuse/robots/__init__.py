@@ -30,12 +30,14 @@ ROBOTS = tuple(sorted(file.parent.name for file in DATA.glob(f"*/{ROBOT_FILE}"))
 def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robot:
     """Load a robot by its bundled name, a name given to `robotdiffuse robot add`, its folder, or its URDF.
 
-    A URDF is looked up by content among the added robots, and refused if several that differ were made from
-    it. A new or changed one is prepared first, which takes about a minute, and stored. As long as its files
-    are unchanged, the same robot is returned as the same object.
+    A URDF is looked up by content among the added robots. If none was made from it, the robot is prepared,
+    which takes about a minute, and stored. If several different ones were made from it, an InputError asks
+    for a name. Calls return the same object as long as the robot's files are unchanged.
 
     Args:
-        name: Name, robot folder, or URDF. Only `robot add` compiles xacro, since that runs code in it.
+        name: Name, robot folder, or URDF. Only `robot add` reads xacro files, since compiling a file runs the
+        code
+            in it.
         locked: Values at which joints are locked [rad] or [m] (see `Robot.with_locked`).
 
     Raises:
@@ -55,7 +57,8 @@ def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robo
 
 
 def names_a_file(name: str | Path) -> bool:
-    """Whether `load_robot` reads a file or folder of this name; else it looks the name up."""
+    """Whether `load_robot` takes this name as the path of a file or folder; else it looks up a robot's
+    name."""
     text = str(name)
     by_form = text.endswith((".urdf", ".xacro", ".xml")) or "/" in text or "\\" in text
     return by_form or isinstance(name, Path) or is_file(Path(name) / ROBOT_FILE)
@@ -71,7 +74,7 @@ def _by_name(name: str) -> Robot:
 
 
 def _read(folder: Path, source: str | None) -> Robot:
-    """The robot in a folder; a cached one if its files are unchanged."""
+    """The robot in a folder: the cached object if the folder's files are unchanged."""
     states = (_state(folder / name) for name in (ROBOT_FILE, MESH_FILE, SURFACE_FILE))
     return _read_state(folder.resolve(), source, *states)
 
@@ -120,7 +123,7 @@ def _from_urdf(urdf: Path) -> Robot:
             if _digest(folder, _state(folder / ROBOT_FILE)) == digest:
                 robots[name] = _read(folder, source)
         except InputError:
-            continue  # the damaged folder of another robot must not matter here
+            continue  # another robot's damaged folder must not prevent loading this one
     if len({(robot_fingerprint(robot), json.dumps(robot.poses)) for robot in robots.values()}) > 1:
         raise InputError(
             f"{urdf} was added as {', '.join(robots)}, which differ in joints, limits, spheres, allowed "

@@ -31,7 +31,8 @@ class ConvexMesh(Surface):
 
 
 def polygon_around_circle(radius: float) -> Float[ndarray, "32 2"]:
-    """Corners of a regular polygon, 0.5 % wider than the circle about the origin that it contains."""
+    """Corners of a regular polygon around a circle about the origin [m]; it is 0.5 % wider than the
+    circle."""
     angles = 2 * np.pi * np.arange(POLYGON_SIDES) / POLYGON_SIDES
     return radius / np.cos(np.pi / POLYGON_SIDES) * np.column_stack([np.cos(angles), np.sin(angles)])
 
@@ -44,8 +45,8 @@ class RigidShape(Protocol):
     def name(self) -> str: ...
 
     def solid(self) -> tuple[Pose, tuple[ConvexMesh, ...]]:
-        """The shape's pose in the frame in which it is given, and convex meshes in its own frame that contain
-        it."""
+        """The shape's pose in the frame in which it is given, and convex meshes in the shape's own frame that
+        together contain the shape."""
         ...
 
 
@@ -58,7 +59,7 @@ class AttachedBody(Value):
     """Link to which the body is fixed."""
     T_link_body: Pose
     shapes: tuple[RigidShape, ...] = ()
-    """Shapes, posed in the frame of `link`. A body without shapes is only a frame."""
+    """Shapes, given in the frame of `link`. A body without shapes is only a frame."""
     touch_links: tuple[str, ...] = ()
     """Links that the body may touch, besides those that move with it."""
     tool: bool = False
@@ -88,7 +89,7 @@ def _content(value: Any) -> object:
 
 
 SLACK = 1e-6
-"""Largest size of a negative principal moment that is accepted as a rounding error of the file, relative to
+"""A negative principal moment of at most this size is accepted as a rounding error of the file; relative to
 the largest entry of the inertia matrix."""
 
 
@@ -96,7 +97,7 @@ class Inertia(NamedTuple):
     """Mass and inertia of a link, in its frame."""
 
     mass: float
-    """ALL Mass [kg]."""
+    """Mass [kg]."""
     com: Vector
     """Center of mass [m]."""
     moments: Rotation
@@ -110,8 +111,8 @@ class Inertia(NamedTuple):
 
 
 def inertia_of(values: ArrayLike) -> Inertia:
-    """An inertia from mass, x, y, z, ixx, ixy, ixz, iyy, iyz, izz; raises ValueError if physically
-    impossible."""
+    """An inertia from the ten numbers mass, x, y, z, ixx, ixy, ixz, iyy, iyz, izz. Raises ValueError if it is
+    physically impossible."""
     row = np.array(values, np.float64)
     if row.shape != (10,) or not within(row):
         raise ValueError("ten finite numbers expected")
@@ -132,7 +133,7 @@ class Payload(Value):
     """
 
     mass: float
-    """ALL Mass [kg]."""
+    """Mass [kg]."""
     com: GivenVector = (0.0, 0.0, 0.0)  # pyright: ignore[reportAssignmentType]
     """Center of mass, in the frame of the link [m]."""
     link: str | None = None

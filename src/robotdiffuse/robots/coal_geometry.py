@@ -17,7 +17,8 @@ def coal_pose(T: Pose) -> coal.Transform3s:
 
 
 def coal_rounded(half: Vector, disc: float, rounding: float) -> coal.CollisionGeometry:
-    """A sphere, box, cylinder or capsule: the Minkowski sum of a box, a disc about its z axis and a ball."""
+    """A sphere, box, cylinder or capsule, given as the Minkowski sum of a box with half edges `half`, a disc
+    of radius `disc` around its z axis, and a ball of radius `rounding` [m]."""
     x, y, z = (2 * half).tolist()
     if disc > 0:
         return coal.Cylinder(disc, z)

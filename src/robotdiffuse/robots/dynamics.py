@@ -1,11 +1,11 @@
-"""Joint torques by Pinocchio's inverse dynamics, and bounds on their second derivatives along a motion, to
-show that limits hold between samples.
+"""Joint torques by Pinocchio's inverse dynamics, and bounds on their second derivatives along a motion. The
+bounds show that torque limits hold between samples.
 
 Between two samples, a torque deviates from linear interpolation by at most an eighth of its largest second
-derivative times the square of the interval. Norms bound that derivative: inverse dynamics consists of sums
-and products of vectors, and the Newton-Euler recursion propagates upper bounds on the lengths of each
-vector and of its first two derivatives. A vector that is fixed in a body rotates with it and keeps its
-length.
+derivative times the square of the interval. To bound this derivative, the Newton-Euler recursion is run on
+bounds: inverse dynamics consists of sums and products of vectors, and each vector is replaced by upper bounds
+on its length and on the lengths of its first two derivatives. A vector that is fixed in a body rotates with
+the body and keeps its length.
 """
 
 from typing import Any, NamedTuple
@@ -25,17 +25,19 @@ derivatives, on n pieces of a motion."""
 
 
 class Stretches(NamedTuple):
-    """Bounds for n stretches of a motion, on each of which the motion is smooth."""
+    """Bounds for n stretches of a motion, on each of which the motion is smooth. Derivatives are by the share
+    of the stretch, which goes from 0 to 1; velocities and accelerations are by time."""
 
     q: Configurations
     """Largest absolute values of the joint positions [rad] or [m]."""
     v: Float[ndarray, "3 n dof"]
     """Largest absolute values of the first three derivatives of the joint positions."""
     speed: Float[ndarray, "3 n dof"]
-    """Largest absolute values of the joint velocities and of their first two derivatives."""
+    """Largest absolute values of the joint velocities and of the velocities' first two derivatives. For a
+    path without times they are zero."""
     pull: Float[ndarray, "3 n dof"]
-    """Largest absolute values of the joint accelerations and of their first two derivatives. Velocities and
-    accelerations are zero where the motion holds a position."""
+    """Largest absolute values of the joint accelerations and of the accelerations' first two derivatives;
+    zero for a path without times."""
 
 
 class Body(NamedTuple):
@@ -46,7 +48,8 @@ class Body(NamedTuple):
     slides: bool
     """Whether the joint is prismatic."""
     offset: float
-    """Distance of the frame's origin from that of the parent frame, with a prismatic joint at zero [m]."""
+    """Distance between the origins of this frame and of the parent frame, with a prismatic joint at zero
+    [m]."""
     mass: float
     """Mass of the bodies that are fixed to the frame [kg]."""
     lever: float
@@ -56,16 +59,19 @@ class Body(NamedTuple):
 
 
 def product(a: Jet, b: Jet) -> Jet:
-    """Bounds for a product of two vectors or numbers whose length is at most the product of their lengths."""
+    """Bounds for a product of two vectors or numbers, such as a cross product, by the product rule. The
+    length of the product must be at most the product of the lengths."""
     return np.stack([a[0] * b[0], a[1] * b[0] + a[0] * b[1], a[2] * b[0] + 2 * a[1] * b[1] + a[0] * b[2]])
 
 
 def second_derivative_bounds(bodies: list[Body], gravity: float, along: Stretches) -> Configurations:
-    """Upper bounds on the second derivatives of torques, by the parameter of the stretches."""
+    """Upper bounds on the second derivatives of joint torques by the share of the stretch, in each
+    stretch."""
     still = np.zeros((3, len(along.q)))
     weight = still.copy()
     weight[0] = gravity
-    # per frame: rotation rate of the path, angular velocity, angular and linear acceleration of the dynamics
+    # from the base to the tips, for each frame: rotation per share of the stretch, angular velocity, angular
+    # acceleration, linear acceleration
     frames: list[tuple[Jet, Jet, Jet, Jet]] = []
     axes: list[Jet] = []
     arms: list[Jet] = []
@@ -91,6 +97,8 @@ def second_derivative_bounds(bodies: list[Body], gravity: float, along: Stretche
         frames.append((turn, spin, angular, linear))
         axes.append(axis)
         arms.append(arm)
+    # from the tips to the base: forces and moments that each body needs, and their components along the
+    # joints
     forces = [still] * len(bodies)
     moments = [still] * len(bodies)
     bounds = np.empty(along.q.shape)
@@ -126,7 +134,7 @@ class Dynamics:
     """Inverse dynamics of a robot with a payload, without joint friction and motor inertia."""
 
     def __init__(self, robot: Robot, payload: Payload, T_world_base: ndarray | None = None) -> None:
-        """Build the model; the base is upright unless T_world_base is given.
+        """Build the model. Without T_world_base, the z axis of the base points up.
 
         Raises InputError for a robot without inertias or effort limits, for an unknown link, and if Pinocchio
         is not installed.
@@ -178,7 +186,8 @@ class Dynamics:
         return out
 
     def second_derivatives(self, along: Stretches) -> Configurations:
-        """Bounds on the second derivatives of torques along stretches, by the parameter of the stretches."""
+        """Bounds on the second derivatives of torques by the share of the stretch, for each stretch and
+        joint."""
         return second_derivative_bounds(self._bodies, GRAVITY, along)
 
     def holding_torques(self, q: Configurations) -> Configurations:
@@ -187,7 +196,8 @@ class Dynamics:
         return self.torques(q, still, still)
 
     def overload_message(self, q: Configuration) -> str | None:
-        """A message about the joint whose torque at rest exceeds its limit most; None if none does."""
+        """A message about the joint with the largest torque at rest relative to its limit; None if all
+        torques are within their limits."""
         torques = np.abs(self.holding_torques(q[None])[0])
         j = int((torques / self.limits).argmax())
         return None if torques[j] <= self.limits[j] else self.torque_message(j, torques[j])
@@ -201,11 +211,11 @@ class Dynamics:
 
 def check_dynamics(robot: Robot) -> None:
     """Raise InputError for a robot whose URDF gives no inertias or effort limits."""
-    heavy = {robot.link_frame(link) for link in robot.inertias}
+    frames_with_mass = {robot.link_frame(link) for link in robot.inertias}
     for j, name in enumerate(robot.joint_names):
-        lacks = "inertia of what moves with" if j + 1 not in heavy else "effort limit of"
-        if not robot.effort[j] > 0 or j + 1 not in heavy:
+        missing = "inertia of what moves with" if j + 1 not in frames_with_mass else "effort limit of"
+        if not robot.effort[j] > 0 or j + 1 not in frames_with_mass:
             raise InputError(
-                f"payload: {robot.name} has no {lacks} joint {name}; its URDF must give inertias and "
+                f"payload: {robot.name} has no {missing} joint {name}; its URDF must give inertias and "
                 f"effort limits; then create the robot again with: robotdiffuse robot add"
             )

@@ -33,26 +33,30 @@ def column(R, k):
 
 @inlined
 def rotated_back(R, v):
-    """The product of the transpose of R with v."""
+    """The product of R transposed and v."""
     return dot(column(R, 0), v), dot(column(R, 1), v), dot(column(R, 2), v)
 
 
 @inlined
 def placed(T, p):
-    """The point p of frame T in the base frame."""
+    """T @ p: the point p of a frame, seen in the base frame; T = T_base_frame."""
     return dot(T[0], p) + T[0, 3], dot(T[1], p) + T[1, 3], dot(T[2], p) + T[2, 3]
 
 
 @inlined
 def ball_gap(T, ball, T_other, other):
-    """Signed distance of two balls [4] of frames [m]."""
+    """Signed distance of two balls [x, y, z, radius], each given in its own frame [m]."""
     return length(minus(placed(T, ball), placed(T_other, other))) - ball[3] - other[3]
 
 
 @inner_kernel()
 def step(parent, offset, slides, q, child):
-    """Writes the frame behind a joint at q [rad or m]: T_base_child from T_base_parent, which may be the same
-    array, and T_parent_joint [4, 4]."""
+    """Writes the frame that a joint moves, at joint value q [rad or m], to `child`: T_base_child =
+    T_base_parent @ T_parent_joint @ M(q), where M rotates about z, or translates along z if the joint
+    `slides`.
+
+    `parent` is T_base_parent and `offset` T_parent_joint. `parent` and `child` may be the same array.
+    """
     c, s, slide = (1.0, 0.0, q) if slides else (np.cos(q), np.sin(q), 0.0)
     for r in range(3):
         x = parent[r, 0] * offset[0, 0] + parent[r, 1] * offset[1, 0] + parent[r, 2] * offset[2, 0]

@@ -1,7 +1,7 @@
 """Compiled part of inverse kinematics: damped Newton iterations from many seeds.
 
-Without jaxtyping annotations, since Numba compiles these functions. Arrays are float64 and C-contiguous.
-Continuous joints are unbounded while solving, and wrapped to [-pi, pi] in solutions.
+There are no jaxtyping annotations because Numba compiles these functions. Arrays are float64 and
+C-contiguous. Continuous joints are unbounded during the iterations, and wrapped to [-pi, pi] in solutions.
 """
 
 from typing import NamedTuple
@@ -12,22 +12,23 @@ from numpy import ndarray
 from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.robots.frame_kernel import step
 
+# values of `IKChain.kinds`
 REVOLUTE = 0
 PRISMATIC = 1
 CONTINUOUS = 2
 TURN = 2 * np.pi
 
-# Levenberg-Marquardt damping, relative to the squared error; a seed is given up above the maximum.
+# Levenberg-Marquardt damping as a factor on the squared error; a seed is given up above the maximum
 INITIAL_DAMPING = 1.0
 MIN_DAMPING = 1e-9
 MAX_DAMPING = 1e3
-# Factors on the damping after a step that reduced the error, and after one that did not.
+# factors on the damping after a step that reduces the error, and after a step that does not
 DAMPING_DECREASE = 0.3
 DAMPING_INCREASE = 4.0
 CHECK_EVERY = 8
 """Number of iterations between two checks of the progress."""
 REQUIRED_PROGRESS = 0.5
-"""A seed whose error has not dropped to this fraction since the last check is given up."""
+"""A seed is given up if its error is above this fraction of the error at the last check."""
 
 
 @inner_kernel()
@@ -52,13 +53,14 @@ def forward(q, offsets, tool, kinds, frame, T, axes, origins):
 def pose_error(T, target, rows, rotation_weight, error):
     """Write the error of pose T into `error` [6] and return its squared norm.
 
-    Entries 0 to 2 are the position difference to the target [m]; 3 to 5, if `rows` is 6, the rotation vector
-    from T to the target [rad] times `rotation_weight` [m/rad].
+    Entries 0 to 2 are the position of the target minus that of T [m]. If `rows` is 6, entries 3 to 5 are the
+    rotation vector from T to the target [rad] times `rotation_weight` [m/rad]; if it is 3, rotation is
+    ignored.
     """
     for i in range(3):
         error[i] = target[i, 3] - T[i, 3]
     if rows == 6:
-        # R = target @ T.T; the rotation vector from the sine and cosine of its angle
+        # the rotation vector of R = target @ T.T, from the sine and cosine of its angle
         r01 = r02 = r10 = r12 = r20 = r21 = r00 = r11 = r22 = 0.0
         for k in range(3):
             r00 += target[0, k] * T[0, k]
@@ -78,7 +80,7 @@ def pose_error(T, target, rows, rotation_weight, error):
         scale = 1.0
         if sine > 1e-12:
             scale = np.arctan2(sine, cosine) / sine
-        elif cosine < 0.0:  # half a turn: an axis close to the right one suffices as a descent direction
+        elif cosine < 0.0:  # half a turn: an approximate axis suffices as a descent direction
             x = np.sqrt(max(r00 + 1, 0.0))
             y = np.sqrt(max(r11 + 1, 0.0))
             z = np.sqrt(max(r22 + 1, 0.0))
@@ -95,7 +97,8 @@ def pose_error(T, target, rows, rotation_weight, error):
 
 @inner_kernel()
 def _jacobian(T, axes, origins, kinds, frame, rows, rotation_weight, J):
-    """Write the geometric Jacobian of the tool, rotations weighted, into J [6, dof]."""
+    """Write the geometric Jacobian of the tool into J [6, dof], with the rotation rows times
+    `rotation_weight`."""
     for j in range(frame):
         ax = axes[j, 0]
         ay = axes[j, 1]
@@ -121,7 +124,9 @@ def _jacobian(T, axes, origins, kinds, frame, rows, rotation_weight, J):
 
 @inner_kernel()
 def damped_step(J, error, damping, rows, frame, held, A, y, step):
-    """Write step = J^T (J J^T + damping I)^-1 error for the joints that are not held; solved by Cholesky."""
+    """Write step = J^T (J J^T + damping I)^-1 error; the columns of J and entries of step for held joints
+    count as zero."""
+    # A = J J^T + damping I, its Cholesky factor, and the two triangular solves
     for i in range(rows):
         for k in range(i + 1):
             total = damping if i == k else 0.0
@@ -155,25 +160,25 @@ def damped_step(J, error, damping, rows, frame, held, A, y, step):
 
 @inner_kernel()
 def _is_new(q, others, count, kinds, min_distance):
-    """Whether q is further than min_distance from the first `count` others: max norm, continuous joints
-    wrapped."""
+    """Whether q differs from each of the first `count` others by more than min_distance in at least one
+    joint. Values of continuous joints that are a turn apart are equal."""
     for n in range(count):
-        far = False
+        differs = False
         for j in range(len(q)):
             gap = abs(q[j] - others[n, j])
             if kinds[j] == CONTINUOUS:
                 gap = min(gap, TURN - gap)
             if gap > min_distance:
-                far = True
+                differs = True
                 break
-        if not far:
+        if not differs:
             return False
     return True
 
 
 class IKChain(NamedTuple):
-    """A chain of joints with a tool frame at its end. Arrays cover `dof` joints: those of the chain come
-    first, then joints after the tool, which keep their seed's values."""
+    """A chain of joints with a tool frame at its end. Arrays have entries for `dof` joints: first the joints
+    of the chain, then joints after the tool, which keep the values of the seed."""
 
     offsets: ndarray
     """[dof, 4, 4] `Robot.frame_offsets` of the joints."""
@@ -184,12 +189,13 @@ class IKChain(NamedTuple):
     length: int
     """Number of joints in the chain."""
     lower: ndarray
-    """[dof] limits [rad or m]."""
+    """[dof] lower limits [rad or m]."""
     upper: ndarray
+    """[dof] upper limits [rad or m]."""
 
 
 class IKParameters(NamedTuple):
-    """See `InverseKinematicsSettings`."""
+    """Parameters of `solve_seeds`; see `inverse_kinematics.py` for their values and units."""
 
     position_only: bool
     rotation_weight: float
@@ -201,11 +207,12 @@ class IKParameters(NamedTuple):
 
 @kernel()
 def solve_seeds(seeds, known, wanted, chain, target, parameters):
-    """Solve seed after seed until `wanted` configurations are found that differ from `known` and each other.
+    """Solve seed after seed until `wanted` configurations are found that differ from those in `known` and
+    from each other.
 
-    seeds [n, dof] and known [m, dof] are configurations, chain an `IKChain`, target [4, 4] the pose wanted
-    for the tool, parameters `IKParameters`. Returns the new configurations [k, dof] and the number of seeds
-    used.
+    seeds [n, dof] and known [m, dof] are configurations, chain is an `IKChain`, target [4, 4] the pose that
+    the tool shall reach, and parameters are `IKParameters`. Returns the new configurations [k, dof] and the
+    number of seeds that were used.
     """
     offsets, tool, kinds, frame, lower, upper = chain
     position_only, rotation_weight, position_tolerance, rotation_tolerance, max_iterations, min_distance = (
@@ -227,16 +234,16 @@ def solve_seeds(seeds, known, wanted, chain, target, parameters):
     solutions = np.empty((len(known) + wanted, dof))
     solutions[: len(known)] = known
     count = len(known)
-    used = 0
+    seeds_used = 0
     for s in range(len(seeds)):
-        used = s + 1
+        seeds_used = s + 1
         q = seeds[s].copy()
         forward(q, offsets, tool, kinds, frame, T, axes, origins)
         cost = pose_error(T, target, rows, rotation_weight, error)
         damping = INITIAL_DAMPING
-        checked = cost
+        checked_cost = cost
         solved = False
-        new_seed = True
+        jacobian_outdated = True
         for iteration in range(max_iterations):
             position = np.sqrt(error[0] ** 2 + error[1] ** 2 + error[2] ** 2)
             rotation = np.sqrt(error[3] ** 2 + error[4] ** 2 + error[5] ** 2) / rotation_weight
@@ -244,12 +251,12 @@ def solve_seeds(seeds, known, wanted, chain, target, parameters):
             if solved or damping > MAX_DAMPING:
                 break
             if iteration % CHECK_EVERY == CHECK_EVERY - 1:
-                if cost > REQUIRED_PROGRESS * REQUIRED_PROGRESS * checked:
+                if cost > REQUIRED_PROGRESS * REQUIRED_PROGRESS * checked_cost:
                     break
-                checked = cost
-            if new_seed:
+                checked_cost = cost
+            if jacobian_outdated:
                 _jacobian(T, axes, origins, kinds, frame, rows, rotation_weight, J)
-                new_seed = False
+                jacobian_outdated = False
             # hold joints that the step would push through a limit, and solve for the others again
             fixed[:] = False
             damped_step(J, error, damping * cost, rows, frame, fixed, A, y, step)
@@ -274,7 +281,7 @@ def solve_seeds(seeds, known, wanted, chain, target, parameters):
                 error[:] = trial_error
                 cost = trial_cost
                 damping = max(damping * DAMPING_DECREASE, MIN_DAMPING)
-                new_seed = True
+                jacobian_outdated = True
             else:
                 damping *= DAMPING_INCREASE
         if not solved:
@@ -287,15 +294,17 @@ def solve_seeds(seeds, known, wanted, chain, target, parameters):
             count += 1
             if count == len(solutions):
                 break
-    return solutions[len(known) : count], used
+    return solutions[len(known) : count], seeds_used
 
 
 @kernel()
 def follow(start, goal, steer, longest, targets, chain, parameters):
-    """Configurations from the start [dof] on, one for each target [n, 4, 4], as long as there is one whose
-    joints are each within `longest` [rad] or [m] of the one before.
+    """A path of configurations through the targets [n, 4, 4]: the start [dof], then one configuration per
+    target.
 
-    steer: whether seeds approach the goal [dof] evenly, rather than being the configuration before.
+    Each joint moves by at most `longest` [rad] or [m] from row to row. The path ends before the first target
+    for which no such configuration is found. The seed for a target is the previous configuration; with
+    `steer` it is moved towards the goal [dof], evenly over the remaining targets.
     """
     dof = len(start)
     rows = np.empty((len(targets) + 1, dof))

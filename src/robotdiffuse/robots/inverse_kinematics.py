@@ -28,7 +28,7 @@ LIMIT_MARGIN = 1e-6
 MAX_ITERATIONS = 60
 """Largest number of damped Newton steps from each seed."""
 ROTATION_WEIGHT = 0.3
-"""Weight of orientation errors against position errors [m/rad]."""
+"""Weight of orientation errors: an error of 1 rad counts like a position error of this length [m/rad]."""
 PARAMETERS = IKParameters(
     False, ROTATION_WEIGHT, POSITION_TOLERANCE, ROTATION_TOLERANCE, MAX_ITERATIONS, MIN_DISTANCE
 )
@@ -45,7 +45,7 @@ class InverseKinematicsSettings(Settings, name="inverse kinematics"):
     max_rounds: Count = 64
     """Largest number of rounds."""
     patience: Count = 4
-    """The search ends after this many rounds without a new solution, if it has found one."""
+    """Once a solution is found, the search ends after this many consecutive rounds without a new one."""
 
 
 def inverse_kinematics(
@@ -63,8 +63,8 @@ def inverse_kinematics(
     """Up to `count` distinct configurations that bring link `frame` to the pose, inside the joint limits.
 
     Damped Newton steps (Levenberg-Marquardt) start from uniformly random seeds. Steps are clipped to the
-    limits, and joints pushed against a limit are held while the others move. Joints after the link keep
-    random values. The result depends only on the arguments and the state of `rng`.
+    limits, and joints pushed against a limit are held while the other joints move. Joints after the link keep
+    the random values of the seed. The result depends only on the arguments and the state of `rng`.
 
     Args:
         robot: The robot.
@@ -72,13 +72,14 @@ def inverse_kinematics(
         T_base_frame: Pose that the link shall reach [m].
         count: Largest number of configurations.
         rng: Source of the seeds.
-        accept: Called with batches of solutions; returns which to keep, e.g. those free of collision. A
-            rejected solution does not block solutions close to it.
-        settings: Whether the orientation counts, and effort.
-        near: A configuration, used as the first seed: if the pose moves slightly, so does the first solution.
-            The results are sorted by their distance from it; joints that can turn more than once take the
-            turn nearest to it.
-        rest: Values for joints of another arm, which are neither before nor after the link; None: random.
+        accept: Called with batches of solutions; returns a mask of the solutions to keep, e.g. those free of
+            collision. Rejected solutions do not count for the distance between solutions.
+        settings: Whether the orientation of the pose must be reached, and the effort.
+        near: A configuration that is the first seed, so that a slightly moved pose has a slightly moved first
+            solution. Results are sorted by their distance from it. Joints that can turn more than once are
+            turned by whole turns to be as close to it as possible.
+        rest: Values for joints of another arm, which neither move the link nor are moved by it; None: random
+        values.
 
     Returns:
         Configurations, one per row; no rows if the pose was not reached.
@@ -133,8 +134,8 @@ def each_pose(
     seeds: Configurations,
     rest: Configuration,
 ) -> Iterator[Configurations]:
-    """Up to `count` distinct configurations for each of several poses of a link, all from these seeds; joints
-    that are on another arm have the values that `rest` gives."""
+    """Up to `count` distinct configurations for each of several poses of a link. Each pose is solved from the
+    same seeds; joints of another arm have the values of `rest`."""
     arm, chain = ik_chain(robot, frame, LIMIT_MARGIN)
     seeds = np.clip(np.ascontiguousarray(seeds[:, arm]), chain.lower, chain.upper)
     for T in poses:
@@ -147,17 +148,17 @@ def each_pose(
 
 
 def _out_of_reach(chain: IKChain, target: Pose) -> bool:
-    """Whether a pose is further from the first joint than the chain is long."""
+    """Whether a pose is further from the first joint than the length of the stretched chain."""
     joints = chain.length
     travel = np.maximum(abs(chain.lower), abs(chain.upper))[chain.kinds == PRISMATIC].sum()
     reach = np.linalg.norm(chain.offsets[1:joints, :3, 3], axis=1).sum() + np.linalg.norm(chain.tool[:3, 3])
-    away = np.linalg.norm(target[:3, 3] - chain.offsets[0, :3, 3])
-    return bool(away > reach + travel + POSITION_TOLERANCE)
+    distance = np.linalg.norm(target[:3, 3] - chain.offsets[0, :3, 3])
+    return bool(distance > reach + travel + POSITION_TOLERANCE)
 
 
 def ik_chain(robot: KinematicTree, frame: str, limit_margin: float) -> tuple[Int[ndarray, "k"], IKChain]:
-    """The joints that move a link or come after it, and their kinematic chain with limits narrowed by a
-    margin. Raises InputError if no planned joint moves the link."""
+    """Indices of the planned joints that move a link or come after it, and the chain of these joints with
+    limits narrowed by a margin [rad] or [m]. Raises InputError if no planned joint moves the link."""
     if robot.link_frame(frame) == 0:
         raise InputError(f"inverse kinematics: no planned joint moves the link {shown(frame)}")
     arm = np.flatnonzero(~on_other_arm(robot, frame))
@@ -178,8 +179,8 @@ def random_seeds(
 ) -> Configurations:
     """Uniformly random configurations.
 
-    With `near`, random points on the straight lines from `near` to random configurations, whose rotating
-    joints are within half a turn of it.
+    With `near`, they are random points on straight lines from `near` to random configurations. Each rotating
+    joint of these configurations is within half a turn of `near`.
     """
     if near is None:
         return rng.uniform(lower, upper, (count, robot.dof))
@@ -192,7 +193,7 @@ def random_seeds(
 
 
 def on_other_arm(robot: KinematicTree, link: str) -> Bool[ndarray, "dof"]:
-    """Mask of the planned joints that are neither before nor after a link: those of another arm."""
+    """Mask of the planned joints of other arms: joints that neither move a link nor come after it."""
     frame = robot.link_frame(link)
     before = robot.moved_by[frame]
     downstream = robot.moved_by[1:, frame - 1] if frame else np.ones(robot.dof, bool)

@@ -1,4 +1,4 @@
-"""Joints and links of a robot, and what follows from them: limits, frames, chains."""
+"""Joints and links of a robot, and data derived from them: limits, frames, chains of joints."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -18,10 +18,11 @@ from robotdiffuse.core.types import Configuration, Configurations, JointValues, 
 MOVING_KINDS = ("revolute", "continuous", "prismatic")
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 CONTINUOUS_LIMIT = 3 * np.pi
-"""Position limits of continuous joints in planning, plus and minus [rad]: a start is within pi of 0,
-and a goal within 2 pi of the start. The joints themselves have no limits."""
+"""Continuous joints have no limits, but in planning their values stay within plus and minus this [rad]: a
+start is within pi of 0, and a goal within 2 pi of the start."""
 MIMIC_SLACK = 1e-6
-"""Largest difference between a value given for a mimic joint and the value that its leader implies."""
+"""Largest difference between a given value of a mimic joint and the value that follows from the joint that it
+mimics [rad] or [m]."""
 
 
 class Mimic(NamedTuple):
@@ -52,7 +53,7 @@ class Joint(Value):
     acceleration: float = 0.0
     jerk: float = 0.0
     mimic: Mimic | None = None
-    """The joint that this joint follows, if any. If one is locked, so is the other."""
+    """The rule by which this joint follows another joint, if any. If that joint is locked, so is this one."""
     effort: float = 0.0
     """Largest torque [N m] or force [N]; 0 if the URDF gives none."""
 
@@ -83,8 +84,8 @@ def with_mimics(joints: tuple[Joint, ...], locked: dict[str, Any]) -> dict[str, 
 
 
 MAX_WRAPPED_STEP = 0.5
-"""If a step of a continuous joint differs from a whole turn by at most this, its values count as wrapped
-[rad]."""
+"""If a step between two values of a continuous joint differs from a whole turn by less than this [rad], the
+values count as wrapped to [-pi, pi]."""
 
 
 T = TypeVar("T")
@@ -111,7 +112,8 @@ def _limit(name: str) -> "cached_property[JointValues]":
 
 
 class KinematicTree(Value):
-    """Base of `Robot`, which has the fields and describes the frames."""
+    """Base class of `Robot`: joints, limits and frames. `Robot` declares the fields and describes the
+    frames."""
 
     base: str
     tip: str
@@ -133,7 +135,7 @@ class KinematicTree(Value):
 
     @cached_property
     def links_fixed_to_base(self) -> dict[str, Pose]:
-        """T_base_link of the base and of the links that only fixed joints connect to it."""
+        """T_base_link of the base and of all links that fixed joints alone connect to the base."""
         fixed_links = {self.base: np.eye(4)}
         for joint in self.joints:
             if joint.kind == "fixed" and joint.parent in fixed_links:
@@ -181,7 +183,8 @@ class KinematicTree(Value):
     """Largest torques [N m] or forces [N]; 0 where the URDF gives none."""
 
     def limit_excess(self, q: JointArray) -> JointArray:
-        """By how much joint values are beyond the limits, negative within; 0 for continuous joints."""
+        """How far joint values exceed the limits [rad] or [m]; negative within the limits, 0 for continuous
+        joints."""
         excess = np.maximum(self.lower - q, q - self.upper)
         excess[..., self.continuous] = 0.0
         return excess
@@ -200,15 +203,16 @@ class KinematicTree(Value):
         return np.where(self.continuous, TURN * np.round(q / TURN), 0.0)
 
     def wraps(self, q: Configurations) -> Configurations:
-        """For each step from row to row, its whole turns if it is nearly a multiple of a turn, as where
-        values of a continuous joint are wrapped to [-pi, pi]; else 0."""
+        """For each step of a continuous joint from row to row, the nearest multiple of 2 pi if the step
+        differs from it by less than MAX_WRAPPED_STEP, else 0 [rad]. Such steps occur where values are wrapped
+        to [-pi, pi]."""
         steps = np.diff(q, axis=0)
         turns = self.whole_turns(steps)
         return np.where(np.abs(steps - turns) < MAX_WRAPPED_STEP, turns, 0.0)
 
     def unwound(self, q: JointArray) -> JointArray:
-        """Equivalent configurations in which joints with a range above one turn are within half a turn of the
-        middle of their limits."""
+        """Equivalent configurations: joints with a range above one turn are turned by whole turns to within
+        half a turn of the middle of their limits."""
         middle = 0.5 * (self.lower + self.upper)
         return np.where(self._more_than_a_turn, q - TURN * np.round((q - middle) / TURN), q)
 
@@ -216,13 +220,13 @@ class KinematicTree(Value):
         """Configurations within the limits that differ from `q` by whole turns of joints that have limits and
         a range above one turn.
 
-        In the first one, all of these joints are as close to `start` as possible. In each further one, one
-        joint turns the other way, since obstacles may block the short way.
+        In the first row, all of these joints are as close to `start` as possible. In each further row, one of
+        these joints reaches `q` by turning in the other direction, since obstacles may block the short way.
         """
-        many = self._more_than_a_turn & ~self.continuous
-        nearest = self._turned(q, start, many)
+        several_turns = self._more_than_a_turn & ~self.continuous
+        nearest = self._turned(q, start, several_turns)
         rows = [nearest]
-        for j in np.flatnonzero(many):
+        for j in np.flatnonzero(several_turns):
             image = nearest.copy()
             image[j] -= np.copysign(TURN, nearest[j] - start[j])
             if self.lower[j] <= image[j] <= self.upper[j]:
@@ -230,8 +234,8 @@ class KinematicTree(Value):
         return np.stack(rows)
 
     def nearest_turns(self, q: Configurations, start: Configuration) -> Configurations:
-        """The configurations with continuous joints and joints with a range above one turn turned by whole
-        turns, to be as close to `start` as the limits allow."""
+        """Equivalent configurations as close to `start` as the limits allow: continuous joints and joints
+        with a range above one turn are turned by whole turns."""
         return self._turned(q, start, self._more_than_a_turn | self.continuous)
 
     def _turned(self, q: ndarray, start: ndarray, joints: JointMask) -> ndarray:
@@ -295,7 +299,7 @@ class KinematicTree(Value):
         return read_only(rows)
 
     def at_end(self, link: str) -> bool:
-        """Whether planned joints move a link, and none comes after it."""
+        """Whether a planned joint moves a link, and no planned joint comes after the link."""
         frame = self.link_frame(link)
         return frame > 0 and not self.moved_by[frame + 1 :, frame - 1].any()
 
@@ -304,9 +308,10 @@ class KinematicTree(Value):
         return tuple(np.flatnonzero(self.moved_by[self.link_frame(link)]).tolist())
 
     def joints_between(self, a: str, b: str) -> tuple[int, ...]:
-        """Indices of the planned joints between two links of which one carries the other.
+        """Indices of the planned joints between two links on one chain, from the base on.
 
-        Empty if neither carries the other, or if a movable joint between them is not planned.
+        Empty if the links are not on one chain from the base, or if a movable joint between them is not
+        planned.
         """
         near, far = sorted(
             (
@@ -327,7 +332,7 @@ class KinematicTree(Value):
         return self._link(link)[1]
 
     def check_moved(self, field: str, link: str) -> None:
-        """Raises InputError, naming the field, unless a planned joint moves the link."""
+        """Raises InputError, with `field` in its message, unless a planned joint moves the link."""
         moved = [name for name in self.link_names if self.link_frame(name) > 0]
         if link not in self.link_names:
             raise unknown_name(f"link in {field}:", link, moved)
@@ -335,8 +340,8 @@ class KinematicTree(Value):
             raise InputError(f"{field}: no planned joint moves {link!r}; they move {', '.join(moved)}")
 
     def planned_values(self, where: str, values: Mapping[str, Any], advice: str = "") -> list[Any]:
-        """The values of the planned joints in order. Raises InputError, with the advice at its end, for those
-        that are missing."""
+        """The values of the planned joints in order. Raises InputError if some are missing; its message
+        begins with `where` and ends with `advice`."""
         missing = [name for name in self.joint_names if name not in values]
         if missing:
             raise InputError(f"{where} has no {', '.join(missing)}{advice}")
@@ -349,18 +354,18 @@ class KinematicTree(Value):
 
 
 def once_per_robot(build: Callable[[R], T]) -> Callable[[R], T]:
-    """Decorator: cache a function of a robot on the robot itself, for the robot's lifetime. The first call
-    counts as loading."""
+    """Decorator that caches the result of a function of a robot on the robot object. The first call counts as
+    loading (see `core.loading`), not as planning time."""
     name = f"{build.__module__}.{build.__qualname__}"
 
     @wraps(build)
-    def known(robot: R) -> T:
+    def cached(robot: R) -> T:
         if name not in robot.__dict__:
             with loading():
                 robot.__dict__[name] = build(robot)
         return robot.__dict__[name]
 
-    return known
+    return cached
 
 
 class JointNormalizer:

@@ -11,7 +11,8 @@ from robotdiffuse.robots.kinematic_tree import KinematicTree, once_per_robot
 REACH_SAMPLES = 4096
 """Number of random configurations at which the reach is measured."""
 REACH_QUANTILE = 0.99
-"""The reach is this quantile of the distances of the tip: the largest distances are rare and random."""
+"""The reach is this quantile of the tip's distances, since the very largest ones are rare and vary with the
+sample."""
 
 
 def link_pose(robot: KinematicTree, q: Configuration, link: str) -> Pose:
@@ -20,7 +21,7 @@ def link_pose(robot: KinematicTree, q: Configuration, link: str) -> Pose:
 
 
 def _motions(robot: KinematicTree, j: int, q: Configurations) -> Poses:
-    """The motion of planned joint j about or along its z axis, at each configuration."""
+    """The motion of planned joint j at each configuration: a rotation about z, or a translation along z."""
     motion = np.broadcast_to(np.eye(4), (len(q), 4, 4)).copy()
     if robot.prismatic[j]:
         motion[:, 2, 3] = q[:, j]
@@ -32,7 +33,7 @@ def _motions(robot: KinematicTree, j: int, q: Configurations) -> Poses:
 
 
 def _frames(robot: KinematicTree, q: Configurations, link: str) -> list[Poses]:
-    """Poses of the frames from the base to a link."""
+    """Poses T_base_frame [n, 4, 4] of the base and of each frame on the chain to a link."""
     frames = [np.broadcast_to(np.eye(4), (len(q), 4, 4))]
     for j in robot.chain(link):
         frames.append(frames[-1] @ robot.frame_offsets[j] @ _motions(robot, j, q))
@@ -47,8 +48,8 @@ def link_poses(robot: KinematicTree, q: Configurations, link: str) -> Poses:
 def link_jacobians(robot: KinematicTree, q: Configurations, link: str) -> Float[ndarray, "n 6 dof"]:
     """Geometric Jacobians of a link at a batch of configurations; raises InputError for an unknown link.
 
-    Rows are linear, then angular, in the axes of the base frame; the linear velocities are of the link's
-    origin.
+    The first three rows are the linear velocity of the link's origin, the last three the angular velocity,
+    both in the axes of the base frame and per unit of joint velocity.
     """
     frames = _frames(robot, q, link)
     origins = (frames[-1] @ robot.T_frame_link(link))[:, :3, 3]
@@ -84,7 +85,7 @@ def reach(robot: KinematicTree) -> float:
     """Distance between tip and shoulder that 99 % of the configurations do not exceed [m].
 
     The shoulder is the point on the first joint's axis at the height of the second joint. With several arms,
-    the reach of the longest one.
+    the largest reach of an arm is returned.
     """
     q = np.random.default_rng(0).uniform(robot.lower, robot.upper, (REACH_SAMPLES, robot.dof))
     reached = []

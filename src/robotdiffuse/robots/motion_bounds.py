@@ -12,40 +12,44 @@ from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot
 
 COLUMNS = 180
-"""Number of directions around a joint's axis in a grid. The bounds exceed the true maxima by about 0.1 % for
-each joint in between."""
+"""Number of directions around a joint's axis in the grid. Per joint between axis and link, bounds exceed the
+true maxima by about 0.1 %."""
 LIMIT_SLACK = 1e-3
-"""Joint limits are widened by this [rad] or [m], so that the bounds also hold for configurations clipped to
-them."""
+"""Joint limits are widened by this [rad] or [m], so that rounding errors of configurations at the limits do
+not matter."""
 
 STEP = 2 * np.pi / COLUMNS
+"""Angle between neighboring directions of the grid [rad]."""
 ROWS = COLUMNS // 2 + 1
+"""Number of latitudes of the grid, from pole to pole."""
 ARC_SAGITTA = 1 - np.cos(STEP / 2)
+"""Height of a circular arc of this angle over its chord, for radius 1."""
 
 
 @once_per_robot
 def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
     """Bounds on the motion of links per unit of joint motion; one row per link with spheres.
 
-    Rows follow `robot.link_names` without the links that have no spheres. Entry [l, j] is at least the
-    distance [m] between the axis of planned joint j and any point of the spheres of link l, over all
-    configurations within the limits; 1 for a prismatic joint; 0 where the joint does not move the link.
-    So when the joints move by dq, no point of link l moves further than radii[l] @ abs(dq). Read-only.
+    Rows are in the order of `robot.link_names`, without links that have no spheres. Entry [l, j] is at least
+    the distance [m] of any point of link l's spheres from the axis of planned joint j, in all configurations
+    within the limits. It is 1 for a prismatic joint, and 0 if the joint does not move the link. So when the
+    joints move by dq, no point of link l moves further than radii[l] @ abs(dq). The array is read-only.
 
     Method: the region that a link can reach, seen from frame j, is described by its support function h(u) =
-    max p.u on a grid of directions u, which is propagated from joint to joint towards the base. Rotating by
-    an interval of angles is a sliding maximum along a circle of latitude; a rigid offset maps h(u) to h(R^T
-    u) + t.u. Sublinearity bounds h between grid directions from above: for weights that sum to one and e = u
-    - sum w_i u_i, h(u) <= sum w_i h(u_i) + |e| max |p|. So each step rounds upwards. The distance from an
-    axis is convex, so using the support function, which is that of the convex hull, loses nothing.
+    max p.u on a grid of directions u. This function is propagated from joint to joint towards the base.
+    Rotation by an interval of angles is a sliding maximum along a circle of latitude. A rigid offset maps
+    h(u) to h(R^T u) + t.u. Between the grid's directions, h is bounded by its sublinearity: h(u) <= sum w_i
+    h(u_i) + |e| max |p| for weights w_i that sum to one and e = u - sum w_i u_i. So each step rounds upwards.
+    The support function describes the region's convex hull; this does not enlarge the radii, since the
+    distance from an axis is a convex function.
     """
     links = [link for link in robot.link_names if link in robot.spheres]
     bare_radii = motion_radii(robot.bare) if robot.bare is not None else np.zeros((0, robot.dof))
-    links = links[len(bare_radii) :]  # attached bodies come last
+    links = links[len(bare_radii) :]  # only the attached bodies, which come last
     frames = np.array([robot.link_frame(link) for link in links], dtype=int)
     radii = np.zeros((len(links), robot.dof))
     directions = _directions()
-    by_row = np.ascontiguousarray(directions.transpose(0, 2, 1))
+    directions_by_row = np.ascontiguousarray(directions.transpose(0, 2, 1))
     support = np.full((len(links), ROWS, COLUMNS), -np.inf)
     farthest = np.zeros(len(links))
     interpolation_of = lru_cache(_offset_interpolation)  # many offsets share a rotation
@@ -53,7 +57,7 @@ def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
         for i in np.flatnonzero(frames == j + 1):
             spheres = robot.spheres[links[i]]
             centers = placed(robot.T_frame_link(links[i]), spheres[:, :3])
-            support[i] = (centers @ by_row + spheres[:, 3, None]).max(axis=1)
+            support[i] = (centers @ directions_by_row + spheres[:, 3, None]).max(axis=1)
             farthest[i] = (np.linalg.norm(centers, axis=1) + spheres[:, 3]).max()
         moved = np.flatnonzero(robot.moved_by[frames, j])
         if not len(moved):
@@ -88,13 +92,13 @@ def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
 
 
 def radii_of(robot: Robot, links: Sequence[str]) -> Float[ndarray, "links dof"]:
-    """The rows of `motion_radii` of some links, as a new array."""
+    """The rows of `motion_radii` for the given links, in a new array."""
     rows = [link for link in robot.link_names if link in robot.spheres]
     return motion_radii(robot)[[rows.index(link) for link in links]]
 
 
 def _directions() -> Float[ndarray, "rows columns 3"]:
-    """Unit vectors by latitude (pole to pole, the equator is a row) and longitude."""
+    """Unit vectors by latitude (rows, from pole to pole, including the equator) and longitude (columns)."""
     latitude = -np.pi / 2 + STEP * np.arange(ROWS)[:, None]
     longitude = STEP * np.arange(COLUMNS)[None, :]
     return np.stack(
@@ -111,20 +115,20 @@ _Interpolation = tuple[Int[ndarray, "4 n"], Float[ndarray, "4 n"], Float[ndarray
 
 
 def _offset_interpolation(rotation: bytes) -> _Interpolation:
-    """Interpolation that maps support functions over an offset with a rotation, given as bytes of its
-    matrix."""
+    """Interpolation by which a rigid offset maps support functions; its rotation matrix is given as bytes."""
     return _interpolation(_directions() @ np.frombuffer(rotation).reshape(3, 3))
 
 
 _cached_interpolation = lru_cache(maxsize=64)(_offset_interpolation)
-"""Cached for arms with attached bodies: every new object on the same arm needs the same interpolations. An
+"""Cache for arms with attached bodies: each new object on the same arm needs the same interpolations. An
 entry takes about 1 MB."""
 
 
 def _rotated(
     support: Float[ndarray, "n rows columns"], lower: float, upper: float
 ) -> Float[ndarray, "n rows columns"]:
-    """Largest grid value among the longitudes that rotations by [lower, upper] map to each longitude."""
+    """For each longitude, the largest grid value among the longitudes that rotations by angles in [lower,
+    upper] map to it."""
     first = -int(np.ceil(upper / STEP))
     width = -int(np.floor(lower / STEP)) - first + 1
     if width >= COLUMNS:
@@ -139,8 +143,8 @@ def _rotated(
 
 
 def _interpolation(directions: Float[ndarray, "rows columns 3"]) -> _Interpolation:
-    """Grid corners around each direction, their weights, which sum to one, and the lengths of the
-    residuals."""
+    """Indices of the four grid directions around each direction, their weights, which sum to one, and the
+    lengths |e| of the residuals."""
     u = directions.reshape(-1, 3)
     row = (np.arcsin(np.clip(u[:, 2], -1, 1)) + np.pi / 2) / STEP
     column = np.arctan2(u[:, 1], u[:, 0]) % (2 * np.pi) / STEP

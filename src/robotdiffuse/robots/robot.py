@@ -1,4 +1,4 @@
-"""Robot: one or several arms as plain data, used by kinematics and collision checking alike."""
+"""Robot: the description of one or several arms, used by kinematics, collision checking and planning."""
 
 import hashlib
 import json
@@ -54,10 +54,10 @@ class LinkPairTable(Value):
     """Joint values at which the table ends. If the range of a joint is one whole turn, the table is periodic
     in this joint."""
     apart: Bool[ndarray, "*cells"]
-    """Whether the links are apart throughout a cell."""
+    """Whether the links are apart for all joint values in a cell."""
 
     def at(self, *values: Values) -> Mask:
-        """Whether the links are known to be apart at joint values, one array per joint."""
+        """Whether the links are known to be apart at joint values; `values` are one array [n] per joint."""
         inside = np.ones(len(values[0]), dtype=bool)
         index = []
         for axis, value in enumerate(values):
@@ -69,10 +69,11 @@ class LinkPairTable(Value):
         return inside & self.apart[tuple(index)]
 
     def throughout(self, *intervals: tuple[Values, Values]) -> Bool[ndarray, "*intervals"]:
-        """Whether the links are known to be apart at all values in intervals [low, high] of the joints
-        between them.
+        """Whether the links are known to be apart at all joint values in intervals, given as (low, high) per
+        joint.
 
-        With two joints, the result holds every combination of an interval of the first and one of the second.
+        With two joints, the result has a row per interval of the first joint and a column per interval of the
+        second.
         """
         touch = ~self.apart
         for axis, (low, high) in enumerate(intervals):
@@ -102,8 +103,8 @@ class LinkPairTable(Value):
 
 
 LOCKED_CACHE = 256
-"""Largest number of robots with locked joints in the cache, about 0.1 MB each; the least recently used one is
-dropped first."""
+"""Largest number of robots with locked joints in the cache, about 0.1 MB each. The least recently used robot
+is dropped first."""
 ATTACHED_CACHE = 64
 """Largest number of robots with attached bodies in the cache."""
 
@@ -114,9 +115,9 @@ class Robot(KinematicTree):
 
     Planned joints are the movable, unlocked joints between the base and the tips.
 
-    Frames: frame 0 is the base link; frame j + 1 moves with planned joint j, and T_base_frame[j + 1] =
+    Frame 0 is the base link, and frame j + 1 moves with planned joint j: T_base_frame[j + 1] =
     T_base_frame[parents[j]] @ frame_offsets[j] @ M(q_j), where M rotates about z, or translates along z for a
-    prismatic joint. For a serial arm, parents[j] is j. Every link is fixed to one frame.
+    prismatic joint. For a serial arm, parents[j] is j. Every link is rigidly fixed to one frame.
     """
 
     name: str
@@ -126,7 +127,7 @@ class Robot(KinematicTree):
     joints: tuple[Joint, ...]
     """All joints below the base, parents before children."""
     spheres: dict[str, Spheres] = field(default_factory=dict)
-    """Collision spheres by link, x y z radius in the link frame [m]. They cover `meshes`."""
+    """Collision spheres by link: rows of x, y, z, radius in the link's frame [m]. They cover `meshes`."""
     meshes: dict[str, tuple[ConvexMesh, ...]] = field(default_factory=dict)
     """Convex collision meshes by link: the geometry that the validator checks."""
     allowed_collisions: frozenset[frozenset[str]] = frozenset()
@@ -147,7 +148,7 @@ class Robot(KinematicTree):
     attached: tuple[AttachedBody, ...] = ()
     """Tool and held objects; each is a link too."""
     bare: "Robot | None" = None
-    """The robot without attached bodies; None if there are none. See `arm`."""
+    """The robot without attached bodies; None if no body is attached. See `arm`."""
     inertias: dict[str, Inertia] = field(default_factory=dict)
     """Inertias of the links for which the URDF gives them."""
     other_tips: tuple[str, ...] = ()
@@ -183,8 +184,8 @@ class Robot(KinematicTree):
     def jacobian(self, q: ArrayLike, link: str | None = None) -> ndarray:
         """Geometric Jacobian of a link.
 
-        Its linear, then its angular velocity, for each unit of a joint's velocity. Both are in the axes of
-        the base; the linear velocity is of the link's origin.
+        The first three rows are the linear velocity of the link's origin, the last three the angular
+        velocity, both in the axes of the base and per unit of joint velocity.
 
         Args:
             q: A configuration [dof], or several [n, dof], of the planned joints [rad] or [m].
@@ -214,7 +215,7 @@ class Robot(KinematicTree):
     ) -> ndarray:
         """Inverse kinematics: configurations within the joint limits that bring a link to a pose.
 
-        They may collide: see `Problem.is_free`.
+        The configurations may collide; `Problem.is_free` checks this.
 
         Args:
             pose: T_base_link [4, 4].
@@ -237,12 +238,14 @@ class Robot(KinematicTree):
         from robotdiffuse.robots.inverse_kinematics import inverse_kinematics  # compiled code
 
         rng = np.random.default_rng(seed)
-        seeded = None if near is None else configurations(self, near)
-        return inverse_kinematics(self, link or self.tip, cast(ndarray, pose), count, rng=rng, near=seeded)
+        near_configuration = None if near is None else configurations(self, near)
+        return inverse_kinematics(
+            self, link or self.tip, cast(ndarray, pose), count, rng=rng, near=near_configuration
+        )
 
     def checked_pairs(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of links that are checked against each other: both links have geometry, they are on different
-        frames, and the pair is not in `allowed_collisions`."""
+        """Pairs of links that are checked against each other: both links have spheres, they are fixed to
+        different frames, and the pair is not in `allowed_collisions`."""
         return tuple(
             pair
             for pair in moving_pairs(self, self.spheres)
@@ -250,13 +253,13 @@ class Robot(KinematicTree):
         )
 
     def with_locked(self, locked: dict[str, float]) -> "Robot":
-        """The robot with joints held at values. Mimic joints follow.
+        """The robot with some joints locked at values. Joints that mimic them follow.
 
-        Values beyond the URDF's limits are accepted, since gripper openings in published problems exceed
-        them. Equal values give the same object.
+        Values beyond the URDF's limits are accepted, since some published problems open grippers further.
+        Calls with equal values return the same object.
 
         Args:
-            locked: Values [rad] or [m] by the names of joints, which may be planned joints.
+            locked: Values [rad] or [m] by joint name. Planned joints may be locked as well.
 
         Raises:
             InputError: For an unknown or fixed joint, a value that is not finite, or a value of a mimic joint
@@ -294,14 +297,15 @@ class Robot(KinematicTree):
     def attach(self, shape: RigidShape, link: str, touch_links: Sequence[str] = ()) -> "Robot":
         """The robot holding an object.
 
-        The object becomes a link of its name, so goals may name it. Collision checks keep it clear of
-        obstacles and of all links but those that move with it.
+        The object becomes a link with its own name, which goals may use. It is checked for collision with
+        obstacles and with all links that do not move with it.
 
         Args:
-            shape: The object, at its pose in the frame of the link. A curved shape is replaced by a
-                polyhedron around it that exceeds it by at most 2 % of its radius.
-            link: The link that holds it.
-            touch_links: Further links that it may touch.
+            shape: The object, at its pose in the frame of `link`. A curved shape is replaced by a polyhedron
+            around
+                it, which is larger by at most 2 % of the radius.
+            link: The link that holds the object.
+            touch_links: Further links that the object may touch.
 
         Raises:
             InputError: For unknown links, a link that no planned joint moves, a name that is taken, and a
@@ -330,14 +334,14 @@ class Robot(KinematicTree):
         The tool becomes the tip if no planned joint comes after its link.
 
         Args:
-            link: The link that carries it.
+            link: The link that carries the tool.
             T_link_tool: Pose of the tool's frame [4, 4].
-            shapes: Its shapes, in the frame of the link.
+            shapes: Shapes of the tool, in the frame of `link`.
             touch_links: Links that the shapes may touch.
-            name: Name of the frame.
+            name: Name of the tool's frame.
 
         Raises:
-            InputError: As `attach` does, and if the robot has a tool already.
+            InputError: In the cases in which `attach` raises it, and if the robot already has a tool.
         """
         tools = [body.name for body in self.attached if body.tool]
         if tools:
@@ -346,14 +350,15 @@ class Robot(KinematicTree):
         return self.with_body(AttachedBody(name, link, T, tuple(shapes), tuple(touch_links), tool=True))
 
     def with_body(self, body: AttachedBody) -> "Robot":
-        """The robot with a body attached; the same object for bodies of equal content.
+        """The robot with a body attached. Calls with bodies of equal content return the same object.
 
         Args:
             body: The held object or tool.
 
         Raises:
-            InputError: For unknown links, a link that no planned joint moves, a name that a link has, and
-                shapes that cannot be held.
+            InputError: For unknown links, a link that no planned joint moves, a name that is already a
+            link's, and
+                shapes that cannot be attached.
         """
         field = TOOL if body.tool else "attached"
         self.check_moved(f"{field}.link", body.link)
@@ -370,17 +375,19 @@ class Robot(KinematicTree):
         """The robot without a held object or tool.
 
         Args:
-            name: Its name.
+            name: Name of the object or tool.
 
         Raises:
-            InputError: For an unknown name, and for a body that holds another one.
+            InputError: For an unknown name, and for a body to which another body is attached.
         """
         names = [body.name for body in self.attached]
         if name not in names:
             raise unknown_name("body to detach:", name, names)
-        holds = [body.name for body in self.attached if body.link == name]
-        if holds:
-            raise InputError(f"{name} cannot be detached: it holds {', '.join(holds)}; detach that first")
+        held_bodies = [body.name for body in self.attached if body.link == name]
+        if held_bodies:
+            raise InputError(
+                f"{name} cannot be detached: it holds {', '.join(held_bodies)}; detach that first"
+            )
         remaining = [
             replace(body, touch_links=tuple(link for link in body.touch_links if link != name))
             for body in self.attached
@@ -389,10 +396,11 @@ class Robot(KinematicTree):
         return reduce(Robot.with_body, remaining, self.arm)
 
     def placed_in_world(self, T_world_base: Pose) -> "Robot":
-        """The robot with a new base link, the world, that carries the old one: for pictures and simulators.
+        """The robot with a new base link, the world, to which the old base is fixed; for pictures and
+        simulators.
 
         Args:
-            T_world_base: Pose of the old base [4, 4].
+            T_world_base: Pose of the old base in the world [4, 4].
         """
         name = "world"
         while name in self.link_names:
@@ -403,7 +411,7 @@ class Robot(KinematicTree):
 
     @property
     def unlocked(self) -> "Robot":
-        """The robot from which `with_locked` made this one; else the robot itself."""
+        """The robot from which `with_locked` made this robot; the robot itself if it was made otherwise."""
         return self.__dict__.get("_unlocked", self)
 
     def __repr__(self) -> str:
@@ -431,13 +439,14 @@ class Robot(KinematicTree):
         return "\n".join(line for line in lines if line)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Fields only: what was compiled or cached for the robot is not pickled."""
+        """The dataclass fields. Data that was compiled or cached for the robot is not pickled."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
 @lru_cache(maxsize=LOCKED_CACHE)
 def _variant(robot: Robot, locked: tuple[tuple[str, float], ...]) -> Robot:
-    """The same object for equal values, so that data derived from a robot is computed once."""
+    """The robot with these locked joints; the same object for equal values, so that data derived from it is
+    computed once."""
     if dict(locked) == robot.locked:
         return robot
     variant = replace(robot, locked=dict(locked))
@@ -457,7 +466,7 @@ def _with_body(robot: Robot, content: BodyContent) -> Robot:
     spheres = dict(robot.spheres)
     if body.shapes:
         meshes[body.name], spheres[body.name] = body_geometry(body)
-    # goals and pictures refer to the tip; a tool on another branch than the tip's does not replace it
+    # a tool replaces the tip of its own chain only; goals and pictures refer to the tip
     frame = robot.link_frame(body.link) if body.tool and robot.at_end(body.link) else -1
     tip, *remaining_tips = [body.name if robot.link_frame(tip) == frame else tip for tip in robot.tips]
     return replace(
@@ -475,8 +484,8 @@ def _with_body(robot: Robot, content: BodyContent) -> Robot:
 
 
 def scaled(robot: Robot, scale: float) -> Robot:
-    """The arm without attached bodies, scaled by a factor with its spheres and meshes; angular limits
-    stay."""
+    """The arm without attached bodies, with all its lengths, spheres and meshes scaled by a factor. Limits in
+    radians are unchanged."""
     arm = robot.arm
     prismatic = {joint.name for joint in arm.joints if joint.kind == "prismatic"}
 
@@ -505,13 +514,13 @@ def _moved(T: Pose, scale: float) -> Pose:
 
 
 def moving_pairs(robot: Robot, names: Container[str]) -> list[tuple[str, str]]:
-    """Pairs of links with these names that are on different frames."""
+    """Pairs of links with these names that are fixed to different frames."""
     links = [link for link in robot.link_names if link in names]
     return [(a, b) for a, b in combinations(links, 2) if robot.link_frame(a) != robot.link_frame(b)]
 
 
 def configurations(robot: Robot, q: ArrayLike) -> ndarray:
-    """A configuration [dof], or several [n, dof]. Raises InputError for anything else."""
+    """q as an array: a configuration [dof], or several [n, dof]. Raises InputError for other values."""
     rows = numbers(q)
     if rows is None or rows.ndim not in (1, 2) or rows.shape[-1] != robot.dof or not within(rows):
         names = ", ".join(robot.joint_names)
@@ -522,8 +531,8 @@ def configurations(robot: Robot, q: ArrayLike) -> ndarray:
 def named_pose(robot: Robot, field: str, name: str) -> list[float]:
     """The planned joints' values in a named pose of the robot [rad] or [m].
 
-    Raises InputError, naming the field, for an unknown name (the message lists the poses with values for all
-    planned joints) and for a pose without a value for some planned joint.
+    Raises InputError for an unknown name, and for a pose that lacks a value for a planned joint. The message
+    names the field and lists the poses that have values for all planned joints.
     """
     complete = [pose for pose, values in robot.poses.items() if {*robot.joint_names} <= values.keys()]
     if not complete:
@@ -536,12 +545,12 @@ def named_pose(robot: Robot, field: str, name: str) -> list[float]:
 
 
 DIGITS = 9
-"""Number of decimals to which numbers are rounded, since the last bits of rotations from quaternions differ
-between machines."""
+"""Number of decimals to which numbers are rounded before hashing, since the last bits of rotations computed
+from quaternions differ between machines."""
 
 
 def hashed_content(names: object, *numbers: object) -> bytes:
-    """Names and rounded arrays as bytes, which hashes of robots, scenes and requests are made of."""
+    """Names and rounded arrays as bytes, the input of the hashes of robots, scenes and requests."""
     content = json.dumps(names).encode()
     for values in numbers:
         rounded = np.round(np.asarray(values, np.float64), DIGITS) + 0.0  # no negative zeros
@@ -550,9 +559,10 @@ def hashed_content(names: object, *numbers: object) -> bytes:
 
 
 def robot_fingerprint(robot: Robot) -> str:
-    """The first 16 hexadecimal digits of a SHA-256, the same in every process.
+    """A hash of the robot: the first 16 hexadecimal digits of a SHA-256, equal in every process.
 
-    It covers joints, limits, spheres, meshes, locked joints and allowed collisions, but not the robot's name.
+    The hash covers base, tips, joints, limits, spheres, meshes, locked joints and allowed collisions. The
+    robot's name is not part of it.
     """
     digest = hashlib.sha256()
 

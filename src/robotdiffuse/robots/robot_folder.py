@@ -1,9 +1,9 @@
 """Reads and writes robot folders: robot.json (human-readable), meshes.npz (convex collision meshes) and,
 if links graze each other, surfaces.npz.
 
-surfaces.npz holds the surfaces of grazing links (`Robot.grazing`). It is optional and no part of a robot's
-identity: data, weights and proofs that were made without it stay valid, because surfaces only free
-configurations in which convex parts overlap.
+surfaces.npz contains the mesh surfaces of grazing links (`Robot.grazing`). The file is optional and not part
+of a robot's identity. Surfaces only make more configurations count as free: some in which convex parts
+overlap. So data, weights and proofs that were made without the file stay valid.
 """
 
 import hashlib
@@ -45,18 +45,19 @@ SURFACE_FILE = "surfaces.npz"
 FORMAT = 2
 """Version of the format."""
 AXIS_LENGTH_TOLERANCE = 1e-3
-"""Largest difference between the length of a joint axis and 1."""
+"""A joint axis in a file may differ from unit length by at most this."""
 ROBOT_FILE = "robot.json"
 MESH_FILE = "meshes.npz"
 
 
 def write_robot_folder(robot: Robot, folder: str | Path, source: dict[str, Any]) -> None:
-    """Write robot.json, meshes.npz and, for grazing links, surfaces.npz into a folder, each file atomically;
-    other files in the folder stay.
+    """Write robot.json, meshes.npz and, for grazing links, surfaces.npz into a folder. Each file is written
+    atomically; other files in the folder stay.
 
-    `source` describes the origin: urdf, sha256, licence, and, if preparation measured them, `free`, the
-    fraction of free configurations, and `refused`, the fraction of these with false collisions of spheres.
-    Raises InputError if the folder cannot be written.
+    `source` describes the robot's origin by the keys urdf, sha256 and licence. If preparation measured them,
+    it also has `free`, the fraction of configurations that are free, and `refused`, the fraction of the free
+    configurations in which covering spheres collide falsely. Raises InputError if the folder cannot be
+    written.
     """
     folder = Path(folder)
     arrays = _packed([(link, mesh) for link, meshes in robot.meshes.items() for mesh in meshes])
@@ -116,7 +117,7 @@ def read_robot_folder(folder: str | Path) -> Robot:
 
 @contextmanager
 def _damage(file: Path) -> Iterator[None]:
-    """Errors of any kind that damaged data raises become InputError."""
+    """Turns errors that damaged data raises into an InputError that names the file."""
     try:
         yield
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
@@ -132,7 +133,7 @@ def _digest(robot: Robot) -> str:
 
 
 def _check_tree(robot: Robot) -> None:
-    """Raise ValueError if the joints do not form a tree, or if other entries are inconsistent with it."""
+    """Raise ValueError if the joints do not form a tree, or if other entries do not fit the tree."""
     links = {robot.base}
     for joint in robot.joints:
         if joint.parent not in links or joint.child in links:
@@ -146,8 +147,8 @@ def _check_tree(robot: Robot) -> None:
                 raise ValueError(f"joint {name} mimics itself")
             visited.add(name)
             name = leaders[name]
-    of_tables = {link for table in robot.tables for link in table.links}
-    if not {*robot.tips, *robot.meshes, *of_tables} <= links:
+    table_links = {link for table in robot.tables for link in table.links}
+    if not {*robot.tips, *robot.meshes, *table_links} <= links:
         raise ValueError("the tip, meshes or a table of an unknown link")
     if any((rows[:, 3] <= 0).any() for rows in robot.spheres.values() if len(rows)):
         raise ValueError("spheres without a size")
@@ -183,7 +184,8 @@ def _to_json(robot: Robot, source: dict[str, Any]) -> dict:
 
 
 def _table_to_json(table: LinkPairTable) -> dict:
-    """Entry of a table; cells along the last joint are packed as bits into hexadecimal rows."""
+    """JSON entry of a table. Cells along the last joint are packed as bits; each row is a hexadecimal
+    string."""
     rows = np.packbits(np.atleast_2d(table.apart), axis=1)
     return {
         "links": list(table.links),
@@ -234,7 +236,7 @@ def _dump(data: dict) -> str:
 
 
 def _dump_value(value: Any, levels: int, pad: str) -> str:
-    """JSON text of a value, of which this many levels have an entry per line."""
+    """JSON text of a value. In the outer `levels` levels of nesting, each entry is on its own line."""
     if not levels or not value:
         return json.dumps(value, allow_nan=False)
     named = isinstance(value, dict)
@@ -323,7 +325,7 @@ def _array(rows: object, width: int, what: str) -> Float[ndarray, "n w"]:
 
 
 def _packed(meshes: Sequence[tuple[str, Surface]]) -> dict[str, ndarray]:
-    """Meshes of links in four arrays, since reading many small ones would take longer."""
+    """Meshes of links, joined in four arrays, which are read faster than many small ones."""
     return {
         "links": np.array([link for link, _ in meshes], dtype=np.str_),
         "sizes": np.array([(len(mesh.vertices), len(mesh.faces)) for _, mesh in meshes], np.int64).reshape(
@@ -337,10 +339,10 @@ def _packed(meshes: Sequence[tuple[str, Surface]]) -> dict[str, ndarray]:
 def _unpacked(arrays: dict[str, ndarray], kind: type[M]) -> Iterator[tuple[str, M]]:
     """Links and meshes from the arrays that `_packed` made."""
     links, sizes, vertices, faces = (arrays[key] for key in ("links", "sizes", "vertices", "faces"))
-    ends = np.cumsum(sizes, axis=0)
-    if len(links) and (ends[-1] != (len(vertices), len(faces))).any():
+    end_indices = np.cumsum(sizes, axis=0)
+    if len(links) and (end_indices[-1] != (len(vertices), len(faces))).any():
         raise ValueError("sizes do not add up")
-    for link, (v, f), (v_end, f_end) in zip(links, sizes, ends, strict=True):
+    for link, (v, f), (v_end, f_end) in zip(links, sizes, end_indices, strict=True):
         corners = _array(vertices[v_end - v : v_end], 3, f"vertices of {link}")
         indices = np.asarray(faces[f_end - f : f_end], np.int64)
         if indices.shape[1:] != (3,) or not ((indices >= 0) & (indices < len(corners))).all():

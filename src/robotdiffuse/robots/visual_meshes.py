@@ -13,10 +13,10 @@ from robotdiffuse.robots.robot import Robot
 UNIT = 5e-5
 """Resolution of stored vertices [m]."""
 MAX_BOX_DIFFERENCE = 0.03
-"""Largest difference between the bounding boxes of a visual mesh that is used and of the collision geometry
+"""A visual mesh is used only if its bounding box and that of the collision geometry differ by less than this
 [m]."""
 LINK_COLOR = (236, 238, 240)
-# Colors of held objects and of tools [sRGB].
+# sRGB colors of held objects and of tools
 HELD_COLOR = (0xE3, 0xB2, 0x3C)
 TOOL_COLOR = (0xB0, 0xB6, 0xBE)
 
@@ -31,11 +31,11 @@ class VisualMesh(Value):
 
 
 def load_visual(robot: Robot) -> dict[str, tuple[VisualMesh, ...]]:
-    """Meshes to draw, by link: bundled visual meshes, or else the convex collision meshes, or else the
-    spheres.
+    """Meshes to draw, by link: the bundled visual mesh, else the convex collision meshes, else the spheres.
 
-    A bundled mesh that differs from the robot's collision geometry is not used, so that pictures show the
-    robot that was planned for. It may be smaller on links that no planned joint moves.
+    A bundled mesh is not used if its size differs from that of the link's collision geometry, so that
+    pictures show the robot that was planned for. On links that no planned joint moves, the mesh may be
+    smaller.
     """
     bundled = _read_bundled(robot.name)
     meshes: dict[str, tuple[VisualMesh, ...]] = {}
@@ -73,7 +73,7 @@ def _agree(visual: VisualMesh, collision: tuple[VisualMesh, ...], both_ways: boo
 
 
 def has_visual(robot: Robot) -> bool:
-    """Whether visual meshes of the arm are bundled; else `load_visual` draws its collision geometry."""
+    """Whether visual meshes of the robot are bundled; else `load_visual` returns its collision geometry."""
     return bool(_read_bundled(robot.name))
 
 

@@ -1,10 +1,11 @@
-"""Compiled signed distances of points to obstacles with gradients, the collision cost of a configuration, and
-its gradient, which guidance and refinement descend. The yes-or-no check is in `lane_collision.py`.
+"""Compiled signed distances of points to obstacles with gradients, and the collision cost of a configuration
+with its gradient, which guidance and refinement descend. The yes-or-no check is in `lane_collision.py`.
 
-The cost is computed from coarse to fine: first the obstacles whose boxes are within reach of the bounding
-sphere of 16 of a link's spheres, then their distances to these 16 at once, then, one by one, the spheres
-within the margin. The gradients of a link's spheres add up to a force and a moment (a wrench), which act on
-the joints before the link.
+The cost is computed from coarse to fine, for rows of up to 16 of a link's spheres. First, obstacles are
+selected whose bounding boxes are near the row's bounding sphere. Then the distances of all spheres of the row
+to these obstacles are computed at once. Last, the spheres within the margin are processed one by one. The
+gradients of a link's spheres add up to a force and a moment (a wrench), which act on the joints that move the
+link.
 """
 
 from typing import NamedTuple
@@ -23,7 +24,7 @@ from robotdiffuse.collision.kernels.simd import W, first_lane, lane, load, maxim
 from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
 
 CLEARANCE_CAP = np.float32(1.0)
-"""Larger clearances are reported as this [m]."""
+"""Larger clearances are capped at this value [m]."""
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _TINY = np.float32(1e-9)
 
@@ -59,7 +60,7 @@ def frames_of(robot, q, frames):
 
 @allocation_free(fastmath=True)
 def placed(frame, x, y, z):
-    """Position of a point of a frame in the base frame."""
+    """Position in the base frame of the point (x, y, z) of a frame[12]."""
     return (
         frame[0] * x + frame[1] * y + frame[2] * z + frame[9],
         frame[3] * x + frame[4] * y + frame[5] * z + frame[10],
@@ -69,7 +70,8 @@ def placed(frame, x, y, z):
 
 @allocation_free(fastmath=True)
 def solid_distance(solid, x, y, z):
-    """Signed distance of a point to a row of `SceneArrays.solids`, and its gradient."""
+    """Signed distance of a point to a row of `SceneArrays.solids` [m], and its gradient."""
+    # the point in the solid's axes, and its distances outside the faces
     dx = x - solid[0]
     dy = y - solid[1]
     dz = z - solid[2]
@@ -122,7 +124,8 @@ def solid_distance(solid, x, y, z):
 
 @allocation_free(inline="always")
 def scene_distance(scene, x, y, z, limit):
-    """Signed distance of a point to the nearest obstacle, at most `limit`, and its gradient.
+    """Signed distance of a point to the nearest obstacle, at most `limit` [m], and its gradient (0 at
+    `limit`).
 
     Distances to point clouds may be too large by a few millimeters.
     """
@@ -148,8 +151,8 @@ def scene_distance(scene, x, y, z, limit):
 
 
 @allocation_free(forceinline=True)
-def _push(wrench, x, y, z, fx, fy, fz):
-    """Adds a force at a point, and its moment about the base's origin, to a wrench."""
+def _add_force(wrench, x, y, z, fx, fy, fz):
+    """Adds a force at the point (x, y, z), and its moment about the base's origin, to a wrench."""
     wrench[0] += fx
     wrench[1] += fy
     wrench[2] += fz
@@ -159,8 +162,9 @@ def _push(wrench, x, y, z, fx, fy, fz):
 
 
 @allocation_free(forceinline=True)
-def _pull(robot, frames, frame, wrench, grad):
-    """Subtracts the effect of a wrench on a frame on the joints before it from `grad`."""
+def _subtract_torques(robot, frames, frame, wrench, grad):
+    """Subtracts from `grad` the forces and torques that a wrench on a frame exerts on the joints that move
+    the frame."""
     while frame > 0:
         j = frame - 1
         axis = frames[j + 1]
@@ -185,7 +189,7 @@ def _pull(robot, frames, frame, wrench, grad):
 
 @allocation_free(forceinline=True)
 def _close(around, part, x, y, z, reach):
-    """Mask of those of 16 obstacles whose bounding boxes are within reach of a point."""
+    """Mask of the obstacles, in row `part` of 16, with bounding boxes within `reach` [m] of a point."""
     dx = maximum(maximum(load(around, part, 0) - x, x - load(around, part, 3)), _ZERO)
     dy = maximum(maximum(load(around, part, 1) - y, y - load(around, part, 4)), _ZERO)
     dz = maximum(maximum(load(around, part, 2) - z, z - load(around, part, 5)), _ZERO)
@@ -194,7 +198,8 @@ def _close(around, part, x, y, z, reach):
 
 @allocation_free(forceinline=True)
 def _row_cost(robot, scene, g, row, frame, margin, nearest, wrench):
-    """Cost of a group's row of spheres towards the scene; adds their forces to the wrench."""
+    """Cost of a row of spheres of group g towards the scene; adds the spheres' forces to `wrench`."""
+    # obstacles near the row's bounding sphere
     cost = _ZERO
     around = scene.solid_boxes
     bound = robot.row_bounds[row]
@@ -208,14 +213,15 @@ def _row_cost(robot, scene, g, row, frame, margin, nearest, wrench):
     near_cloud = len(scene.points) > 0 and points_lower_bound(scene, u, v, w) < reach
     if any_close == 0 and not near_cloud:
         return cost
+    # nearest obstacle of each sphere within the margin; `pushed` is the mask of these spheres
     a = load(robot.rows, row, 0)
     b = load(robot.rows, row, 1)
     c = load(robot.rows, row, 2)
     x = a * frame[0] + b * frame[1] + c * frame[2] + frame[9]
     y = a * frame[3] + b * frame[4] + c * frame[5] + frame[10]
     z = a * frame[6] + b * frame[7] + c * frame[8] + frame[11]
-    within = load(robot.rows, row, 3) + margin
-    best = within
+    radius_and_margin = load(robot.rows, row, 3) + margin
+    best = radius_and_margin
     pushed = 0
     zero = x * _ZERO
     for part in range(len(around)):
@@ -232,6 +238,7 @@ def _row_cost(robot, scene, g, row, frame, margin, nearest, wrench):
             while nearer:
                 nearest[first_lane(nearer)] = k
                 nearer &= nearer - 1
+    # spheres that are nearest to a point of the clouds, then the others
     if near_cloud:
         for i in range(robot.row_sizes[row]):
             px = lane(x, i)
@@ -240,9 +247,9 @@ def _row_cost(robot, scene, g, row, frame, margin, nearest, wrench):
             d, nx, ny, nz = near_point(scene, px, py, pz, lane(best, i))
             if d < lane(best, i):
                 pushed &= ~(1 << i)
-                h = lane(within, i) - d
+                h = lane(radius_and_margin, i) - d
                 cost += _HALF * h * h
-                _push(wrench, px, py, pz, h * nx, h * ny, h * nz)
+                _add_force(wrench, px, py, pz, h * nx, h * ny, h * nz)
     pushed &= (1 << robot.row_sizes[row]) - 1
     while pushed:
         i = first_lane(pushed)
@@ -251,9 +258,9 @@ def _row_cost(robot, scene, g, row, frame, margin, nearest, wrench):
         py = lane(y, i)
         pz = lane(z, i)
         d, nx, ny, nz = solid_distance(scene.solids[nearest[i]], px, py, pz)
-        h = max(lane(within, i) - d, _ZERO)
+        h = max(lane(radius_and_margin, i) - d, _ZERO)
         cost += _HALF * h * h
-        _push(wrench, px, py, pz, h * nx, h * ny, h * nz)
+        _add_force(wrench, px, py, pz, h * nx, h * ny, h * nz)
     return cost
 
 
@@ -263,9 +270,9 @@ class CostWorkspace(NamedTuple):
     frames: np.ndarray
     """[dof + 1, 12]"""
     nearest: np.ndarray
-    """[16] index of the obstacle that is nearest to each sphere of a row."""
+    """[16] index of the nearest obstacle of each sphere in a row."""
     wrench: np.ndarray
-    """[2, 6] forces and moments on one link and on another."""
+    """[2, 6] force and moment on each of two links."""
 
 
 @inner_kernel()
@@ -278,12 +285,12 @@ def make_cost_workspace(dof):
 
 @allocation_free(fastmath=True)
 def cost_gradient_at(robot, scene, q, pairs, margin, self_margin, work, grad):
-    """Collision cost of a configuration and its gradient (added to `grad`).
+    """Returns the collision cost of a configuration and adds its gradient to `grad`.
 
-    The cost is the paper's hinge loss, squared: the sum over the spheres of (S - D)^2 / 2 for D < S, with D
-    the signed distance and S the margin [m], plus the same between the links of the checked pairs. `pairs`
-    are the clearances of the pairs at q (`lane_clearance.pair_clearances_into`), at most the self margin. A
-    sufficiently negative margin turns its part of the cost off.
+    The cost is the paper's hinge loss, squared. A sphere at signed distance D < S from the scene costs
+    (S - D)^2 / 2, where S is `margin` [m]. Two spheres of a checked pair of links cost the same expression of
+    their distance and `self_margin` [m]. `pairs` are the clearances of the pairs at q, at most `self_margin`
+    (`lane_clearance.pair_clearances_into`). A sufficiently negative margin turns off its part of the cost.
     """
     frames_of(robot, q, work.frames)
     frames = work.frames
@@ -295,12 +302,12 @@ def cost_gradient_at(robot, scene, q, pairs, margin, self_margin, work, grad):
         if index == 0:
             continue
         wrench[:] = _ZERO
-        of_link = _ZERO
+        link_cost = _ZERO
         for row in range(robot.first_row[g], robot.first_row[g + 1]):
-            of_link += _row_cost(robot, scene, g, row, frames[index], margin, work.nearest, wrench)
-        if of_link > _ZERO:
-            cost += of_link
-            _pull(robot, frames, index, wrench, grad)
+            link_cost += _row_cost(robot, scene, g, row, frames[index], margin, work.nearest, wrench)
+        if link_cost > _ZERO:
+            cost += link_cost
+            _subtract_torques(robot, frames, index, wrench, grad)
     for p in range(len(robot.pairs)):
         a = robot.pairs[p, 0]
         b = robot.pairs[p, 1]
@@ -331,10 +338,10 @@ def cost_gradient_at(robot, scene, q, pairs, margin, self_margin, work, grad):
                     fx = h * dx / d
                     fy = h * dy / d
                     fz = h * dz / d
-                    _push(wrench, x, y, z, fx, fy, fz)
-                    _push(opposite_wrench, u, v, w, -fx, -fy, -fz)
-        _pull(robot, frames, ia, wrench, grad)
-        _pull(robot, frames, ib, opposite_wrench, grad)
+                    _add_force(wrench, x, y, z, fx, fy, fz)
+                    _add_force(opposite_wrench, u, v, w, -fx, -fy, -fz)
+        _subtract_torques(robot, frames, ia, wrench, grad)
+        _subtract_torques(robot, frames, ib, opposite_wrench, grad)
     return cost
 
 
@@ -354,15 +361,15 @@ def cost_gradients(robot, scene, q, margin, self_margin):
 def clearances_and_gradients_into(robot, scene, q, limit, margin, work, clearances, gradients):
     """Writes clearances[n, groups] of the moving groups and gradients[n, dof] for the rows of q[n, dof].
 
-    The gradients are those of sqrt(2 cost), with the cost of `cost_gradient_at` towards the scene alone: the
-    root of the sum of h^2 over the spheres with h = max(0, S - D), S being the margin and D the signed
-    distance. Because of the root, gradients have the size of a sphere's distance from the joint axes, from
-    the edge of the margin to deep inside an obstacle. Gradients of the cost itself vary by a factor of a
-    thousand.
+    The gradients are those of sqrt(2 cost), where the cost is that of `cost_gradient_at` towards the scene
+    alone. This is the root of the sum of h^2 over the spheres, where h = max(0, S - D), S is the margin and D
+    the signed distance. Because of the root, gradients are about as large as a sphere's distance from the
+    joint axes, whether the sphere is at the edge of the margin or deep inside an obstacle. Gradients of the
+    cost itself vary by a factor of a thousand.
     """
     clearances_into(robot, scene, q, limit, work, clearances)
     scratch = make_cost_workspace(q.shape[1])
-    pairs = np.zeros(len(robot.pairs), np.float32)  # with a self margin of 0 they cost nothing
+    pairs = np.zeros(len(robot.pairs), np.float32)  # clearances of 0, which a self margin of 0 does not count
     gradients[:] = np.float32(0.0)
     for i in range(len(q)):
         if clearances[i].min() < margin:

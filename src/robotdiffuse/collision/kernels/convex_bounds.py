@@ -1,11 +1,11 @@
 """Compiled lower bounds of the distances between convex meshes and shapes along short motions.
 
-A plane that separates two convex bodies proves that they do not touch, whatever algorithm found it. The
-algorithm of Gilbert, Johnson and Keerthi (GJK, 1988) finds the best plane for the poses in the middle of the
-motion, starting from the plane that was found last. The bound needs only this plane: it is the smallest gap
-along the plane's normal between the vertices of one body and the other body, while each vertex moves from its
-place in the middle by t v + r, t in [-1, 1]. Here v is the vertex's velocity and r a small remainder of
-second order (see `lane_clearance.py`). All computations are in float64.
+A plane that separates two convex bodies proves that they do not touch, whatever algorithm found the plane.
+The algorithm of Gilbert, Johnson and Keerthi (GJK, 1988) finds the best plane for the poses in the middle of
+the motion, starting from the plane of the previous motion. The bound needs only this plane: it is the
+smallest gap, along the plane's normal, between the vertices of one body and the other body during the motion.
+Each vertex moves from its position in the middle by t v + r with t in [-1, 1], where v is the vertex's
+velocity and r a small remainder of second order (see `lane_clearance.py`). All computations are in float64.
 """
 
 from typing import NamedTuple
@@ -34,7 +34,7 @@ class Hulls(NamedTuple):
     frame: np.ndarray
     """[parts] index of the frame that each part is fixed to."""
     balls: np.ndarray
-    """[parts, 4] center and radius of a ball around all of the part."""
+    """[parts, 4] center and radius of a ball around the whole part, in the part's frame."""
     rounding: np.ndarray
     """[parts] radius by which the hull is inflated."""
 
@@ -53,29 +53,31 @@ class Solids(NamedTuple):
     rounding: np.ndarray
     """[n] radius of the ball."""
     is_bound: np.ndarray
-    """[n] whether the solid only encloses a surface or a point cloud; then only Coal computes the exact
-    distance."""
+    """[n] whether the solid is only the bounding box of a surface or a point cloud. Only Coal computes the
+    exact distances of these."""
     may_touch: np.ndarray
-    """[checks, n] whether the link of a check may touch the obstacle; [0, 0] without allowed contacts."""
+    """[checks, n] whether the link of a check may touch the obstacle; shape [0, 0] without allowed
+    contacts."""
 
 
 class Posture(NamedTuple):
-    """Scratch memory of one thread: the robot's frames in the middle of the current motion, and what GJK
-    keeps from one motion to the next."""
+    """Scratch memory of one thread: the robot's frames in the middle of the current motion, and the planes
+    that GJK found for earlier motions."""
 
     frames: np.ndarray
     """[dof + 1, 3, 4]"""
     twists: np.ndarray
     """[dof + 1, 6] as in `lane_clearance.py`."""
     planes: np.ndarray
-    """[parts, solids + parts, 3] for each pair of a part (first index) and a solid or another part, the
-    normal of the plane that was found last. It points towards the first part; zero if none was found yet."""
+    """[parts, solids + parts, 3] for each pair of a part (first index) and a solid or another part, the unit
+    normal of the last separating plane. It points towards the first part; it is zero before the first plane
+    is found."""
     simplex: np.ndarray
-    """[4, 3]"""
+    """[4, 3] vertices of GJK's simplex."""
     edges: np.ndarray
-    """[3, 3]"""
+    """[3, 3] its edges from the newest vertex."""
     points: np.ndarray
-    """[3, 3] a normal, and the support points of the two bodies along it."""
+    """[3, 3] the current normal, and the support points of the two bodies along it."""
 
 
 @kernel()
@@ -161,8 +163,9 @@ def ball_to_ball(hulls, p, q, posture):
 
 
 @inner_kernel(fastmath=True)
-def _least(vertices, first, last, x, y, z, offset, u, v, w, speed):
-    """Minimum of a - |b| over vertices, where a and b are linear functions of the vertex; plus `offset`."""
+def _lowest(vertices, first, last, x, y, z, offset, u, v, w, speed):
+    """Minimum over vertices of a - |b|, plus `offset`. a is the vertex's height along a normal, b its speed
+    along the normal; both are linear in the vertex."""
     minimum = np.inf
     for i in range(first, last):
         a = vertices[0, i] * x + vertices[1, i] * y + vertices[2, i] * z
@@ -173,7 +176,7 @@ def _least(vertices, first, last, x, y, z, offset, u, v, w, speed):
 
 @inner_kernel()
 def _furthest(vertices, first, last, x, y, z):
-    """Index of the vertex that is furthest in a direction."""
+    """Index of the vertex that is furthest in the direction (x, y, z)."""
     best = -np.inf
     at = first
     for i in range(first, last):
@@ -225,9 +228,9 @@ def _support_of_solid(solids, o, posture):
 
 
 @inner_kernel()
-def _least_along(hulls, p, base, sign, posture):
-    """Minimum height of a part in the direction sign * points[0] at the start and at the end of the motion,
-    without the remainder r, with velocities relative to frame `base`."""
+def _lowest_along(hulls, p, base, sign, posture):
+    """Minimum height of a part in the direction sign * points[0] at the start and at the end of the motion
+    [m]. The remainder r is left out; velocities are relative to frame `base`."""
     n = posture.points[0]
     T = posture.frames[hulls.frame[p]]
     twist = posture.twists[hulls.frame[p]]
@@ -256,10 +259,10 @@ def _least_along(hulls, p, base, sign, posture):
 def separation(hulls, p, solids, other, base, posture):
     """Widths of the gap between two bodies along the unit normal points[0] [m].
 
-    Returns the gap in the middle of the motion, and the smallest gap along the motion. The latter leaves out
-    the remainder r (see the module's docstring) and uses velocities relative to frame `base`. `other` is the
-    index of an obstacle or, if negative, -1 minus the index of a part; if that part is not on frame `base`,
-    its own motion counts too.
+    Returns the gap in the middle of the motion, and the smallest gap along the motion. The smallest gap
+    leaves out the remainder r (see the module's docstring) and uses velocities relative to frame `base`.
+    `other` is the index of an obstacle or, if negative, -1 minus the index of a part. If this part is not
+    fixed to frame `base`, its motion is included.
     """
     x = posture.points[0, 0]
     y = posture.points[0, 1]
@@ -277,6 +280,7 @@ def separation(hulls, p, solids, other, base, posture):
     w = x * b - y * a
     speed = u * T[0, 3] + v * T[1, 3] + w * T[2, 3]
     speed += x * (twist[3] - base_twist[3]) + y * (twist[4] - base_twist[4]) + z * (twist[5] - base_twist[5])
+    # height and speed along the normal as linear functions of a vertex in the part's frame
     offset = x * T[0, 3] + y * T[1, 3] + z * T[2, 3] - hulls.rounding[p]
     lx = T[0, 0] * x + T[1, 0] * y + T[2, 0] * z
     ly = T[0, 1] * x + T[1, 1] * y + T[2, 1] * z
@@ -286,8 +290,8 @@ def separation(hulls, p, solids, other, base, posture):
     lw = T[0, 2] * u + T[1, 2] * v + T[2, 2] * w
     first = hulls.first[p]
     last = hulls.first[p + 1]
-    along = _least(hulls.vertices, first, last, lx, ly, lz, offset, lu, lv, lw, speed)
-    middle = _least(hulls.vertices, first, last, lx, ly, lz, offset, 0.0, 0.0, 0.0, 0.0)
+    along = _lowest(hulls.vertices, first, last, lx, ly, lz, offset, lu, lv, lw, speed)
+    middle = _lowest(hulls.vertices, first, last, lx, ly, lz, offset, 0.0, 0.0, 0.0, 0.0)
     reach = 0.0
     if other >= 0:
         _support_of_solid(solids, other, posture)
@@ -298,8 +302,8 @@ def separation(hulls, p, solids, other, base, posture):
     at = posture.points[2]
     reach += x * at[0] + y * at[1] + z * at[2]
     if other < 0 and hulls.frame[-1 - other] != base:
-        start, stop = _least_along(hulls, p, base, 1.0, posture)
-        other_start, other_stop = _least_along(hulls, -1 - other, base, -1.0, posture)
+        start, stop = _lowest_along(hulls, p, base, 1.0, posture)
+        other_start, other_stop = _lowest_along(hulls, -1 - other, base, -1.0, posture)
         return middle - reach - 1e-9, min(start + other_start, stop + other_stop) - 1e-9
     # 1e-9 covers floating-point errors in the length of the normal, which are multiplied by the size of the
     # bodies
@@ -312,8 +316,9 @@ def _dot(a, b):
 
 
 @inner_kernel()
-def _holds_origin(e, new):
-    """Whether the tetrahedron of `new` and `new` + e[0], e[1], e[2] contains the origin."""
+def _contains_origin(e, new):
+    """Whether the tetrahedron with the vertices `new`, `new` + e[0], `new` + e[1] and `new` + e[2] contains
+    the origin: whether all its barycentric coordinates are positive."""
     inside = 1.0
     for k in range(3):
         a = e[(k + 1) % 3]
@@ -333,12 +338,13 @@ def _holds_origin(e, new):
 
 @inner_kernel()
 def _nearest(simplex, count, edges, nearest):
-    """Writes to `nearest` the point of a simplex that is nearest to the origin. The smallest face that
-    contains this point always has the last vertex, which GJK has just added.
+    """Writes to `nearest` the point of a simplex that is nearest to the origin.
 
-    The simplex is reduced to the smallest face that contains the point. Returns the number of its vertices,
-    or 0 if the origin is inside.
+    Reduces the simplex to the smallest face that contains this point, and returns the face's number of
+    vertices, or 0 if the origin is inside. The face always contains the last vertex, which GJK has just
+    added.
     """
+    # vertex, edges (i == j) and triangles that contain the last vertex
     new = simplex[count - 1]
     best_square = _dot(new, new)
     face = 0
@@ -346,7 +352,7 @@ def _nearest(simplex, count, edges, nearest):
         nearest[r] = new[r]
         for k in range(count - 1):
             edges[k, r] = simplex[k, r] - new[r]
-    if count == 4 and _holds_origin(edges, new):
+    if count == 4 and _contains_origin(edges, new):
         return 0
     for i in range(count - 1):
         for j in range(i, count - 1):
@@ -388,7 +394,8 @@ def _nearest(simplex, count, edges, nearest):
 @inner_kernel()
 def find_plane(hulls, p, solids, other, posture):
     """Replaces points[0], an initial guess, by the normal of the plane with the widest gap between two bodies
-    in the middle of the motion. Returns False if they touch, or nearly."""
+    in the middle of the motion. Returns False if the bodies touch or nearly touch."""
+    # `best` and `gap` are a lower and an upper bound of the distance of the bodies without their roundings
     points = posture.points
     simplex = posture.simplex
     rounding = hulls.rounding[p] + (solids.rounding[other] if other >= 0 else hulls.rounding[-1 - other])
@@ -432,12 +439,12 @@ def find_plane(hulls, p, solids, other, posture):
 
 @kernel()
 def best_plane(hulls, p, solids, other, base, enough, plane, posture):
-    """Gaps between two bodies by a separating plane, and whether GJK computed it.
+    """Gaps between two bodies along the normal of a separating plane [m], and whether GJK was run.
 
-    The gaps are those in the middle and along the motion, without the remainder; if GJK computed the plane,
-    the first is a lower bound at most about 2 % below the distance (-inf if the bodies touch, or nearly). GJK
-    runs only if `plane`, the one that was found last, shows less than `enough` along the motion; then it
-    replaces `plane`.
+    The first gap is in the middle of the motion, the second is the smallest along the motion, without the
+    remainder r. GJK is run only if the gap of `plane`, the last plane of this pair, is less than `enough`
+    along the motion; then `plane` is replaced. After GJK, the first gap is at most about 2 % below the
+    distance, or -inf if the bodies touch or nearly touch.
     """
     n = posture.points[0]
     cached = False

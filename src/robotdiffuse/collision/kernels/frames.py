@@ -9,8 +9,8 @@ from robotdiffuse.core.kernels import inner_kernel
 
 
 def parent_of(parents, j):
-    """The parent frame of joint j. `parents` is None for a chain; code for chains is compiled separately, so
-    that support for trees costs them nothing."""
+    """The parent frame of joint j. `parents` is None for a chain. Code for chains is compiled separately, so
+    chains pay nothing for the support of trees."""
     return j if parents is None else parents[j]
 
 
@@ -21,14 +21,18 @@ def _parent_of(parents, j):
 
 @inner_kernel()
 def placed(T, p, r):
-    """Coordinate r in the base frame of the point p of frame T."""
+    """Coordinate r (0 to 2) of T @ p: the point p of a frame, seen in the base frame; T = T_base_frame."""
     return T[r, 0] * p[0] + T[r, 1] * p[1] + T[r, 2] * p[2] + T[r, 3]
 
 
 @inner_kernel()
 def point_to_box(x, y, z, rotation, middle, half, disc):
-    """Lower bound of the signed distance [m] from a point to a box with rotation R_box_base[3, 3], whose
-    first two half edges are increased by the radius of a disc; negative inside."""
+    """Lower bound of the signed distance [m] from a point to the Minkowski sum of a box and a disc around the
+    box's z axis. The bound is the distance to a larger box: the first two half edges grow by the disc's
+    radius.
+
+    `rotation` is R_box_base[3, 3]; the result is negative inside.
+    """
     outside = 0.0
     deepest = -np.inf
     x = x - middle[0]
@@ -44,7 +48,7 @@ def point_to_box(x, y, z, rotation, middle, half, disc):
 
 @inner_kernel()
 def write_rotation(w, x, y, z, out):
-    """Writes the matrix of a unit quaternion."""
+    """Writes the rotation matrix of the unit quaternion w, x, y, z to out[3, 3]."""
     for r, row in enumerate(
         (
             (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),

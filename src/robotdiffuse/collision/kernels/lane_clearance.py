@@ -1,12 +1,13 @@
-"""Compiled clearances of covering spheres to the scene and to each other, of 16 configurations or short
+"""Compiled clearances of covering spheres to the scene and to each other, for 16 configurations or short
 motions at once; see `lane_collision.py`.
 
-A motion is given by its middle and the joint motion dq from there to either end. A sphere's center moves by t
-v + r from the middle to the place t in [-1, 1]: v is the Jacobian times dq, and |r| is at most a remainder
-that `motion_certificate.py` computes for the whole link. Distance to a convex obstacle is a convex function
-along t v and thus nowhere below its tangent: with the distance d and the direction n to the obstacle's
-nearest point in the middle, the sphere stays at least d - |n . v| - |r| away. A configuration is a motion
-with v = 0.
+A short motion is given by its middle configuration and dq, half of the joint motion from its start to its
+end. The parameter t goes from -1 (start) over 0 (middle) to 1 (end). At t, the center of a sphere has moved
+by t v + r from its position in the middle. v is the Jacobian times dq, and `motion_certificate.py` computes a
+bound on the remainder |r| for the whole link. The distance to a convex obstacle is a convex function of the
+position, so along t v it is nowhere below its tangent in the middle. With d the distance and n the direction
+to the obstacle's nearest point, both in the middle, the sphere stays at least d - |n . v| - |r| away. A
+configuration is a motion with v = 0.
 """
 
 from typing import NamedTuple
@@ -42,26 +43,27 @@ class ClearanceWorkspace(NamedTuple):
     """Scratch memory for 16 configurations or motions."""
 
     frames: np.ndarray
-    """[dof + 1, 12 * W] in the middles."""
+    """[dof + 1, 12 * W] in the middle of each motion."""
     twists: np.ndarray
-    """[dof + 1, 6 * W] angular velocity of each frame, and velocity of its point at the base's origin, per
-    unit of t."""
+    """[dof + 1, 6 * W] for each frame the angular velocity, and the velocity of the point of the frame that
+    is at the base's origin, per unit of t."""
     centers: np.ndarray
     """[groups, 3 * W] centers of the bounding spheres."""
     positions: np.ndarray
-    """[spheres, 3 * W]"""
+    """[spheres, 3 * W] centers of the spheres of the groups in `placed`."""
     placed: np.ndarray
     """[groups] whether the group's positions have been computed for this block."""
     near: np.ndarray
-    """[obstacles]"""
+    """[obstacles] whether the obstacle may be the nearest one of a group in any lane; the last entry stands
+    for all points."""
     bounds: np.ndarray
-    """[obstacles, W] distances of a bounding sphere's center."""
+    """[obstacles, W] distances of the center of a group's bounding sphere [m]."""
     need: np.ndarray
-    """[1, W] clearances are computed up to this [m]; a lane with a negative value is skipped."""
+    """[1, W] clearances are computed up to this value [m]; a lane with a negative value is skipped."""
     clearance: np.ndarray
-    """[1, W] signed distances in the middles."""
+    """[1, W] signed distances in the middle of each motion [m]."""
     lower: np.ndarray
-    """[1, W] lower bounds along the motions, without the remainder."""
+    """[1, W] lower bounds along each motion, without the remainder [m]."""
 
 
 @kernel()
@@ -88,15 +90,17 @@ def make_clearance_workspace(robot, solids):
 
 @allocation_free(forceinline=True)
 def to_solid(x, y, z, vx, vy, vz, solid):
-    """Signed distances of points in 16 lanes to a row of `SceneArrays.solids`, and the parts of their
-    velocities along the lines to its nearest points."""
+    """Signed distances of the points (x, y, z) in 16 lanes to a row of `SceneArrays.solids`, and the
+    components of the points' velocities (vx, vy, vz) along the lines to the solid's nearest points, as
+    absolute values."""
     dx = x - solid[0]
     dy = y - solid[1]
     dz = z - solid[2]
     u = dx * solid[3] + dy * solid[4] + dz * solid[5]
     v = dx * solid[6] + dy * solid[7] + dz * solid[8]
     w = dx * solid[9] + dy * solid[10] + dz * solid[11]
-    # speeds away from the solid's center
+    # velocity in the solid's axes; multiplied by the sign of the coordinate, it is the speed away from the
+    # center
     p = vx * solid[3] + vy * solid[4] + vz * solid[5]
     q = vx * solid[6] + vy * solid[7] + vz * solid[8]
     r = (vx * solid[9] + vy * solid[10] + vz * solid[11]) * copysign(_ONE, w)
@@ -125,7 +129,7 @@ def _at(positions, s):
 
 @allocation_free(forceinline=True)
 def _velocity(twists, f, x, y, z):
-    """Velocities of points of a frame."""
+    """Velocities of the points (x, y, z) of frame f."""
     a, b, c = _at(twists, f)
     return (
         b * z - c * y + load(twists, f, 3),
@@ -136,7 +140,8 @@ def _velocity(twists, f, x, y, z):
 
 @allocation_free(forceinline=True)
 def _speed(twists, f, other, x, y, z, radius):
-    """Upper bounds on the speed of any point of a ball that is fixed to a frame, seen from another frame."""
+    """Upper bounds on the speed, relative to frame `other`, of any point of a ball that is fixed to frame
+    f."""
     u, v, w = _velocity(twists, f, x, y, z)
     p, q, r = _velocity(twists, other, x, y, z)
     a, b, c = _at(twists, f)
@@ -151,8 +156,8 @@ def _length(x, y, z):
 
 @allocation_free()
 def place_motions(robot, q, dq, work):
-    """Writes the frames in the middles q[dof, 16] and their twists along dq[dof, 16]; a joint's axis is the z
-    axis of its frame."""
+    """Writes the frames at the middle configurations q[dof, 16] and the frames' twists along dq[dof, 16]. A
+    joint's axis is the z axis of its frame."""
     place_frames(robot, q, work.frames, work.centers)
     work.placed[:] = False
     for j in range(len(robot.offsets)):
@@ -186,17 +191,19 @@ def _reset(work):
 
 @allocation_free(forceinline=True)
 def _lower_to(distance, towards, work):
-    """Lowers clearances and bounds."""
+    """Lowers the clearances to `distance`, and the bounds along the motions to `distance - towards` [m]."""
     store(work.clearance, 0, 0, minimum(load(work.clearance, 0, 0), distance))
     store(work.lower, 0, 0, minimum(load(work.lower, 0, 0), distance - towards))
 
 
 @allocation_free(forceinline=True)
 def _mark_near(robot, scene, g, speed, work):
-    """Marks the obstacles that can be nearest to a group in any lane; returns whether there are any.
+    """Marks in `work.near` the obstacles that may be the nearest one of group g in any lane; returns whether
+    there is any.
 
     An obstacle at distance d from the center of the bounding sphere is at least d - radius and at most d +
-    radius away from the group. For the points, which come after the solids, there is only a lower bound.
+    radius away from the group. All points together are the last obstacle; for them only the lower bound is
+    used.
     """
     x, y, z = _at(work.centers, g)
     radius = robot.bounds[g, 3]
@@ -215,17 +222,17 @@ def _mark_near(robot, scene, g, speed, work):
         for i in range(W):
             distance = points_lower_bound(scene, lane(x, i), lane(y, i), lane(z, i))
             work.bounds[solids, i] = min(distance, POINT_RANGE + radius)
-    some = False
+    any_near = False
     for k in range(obstacles):
         work.near[k] = (load(work.bounds, k, 0) - radius - speed < upper_bound) != 0
-        some |= work.near[k]
-    return some
+        any_near |= work.near[k]
+    return any_near
 
 
 @allocation_free(forceinline=True)
 def group_along(robot, scene, g, moving, work):
-    """Writes to `work` the clearances of a group to the scene, at most `work.need`, and their bounds along
-    the motions. Without `moving` the twists count as zero."""
+    """Writes to `work` the clearances of group g to the scene, at most `work.need`, and lower bounds of the
+    clearances along the motions. Without `moving` the twists count as zero."""
     frame = robot.frame[g]
     solids = len(scene.solids)
     x, y, z = _at(work.centers, g)
@@ -244,8 +251,8 @@ def group_along(robot, scene, g, moving, work):
                 distance, towards = to_solid(x, y, z, u, v, w, scene.solids[k])
                 _lower_to(distance - radius, towards, work)
         if len(scene.points) and work.near[solids]:
-            # the nearest point changes along the motion, so the sphere's whole speed counts, not its part
-            # towards that point
+            # the nearest point changes along the motion, so the bound uses the sphere's whole speed instead
+            # of the component towards one point
             speed = _length(u, v, w)
             for i in range(W):
                 limit = min(work.clearance[0, i] + lane(speed, i), POINT_RANGE) + radius
@@ -283,8 +290,8 @@ def pair_along(robot, p, moving, work):
         p, q, r = _velocity(twists, f, x, y, z) if moving else (zero, zero, zero)
         for t in range(robot.first[b], robot.first[b + 1]):
             dx, dy, dz = _at(work.positions, t)
-            # only the difference of the velocities along the line between the centers counts; it is the same
-            # in every frame
+            # only the difference of the velocities along the line between the centers matters; this
+            # difference is the same in every frame of reference
             i, j, k = _velocity(twists, g, dx, dy, dz) if moving else (zero, zero, zero)
             dx = x - dx
             dy = y - dy
@@ -296,10 +303,8 @@ def pair_along(robot, p, moving, work):
 
 @allocation_free(inner=False)
 def block_clearances(robot, scene, q, limit, work, out):
-    """Writes signed distances to the scene, at most `limit`, of the last groups to out[groups, 16].
-
-    q: [dof, 16].
-    """
+    """Writes the signed distances of the moving groups to the scene at q[dof, 16], at most `limit` [m], to
+    out[groups, 16]. Moving groups come last in `robot`."""
     place_frames(robot, q, work.frames, work.centers)
     work.placed[:] = False
     work.need[:] = limit
@@ -310,11 +315,11 @@ def block_clearances(robot, scene, q, limit, work, out):
 
 @allocation_free()
 def block_pair_clearances(robot, q, limit, work, out):
-    """Writes distances between the links of the checked pairs at q[dof, 16], at most `limit`, to out[pairs,
-    16].
+    """Writes the distances between the links of the checked pairs at q[dof, 16], at most `limit` [m], to
+    out[pairs, 16].
 
-    Where spheres touch although the pair's table excludes contact, the distance is unknown and `limit` is
-    written.
+    Where the spheres touch although the pair's table excludes contact of the links, the distance is unknown
+    and `limit` is written.
     """
     place_frames(robot, q, work.frames, work.centers)
     work.placed[:] = False
@@ -354,10 +359,10 @@ def clearances_into(robot, scene, q, limit, work, out):
 
 
 @inner_kernel()
-def _put_block(found, start, out):
-    """Writes columns of a block to rows from `start` on."""
+def _put_block(block, start, out):
+    """Writes the columns of a block to the rows of `out` from `start` on."""
     for i in range(min(W, len(out) - start)):
-        out[start + i] = found[:, i]
+        out[start + i] = block[:, i]
 
 
 @kernel(nogil=True)

@@ -1,10 +1,11 @@
 """The compiled collision check of 16 configurations at once.
 
-The check goes from coarse to fine, and SIMD lanes stand for different things at each step: frames and
-bounding spheres are computed with a lane per configuration; the obstacles that a link may touch in any
-configuration, from their bounding boxes, with a lane per obstacle; the configurations in which the bounding
-sphere touches such an obstacle, with a lane per configuration; and whether the link itself does, for one
-configuration after the other, with a lane per sphere.
+The check goes from coarse to fine. What a SIMD lane stands for changes with the step:
+
+1. Frames and bounding spheres of the links: a lane is a configuration.
+2. Obstacles that a link may touch in any configuration, from their bounding boxes: a lane is an obstacle.
+3. Configurations in which the link's bounding sphere touches such an obstacle: a lane is a configuration.
+4. Whether the link's spheres touch it, one configuration after the other: a lane is a sphere.
 """
 
 from typing import NamedTuple
@@ -35,8 +36,8 @@ from robotdiffuse.core.kernels import allocation_free, kernel
 _INV_TAU = np.float32(0.15915494309189535)
 _QUARTER = np.float32(0.25)
 _HALF = np.float32(0.5)
-# In a table of `sphere_pair_tables.py`: how many numbers precede the cells, and the number of cells along
-# each side.
+# in a table of `sphere_pair_tables.py`: how many numbers precede the cells, and the number of cells along
+# each of its two joints
 TABLE_HEADER = 6
 TABLE_SIDE = 130
 ALL_LANES = (1 << W) - 1
@@ -60,13 +61,13 @@ def _sine_of_turn(u):
 
 @allocation_free(forceinline=True)
 def _turn(frames, parent, j, offset, q):
-    """Writes the frame behind a revolute joint in 16 lanes: frames[j + 1] = frames[parent] @ offset @
+    """Writes the frame that revolute joint j moves, in 16 lanes: frames[j + 1] = frames[parent] @ offset @
     Rz(q)."""
     turns = load(q, j, 0) * _INV_TAU
     turns = turns - floor(turns + _HALF)
-    far = absolute(turns)
-    c = _sine_of_turn(_QUARTER - far)
-    s = copysign(_sine_of_turn(_QUARTER - absolute(far - _QUARTER)), turns)
+    turned = absolute(turns)
+    c = _sine_of_turn(_QUARTER - turned)
+    s = copysign(_sine_of_turn(_QUARTER - absolute(turned - _QUARTER)), turns)
     for k in range(3):
         r0 = load(frames, parent, 3 * k)
         r1 = load(frames, parent, 3 * k + 1)
@@ -83,7 +84,7 @@ def _turn(frames, parent, j, offset, q):
 
 @allocation_free(forceinline=True)
 def _slide(frames, parent, j, offset, q):
-    """Writes the frame behind a prismatic joint in 16 lanes: frames[j + 1] = frames[parent] @ offset @
+    """Writes the frame that prismatic joint j moves, in 16 lanes: frames[j + 1] = frames[parent] @ offset @
     Tz(q)."""
     for k in range(3):
         r0 = load(frames, parent, 3 * k)
@@ -99,7 +100,7 @@ def _slide(frames, parent, j, offset, q):
 
 @allocation_free(forceinline=True)
 def _centers_of(frames, f, spheres, s):
-    """Positions of a sphere's center in 16 lanes."""
+    """Positions of the center of sphere s, fixed to frame f, in 16 lanes."""
     x = spheres[s, 0]
     y = spheres[s, 1]
     z = spheres[s, 2]
@@ -112,7 +113,8 @@ def _centers_of(frames, f, spheres, s):
 
 @allocation_free(forceinline=True)
 def place(frames, f, spheres, s, positions, p):
-    """Writes the positions of a sphere's center in 16 lanes to row p of `positions`."""
+    """Writes the positions of the center of sphere s, fixed to frame f, in 16 lanes to row p of
+    `positions`."""
     x, y, z = _centers_of(frames, f, spheres, s)
     store(positions, p, 0, x)
     store(positions, p, 1, y)
@@ -121,8 +123,7 @@ def place(frames, f, spheres, s, positions, p):
 
 @allocation_free(forceinline=True)
 def place_frames(robot, q, frames, centers):
-    """Writes the frames of 16 configurations q[dof, 16], and the centers of the bounding spheres of all
-    groups."""
+    """Writes the frames of 16 configurations q[dof, 16], and the centers of all groups' bounding spheres."""
     for j in range(len(robot.offsets)):
         if robot.offsets[j, 12] > _ZERO:
             _slide(frames, parent_of(robot.parents, j), j, robot.offsets[j], q)
@@ -133,7 +134,7 @@ def place_frames(robot, q, frames, centers):
 
 
 class Workspace(NamedTuple):
-    """Scratch memory of `block_hits`, which does not allocate."""
+    """Scratch memory of `block_hits`, which itself allocates nothing."""
 
     frames: np.ndarray
     """[dof + 1, 12 * W]"""
@@ -154,7 +155,7 @@ def make_workspace(robot, scene):
 
 @allocation_free(forceinline=True)
 def _touching(x, y, z, radius, solids, k):
-    """Mask of the lanes whose sphere touches obstacle k."""
+    """Mask of the lanes with a sphere that touches obstacle k."""
     dx = x - solids[k, 0]
     dy = y - solids[k, 1]
     dz = z - solids[k, 2]
@@ -173,7 +174,8 @@ def _touching(x, y, z, radius, solids, k):
 
 @allocation_free(forceinline=True)
 def _coordinate(frames, f, i, k, x, y, z):
-    """Coordinate k of a point of frame f, or of points in lanes, in configuration (lane) i."""
+    """Coordinate k (0 to 2) in the base frame of the point (x, y, z) of frame f in configuration (lane) i. x,
+    y and z may also be lanes with a point each."""
     return (
         x * frames[f, 3 * k * W + i]
         + y * frames[f, (3 * k + 1) * W + i]
@@ -197,7 +199,7 @@ def _place_row(robot, row, frames, f, i):
 
 @allocation_free(forceinline=True)
 def _touching_group(robot, g, frames, near, padding, solids, k, stop_at_first):
-    """Mask of the lanes, of those in `near`, in which a group touches obstacle k."""
+    """Mask of the lanes among `near` in which group g touches obstacle k."""
     hits = 0
     f = robot.frame[g]
     first = robot.first_row[g]
@@ -220,7 +222,7 @@ def _touching_group(robot, g, frames, near, padding, solids, k, stop_at_first):
 
 @allocation_free(forceinline=True)
 def _touching_points(robot, g, frames, near, padding, scene, stop_at_first):
-    """Mask of the lanes, of those in `near`, in which a group touches a point of the scene."""
+    """Mask of the lanes among `near` in which group g touches a point of the scene."""
     hits = 0
     f = robot.frame[g]
     first = robot.first_row[g]
@@ -253,7 +255,7 @@ def _touching_balls(x, y, z, radius, u, v, w, other):
 
 @allocation_free(forceinline=True)
 def _touching_each_other(robot, a, b, near, stop_at_first, work):
-    """Mask of the lanes, of those in `near`, in which two groups touch each other."""
+    """Mask of the lanes among `near` in which the groups a and b touch each other."""
     hits = 0
     frames = work.frames
     bounds = robot.row_bounds
@@ -281,7 +283,7 @@ def _touching_each_other(robot, a, b, near, stop_at_first, work):
 
 @allocation_free(forceinline=True)
 def _rows_touch(robot, row, f, other, g, i, work):
-    """Whether a row of spheres of frame f touches another one of frame g in lane i."""
+    """Whether a row of spheres of frame f touches the row `other` of frame g in lane i."""
     x, y, z = _place_row(robot, row, work.frames, f, i)
     u, v, w = _place_row(robot, other, work.frames, g, i)
     radius = load(robot.rows, row, 3)
@@ -299,6 +301,7 @@ def _rows_touch(robot, row, f, other, g, i, work):
 @allocation_free(forceinline=True)
 def _hits_scene(robot, scene, padding, stop_at_first, work):
     """Mask of the lanes in which the robot touches the scene."""
+    # x0 to z1: box around the 16 centers of a group's bounding sphere
     hits = 0
     frames = work.frames
     around = scene.solid_boxes
@@ -344,7 +347,8 @@ def _hits_scene(robot, scene, padding, stop_at_first, work):
 
 @allocation_free(forceinline=True)
 def lanes_that_may_touch(robot, table, bit, q):
-    """Mask of the lanes in which a pair may touch according to its table; see `sphere_pair_tables.py`."""
+    """Mask of the lanes in which a pair of links may touch according to its table
+    (`sphere_pair_tables.py`)."""
     row = robot.pair_tables[table]
     first = load(q, np.int32(row[0]), 0)
     second = load(q, np.int32(row[3]), 0)
@@ -356,7 +360,7 @@ def lanes_that_may_touch(robot, table, bit, q):
 
 @allocation_free(forceinline=True)
 def _hits_itself(robot, q, hits, stop_at_first, work):
-    """`hits`, with the lanes added in which a checked pair of links touches."""
+    """`hits` plus the lanes in which a checked pair of links touches."""
     centers = work.centers
     bounds = robot.bounds
     for p in range(len(robot.pairs)):
@@ -384,8 +388,8 @@ def _hits_itself(robot, q, hits, stop_at_first, work):
 def block_hits(robot, scene, q, padding, stop_at_first, work):
     """Mask of the configurations of q[dof, 16] that collide: bit i belongs to column i.
 
-    `padding` [m] is added to the radii for checks against the scene. With `stop_at_first` the check ends at
-    the first configuration that collides.
+    `padding` [m] is added to the spheres' radii for checks against the scene. With `stop_at_first` the check
+    ends at the first collision that it finds.
     """
     place_frames(robot, q, work.frames, work.centers)
     hits = _hits_scene(robot, scene, padding, stop_at_first, work)
@@ -396,7 +400,8 @@ def block_hits(robot, scene, q, padding, stop_at_first, work):
 
 @allocation_free()
 def take_block(q, start, block):
-    """Writes 16 rows of q[n, dof] from `start` on to block[dof, 16]; the last row is repeated."""
+    """Writes 16 rows of q[n, dof] from `start` on to the columns of block[dof, 16]. Row n - 1 fills columns
+    beyond the end of q."""
     for i in range(W):
         for j in range(len(block)):
             block[j, i] = q[min(start + i, len(q) - 1), j]

@@ -24,10 +24,10 @@ def forward(offsets, parents, slides, q):
 
 @kernel()
 def scene_bounds(frames, frame, centers, radii, boxes):
-    """Lower bounds [n, pieces * obstacles] of the distances of a link's pieces to obstacles [m].
+    """Lower bounds [n, pieces * obstacles] of the distances of a link's convex pieces to obstacles [m].
 
-    Pieces are given by balls in frame `frame`, obstacles by `boxes`: R_box_base [o, 3, 3], centers [o, 3],
-    half sizes [o, 3] and roundings [o].
+    The pieces are enclosed by balls in the frame `frame`, the obstacles by `boxes`: R_box_base [o, 3, 3],
+    centers [o, 3], half edges [o, 3], and radii by which the boxes are inflated [o].
     """
     rotation, middle, half, rounding = boxes
     obstacles = len(middle)
@@ -46,8 +46,8 @@ def scene_bounds(frames, frame, centers, radii, boxes):
 
 @kernel()
 def pair_bounds(frames, frame, centers, radii, other_frame, other_centers, other_radii):
-    """Lower bounds [n, pieces * others] of the distances between the pieces of two links, given by balls
-    [m]."""
+    """Lower bounds [n, pieces * others] of the distances between the convex pieces of two links [m]. Each
+    piece is enclosed by a ball in the frame of its link."""
     other_count = len(other_radii)
     out = np.empty((len(frames), len(radii) * other_count))
     for i in range(len(frames)):

@@ -1,19 +1,20 @@
 """The compiled part of the motion certificate; see `collision/motions.py`.
 
 A check is a link against the scene, or a pair of links. A piece of a motion is settled for a check when the
-lower bound of the clearance along the piece is at least the fraction `tightness` of the smallest clearance
-that was measured to the scene, or between links. Bounds come from the covering spheres, and from the convex
-meshes where the spheres are too coarse.
+lower bound of the clearance along the piece is at least `tightness` times the smallest clearance measured so
+far; the scene and the pairs of links each have their own smallest clearance. Bounds come from the covering
+spheres, and from the convex meshes where the spheres are too coarse.
 
-A piece reaches from its middle q to both ends. Any of its configurations is q + d with |d_j| <= D_j, and for
-some t in [-1, 1] |d_j - t dq_j| <= e_j; on a straight line e is zero. Twice differentiating a point's place
-p by joints j <= k gives at most the distance L_k of the point from the axis of joint k, so
+Let q be the middle of a piece and dq half of the joint motion from its start to its end. Each configuration
+of the piece is q + d with |d_j| <= D_j, and there is a t in [-1, 1] with |d_j - t dq_j| <= e_j for all j. On
+a straight line e is zero. The second derivative of a point's position p by joints j <= k is at most the
+distance L_k of the point from the axis of joint k, so
 
     p(q + d) = p(q) + t v + r,   v = J(q) dq,   |r| <= sum_k L_k (e_k + D_k (D_k / 2 + sum_{j<k} D_j)).
 
-For two links on one chain, motion is seen from the nearer link, so only the joints between them count. For
-two links on different arms, motion is seen from the frame where the arms part, and the remainders of both
-links add up.
+For two links on one chain, motion is measured relative to the link nearer to the base, so only the joints
+between the links contribute. For two links on different arms, motion is measured relative to the frame where
+the arms part, and the remainders r of both links add up.
 """
 
 from typing import NamedTuple
@@ -32,17 +33,19 @@ from robotdiffuse.collision.kernels.motion_pieces import Pieces, configuration, 
 from robotdiffuse.core.kernels import inner_kernel, kernel
 
 CLEARANCE_CAP = 1.0
-"""Larger clearances are not computed [m]."""
+"""Larger clearances are capped at this value [m]."""
 FLOAT32_SLACK = 1e-5
 """Upper bound of the rounding error in the clearances of the float32 kernels [m]."""
 CONVEX_PARTS_BELOW = 0.01
-"""If the clearance of the spheres is below this, the convex meshes are used before a piece is split further:
-the spheres stick out by about as much [m]."""
+"""If the clearance of the spheres is below this [m], the convex meshes are used before a piece is split
+further. The spheres stick out of the meshes by about as much."""
 COAL_BELOW = 0.002
-"""If the clearance of the spheres is below this, distances that only Coal computes, which take fifty times as
-long, are used before a piece is split further [m]."""
+"""If the clearance of the spheres is below this [m], Coal computes distances to surfaces and point clouds
+before a piece is split further. Above it, splitting is tried first, since a distance by Coal takes fifty
+times as long."""
 MAX_SPLIT = 4
 """A piece is split into at most this many parts at a time."""
+# values of `Checks.kind`
 SCENE = 0
 PAIR = 1
 
@@ -68,42 +71,46 @@ class Checks(NamedTuple):
     kind: np.ndarray
     """[checks] SCENE or PAIR."""
     where: np.ndarray
-    """[checks] index of the group of spheres, or of the pair of groups; -1 where there are no spheres."""
+    """[checks] index in RobotArrays of the link's group of spheres, or of the pair of groups; -1 without
+    spheres."""
     parts: np.ndarray
-    """[checks, 4] range of the link's convex parts, of a pair those of the link further from the base; and
-    range of the other link's parts."""
+    """[checks, 4] index range of the link's convex parts, then of the other link's parts. In a pair, the link
+    further from the base comes first."""
     base: np.ndarray
-    """[checks] the frame of what the link is checked against: the base, or that of the nearer link."""
+    """[checks] the frame of what the link is checked against: frame 0, or that of the link nearer to the
+    base."""
     common: np.ndarray
-    """[checks] the frame from which motion is seen: `base`, or the one where the arms of two links part."""
+    """[checks] the frame relative to which motion is measured: `base`, or the frame where two arms part."""
     second: np.ndarray
     """[checks] for links on two arms, the first joint of the second arm; else 0."""
     motion_radii: np.ndarray
     """[checks, dof] bound on the motion of any point of the link, or of either link of a pair, per unit of
-    joint motion, seen from `common`."""
+    joint motion, relative to `common`."""
     undecided: np.ndarray
-    """[checks] distance of the convex parts up to which Coal decides by the surfaces [m]; 0 where the parts
-    decide."""
+    """[checks] for grazing links, distance of the convex parts up to which their mesh surfaces decide,
+    computed by Coal [m]; else 0."""
 
 
 class Round(NamedTuple):
-    """Open pieces with the bounds of each check."""
+    """Undecided pieces with the bounds of each check."""
 
     pieces: Pieces
     clearance: np.ndarray
-    """[n, checks] lower bounds of the clearance in the middles [m]; infinite where settled."""
+    """[n, checks] lower bounds of the clearance in the middle of each piece [m]; infinite where settled."""
     lower: np.ndarray
-    """[n, checks] lower bounds of the clearance along the pieces [m]."""
+    """[n, checks] lower bounds of the clearance along each piece [m]."""
     rest: np.ndarray
-    """[n, checks] the remainder |r|, which `lower` contains [m]."""
+    """[n, checks] the bound on the remainder |r|, already subtracted in `lower` [m]."""
     travel: np.ndarray
-    """[n, checks] where only Coal can decide: bound on the motion of the link from the middle to an end [m];
-    else negative."""
+    """[n, checks] where only Coal can decide: bound on how far the link moves from the middle of the piece to
+    either end [m]; negative elsewhere."""
 
 
 @inner_kernel()
-def _spread(motion, start, stop, q, dq, e, most, scratch):
-    """Writes q, dq, e and D (`most`), as defined at the top of this file, for a piece."""
+def _spread(motion, start, stop, q, dq, e, max_offset, scratch):
+    """Writes q, dq, e and D (`max_offset`), as defined at the top of this file, for the piece from start to
+    stop."""
+    # the ends of the piece, then the waypoints between them
     dof = len(q)
     configuration(motion, 0.5 * (start + stop), q)
     configuration(motion, start, dq)
@@ -114,7 +121,7 @@ def _spread(motion, start, stop, q, dq, e, most, scratch):
         after = scratch[j] - q[j]
         dq[j] = 0.5 * (after - before)
         e[j] = 0.5 * abs(after + before)
-        most[j] = max(abs(before), abs(after))
+        max_offset[j] = max(abs(before), abs(after))
         square += dq[j] * dq[j]
     first = np.searchsorted(motion.travel, start, side="right")
     for i in range(first, len(motion.travel)):
@@ -126,12 +133,12 @@ def _spread(motion, start, stop, q, dq, e, most, scratch):
         t = min(max(t / max(square, 1e-300), -1.0), 1.0)
         for j in range(dof):
             d = motion.q[i, j] - q[j]
-            most[j] = max(most[j], abs(d))
+            max_offset[j] = max(max_offset[j], abs(d))
             e[j] = max(e[j], abs(d - t * dq[j]))
 
 
 @inner_kernel(inline="always")
-def _remainder(radii, second, e, most):
+def _remainder(radii, second, e, max_offset):
     """The bound on |r| at the top of this file [m]."""
     total = 0.0
     before = 0.0
@@ -139,14 +146,14 @@ def _remainder(radii, second, e, most):
         if k == second:
             before = 0.0
         if radii[k] > 0:
-            total += radii[k] * (e[k] + most[k] * (0.5 * most[k] + before))
-            before += most[k]
+            total += radii[k] * (e[k] + max_offset[k] * (0.5 * max_offset[k] + before))
+            before += max_offset[k]
     return total
 
 
 @kernel()
 def bound_by_spheres(arm, scene, motion, checks, pieces, best, work):
-    """Bounds of the pieces from the spheres; lowers best[2], the smallest measured clearances by kind."""
+    """Bounds of the pieces from the covering spheres. Lowers best[kind], the smallest clearance measured."""
     n, count = pieces.undecided.shape
     dof = motion.q.shape[1]
     clearance = np.full((n, count), np.inf)
@@ -157,31 +164,31 @@ def bound_by_spheres(arm, scene, motion, checks, pieces, best, work):
     q = np.empty(dof)
     dq = np.empty(dof)
     e = np.empty(dof)
-    max_speeds = np.empty(dof)
+    max_offset = np.empty(dof)
     scratch = np.empty(dof)
     for first in range(0, n, W):
         last = min(first + W, n)
         for i in range(W):
             row = first + i
             if row < n:
-                _spread(motion, pieces.start[row], pieces.stop[row], q, dq, e, max_speeds, scratch)
+                _spread(motion, pieces.start[row], pieces.stop[row], q, dq, e, max_offset, scratch)
                 for c in range(count):
                     if pieces.undecided[row, c]:
-                        rest[row, c] = _remainder(checks.motion_radii[c], checks.second[c], e, max_speeds)
+                        rest[row, c] = _remainder(checks.motion_radii[c], checks.second[c], e, max_offset)
             for j in range(dof):
                 block[j, i] = q[j]
                 moves[j, i] = dq[j]
         place_motions(arm.spheres, block, moves, work)
         for c in range(count - 1, -1, -1):
-            open_ones = 0
+            undecided_count = 0
             kind = checks.kind[c]
             for i in range(W):
                 row = first + i
                 work.need[0, i] = -1.0
                 if row < n and pieces.undecided[row, c]:
-                    open_ones += 1
+                    undecided_count += 1
                     work.need[0, i] = best[kind] + rest[row, c] + FLOAT32_SLACK
-            if open_ones == 0:
+            if undecided_count == 0:
                 continue
             if checks.where[c] >= 0:
                 if kind == SCENE:
@@ -210,35 +217,35 @@ def _is_open(bounds, checks, best, tightness, row, c):
 
 @kernel()
 def bound_by_convex_parts(arm, solids, motion, checks, bounds, best, tightness, contact, posture):
-    """Better bounds from the convex meshes where those of the spheres are too coarse; lowers best[2].
+    """Improves `bounds` by the convex meshes where the spheres are too coarse. Lowers best[kind].
 
-    Returns the number of checks that are left to Coal.
+    Returns the number of checks that only Coal can decide; `bounds.travel` marks them.
     """
     n, count = bounds.clearance.shape
     dof = motion.q.shape[1]
     q = np.empty(dof)
     dq = np.empty(dof)
     e = np.empty(dof)
-    max_speeds = np.empty(dof)
+    max_offset = np.empty(dof)
     scratch = np.empty(dof)
     open_count = 0
     for row in range(n):
-        posed = False
+        is_posed = False
         for c in range(count):
             if bounds.clearance[row, c] > CONVEX_PARTS_BELOW or not _is_open(
                 bounds, checks, best, tightness, row, c
             ):
                 continue
-            if not posed:
+            if not is_posed:
                 _spread(
-                    motion, bounds.pieces.start[row], bounds.pieces.stop[row], q, dq, e, max_speeds, scratch
+                    motion, bounds.pieces.start[row], bounds.pieces.stop[row], q, dq, e, max_offset, scratch
                 )
                 meshes.pose(arm.offsets, arm.parents, arm.slides, q, dq, posture)
-                posed = True
+                is_posed = True
             rest = bounds.rest[row, c]
             kind = checks.kind[c]
             coarser = bounds.clearance[row, c]
-            clearance, lower, best[kind], unresolved, touching = _parted(
+            clearance, lower, best[kind], unresolved, touching = _bound_by_planes(
                 arm.hulls, solids, checks, c, rest, best[kind], tightness, contact, posture
             )
             if not unresolved:
@@ -247,21 +254,24 @@ def bound_by_convex_parts(arm, solids, motion, checks, bounds, best, tightness, 
             if unresolved and not touching and coarser > COAL_BELOW:
                 best[kind] = min(best[kind], coarser)
             elif touching or unresolved:
-                speed = 0.0
+                part_travel = 0.0
                 for p in range(checks.parts[c, 0], checks.parts[c, 1]):
-                    speed = max(speed, meshes.part_travel(arm.hulls, p, checks.base[c], posture))
-                bounds.travel[row, c] = speed + rest
+                    part_travel = max(part_travel, meshes.part_travel(arm.hulls, p, checks.base[c], posture))
+                bounds.travel[row, c] = part_travel + rest
                 open_count += 1
     return open_count
 
 
 @inner_kernel(inline="always")
-def _parted(hulls, solids, checks, c, rest, best, tightness, contact, posture):
+def _bound_by_planes(hulls, solids, checks, c, rest, best, tightness, contact, posture):
     """Bounds of one check of a piece from separating planes.
 
-    Returns lower bounds of the clearance in the middle and along the piece; `best`, or less if a smaller
-    clearance was measured; whether a surface or point cloud, of which only a bounding box is known, is too
-    near; and whether bodies touch, or nearly.
+    Returns:
+        A lower bound of the clearance in the middle of the piece [m].
+        A lower bound of the clearance along the piece [m].
+        `best`, or the smaller clearance that was measured [m].
+        Whether a surface or point cloud is too near; only a box around it is known here.
+        Whether bodies touch or nearly touch.
     """
     against_scene = checks.kind[c] == SCENE
     base = checks.base[c]
@@ -273,7 +283,7 @@ def _parted(hulls, solids, checks, c, rest, best, tightness, contact, posture):
     touching = False
     partners = range(len(solids.disc)) if against_scene else range(checks.parts[c, 2], checks.parts[c, 3])
     for p in range(checks.parts[c, 0], checks.parts[c, 1]):
-        speed = meshes.part_travel(hulls, p, base, posture)
+        part_travel = meshes.part_travel(hulls, p, base, posture)
         for o in partners:
             if against_scene and len(solids.may_touch) and solids.may_touch[c, o]:
                 continue
@@ -281,7 +291,7 @@ def _parted(hulls, solids, checks, c, rest, best, tightness, contact, posture):
                 middle = meshes.ball_to_solid(hulls, p, solids, o, posture)
             else:
                 middle = meshes.ball_to_ball(hulls, p, o, posture)
-            along = middle - speed
+            along = middle - part_travel
             if against_scene and solids.is_bound[o]:
                 if along - rest < tightness * best:
                     unresolved = True
@@ -302,7 +312,8 @@ def _parted(hulls, solids, checks, c, rest, best, tightness, contact, posture):
 
 @kernel()
 def settle(checks, bounds, best, certified, tightness):
-    """Settles the checks whose bounds suffice and splits the other pieces; lowers certified[2]."""
+    """Settles the checks with sufficient bounds and splits pieces with other checks. Lowers
+    certified[kind]."""
     pieces = bounds.pieces
     n, count = bounds.clearance.shape
     parts = np.zeros(n, np.int64)
@@ -318,7 +329,8 @@ def settle(checks, bounds, best, certified, tightness):
                 pieces.undecided[row, c] = False
                 certified[kind] = min(certified[kind], lower)
                 continue
-            # the loss of clearance along a piece falls linearly with its length, the remainder quadratically
+            # the loss of clearance along a piece is proportional to its length, the remainder to its square;
+            # the piece is split into the fewest parts for which their sum is likely to be small enough
             rest = bounds.rest[row, c]
             spare = bounds.clearance[row, c] - required
             lost = bounds.clearance[row, c] - lower - rest
@@ -332,10 +344,10 @@ def settle(checks, bounds, best, certified, tightness):
 
 @kernel(nogil=True)
 def rounds(arm, scene, solids, motion, checks, pieces, best, certified, tightness, contact):
-    """Repeats bounding, settling and splitting until a check needs Coal, or nothing is left.
+    """Repeats bounding, settling and splitting until a check needs Coal, or no piece is left.
 
-    Lowers best[2] and certified[2], by kind. Returns the last round, not yet settled, and the rows and
-    columns of the checks that Coal has to decide, in the order of the motion.
+    Lowers best[kind] and certified[kind]. Returns the bounds of the last round, before settling, and the rows
+    and columns in them of the checks that Coal has to decide, in the order of the motion.
     """
     work = make_clearance_workspace(arm.spheres, len(scene.solids))
     posture = meshes.make_posture(arm.hulls, solids, motion.q.shape[1])

@@ -16,23 +16,25 @@ class Motion(NamedTuple):
     q: np.ndarray
     """[n, dof]"""
     travel: np.ndarray
-    """[n] bound on the motion of any point of the arm up to each waypoint [m]. Places on the motion are
-    values of it."""
+    """[n] upper bound on how far any point of the arm has moved up to each waypoint [m]. A place on the
+    motion is given as a value of this bound."""
 
 
 class Pieces(NamedTuple):
     """Pieces of a motion in order."""
 
     start: np.ndarray
-    """[n] place where each begins."""
+    """[n] place where each piece begins, as a value of `Motion.travel` [m]."""
     stop: np.ndarray
+    """[n] place where each piece ends [m]."""
     undecided: np.ndarray
-    """[n, checks] whether the check is still open."""
+    """[n, checks] whether the check of the piece is still undecided."""
 
 
 @kernel()
 def travel_along(q, motion_radii):
-    """`Motion.travel` [n] of the waypoints q[n, dof]: each step counts the link that moves most."""
+    """`Motion.travel` [n] of the waypoints q[n, dof]: the sum over segments of the motion bound of the check
+    that moves most. `motion_radii` [checks, dof] are bounds per unit of joint motion."""
     travel = np.zeros(len(q))
     for i in range(1, len(q)):
         link_travel = 0.0
@@ -47,7 +49,8 @@ def travel_along(q, motion_radii):
 
 @kernel()
 def segment_at(travel, at):
-    """The last waypoint that is not beyond a place, and the share of the segment from there to the next."""
+    """The last waypoint at or before a place, and the fraction of the segment from this waypoint to the
+    next."""
     low = min(max(np.searchsorted(travel, at, side="right") - 1, 0), max(len(travel) - 2, 0))
     if low + 1 >= len(travel) or travel[low + 1] <= travel[low]:
         return low, 0.0
@@ -74,7 +77,8 @@ def configurations(motion, places):
 
 @inner_kernel()
 def _cut(ends, start, stop, travel):
-    """Appends the ends of the equal parts, about `travel` long, of a stretch."""
+    """Divides start to stop into equal parts of at most `travel` [m] and appends the end of each to
+    `ends`."""
     count = max(int(np.ceil((stop - start) / travel)), 1)
     for k in range(1, count):
         ends.append(start + (stop - start) * (k / count))
@@ -83,8 +87,8 @@ def _cut(ends, start, stop, travel):
 
 @kernel()
 def first_pieces(motion, checks, travel):
-    """The initial pieces: one of length zero at the start, then pieces with a motion bound of about `travel`
-    [m] that change their direction little."""
+    """The initial pieces: one of length zero at the start, then pieces with a motion bound of at most
+    `travel` [m]. A piece also ends where the direction changes by more than STRAIGHT_COSINE allows."""
     q, travelled = motion
     n, dof = q.shape
     ends = [0.0]
@@ -93,6 +97,7 @@ def first_pieces(motion, checks, travel):
     for i in range(1, n):
         if travelled[i] <= travelled[i - 1]:
             continue
+        # cosine of the angle between this segment and the previous one
         dot = 1.0
         a = 1.0
         b = 1.0
@@ -122,7 +127,8 @@ def first_pieces(motion, checks, travel):
 
 @inner_kernel()
 def split(pieces, parts, total):
-    """Every piece in parts[n] equal parts, `total` altogether; 0 drops a piece."""
+    """Divides piece i into parts[i] equal parts; a piece with 0 parts is dropped. `total` is the sum of
+    parts."""
     start = np.empty(total)
     stop = np.empty(total)
     undecided = np.empty((total, pieces.undecided.shape[1]), np.bool_)

@@ -1,5 +1,5 @@
-"""Compiled checks of straight motions in joint space, at configurations so close to each other that no point
-of the arm moves further than a resolution between two of them."""
+"""Compiled collision checks of straight motions in joint space. They check configurations that are so close
+together that no point of the arm moves further than a resolution [m] between neighbors."""
 
 from typing import NamedTuple
 
@@ -11,10 +11,11 @@ from robotdiffuse.core.kernels import allocation_free, kernel
 
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 RELAXATION_SLOPE = np.float32(0.1)
-"""If a start or goal is closer to the scene than the padding, the padding is reduced there, and grows by this
-per radian of distance from that configuration [m/rad]."""
+"""If a start or goal is closer to the scene than the padding, the padding is reduced at this configuration
+and grows by this much per radian of distance from it [m/rad]."""
 RELAXATION_STEP = np.float32(0.1)
-"""There the padding changes in steps of this length [rad]."""
+"""Near such a start or goal, a motion is divided into parts of at most this length, each with a constant
+padding [rad]."""
 
 
 class Space(NamedTuple):
@@ -29,12 +30,12 @@ class Space(NamedTuple):
     motion_radii: np.ndarray
     """[dof] largest distance of any point of the arm from each joint's axis [m]; 1 for prismatic joints."""
     resolution: np.float32
-    """No point of the arm moves further than this between two checked configurations [m]."""
+    """No point of the arm moves further than this between neighboring checked configurations [m]."""
     padding: np.float32
     """Added to the radii of the spheres for checks against the scene [m]."""
     near_ends: np.ndarray
-    """[m, dof + 1] starts and goals that are closer to the scene than `padding`, each with the padding that
-    it allows [m]."""
+    """[m, dof + 1] starts and goals that are closer to the scene than `padding`; the last column is the
+    padding that is free of collision there [m]."""
 
 
 @allocation_free(fastmath=True)
@@ -58,11 +59,11 @@ def path_length(path):
 
 @allocation_free(inner=False)
 def motion_free(space, a, b, block, work):
-    """Whether the straight motion from a to b is free of collision; b is checked, a is not.
+    """Whether the straight motion from a (exclusive) to b (inclusive) is free of collision.
 
     a and b may be of any float type. The 16 configurations of a block are spread over the whole motion, so
-    that the first block finds most collisions (the rake of W. Thomason et al., "Motions in Microseconds",
-    ICRA 2024).
+    that the first block finds most collisions (called a rake by W. Thomason et al., "Motions in
+    Microseconds", ICRA 2024).
     """
     if len(space.near_ends) == 0:
         return _stretch_free(space, a, b, np.float32(0.0), _ONE, space.padding, block, work)
@@ -87,11 +88,10 @@ def motion_free(space, a, b, block, work):
 
 @allocation_free()
 def padding_near(space, a, b, share, around):
-    """The least padding [m] that is required at configurations at most `around` [rad] from a + share * (b -
-    a).
+    """The smallest required padding [m] over the configurations within `around` [rad] of a + share * (b - a).
 
-    Near a start or goal that is closer to the scene than `space.padding`, the required padding is what this
-    start or goal allows, plus RELAXATION_SLOPE per radian of distance from it.
+    Near a start or goal that is closer to the scene than `space.padding`, the required padding is the padding
+    of that start or goal (`space.near_ends`), plus RELAXATION_SLOPE per radian of distance from it.
     """
     padding = space.padding
     dof = len(a)
@@ -108,8 +108,7 @@ def padding_near(space, a, b, share, around):
 
 @allocation_free()
 def _stretch_free(space, a, b, s, t, padding, block, work):
-    """Whether the part of the motion from a to b between a + s (b - a), exclusive, and a + t (b - a),
-    inclusive, is free of collision."""
+    """Whether the motion from a + s (b - a), exclusive, to a + t (b - a), inclusive, is free of collision."""
     dof = len(a)
     travel = np.float32(0.0)
     for j in range(dof):
@@ -128,8 +127,8 @@ def _stretch_free(space, a, b, s, t, padding, block, work):
 
 @kernel(nogil=True)
 def motions_free(space, path):
-    """Whether each straight motion between rows of path[n, dof] is free of collision; row 0 is not
-    checked."""
+    """Whether the straight motion between each two consecutive rows of path[n, dof] is free of collision, [n
+    - 1]; row 0 itself is not checked."""
     work = make_workspace(space.robot, space.scene)
     block = np.empty((path.shape[1], W), np.float32)
     out = np.empty(len(path) - 1, np.bool_)

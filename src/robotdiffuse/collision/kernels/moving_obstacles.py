@@ -1,10 +1,10 @@
 """The compiled part of the motion certificate among moving obstacles; see `collision/moving_obstacles.py`.
 
-A task is an interval of a timed motion with the pairs of a link and an obstacle that are open there. The
-clearance of a pair is computed in the middle of the interval, from the covering spheres. The pair is settled
-if this clearance, minus how far points of the link and of the obstacle can move from there to either end, is
-at least the required clearance; otherwise the interval is halved. If the spheres touch, the pair is left to
-the exact meshes.
+A task is an interval of a timed motion, with the pairs of a link and an obstacle that are undecided there.
+The clearance of a pair is computed in the middle of the interval, from the covering spheres. From it is
+subtracted how far points of the link and of the obstacle can move from the middle to either end. The pair is
+settled if the result is at least the required clearance; otherwise the interval is halved. If the spheres
+touch, the pair is left to the exact meshes.
 """
 
 from typing import NamedTuple
@@ -16,7 +16,7 @@ from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.robots.frame_kernel import step
 
 CLEARANCE_CAP = 1.0
-"""Larger clearances are reported as this [m]."""
+"""Larger clearances are capped at this value [m]."""
 MAX_HALVINGS = 48
 """Largest number of halvings of an interval."""
 
@@ -47,17 +47,18 @@ class Tracks(NamedTuple):
     `convex_bounds.Solids`."""
 
     first: np.ndarray
-    """[obstacles + 1] first pose of each."""
+    """[obstacles + 1] index of the first pose of each obstacle."""
     times: np.ndarray
-    """[k] of the poses [s]"""
+    """[k] times of the poses [s]."""
     xyz: np.ndarray
-    """[k, 3] of the poses of the obstacles' frames."""
+    """[k, 3] origins of the obstacle's frame in the base frame at these times [m]."""
     wxyz: np.ndarray
-    """[k, 4] each in the same half of quaternion space as the one before."""
+    """[k, 4] orientations at these times. The sign of each quaternion is chosen for a nonnegative dot product
+    with the one before."""
     speeds: np.ndarray
-    """[k] bound on the speed of the obstacle's points until the next pose [m/s]; 0 for its last."""
+    """[k] bound on the speed of the obstacle's points until the next pose [m/s]; 0 at its last pose."""
     growth: np.ndarray
-    """[obstacles] inflation per second since time 0 [m/s]."""
+    """[obstacles] inflation per second since time 0 [m/s], for obstacles with a known maximum speed."""
     center: np.ndarray
     """[obstacles, 3] center of the box in the obstacle's frame."""
     half: np.ndarray
@@ -69,18 +70,20 @@ class Tracks(NamedTuple):
 
 
 class Tasks(NamedTuple):
-    """Intervals of a timed motion with their open pairs."""
+    """Intervals of a timed motion with their undecided pairs."""
 
     start: np.ndarray
     """[n] start of each interval [s]."""
     stop: np.ndarray
+    """[n] end of each interval [s]."""
     pairs: np.ndarray
-    """[n, links, obstacles] whether the pair is open."""
+    """[n, links, obstacles] whether the pair is undecided."""
 
 
 @inner_kernel()
 def pose_at(tracks, o, time, rotation, xyz):
-    """Writes the pose of obstacle o at a time: R_base_obstacle [3, 3] and its origin [3]."""
+    """Writes the pose of obstacle o at a time [s]: R_base_obstacle [3, 3] and its origin [3]. Positions are
+    interpolated linearly, orientations by slerp."""
     low = tracks.first[o]
     high = tracks.first[o + 1] - 1
     share = 0.0
@@ -144,18 +147,18 @@ def _obstacle_distance(tracks, o, rotation, xyz, x, y, z):
 
 @inner_kernel()
 def _clearance(links, frames, link, tracks, o, rotation, xyz, enough):
-    """Clearance of the spheres of a link to obstacle o [m]; if it exceeds `enough`, a lower bound that does
-    too."""
+    """Clearance of the spheres of a link to obstacle o [m]. If it exceeds `enough`, the result may be a lower
+    bound that also exceeds `enough`."""
     T = frames[links.frame[link]]
     ball = links.bounds[link]
-    around = (
+    ball_clearance = (
         _obstacle_distance(
             tracks, o, rotation, xyz, placed(T, ball, 0), placed(T, ball, 1), placed(T, ball, 2)
         )
         - ball[3]
     )
-    if around > enough:
-        return around
+    if ball_clearance > enough:
+        return ball_clearance
     clearance = np.inf
     for s in range(links.first[link], links.first[link + 1]):
         p = links.spheres[s]
@@ -169,14 +172,14 @@ def _clearance(links, frames, link, tracks, o, rotation, xyz, enough):
 
 @inner_kernel()
 def _pose_arm(links, q, frames):
-    """Writes the frames at q."""
+    """Writes the frames T_base_frame[dof + 1, 4, 4] at q[dof]."""
     for j in range(len(q)):
         step(frames[parent_of(links.parents, j)], links.offsets[j], links.slides[j], q[j], frames[j + 1])
 
 
 @inner_kernel()
 def _row_at(times, time):
-    """The last row that is not later than a time, and the share of the time from there to the next."""
+    """The last row at or before a time, and the fraction of the interval from this row to the next."""
     low = min(max(np.searchsorted(times, time, side="right") - 1, 0), max(len(times) - 2, 0))
     if low + 1 >= len(times):
         return low, 0.0
@@ -192,7 +195,8 @@ def _interpolated(rows, low, share, j):
 
 @kernel()
 def cumulative_motion(q):
-    """[n, dof] total motion of each joint, forwards and backwards, from the first row to each row."""
+    """Total motion of each joint from the first row to each row [n, dof]; motion in both directions adds
+    up."""
     travel = np.zeros_like(q)
     for i in range(1, len(q)):
         for j in range(q.shape[1]):
@@ -202,14 +206,16 @@ def cumulative_motion(q):
 
 @kernel(nogil=True)
 def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
-    """Settles the tasks, in order, as far as the spheres can.
+    """Settles the tasks, in order, as far as the covering spheres can.
 
     The motion is on straight lines between the rows q[n, dof] at times[n], at rest before and after. A pair
     is settled if its bound is at least `least` [m] and at least the fraction `tightness` of the smallest
-    clearance measured so far. That is `best`, an array of one number, which this function updates in place.
-    Returns the smallest bound that settled a pair, and the tasks that are left to the exact meshes, one pair
-    each, as (start, stop, link, obstacle). In the middle of such an interval the link's spheres are at most
-    `least` from the obstacle, or the interval was halved MAX_HALVINGS times.
+    clearance measured so far. This smallest clearance is best[0], which this function updates.
+
+    Returns:
+        The smallest bound that settled a pair [m]. The tasks that are left to the exact meshes, one pair
+        each, as (start, stop, link, obstacle). In the middle of such an interval the link's spheres are at
+        most `least` from the obstacle, or the interval was halved MAX_HALVINGS times.
     """
     dof = q.shape[1]
     count = len(links.frame)
@@ -221,7 +227,7 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
     for k in range(3):
         frames[0, k, k] = 1.0
     middle = np.empty(dof)
-    moved = np.empty(dof)
+    joint_motion = np.empty(dof)
     rotation = np.empty((3, 3))
     xyz = np.empty(3)
     travel = np.empty(count)
@@ -243,47 +249,51 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
             stop = stops[size]
             depth = depths[size]
             time = 0.5 * (start + stop)
-            half = 0.5 * (stop - start)
+            half_duration = 0.5 * (stop - start)
             row, share = _row_at(times, time)
             first, first_share = _row_at(times, start)
             last, last_share = _row_at(times, stop)
+            # largest motion of each joint, then of each link, from the middle to either end
             for j in range(dof):
                 middle[j] = _interpolated(q, row, share, j)
                 joint_travel_middle = _interpolated(joint_travel, row, share, j)
                 before = joint_travel_middle - _interpolated(joint_travel, first, first_share, j)
-                moved[j] = max(before, _interpolated(joint_travel, last, last_share, j) - joint_travel_middle)
+                joint_motion[j] = max(
+                    before, _interpolated(joint_travel, last, last_share, j) - joint_travel_middle
+                )
             _pose_arm(links, middle, frames)
             for link in range(count):
                 travel[link] = 0.0
                 for j in range(dof):
-                    travel[link] += links.motion_radii[link, j] * moved[j]
+                    travel[link] += links.motion_radii[link, j] * joint_motion[j]
             split_needed = False
             for o in range(obstacles):
-                posed = False
+                is_posed = False
                 obstacle_travel = 0.0
                 for link in range(count):
                     if not pairs[size, link, o]:
                         continue
-                    if not posed:
+                    if not is_posed:
                         pose_at(tracks, o, time, rotation, xyz)
-                        obstacle_travel = speed_between(tracks, o, start, stop) * half
-                        posed = True
-                    grown = tracks.growth[o] * max(time, 0.0)
-                    lost = travel[link] + obstacle_travel + tracks.growth[o] * half
+                        obstacle_travel = speed_between(tracks, o, start, stop) * half_duration
+                        is_posed = True
+                    inflation = tracks.growth[o] * max(time, 0.0)
+                    clearance_loss = travel[link] + obstacle_travel + tracks.growth[o] * half_duration
                     required = max(least, tightness * best[0])
-                    cutoff = grown + lost + max(required, best[0] if tightness > 0 else 0.0)
-                    clear = _clearance(links, frames, link, tracks, o, rotation, xyz, cutoff) - grown
-                    clear = min(clear, CLEARANCE_CAP + lost)
-                    if clear <= least or depth == MAX_HALVINGS:
+                    cutoff = inflation + clearance_loss + max(required, best[0] if tightness > 0 else 0.0)
+                    clearance = _clearance(links, frames, link, tracks, o, rotation, xyz, cutoff) - inflation
+                    clearance = min(clearance, CLEARANCE_CAP + clearance_loss)
+                    if clearance <= least or depth == MAX_HALVINGS:
                         remaining.append((start, stop, link, o))
                         pairs[size, link, o] = False
                         continue
-                    best[0] = min(best[0], clear)
-                    if clear - lost >= max(least, tightness * best[0]):
-                        certified = min(certified, clear - lost)
+                    best[0] = min(best[0], clearance)
+                    if clearance - clearance_loss >= max(least, tightness * best[0]):
+                        certified = min(certified, clearance - clearance_loss)
                         pairs[size, link, o] = False
                     else:
                         split_needed = True
+            # the first half is put on top of the stack, so that intervals are processed in order
             if split_needed:
                 pairs[size + 1] = pairs[size]
                 starts[size + 1] = start
@@ -297,8 +307,8 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
 
 @kernel(nogil=True)
 def free_at_times(links, tracks, q, times, least):
-    """Whether the covering spheres keep `least` [m] from all obstacles, [n, k], at each of q[n, dof] and each
-    of the increasing times[k]."""
+    """Whether the covering spheres keep `least` [m] from all obstacles, [n, k], for each configuration of
+    q[n, dof] at each of the increasing times[k]."""
     dof = q.shape[1]
     count = len(links.frame)
     obstacles = len(tracks.growth)

@@ -6,21 +6,22 @@ import numpy as np
 from robotdiffuse.core.kernels import allocation_free, kernel
 
 _NO_POINTS = np.int32(1 << 30)
-"""Squared distance in lines without any points [voxels²]."""
+"""Squared distance that stands for infinity, in lines without any points [voxels²]."""
 _ROUNDED = 1e-6
-"""More than the rounding error of a place in a line, less than the distance of a fractional place from an
-integer."""
+"""Added before a position along a line is rounded down [voxels]: more than its rounding error, less than the
+distance of a fractional position from the next integer."""
 
 
 @kernel(fastmath=True)
 def nearest_voxels(run):
-    """For each voxel the squared distance to the nearest voxel with points [voxels²], and that voxel's value
-    in `run`.
+    """For each voxel the squared distance to the nearest voxel with points [voxels²], and the value of `run`
+    at this nearest voxel.
 
-    run int32[nx, ny, nz] is -1 for voxels without points; at least one has points. The transform goes axis by
-    axis (A. Meijster, J. Roerdink, W. Hesselink, 2000).
+    run int32[nx, ny, nz] is -1 for voxels without points; at least one voxel has points. The transform goes
+    axis by axis (A. Meijster, J. Roerdink, W. Hesselink, 2000).
     """
     nx, ny, nz = run.shape
+    # along z: a scan in both directions; then along y and x: lower envelopes of parabolas
     squares = np.full((nx, ny, nz), _NO_POINTS, np.int32)
     holders = run.copy()
     for i in range(nx):
@@ -49,9 +50,11 @@ def nearest_voxels(run):
 
 @allocation_free(fastmath=True)
 def _nearest_in_line(squares, holders, kept, since, before, whose):
-    """Updates the voxels of a line from the other voxels of the line, by the lower envelope of parabolas.
+    """Updates the squared distances and nearest values of a line from the other voxels of the line.
 
-    The first `top` + 1 entries of `kept` are the voxels on the envelope, each from place `since` on.
+    Voxel s contributes the parabola before[s] + (u - s)² at position u; the new squared distance is the lower
+    envelope of all parabolas. The first `top` + 1 entries of `kept` are the voxels on the envelope in order;
+    kept[i] is lowest from position since[i] on. `before` and `whose` are copies of the input.
     """
     n = len(squares)
     top = -1

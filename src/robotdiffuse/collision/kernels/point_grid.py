@@ -1,10 +1,17 @@
-"""Compiled queries to point clouds: a grid of distances answers most of them, the points themselves the rest.
+"""Compiled distance queries to point clouds. A grid of distances answers most queries; the others compute
+distances to points.
 
-For the center of each voxel the grid holds the index of the nearest point and the distance to its center.
-Both are exact within a band around the points; beyond it, the distance is a lower bound and the point only
-nearly the nearest. A query at distance e from its voxel's center knows the distance to within e. If that is
-not enough, it computes the distances to points in the cells around. `point_cloud_grid.py` builds the arrays,
+A point is a sphere: its center and a radius. For the center of each voxel, the grid stores the index of the
+nearest point and the distance to that point's center. Both are exact within a band around the points. Beyond
+the band, the distance is a lower bound, and the index is that of a point near the nearest one or -1. At
+distance e from the center of its voxel, a query knows the distance to within e. If this is not precise
+enough, it computes the distances to the points in the cells around. `point_cloud_grid.py` builds the arrays,
 which are fields of SceneArrays.
+
+Coordinates called f are in voxels from the grid's origin, and c are the same clamped to the grid. i is the
+voxel, e the offset from the voxel's center, and o = f - c the offset of a query outside the grid. Entries of
+`scene.grid_frame`: 0 to 2 origin, 3 voxel, 4 cell, 5 and 6 largest and smallest radius of a point, 7 band, 8
+to 10 numbers of voxels, 11 to 13 numbers of cells.
 """
 
 import numpy as np
@@ -24,7 +31,8 @@ from robotdiffuse.collision.kernels.simd import (
 from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
 
 POINT_RANGE = np.float32(0.3)
-"""Points are kept up to this far beyond the robot's reach, and clearances to points are at most this [m]."""
+"""Points farther than this beyond the robot's reach are left out; clearances to points are capped at this
+value [m]."""
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
 _HALF = np.float32(0.5)
@@ -35,15 +43,16 @@ _SLACK = np.float32(1e-5)
 
 @kernel(fastmath=True)
 def make_grid(points, starts, run, low, voxel, shape, band, known):
-    """For every voxel center the distance to the nearest point, and the index of that point.
+    """For every voxel center the distance to the nearest point's center [m], and the index of that point.
 
-    Both are exact below `band` [m]; beyond, the distance is a lower bound, and the point is near the nearest
-    one where there may be one within `known` [m], else -1. Points starts[b] to starts[b + 1] lie in the voxel
-    with value b in run[nx * ny * nz], which is -1 for voxels without points.
+    Both are exact below `band` [m]. Beyond the band, the distance is a lower bound, and the index is that of
+    a point near the nearest one, or -1 if no point is within `known` [m]. `low` is the grid's lower corner
+    [m], `voxel` the edge of a voxel [m]. run[nx * ny * nz] has the value b for the voxel that contains the
+    points starts[b] to starts[b + 1], exclusive, and -1 for voxels without points.
     """
     nx, ny, nz = shape
     balls = _balls(points, starts)
-    blur = _blur(points, low, voxel)
+    max_offset = _max_offset(points, low, voxel)
     distances = np.empty(nx * ny * nz, np.float32)
     nearest = np.full(nx * ny * nz, -1, np.int32)
     squares, holders = nearest_voxels(run.reshape(nx, ny, nz))
@@ -52,8 +61,9 @@ def make_grid(points, starts, run, low, voxel, shape, band, known):
             for k in range(nz):
                 v = (i * ny + j) * nz + k
                 b = holders[i, j, k]
-                # no voxel with points is nearer, and no point is more than `blur` from its voxel's center
-                lower = voxel * np.sqrt(np.float32(squares[i, j, k])) - blur
+                # no voxel with points is nearer, and no point is farther than `max_offset` from its voxel's
+                # center
+                lower = voxel * np.sqrt(np.float32(squares[i, j, k])) - max_offset
                 distances[v] = max(band, lower)
                 if lower >= known:
                     continue
@@ -79,7 +89,7 @@ def make_grid(points, starts, run, low, voxel, shape, band, known):
 
 @inner_kernel(fastmath=True)
 def _balls(points, starts):
-    """A ball [x, y, z, radius] around the points of each voxel that has any."""
+    """A ball [x, y, z, radius] around the centers of the points of each voxel that has points."""
     balls = np.zeros((len(starts) - 1, 4), np.float32)
     for b in range(len(balls)):
         ball = balls[b]
@@ -96,7 +106,7 @@ def _balls(points, starts):
 
 
 @inner_kernel(fastmath=True)
-def _blur(points, low, voxel):
+def _max_offset(points, low, voxel):
     """Largest distance of a point from the center of its voxel [m]."""
     max_square = _ZERO
     for p in range(len(points)):
@@ -111,8 +121,10 @@ def _blur(points, low, voxel):
 
 @inner_kernel(fastmath=True)
 def _settle(points, starts, balls, low, voxel, shape, band, distances, nearest):
-    """Makes distances below the band exact, and larger ones at least the band."""
+    """Makes distances below `band` exact, and larger distances at least `band`."""
     nx, ny, nz = shape
+    # each voxel's ball of points updates the voxel centers within `band` of the ball, one row along z at a
+    # time
     for b in range(len(balls)):
         x, y, z, radius = balls[b]
         reach = band + radius
@@ -145,13 +157,14 @@ def _settle(points, starts, balls, low, voxel, shape, band, distances, nearest):
 
 @allocation_free(fastmath=True)
 def _any_closer(distances, at, n, base, z, voxel, radius):
-    """Whether a ball of points may contain one nearer to n voxels in a row than their current distances."""
-    some = np.int32(0)
+    """Whether a ball of points may contain a point that is nearer to one of n voxels in a row than the
+    voxel's current distance."""
+    any_closer = np.int32(0)
     for k in range(n):
         dz = (np.float32(k) - z) * voxel
-        within = distances[at + k] + radius
-        some |= np.int32(base + dz * dz < within * within)
-    return some
+        threshold = distances[at + k] + radius
+        any_closer |= np.int32(base + dz * dz < threshold * threshold)
+    return any_closer
 
 
 @allocation_free(fastmath=True)
@@ -168,8 +181,8 @@ def _closer(distances, nearest, at, n, base, z, voxel, p, band):
 
 @allocation_free(forceinline=True)
 def _ask_grid(x, y, z, radius, scene):
-    """Two masks of spheres in 16 lanes, from the grid: those that may touch a point, and those that surely
-    do."""
+    """Two masks of spheres in 16 lanes, from the grid alone: the spheres that may touch a point, and the
+    spheres that certainly do."""
     frame = scene.grid_frame
     band = frame[7]
     voxel = frame[3]
@@ -193,16 +206,16 @@ def _ask_grid(x, y, z, radius, scene):
     oz = fz - cz
     out = (ox * ox + oy * oy + oz * oz) * (voxel * voxel)
     grid_distance = maximum(g - e, _ZERO)
-    free = radius + (frame[5] + _SLACK)
-    near = grid_distance * grid_distance + out < free * free
+    touch_distance = radius + (frame[5] + _SLACK)
+    near = grid_distance * grid_distance + out < touch_distance * touch_distance
     inside = (g + e + sqrt(out) < radius + (frame[6] - _SLACK)) & (g < band)
     return near, near & inside
 
 
 @allocation_free()
 def far_from_points(scene, x0, x1, y0, y1, z0, z1, radius):
-    """Whether a look-up in the middle of a box excludes that a sphere with its center in the box touches a
-    point."""
+    """Whether no sphere with its center in a box can touch a point, according to one look-up in the middle of
+    the box."""
     lower, _, _ = _look_up(scene, _HALF * (x0 + x1), _HALF * (y0 + y1), _HALF * (z0 + z1))
     dx = x1 - x0
     dy = y1 - y0
@@ -220,7 +233,7 @@ def near_points(x, y, z, radius, scene):
 def _near_by_eight(x, y, z, radius, scene):
     """Mask of the lanes whose sphere may touch a point, from the eight voxels around its center.
 
-    The bound of the voxel on the side away from the nearest point is almost exact.
+    Of the eight lower bounds, the one from the voxel on the side away from the nearest point is almost exact.
     """
     frame = scene.grid_frame
     inverse = _ONE / frame[3]
@@ -261,8 +274,8 @@ def touch_points(x, y, z, radius, scene):
 
 @allocation_free(forceinline=True)
 def _columns(frame, rx, ry, reach):
-    """Index ranges of the columns of cells that may contain points within `reach` of a place in the grid's
-    frame."""
+    """Index ranges along x and y of the columns of cells that may contain points within `reach` of (rx, ry),
+    given from the grid's origin [m]."""
     cell = frame[4]
     mx = int(frame[11])
     my = int(frame[12])
@@ -275,17 +288,17 @@ def _columns(frame, rx, ry, reach):
 
 @allocation_free(forceinline=True)
 def _in_column(scene, i, j, rx, ry, rz, reach):
-    """Index range of the points in a column's cells within `reach`; empty if there are none."""
+    """Index range of the points in a column's cells within `reach` [m]; empty if no cell is."""
     frame = scene.grid_frame
     cell = frame[4]
     my = int(frame[12])
     mz = int(frame[13])
     gx = max(max(np.float32(i) * cell - rx, rx - np.float32(i + 1) * cell), _ZERO)
     gy = max(max(np.float32(j) * cell - ry, ry - np.float32(j + 1) * cell), _ZERO)
-    rest = reach * reach - gx * gx - gy * gy
-    if rest <= _ZERO:
+    squared_half = reach * reach - gx * gx - gy * gy
+    if squared_half <= _ZERO:
         return np.int32(0), np.int32(0)
-    half = np.sqrt(rest) + _SLACK
+    half = np.sqrt(squared_half) + _SLACK
     k0 = max(int((rz - half) / cell), 0)
     k1 = min(int((rz + half) / cell), mz - 1)
     if k0 > k1:
@@ -296,7 +309,8 @@ def _in_column(scene, i, j, rx, ry, rz, reach):
 
 @allocation_free()
 def _touches(scene, x, y, z, radius):
-    """Whether a sphere touches a point: the nearest one by the grid, or another in the cells around."""
+    """Whether a sphere touches a point. The point that the grid stores as the nearest is checked first, then
+    the points in the cells around."""
     frame = scene.grid_frame
     rows = scene.point_rows
     _, _, p = _look_up(scene, x, y, z)
@@ -318,8 +332,8 @@ def _touches(scene, x, y, z, radius):
     for i in range(i0, i1):
         for j in range(j0, j1):
             first, last = _in_column(scene, i, j, rx, ry, rz, reach)
-            # sixteen points at once; a row may begin and end with points outside the range, which does no
-            # harm
+            # sixteen points at once; points of the first and last row that are outside the range are checked
+            # too
             for row in range(first // W, (last + W - 1) // W if last > first else 0):
                 dx = load(rows, row, 0) - x
                 dy = load(rows, row, 1) - y
@@ -332,8 +346,8 @@ def _touches(scene, x, y, z, radius):
 
 @allocation_free()
 def _look_up(scene, x, y, z):
-    """A lower bound of the distance to the surface of all points [m], the squared distance to the grid's box,
-    and the index of the point stored in the voxel."""
+    """A lower bound of the distance to the nearest point's surface [m], the squared distance to the grid's
+    box [m²], and the index of the point stored in the voxel."""
     frame = scene.grid_frame
     voxel = frame[3]
     fx = (x - frame[0]) / voxel
@@ -359,7 +373,7 @@ def _look_up(scene, x, y, z):
 
 @allocation_free(fastmath=True)
 def _search(scene, x, y, z, limit):
-    """Distance to the surface of the nearest point below `limit`, else `limit`."""
+    """Distance to the surface of the nearest point if it is below `limit`, else `limit` [m]."""
     points = scene.points
     frame = scene.grid_frame
     reach = limit + frame[5] + _SLACK
@@ -391,7 +405,8 @@ def _search(scene, x, y, z, limit):
 def points_distance(scene, x, y, z, limit):
     """Distance to the surface of the scene's nearest point, at most `limit` [m].
 
-    Exact within the grid's band, a lower bound beyond it.
+    It is exact if the grid stores a point for the voxel of (x, y, z): up to a clearance of about EXACT_RANGE
+    (`point_cloud_grid.py`) for the robot's largest sphere. Else it is a lower bound.
     """
     lower, _, p = _look_up(scene, x, y, z)
     if lower >= limit:
@@ -408,16 +423,16 @@ def points_distance(scene, x, y, z, limit):
 
 @allocation_free()
 def points_lower_bound(scene, x, y, z):
-    """A lower bound of the distance to the points, from the grid alone."""
+    """A lower bound of the distance to the nearest point's surface, from the grid alone [m]."""
     return _look_up(scene, x, y, z)[0]
 
 
 @allocation_free()
 def near_point(scene, x, y, z, limit):
-    """Distance to a nearly nearest point, at most `limit`, and its gradient.
+    """Distance to the surface of a point near the nearest one, at most `limit` [m], and its gradient.
 
-    It is the nearest of the points stored in the eight voxels around, and too far by a few millimeters at
-    most. It serves for gradients, where an exact search would take too long.
+    The point is the nearest of the eight points stored in the voxels around (x, y, z). The distance is too
+    large by a few millimeters at most. It is used for gradients, where an exact search would take too long.
     """
     best = limit
     bx = _ZERO

@@ -1,4 +1,4 @@
-"""Random numbers of compiled code."""
+"""Random numbers for compiled code."""
 
 import numpy as np
 from numpy import ndarray
@@ -7,7 +7,7 @@ from robotdiffuse.core.kernels import allocation_free
 
 
 def random_state(seed: int, attempt: int = 0) -> ndarray:
-    """State [1] of the compiled random number generator, from a seed and an attempt."""
+    """State uint64[1] of the compiled random number generator, from a seed and the number of the attempt."""
     return np.random.SeedSequence([seed, attempt]).generate_state(1, np.uint64) | np.uint64(1)
 
 

@@ -1,9 +1,9 @@
 """SIMD in compiled code: sixteen float32 numbers as one value of the type `Lanes`, LLVM's <16 x float>.
 
 Operations on lanes become SIMD instructions without relying on LLVM's vectorizer: one instruction each with
-AVX-512, two with AVX2, four with SSE or NEON. `+ - * /` work on lanes, and on lanes and a float32, which is
-broadcast. `a < b` is a mask: an int64 whose bit i belongs to lane i. Arithmetic may be contracted to fused
-multiply-add and ignores NaN.
+AVX-512, two with AVX2, four with SSE or NEON. `+ - * /` take two values of lanes, or lanes and a float32,
+which is broadcast. `a < b` returns a mask: an int64 with bit i set if lane i of a is less than lane i of b.
+The compiler may contract arithmetic to fused multiply-add and assumes that no value is NaN.
 """
 
 import operator
@@ -23,14 +23,15 @@ from numpy import ndarray
 from robotdiffuse.core.kernels import kernel
 
 W = 16
-"""Number of lanes: of configurations per block, or of spheres or obstacles per row."""
+"""Number of lanes. It is also the number of configurations in a block, and of spheres or obstacles in a
+row."""
 _FLAGS = ("nnan", "nsz", "contract")
 _FLOAT, _BITS = ir.FloatType(), ir.IntType(64)
 _VECTOR = ir.VectorType(_FLOAT, W)
 _INTEGERS = ir.VectorType(ir.IntType(32), W)
 _EVERYWHERE = ir.Constant(_INTEGERS, [0] * W)
 _ALIGN = 4
-# of any type, since the context is no argument of the calls
+# typed Any because callers do not pass the first argument, the context
 _operation: Any = intrinsic
 
 
@@ -141,7 +142,7 @@ reduce_max = _reduction("fmax")
 
 
 def _address(context: Any, builder: Any, array_type: Any, array: Any, row: Any, part: Any) -> Any:
-    """Address of the sixteen numbers from column 16 * part on in a row of a contiguous array."""
+    """Address of array[row, 16 * part] in a contiguous array."""
     struct = context.make_array(array_type)(context, builder, array)
     columns = cgutils.unpack_tuple(builder, struct.shape, 2)[1]
     size = columns.type
@@ -162,7 +163,7 @@ def _holds_floats(array: Any, dimensions: int) -> bool:
 
 @_operation
 def lane_numbers(_context: Any) -> Any:
-    """Lanes that hold their own numbers, 0 to 15."""
+    """Lanes with the values 0 to 15: lane i has the value i."""
     return LANES(), lambda *_: ir.Constant(_VECTOR, [float(i) for i in range(W)])
 
 
@@ -225,7 +226,7 @@ def lane(_context: Any, a: Any, i: Any) -> Any:
 
 @_operation
 def lanes_with_bit(_context: Any, a: Any, bit: Any) -> Any:
-    """Mask of the lanes whose integer value has a bit in common with `bit`."""
+    """Mask of the lanes with an integer value that has a bit in common with `bit`."""
 
     def codegen(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
         numbers = builder.fptosi(args[0], _INTEGERS)
@@ -249,8 +250,8 @@ def first_lane(_context: Any, mask: Any) -> Any:
 
 @kernel()
 def lanes_array(rows, parts):
-    """Zeros [rows, parts * 16], aligned to cache lines, so that no load or store of lanes touches two of
-    them."""
+    """Zeros [rows, parts * 16], aligned to cache lines, so that no load or store of lanes touches two cache
+    lines."""
     size = rows * parts * W
     memory = np.zeros(size + W, np.float32)
     start = -(memory.ctypes.data // 4) % W
@@ -258,10 +259,10 @@ def lanes_array(rows, parts):
 
 
 def by_sixteen(rows: ndarray, fill: ndarray) -> ndarray:
-    """Rows [n, k] in groups of sixteen, [ceil(n / 16), k * 16]: column 0 of sixteen rows, then column 1, and
-    so on.
+    """Rearranges rows [n, k] in groups of sixteen, [ceil(n / 16), k * 16]: a group is column 0 of sixteen
+    rows, then their column 1, and so on.
 
-    The last group is filled with `fill`, one row [1, k].
+    The last group is filled up with copies of `fill` [1, k].
     """
     n, k = rows.shape
     filled = np.concatenate([rows, np.repeat(fill, -n % W, axis=0)]).astype(np.float32)

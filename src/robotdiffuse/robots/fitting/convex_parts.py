@@ -1,11 +1,11 @@
 """Approximate convex decomposition: convex parts that cover a collision mesh, for exact distances by Coal.
 
-Planes cut a mesh until no part's hull sticks out of it too far. Then parts are merged as long as their common
-hull does not stick out too far. If a plane cuts a closed surface, the convex hull of the surface's piece on
-one side contains the whole solid on that side. So the parts always cover both the mesh and the solid that it
-encloses. A voxel grid measures how far a hull sticks out. Voxels that cannot be reached from outside without
-crossing the surface count as solid, so holes smaller than a voxel, inner walls and overlapping triangles do
-no harm.
+Planes cut a mesh into parts until no part's convex hull sticks out of the mesh by more than a tolerance. Then
+parts are merged as long as their common hull stays within the tolerance. If a plane cuts a closed surface,
+the convex hull of the surface's piece on one side contains the whole solid on that side. So the parts always
+cover the mesh and the solid that it encloses. A voxel grid measures how far a hull sticks out. Voxels that
+cannot be reached from outside without crossing the surface count as solid. Therefore holes smaller than a
+voxel, inner walls and overlapping triangles do no harm.
 """
 
 from dataclasses import dataclass, replace
@@ -24,12 +24,13 @@ from robotdiffuse.robots.bodies import ConvexMesh, Surface
 
 Triangles = Float[ndarray, "_ 3 3"]
 MIN_THICKNESS = 1e-3
-"""Smallest thickness of a hull [m]: spheres and distances need a sheet to have a volume."""
+"""Smallest thickness of a hull [m]: fitting spheres and computing distances need a volume, also for thin
+sheets."""
 
 
 def convex_hull(points: Points) -> ConvexMesh:
-    """Convex hull with outward faces; a point set thinner than `MIN_THICKNESS` in a direction is thickened to
-    it."""
+    """Convex hull with outward faces. A point set that is thinner than `MIN_THICKNESS` in a direction is
+    thickened to it first."""
     points = thickened(points)
     hull = ConvexHull(points)
     used, index = np.unique(hull.simplices, return_inverse=True)
@@ -42,7 +43,8 @@ def convex_hull(points: Points) -> ConvexMesh:
 
 
 def thickened(points: Points) -> Points:
-    """The points, or copies shifted to both sides along the principal axes in which the set is too thin."""
+    """The points. Along each principal axis in which the set is thinner than `MIN_THICKNESS`, two copies
+    shifted by half of it to both sides replace the points."""
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     for axis in axes[np.ptp(points @ axes.T, axis=0) < MIN_THICKNESS]:
         points = np.concatenate([points - axis * MIN_THICKNESS / 2, points + axis * MIN_THICKNESS / 2])
@@ -58,7 +60,8 @@ def face_normals(mesh: ConvexMesh) -> Points:
 
 
 def planes_of(mesh: ConvexMesh) -> tuple[Points, Values]:
-    """Normals and offsets of the distinct planes of a convex mesh."""
+    """Unit normals n and offsets d [m] of the distinct face planes of a convex mesh, which is inside n . x <=
+    d."""
     normals = face_normals(mesh)
     normals = np.unique(np.round(normals[np.linalg.norm(normals, axis=1) > 0.5], 9), axis=0)
     # offsets from the farthest vertex, so that rounding does not put a plane inside the mesh
@@ -73,12 +76,13 @@ def hull_volume(points: Points) -> float:
 
 
 MAX_SPLITS = 60
-"""Largest number of times that a triangle is halved."""
-# Tight places are points where two links pass close to each other. There, parts may stick out by
-# TIGHT_FRACTION of `concavity`. Beyond a distance of 2 `concavity` from the place, the allowance grows with
-# slope TIGHT_SLOPE.
+"""Largest depth of the stack of halves when a triangle is halved repeatedly."""
 TIGHT_FRACTION = 0.125
+"""Parts may stick out by this fraction of `concavity` at tight places: points where two links pass close to
+each other."""
 TIGHT_SLOPE = 0.3
+"""Farther than 2 `concavity` from a tight place, parts may stick out by this much more per meter of distance
+[m/m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,12 +90,14 @@ class DistanceGrid:
     """Distances of voxels from a solid, zero inside [m]."""
 
     origin: Vector
+    """Lower corner of the grid [m]."""
     pitch: float
+    """Edge of a voxel [m]."""
     distance: Float[ndarray, "nx ny nz"]
 
     @staticmethod
     def around(soups: list[Triangles], voxels: int, finest: float) -> "DistanceGrid":
-        """A grid around triangles with about `voxels` voxels, whose edge is at least `finest` [m]."""
+        """A grid around triangles with about `voxels` voxels. Their edge is at least `finest` [m]."""
         corners = np.concatenate(soups).reshape(-1, 3)
         low = corners.min(0)
         high = corners.max(0)
@@ -108,19 +114,21 @@ class DistanceGrid:
         return DistanceGrid(origin, pitch, ndimage.distance_transform_edt(free) * pitch)
 
     def near_tight(self, tight: Points, concavity: float) -> tuple["DistanceGrid", "DistanceGrid"]:
-        """Two copies in which distances near `tight` places are enlarged, so that it counts more if a part
-        sticks out there.
+        """Two copies in which distances near `tight` places are enlarged, so that parts that stick out there
+        have a larger concavity.
 
-        The first copy is zero at all other places; the second keeps the distances there.
+        At all other places, the first copy is zero, and the second copy has the original distances.
         """
         near = np.argwhere((self.distance > 0) & (self.distance < 3 * concavity))
-        far = KDTree(tight).query(self.origin + (near + 0.5) * self.pitch)[0]
-        allowed = TIGHT_FRACTION * concavity + TIGHT_SLOPE * np.maximum(far - 2 * concavity, 0.0)
+        tight_distance = KDTree(tight).query(self.origin + (near + 0.5) * self.pitch)[0]
+        allowed = TIGHT_FRACTION * concavity + TIGHT_SLOPE * np.maximum(tight_distance - 2 * concavity, 0.0)
         near = near[allowed < concavity]
         allowed = allowed[allowed < concavity]
-        alone = np.zeros_like(self.distance)
-        alone[tuple(near.T)] = self.distance[tuple(near.T)] * concavity / allowed
-        return replace(self, distance=alone), replace(self, distance=np.maximum(alone, self.distance))
+        tight_distances = np.zeros_like(self.distance)
+        tight_distances[tuple(near.T)] = self.distance[tuple(near.T)] * concavity / allowed
+        return replace(self, distance=tight_distances), replace(
+            self, distance=np.maximum(tight_distances, self.distance)
+        )
 
     def concavity(self, hull: ConvexMesh) -> float:
         """How far a hull sticks out of the solid, approximately [m]."""
@@ -161,40 +169,40 @@ def split(triangles: Triangles, size: "float | Float[ndarray, 'n']") -> Triangle
 def _split(triangles, squares):
     out = np.empty((4 * len(triangles) + 64, 3, 3))
     count = 0
-    open_ones = np.empty((MAX_SPLITS + 2, 3, 3))
+    stack = np.empty((MAX_SPLITS + 2, 3, 3))
     for t in range(len(triangles)):
-        open_ones[0] = triangles[t]
-        open_count = 1
-        while open_count > 0:
-            open_count -= 1
+        stack[0] = triangles[t]
+        stack_size = 1
+        while stack_size > 0:
+            stack_size -= 1
             longest = -1.0
             k = 0
             for i in range(3):
                 j = (i + 1) % 3
                 square = 0.0
                 for d in range(3):
-                    square += (open_ones[open_count, i, d] - open_ones[open_count, j, d]) ** 2
+                    square += (stack[stack_size, i, d] - stack[stack_size, j, d]) ** 2
                 if square > longest:
                     longest = square
                     k = i
-            if longest <= squares[t] or open_count >= MAX_SPLITS:
+            if longest <= squares[t] or stack_size >= MAX_SPLITS:
                 if count == len(out):
                     out = np.concatenate((out, np.empty_like(out)))
-                out[count] = open_ones[open_count]
+                out[count] = stack[stack_size]
                 count += 1
                 continue
             for d in range(3):
-                a = open_ones[open_count, k, d]
-                b = open_ones[open_count, (k + 1) % 3, d]
-                c = open_ones[open_count, (k + 2) % 3, d]
+                a = stack[stack_size, k, d]
+                b = stack[stack_size, (k + 1) % 3, d]
+                c = stack[stack_size, (k + 2) % 3, d]
                 middle = 0.5 * (a + b)
-                open_ones[open_count, 0, d] = a
-                open_ones[open_count, 1, d] = middle
-                open_ones[open_count, 2, d] = c
-                open_ones[open_count + 1, 0, d] = middle
-                open_ones[open_count + 1, 1, d] = b
-                open_ones[open_count + 1, 2, d] = c
-            open_count += 2
+                stack[stack_size, 0, d] = a
+                stack[stack_size, 1, d] = middle
+                stack[stack_size, 2, d] = c
+                stack[stack_size + 1, 0, d] = middle
+                stack[stack_size + 1, 1, d] = b
+                stack[stack_size + 1, 2, d] = c
+            stack_size += 2
     return out[:count].copy()
 
 
@@ -203,20 +211,20 @@ CUT_FRACTIONS = np.arange(1, 10) / 10
 WALL_OFFSET = 1e-4
 """Distance between a surface and a cut beside it [m]."""
 IMPROVEMENT = 0.999
-"""A later candidate cut replaces the best one so far only if the volume of its hulls is below this fraction
-of the best volume."""
+"""A candidate cut replaces the best cut so far only if the total volume of its two hulls is below this
+fraction of the best volume."""
 MAX_WALLS = 6
 """Largest number of surfaces perpendicular to an axis at which further cuts are tried."""
 MAX_CUT_POINTS = 1200
 """Approximate largest number of surface points for choosing a cut."""
 MAX_NORMALS = 1000
-"""A hull with more faces has similar normals merged before it is simplified."""
+"""If a hull has more faces, similar normals are merged before it is simplified."""
 TIGHT_PART_FACTOR = 4
-"""A link with tight places may have this many times as many parts."""
+"""Factor on the largest number of parts of a link with tight places."""
 MAX_PLANES = 120
 """Largest number of planes of a simplified hull."""
 SIMPLIFIED_GROWTH = 1e-7
-"""Growth of simplified hulls [m], larger than rounding errors."""
+"""Distance by which the planes of simplified hulls are moved outwards [m], larger than rounding errors."""
 
 
 @dataclass(frozen=True)
@@ -232,10 +240,10 @@ class PartSettings(Settings, name="convex parts"):
     finest: Positive = 0.0015
     """Smallest voxel edge [m]."""
     faces: int = 400
-    """Hulls with more triangles are simplified; they only grow."""
+    """Hulls with more triangles are simplified. A simplified hull contains the original one."""
     rounding: float = 5e-4
-    """How far a simplified hull may stick out of the original hull [m]; with MAX_PLANES planes it may be
-    more."""
+    """How far a simplified hull may stick out of the original hull [m], unless it already has MAX_PLANES
+    planes."""
 
 
 def convex_parts(
@@ -243,9 +251,9 @@ def convex_parts(
     settings: PartSettings = PartSettings(),
     tight: Points | None = None,
 ) -> tuple[ConvexMesh, ...]:
-    """Convex meshes whose union contains the surfaces of a link and the space that they enclose.
+    """Convex meshes that together contain the surfaces of a link and the space that they enclose.
 
-    Near `tight` places [n, 3], in the link's frame, the meshes stick out as little as possible.
+    Near `tight` places [n, 3], in the link's frame [m], the meshes stick out less.
     """
     soups = [surface.vertices[surface.faces] for surface in surfaces]
     finer = 1 if tight is None else 2
@@ -260,8 +268,8 @@ def convex_parts(
 
 
 def _cut(parts: list["Part"], space: DistanceGrid, settings: PartSettings, most: int) -> list["Part"]:
-    """Parts cut in two, the most concave first, until all are within `settings.concavity` or there are
-    `most`."""
+    """Cuts parts in two, the most concave part first, until all parts are within `settings.concavity` or
+    there are `most` parts."""
     parts = list(parts)
     while len(parts) < most:
         most_concave = max(range(len(parts)), key=lambda i: parts[i].concavity)
@@ -272,10 +280,11 @@ def _cut(parts: list["Part"], space: DistanceGrid, settings: PartSettings, most:
 
 
 def simplified(hull: ConvexMesh, settings: PartSettings = PartSettings()) -> ConvexMesh:
-    """A convex mesh with fewer faces that contains a hull; the hull itself if it has at most
-    `settings.faces`.
+    """A convex mesh with fewer faces that contains a hull; the hull itself if it has at most `settings.faces`
+    faces.
 
-    It is bounded by up to `MAX_PLANES` of the hull's planes, added where its corners stick out most.
+    The mesh is bounded by up to `MAX_PLANES` of the hull's planes. Planes are added where the mesh's corners
+    stick out most.
     """
     if len(hull.faces) <= settings.faces:
         return hull
@@ -314,14 +323,14 @@ class Part:
     @staticmethod
     def of(triangles: ndarray, points: ndarray, space: DistanceGrid, settings: PartSettings) -> "Part":
         hull = simplified(convex_hull(triangles.reshape(-1, 3)), settings)
-        # all sampled points of a thin sheet may lie on the other side of the cut: sample this side anew
+        # all sampled points of a thin sheet may lie on the other side of the cut: sample this side again
         if not len(points):
             points = _spread(triangles, space.pitch)
         return Part(triangles, points, hull, space.concavity(hull))
 
     def halves(self, space: DistanceGrid, settings: PartSettings) -> list["Part"]:
-        """The two parts on the sides of the plane that gives hulls of least volume; the part itself if too
-        small to cut."""
+        """The two parts on both sides of the plane that minimizes the total volume of their hulls. A part
+        that is too small to cut is returned alone, with concavity 0."""
         low = self.hull.vertices.min(0)
         size = np.ptp(self.hull.vertices, axis=0)
         points, pitch = _thinned(self.points, space.pitch)
@@ -347,7 +356,8 @@ class Part:
 
 
 def _wall_cuts(heights: Values, pitch: float) -> list[float]:
-    """Cuts just before and after surfaces perpendicular to an axis, where parts often meet."""
+    """Coordinates of cuts just below and above surfaces perpendicular to an axis, where parts often meet
+    [m]."""
     counts, edges = np.histogram(heights, max(int(np.ptp(heights) / pitch), 1))
     fullest = np.argsort(-counts)[:MAX_WALLS]
     middles = [
@@ -380,13 +390,13 @@ def _one_per_cube(points: Points, size: float) -> Points:
 def _sides(
     triangles: Triangles, axis: int, at: float
 ) -> tuple[Float[ndarray, "a 3 3"], Float[ndarray, "b 3 3"]]:
-    """Triangles cut by an axis-aligned plane: those below and those above it."""
+    """Cuts triangles by an axis-aligned plane; returns the triangles below and above it."""
     height = triangles[:, :, axis] - at
     below = (height <= 0).all(1)
     above = (height >= 0).all(1)
     crossing = triangles[~below & ~above]
     height = height[~below & ~above]
-    # rotate corners so that the one alone on its side comes first
+    # reorder corners so that the corner that is alone on its side comes first
     negative = height < 0
     alone = np.where(negative.sum(1) == 1, negative.argmax(1), (~negative).argmax(1))
     turn = (alone[:, None] + np.arange(3)) % 3
@@ -404,8 +414,8 @@ def _sides(
 
 
 def _merged(hulls: list[ConvexMesh], space: DistanceGrid, settings: PartSettings) -> list[ConvexMesh]:
-    """Merges pairs of hulls: in each step the pair whose common hull sticks out least, as long as it sticks
-    out by at most `settings.concavity`."""
+    """Merges pairs of hulls. Each step merges the pair with the common hull that sticks out least, as long as
+    it sticks out by at most `settings.concavity`."""
     hulls = list(hulls)
     merged: dict[tuple[int, int], tuple[float, ConvexMesh]] = {}
     while len(hulls) > 1:
@@ -427,7 +437,7 @@ def _merged(hulls: list[ConvexMesh], space: DistanceGrid, settings: PartSettings
 
 
 def _without_contained(hulls: list[ConvexMesh]) -> list[ConvexMesh]:
-    """The hulls that no other hull contains."""
+    """The hulls without those that another hull contains."""
     remaining = sorted(hulls, key=lambda hull: float(np.prod(np.ptp(hull.vertices, axis=0))))
     for hull in tuple(remaining):
         other_planes = [planes_of(neighbor) for neighbor in remaining if neighbor is not hull]

@@ -4,9 +4,9 @@ The solid is cut along its axes into a lattice of convex pieces, and each piece 
 corners. So the spheres provably cover surface and interior. The fit in `sphere_fitting.py` needs about half
 as many spheres for the same tolerance, but takes seconds.
 
-`Robot.attach` and `Robot.with_tool` add a body as one more link: with convex meshes for the validator,
-spheres that cover them for planning, and pairs of links to check. The joints stay the same, so weights
-trained for the bare arm apply.
+`Robot.attach` and `Robot.with_tool` add a body to a robot as one more link. The link has convex meshes for
+the validator and covering spheres for planning, and is checked against other links. The joints stay the same,
+so network weights trained for the bare arm can still be used.
 """
 
 import numpy as np
@@ -20,16 +20,16 @@ from robotdiffuse.robots.bodies import AttachedBody, ConvexMesh
 from robotdiffuse.robots.fitting.sphere_fitting import MARGIN, SphereSettings
 
 LINK_TOLERANCES = SphereSettings()
-"""Tolerances of the spheres of links."""
+"""Tolerances of the spheres of a robot's links, used for attached bodies too."""
 HAND = (1, 0)
 """Arguments `frame` and `dof` of `SphereSettings.tolerance` for a body at the end of an arm."""
 MAX_SPHERES = 100
 """Largest number of spheres for each solid; if they do not suffice, the spheres exceed the tolerance."""
 MAX_PIECES_PER_AXIS = 40
-# Steps of the search for a small sphere around points. It ends early if all points are at least at this
-# fraction of the radius from the center.
 BOUNDING_STEPS = 15
+"""Number of centers that the search for a small sphere around points tries, plus one."""
 EQUIDISTANT = 0.999
+"""This search ends when the nearest point is at least this fraction of the radius away from the center."""
 
 
 def cover(mesh: ConvexMesh) -> Spheres:
@@ -53,8 +53,8 @@ def cover(mesh: ConvexMesh) -> Spheres:
 
 
 def _axes(vertices: Points) -> Rotation:
-    """Axes as rows: the axes of the mesh's frame, or the principal axes if a box along the latter is
-    smaller."""
+    """Axes of the lattice, as rows: the principal axes if a box along them is clearly smaller, else the axes
+    of the mesh's frame."""
     principal = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
     frame_volume = np.ptp(vertices, axis=0).prod()
     principal_volume = np.ptp(vertices @ principal.T, axis=0).prod()
@@ -62,8 +62,8 @@ def _axes(vertices: Points) -> Rotation:
 
 
 def _lattice(size: Vector) -> tuple[int, ...]:
-    """Number of pieces along each axis: the fewest within the tolerance, or else the closest of at most
-    MAX_SPHERES."""
+    """Number of pieces along each axis: the fewest pieces within the tolerance. If MAX_SPHERES do not
+    suffice, the pieces with the smallest excess are returned."""
     counts = np.stack(
         np.meshgrid(*3 * [np.arange(1, MAX_PIECES_PER_AXIS + 1)], indexing="ij"), axis=-1
     ).reshape(-1, 3)
@@ -76,7 +76,7 @@ def _lattice(size: Vector) -> tuple[int, ...]:
 
 
 def _slices(corners: Points, axis: int, cuts: Values) -> list[ndarray]:
-    """The hull of `corners`, cut at coordinates along an axis: the corners of each slice."""
+    """Cuts the convex hull of `corners` at coordinates along an axis; returns the corners of each slice."""
     slices = []
     for cut in cuts:
         below = corners[corners[:, axis] < cut]
@@ -101,17 +101,17 @@ def _outermost(points: Points, axis: int) -> Points:
 
 
 def _around(points: Points) -> Float[ndarray, "4"]:
-    """A small sphere around points: the best of the center of their box and of some steps of Badoiu and
-    Clarkson's algorithm."""
+    """A small sphere around points. Centers are tried from the center of the points' box on, by Badoiu and
+    Clarkson's algorithm; the smallest sphere is returned."""
     center = (points.min(axis=0) + points.max(axis=0)) / 2
     best = np.array([*center, np.inf])
     for i in range(1, BOUNDING_STEPS):
-        far = np.linalg.norm(points - center, axis=1)
-        if far.max() < best[3]:
-            best = np.array([*center, far.max()])
-        if far.min() > EQUIDISTANT * far.max():
+        distances = np.linalg.norm(points - center, axis=1)
+        if distances.max() < best[3]:
+            best = np.array([*center, distances.max()])
+        if distances.min() > EQUIDISTANT * distances.max():
             break
-        center = center + (points[far.argmax()] - center) / (i + 1)
+        center = center + (points[distances.argmax()] - center) / (i + 1)
     return best
 
 

@@ -1,10 +1,10 @@
 """Prepares a robot for planning: convex parts, covering spheres and allowed collisions from its collision
 meshes.
 
-Configurations in which the true meshes are free, but parts or spheres collide, are lost to planning.
-Preparation measures these false collisions. If a pair of links has too many, its parts and spheres are made
-again, finer at the places where they touch. If no spheres are fine enough, a table over the joints between
-the links tells where they are apart.
+If parts or spheres collide in a configuration although the true meshes do not, planning cannot use this
+configuration. Preparation measures these false collisions. If a pair of links has many of them, its parts and
+spheres are computed again, finer at the places where they touch. If spheres cannot be fine enough, a table
+over the joints between the links tells at which joint values the links are apart.
 
 `add_robot` reads a URDF, prepares the robot and writes its folder.
 """
@@ -62,23 +62,26 @@ from robotdiffuse.robots.robot_folder import read_robot_folder, user_robots, wri
 JOINT_SAMPLES = 9
 """Number of values of the joint between two links at which points are tested."""
 GAP = 0.004
-"""Points this close to a neighbor count as inside [m]: gaps between links are about this thin."""
+"""Points closer than this to a neighboring link count as inside it [m]: gaps between links are about this
+thin."""
 BOX_PADDING = 10 * GAP
-"""Points further than this from a neighbor's bounding box are skipped, even near sharp edges [m]."""
+"""Points farther than this from a neighboring link's bounding box count as outside it [m]; a multiple of GAP,
+because near sharp edges the distance from the face planes is smaller than the distance from the link."""
 
 
 class Neighbor(NamedTuple):
-    """A link that a joint connects to another one."""
+    """A link that a joint connects to a given link."""
 
     link: str
+    """Name of the neighbor."""
     T_link_neighbor: Poses
-    """Poses of the neighbor in the frame of the link, at values over the range of the joint between the two;
-    one pose if the joint is fixed."""
+    """Poses of the neighbor in the frame of the given link, at values over the range of the joint between
+    both; one pose if the joint is fixed."""
 
 
 def neighbors(robot: Robot, link: str) -> tuple[Neighbor, ...]:
-    """Links with geometry that a joint connects to this one; skips fixed links without geometry in
-    between."""
+    """Links with geometry that a joint connects to the given link. Links without geometry that are rigidly
+    fixed between both are skipped."""
     adjacent = []
     for joint in robot.joints:
         above = joint.parent
@@ -101,7 +104,7 @@ def neighbors(robot: Robot, link: str) -> tuple[Neighbor, ...]:
 
 
 def hidden_by_neighbors(robot: Robot, link: str) -> Callable[[Points], Mask]:
-    """A function that tells which points, in the link's frame [m], are inside one neighbor at all joint
+    """A function that tells which points, in the link's frame [m], are inside the same neighbor at all joint
     values."""
     neighbor_planes: list[tuple[Neighbor, tuple[ndarray, ndarray], Planes]] = []
     for near_link in neighbors(robot, link):
@@ -128,7 +131,8 @@ def hidden_by_neighbors(robot: Robot, link: str) -> Callable[[Points], Mask]:
 def with_grazing_links(
     robot: Robot, surfaces: Mapping[str, tuple[Surface, ...]], measured: Iterable[FalseCollisions]
 ) -> Robot:
-    """The robot with the surfaces of all pairs of links whose parts collided falsely in any measurement."""
+    """The robot with `grazing` pairs, and the surfaces of their links: all pairs of links with a false
+    collision of convex parts in any of the measurements."""
     grazing = frozenset(
         frozenset(pair.links) for measurement in measured for pair in measurement.pairs if pair.by_parts > 0
     )
@@ -137,8 +141,8 @@ def with_grazing_links(
 
 
 def _joined(surfaces: Iterable[Surface]) -> Surface:
-    """One surface with equal vertices merged, so that its connected components are known; coordinates as
-    stored, in float32."""
+    """One surface with equal vertices merged, so that its connected components can be found. Coordinates are
+    rounded to float32, as they are stored."""
     corners = np.concatenate([surface.vertices[surface.faces].reshape(-1, 3) for surface in surfaces])
     vertices, index = np.unique(corners.astype(np.float32), axis=0, return_inverse=True)
     faces = index.reshape(-1, 3)
@@ -147,23 +151,23 @@ def _joined(surfaces: Iterable[Surface]) -> Surface:
 
 
 LARGE_REACH = 1.4
-"""Reach beyond which the lengths in the settings grow with the reach [m]: a larger arm works in more space,
-and needs no more parts and spheres."""
+"""For an arm with a larger reach [m], lengths in the settings are scaled with the reach, so that it does not
+need more parts and spheres."""
 GRAZING_ROUNDS = 10
-"""Number of measurements of false collisions that look for grazing links. In few configurations links graze,
+"""Number of measurements of false collisions that look for grazing links. Links graze in few configurations,
 so one measurement does not find all of them."""
 Progress = Callable[[str, int, int], None]
 """Called with the current activity, the index of the step and the number of steps."""
 CONCAVITY_SHRINKAGE = 0.5
 """Factor per round on the concavity of convex parts with many false collisions."""
 UNREFINED_FRACTION = 0.6
-"""Pairs of links are left as they are as long as together they have at most this fraction of the allowed
-false collisions."""
+"""Pairs of links are not refined as long as together they have at most this fraction of the allowed false
+collisions."""
 GAP_SHRINKAGE = 0.6
 """Factor per round on `GAP_FRACTION`."""
 GAP_FRACTION = 1.2
-"""Average distance that spheres of each link may stick out into a gap that they bridge, as a fraction of the
-gap."""
+"""Where spheres of two links touch across a gap, how far spheres of each link may then stick out into the
+gap, as a fraction of the gap, on average over both links."""
 
 
 @dataclass(frozen=True)
@@ -203,7 +207,8 @@ class LinkReport:
     parts: int
     spheres: int
     stick_out: float
-    """Largest distance that a sphere sticks out of the parts [m]; includes space inside neighbors."""
+    """Largest distance that a sphere sticks out of the parts [m], also where it sticks out into a neighboring
+    link."""
     covered: bool
     """Whether the spheres provably cover the surface of the parts."""
 
@@ -216,7 +221,7 @@ class Prepared:
     links: tuple[LinkReport, ...]
     pairs: tuple[PairReport, ...]
     sampled: tuple[PairReport, ...]
-    """Pairs of links as sampling alone classifies them."""
+    """Pairs of links as sampling alone classifies them, without the pairs given by the caller."""
     false_collisions: FalseCollisions
 
 
@@ -228,7 +233,7 @@ class _Link:
     surfaces: tuple[Surface, ...]
     parts: PartSettings
     tight: Points = field(default_factory=lambda: np.zeros((0, 3)))
-    """Places where parts should stick out as little as possible."""
+    """Places in the link's frame where parts should stick out less [m]."""
     bounds: Bounds = field(default_factory=lambda: Bounds(0.0))
     solid: Solid | None = None
 
@@ -260,7 +265,7 @@ def prepare(
     progress: Progress = lambda what, step, steps: None,
     allowed: Mapping[frozenset[str], str] | None = None,
 ) -> Prepared:
-    """The robot with parts, spheres and allowed pairs for the collision meshes of its links.
+    """Computes convex parts, covering spheres and allowed pairs from the collision meshes of a robot's links.
 
     Args:
         robot: The robot; its meshes, spheres and allowed collisions are replaced.
@@ -270,7 +275,7 @@ def prepare(
         progress: Called at each step.
         allowed: Pairs of links, with reasons, that are not checked even if sampling finds collisions.
     """
-    # without prismatic joints, since an arm on a long rail is not larger
+    # measured with prismatic joints locked, since a long rail does not make an arm larger
     slides = {j.name: (j.lower + j.upper) / 2 for j in robot.planned_joints if j.kind == "prismatic"}
     size = 0.0 if len(slides) == robot.dof else reach(robot.with_locked(slides))
     settings = settings.for_reach(size)
@@ -305,7 +310,7 @@ def prepare(
         robot = _refined(robot, links, false_collisions, k, settings, seed)
     _, _, robot, false_collisions = min(
         attempts, key=lambda attempt: attempt[:2]
-    )  # refinement can add false collisions
+    )  # the best attempt: refinement can also add false collisions
     closer = with_finer_parts(robot, links, false_collisions, settings, seed)
     if closer is not None:
         remeasured = measure_false_collisions(closer, surfaces, settings.samples, np.random.default_rng(seed))
@@ -379,9 +384,9 @@ def with_finer_parts(
     settings: PreparationSettings,
     seed: int,
 ) -> Robot | None:
-    """The robot with finer parts for pairs of links whose parts collide falsely; None if there are none.
+    """The robot with finer parts for pairs of links with false collisions of parts; None if there are none.
 
-    Starts and goals often are such contacts, of an arm at rest beside its own body.
+    Starts and goals often have such false collisions, when an arm rests close to its own body.
     """
     places: dict[str, list[ndarray]] = {}
     for pair in false_collisions.pairs:
@@ -400,8 +405,8 @@ def with_finer_parts(
 def _with_tables(
     robot: Robot, pairs: set[tuple[str, str]], changed: set[str], settings: PreparationSettings
 ) -> Robot:
-    """The robot with new tables over the joints between the given pairs of links, and of links whose
-    parts have changed."""
+    """The robot with new tables over the joints between the links of the given pairs. Existing tables of
+    links in `changed`, with changed parts, are computed again."""
     of_parts = Links(robot)
     pairs = pairs | {table.links for table in robot.tables if changed & {*table.links}}
     tables = {table.links: table for table in robot.tables}
@@ -411,25 +416,26 @@ def _with_tables(
 
 
 def _beyond_spheres(robot: Robot, pair: PairFalseCollisions, settings: PreparationSettings) -> bool:
-    """Whether even the finest spheres of a pair collide falsely too often, and a table over one or two joints
-    can help."""
+    """Whether even the finest spheres of a pair would collide falsely too often, and one or two joints are
+    between the links, so that a table can be used instead."""
     narrow_fraction = (pair.gaps < 2 * settings.finest).mean() if len(pair.gaps) else 0.0
     hopeless = narrow_fraction * (pair.by_spheres - pair.by_parts) > settings.max_false_collisions / 3
     return bool(hopeless) and len(robot.joints_between(*pair.links)) in (1, 2)
 
 
 def _shared(pair: PairFalseCollisions, link: str) -> Spheres:
-    """Places on one of two links, and the part of the gap that its spheres may fill [m].
+    """Places x, y, z on one of two links, and twice the part of the gap that the link's spheres may fill [m].
 
-    About A / t spheres that stick out by t cover an area A. The two links need the fewest spheres together if
-    they share the gap in proportion to the square roots of their areas.
+    Covering an area A takes about A / t spheres that stick out by t. Together the two links need the fewest
+    spheres if they share the gap in proportion to the square roots of their areas.
     """
     areas = np.sqrt([len(pair.places[link]), *(len(places) for places in pair.places.values())])
     return pair.places[link] * (1, 1, 1, 2 * areas[0] / max(areas[1:].sum(), 1))
 
 
 def _worst(false_collisions: FalseCollisions, allowed: float) -> list[PairFalseCollisions]:
-    """The fewest pairs without which the others are well below the allowed fraction of false collisions."""
+    """The pairs with the most false collisions, as few as possible: all other pairs together must be at most
+    UNREFINED_FRACTION of the allowed fraction."""
     remaining = sum(pair.by_spheres for pair in false_collisions.pairs)
     worst_pairs = []
     for pair in false_collisions.pairs:
@@ -441,11 +447,11 @@ def _worst(false_collisions: FalseCollisions, allowed: float) -> list[PairFalseC
 
 
 def _floor(robot: Robot, link: str) -> tuple[ndarray, float] | None:
-    """Upward normal and offset of the floor in the link's frame, for a link that moves but never tilts or
-    rises.
+    """Upward normal and offset [m] of the floor in the link's frame, for a link that moves but never tilts or
+    changes its height; None for other links.
 
-    The floor is the plane z = 0 of the base, where the robot may stand on a table, or lower if the link's own
-    meshes reach lower. None for other links.
+    The floor is the plane z = 0 of the base, since the robot may stand on a table. It is lower if the link's
+    own meshes reach lower.
     """
     if robot.link_frame(link) == 0:
         return None  # base links are never checked against the scene
@@ -459,10 +465,10 @@ def _floor(robot: Robot, link: str) -> tuple[ndarray, float] | None:
     return up, min(-height, lowest - FLOOR_TOLERANCE)
 
 
-# A warning is given below this fraction of free configurations, and above this fraction of false
-# collisions.
 MIN_FREE = 0.2
+"""Fraction of free configurations below which a warning is given."""
 MAX_FALSE_COLLISIONS = 0.08
+"""Fraction of free configurations with false collisions above which a warning is given."""
 MAX_PROPOSED = 3
 """Largest number of pairs that the error message proposes for a robot that always collides with itself
 although no single pair always collides."""
@@ -470,7 +476,7 @@ ASSUMED_SAFE = {
     LIMITS: "up to a limit of one joint, and the URDF's limits allow that",
     POSE: "also in a pose that the SRDF names",
 }
-"""Reasons for allowing a pair that a person should check, each with what the reason rests on."""
+"""Reasons for allowing a pair that a person should check, each with an explanation for the warning."""
 BYTES_PER_UNIT = 1 if sys.platform == "darwin" else 1024
 """Bytes per unit of `ru_maxrss`."""
 
@@ -512,7 +518,8 @@ class AddReport:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Problems that will limit planning, and allowed pairs of links whose meshes collide."""
+        """Problems that will limit planning, and allowed pairs of links with colliding meshes that a person
+        should check."""
         warnings = []
         rates = self.false_collisions
         worst_text = "; ".join(f"{' against '.join(p.links)} {p.by_spheres:.1%}" for p in rates.pairs[:3])
@@ -558,18 +565,15 @@ def add_robot(
     """Read a URDF, prepare the robot (see `prepare`) and write the robot folder.
 
     Args:
-        urdf: URDF or xacro file, or MuJoCo model. Compiling xacro runs the code in its expressions.
-        name: Name of the robot; by default the URDF's.
-        base: See `UrdfTree.robot`, also for `tip`, `locked` and `group`.
-        limits: Joint limits, a file in the form of MoveIt's joint_limits.yaml.
-        out: Folder to write; by default `user_robots() / name`.
-        license: License of the geometry, kept in the folder.
-        settings: Settings of the preparation.
-        seed: The same input and seed give the same robot.
-        progress: Called at each step.
-        srdf: Source of groups, poses and passive joints; by default the SRDF found beside the URDF. Pairs of
-            links that it allows are not checked, but only if it is given here. All pairs found by sampling
-            are compared with the SRDF's.
+        urdf: URDF or xacro file, or MuJoCo model. Compiling xacro runs the code in its expressions. name:
+        Name of the robot; by default the URDF's. base: See `UrdfTree.robot`, also for `tip`, `locked` and
+        `group`. limits: Joint limits, a file in the form of MoveIt's joint_limits.yaml. out: Folder to write;
+        by default `user_robots() / name`. license: License of the geometry, kept in the folder. settings:
+        Settings of the preparation. seed: The same input and seed give the same robot. progress: Called at
+        each step. srdf: Source of groups, poses and passive joints; by default the SRDF found beside the
+        URDF. Only an SRDF that
+            is given here also allows pairs of links, which are then not checked. In both cases, the report
+            lists where sampling and the SRDF differ.
         allow: Further pairs of links that are not checked.
         packages: Folders of ROS packages by name.
 

@@ -1,10 +1,10 @@
 """Distances and contacts between the links of a robot at sampled joint values, and tables for pairs of links
 that pass so close to each other that covering spheres overlap, such as a flange in a fork.
 
-The relative pose of two links depends only on the joints between them. If these are one or two joints, a
-table over their values tells where the convex parts of the links are apart. A cell counts as free if the
-distance of the links at its center exceeds the motion of any point of one link, seen from the other, within
-the cell. Other cells are split, down to a fraction of a millimeter of motion.
+The relative pose of two links depends only on the joints between them. For one or two such joints, a table
+over their values tells where the convex parts of the links are apart. A cell of the table counts as free if
+the links' distance at its center exceeds the largest relative motion of the links within the cell. Other
+cells are split, down to a fraction of a millimeter of motion.
 """
 
 # Coal's Python module has no type information.
@@ -30,14 +30,17 @@ from robotdiffuse.robots.robot import LinkPairTable, Robot
 BINS = 24
 """Number of bins of a joint's range, to test whether the joint alone determines when two links collide."""
 MAX_STOPPED_RANGE = 5.2
-"""A joint with a narrower range has mechanical stops [rad]; limits of wider ranges may be arbitrary."""
+"""A joint with a range of at most this is taken to have mechanical stops at its limits [rad]; limits of wider
+ranges may be arbitrary."""
 MAX_UNEXPLAINED = 0.25
-"""A pair of links is allowed for the reason `limits` (see `self_collisions`) if the joint's value leaves at
-most this fraction of the variance of the indicator "the links collide" unexplained."""
+"""A pair of links is allowed for the reason `limits` (see `self_collisions`) only if the value of one joint
+explains when the links collide: less than this fraction of the variance of "the links collide" (0 or 1) stays
+unexplained."""
 BALL_MARGIN = 1e-9
 """Margin of bounding and inscribed balls of meshes [m], larger than rounding errors."""
 NEAR_DISTANCE = 0.1
-"""Fewer searches for a collision are made for pairs of links that stay further apart than this [m]."""
+"""For pairs of links that are farther apart than this in all samples, fewer searches for a collision are made
+[m]."""
 
 
 class Links:
@@ -71,27 +74,30 @@ class Links:
         return rng.uniform(self.lower, self.upper, (count, len(self.joints)))
 
     def named(self, pose: dict[str, float]) -> Values:
-        """Values of all joints in a named pose; joints that it omits keep their locked value, or else
-        zero."""
+        """Values of all joints in a pose given by joint names. Joints that `pose` omits have their locked
+        value, else zero clipped to their limits."""
         rest = self.robot.locked | pose
         return np.array([rest.get(j.name, min(max(0.0, j.lower), j.upper)) for j in self.joints])
 
     def stop_explains(self, joint: Joint, q: Configurations, colliding: Mask) -> bool:
-        """Whether the value of a joint alone determines if two links collide, and they collide from some
-        value on up to one of the joint's stops."""
+        """Whether the value of one joint alone determines if two links collide, and the links collide at one
+        of the joint's stops. `colliding` tells for each row of q whether they collide."""
         if joint not in self.joints or joint.upper - joint.lower > MAX_STOPPED_RANGE:
             return False
-        share = (q[:, self.joints.index(joint)] - joint.lower) / (joint.upper - joint.lower)
-        place = np.minimum((share * BINS).astype(int), BINS - 1)
-        count = np.maximum(np.bincount(place, minlength=BINS), 1)
-        often = np.bincount(place, colliding, minlength=BINS) / count
-        unexplained = (often * (1 - often) * count).sum() / len(q)
+        fraction = (q[:, self.joints.index(joint)] - joint.lower) / (joint.upper - joint.lower)
+        bin_index = np.minimum((fraction * BINS).astype(int), BINS - 1)
+        count = np.maximum(np.bincount(bin_index, minlength=BINS), 1)
+        colliding_fraction = np.bincount(bin_index, colliding, minlength=BINS) / count
+        unexplained = (colliding_fraction * (1 - colliding_fraction) * count).sum() / len(q)
         variance = colliding.mean() * (1 - colliding.mean())
-        return bool(max(often[0], often[-1]) > 0.99 and unexplained < MAX_UNEXPLAINED * variance)
+        return bool(
+            max(colliding_fraction[0], colliding_fraction[-1]) > 0.99
+            and unexplained < MAX_UNEXPLAINED * variance
+        )
 
     def poses(self, q: Configurations, wanted: frozenset[str] | None = None) -> dict[str, Poses]:
-        """T_base_link by link. With `wanted` links, only their poses relative to each other, in the frame of
-        their last common ancestor."""
+        """T_base_link [n, 4, 4] by link. With `wanted` links, only the poses of these links and of those on
+        the way to them, in the frame of their last common ancestor."""
         start, joints = (self.robot.base, self.robot.joints) if wanted is None else self._between(wanted)
         poses = {start: np.broadcast_to(np.eye(4), (len(q), 4, 4))}
         values = with_mimics(self.robot.joints, {joint.name: q[:, i] for i, joint in enumerate(self.joints)})
@@ -103,7 +109,7 @@ class Links:
         return poses
 
     def _between(self, links: frozenset[str]) -> tuple[str, list[Joint]]:
-        """The last common ancestor of links, and the joints from there to them."""
+        """The last common ancestor of links, and the joints from this ancestor to the links."""
         if links not in self._joints_between:
             chains = [self.robot.joints_above(link) for link in links]
             common = [first for first, *partners in zip(*chains, strict=False) if {*partners} <= {first}]
@@ -113,13 +119,14 @@ class Links:
         return self._joints_between[links]
 
     def sphere_distance(self, poses: dict[str, ndarray], a: str, b: str) -> Values:
-        """Signed distances between the covering spheres of two links [m], a lower bound of the distances of
-        their meshes."""
+        """Signed distances [n] between the covering spheres of two links [m]: lower bounds of the distances
+        of the links' meshes."""
         first, second = (for_kernels(self.robot.spheres[link]) for link in (a, b))
         return -deepest_touches(poses[a], poses[b], first, second, NEAR_DISTANCE, -np.inf)[0]
 
     def _placed(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> tuple[Any, Any, ndarray]:
-        """Poses of two links in configuration i, and distances between the balls around their parts."""
+        """Coal poses of two links in configuration i, and the distances [a, b] between the balls around their
+        parts [m]."""
         ball_gaps = ball_distances(poses[a][i], poses[b][i], self.balls[a], self.balls[b])
         return coal_pose(poses[a][i]), coal_pose(poses[b][i]), ball_gaps
 
@@ -133,8 +140,8 @@ class Links:
         return False
 
     def contacts(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> Points:
-        """Points where convex parts of two links overlap in configuration i, one for each pair of parts
-        [m]."""
+        """Points where convex parts of two links overlap in configuration i, one for each overlapping pair of
+        parts [m], in the frame of `poses`."""
         T_a, T_b, ball_gaps = self._placed(poses, a, b, i)
         contact_points = []
         for m, n in zip(*np.nonzero(ball_gaps <= 0), strict=True):
@@ -169,8 +176,9 @@ class Links:
         parts: Int[ndarray, "2 n"],
         limit: float,
     ) -> Values:
-        """Distances between parts of two links [m]: parts[:, k] in configuration rows[k]. Distances above
-        `limit` are replaced by lower bounds that are above it too."""
+        """Distances [n] between convex parts of two links [m]: entry k is for part parts[0, k] of link a and
+        part parts[1, k] of link b in configuration rows[k]. A distance above `limit` may be replaced by a
+        lower bound that is also above `limit`."""
         balls = [self.balls[link][parts[k]] for k, link in enumerate((a, b))]
         middles = [
             np.einsum("nij,nj->ni", poses[link][rows, :3, :3], ball[:, :3]) + poses[link][rows, :3, 3]
@@ -200,10 +208,10 @@ ROUNDING = 1e-5
 
 
 def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float) -> LinkPairTable:
-    """Table over the one or two joints between two links: where their convex parts are apart.
+    """Table over the one or two joints between two links that tells where their convex parts are apart.
 
-    Cells in which the links move by less than `finest` [m] relative to each other are not split; they count
-    as colliding unless proven free.
+    Cells are not split further if the links move by less than `finest` [m] relative to each other within the
+    cell. They count as colliding unless they are proven free.
     """
     joints = robot.joints_between(*pair)
     far = max(pair, key=robot.link_frame)
@@ -215,12 +223,13 @@ def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float
     columns = [[j.name for j in links.joints].index(robot.joint_names[joint]) for joint in joints]
     nominal = links.named({})
     edge = (upper - lower) / CELLS
+    # boxes of joint values, in units of the table's cells: all have the same `size`, which is halved along
+    # one joint per iteration; `low` is their lower corner, with a row per pair of parts that may touch in the
+    # box
     separated = np.ones((CELLS,) * len(joints), dtype=bool)
     size = np.full(len(joints), float(CELLS))
     parts = np.indices([len(robot.meshes[link]) for link in pair]).reshape(2, -1)
-    low = np.zeros(
-        (parts.shape[1], len(joints))
-    )  # one row for each pair of parts and cell in which the parts may touch
+    low = np.zeros((parts.shape[1], len(joints)))
     while len(low):
         cells, cell_of_row = np.unique(low, axis=0, return_inverse=True)
         q = np.tile(nominal, (len(cells), 1))
@@ -248,5 +257,5 @@ def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float
 
 
 def _cells(low: Float[ndarray, "n joints"], size: Float[ndarray, "joints"]) -> tuple[ndarray, ndarray]:
-    """Index of the first cell along each joint that boxes overlap, and one past the last."""
+    """Along each joint, the index of the first cell that boxes overlap, and one past the last."""
     return np.floor(low).astype(int), np.ceil(low + size).astype(int)

@@ -1,5 +1,5 @@
 """Finds pairs of links that need no collision check against each other, and measures false collisions:
-free configurations in which covering spheres or convex parts of two links collide.
+configurations in which covering spheres or convex parts of two links collide although the true meshes do not.
 """
 
 # Coal's Python module has no type information.
@@ -24,6 +24,7 @@ from robotdiffuse.robots.fitting.sphere_fitting_kernel import deepest_touches
 from robotdiffuse.robots.kinematic_tree import MOVING_KINDS, Joint
 from robotdiffuse.robots.robot import Robot, moving_pairs
 
+# reasons of `PairReport`, explained in `find_allowed_collisions`
 ADJACENT = "adjacent"
 ALWAYS = "always"
 NEVER = "never"
@@ -31,18 +32,19 @@ CHECKED = "checked"
 DEFAULT = "default"
 POSE = "pose"
 LIMITS = "limits"
-# Reasons given by the user: the pair was named when the robot was added, or an SRDF allows it.
+# reasons given by the user: the pair was named when the robot was added, or an SRDF allows it
 NAMED = "named"
 BY_SRDF = "srdf"
 ADJACENT_STRIDE = 10
-"""Only every n-th sample is tested for adjacent links, which are allowed to touch in any case."""
+"""Adjacent links, which are allowed to touch in any case, are tested in only one of this number of
+samples."""
 MIN_LIMITS_COLLIDING = 0.2
-"""Smallest fraction of colliding configurations for the reason `limits`."""
+"""Smallest fraction of colliding samples for the reason `limits`."""
 MAX_HELD_JOINTS = 1
-"""Largest number of held joints between an arm's link and another link that belongs to the arm, such as the
-bellows of a lift. Links after more held joints belong to a head or another arm."""
+"""A link belongs to the arm if at most this many held joints connect it to the arm, such as the bellows of a
+lift. Links after more held joints belong to a head or another arm."""
 MAX_POSE_OVERLAP = 0.03
-"""If links overlap in a named pose by less than this, their meshes count as coarse there [m]."""
+"""If links overlap in a named pose by less than this [m], the pair is allowed for the reason `pose`."""
 
 
 ALWAYS_FRACTION = 0.95
@@ -57,10 +59,11 @@ class SamplingSettings(Settings, name="sampling"):
     samples: Annotated[int, Bound(least=100.0)] = 20_000
     """Number of configurations, uniform within the limits of all joints, including gripper joints."""
     descents: Natural = 20
-    """For a pair without collisions: number of closest samples from which a descent searches for one."""
+    """For a pair without collisions in the samples: number of closest samples from which a descent searches
+    for a collision."""
     assumptions: bool = True
-    """Whether links that are adjacent, or that collide at rest, in a named pose or up to a stop of a joint,
-    are assumed safe; False for MuJoCo models, which say themselves what may touch."""
+    """Whether pairs may be allowed for the reasons `adjacent`, `default`, `pose` and `limits`. False for
+    MuJoCo models, which define themselves which links may touch."""
 
 
 @dataclass(frozen=True)
@@ -77,24 +80,28 @@ class PairReport:
 def find_allowed_collisions(
     robot: Robot, settings: SamplingSettings, rng: np.random.Generator
 ) -> tuple[PairReport, ...]:
-    """Classify each pair of links with meshes on different frames; the robot needs covering spheres.
+    """Classify each pair of links that have meshes and are on different frames; the robot needs covering
+    spheres.
 
-    These pairs are allowed, the first four as in MoveIt's Setup Assistant:
+    Pairs are allowed for these reasons, the first four as in MoveIt's Setup Assistant:
 
-    - adjacent: a joint connects the links; links without geometry between them are skipped.
-    - always: the links collide in nearly all samples.
-    - never: the links collide in no sample, and no descent finds a collision.
-    - default: the links collide in the default pose, with the joints between them at zero. If the limits
-      include that pose, the manufacturer considers it safe, so the meshes are too coarse there. Both links
+    - adjacent: a joint connects the links; links without geometry between them are skipped. - always: the
+    links collide in nearly all samples. - never: the links collide in no sample, and no descent finds a
+    collision. - default: the links collide in the default pose, with the joints between them at zero. If the
+    limits include this
+      pose, the manufacturer considers it safe, so the meshes are taken to be too coarse there. Both links
       must belong to the arm, since the limits do not account for a tool on the last link or for another arm.
-      A link after one held joint belongs to the arm too, if the pair also collides at that joint's held
-      value: planning cannot move it away.
-    - limits: the links collide in at least a fifth of the samples, up to a stop of one joint between them,
-      which alone determines where. Joints have stops where the links on both sides meet.
+      A link after one held joint also counts as part of the arm. The pair must then also collide at the
+      joint's held value, which planning does not change.
+    - limits: the links collide in at least a fifth of the samples. The value of one joint between them
+    determines when,
+      and they collide at a stop of this joint: joints often have their stops where the links on both sides
+      meet.
     - pose: the links overlap slightly in a named pose of the SRDF, such as a tucked one.
 
-    Coal tests the meshes unless the covering spheres show that they are apart. For pairs without collisions,
-    random descents from the closest samples search for one; if they find one, the pair is checked.
+    Coal tests the meshes unless the covering spheres show that they are apart. For pairs without collisions
+    in the samples, random descents from the closest samples search for a collision; if they find one, the
+    pair is checked.
     """
     links = Links(robot)
     default = np.clip(np.zeros((1, len(links.joints))), links.lower, links.upper)
@@ -164,14 +171,15 @@ def _descend(links: "Links", a: str, b: str, starts: Float[ndarray, "n d"], rng:
 
 
 def _own_between(robot: Robot, a: str, b: str, max_held: int = 0) -> list[Joint] | None:
-    """The movable joints between two links that belong to the arm; None if one of them does not.
+    """The movable joints between two links of the arm; None if one of the links does not belong to the arm.
 
-    A link belongs to the arm if at most `max_held` held joints connect it to a moving link, and if it is not
-    a tool.
+    A link belongs to the arm if at most `max_held` held joints connect it to a link that planned joints move,
+    and if it is not a tool.
     """
 
     def own(link: str) -> bool:
-        """Whether a link belongs to the arm; true for what its links carry, except for the last one."""
+        """Whether a link belongs to the arm. Links fixed to a link of the arm belong to it, except those
+        fixed to the last link, which are tools."""
         planned = [joint for joint in above[link] if joint in robot.planned_joints][:1]
         carried = above[link][: above[link].index(planned[0])] if planned else above[link]
         moving = [joint for joint in carried if joint.kind in MOVING_KINDS]
@@ -197,13 +205,14 @@ def _adjacent(robot: Robot) -> set[frozenset[str]]:
 
 
 PLACE_SPACING = 0.01
-"""Edge of the cubes of which each keeps one place where spheres touch [m]."""
+"""Edge of cubes [m]: of all places where spheres touch, one per cube is kept."""
 MAX_SPHERE_CASES = 2000
 """Largest number of false collisions of spheres per pair of links that are examined."""
 MAX_PART_CASES = 60
 """Largest number of false collisions of convex parts per pair of links that are examined."""
 NARROWEST_FRACTION = 0.003
-"""Fraction of the configurations, those with the narrowest gaps, that a pair may keep as false collisions."""
+"""The false collisions with the narrowest gaps, up to this fraction of the configurations, are not
+refined."""
 
 
 @dataclass(frozen=True)
@@ -216,17 +225,17 @@ class PairFalseCollisions:
     by_parts: float
     """Fraction of the free configurations in which convex parts of the two links collide."""
     by_spheres: float
-    """Fraction of the free configurations in which spheres of the two links collide; includes configurations
+    """Fraction of the free configurations in which spheres of the two links collide, including configurations
     in which the convex parts collide too."""
     gaps: Values
-    """Distances between the convex parts in some of the configurations in which only the spheres collide
-    [m]."""
+    """Distances between the convex parts in up to MAX_SPHERE_CASES configurations in which only the spheres
+    collide [m]."""
     places: dict[str, Spheres]
-    """By link and in its frame: rows x y z where spheres touch although the parts are apart, and the smallest
-    distance of the parts there [m]."""
+    """By link and in the link's frame: rows of a point x, y, z where spheres touch although the parts are
+    apart, and the smallest distance of the parts there [m]."""
     coarse: dict[str, Points]
-    """By link and in its frame: places where parts overlap although the true meshes are apart [m]. Each place
-    is listed for the link whose parts stick out further there."""
+    """By link and in the link's frame: places where parts overlap although the true meshes are apart [m].
+    Each place is listed only for the link with the parts that stick out further there."""
 
 
 @dataclass(frozen=True)
@@ -249,7 +258,8 @@ def measure_false_collisions(
     """Measure false collisions over `samples` random configurations.
 
     Planned joints are uniform within their limits; locked joints keep their values. `surfaces` are the true
-    meshes by link. They are tested only where convex parts collide, and the parts only where spheres do.
+    meshes by link. Convex parts are tested only where spheres collide, and the true meshes only where convex
+    parts collide.
     """
     links = Links(robot)
     q = links.random(samples, rng)
@@ -278,7 +288,7 @@ def measure_false_collisions(
             if parts[i]:
                 places = coal_pose(poses[a][i]), coal_pose(poses[b][i])
                 result.clear()
-                meshes[i] = any(  # one inside the other is not detected
+                meshes[i] = any(  # surfaces: a mesh inside another one is not detected
                     coal.collide(first_mesh, places[0], second_mesh, places[1], request, result)
                     for first_mesh in trees[a]
                     for second_mesh in trees[b]
@@ -296,8 +306,8 @@ def measure_false_collisions(
     for (a, b), (spheres, parts, meshes, middle) in zip(robot.checked_pairs(), collisions, strict=True):
         false_spheres = np.flatnonzero(spheres & ~parts & free)[:MAX_SPHERE_CASES]
         gaps = np.array([links.mesh_distance(poses, a, b, int(i)) for i in false_spheres])
-        every = gaps
-        # tolerate the narrowest few
+        all_gaps = gaps
+        # leave out the cases with the narrowest gaps, see NARROWEST_FRACTION
         far_enough = gaps >= np.sort(gaps)[
             : int(samples * NARROWEST_FRACTION * len(false_spheres) / max(spheres.sum(), 1)) + 1
         ].max(initial=0.0)
@@ -311,7 +321,9 @@ def measure_false_collisions(
         false_parts = np.flatnonzero(parts & ~meshes & free)[:MAX_PART_CASES]
         sticking_out = _sticking_out(links, trees, poses, (a, b), false_parts)
         shares = share(parts), share(spheres)
-        pairs.append(PairFalseCollisions((a, b), float(meshes.mean()), *shares, every, places, sticking_out))
+        pairs.append(
+            PairFalseCollisions((a, b), float(meshes.mean()), *shares, all_gaps, places, sticking_out)
+        )
     spheres, parts, _ = (np.any(rows, axis=0) for rows in list(zip(*collisions, strict=True))[:3])
     worst_first = sorted(pairs, key=lambda pair: -pair.by_spheres)
     return FalseCollisions(float(free.mean()), share(parts), share(spheres), tuple(worst_first))
@@ -324,8 +336,8 @@ def _sticking_out(
     pair: tuple[str, str],
     rows: Int[ndarray, "n"],
 ) -> dict[str, Points]:
-    """Places where parts of two links overlap in configurations `rows`, each listed for the link whose true
-    meshes are further from it, in that link's frame."""
+    """Places where parts of two links overlap in the configurations `rows`, by link and in the link's frame
+    [m]. Each place is listed for the link with the true meshes that are further away from it."""
     places_by_link: dict[str, list[ndarray]] = {link: [] for link in pair}
     request = coal.DistanceRequest()
     point = coal.Sphere(1e-6)
@@ -347,7 +359,8 @@ def _sticking_out(
 
 
 def _one_per_cube(points: Points, gaps: Values) -> Spheres:
-    """The place with the narrowest gap of each cube."""
+    """The place with the narrowest gap in each cube of edge PLACE_SPACING, as rows of the point and its gap
+    [m]."""
     order = np.argsort(gaps)
     rows = np.column_stack([points, gaps])[order]
     return rows[np.unique(np.floor(rows[:, :3] / PLACE_SPACING), axis=0, return_index=True)[1]]

@@ -1,18 +1,18 @@
 """Fits covering spheres to the convex collision meshes of a link.
 
-The surface is cut into small triangles, the cells. A sphere is convex, so it covers a triangle if and only
-if it contains the three corners. If every cell lies within one sphere, the spheres provably cover the
+The surface is cut into small triangles, called cells. A sphere is convex, so it covers a triangle if and only
+if it contains the three corners. If every cell is inside one sphere, the spheres provably cover the whole
 surface, not just samples of it.
 
-A grid holds the largest allowed radius of a sphere by its center (`SphereSizeGrid`). For the cells assigned
+A grid stores the largest allowed radius of a sphere at each center (`SphereSizeGrid`). For the cells assigned
 to a sphere, the best center p minimizes the excess radius max |corner - p| - max_radius(p). Like Lloyd's
-algorithm, the fit alternates between assigning each cell to the sphere that covers it with the least excess
-and moving each sphere to its best center. It starts from a greedy set cover and drops spheres as long as
-none gets too large.
+algorithm, the fit alternates between two steps: assigning each cell to the sphere that covers it with the
+least excess, and moving each sphere to its best center. It starts from a greedy set cover, and then drops
+spheres as long as the others stay within their allowed radii.
 
-A sphere may contain points whose distance from the link is at most the tolerance, which may be smaller near
-some places, and points that are inside a neighboring link at any angle of the joint between them. It may
-not contain points below the plane that the robot stands on.
+A sphere may contain points up to a tolerance away from the link; the tolerance may be smaller near some
+places. It may also contain points that are inside a neighboring link at all angles of the joint between both.
+It may not contain points below the plane that the robot stands on.
 """
 
 from collections.abc import Callable
@@ -48,17 +48,18 @@ MIN_SPACING = 0.0015
 """Smallest spacing of a grid [m]."""
 MIN_PADDING = 0.03
 """Smallest padding of the grid around the link [m]: spheres may reach this far into a neighbor."""
-# A smaller tolerance applies within this distance of its place [m]; beyond, it grows by this much per
-# meter.
 TIGHT_RADIUS = 0.015
+"""The smaller tolerance of a tight place applies within this distance from it [m]."""
 TIGHT_SLOPE = 0.3
+"""Farther away, the tolerance grows by this much per meter [m/m]."""
 
 MIN_DEPTH = 5e-4
 """Lower bound on the inscribed radius of a link, for thin plates [m]."""
 FLOOR_TOLERANCE = 0.0015
 """Spheres may always stick out this far towards the floor [m], since a link may lie on it."""
 TOLERANCE_LEVEL = np.log(1.3)
-"""Logarithm of the factor within which tolerances are grouped; the lowest of a group applies to all of it."""
+"""Tight places are grouped by tolerance for speed: within a group, tolerances differ by at most this factor
+(as a logarithm), and the lowest one applies to the whole group."""
 
 Planes = tuple[Points, Values, ndarray]
 
@@ -70,7 +71,7 @@ class Bounds:
     tolerance: float
     """How far a sphere may stick out of the link [m]."""
     hidden: Callable[[Points], Mask] | None = None
-    """Whether points are inside a neighbor, so that spheres may contain them."""
+    """Tells which points are inside a neighboring link, so that spheres may contain them."""
     tight: Spheres = field(default_factory=lambda: np.zeros((0, 4)))
     """Tight places: rows of x, y, z and how far spheres may stick out there [m]. Near these places, `hidden`
     does not apply."""
@@ -91,18 +92,18 @@ class Bounds:
         level = np.ceil(np.log(self.tight[:, 3]) / TOLERANCE_LEVEL)
         for group_level in np.unique(level):
             places = self.tight[level == group_level]
-            far = KDTree(places[:, :3]).query(
+            distances = KDTree(places[:, :3]).query(
                 points, distance_upper_bound=TIGHT_RADIUS + self.tolerance / TIGHT_SLOPE
             )[0]
-            tight_bound = places[:, 3].min() + TIGHT_SLOPE * np.maximum(far - TIGHT_RADIUS, 0.0)
+            tight_bound = places[:, 3].min() + TIGHT_SLOPE * np.maximum(distances - TIGHT_RADIUS, 0.0)
             np.minimum(allowed, tight_bound, out=allowed)
         return allowed
 
 
 @dataclass(frozen=True, eq=False)
 class SphereSizeGrid:
-    """Largest radius of a sphere by its center [m], interpolated on a grid; negative where no sphere may
-    be."""
+    """Largest allowed radius of a sphere at each center [m], interpolated on a grid; negative where no sphere
+    may be centered."""
 
     grid: Float[ndarray, "nx ny nz"]
     origin: Vector
@@ -140,7 +141,8 @@ class Solid:
         planes = stacked_planes(meshes)
         depth = plane_depths(_grid_points(shape, low, spacing), *planes, -np.inf).reshape(shape)
         inside = depth > 0
-        # planes between overlapping meshes are not surface: measure from the outer surface instead
+        # face planes inside other meshes are not part of the surface: measure the depth from the outer
+        # surface instead
         deep = depth if len(meshes) == 1 else _distance_inside(inside, spacing, np.maximum(-depth, 0.0))
         return Solid(meshes, np.where(inside, -deep, -depth), low, spacing)
 
@@ -151,21 +153,23 @@ class Solid:
 
     @property
     def depth(self) -> float:
-        """Approximate radius of the largest inscribed sphere [m]."""
+        """Approximate radius of the largest inscribed sphere, at least MIN_DEPTH [m]."""
         return max(float(-self.distance.min()), MIN_DEPTH)
 
     @property
     def inside(self) -> Points:
-        """Grid points inside the solid; the nearest ones if the solid is thinner than the spacing."""
+        """Grid points inside the solid. If the solid is so thin that there are none, the grid points nearest
+        to it."""
         distance = self.distance.ravel()
         return self.points[distance < max(0.0, float(distance.min()) + self.spacing / 2)]
 
     def inscribed_sizes(self) -> SphereSizeGrid:
-        """Largest radii of spheres that do not stick out at all."""
+        """Largest radii of spheres that do not stick out of the solid at all."""
         return SphereSizeGrid(-self.distance, self.origin, self.spacing)
 
     def sphere_sizes(self, bounds: Bounds) -> SphereSizeGrid:
-        """Largest radii of spheres within bounds."""
+        """Largest radii of spheres that respect the bounds."""
+        # `beyond`: how far a grid point is outside the region that spheres may fill
         points = self.points
         distance = self.distance.ravel()
         allowed = np.full(len(points), bounds.tolerance)
@@ -188,8 +192,11 @@ class Solid:
 def _distance_inside(
     mask: Bool[ndarray, "nx ny nz"], spacing: float, value: Float[ndarray, "nx ny nz"]
 ) -> Float[ndarray, "nx ny nz"]:
-    """Distance of the points of a mask from its surface [m]: that to the nearest point outside the mask,
-    minus `value` there, the distance of that point from the surface."""
+    """Distance of the points in a mask from the surface of the masked region [m]; 0 outside the mask.
+
+    It is the distance to the nearest point outside the mask, minus the distance of this point from the
+    surface, which `value` gives.
+    """
     if not mask.any() or mask.all():
         return np.where(mask, spacing * sum(mask.shape), 0.0)
     transform: Any = ndimage.distance_transform_edt(mask, return_indices=True)
@@ -206,13 +213,13 @@ def stacked_planes(meshes: tuple[ConvexMesh, ...]) -> Planes:
 
 
 def is_inside(points: Points, planes: Planes, depth: float) -> Mask:
-    """Which points are deeper than `depth` in a part."""
+    """Which points are deeper than `depth` [m] in a part; a negative depth includes points near a part."""
     return plane_depths(points, *planes, depth) > depth
 
 
 def depths(meshes: tuple[ConvexMesh, ...], points: Points) -> Values:
-    """Distance from points to the nearest face plane of the mesh in which they are deepest [m]; negative
-    outside."""
+    """Distance from points to the nearest face plane of the mesh in which they are deepest [m]; negative for
+    points outside all meshes."""
     return plane_depths(np.ascontiguousarray(points), *stacked_planes(meshes), -np.inf)
 
 
@@ -223,21 +230,21 @@ def _grid_points(shape: tuple[int, ...] | ndarray, origin: Vector, spacing: floa
 
 
 MARGIN = 1e-5
-"""Margin added to the radii [m]: files and single-precision kernels round them."""
+"""Margin added to the radii [m], since files and single-precision kernels round them."""
 BURIED_DEPTH = 1e-9
 """Points deeper than this in another part are not on the surface of the union [m]."""
 EXCESS_TOLERANCE = 0.1
 """Largest excess radius that is accepted, as a fraction of the grid spacing."""
-# Cell sizes for choosing spheres and for the final fit: cells per radius of the disc that a sphere covers,
-# and the largest number of cells.
+# cells for choosing spheres, and for the final fit: how many edges of a cell fit into the radius of the disc
+# that a sphere covers, and the largest number of cells
 COARSE_CELLS = (5.0, 60_000)
 FINE_CELLS = (8.0, 150_000)
 MAX_CROWD = 10
-"""Cells are not computed for a surface that has room for more than this many times the allowed number of
-cells: they would not fit into memory."""
+"""If the surface would have more than this many times the allowed number of cells, larger cells are computed
+at once, since the small ones may not fit into memory."""
 SMALLEST_TRIANGLE = 2e-6
-"""A piece of the surface that no single sphere contains is split down to this size [m]; then it counts as
-uncovered."""
+"""A triangle of the surface that no single sphere contains is split down to this size [m]; a smaller one
+counts as uncovered."""
 ADDED_SPACING = 0.02
 """Smallest distance between spheres that are added in one round [m]."""
 
@@ -249,20 +256,19 @@ class SphereSettings(Settings, name="sphere tolerances"):
     first_half: float = 0.015
     """How far a sphere may stick out of a link that at most half of the joints (rounded up) move [m]."""
     second_half: float = 0.009
-    """How far a sphere may stick out of a link that more than half of the joints move [m]: these links work
-    closer to obstacles."""
+    """How far a sphere may stick out of a link that more than half of the joints move [m]. It is smaller
+    because these links work closer to obstacles."""
     fixed: float = 0.03
-    """How far a sphere may stick out of a link that no planned joint moves [m]: it can only collide with the
-    arm itself."""
+    """How far a sphere may stick out of a link that no planned joint moves [m]. It is larger because such a
+    link is only checked against other links."""
     finest: Positive = 0.004
     """Lower bound of these tolerances [m]."""
     candidates: int = 1000
     """Number of candidate centers of the greedy cover."""
     rounds: int = 5
-    """Number of rounds, for each number of spheres, in which cells are assigned to spheres and spheres are
-    moved."""
+    """Number of rounds of assigning cells and moving spheres, after each change of the number of spheres."""
     tries: int = 3
-    """A round of dropping spheres ends after this number of failed attempts."""
+    """A round of dropping spheres ends after this number of failed attempts to drop one."""
     most: int = 200
     """Approximate largest number of spheres for each link; if they do not suffice, the spheres exceed the
     tolerance."""
@@ -276,8 +282,11 @@ class SphereSettings(Settings, name="sphere tolerances"):
             )
 
     def tolerance(self, frame: int, dof: int, inradius: float) -> float:
-        """How far the spheres of a link may stick out [m]: a link on a frame (see `Robot.link_frame`) of a
-        robot with `dof` planned joints, whose largest inscribed sphere has the radius `inradius` [m]."""
+        """How far the spheres of a link may stick out [m].
+
+        The link is fixed to frame `frame` (see `Robot.link_frame`) of a robot with `dof` planned joints.
+        `inradius` [m] is the radius of the link's largest inscribed sphere.
+        """
         target = self.first_half if frame <= (dof + 1) // 2 else self.second_half
         if frame == 0:
             target = max(target, self.fixed)
@@ -290,7 +299,7 @@ def fit_spheres(
     rng: np.random.Generator,
     settings: SphereSettings = SphereSettings(),
 ) -> Spheres:
-    """Spheres [x y z radius, m] within bounds that cover surface and interior of a solid."""
+    """Spheres [x y z radius, m] that cover surface and interior of a solid and respect `bounds`."""
     sizes = solid.sphere_sizes(bounds)
     inside = solid.inside
     # a sphere that sticks out of a flat face by e covers a disc of radius sqrt(2 r e); cells are much smaller
@@ -313,8 +322,8 @@ def stick_out(solid: Solid, spheres: Spheres) -> Values:
 def covered(meshes: tuple[ConvexMesh, ...], spheres: Spheres) -> bool:
     """Whether the spheres provably cover the surface of the union of the meshes.
 
-    Triangles that no single sphere contains are cut in four, until all are contained, or a corner is found
-    outside all spheres, or triangles are smaller than SMALLEST_TRIANGLE.
+    Triangles that no single sphere contains are cut in four, until all are contained, a corner outside all
+    spheres is found, or a triangle is smaller than SMALLEST_TRIANGLE.
     """
     triangles = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
     spheres = for_kernels(spheres)
@@ -347,16 +356,17 @@ class Cells:
 
     points: Points
     corners: Int[ndarray, "c 3"]
-    """Indices of the corners of each cell in the points."""
+    """Indices in `points` of the corners of each cell."""
     sharp: Mask
-    """Whether a point is a vertex of a mesh; all others lie between neighbors on a face or an edge."""
+    """Whether a point is a vertex of a mesh. All other points lie on a face or an edge between other points
+    of the cells, so a sphere that covers these covers them."""
 
     @staticmethod
     def of(solid: Solid, bounds: Bounds, cut: float, most: int) -> "Cells":
-        """Cells of a solid without triangles inside another mesh.
+        """Cells on the surface of a solid. Triangles of a mesh that are inside another mesh are left out.
 
-        Edges are at most 1 / `cut` of the radius of the largest disc that a sphere within bounds can cover;
-        longer if there would be more than `most` cells.
+        A sphere within the bounds covers a disc of a flat face. Edges of cells are at most 1 / `cut` of the
+        radius of the largest such disc, but longer if there would be more than `most` cells.
         """
         size = _disc(bounds.tolerance, solid.depth) / cut
         corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in solid.meshes])
@@ -408,8 +418,8 @@ class Cells:
         return _Assignment(*assign(self.points, self.corners, centers, sizes.at(centers)))
 
     def part(self, mine: Mask) -> "Cells":
-        """A subset of the cells; points on its border count as vertices, since other cells need them
-        covered."""
+        """The cells in the mask `mine`. Points on the border to other cells count as sharp, since cells on
+        one side only do not imply that they are covered."""
         outside = np.zeros(len(self.points), dtype=bool)
         outside[self.corners[~mine]] = True
         used, index = np.unique(self.corners[mine], return_inverse=True)
@@ -417,7 +427,7 @@ class Cells:
 
 
 class _Assignment(NamedTuple):
-    """Which sphere each cell is assigned to."""
+    """The sphere that each cell is assigned to, and the second best sphere."""
 
     owner: Int[ndarray, "c"]
     """The sphere that covers the cell with the least excess."""
@@ -432,15 +442,15 @@ class _Assignment(NamedTuple):
 def _relax(
     sizes: SphereSizeGrid, cells: Cells, centers: Points, rounds: int, enough: float
 ) -> tuple[Points, float]:
-    """Improved centers and the largest excess radius [m]; ends early at `enough`."""
+    """Improved centers, and their largest excess radius [m]. Ends early when this is at most `enough`."""
     return relax(cells.points, cells.corners, cells.sharp, centers, rounds, enough, *sizes.arrays, DIRECTIONS)
 
 
 def _with_enough_spheres(
     sizes: SphereSizeGrid, cells: Cells, centers: Points, settings: SphereSettings
 ) -> Points:
-    """Improved centers, with spheres added until none exceeds its largest radius, or there are
-    `settings.most`."""
+    """Improved centers. Spheres are added until none exceeds its allowed radius by more than the tolerance,
+    or there are `settings.most` spheres."""
     max_excess = sizes.spacing * EXCESS_TOLERANCE
     centers, largest_excess = _relax(sizes, cells, centers, settings.rounds, max_excess)
     while largest_excess > max_excess and len(centers) < settings.most:
@@ -453,7 +463,7 @@ def _with_enough_spheres(
 
 
 def _farthest_apart(points: Points, excess: Values, count: int) -> Points:
-    """Up to `count` points with the largest excess, apart from each other."""
+    """Up to `count` points with the largest excess that are at least ADDED_SPACING apart."""
     order = np.argsort(-excess)[: max(1, int((excess > 0).sum()))]
     points = points[order]
     chosen = []
@@ -464,10 +474,10 @@ def _farthest_apart(points: Points, excess: Values, count: int) -> Points:
 
 
 def _thin_out(sizes: SphereSizeGrid, cells: Cells, centers: Points, settings: SphereSettings) -> Points:
-    """Centers without the spheres whose cells the others can cover; the least needed spheres are dropped
-    first.
+    """Drops spheres as long as the others can cover their cells, and returns the centers that are left.
+    Spheres that are the easiest to replace are dropped first.
 
-    Only the spheres that take over cells are moved.
+    When a sphere is dropped, only the spheres that take over its cells are moved.
     """
     max_excess = sizes.spacing * EXCESS_TOLERANCE
     centers, required = centers.copy(), np.zeros(len(centers), dtype=bool)
@@ -485,19 +495,19 @@ def _thin_out(sizes: SphereSizeGrid, cells: Cells, centers: Points, settings: Sp
             if not len(takers):
                 dropped[i] = True
                 continue
-            among = np.zeros(len(centers), dtype=bool)
-            among[i] = among[takers] = True
-            part = cells.part(among[assignment.owner])
-            rest, excess = _relax(sizes, part, centers[takers], settings.rounds, max_excess)
+            affected = np.zeros(len(centers), dtype=bool)
+            affected[i] = affected[takers] = True
+            part = cells.part(affected[assignment.owner])
+            new_centers, excess = _relax(sizes, part, centers[takers], settings.rounds, max_excess)
             if excess > max_excess:
                 required[i] = True
                 failures = failures + 1
                 if failures == settings.tries:
                     break
                 continue
-            centers[takers] = rest
+            centers[takers] = new_centers
             dropped[i] = True
-            moved |= among
+            moved |= affected
         if not dropped.any():
             break
         required &= ~moved
@@ -507,18 +517,18 @@ def _thin_out(sizes: SphereSizeGrid, cells: Cells, centers: Points, settings: Sp
 
 
 def _with_radii(sizes: SphereSizeGrid, cells: Cells, centers: Points) -> Spheres:
-    """Spheres with the smallest radii that cover the cells assigned to them; spheres without cells are
-    dropped."""
+    """Spheres at the centers, each with the smallest radius that covers the cells assigned to it. Spheres
+    without cells are dropped."""
     owner = cells.assigned(sizes, centers).owner
     radii = np.zeros(len(centers))
-    far = np.linalg.norm(cells.points[cells.corners] - centers[owner][:, None], axis=2).max(1)
-    np.maximum.at(radii, owner, far + MARGIN)
+    corner_distances = np.linalg.norm(cells.points[cells.corners] - centers[owner][:, None], axis=2).max(1)
+    np.maximum.at(radii, owner, corner_distances + MARGIN)
     return np.concatenate([centers, radii[:, None]], axis=1)[radii > 0]
 
 
 def _without_holes(solid: Solid, inside: Points, spheres: Spheres) -> Spheres:
-    """The spheres, and further ones in uncovered holes inside the solid, where a small obstacle could
-    hide."""
+    """The spheres, plus further spheres that fill uncovered holes inside the solid, where a small obstacle
+    could hide."""
     depth = solid.inscribed_sizes().at(inside)
     gap = gaps(inside, spheres)
     # every point is within half a cube's diagonal of a grid point
@@ -538,6 +548,6 @@ def _without_holes(solid: Solid, inside: Points, spheres: Spheres) -> Spheres:
 
 
 def _disc(tolerance: Any, depth: float) -> Any:
-    """Radius of the disc on a flat face that a sphere covers [m]: one whose inscribed part has the radius
-    `depth` and which sticks out by `tolerance`."""
+    """Radius of the disc on a flat face that a sphere covers [m]. The sphere's center is `depth` below the
+    face, and the sphere sticks out by `tolerance`."""
     return np.sqrt(2 * tolerance * depth + tolerance**2)

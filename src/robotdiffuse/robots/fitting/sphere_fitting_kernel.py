@@ -1,7 +1,8 @@
 """Compiled inner loops of the sphere fit, and of tests between sets of spheres.
 
-A surface consists of cells, which are triangles of points. A grid holds the largest radius of a sphere by its
-center. Without jaxtyping annotations, since Numba compiles these functions. Lengths are in meters.
+A surface consists of cells: triangles, given by indices of points. A grid stores the largest allowed radius
+of a sphere at each center. Excess is how far a radius exceeds it. There are no jaxtyping annotations because
+Numba compiles these functions. Lengths are in meters.
 """
 
 import math
@@ -11,8 +12,7 @@ import numpy as np
 from robotdiffuse.core.kernels import allocation_free, kernel
 from robotdiffuse.robots.frame_kernel import ball_gap, column, dot, length, minus, placed, rotated_back
 
-# Initial step of the search for a center [m]: in the first round, its lower bound, and its factor per
-# round.
+# initial step of the search for a center [m]: in the first round, its lower bound, and its factor per round
 INITIAL_STEP = 0.004
 MIN_INITIAL_STEP = 0.0005
 STEP_SHRINKAGE = 0.8
@@ -23,6 +23,7 @@ OUTSIDE_GRID = -1.0
 MIN_GAIN = 1e-7
 """Steps that reduce the excess by less than this are not taken [m]."""
 
+# unit vectors to the 26 neighbors of a voxel, in which the search for a center steps
 DIRECTIONS = np.array(
     [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], dtype=np.float64
 )
@@ -31,8 +32,8 @@ DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 
 @kernel()
 def plane_depths(points, normals, offsets, starts, lowest):
-    """Distance [n] from each point to the nearest face plane of the part in which it is deepest; negative
-    outside. At least `lowest`.
+    """Distance [n] from each point to the nearest face plane of the part in which the point is deepest;
+    negative outside all parts. Values below `lowest` are replaced by it.
 
     Planes are as in `sphere_fitting.stacked_planes`.
     """
@@ -100,10 +101,10 @@ def farthest_corner(points, corners, c, center):
 
 @kernel(fastmath=True)
 def assign(points, corners, centers, depths):
-    """For each cell: the sphere that covers it with the least excess, that excess, and both of the second
-    one; -1 if there is none.
+    """For each cell: the index of the sphere that covers it with the least excess, this excess, the index of
+    the second best sphere, and its excess. An index is -1 if there is no such sphere.
 
-    `depths` are the largest radii of spheres at `centers`.
+    `depths` are the largest allowed radii of spheres at `centers`.
     """
     owner = np.empty(len(corners), np.int64)
     min_excess = np.empty(len(corners))
@@ -115,7 +116,7 @@ def assign(points, corners, centers, depths):
         mine = -1
         next_best = -1
         for i in range(len(centers)):
-            # most spheres are too far from the first corner already
+            # most spheres can be excluded by their distance from the first corner
             reach = runner + depths[i]
             near = squared_distance(points[corners[c, 0]], centers[i])
             if reach <= 0.0 or near >= reach * reach:
@@ -138,11 +139,12 @@ def assign(points, corners, centers, depths):
 
 @kernel(fastmath=True)
 def greedy_cover(points, corners, places, depths):
-    """Indices of places at which spheres cover all cells, by a greedy choice.
+    """Indices of places at which spheres cover all cells, chosen greedily: next is the sphere that covers the
+    most uncovered cells.
 
-    A cell that no sphere of an allowed radius covers is left to the spheres with the least excess.
+    A cell that no sphere of an allowed radius covers counts as covered by the spheres with the least excess.
     """
-    holds = np.zeros((len(corners), len(places)), np.bool_)
+    covers = np.zeros((len(corners), len(places)), np.bool_)
     counts = np.zeros(len(places), np.int64)
     for c in range(len(corners)):
         min_excess = 1e9
@@ -152,26 +154,26 @@ def greedy_cover(points, corners, places, depths):
             lacks = math.sqrt(farthest_corner(points, corners, c, places[i])) - depths[i]
             if min_excess > 0.0 and lacks < min_excess:
                 min_excess = max(lacks, 0.0)
-                holds[c, :i] = False
-            holds[c, i] = lacks <= min_excess
+                covers[c, :i] = False
+            covers[c, i] = lacks <= min_excess
         for i in range(len(places)):
-            counts[i] += holds[c, i]
+            counts[i] += covers[c, i]
     is_open = np.ones(len(corners), np.bool_)
     chosen = []
     while counts.max() > 0:
         best = counts.argmax()
         chosen.append(best)
         for c in range(len(corners)):
-            if is_open[c] and holds[c, best]:
+            if is_open[c] and covers[c, best]:
                 is_open[c] = False
                 for i in range(len(places)):
-                    counts[i] -= holds[c, i]
+                    counts[i] -= covers[c, i]
     return np.array(chosen)
 
 
 @kernel()
 def enclosing(spheres):
-    """A ball [4] that contains spheres."""
+    """A ball [x, y, z, radius] that contains all spheres."""
     ball = np.zeros(4)
     for k in range(3):
         ball[k] = 0.5 * (spheres[:, k].min() + spheres[:, k].max())
@@ -202,12 +204,12 @@ def ball_distances(T_base_a, T_base_b, first, second):
 
 @kernel()
 def deepest_touches(T_base_a, T_base_b, first, second, apart, least):
-    """Deepest overlap of two sets of spheres at each of n poses [m], negative if none overlap, and its
-    middle.
+    """Depth of the deepest overlap of two sets of spheres at each of n poses [m], negative if they do not
+    overlap, and the middle of this overlap.
 
-    Poses are [n, 4, 4]; middles are [n, 3], in the frame of the first set. Where bounding balls of the sets
-    are more than `apart` from each other, the depth is minus their distance. Overlaps up to `least` are not
-    searched.
+    Poses are [n, 4, 4]; middles are [n, 3], in the frame of the first set. Where the bounding balls of the
+    sets are more than `apart` from each other, the depth is minus the balls' distance. Overlaps of at most
+    `least` are ignored, and `least` is returned.
     """
     depth = np.full(len(T_base_a), least)
     middle = np.zeros((len(T_base_a), 3))
@@ -216,9 +218,9 @@ def deepest_touches(T_base_a, T_base_b, first, second, apart, least):
     T = np.empty((3, 4))
     for n in range(len(T_base_a)):
         relative(T_base_a[n], T_base_b[n], T)
-        far = length(minus(placed(T, b), a)) - a[3] - b[3]
-        if far > apart:
-            depth[n] = -far
+        distance = length(minus(placed(T, b), a)) - a[3] - b[3]
+        if distance > apart:
+            depth[n] = -distance
             continue
         for j in range(len(second)):
             center = placed(T, second[j])
@@ -231,10 +233,11 @@ def deepest_touches(T_base_a, T_base_b, first, second, apart, least):
                 d = minus(first[i], center)
                 if reach <= 0.0 or dot(d, d) >= reach * reach:
                     continue
-                far = length(d)
-                depth[n] = first[i, 3] + second[j, 3] - far
-                # from b's center towards a's, to the middle of the two surfaces
-                along = (far + second[j, 3] - first[i, 3]) / 2 / max(far, 1e-9)
+                distance = length(d)
+                depth[n] = first[i, 3] + second[j, 3] - distance
+                # from the center in the second set towards that in the first set, to the middle of the
+                # overlap
+                along = (distance + second[j, 3] - first[i, 3]) / 2 / max(distance, 1e-9)
                 for k in range(3):
                     middle[n, k] = center[k] + along * d[k]
     return depth, middle
@@ -242,7 +245,7 @@ def deepest_touches(T_base_a, T_base_b, first, second, apart, least):
 
 @kernel(fastmath=True)
 def gaps(points, spheres):
-    """Signed distance of points from a union of spheres [m]; inside, only a bound."""
+    """Signed distance of points from a union of spheres [m]; inside the union, only a bound."""
     out = np.empty(len(points))
     for n in range(len(points)):
         gap = 1e9
@@ -257,7 +260,7 @@ def gaps(points, spheres):
 
 @kernel()
 def held_by_one(triangles, spheres):
-    """Whether a single sphere contains each triangle [t]; and whether each corner [3 t] is outside all
+    """Whether each triangle [t] is contained in a single sphere, and whether each corner [3 t] is outside all
     spheres."""
     contained = np.zeros(len(triangles), np.bool_)
     bare = np.ones(3 * len(triangles), np.bool_)
@@ -280,7 +283,7 @@ def held_by_one(triangles, spheres):
 
 @allocation_free(fastmath=True)
 def excess_radius(center, own, count, grid, origin, spacing):
-    """Excess radius of a sphere at a center that contains the first `count` points of `own`."""
+    """Excess radius of the smallest sphere at a center that contains the first `count` points of `own`."""
     far = 0.0
     for k in range(count):
         far = max(far, squared_distance(own[k], center))
@@ -289,7 +292,7 @@ def excess_radius(center, own, count, grid, origin, spacing):
 
 @kernel(fastmath=True)
 def move_center(center, own, count, step, grid, origin, spacing, directions):
-    """Pattern search for the center of least excess radius, in place."""
+    """Moves `center` in place to the least excess radius, by pattern search with an initial `step`."""
     min_radius = excess_radius(center, own, count, grid, origin, spacing)
     while step > MIN_STEP:
         best = min_radius - MIN_GAIN
@@ -311,7 +314,7 @@ def move_center(center, own, count, step, grid, origin, spacing, directions):
 def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing, directions):
     """Alternate between assigning cells to spheres and moving the spheres.
 
-    Returns the best centers found and their largest excess radius; ends early at `enough`.
+    Returns the best centers found and their largest excess radius. Ends early when this is at most `enough`.
     """
     cells = len(corners)
     count = len(centers)
@@ -347,6 +350,7 @@ def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing
                     first[p] = owner[c]
                 elif first[p] != owner[c]:
                     rim[p] = True
+        # `order` lists the cells by owner; those of sphere i are order[ends[i] : ends[i + 1]]
         for i in range(count):
             ends[i + 1] += ends[i]
         fill = ends[:count].copy()

@@ -1,6 +1,7 @@
-"""Reads robots from MuJoCo models (MJCF): the model, as MuJoCo compiles it, becomes a URDF with mesh files.
+"""Reads robots from MuJoCo models (MJCF). MuJoCo compiles the model, which is then written as a URDF with
+mesh files.
 
-Links are the bodies of the model, at MuJoCo's frames; sites are links too. Values of joints are MuJoCo's
+Each body and each site of the model becomes a link with the body's or site's frame. Joint values are MuJoCo's
 `qpos`.
 """
 
@@ -33,9 +34,9 @@ DRAWN = ("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
 WORLD = 0
 """Index of the world body, which does not move."""
 EXCLUDED = "excluded by the model"
-"""Reason for pairs of links that are not checked."""
+"""Reason that is given for pairs of links that are not checked."""
 MIN_SHIFT = 1e-9
-"""A joint whose distance from the origin of its body is smaller counts as being at the origin [m]."""
+"""A joint closer than this to the origin of its body counts as being at the origin [m]."""
 
 
 def imported_mujoco() -> Any:
@@ -67,9 +68,8 @@ def compiled_model(path: Path) -> Any:
 
 
 def robot_bodies(model: Any) -> list[int]:
-    """The bodies of the robot, parents before children. They are the bodies of the kinematic trees that
-    actuators move; without actuators, the bodies of all trees with hinges or slides and without a free
-    joint."""
+    """The bodies of the robot, parents before children: the bodies of all kinematic trees that actuators
+    move. If actuators move none, the trees with hinges or slides and without a free joint are taken."""
     trees: dict[int, list[int]] = {}
     for body in range(1, model.nbody):
         trees.setdefault(int(model.body_rootid[body]), []).append(body)
@@ -94,7 +94,8 @@ def robot_bodies(model: Any) -> list[int]:
 
 
 def placing_joints(model: Any, bodies: list[int]) -> set[int]:
-    """The joints that only place the base: slides without range, if the robot has other joints."""
+    """The joints that only place the base: slide joints without a range, if the robot has other joints
+    too."""
     joints = _joints_of(model, bodies)
     unlimited = {
         joint
@@ -121,13 +122,13 @@ class ConvertedModel:
     """The robot of an MJCF file as a URDF whose root link is the world."""
 
     def __init__(self, path: Path) -> None:
-        """Raises InputError for a model without a joint, for ball joints, and for geoms that cannot be
-        planned with."""
+        """Raises InputError for a model without hinge or slide joints, for ball joints, and for colliding
+        geoms of types that a URDF cannot contain."""
         self.path = path
         self.model = model = compiled_model(path)
         self.mujoco = imported_mujoco()
         self.folder = TemporaryDirectory(prefix="robotdiffuse-mjcf-")
-        """Holds the mesh files that the URDF names."""
+        """Contains the mesh files that the URDF names."""
         self.root = ET.Element("robot", name=bytes(model.names).partition(b"\0")[0].decode() or path.stem)
         self.bodies = robot_bodies(model)
         self.held = placing_joints(model, self.bodies)
@@ -153,7 +154,7 @@ class ConvertedModel:
         self.urdf = ET.tostring(self.root)
 
     def name(self, kind: str, index: int) -> str:
-        """The name of an element, or its kind and number."""
+        """The name of an element of the model; if it has none, its kind and index, such as "geom3"."""
         return getattr(self.model, kind)(index).name or f"{kind}{index}"
 
     def joint_name(self, joint: int) -> str:
@@ -163,7 +164,7 @@ class ConvertedModel:
         return kind_of("Joint", self.model.jnt_type[joint])
 
     def _element(self, name: str, kind: str, parent: str, child: str, T: Pose) -> ET.Element:
-        """A new joint of the URDF."""
+        """Adds a joint to the URDF; T is T_parent_joint."""
         joint = ET.SubElement(self.root, "joint", name=name, type=kind)
         ET.SubElement(joint, "parent", link=parent)
         ET.SubElement(joint, "child", link=child)
@@ -175,8 +176,8 @@ class ConvertedModel:
         return ET.SubElement(self.root, "link", name=name)
 
     def _body(self, body: int, mimics: dict[int, dict[str, str]]) -> None:
-        """The link of a body, and its joints. Each joint is at its anchor, which need not be the
-        origin of the body's frame."""
+        """Adds the link of a body and its joints to the URDF. The frame of a joint is at the joint's anchor,
+        which may differ from the origin of the body's frame."""
         model = self.model
         name = self.name("body", body)
         parent = int(model.body_parentid[body])
@@ -207,7 +208,7 @@ class ConvertedModel:
         self._geometry(self._link(name), body)
 
     def _moved(self, joint: int, value: float) -> Pose:
-        """The motion of a joint by a value."""
+        """The transform by which a joint moves for a value [rad] or [m]."""
         axis = self.model.jnt_axis[joint]
         if self.joint_kind(joint) == "slide":
             return transform(value * axis)
@@ -235,7 +236,8 @@ class ConvertedModel:
             ET.SubElement(element, "mimic", mimic)
 
     def _effort(self, joint: int) -> float:
-        """The largest force or torque that the model lets actuators apply; 0 if it has no limit."""
+        """The largest force or torque that actuators may apply to a joint [N] or [N m]; 0 if it has no
+        limit."""
         model = self.model
         if model.jnt_actfrclimited[joint]:
             return float(np.abs(model.jnt_actfrcrange[joint]).max())
@@ -251,7 +253,8 @@ class ConvertedModel:
         )
 
     def _mimics(self) -> dict[int, dict[str, str]]:
-        """The attributes of <mimic> for each joint that a linear equality constraint ties to another."""
+        """The attributes of <mimic>, by index of the joint, for joints that a linear equality constraint ties
+        to another joint."""
         model = self.model
         mimics: dict[int, dict[str, str]] = {}
         for k in range(model.neq):
@@ -277,7 +280,8 @@ class ConvertedModel:
         return mimics
 
     def _geometry(self, link: ET.Element, body: int) -> None:
-        """The inertia and the geoms of a body; geoms that collide with nothing are visual."""
+        """Adds the inertia and the geoms of a body to its link. Geoms that collide with nothing become visual
+        elements."""
         model = self.model
         if model.body_mass[body] > 0:
             inertial = ET.SubElement(link, "inertial")
@@ -295,7 +299,7 @@ class ConvertedModel:
             self._shape(ET.SubElement(element, "geometry"), geom)
 
     def _shape(self, parent: ET.Element, geom: int) -> None:
-        """The shape of a geom. A mesh that collides is replaced by its hull, as in MuJoCo."""
+        """Adds the shape of a geom. A mesh that collides is replaced by its convex hull, as MuJoCo does."""
         kind = kind_of("Geom", self.model.geom_type[geom])
         size = self.model.geom_size[geom]
         if kind == "sphere":
@@ -342,8 +346,9 @@ class ConvertedModel:
             self._link(link)
 
     def _excluded(self) -> dict[frozenset[str], str]:
-        """Pairs of links that MuJoCo does not let collide: excluded pairs, links that move as one, a link
-        and the link that carries it, and links whose masks let no two of their geoms collide."""
+        """Pairs of links that MuJoCo does not check for collision: excluded pairs, rigidly connected links, a
+        link and the link that carries it, and links between which the masks of all geoms exclude
+        collision."""
         model = self.model
         excluded = {frozenset(divmod(int(signature), 2**16)) for signature in model.exclude_signature}
         unfiltered = bool(model.opt.disableflags & int(self.mujoco.mjtDisableBit.mjDSBL_FILTERPARENT))
@@ -351,7 +356,7 @@ class ConvertedModel:
         solid = [body for body in self.bodies if geoms[body]]
 
         def meet(first: int, second: int) -> bool:
-            """Whether the masks let any geom of one body collide with one of the other."""
+            """Whether the masks let a geom of one body collide with a geom of the other."""
             a, b = geoms[first], geoms[second]
             kinds, partners = model.geom_contype, model.geom_conaffinity
             return bool((kinds[a, None] & partners[b] | kinds[b] & partners[a, None]).any())
@@ -398,8 +403,8 @@ def _geoms_of(model: Any, body: int) -> range:
 
 
 def _related(model: Any, first: int, second: int, unfiltered: bool) -> bool:
-    """Whether two bodies, neither of which is the world, are joined rigidly or by the joints of one of
-    them."""
+    """Whether two bodies are rigidly connected, or connected by joints of only one of them. Neither body is
+    the world. `unfiltered`: whether the model lets a body collide with its parent."""
     welded = [int(model.body_weldid[body]) for body in (first, second)]
     above = [int(model.body_weldid[model.body_parentid[body]]) for body in welded]
     carried = welded[0] == above[1] or welded[1] == above[0]

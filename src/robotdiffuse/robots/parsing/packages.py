@@ -15,7 +15,7 @@ from robotdiffuse.core.input_files import is_file
 MAX_PACKAGES = 32
 """Largest number of packages that a xacro file may refer to."""
 NAMESPACE_PREFIX = re.compile(rb"""</?([A-Za-z_][\w.-]*):[\w.-]+|\s([A-Za-z_][\w.-]*):[\w.-]+\s*=\s*["']""")
-"""Matches the namespace prefix of an element or attribute."""
+"""Matches the namespace prefix of an XML element or attribute."""
 XACRO = Lock()
 """Lock that is held while xacro compiles a file, because xacro keeps its state in module globals."""
 PACKAGE_NOT_FOUND = re.compile(r"Package not found: (\S+)")
@@ -26,17 +26,17 @@ PACKAGE_NOT_FOUND = re.compile(r"Package not found: (\S+)")
 class Packages:
     """Finds the ROS packages of a URDF.
 
-    The folder of a package is searched in `folders`, then in ROS_PACKAGE_PATH and AMENT_PREFIX_PATH.
-    Otherwise, files are searched relative to the URDF's folder and all folders above, with or without the
-    package's name.
+    The folder of a package is searched in `folders`, then in ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, then
+    among the URDF's folder and all folders above it. Files that the package's folder lacks are searched
+    relative to the URDF's folder and all folders above it, with and without the package's name.
     """
 
     urdf: Path
     folders: dict[str, str | Path]
 
     def folder(self, name: str) -> Path | None:
-        """The folder of a package, from `folders`, the environment, or the folders above the URDF; None if
-        none."""
+        """The folder of a package, from `folders`, the environment, or the folders above the URDF; None if it
+        is not found."""
         if name in self.folders:
             return Path(self.folders[name])
         ros = _folders("ROS_PACKAGE_PATH")
@@ -52,7 +52,7 @@ class Packages:
         return next((folder for folder in candidates if folder.is_dir()), None)
 
     def file(self, filename: str) -> Path:
-        """The path of a package://, file:// or relative file name, also with %20 for a blank.
+        """The path of a package://, file:// or relative file name. Escapes such as %20 are understood.
 
         Raises InputError if there is no such file.
         """
@@ -82,7 +82,8 @@ def _folders(variable: str) -> list[Path]:
 
 
 def is_xacro(file: Path, root: ET.Element) -> bool:
-    """Whether a URDF must be compiled by xacro: by its file name, its elements, or an expression in it."""
+    """Whether a file must be compiled by xacro, judged by its name, its elements, and expressions in
+    attributes."""
     return ".xacro" in file.name.lower() or any(
         "xacro" in element.tag.rpartition("}")[0]
         or any("${" in value or "$(" in value for value in element.attrib.values())
@@ -91,8 +92,8 @@ def is_xacro(file: Path, root: ET.Element) -> bool:
 
 
 def with_prefixes(text: bytes) -> bytes:
-    """The XML with undeclared namespace prefixes declared, which simulators' elements such as <drake:member>
-    often lack."""
+    """The XML with declarations added for undeclared namespace prefixes. Elements of simulators, such as
+    <drake:member>, often use prefixes without declaring them."""
     used = {prefix for pair in NAMESPACE_PREFIX.findall(text) for prefix in pair if prefix}
     missing = sorted(name for name in used - {b"xml", b"xmlns"} if b"xmlns:" + name not in text)
     declared = b"".join(b' xmlns:%s="%s"' % (name, name) for name in missing)
@@ -106,7 +107,7 @@ def compiled_xacro(path: Path, packages: Packages) -> bytes:
     """
     try:
         import xacro
-        from xacrodoc import packages as known  # importing it makes xacro use its package look-up
+        from xacrodoc import packages as known  # on import, xacrodoc replaces xacro's package look-up
     except ImportError:
         raise InputError(
             f"{path} is a xacro file; install its compiler with pip install 'robotdiffuse[xacro]', or "
@@ -117,7 +118,8 @@ def compiled_xacro(path: Path, packages: Packages) -> bytes:
 
 
 def _by_xacro(xacro: Any, known: Any, path: Path, packages: Packages) -> bytes:
-    """`known`: the packages that xacro asks for."""
+    """Compiles the file again after each error for an unknown package, whose folder is then added to `known`:
+    xacrodoc's package look-up."""
     known.reset()
     known.walk_up_from(path)
     known.update_package_cache(packages.folders)

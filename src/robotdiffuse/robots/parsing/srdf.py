@@ -1,4 +1,5 @@
-"""Reads SRDF files, which MoveIt's Setup Assistant writes for a URDF.
+"""Reads SRDF files, which MoveIt's Setup Assistant writes for a URDF, and chooses the planned joints of a
+robot.
 
 Format: https://docs.ros.org/en/noetic/api/srdfdom/html/ and MoveIt's "URDF and SRDF" page.
 """
@@ -32,7 +33,7 @@ REST_POSES = (
     "open",
     "opened",
 )
-"""Names of poses in which joints outside the planned group are held, in order of preference."""
+"""Joints outside the planned group are held in a pose with one of these names, in order of preference."""
 
 
 @dataclass(frozen=True)
@@ -41,12 +42,13 @@ class Srdf:
 
     path: Path
     allowed: dict[frozenset[str], str] = field(default_factory=dict)
-    """Pairs of links that are not checked, with the reason: Adjacent, Never, Default, Always, User ..."""
+    """Pairs of links that are not checked against each other, with the reason that the SRDF gives, such as
+    Adjacent or Never."""
     groups: dict[str, "Group"] = field(default_factory=dict)
     poses: dict[str, dict[str, float]] = field(default_factory=dict)
     """Named poses: values by joint [rad] or [m]. States of several groups with the same name are merged."""
     passive: frozenset[str] = frozenset()
-    """Joints without an actuator."""
+    """Names of joints without an actuator."""
 
     def joints(self, group: str, joints: tuple[Joint, ...]) -> list[Joint]:
         """The movable joints of a group and of its subgroups, parents before children.
@@ -57,7 +59,8 @@ class Srdf:
         return [joint for joint in joints if joint.name in named and joint.kind in MOVING_KINDS]
 
     def tips(self, group: str) -> list[str]:
-        """Tip links of the chains that define a group and its subgroups; the group must exist."""
+        """Tip links of the chains that define a group and its subgroups. Raises KeyError for an unknown
+        group."""
         content = self.groups[group]
         return [tip for _, tip in content.chains] + [tip for sub in content.groups for tip in self.tips(sub)]
 
@@ -81,27 +84,26 @@ class Srdf:
         return names.union(*(self._named(name, above, (*within, group)) for name in content.groups))
 
     def resting(self) -> dict[str, float]:
-        """Values of joints in the poses named in `REST_POSES` [rad] or [m], the first pose that has the
-        joint."""
+        """Values of joints in the poses named in `REST_POSES` [rad] or [m]; for each joint from the first
+        pose that has it."""
         poses = (self.poses.get(name, {}) for name in reversed(REST_POSES))
         return {joint: value for pose in poses for joint, value in pose.items()}
 
 
 @dataclass(frozen=True)
 class Group:
-    """A group as defined in the file, by any combination of the fields."""
+    """A planning group as defined in the file, by any combination of the fields."""
 
     joints: tuple[str, ...] = ()
     links: tuple[str, ...] = ()
-    """Links, each of which stands for its parent joint."""
+    """Links; each adds its parent joint to the group."""
     chains: tuple[tuple[str, str], ...] = ()
     """Base and tip link of each chain."""
     groups: tuple[str, ...] = ()
 
 
 def srdf_beside(urdf: str | Path, robot: str) -> Path | None:
-    """The SRDF with the name of the URDF or of its robot, in the URDF's folder or in `SRDF_FOLDERS`; None if
-    none."""
+    """The SRDF in `SRDF_FOLDERS` that has the name of the URDF or of its robot; None if there is none."""
     urdf = Path(urdf)
     names = dict.fromkeys((urdf.name.split(".")[0], robot))
     candidates = (urdf.parent / folder / f"{name}.srdf" for name in names for folder in SRDF_FOLDERS)
@@ -163,19 +165,20 @@ def read_srdf(file: str | Path) -> Srdf:
 
 
 GRIPPER = re.compile("grip|finger|jaw|claw|knuckle|thumb", re.IGNORECASE)
-"""Matches names of gripper joints, if few joints come after them."""
-# Names of the group of all arms: of two, and of any number.
+"""Matches names of joints that count as gripper joints if few joints come after them."""
 BOTH = "both"
+"""Name of the group of all arms of a robot with two arms."""
 ALL = "all"
+"""Name of the group of all arms, for any number of arms."""
 SUFFIX_CHARACTERS = "_-/0123456789 "
 """Characters stripped from the end of the common prefix of an arm's joint names."""
-# Largest number of movable joints per branch of a gripper: with two branches, such as two fingers, and with
-# other numbers of branches.
 MAX_FINGER_JOINTS = 2
+"""Largest number of movable joints per finger of a gripper with two fingers."""
 MAX_HAND_FINGER_JOINTS = 3
+"""Largest number of movable joints per finger of a gripper with another number of fingers."""
 MIN_ARM_JOINTS = 4
 """Smallest number of movable joints of an arm if there are several chains. After this many joints, three or
-more branches form a hand, however long its fingers are."""
+more branches form a hand, whatever the number of joints per finger."""
 
 
 class Arm(NamedTuple):
@@ -184,11 +187,12 @@ class Arm(NamedTuple):
     joints: tuple[str, ...]
     tip: str
     own_joints: int
-    """Number of joints after the last branching."""
+    """Number of movable joints after the last link at which the tree branches."""
 
     @property
     def name(self) -> str:
-        """The common prefix of the names of the joints after the last branching, or else the tip."""
+        """The common prefix of the names of the arm's own joints; the name of the tip if there is no common
+        prefix."""
         columns = zip(*self.joints[-self.own_joints :], strict=False)
         common_letters = takewhile(lambda letters: len({*letters}) == 1, columns)
         common = "".join(letters[0] for letters in common_letters).rstrip(SUFFIX_CHARACTERS)
@@ -199,7 +203,7 @@ class JointTree:
     """The movable joints below a link."""
 
     def __init__(self, base: str, joints: list[Joint]) -> None:
-        """Takes `joints` as in `Robot.joints`: all below the base, parents before children."""
+        """`joints` are all joints below the base, parents before children, as in `Robot.joints`."""
         self.base = base
         self.below: dict[str, list[Joint]] = {}
         self.moving: dict[str, int] = {}
@@ -222,15 +226,16 @@ class JointTree:
         return self.moving.get(joint.child, 0) + drives
 
     def arms(self) -> list[Arm]:
-        """The arms below the base, or else the longest chains of movable joints."""
+        """The chains below the base with at least MIN_ARM_JOINTS own joints; if there are none, the longest
+        chains."""
         chains = self._arms_from(self.base, (), 0)
         arms_with_joints = [arm for arm in chains if arm.own_joints >= MIN_ARM_JOINTS]
         longest = max((len(arm.joints) for arm in chains), default=0)
         return arms_with_joints or [arm for arm in chains if len(arm.joints) == longest]
 
     def _arms_from(self, link: str, chain: tuple[str, ...], own_joints: int) -> list[Arm]:
-        """Arms that continue a chain of joints at a link; `own_joints` of its joints come after the last
-        branching."""
+        """Arms that continue a chain of joints at a link. The last `own_joints` joints of the chain come
+        after the last branching."""
         while True:
             next_joints = [
                 j for j in self.below.get(link, []) if j.kind in MOVING_KINDS or j.child in self.moved
@@ -246,7 +251,7 @@ class JointTree:
             link = next_joints[0].child
 
     def _extended(self, joint: Joint, chain: tuple[str, ...], own_joints: int) -> tuple[tuple[str, ...], int]:
-        """A chain and its number of own joints, extended by a joint if that is movable."""
+        """A chain and its number of own joints, extended by a joint if the joint is movable."""
         return ((*chain, joint.name), own_joints + 1) if joint.kind in MOVING_KINDS else (chain, own_joints)
 
     def _begins_gripper(self, branches: list[Joint], own_joints: int) -> bool:
@@ -273,8 +278,9 @@ def planned_joints(
     """Names of the joints that are planned unless they are locked, and the tips.
 
     There are several tips if the group has several chains, such as two arms. `joints` are all joints below
-    the base, parents before children. Raises InputError for an unknown tip or group, a group with joints that
-    do not lead to the given tip, and a robot with several arms of which none is chosen.
+    the base, parents before children. Raises InputError for an unknown tip or group, for a group with joints
+    that do not lead to the given tip, and for a robot with several arms if neither `tip` nor `group` is
+    given.
     """
     above = {joint.child: joint for joint in joints}
     if tip is not None and tip not in (base, *above):
@@ -292,18 +298,19 @@ def planned_joints(
     else:
         tips = [tip]
     leading = [joint for end in tips for joint in chain(above, end) if joint.kind in MOVING_KINDS]
-    off = [name for name in chosen or () if name not in {joint.name for joint in leading}]
-    if off:
+    not_leading = [name for name in chosen or () if name not in {joint.name for joint in leading}]
+    if not_leading:
         raise InputError(
-            f"{file}: {', '.join(off)} of group {group} do not lead to {tip}; leave out --tip, or choose a "
-            f"group of one arm"
+            f"{file}: {', '.join(not_leading)} of group {group} do not lead to {tip}; leave out --tip, or "
+            f"choose a group of one arm"
         )
     names = {joint.name for joint in leading if joint.mimic is None and joint.name not in srdf.passive}
     return names if chosen is None else names & {*chosen}, tips
 
 
 def _ends(chosen: list[str], above: dict[str, Joint], written: list[str]) -> list[str]:
-    """Tips of a group: the tips of the chains that define the group, or else the last links of its joints."""
+    """Tips of a group with the joints `chosen`: the child links of its last joints. A tip that the SRDF gives
+    (`written`) replaces the last link on the way to it."""
     last = {joint.child: joint.child for joint in above.values() if joint.name in chosen}
     for link in [*last]:
         for joint in chain(above, link)[:-1]:
@@ -316,7 +323,8 @@ def _ends(chosen: list[str], above: dict[str, Joint], written: list[str]) -> lis
 
 
 def refuse_linkages(file: Path, robot: Robot) -> None:
-    """Raise InputError if joints that mimic a planned joint move geometry, since planning would hold them."""
+    """Raise InputError if a joint that mimics a planned joint moves geometry or a tip: planning would keep
+    the mimic joint still."""
     by_name = {joint.name: joint for joint in robot.joints}
     for joint in robot.joints:
         leader = joint
@@ -332,27 +340,28 @@ def refuse_linkages(file: Path, robot: Robot) -> None:
 
 
 def _chosen_arms(file: Path, arms: list[Arm], group: str | None, groups: list[str]) -> list[Arm]:
-    """The arm with the name or tip `group`, or all arms for `ALL`; without it, the only arm, or none.
+    """The arm with the name or tip `group`, or all arms for `ALL` and `BOTH`. Without `group`, the robot's
+    only arm, or an empty list.
 
-    `groups` are the names of groups in the SRDF, for messages. Raises InputError for another name, and for
-    several arms of which none is named.
+    `groups` are the names of groups in the SRDF, for messages. Raises InputError for an unknown name, and for
+    several arms without `group`.
     """
-    twice = repeated(arm.name for arm in arms)
-    names = [arm.tip if arm.name in twice else arm.name for arm in arms]
-    together = BOTH if len(arms) == 2 else ALL
+    repeated_names = repeated(arm.name for arm in arms)
+    names = [arm.tip if arm.name in repeated_names else arm.name for arm in arms]
+    all_name = BOTH if len(arms) == 2 else ALL
     if group is None and len(arms) > 1:
         listed = (
             f"{name} ({len(arm.joints)} joints to {arm.tip})" for name, arm in zip(names, arms, strict=True)
         )
         raise InputError(
-            f"{file} has {len(arms)} arms: {', '.join(listed)}; choose one, or {together} as one robot: "
+            f"{file} has {len(arms)} arms: {', '.join(listed)}; choose one, or {all_name} as one robot: "
             f"robotdiffuse robot add {file.name} --group {names[0]}"
             + (f" (groups of its SRDF: {', '.join(groups)})" if groups else "")
         )
     if group is None:
         return arms
     chosen = [arm for arm, name in zip(arms, names, strict=True) if group in (name, arm.tip)]
-    words = sorted({ALL, together}) if len(arms) > 1 else []
+    words = sorted({ALL, all_name}) if len(arms) > 1 else []
     if not chosen and group not in words:
         raise unknown_name(f"group of {file}", group, [*names, *words, *groups])
     return chosen[:1] or arms

@@ -46,8 +46,8 @@ RIGHT_ANGLE_TOLERANCE = 1e-3
 
 
 def moves_in_a_plane(joints: Sequence[Joint]) -> bool:
-    """Whether a chain of joints moves in a plane, as a base on wheels: two perpendicular prismatic joints,
-    and a rotation about the axis perpendicular to both."""
+    """Whether a chain of joints moves in a plane, like a base on wheels: it has two perpendicular prismatic
+    joints, and a rotating joint with an axis perpendicular to both."""
     moving = [joint for joint in joints if joint.kind != "fixed"]
     if sorted(joint.kind in ROTATING_KINDS for joint in moving) != [False, False, True]:
         return False
@@ -75,16 +75,16 @@ KINDS = (*MOVING_KINDS, "fixed")
 MAX_LINKS = 500
 """Largest number of links of a robot; humanoids with hands have about 100."""
 MAX_LINK_SIZE = 10.0
-"""A larger link gets a note [m]."""
+"""Size of a link above which a note asks to check the units [m]."""
 MAX_SIZE_PER_REACH = 10.0
 """A moving link that is larger than the arm's reach by this factor is refused."""
 DEFAULT_VELOCITY = 1.0
 """Velocity limit of movable joints for which the URDF gives none [rad/s] or [m/s]."""
 ACCELERATION_PER_VELOCITY = 4.0
-"""Ratio of acceleration and velocity limits, since URDF has no acceleration limit: full speed after 0.25 s
-[1/s]."""
+"""Ratio of acceleration and velocity limits [1/s], since URDF has no acceleration limit: full speed is
+reached after 0.25 s."""
 JERK_PER_ACCELERATION = 10.0
-"""Ratio of jerk and acceleration limits: full acceleration after 0.1 s [1/s]."""
+"""Ratio of jerk and acceleration limits [1/s]: full acceleration is reached after 0.1 s."""
 
 
 @dataclass
@@ -139,7 +139,8 @@ class UrdfTree:
             raise InputError(f"{self.path} has {len(self.links)} links; at most {MAX_LINKS} are supported")
         solid = any(link.find("collision") is not None for link in self.links.values())
         self.kind = "collision" if solid else "visual"
-        """Elements of links that are read as collision geometry."""
+        """Tag of the elements that are read as collision geometry: "visual" only if no link has
+        "collision"."""
         self.elements = self._named(root, "joint")
         self.parents: dict[str, str] = {}
         """Parent joint of each link except the root."""
@@ -179,25 +180,28 @@ class UrdfTree:
     ) -> Robot:
         """The robot, with convex collision meshes and without spheres.
 
-        Planned joints are the movable joints of the group, or all from base to tip, without passive joints
-        and mimic joints. All other joints are locked: at the value in `locked`, in a rest pose of the SRDF,
-        or at zero clipped into their limits. Locked mimic joints follow their leaders.
+        Planned joints are the movable joints of the group, or all movable joints from base to tip. Passive
+        joints and mimic joints are not planned. All joints that are not planned are locked: at the value in
+        `locked`, else at their value in a rest pose of the SRDF, else at zero clipped to their limits. Locked
+        mimic joints follow the joints that they mimic.
 
         Acceleration and jerk limits, which URDF lacks, are 4 / s times the velocity limit and 10 / s times
-        the acceleration limit (`with_limits` changes them). Collision elements become convex hulls in the
-        link's frame; cylinders, capsules and spheres become polyhedra around them. If no link has collision
-        elements, visual elements are used, with a note.
+        the acceleration limit; `with_limits` changes them. Each collision element becomes a convex hull in
+        the link's frame; cylinders, capsules and spheres become polyhedra around the shape. If no link has
+        collision elements, visual elements are used, with a note.
 
         Args:
             base: First link of the robot; by default the root. Links between the root and the base are left
-                out, but the pose of the base in the root's frame is kept, for scenes given in that frame.
+            out. The
+                pose of the base in the root's frame is kept, for scenes that are given in the root's frame.
             tip: Last link. By default the link where a gripper or a hand begins (see `robots.parsing.srdf`),
-                such as panda_hand for a Panda with fingers, or else the deepest link.
-            locked: Values of locked joints by name [rad] or [m].
-            group: A group of the SRDF, the common prefix of an arm's joint names, or all arms: "both" (of
-                two) or "all". A group of several chains, such as two arms, is one robot with several tips.
-                Without group and tip, the robot must have one arm.
-            srdf: Groups, named poses and passive joints.
+            such as
+                panda_hand for a Panda with fingers; without a gripper, the deepest link.
+            locked: Values of locked joints by name [rad] or [m]. group: A group of the SRDF, the common
+            prefix of an arm's joint names, "both" for two arms, or "all" for
+                all arms. A group of several chains, such as two arms, is one robot with several tips. Without
+                group and tip, the robot must have exactly one arm.
+            srdf: Source of groups, named poses and passive joints.
 
         Raises:
             InputError: If the file or the arguments are incomplete or contradictory; it names the file.
@@ -253,7 +257,8 @@ class UrdfTree:
         return replace(robot, notes=(*robot.notes, *self._size_notes(robot)))
 
     def _size_notes(self, robot: Robot) -> list[str]:
-        """Notes on very large links. Raises InputError for a moving one that dwarfs the arm."""
+        """Notes on very large links. Raises InputError for a moving link larger than MAX_SIZE_PER_REACH times
+        the arm's reach."""
         notes = []
         for link, parts in robot.meshes.items():
             size = float(np.ptp(np.concatenate([part.vertices for part in parts]), axis=0).max())
@@ -270,16 +275,16 @@ class UrdfTree:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the URDF (compiled, if it is a xacro file) and of its mesh files: equal for equal
-        robots."""
+        """SHA-256 of the URDF and of its mesh files, equal for equal robots. For a xacro file, the compiled
+        URDF is hashed."""
         digest = hashlib.sha256(self.text)
         for element in self.links.values():
             for mesh in element.findall(f"{self.kind}/geometry/mesh"):
                 file = self.packages.file(mesh.get("filename", ""))
                 digest.update(read_bytes(file, "mesh file"))
                 if file.suffix.lower() in (".dae", ".glb", ".gltf"):
-                    # these formats are now converted to meters and z up; robots prepared before that need
-                    # another digest
+                    # these formats were once read without conversion to meters and z up; robots prepared then
+                    # must have another digest
                     digest.update(b"in metres, z up")
         return digest.hexdigest()
 
@@ -313,7 +318,7 @@ class UrdfTree:
         return joints
 
     def above(self, link: str) -> dict[str, Pose]:
-        """T_link_ancestor by ancestor of a link, up to the first movable joint."""
+        """T_link_ancestor of each ancestor of a link that fixed joints alone connect to the link."""
         transforms: dict[str, ndarray] = {}
         T_link_ancestor = np.eye(4)
         while link in self.parents:
@@ -327,10 +332,12 @@ class UrdfTree:
         return transforms
 
     def pose_link(self, link: str) -> str:
-        """The link whose pose a scene gives as the robot's pose: a link between the root and `link`.
+        """The link that stands for the robot in scene files: where a scene gives the robot's pose, it is this
+        link's.
 
-        If the URDF begins with a mobile base without geometry (a planar or floating joint, or three joints
-        that move in a plane), it is the link after these joints, otherwise the root.
+        It is the root, unless the URDF begins with a mobile base without geometry: a planar or floating
+        joint, or three joints that move in a plane. Then it is the link after these joints. Only joints from
+        the root to `link` are considered.
         """
         way: list[str] = []
         end = link
@@ -450,7 +457,8 @@ class UrdfTree:
         )
 
     def inertias(self, links: list[str]) -> dict[str, Inertia]:
-        """Inertias of the links that have a mass. Physically impossible ones are left out, with a note."""
+        """Inertias of the links that have a mass. Physically impossible inertias are left out, with a
+        note."""
         inertias = {}
         for link in links:
             element = self.links[link].find("inertial")
@@ -471,9 +479,9 @@ class UrdfTree:
         return inertias
 
     def geometry(self, links: list[str]) -> dict[str, tuple[ConvexMesh, ...]]:
-        """Convex hulls of the links' collision elements, by link and in its frame.
+        """Convex hulls of the links' collision elements, by link and in the link's frame.
 
-        If no link of the file has collision elements, those of the visual elements.
+        If no link of the file has collision elements, the hulls of the visual elements are returned.
         """
         parts = {
             link: tuple(convex_hull(surface.vertices) for surface in self.surfaces(link)) for link in links
@@ -522,7 +530,7 @@ class UrdfTree:
         return self._surfaces[link]
 
     def _primitive(self, shape: ET.Element, link: str) -> Points:
-        """Corners of a polyhedron around a primitive."""
+        """Corners of a polyhedron that encloses a primitive shape [m], in the shape's frame."""
 
         def positive(name: str, count: int) -> Values:
             location = f"link {link}: {shape.tag} {name}"
@@ -537,11 +545,11 @@ class UrdfTree:
         if shape.tag == "sphere":
             return _ball() * radius
         if shape.tag == "capsule":
-            end = _ball() * radius
+            end_points = _ball() * radius
         else:
-            end = np.insert(polygon_around_circle(float(radius[0])), 2, 0.0, axis=1)
+            end_points = np.insert(polygon_around_circle(float(radius[0])), 2, 0.0, axis=1)
         half = float(positive("length", 1)[0]) / 2
-        return np.concatenate([end + np.array([0, 0, z]) for z in (-half, half)])
+        return np.concatenate([end_points + np.array([0, 0, z]) for z in (-half, half)])
 
     def _mesh(self, shape: ET.Element, link: str) -> Surface:
         file = self.packages.file(shape.get("filename", ""))
@@ -564,7 +572,7 @@ class UrdfTree:
         return Surface(vertices, faces)
 
     def _numbers(self, text: str, count: int, what: str, most: float = MAX_COORDINATE) -> Values:
-        """The numbers of an attribute, whose absolute values are at most `most`."""
+        """The `count` numbers of an attribute. Raises InputError if their absolute values exceed `most`."""
         try:
             values = np.array([float(word) for word in text.split()])
         except ValueError:
@@ -576,7 +584,7 @@ class UrdfTree:
         return values
 
     def _origin(self, element: ET.Element, what: str) -> Pose:
-        """The transform of the element's <origin>."""
+        """The transform of the element's <origin>: T_link_element, or T_parent_joint of a joint."""
         origin = element.find("origin")
         if origin is None:
             return np.eye(4)
@@ -592,6 +600,8 @@ class UrdfTree:
         return transform(xyz, rotation_from_quaternion(np.array([w, x, y, z])))
 
 
+# fields of MoveIt's joint_limits.yaml and of `Joint`; then MoveIt's fields that get a note, or switch a limit
+# off
 FIELDS = {
     "min_position": "lower",
     "max_position": "upper",
@@ -609,12 +619,12 @@ FLAGS = (
 
 
 def read_limits(file: str | Path) -> tuple[dict[str, dict[str, float]], tuple[str, ...]]:
-    """Read limits from a YAML or JSON file: values by joint and by field of `Joint`, and notes.
+    """Read limits from a YAML or JSON file. Returns values by joint and by field of `Joint`, and notes.
 
     The file has the form joint_limits: {JOINT: {max_velocity: 2.0}}, with the fields min_position,
-    max_position, max_velocity, max_acceleration and max_jerk. A field is ignored if MoveIt's flag
-    has_..._limits for it is false. Other fields of the file, such as MoveIt's default scaling factors, are
-    ignored, with a note. Raises InputError that names the joint and the field.
+    max_position, max_velocity, max_acceleration and max_jerk. A field is ignored if MoveIt's flag for it,
+    such as has_velocity_limits, is false. Other entries beside joint_limits, such as MoveIt's default scaling
+    factors, are ignored, with a note. Raises InputError that names the joint and the field.
     """
     data = read_yaml(file, "joint limits")
     joints = data.get("joint_limits") if isinstance(data, dict) else None
@@ -636,10 +646,11 @@ def read_limits(file: str | Path) -> tuple[dict[str, dict[str, float]], tuple[st
 
 
 def with_limits(robot: Robot, limits: dict[str, dict[str, float]]) -> Robot:
-    """The robot with limits changed, by joint and field; InputError for an unknown joint.
+    """The robot with changed limits, given by joint and field. Raises InputError for an unknown joint.
 
-    A new velocity limit also scales acceleration and jerk limits, unless these are given. A continuous joint
-    with a position limit becomes revolute; a missing second limit is half a turn.
+    A new velocity limit also sets the acceleration and jerk limits in the default ratios, unless these are
+    given. A continuous joint with a position limit becomes revolute; if only one of its limits is given, the
+    other one is half a turn from zero.
     """
     movable = {joint.name: joint for joint in robot.joints if joint.kind in MOVING_KINDS}
     for name in limits:
