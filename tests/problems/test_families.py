@@ -139,7 +139,7 @@ def test_obstacles_stay_clear_of_the_base() -> None:
     [
         ({"kinds": ("sphere", "cone")}, "'cone'; known: box, sphere"),
         ({"obstacles": (3, 2)}, "obstacles is from 3 to 2"),
-        ({"kinds": ()}, "must allow a scene"),
+        ({"kinds": ()}, "must not be empty"),
     ],
 )
 def test_wrong_settings(change: dict[str, object], message: str) -> None:

@@ -1,6 +1,6 @@
 """Path constraints: conditions on the pose of a link that hold along the whole motion.
 
-Positions and directions are in the frame of the base.
+Positions and directions are in the frame of the base, except where a field says otherwise.
 
 As with shapes, the constructors check their arguments themselves: see `no_type_check` in scenes/shapes.py.
 """
@@ -15,7 +15,7 @@ from robotdiffuse.core.bounds import MAX_COORDINATE, Value, numbers, read_only, 
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.types import GivenVector, Pose, PoseOrNone
 
-# Tolerances of the tightest constraints [m], [rad].
+# Smallest tolerances and angles that constraints may have [m], [rad].
 MIN_TOLERANCE = 1e-4
 MIN_ANGLE = 1e-3
 SCALAR_BOUNDS = {
@@ -149,9 +149,10 @@ class OnLine(FrameConstraint):
 class CartesianLine(FrameConstraint):
     """The origin of a link moves on the straight segment from its start position to its goal position.
 
-    The goal must therefore determine the pose of the link: one configuration, or a pose without tolerances of
-    a link that is rigidly connected to it. The orientation follows the shortest rotation from start to goal,
-    in proportion to the fraction of the segment traveled.
+    The goal must therefore determine the pose of the link. It may be a configuration, several configurations
+    with the link at the same pose, or a pose without tolerances of this link or of a link rigidly connected
+    to it. The orientation follows the shortest rotation from start to goal, in proportion to the fraction of
+    the segment traveled.
     """
 
     kind: ClassVar[str] = "cartesian_line"

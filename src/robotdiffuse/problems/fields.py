@@ -1,5 +1,7 @@
 """The fields of problem files: how each is read, written, moved between frames and described.
 
+Examples of the less simple fields:
+
 base: {xyz: [0, 0, 0.7], wxyz: [1, 0, 0, 0]}
 tool: {link: panda_hand, xyz: [0, 0, 0.15], shapes: [{cylinder: {...}}]}
 attached:
@@ -63,7 +65,7 @@ OBJECT: Schema = {"type": "object"}
 
 
 def _array(items: Schema, size: int | None = None) -> Schema:
-    """The schema of a list, of a size if it is given."""
+    """The schema of a list, of exactly `size` items if it is given."""
     return {"type": "array", "items": items} | ({} if size is None else {"minItems": size, "maxItems": size})
 
 
@@ -105,11 +107,12 @@ TOOL_FIELDS = {"link": TEXT, "name": TEXT, **POSE, "shapes": _array(SHAPE), "tou
 PAYLOAD_FIELDS = {"mass": NUMBER, "com": NUMBERS, "link": TEXT, "moments": NUMBERS}
 MOTION_FIELDS = ("velocity", "times", "poses", "max_speed")
 WRITTEN_DECIMALS = 12
-"""Number of decimals of computed poses in files: enough to restore the values that were read."""
+"""Decimals of computed poses in files. Rounding restores the values that a user wrote, e.g. 0.3 for
+0.30000000000000004."""
 
 
 def _fields_of(kind: type) -> tuple[dict[str, Schema], list[str]]:
-    """The fields of the entry of a shape or constraint, and its required fields."""
+    """Schemas of the fields of a shape or constraint in a file, by name, and its required fields."""
     schemas: dict[str, Schema] = {}
     for field in fields(kind):
         schemas |= (
@@ -128,7 +131,8 @@ def _entry_schema(kind: type[Shape] | type[Constraint]) -> Schema:
 
 
 def read_pose(where: str, data: object) -> Pose:
-    """The transform of {xyz: [...], wxyz: [...]}, both optional. Raises InputError for anything else."""
+    """The transform of an entry {xyz: [...], wxyz: [...]}; both fields are optional. Raises InputError for
+    anything else."""
     return pose_of(where, check_fields(where, data, (), POSE))
 
 
@@ -139,8 +143,8 @@ def pose_of(where: str, values: dict[str, Any]) -> Pose:
 
 
 def entries_of(where: str, data: object, what: str) -> list[tuple[str, Any]]:
-    """The entries of a list, each with its place. Raises InputError for anything else; `what`
-    is in its message."""
+    """The entries of a list, each with its place for messages. Raises InputError for anything else, with a
+    message that says what the list should hold (`what`)."""
     if not isinstance(data, list):
         raise InputError(f"{where} is {shown(data)}; it must be a list of {what}")
     return [(f"{where}[{i}]", entry) for i, entry in enumerate(data)]
@@ -172,22 +176,23 @@ def _touch_links(where: str, entry: dict[str, Any]) -> tuple[str, ...]:
 def _one_shape(where: str, entry: dict[str, Any], folder: Path, notes: list[str]) -> Shape:
     """The shape of an entry such as {box: {...}}."""
     try:
-        scene, more = read_scene([entry], folder, field=where)
+        scene, shape_notes = read_scene([entry], folder, field=where)
     except InputError as error:
         raise InputError(str(error).replace(f"{where}[0]", where, 1)) from None
-    notes += more
+    notes += shape_notes
     return scene.shapes[0]
 
 
 def equipped(robot: Robot, values: dict[str, Any], folder: Path, notes: list[str]) -> Robot:
-    """The robot with the tool and the attached objects of a problem file; adds to the notes.
+    """The robot with the tool and the attached objects of a problem file.
 
-    Raises InputError that names the field, for unknown fields and what `Robot.attach` does not accept.
+    folder: file names of meshes are relative to it. notes: notes on the shapes are added to this list. Raises
+    InputError that names the field, for unknown fields and for values that `Robot.attach` does not accept.
     """
     if values.get("tool") is not None:
         tool = check_fields("tool", values["tool"], ("link",), TOOL_FIELDS)
-        shapes, more = read_scene(tool.get("shapes", []), folder, field="tool.shapes")
-        notes += more
+        shapes, shape_notes = read_scene(tool.get("shapes", []), folder, field="tool.shapes")
+        notes += shape_notes
         link = _text("tool.link", tool["link"])
         name = _text("tool.name", tool.get("name", TOOL))
         robot = robot.with_tool(link, pose_of("tool", tool), shapes.shapes, _touch_links("tool", tool), name)
@@ -207,7 +212,7 @@ def equipped(robot: Robot, values: dict[str, Any], folder: Path, notes: list[str
 
 
 def equipment_entries(robot: Robot, folder: Path | None) -> dict[str, Any]:
-    """The fields `tool` and `attached` of a robot, as `equipped` reads them."""
+    """The fields `tool` and `attached` of a robot, in the form that `equipped` reads."""
     entries: dict[str, Any] = {}
     for body in robot.attached:
         shapes = scene_entries(Scene([s for s in body.shapes if isinstance(s, Shape)]), folder)
@@ -221,7 +226,7 @@ def equipment_entries(robot: Robot, folder: Path | None) -> dict[str, Any]:
 
 
 class Setting(NamedTuple):
-    """What entries of a problem file refer to."""
+    """What the entries of a problem file may refer to."""
 
     robot: Robot
     scene: Scene
@@ -233,16 +238,16 @@ class Setting(NamedTuple):
 def read_goal(where: str, data: object, setting: Setting) -> Goal:
     """The goal of an entry of a problem file. Raises InputError that names the field.
 
-    As in Python, it may also be a configuration, a list of them, the name of a pose of the robot, or a list
-    of goals, any of which may be reached.
+    Besides the mappings in GOALS, the entry may be what `rd.Problem` accepts: a configuration, a list of
+    configurations, the name of a pose of the robot, or a list of goals, any of which may be reached.
 
-    Poses are in the frame of the scene, or of the object of the scene that `relative_to` names.
+    Poses are in the frame of the scene, or in the frame of the object that `relative_to` names.
     """
     if isinstance(data, str):
         return JointGoal(named_pose(setting.robot, where, data))
     if isinstance(data, list):
-        several = "joint_set" if data and all(isinstance(part, list) for part in data) else "joints"
-        data = {"any" if any(isinstance(part, dict | str) for part in data) else several: data}
+        kind = "joint_set" if data and all(isinstance(part, list) for part in data) else "joints"
+        data = {"any" if any(isinstance(part, dict | str) for part in data) else kind: data}
     if not isinstance(data, dict) or len(data) != 1:
         raise InputError(
             f"{where} is {shown(data)}; it must be one of {', '.join(GOALS)}, or a configuration"
@@ -273,7 +278,7 @@ def read_goal(where: str, data: object, setting: Setting) -> Goal:
 
 
 def _pose_goal(where: str, value: object, scene: Scene, frame: object = None) -> PoseGoal:
-    """The goal of a pose entry. frame: the link, if the entry itself does not name it."""
+    """The goal of a pose entry. frame: the link; None: the entry names it."""
     pose_fields = (
         GOAL_POSE if frame is None else {name: GOAL_POSE[name] for name in GOAL_POSE if name != "frame"}
     )
@@ -291,7 +296,7 @@ def _pose_goal(where: str, value: object, scene: Scene, frame: object = None) ->
 
 
 def goal_entry(goal: Goal) -> dict[str, Any]:
-    """The entry of a goal, as `read_goal` reads it."""
+    """The entry of a goal, in the form that `read_goal` reads."""
     if isinstance(goal, AnyGoal):
         return {"any": [goal_entry(part) for part in goal.goals]}
     if isinstance(goal, JointGoal):
@@ -330,7 +335,7 @@ def _constraint(where: str, entry: object) -> Constraint:
 
 
 def constraint_entry(constraint: Constraint) -> dict[str, Any]:
-    """The entry of a constraint, as it is read."""
+    """The entry of a constraint in a problem file."""
     values: dict[str, Any] = {}
     for field in fields(constraint):
         value = getattr(constraint, field.name)
@@ -363,7 +368,7 @@ def _moving(where: str, entry: object, setting: Setting) -> MovingObstacle:
 
 
 def moving_entry(obstacle: MovingObstacle, folder: Path | None) -> dict[str, object]:
-    """The entry of a moving obstacle, as it is read."""
+    """The entry of a moving obstacle in a problem file; files of meshes are named relative to `folder`."""
     [shape] = scene_entries(Scene([obstacle.shape]), folder)
     entry: dict[str, object] = dict(shape)
     if obstacle.velocity is not None:
@@ -377,7 +382,7 @@ def moving_entry(obstacle: MovingObstacle, folder: Path | None) -> dict[str, obj
 
 
 def payload_entry(payload: Payload) -> dict[str, object]:
-    """The entry of a payload, as it is read."""
+    """The entry of a payload in a problem file."""
     data: dict[str, object] = {"mass": payload.mass, "com": payload.com.tolist()}
     if payload.link is not None:
         data["link"] = payload.link
@@ -393,13 +398,15 @@ def _views(data: object, setting: Setting) -> Any:
 
 
 class Field(NamedTuple):
-    """A field of `Problem` in its file."""
+    """How problem files hold a field of `Problem`."""
 
     schema: Schema
     read: Callable[[Any, Setting], Any] = lambda data, setting: data
+    """Converts the plain data of a file to the argument for `Problem`."""
     write: Callable[[Any, Path | None], Any] = lambda value, folder: value
+    """Converts the field's value to plain data; names of files are relative to the folder."""
     in_world: bool = False
-    """Whether the value is in the frame of the world."""
+    """Whether files give the value in the frame of the world."""
     with_request: bool = True
     """Whether a problem file may give the field beside a MoveIt request."""
 
@@ -479,7 +486,7 @@ FIELDS = {
     ),
     "unknown": Field({"enum": list(UNKNOWN_POLICIES)}),
 }
-"""Fields of problems in the order of files."""
+"""Fields of `Problem`, in the order in which files list them."""
 SETUP: dict[str, Schema] = {
     "robot": TEXT | {"description": f"a URDF file, an added robot, or {', '.join(ROBOTS)}"},
     "locked": OBJECT | {"additionalProperties": NUMBER},
@@ -488,14 +495,14 @@ SETUP: dict[str, Schema] = {
     "attached": _array(OBJECT | {"required": ["link"]}),
     "request": TEXT | {"description": "a MoveIt motion plan request, in place of start and goal"},
 }
-"""Fields that make up the robot, its place and its request."""
+"""The other fields of files: the robot with what it holds, the pose of its base, and a MoveIt request."""
 
 
 def problem_schema() -> Schema:
-    """The schema of a problem file, as JSON values, for editors that complete and check them.
+    """The JSON schema of problem files, for editors that complete and check these files.
 
-    It is made of the tables by which files are read. It says what fields there are; The messages of
-    `load_problem` say more.
+    It is made from the tables by which files are read. It lists the fields and their types; `load_problem`
+    checks more than that.
     """
     shapes = {kind: _entry_schema(shape) for kind, shape in SHAPES.items()}
     goal = {"anyOf": [TEXT, _array({"anyOf": [NUMBER, GOAL]}), _one_of(GOALS)]}

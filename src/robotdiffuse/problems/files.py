@@ -124,8 +124,8 @@ def problem_record(
     Args:
         problem: The problem.
         folder: Files in it or below it are named relative to it, others by their full path.
-        robot: The name of the robot, or the path of its URDF, to write; None: the one that it was loaded
-            from.
+        robot: The name of the robot, or the path of its URDF, to write; None: the name or path from which
+            the robot was loaded.
 
     Raises:
         InputError: For a robot that is neither bundled nor loaded from a file.
@@ -160,8 +160,8 @@ def problem_record(
 def problem_from_record(record: object, robots: Mapping[str, Robot] | None = None) -> Problem:
     """The problem of a record of `problem_record`. Raises InputError as `load_problem` does.
 
-    robots: the only robots that the record may name, by name. With them, the record may not name files
-    either: for records from people who may not read files on this machine.
+    robots: robots by name, the only ones that the record may name. If they are given, the record may not name
+    any file: this is for records from people who may not read files on this machine.
     """
     if robots is None:
         return _problem("problem", record, Path())
@@ -206,10 +206,10 @@ def load_motion_bench_maker(
 ) -> list[ProblemEntry]:
     """The problems of a folder with pairs of files sceneNNNN.yaml and requestNNNN.yaml, in order.
 
-    robot: by default the bundled one that the scenes' robot_model_name names. Its joints that are not planned
-    (fingers) are locked at the values of the request's start state. An invalid problem, e.g. one whose goal
-    is out of limits, or that has joints that the robot lacks (unless `ignore_joints`), becomes an entry with
-    an error. Raises InputError if the folder holds no scene.
+    robot: None stands for the bundled robot that the scene's robot_model_name names. Joints that are not
+    planned (fingers) are locked at the values of the request's start state. An invalid problem becomes an
+    entry with an error, e.g. if its goal is out of limits or, unless `ignore_joints`, if it has joints that
+    the robot lacks. Raises InputError if the folder holds no scene.
     """
     folder = Path(folder)
     scenes = sorted(folder.glob("scene*.yaml"))
@@ -248,7 +248,7 @@ def _moveit_problem(scene_file: Path, robot: Robot | None, ignore_joints: bool) 
 
 
 def _linkable(robot: Robot, request: MoveItRequest | None) -> tuple[str, ...]:
-    """Names of the robot's links and of what it holds at the start."""
+    """Names of the robot's links and of the objects that it holds at the start."""
     return (*robot.link_names, *(attached.name for attached in (request.attached if request else ())))
 
 
@@ -322,11 +322,11 @@ def _problem(
                     raise InputError(f"{name} cannot be combined with request")
             request = moveit_request(read_yaml(folder / str(values["request"])), frames, folder)
         if from_moveit:
-            of_file = (folder / values["scene"]).parent
-            scene = moveit_scene(content, frames, of_file, _linkable(robot, request), contacts)
+            scene_folder = (folder / values["scene"]).parent
+            scene = moveit_scene(content, frames, scene_folder, _linkable(robot, request), contacts)
         else:
-            scene, more = read_scene(values["scene"], folder, contacts)
-            notes += more
+            scene, scene_notes = read_scene(values["scene"], folder, contacts)
+            notes += scene_notes
         setting = Setting(robot, scene, folder, notes)
         options = {
             name: field.read(values[name], setting)

@@ -17,9 +17,10 @@ from robotdiffuse.core.types import GivenConfigurations, GivenPose, Pose, Vector
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class JointGoal(Value):
-    """Any of these configurations (one row each)."""
+    """A goal reached at any of several configurations."""
 
     positions: GivenConfigurations
+    """The configurations, one per row [rad] or [m]."""
 
     def __post_init__(self) -> None:
         positions = numbers(self.positions)
@@ -46,9 +47,9 @@ class PoseGoal(Value):
     paper.
 
     With tolerances, the final pose of the link, in the frame of the goal, must have xyz and rpy within plus
-    and minus the tolerances. xyz is a box along the goal's axes; rpy are roll, pitch and yaw about its x, y
-    and z in the order of URDFs, so that a yaw tolerance of pi allows any turn about z. All poses within the
-    tolerances are equally good.
+    and minus the tolerances. xyz is a position along the goal's axes; rpy are roll, pitch and yaw about the
+    goal's x, y and z axes, in the order of URDFs. A yaw tolerance of pi thus allows any turn about z. All
+    poses within the tolerances are equally good.
     """
 
     frame: str

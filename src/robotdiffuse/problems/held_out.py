@@ -1,9 +1,8 @@
-"""Held-out problems for evaluation: numbered problems of the families that are in no data set, and their
-files.
+"""Held-out problems for evaluation: numbered random problems of each family, none of which is in a data set.
 
 A problem is trivial if the straight line from the start to a goal configuration passes the validator. It is
-hard if it is not trivial and a search solves it. Problems are stored with these results as JSON lines, which
-every benchmark reads.
+hard if it is not trivial and a search solves it. JSON lines files store each problem with whether it is
+trivial and the length that the search found; every benchmark reads these files.
 """
 
 import itertools
@@ -28,8 +27,8 @@ SEED = 20261121
 Validator = Callable[[Problem, Path], bool]
 """A function that says whether a path solves a problem."""
 Search = Callable[[Problem], float | None]
-"""A function that searches a path for a problem and returns the length of the shortest path found [rad], or
-None."""
+"""A function that searches for paths of a problem and returns the length of the shortest path [rad], or None
+if it finds no path."""
 Progress = Callable[[str], None]
 """A function that receives progress messages."""
 REPORT_EVERY = 20
@@ -70,12 +69,12 @@ class Case:
 
 
 def held_out_problem(family: str, number: int) -> Problem:
-    """The Panda's problem of this number. Some problems are trivial, others unsolvable."""
+    """Problem `number` of a family, for the Panda. Some problems are trivial, others unsolvable."""
     FAMILIES.entry(family)
     index = list(FAMILIES).index(family)
     rng = np.random.default_rng([SEED, number] if index == 0 else [SEED, 10 + index, number])
     if index > 1:
-        rng.random()  # keeps the problems of the first published figures
+        rng.random()  # discarded: the first published problems were generated with this additional number
     robot = load_robot("panda")
     return load_family(family).draw(robot, rng).problem(robot)
 
@@ -106,7 +105,7 @@ class CaseFile:
                     f"{file}, line {number} has {', '.join(row)} instead of {', '.join(ROW_FIELDS)}; remove "
                     "the file to generate its problems again"
                 )
-            self._rows[row["name"]] = row  # a later line on the same problem contains more
+            self._rows[row["name"]] = row  # a later line on the same problem adds the search's result
 
     def __len__(self) -> int:
         return len(self._rows)

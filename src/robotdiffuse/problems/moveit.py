@@ -35,22 +35,25 @@ from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, PointCloud, Shape, S
 
 SCENE = "a planning scene"
 REQUEST = "a motion plan request"
-# Names in planning scenes: of the matrix, and in it of the octomap.
+# Names in planning scenes: the field of the matrix, and the octomap's name in the matrix.
 MATRIX = "allowed_collision_matrix"
 OCTOMAP = "<octomap>"
 
-# Edge and thickness of the box below a plane [m].
+# Edge length and thickness of the box that stands for a plane [m].
 PLANE_EXTENT = 20.0
 PLANE_THICKNESS = 0.01
 MAX_PLANES = 1000
-"""Largest number of planes of a collision object; each becomes a box."""
+"""Maximum number of planes in a collision object; each becomes a box."""
 NO_POSE = {"position": [0, 0, 0], "orientation": [0, 0, 0, 1]}
 TYPE_NUMBERS = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone", 5: "prism"}
 """Names of the types of shape_msgs/SolidPrimitive, by their numbers in messages."""
 
 
 def mapping_of(where: str, value: object, *names: str) -> dict[str, Any]:
-    """The mapping, or the mapping in nested fields of it; None counts as empty, as in the messages."""
+    """The value as a mapping, or the mapping in its nested field names[0].names[1]...; None counts as empty.
+
+    where: the place of the value, for messages.
+    """
     for name in names:
         value = mapping_of(where, value).get(name)
         where = name if where in (SCENE, REQUEST) else f"{where}.{name}"
@@ -60,7 +63,8 @@ def mapping_of(where: str, value: object, *names: str) -> dict[str, Any]:
 
 
 def list_of(where: str, entry: dict[str, Any], name: str) -> list[Any]:
-    """The list in a field; None counts as empty."""
+    """The list in the field `name` of an entry; None counts as empty. where: prefix of the field's name in
+    messages."""
     value = entry.get(name)
     if value is not None and not isinstance(value, list):
         raise InputError(f"{where}{name} is {shown(value)}; it must be a list")
@@ -68,7 +72,7 @@ def list_of(where: str, entry: dict[str, Any], name: str) -> list[Any]:
 
 
 def mappings_of(where: str, entry: dict[str, Any], name: str) -> list[tuple[str, dict[str, Any]]]:
-    """The mappings in the list in a field, each with its place."""
+    """The mappings of the list in the field `name`, each with its place for messages."""
     places = [(f"{where}{name}[{i}]", value) for i, value in enumerate(list_of(where, entry, name))]
     return [(place, mapping_of(place, value)) for place, value in places]
 
@@ -78,7 +82,7 @@ def xyz_of(where: str, value: object) -> Vector:
 
 
 def pose_of(where: str, value: object, position: str = "position", orientation: str = "orientation") -> Pose:
-    """The transform of a geometry_msgs/Pose, or of a Transform with other names of its two fields."""
+    """The transform of a geometry_msgs/Pose, or of a Transform, whose two fields have other names."""
     value = mapping_of(where, value)
     turn = value.get(orientation)
     xyzw = [turn.get(axis) for axis in "xyzw"] if isinstance(turn, dict) else turn
@@ -87,7 +91,7 @@ def pose_of(where: str, value: object, position: str = "position", orientation: 
 
 
 def joint_state(state: dict[str, Any], where: str) -> dict[str, float]:
-    """Joint values by name of the state of a robot."""
+    """Joint values by joint name of a RobotState."""
     joints = mapping_of(where, state, "joint_state")
     where = f"{where}.joint_state"
     names = list_of(f"{where}.", joints, "name")
@@ -96,7 +100,7 @@ def joint_state(state: dict[str, Any], where: str) -> dict[str, float]:
 
 
 def frame_name(where: str, entry: dict[str, Any]) -> str:
-    """The name of the frame in the header of an entry."""
+    """The frame_id in the header of an entry, without a leading slash."""
     return str(mapping_of(where, entry, "header").get("frame_id") or "").removeprefix("/")
 
 
@@ -106,13 +110,14 @@ def read_moveit_scene(
     """The collision objects of a planning scene, in the frame of the robot's base, and notes on differences
     between the scene's robot and `robot`.
 
-    The pose of the root of the robot's URDF comes from robot_state.multi_dof_joint_state, the pose of its
-    base relative to the root from the robot (None: base and root are the same), and frames from
-    fixed_frame_transforms and from the links that are fixed to the base. Contacts of the robot's links with
-    objects are allowed as in the allowed collision matrix; its pairs of links are ignored, because the robot
-    has its own. Raises InputError, naming file and object, for a missing or
-    damaged file, unknown frames, shapes that are not supported (prisms), and, unless
-    `ignore_joints`, joints that the robot lacks.
+    The pose of the root of the robot's URDF comes from robot_state.multi_dof_joint_state, and the pose of the
+    base relative to this root from `robot` (None: base and root are the same link). Other known frames are
+    those in fixed_frame_transforms and the links that are fixed to the base. The allowed collision matrix
+    says which links may touch which objects; its entries for two links are ignored, because the robot has its
+    own pairs of links to check.
+
+    Raises InputError, naming file and object, for a missing or damaged file, unknown frames, shapes that are
+    not supported (prisms), and, unless `ignore_joints`, joints that the robot lacks.
     """
     data = read_yaml(file)
     with located(file):
@@ -122,37 +127,40 @@ def read_moveit_scene(
 
 
 class MoveItFrames(dict[str, ndarray]):
-    """T_base_frame of the frames that objects of a planning scene may be given in; '' is the scene's own.
+    """T_base_frame, by name, of the frames in which a planning scene may give objects.
 
-    These are the scene's own frame, the frames that the file defines, and the links that fixed joints connect
-    with the robot's base. Looking up an unknown frame raises InputError, which lists the known frames, or
-    says why the pose of the robot's base in the scene is unknown.
+    These are the scene's own frame (named '' and, usually, `world`), the frames that the file defines, and
+    the links that fixed joints connect with the robot's base.
     """
 
     def __init__(self, robot: Robot | None, T_own_root: Pose, own: tuple[str, ...] = ("", "world")) -> None:
-        """own: names of the scene's own frame; T_own_root: pose of the URDF's root in it."""
+        """own: names of the scene's own frame. T_own_root: pose of the URDF's root in this frame."""
         super().__init__({} if robot is None else robot.above | robot.links_fixed_to_base)
         self.links = frozenset(self)
-        """Frames of the robot, whose poses a file cannot change."""
+        """Links of the robot; a file cannot change their poses."""
         T_base_root = np.eye(4) if robot is None else robot.T_base_root
-        self.lost = ""
+        self.unknown_reason = ""
         """Why the pose of the scene's own frame is unknown; empty if it is known."""
         if T_base_root is not None:
             T_base_own = T_base_root @ inverse(T_own_root)
             self.update({name: T_base_own for name in own if name not in self.links})
         elif robot is not None:
-            self.lost = f"a joint moves {robot.base} in {robot.root}"
+            self.unknown_reason = f"a joint moves {robot.base} in {robot.root}"
 
-    def of(self, where: str, entry: dict[str, Any]) -> Pose:
-        """T_base_frame of the frame that the header of an entry names."""
+    def of_header(self, where: str, entry: dict[str, Any]) -> Pose:
+        """T_base_frame of the frame that the header of an entry names.
+
+        Raises InputError for an unknown frame. The message lists the known frames and, if the pose of the
+        robot's base in the scene is unknown, says why.
+        """
         name = frame_name(where, entry)
         if name in self:
             return self[name]
         frame_names = [frame for frame in self if frame]
-        if self.lost:
+        if self.unknown_reason:
             raise InputError(
                 f"frame_id of {where} is {shown(name)}, and the pose of the robot's base in it is unknown: "
-                f"{self.lost}; known frames: {', '.join(frame_names)}"
+                f"{self.unknown_reason}; known frames: {', '.join(frame_names)}"
             )
         raise unknown_name(f"frame_id of {where}:", name, frame_names)
 
@@ -181,8 +189,8 @@ def moveit_frames(data: object, robot: Robot | None = None) -> MoveItFrames:
     for location, entry in mappings_of("", mapping_of(SCENE, data), "fixed_frame_transforms"):
         child = str(entry.get("child_frame_id", "")).removeprefix("/")
         T = pose_of(f"{location}.transform", entry.get("transform"), "translation", "rotation")
-        if not frames.lost and child not in frames.links:
-            frames[child] = frames.of(location, entry) @ T
+        if not frames.unknown_reason and child not in frames.links:
+            frames[child] = frames.of_header(location, entry) @ T
     return frames
 
 
@@ -191,8 +199,8 @@ def moveit_scene(
 ) -> Scene:
     """`read_moveit_scene` for a parsed file; names of mesh files are relative to `folder`.
 
-    links: names of the robot's links and held objects; contacts: allowed contacts in addition to the file's,
-    as in `Scene`.
+    links: names of the robot's links and held objects. contacts: allowed contacts in addition to those of the
+    file, in the form that `Scene` accepts.
     """
     world = mapping_of(SCENE, data, "world")
     shapes = _octomap(mapping_of("world", world, "octomap"), frames)
@@ -209,11 +217,12 @@ def moveit_scene(
 def matrix_contacts(
     matrix: object, obstacles: Iterable[str], links: Collection[str]
 ) -> dict[str, tuple[str, ...]]:
-    """For each obstacle, the links that may touch it; obstacles without any are left out.
+    """For each obstacle, the links that may touch it; obstacles that no link may touch are left out.
 
-    An entry for a pair decides; without one, the defaults of its names do: contact is allowed if either has a
-    default and none forbids. Pairs of links, and names that are neither links nor obstacles, are ignored.
-    Raises InputError for a matrix that is not square.
+    The matrix entry of a link and an obstacle decides. If there is no entry, the default entries of the two
+    names decide: contact is allowed if at least one name has a default and no default forbids it. Pairs of
+    links, and names that are neither links nor obstacles, are ignored. Raises InputError for a matrix that is
+    not square.
     """
     matrix = mapping_of(MATRIX, matrix)
     names, rows, default_names, defaults = (
@@ -248,7 +257,7 @@ def matrix_contacts(
 
 
 def _octomap(entry: dict[str, Any], frames: MoveItFrames) -> list[Shape]:
-    """The occupied voxels of an OctomapWithPose as a cloud of spheres around them; none without data."""
+    """A point cloud whose spheres cover the occupied voxels of an OctomapWithPose; no shape without data."""
     location = "world.octomap"
     message = mapping_of(location, entry, "octomap")
     data = list_of(f"{location}.octomap.", message, "data")
@@ -258,18 +267,18 @@ def _octomap(entry: dict[str, Any], frames: MoveItFrames) -> list[Shape]:
         raise InputError(f"{location} is not binary; publish it as a binary octomap (octomap_binary)")
     numbers = vector(f"{location}.octomap", "data", data, len(data)).astype(np.int64)
     edge = float(vector(f"{location}.octomap", "resolution", [message.get("resolution")], 1)[0])
-    T = frames.of(location, entry) @ pose_of(f"{location}.origin", entry.get("origin") or NO_POSE)
+    T = frames.of_header(location, entry) @ pose_of(f"{location}.origin", entry.get("origin") or NO_POSE)
     with located(location):
         voxels = occupied_voxels((numbers % 256).astype(np.uint8).tobytes(), edge)
         return [PointCloud(voxels, cover_radius(edge), name="octomap").moved(T)]
 
 
 def object_shapes(entry: dict[str, Any], frames: MoveItFrames, folder: Path) -> list[Shape]:
-    """The shapes of a CollisionObject, all with its name, in the frame of the robot's base.
+    """The shapes of a CollisionObject in the frame of the robot's base, each named like the object.
 
-    folder: where names of mesh files begin.
+    folder: names of mesh files are relative to it.
     """
-    T_base_object = frames.of("header", entry) @ pose_of("pose", entry.get("pose") or NO_POSE)
+    T_base_object = frames.of_header("header", entry) @ pose_of("pose", entry.get("pose") or NO_POSE)
     name = str(entry.get("id") or "object")
     shapes: list[Shape] = []
     for key, plural in (("plane", "planes"), ("primitive", "primitives"), ("mesh", "meshes")):
@@ -334,11 +343,12 @@ PRIMITIVES: dict[str, tuple[int, Callable[[ndarray, ndarray, ndarray, str], Shap
     "cylinder": (2, lambda size, xyz, wxyz, name: Cylinder(xyz, size[1], size[0], wxyz, name)),
     "cone": (2, _cone),
 }
-"""For each type, the number of its dimensions and the shape (of cylinders and cones height and radius)."""
+"""For each type, the number of its dimensions, and a function that makes the shape from its dimensions,
+position, quaternion wxyz and name. The dimensions of cylinders and cones are height and radius."""
 
 
 def _plane(coefficients: Float[ndarray, "4"], name: str) -> Box:
-    """A large, thin box below the plane a x + b y + c z + d = 0; (a, b, c) points away from it.
+    """A large, thin box below the plane a x + b y + c z + d = 0; (a, b, c) points away from the box.
 
     Raises InputError if a, b and c are all zero.
     """
@@ -358,11 +368,11 @@ def moveit_model(data: object) -> str:
 
 
 def scene_robot_notes(data: object, robot: Robot, ignore_joints: bool = False) -> tuple[str, ...]:
-    """Notes on differences between a robot and the one of a parsed planning scene.
+    """Notes on differences between a robot and the robot of a parsed planning scene.
 
     Raises InputError for joints that the robot lacks, unless `ignore_joints`. A different model name alone is
-    only noted: the same arm has many names, and all joints are known. Names of multi-dof joints are ignored:
-    they are virtual joints of an SRDF, whose transforms give the pose of the robot's root.
+    only noted, because the same arm has many names. Names of multi-dof joints are ignored: these are virtual
+    joints of an SRDF, and their transforms only give the pose of the robot's root.
     """
     values = joint_state(mapping_of(SCENE, data, "robot_state"), "robot_state")
     model = moveit_model(data)
@@ -381,9 +391,10 @@ def scene_robot_notes(data: object, robot: Robot, ignore_joints: bool = False) -
 def joint_notes(
     where: str, values: dict[str, float], robot: Robot, model: str, ignore_joints: bool
 ) -> tuple[str, ...]:
-    """A note on joints that the robot lacks. Raises InputError for them unless `ignore_joints`.
+    """A note on joints of `values` that the robot lacks. Raises InputError for them unless `ignore_joints`.
 
-    A fixed joint of the robot counts as known if its value is zero.
+    A joint that is fixed in the robot counts as lacking if its value is not zero. model: name of the scene's
+    robot, for the message.
     """
     kinds = {joint.name: joint.kind for joint in robot.joints}
     lacking = [
@@ -417,7 +428,8 @@ class MoveItAttached:
     touch_links: tuple[str, ...] = ()
 
     def held_by(self, robot: Robot, start: list[float]) -> Robot:
-        """The robot that holds it at the start. touch_links that the robot lacks are ignored."""
+        """The robot, holding this object as at the configuration `start`; touch_links that it lacks are
+        ignored."""
         shapes = self.shapes
         if not self.in_link and self.link in robot.link_names:
             T_link_base = inverse(link_pose(robot, np.array(start), self.link))
@@ -442,7 +454,8 @@ class MoveItRequest:
     """Notes on parts of the request that are ignored."""
 
     def robot_notes(self, robot: Robot, model: str, ignore_joints: bool) -> tuple[str, ...]:
-        """`scene_robot_notes` for a request; `model` is its scene's robot_model_name."""
+        """Notes on joints of start and goals that the robot lacks; see `joint_notes`. model: the
+        robot_model_name of the request's scene."""
         notes = joint_notes("start_state.joint_state", self.start, robot, model, ignore_joints)
         for i, goal in enumerate(self.joint_goals):
             notes += joint_notes(f"goal_constraints[{i}]", goal, robot, model, ignore_joints)
@@ -450,8 +463,9 @@ class MoveItRequest:
 
 
 def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) -> MoveItRequest:
-    """Start, attached objects and goals of a parsed request; `frames` and `folder` belong to the scene of the
-    request.
+    """Start, attached objects and goals of a parsed request.
+
+    frames: the frames of the request's scene. folder: names of mesh files are relative to it.
 
     Several joint goal constraints are alternative goals. A position and an orientation constraint of one link
     are a pose goal at the center of the region, whose size and tolerances are ignored. Raises InputError for
@@ -467,11 +481,13 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
     notes = []
     for quantity in ("velocity", "acceleration"):
         name = f"max_{quantity}_scaling_factor"
-        share = float(vector("request", name, [data.get(name) or 0], 1)[0])  # 0 means 1 in MoveIt
-        if not 0 <= share <= 1:
+        factor = float(vector("request", name, [data.get(name) or 0], 1)[0])  # 0 means 1 in MoveIt
+        if not 0 <= factor <= 1:
             raise InputError(f"{name} is {shown(data[name])}; it must be a number from 0 to 1")
-        if 0 < share < 1:
-            notes.append(f"the request's {name} {share:g} is ignored: plan with {quantity}_scaling={share:g}")
+        if 0 < factor < 1:
+            notes.append(
+                f"the request's {name} {factor:g} is ignored: plan with {quantity}_scaling={factor:g}"
+            )
     state = mapping_of(REQUEST, data, "start_state")
     attached = tuple(
         _attached(location, entry, frames, folder)
@@ -517,23 +533,24 @@ def _joint_goal(where: str, goal: dict[str, Any]) -> dict[str, float]:
 
 
 def _pose_goal(where: str, goal: dict[str, Any], frames: MoveItFrames) -> tuple[str, ndarray]:
-    places, turns = (
+    positions, orientations = (
         mappings_of(f"{where}.", goal, f"{kind}_constraints") for kind in ("position", "orientation")
     )
-    if len(places) != 1 or len(turns) != 1 or goal.get("joint_constraints"):
+    if len(positions) != 1 or len(orientations) != 1 or goal.get("joint_constraints"):
         raise InputError(f"{where} must have one position and one orientation constraint, and no others")
-    [(at, place)], [(_, turn)] = places, turns
-    link = place.get("link_name")
-    if link != turn.get("link_name"):
+    [(at, position)], [(_, orientation)] = positions, orientations
+    link = position.get("link_name")
+    if link != orientation.get("link_name"):
         raise InputError(
-            f"{where} constrains {link} and {turn.get('link_name')}; both must constrain one link"
+            f"{where} constrains {link} and {orientation.get('link_name')}; both must constrain one link"
         )
-    if xyz_of("target_point_offset", place.get("target_point_offset") or [0, 0, 0]).any():
+    if xyz_of("target_point_offset", position.get("target_point_offset") or [0, 0, 0]).any():
         raise InputError(f"{at}.target_point_offset must be zero")
     region = "constraint_region"
-    poses = mappings_of(f"{region}.", mapping_of(at, place, region), "primitive_poses")
+    poses = mappings_of(f"{region}.", mapping_of(at, position, region), "primitive_poses")
     if len(poses) != 1:
         raise InputError(f"{where}: {region} has {len(poses)} primitive_poses; it must have one")
-    T_base_region = frames.of("header", place) @ pose_of(*poses[0])
-    turned = pose_of(where, {"position": [0, 0, 0], "orientation": turn.get("orientation")})
-    return str(link), transform(T_base_region[:3, 3], (frames.of("header", turn) @ turned)[:3, :3])
+    T_base_region = frames.of_header("header", position) @ pose_of(*poses[0])
+    T_frame_goal = pose_of(where, {"position": [0, 0, 0], "orientation": orientation.get("orientation")})
+    T_base_goal = frames.of_header("header", orientation) @ T_frame_goal
+    return str(link), transform(T_base_region[:3, 3], T_base_goal[:3, :3])

@@ -1,5 +1,7 @@
-"""Problem: a robot, a scene, a start and a goal, and optionally depth views of the scene; the checks of its
-fields, each of which returns the value as the problem keeps it, or raises InputError.
+"""Problem: a robot, a scene, a start and a goal, and optionally depth views of the scene.
+
+The functions before the class check its fields: each returns the value that the problem stores, or raises
+InputError.
 
 As with shapes, the constructors check their arguments themselves: see `no_type_check` in scenes/shapes.py.
 """
@@ -31,9 +33,9 @@ from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import ALL_LINKS, Scene
 
 LIMIT_SLACK = 1e-3
-"""Configurations beyond a joint limit by at most this are clamped to it, with a note [rad] or [m]."""
+"""A joint value up to this far beyond a limit is clamped to the limit, with a note [rad] or [m]."""
 VELOCITY_SLACK = 1e-6
-"""Start velocities beyond a limit by at most this fraction of the limit are clamped to it, with a note:
+"""A start velocity beyond a limit by up to this fraction of the limit is clamped to the limit, with a note:
 float32 rounds by up to 6e-8."""
 # Bounds of a `Problem.blend` that is not 0 [rad] or [m].
 MIN_BLEND = 1e-3
@@ -78,7 +80,7 @@ def checked_payload(robot: Robot, payload: Any) -> Payload | None:
 
 
 def blend_radii(value: object, count: int) -> tuple[float, ...]:
-    """One blend for each of `count` waypoints."""
+    """The blend radius of each of `count` waypoints; a single number stands for all of them."""
     blends = numbers(value)
     if blends is not None and blends.ndim == 0 and count:
         blends = np.full(count, blends)
@@ -117,8 +119,10 @@ def moving_obstacles(moving: Any, scene: Scene) -> tuple[MovingObstacle, ...]:
 
 
 def velocity_at_start(robot: Robot, value: object, notes: list[str]) -> JointValues | None:
-    """A velocity, clamped where it is within VELOCITY_SLACK of the limits; `notes` says where. None if it is
-    zero, or nearly."""
+    """The start velocity; None if all its values are below MIN_RATE.
+
+    Values up to VELOCITY_SLACK beyond a limit are clamped to it, each with a note in `notes`.
+    """
     if value is None:
         return None
     velocity = numbers(value)
@@ -140,7 +144,7 @@ def velocity_at_start(robot: Robot, value: object, notes: list[str]) -> JointVal
 
 
 def checked_goal(robot: Robot, field: str, goal: object, notes: list[str]) -> Goal:
-    """The goal as an object of its class, with its configurations within limits."""
+    """The goal as one of the classes of `Goal`, with its configurations within the joint limits."""
     if isinstance(goal, list | tuple):
         goal = [_values(robot, f"{field}[{i}]", each) for i, each in enumerate(goal)]
         if any(isinstance(each, OneGoal) for each in goal):
@@ -178,7 +182,7 @@ def _check_independent_links(robot: Robot, field: str, goal: PosesGoal) -> None:
 
 
 def _values(robot: Robot, field: str, value: Any) -> Any:
-    """The planned joints' values in the named pose, or of a dict by joint; anything else as it is."""
+    """Planned joint values of a pose's name or of a dict by joint; any other value is returned unchanged."""
     if isinstance(value, str):
         return named_pose(robot, field, value)
     if not isinstance(value, Mapping):
@@ -191,7 +195,7 @@ def _values(robot: Robot, field: str, value: Any) -> Any:
 
 
 def configuration(robot: Robot, field: str, value: object) -> Configuration:
-    """The value of each planned joint, of a list of numbers, a dict by joint or the name of a pose."""
+    """The planned joint values; `value` is a list of numbers, a dict by joint or the name of a pose."""
     q = numbers(_values(robot, field, value))
     names = ", ".join(robot.joint_names)
     if q is None or q.ndim != 1:
@@ -202,7 +206,10 @@ def configuration(robot: Robot, field: str, value: object) -> Configuration:
 
 
 def checked_configuration(robot: Robot, field: str, value: object, notes: list[str]) -> Configuration:
-    """The configuration, clamped where it is within LIMIT_SLACK of the limits; `notes` says where."""
+    """The configuration within the joint limits.
+
+    Values up to LIMIT_SLACK beyond a limit are clamped to it, each with a note in `notes`.
+    """
     values = zip(robot.planned_joints, configuration(robot, field, value), strict=True)
     return np.array([_position(field, joint, position, notes) for joint, position in values])
 
@@ -229,15 +236,15 @@ def _position(field: str, joint: Joint, value: float, notes: list[str]) -> float
 
 
 MAX_CLEARANCE = 0.5
-"""Largest clearance that can be requested [m]: hardly any motion of an arm keeps more."""
+"""Largest clearance that can be requested [m]; hardly any motion of an arm has a larger one."""
 OPTIMISTIC = "optimistic"
 PADDED = "padded"
 PREDICTED = "predicted"
 OCCUPIED = "occupied"
 UNKNOWN_POLICIES = (OPTIMISTIC, PADDED, PREDICTED, OCCUPIED)
-"""Policies for space that no view observed. It is assumed to be: free; free, except near observed surfaces;
-occupied where the occupancy completion network predicts obstacles; occupied. See
-`planning/pipeline/unknown_space.py`."""
+"""Policies for space that no view observed. `optimistic` assumes that it is free; `padded`, that it is free
+except near observed surfaces; `predicted`, that it is occupied where the occupancy completion network
+predicts obstacles; `occupied`, that all of it is occupied. See `planning/pipeline/unknown_space.py`."""
 EXCLUSIVE_FIELDS = (
     ("cartesian_line", "waypoints", ": plan from one waypoint to the next"),
     ("waypoints", "views", ": plan from one waypoint to the next"),
@@ -269,7 +276,7 @@ class ProblemOptions(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class StateValidity:
-    """Whether a configuration is free: true in conditions if it is."""
+    """Whether a configuration is free, and if not, why; true in conditions if it is free."""
 
     reason: str = ""
     """Why the configuration is not free: a joint out of limits, or the deepest contact."""
@@ -288,12 +295,12 @@ class Problem(Value):
     `start` accepts a configuration, a dict of values by joint (values of joints that are not planned are
     ignored), or the name of a pose of the robot (`robot.poses`), such as "ready". `goal` accepts these, a
     list of configurations, a JointGoal, a PoseGoal, a PosesGoal, or a list of goals, any of which may be
-    reached. Each waypoint accepts the same.
+    reached. Each waypoint accepts what `goal` accepts.
 
     Values up to `LIMIT_SLACK` beyond a joint limit are clamped, with a note. Values of continuous joints are
-    not changed; a goal may be reached at any number of their full turns. Raises InputError for everything
-    else that no planner could work with: wrong lengths, values that are not finite or out of limits, a goal
-    frame that no planned joint moves. Collisions of start and goal are detected by the planners.
+    not changed: a goal may be reached any number of full turns away. Raises InputError for everything else
+    that no planner could work with: wrong lengths, values that are not finite or out of limits, a goal frame
+    that no planned joint moves. Planners, not this class, detect collisions of start and goal.
 
     With views, `scene` holds the given shapes and the points that the views observed (`SeenPoints`).
     """
@@ -314,11 +321,11 @@ class Problem(Value):
     """Policy for space that no view observed, one of UNKNOWN_POLICIES; None: predicted where the completion
     network covers the arm's reach, else padded. Ignored without views."""
     T_world_base: Pose | None = None
-    """Pose of the base in the world, for files and pictures; None: the base's frame is the world's. Scene,
-    goal and views of a Problem are always in the base's frame; `in_world` accepts them in the world's."""
+    """Pose of the base in the world, for files and pictures; None: the base's frame is the world's frame.
+    Scene, goal and views of a Problem are always in the base's frame; `in_world` accepts them in the
+    world's."""
     waypoints: tuple[Goal, ...] = ()
-    """Goals at which the motion stops on its way, in this order, or which it passes without a stop: see
-    `blend`."""
+    """Goals to reach before `goal`, in this order; the motion stops at those without a `blend`."""
     constraints: tuple[Constraint, ...] = ()
     """Path constraints, which hold along the whole motion."""
     moving: tuple[MovingObstacle, ...] = ()
@@ -326,11 +333,12 @@ class Problem(Value):
     start_velocity: JointValues | None = None
     """Joint velocities at the start [rad/s] or [m/s]; None, or all below 1e-6: the motion starts at rest."""
     blend: tuple[float, ...] = ()
-    """For each waypoint, the distance within which the motion may pass it without stopping: for
-    configurations in joint space [rad, L2], for poses from the position or its box of tolerances [m]. 0: the
-    motion stops there. One number stands for all waypoints; empty: it stops at all of them."""
+    """For each waypoint, the distance within which the motion may pass it without stopping; 0: the motion
+    stops there. For a configuration it is the Euclidean distance in joint space [rad], for a pose the
+    distance from its position or from its box of tolerances [m]. One number stands for all waypoints; empty:
+    the motion stops at all of them."""
     payload: Payload | None = None
-    """Load on a link, with which the timed motion keeps effort limits; None: effort limits are ignored."""
+    """Load on a link. The timed motion then keeps the effort limits; None: effort limits are ignored."""
 
     def __post_init__(self) -> None:
         if self.clearance is not None:
@@ -396,15 +404,17 @@ class Problem(Value):
         goal: "AnyConfiguration | Goal | Sequence[OneGoal | AnyConfiguration]",
         **options: Unpack[ProblemOptions],
     ) -> "Problem":
-        """The problem of a robot on a base that stands elsewhere, given in the frame of the world.
+        """A problem given in the frame of the world, for a robot whose base stands anywhere in it.
+
+        Scene, poses of goals and waypoints, views, constraints and moving obstacles are given in the frame of
+        the world; the problem stores them in the frame of the base.
 
         Args:
             T_world_base: Pose of the base [4, 4].
             robot: The robot.
-            scene: Obstacles in the frame of the world, which are moved into that of the base. So are the
-                poses of goals and waypoints, views, constraints and moving obstacles.
+            scene: Obstacles.
             start: Start configuration [dof], values by joint, or the name of a pose.
-            goal: As of `rd.Problem`.
+            goal: A goal, as `rd.Problem` accepts it.
             options: Further fields of `rd.Problem`.
 
         Raises:
@@ -431,15 +441,15 @@ class Problem(Value):
     def clearance_at(self, q: ArrayLike) -> float | Values:
         """Lower bound of the distance of the arm to obstacles and between its links.
 
-        The spheres that cover the links are measured, so the bound may be negative by some millimeters where
-        the links are apart. Moving obstacles are ignored.
+        It is the distance of the spheres that cover the links, so it may be some millimeters below zero
+        although the links touch nothing. Moving obstacles are ignored.
 
         Args:
             q: A configuration [dof], or several [n, dof].
 
         Returns:
-            The bound [m], one for each row; positive: free of collision. It is at most 1 m, to point clouds
-            and meshes 0.3 m.
+            The bound [m], one for each row; positive: free of collision. It is capped at 1 m, and at 0.3 m
+            if the nearest obstacle is a point cloud or a mesh.
 
         Raises:
             InputError: For q of the wrong shape.
@@ -463,7 +473,7 @@ class Problem(Value):
             q: A configuration [dof], values by joint, or the name of a pose.
 
         Returns:
-            A value that is true if the arm is free; else it has a `reason`.
+            A value that is true in conditions if the arm is free; otherwise its `reason` says why not.
 
         Raises:
             InputError: For q of the wrong shape, and for an unknown name.
@@ -495,13 +505,13 @@ class Problem(Value):
         return self.scene if len(shapes) == len(self.scene.shapes) else self.scene.with_shapes(shapes)
 
     load: ClassVar[Callable[..., "Problem"]]
-    """`problems.files.load_problem`, assigned by the package: files import problems, not the reverse."""
+    """`problems.files.load_problem`; the package assigns it, because files.py imports this module."""
     record: ClassVar[Callable[..., dict[str, object]]]
-    """`problems.files.problem_record`, likewise."""
+    """`problems.files.problem_record`, assigned by the package as well."""
 
 
 def check_problem(problem: object, field: str = "problem") -> None:
-    """InputError for anything but a Problem, with what to call for the name of a file."""
+    """Raises InputError for anything but a Problem; for a file's name, the message says how to read it."""
     hint = "e.g. rd.Problem(robot, scene, start, goal)"
     if isinstance(problem, str | PurePath):
         hint = f"rd.load_problem({shown(str(problem))}) reads one from a file"
@@ -509,7 +519,7 @@ def check_problem(problem: object, field: str = "problem") -> None:
 
 
 def check_clearance(value: object) -> float:
-    """The value as a distance [m]; InputError unless it is from 0 to MAX_CLEARANCE."""
+    """The value as a distance [m]. Raises InputError unless it is from 0 to MAX_CLEARANCE."""
     clearance = numbers(value)
     if clearance is None or clearance.ndim != 0 or not 0 <= clearance <= MAX_CLEARANCE:
         raise InputError(f"clearance is {shown(value)}; it must be a distance from 0 to {MAX_CLEARANCE:g} m")
@@ -517,7 +527,7 @@ def check_clearance(value: object) -> float:
 
 
 def check_unknown(field: str, value: object) -> str:
-    """The value as one of UNKNOWN_POLICIES; InputError for anything else."""
+    """The value, if it is one of UNKNOWN_POLICIES. Raises InputError for anything else."""
     if not isinstance(value, str) or value not in UNKNOWN_POLICIES:
         raise unknown_name(f"policy in {field}:", str(value), UNKNOWN_POLICIES)
     return value
@@ -540,7 +550,7 @@ def _check_combinations(checked: dict[str, Any]) -> None:
 
 
 def moved(value: Any, T: Pose) -> Any:
-    """The value, or each of a list, after the rigid motion T; what has no pose is returned unchanged."""
+    """The value, or each item of a list, after the rigid motion T. A value without a pose is not changed."""
     if isinstance(value, list | tuple):
-        return [moved(part, T) for part in value]
+        return [moved(item, T) for item in value]
     return value.moved(T) if hasattr(value, "moved") else value

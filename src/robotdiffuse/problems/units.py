@@ -14,8 +14,8 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape
 
 MAX_EXTENT = 10.0
-"""Meshes, clouds and views larger than this get a note [m]. Other shapes get one only if all their edges are
-longer: a floor may be wide, but it is flat."""
+"""A mesh or a cloud gets a note if its longest edge exceeds this; a view, if half of its depths do [m]. Other
+shapes get a note only if their shortest edge exceeds it: a floor may be wide, but it is flat."""
 VIEW_STRIDE = 4
 """Only every fourth row and column of a depth image is checked."""
 MIN_POINTS_IN_ARM = 10
@@ -24,7 +24,7 @@ ADVICE = "lengths are in meters: divide millimeters by 1000"
 
 
 def unit_notes(problem: Problem) -> tuple[str, ...]:
-    """Notes on obstacles that are all out of reach or too large: they may be given in millimeters."""
+    """Notes on obstacles that may be in millimeters: each that is too large, or all if none is in reach."""
     reach = reach_bound(problem.robot)
     shapes = [shape for shape in problem.scene.shapes if not isinstance(shape, (SeenPoints, AssumedPoints))]
     has_seen_points = len(shapes) < len(problem.scene.shapes)
@@ -35,15 +35,17 @@ def unit_notes(problem: Problem) -> tuple[str, ...]:
     notes += [_view_note(i, view, reach) for i, view in enumerate(problem.views)]
     messages = tuple(note for note in notes if note)
     solid = [not _is_empty(shape) for shape in shapes]
-    away = _distances(bounds[solid])
+    distances = _distances(bounds[solid])
     if (
         not messages
-        and len(away)
-        and away.min() > reach
+        and len(distances)
+        and distances.min() > reach
         and not (has_seen_points or problem.views or problem.moving)
     ):
-        subject = f"all {len(away)} obstacles are" if len(away) > 1 else f"the obstacle {shapes[0].name} is"
-        distance_text = f"beyond the arm's reach of {reach:.1f} m, at least {away.min():.1f} m from its base"
+        several = len(distances) > 1
+        subject = f"all {len(distances)} obstacles are" if several else f"the obstacle {shapes[0].name} is"
+        nearest = distances.min()
+        distance_text = f"beyond the arm's reach of {reach:.1f} m, at least {nearest:.1f} m from its base"
         messages = (f"check the units: {subject} {distance_text}; {ADVICE}",)
     return messages
 

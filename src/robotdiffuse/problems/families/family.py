@@ -35,6 +35,7 @@ class Ranges(Settings):
         """Raises InputError also for a range whose first number is larger than the second."""
         super().__post_init__()
         for name, value in self.to_json().items():
+            # a pair of strings, such as `Rop.kinds`, is no range
             pair = value if isinstance(value, tuple) and len(value) == 2 else (0, 0)
             if not (isinstance(pair[0], str) or pair[0] <= pair[1]):
                 raise InputError(f"{name} is from {pair[0]} to {pair[1]}; the first must not be greater")
@@ -46,16 +47,16 @@ POSITION = "position"
 POSE = "pose"
 
 BATCH_SIZE = 64
-"""Number of configurations that are sampled at once; many of them are collision-free."""
+"""Number of configurations in a batch; usually many of them are collision-free."""
 MAX_BATCHES = 8
-"""A scene is given up after this many batches: some scenes leave hardly any free space."""
+"""Number of batches sampled in one scene, at most: some scenes leave hardly any free space."""
 MAX_SCENES = 100
 """Sampling fails with an error after this many scenes without a free start or goal."""
 LIMIT_MARGIN = 1e-3
-"""Joints within this distance of a limit count as clipped [rad]."""
+"""A joint this close to a limit counts as clipped by inverse kinematics [rad] or [m]."""
 POSE_IK = InverseKinematicsSettings(max_rounds=4, patience=2)
-"""Settings of the inverse kinematics of targets. They allow few rounds, since sampling another target is
-faster than a long search for configurations at a target inside an obstacle."""
+"""Settings of the inverse kinematics of targets. The rounds are few: a target inside an obstacle is
+unreachable, and sampling another target is faster than searching for long."""
 MIN_POSE_DOF = 6
 """Minimum number of joints for an arm to reach arbitrary poses."""
 POSITION_IK = replace(POSE_IK, position_only=True)
@@ -66,14 +67,14 @@ class SampledProblem:
     """A random problem. All of its goals bring the tip to the same target."""
 
     scene: Scene
-    """The floor first, if the family has one."""
+    """The scene; its first shape is the floor, if the family has one."""
     start: Configuration
     goals: Configurations
     T_base_tip: Pose
-    """The target; if only its position is given, the orientation is that of the first goal."""
+    """Target pose of the tip. If the target is only a position, the first goal gives the orientation."""
 
     def problem(self, robot: Robot) -> Problem:
-        """The problem to reach any of the goals, with any number of full turns of their joints."""
+        """The problem of reaching any goal, or a configuration that full turns of joints make from a goal."""
         goals = np.concatenate([robot.equivalent_configurations(goal, self.start) for goal in self.goals])
         return Problem(robot, self.scene, self.start, JointGoal(goals))
 
@@ -92,7 +93,7 @@ class Family(Protocol):
 
     @property
     def region(self) -> Float[ndarray, "2 3"]:
-        """Lower and upper corner of the box of tip positions at start and goal [m]."""
+        """Lower and upper corner of a box that contains the tip's positions at start and goal [m]."""
         ...
 
     @property
@@ -135,7 +136,7 @@ def uniform_configurations(
 ) -> JointRows:
     """Up to `count` collision-free configurations with the origin of the tip link in the region.
 
-    They are uniform within the joint limits. There are fewer if MAX_BATCHES batches contain no more.
+    They are uniform within the joint limits. Fewer are returned if MAX_BATCHES batches contain fewer.
     """
     configurations = np.zeros((0, robot.dof))
     for _ in range(MAX_BATCHES):
@@ -159,8 +160,9 @@ def reaching_configurations(
     """Up to `count` free configurations with the tip at its target. Arms with fewer than six joints only
     reach the position.
 
-    They are float32, as in data sets, so that the validator gets exactly the stored values. Solutions with a
-    joint at a limit are left out: the solver clips joints there, so they would be far too frequent.
+    The result is float32, as in data sets, so that the validator gets exactly the stored values. Solutions
+    with a joint at a limit are left out: the solver clips joints to their limits, and clipped configurations
+    would be far more frequent than others.
     """
 
     def accept(q: Configurations) -> Bool[ndarray, "n"]:

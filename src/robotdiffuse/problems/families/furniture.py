@@ -1,8 +1,8 @@
 """Furniture: base of the families with shelves, crates and tables around an arm that stands on the ground.
 
-All shapes are spheres, and boxes rotated about the vertical axis, so that the scenes can be packed like those
-of the family `rop`. Each scene has regions in which the arm works: in compartments, in crates and between the
-objects on a table. `sample_target` samples poses with the fingers in a region.
+All shapes are spheres, and boxes rotated about the vertical axis, so that data sets can store these scenes in
+the same arrays as those of the family `rop`. Each scene has regions in which the arm works: in compartments,
+in crates and between the objects on a table. `sample_target` samples poses with the fingers in a region.
 """
 
 from abc import ABC, abstractmethod
@@ -52,12 +52,12 @@ DOWN = np.array([0.0, 0.0, -1.0])
 AHEAD = np.array([1.0, 0.0, 0.0])
 """Direction away from the arm, in the frame of the furniture."""
 MAX_TRIES = 1000
-"""The settings are rejected after this many samples of a scene."""
+"""If this many samples of a scene all fail, the settings are rejected."""
 PLACE_TRIES = 30
-"""The scene is sampled anew after this many samples of a free place for one object."""
+"""If this many samples of a place for an object are all occupied, the scene is sampled anew."""
 MIN_GAP = 0.01
 """Minimum distance between the objects on a table or on the ground [m]."""
-# Minimum height of tables with a region beneath them, and of counters with one inside [m].
+# Minimum height of tables with a region beneath, and of counters with a region inside [m].
 MIN_TABLE_HEIGHT = 0.3
 MIN_COUNTER_HEIGHT = 0.25
 MIN_OPENING = 0.16
@@ -69,7 +69,7 @@ MIN_REGION = 0.1
 DRAWER_SHAPES = 5
 """Number of boxes that make up a drawer."""
 Cell = tuple[float, float, float, float]
-"""Right and left side, bottom and top [m]."""
+"""A compartment: y of its right and left side, z of its bottom and top, in the furniture's frame [m]."""
 AtLeastTwo = Annotated[int, Bound(least=2.0)]
 
 
@@ -101,9 +101,9 @@ def sample_target(
 ) -> Pose:
     """A random pose T_base_tip of the robot's tip link, with its fingers in the region.
 
-    The point at `finger_length` [m] along the link's z axis is uniform in the region, less a margin. The z
-    axis is uniform among the directions within `spread` [rad] of the region's approach, and the rotation
-    about it is uniform.
+    The fingertips, at `finger_length` [m] along the link's z axis, are uniform in the region less a margin.
+    The z axis is uniform among the directions within `spread` [rad] of the region's approach; the rotation
+    about the z axis is uniform.
     """
     half = np.maximum(region.size / 2 - REGION_MARGIN, 0)
     point = region.center + rotation_about(-DOWN, region.yaw) @ rng.uniform(-half, half)
@@ -141,8 +141,8 @@ class Furniture(Ranges, ABC):
 
     @abstractmethod
     def build(self, rng: Generator) -> "Sequence[FurnitureFrame]":
-        """The pieces of furniture, with all regions, in reach or not. Raises NoRoomError if objects do not
-        fit."""
+        """The pieces of furniture with all their regions, also those out of reach. Raises NoRoomError if
+        objects do not fit."""
 
     @property
     def floor(self) -> Box:
@@ -187,8 +187,8 @@ class Furniture(Ranges, ABC):
     ) -> SampledProblem:
         """A random problem; see `Family.draw`.
 
-        For every target, start and goals have the fingers in two of the regions; arms with fewer than six
-        joints only reach the positions of these poses.
+        Whatever the kind of target, the fingers are in one region at the start and in another at the goals.
+        Arms with fewer than six joints only reach the positions of the sampled poses.
         """
         keep_out = base_spheres(robot)
 
@@ -228,8 +228,8 @@ class FurnitureFrame:
         return self.rotation @ xyz + [*self.xy, 0.0]
 
     def box(self, low: Corner, high: Corner, name: str, turn: float = 0.0) -> None:
-        """Adds a box with two opposite corners in this frame, then rotated about its middle by `turn`
-        [rad]."""
+        """Adds a box. `low` and `high` are opposite corners in this frame, before the box is rotated by
+        `turn` about the vertical axis through its middle [rad]."""
         half = (self.yaw + turn) / 2
         middle = (np.array(low) + high) / 2
         size = np.subtract(high, low)
@@ -247,13 +247,13 @@ class FurnitureFrame:
 
 
 class LooseObject:
-    """A random loose box or ball, at most `tallest` high [m]."""
+    """A random loose box or ball, at most `max_height` high [m]."""
 
-    def __init__(self, settings: Furniture, rng: Generator, tallest: float = np.inf) -> None:
+    def __init__(self, settings: Furniture, rng: Generator, max_height: float = np.inf) -> None:
         x, y = rng.uniform(*settings.object_width, 2)
         self.ball = rng.random() < settings.ball_share
-        x = min(x, tallest) if self.ball else x
-        self.size = (x, x, x) if self.ball else (x, y, min(rng.uniform(*settings.object_height), tallest))
+        x = min(x, max_height) if self.ball else x
+        self.size = (x, x, x) if self.ball else (x, y, min(rng.uniform(*settings.object_height), max_height))
         self.turn = float(rng.uniform(-np.pi, np.pi))
         self.half = x / 2 if self.ball else float(np.hypot(x, y)) / 2
         """Half the side of a square that contains the object at any rotation."""
@@ -276,9 +276,9 @@ class NoRoomError(Exception):
 
 
 class Surface:
-    """The top of a table or a counter, where free places for objects and for the fingers are found.
+    """The top of a table or a counter, with the places on it that are taken.
 
-    It extends from 0 to `length` along x and to `side` in both directions of y, at a height [m].
+    In the furniture's frame it extends over x from 0 to `length`, y from -`side` to `side` [m].
     """
 
     def __init__(self, frame: FurnitureFrame, length: float, side: float, height: float) -> None:
@@ -300,8 +300,10 @@ class Surface:
         raise NoRoomError
 
     def furnish(self, settings: "Table | Kitchen", rng: Generator) -> None:
-        """Adds random free regions, as high as they are wide, where the hand points down, and then the random
-        loose objects of the settings."""
+        """Adds random free regions, in which the hand points down, and then random loose objects.
+
+        The settings give the numbers and sizes of both. A region is as high as it is wide.
+        """
         for _ in range(count(settings.spots, rng)):
             half = rng.uniform(*settings.spot_size) / 2
             x, y = self.place(half, half, rng)
@@ -327,8 +329,12 @@ def loose_in_cells(
     rng: Generator,
     at_sides: bool = False,
 ) -> None:
-    """Adds random loose objects, at most one per cell (see `Cell`), and narrows these cells to their free
-    part. Objects that would leave too little space are left out."""
+    """Adds random loose objects, at most one per cell (see `Cell`); leaves out those that take more than two
+    thirds of a cell's width.
+
+    Each cell with an object is narrowed to the wider free part beside the object. depth: of the cells [m].
+    at_sides: whether objects stand at the left or right side of a cell, instead of anywhere.
+    """
     object_count = min(count(settings.objects, rng), len(cells))
     for i in rng.permutation(len(cells))[:object_count]:
         low, high, z, ceiling = cells[i]
@@ -346,7 +352,7 @@ def loose_in_cells(
 
 
 def edges(sizes: Values, t: float) -> Values:
-    """Positions of boards of thickness `t` that are separated by gaps of these sizes; the first is 0."""
+    """Positions of the lower sides of boards of thickness `t`, separated by gaps of these sizes, from 0."""
     return np.concatenate([[0.0], np.cumsum(sizes + t)])
 
 
@@ -359,15 +365,16 @@ def count(numbers: tuple[int, int], rng: Generator) -> int:
 class Shelf(Furniture):
     """A bookcase that faces the arm: boards between uprights, open in front. Lengths in [m].
 
-    Regions are its compartments and the space on its top board; the hand points into it. A compartment has at
-    most one loose object, at one of its sides; objects that would leave too little space are left out.
+    Regions are its compartments and the space on its top board; the hand points forward into them. A
+    compartment has at most one loose object, at one of its sides; objects that would leave too little space
+    are left out.
     """
 
     reach: Positive = 0.85
     """Larger than for other furniture: a hand that points forward reaches farther than one that points
     down."""
     distance: PositiveRange = (0.45, 0.7)
-    """ALL Distance from the base to the middle of the front."""
+    """Distance from the base to the middle of the front."""
     boards: tuple[AtLeastTwo, AtLeastTwo] = (2, 4)
     """Number of boards."""
     lowest: tuple[NotNegative, NotNegative] = (0.0, 0.33)
@@ -451,7 +458,7 @@ class Crate(Furniture):
         occupied: list[Rectangle] = []
 
         def place(half: float) -> FurnitureFrame:
-            """A free place on the ground for an object of this half width, which is then marked as taken."""
+            """The frame of a new object of this half width, at a free place that is then marked as taken."""
             for _ in range(PLACE_TRIES):
                 frame = FurnitureFrame(self, self.distance, rng)
                 square = (float(frame.xy[0]), float(frame.xy[1]), half, half)
@@ -612,7 +619,7 @@ class Kitchen(Furniture):
     appliance_depth: PositiveRange = (0.22, 0.38)
     appliance_height: PositiveRange = (0.22, 0.36)
     cupboards: tuple[Natural, Natural] = (0, 3)
-    """Number of cupboards, side by side in the middle of the wall."""
+    """Number of cupboards, which hang side by side in the middle of the wall."""
     cupboard_width: PositiveRange = (0.28, 0.45)
     cupboard_depth: PositiveRange = (0.2, 0.33)
     cupboard_height: PositiveRange = (0.26, 0.4)
@@ -702,13 +709,13 @@ class Cabinet(Furniture):
     object_height: PositiveRange = (0.03, 0.35)
     objects: tuple[Natural, Natural] = (0, 6)
     distance: PositiveRange = (0.35, 0.65)
-    """ALL Distance from the base to the middle of the front."""
+    """Distance from the base to the middle of the front."""
     lowest: tuple[NotNegative, NotNegative] = (0.0, 0.7)
     """Height of the underside of the lowest board of a cabinet that does not stand on the ground."""
     ground_share: Share = 0.4
     """Fraction of the cabinets whose lowest board is on the ground."""
     legs_share: Share = 0.6
-    """Fraction of the other cabinets that have legs; the rest hang."""
+    """Fraction of the raised cabinets that stand on legs; the other raised cabinets hang."""
     rows: tuple[Count, Count] = (1, 4)
     row_height: PositiveRange = (0.18, 0.55)
     columns: tuple[Count, Count] = (1, 3)
@@ -723,13 +730,13 @@ class Cabinet(Furniture):
     door_share: Share = 0.2
     """Fraction of the cells with a door."""
     door_angle: PositiveRange = (0.3, 2.8)
-    """Angle at which an open door stands [rad]."""
+    """Angle of a door that is not shut; 0 would be shut [rad]."""
     shut_share: Share = 0.3
     """Fraction of the doors that are shut."""
     drawer_share: Share = 0.15
-    """Fraction of the cells with a drawer, up to `max_drawers`. Beside drawers, doors open to a right angle
-    at most."""
+    """Probability that a cell has a drawer. The doors of a cabinet with drawers open to at most 90°."""
     max_drawers: Natural = 2
+    """Maximum number of drawers of a cabinet."""
     pulled: PositiveRange = (0.3, 0.95)
     """How far a drawer is pulled out, as a fraction of the depth."""
 

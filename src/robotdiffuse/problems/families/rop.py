@@ -35,7 +35,7 @@ KINDS = ("sphere", "box")
 FLOOR = Box((0.0, 0.0, -0.05), (2.0, 2.0, 0.1), name="floor")
 """A floor with its top at z = 0."""
 MAX_TRIES = 1000
-"""The settings are rejected after this many samples of an obstacle."""
+"""If this many samples of an obstacle all intersect the robot's base, the settings are rejected."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Rop(Ranges):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.obstacles[1] > 0 and not self.kinds:
-            raise InputError(f"obstacles is {self.obstacles} and kinds {self.kinds}; they must allow a scene")
+            raise InputError(f"kinds is {self.kinds}; it must not be empty, as obstacles is {self.obstacles}")
 
     @property
     def floor(self) -> Box:
@@ -121,24 +121,24 @@ class Rop(Ranges):
         def attempt() -> SampledProblem | None:
             scene = self.scene(rng, keep_out)
             checker = CollisionChecker(robot, scene)
-            ends = self._by_position if target == POSITION else self._by_configuration
-            return ends(robot, scene, checker, goals, target, rng)
+            sample = self._by_position if target == POSITION else self._by_configuration
+            return sample(robot, scene, checker, goals, target, rng)
 
         return sample_until_found(attempt, self, robot)
 
     def _by_position(
         self, robot: Robot, scene: Scene, checker: CollisionChecker, goals: int, _: str, rng: Generator
     ) -> SampledProblem | None:
-        reached_per_pose = []
+        start_and_goals = []
         for count in (1, goals):
             T_base_tip = np.eye(4)
             T_base_tip[:3, 3] = rng.uniform(*self.region)
-            reached_per_pose.append(
+            start_and_goals.append(
                 reaching_configurations(robot, T_base_tip, count, checker, rng, POSITION_IK)
             )
-            if not len(reached_per_pose[-1]):
+            if not len(start_and_goals[-1]):
                 return None
-        (start,), reached = reached_per_pose
+        (start,), reached = start_and_goals
         return SampledProblem(
             scene, start, reached, link_pose(robot, reached[0].astype(np.float64), robot.tip)
         )
@@ -152,13 +152,13 @@ class Rop(Ranges):
         target: str,
         rng: Generator,
     ) -> SampledProblem | None:
-        # one call for two configurations, or two calls for one each: the distribution is the same, but not
-        # the use of rng
-        each = (2,) if target == CONFIGURATION else (1, 1)
-        ends = [uniform_configurations(robot, self.region, checker, count, rng) for count in each]
-        if sum(map(len, ends)) < 2:
+        # Start and goal come from one call or from two. The distribution does not depend on this, but the
+        # numbers drawn from rng do, and these must not change between versions.
+        counts = (2,) if target == CONFIGURATION else (1, 1)
+        samples = [uniform_configurations(robot, self.region, checker, count, rng) for count in counts]
+        if sum(map(len, samples)) < 2:
             return None
-        start, goal = np.concatenate(ends)
+        start, goal = np.concatenate(samples)
         T_base_tip = link_pose(robot, goal, robot.tip)
         if target == CONFIGURATION:
             return SampledProblem(scene, start, goal[None], T_base_tip)

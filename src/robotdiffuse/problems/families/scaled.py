@@ -1,8 +1,8 @@
-"""Scales families to the size of an arm: they are designed for a Panda's reach.
+"""Scales families, which are designed for a Panda's reach, to the size of another arm.
 
 A problem is sampled for a copy of the arm that is scaled to a Panda's reach; then scene and targets are
-scaled to the arm's own size. Joint angles are the same for both. Problems are thus equally hard for small and
-large arms, and families do not depend on the size of the arm.
+scaled to the arm's own size. The joint angles of the copy are those of the arm. Problems are thus equally
+hard for small and large arms, and families do not depend on the size of the arm.
 """
 
 from dataclasses import dataclass, replace
