@@ -1,7 +1,5 @@
-"""What is drawn of a robot and of obstacles: surfaces and colors, over time.
-
-Pictures, replays, the live page, recordings for Rerun and Foxglove, and PyBullet's cameras draw these.
-"""
+"""Surfaces and colors of a robot and of obstacles, over time, for everything that draws them: pictures,
+replays, the live page, recordings for Rerun and Foxglove, and PyBullet's cameras."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -86,25 +84,28 @@ def painted(color: Color, count: int) -> Points:
 def creased(
     vertices: Float[ndarray, "v 3"], faces: Int[ndarray, "f 3"], colors: Float[ndarray, "f 3"]
 ) -> Surface:
-    """A surface that is shaded smoothly except across sharp edges (CREASE_ANGLE); vertices are split
-    there."""
+    """A surface that is shaded smoothly except across sharp edges (CREASE_ANGLE), where vertices are
+    duplicated so that each side has a normal of its own. colors: a color per face, 0 to 1."""
     edges = vertices[faces]
     area = np.cross(edges[:, 1] - edges[:, 0], edges[:, 2] - edges[:, 0])
     unit = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-12)
+    # the corners of all faces, sorted by their vertex (`owner`)
     corner = np.argsort(faces.reshape(-1), kind="stable")
     owner = faces.reshape(-1)[corner]
     counts = np.bincount(owner, minlength=len(vertices))
     first = np.cumsum(counts) - counts
-    # all pairs of corners that share a vertex: `mine` gathers from `other`
+    # all pairs of corners that share a vertex: `mine` and `partner`, as indices of the sorted corners
     repeats = counts[owner]
     mine = np.repeat(np.arange(len(owner)), repeats)
     within = np.arange(len(mine)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
     partner = first[owner[mine]] + within
     face = corner // 3
+    # normal of a corner: sum over the faces at its vertex that make a smooth edge with its own face
     alike = np.einsum("ij,ij->i", unit[face[mine]], unit[face[partner]]) > np.cos(CREASE_ANGLE)
     summed = [np.bincount(mine[alike], area[face[partner[alike]], i], minlength=len(owner)) for i in range(3)]
     normals = np.stack(summed, axis=1).astype(np.float64)  # integers if no face has an area
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    # corners with the same vertex, normal and color become one vertex of the surface
     keys = np.column_stack([owner, np.round(normals * 100), np.round(colors[face] * 255)]).astype(np.int64)
     _, keep, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     split = np.empty(3 * len(faces), np.int64)
@@ -113,7 +114,7 @@ def creased(
 
 
 def link_surfaces(robot: Robot) -> dict[str, Surface]:
-    """The surface of each link, in the link's coordinates."""
+    """The surface of each link, in the link's frame."""
     return {
         link: join([creased(mesh.vertices, mesh.faces, mesh.colors / 255.0) for mesh in meshes])
         for link, meshes in load_visual(robot).items()
@@ -144,12 +145,13 @@ class Drawable:
 
     @property
     def own(self) -> "Drawable":
-        """The obstacle at rest in its own frame."""
+        """The obstacle without its motion, in coordinates of its own frame."""
         return Drawable(self.shape.moved(inverse(self.frame())), self.color)
 
     @property
     def fixed(self) -> "Drawable":
-        """The obstacle in the frame that it is fixed to: the base, or its own if it moves."""
+        """The obstacle in coordinates of the frame that it is fixed to: the base frame, or its own frame if
+        it moves."""
         return self if self.moving is None else self.own
 
     def surface_at(self, time: float) -> Surface:
@@ -167,7 +169,8 @@ def drawables(scene: Scene, moving: Sequence[MovingObstacle] = ()) -> list[Drawa
 
 
 def own_frame(shape: Shape) -> Pose:
-    """The pose of a shape's own frame; of clouds the middle of their bounds, else the base."""
+    """The pose of a shape's own frame in the base frame. A point cloud's frame is at the middle of its
+    bounds; a shape without a frame of its own has the base frame."""
     if isinstance(shape, PointCloud):
         return transform(shape.bounds.mean(axis=0))
     try:
@@ -232,8 +235,8 @@ def thinned(points: Points) -> Points:
 def decimated(
     vertices: Float[ndarray, "v 3"], faces: Int[ndarray, "f 3"]
 ) -> tuple[Float[ndarray, "w 3"], Int[ndarray, "g 3"]]:
-    """At most MAX_SIZE faces: merge the vertices in each cell of a grid, with growing cells until it
-    suffices."""
+    """The mesh with at most MAX_SIZE faces: the vertices in each cell of a grid are merged, and the cells
+    grow until few enough faces are left."""
     cell = float(np.ptp(vertices, axis=0).max()) / 400
     while len(faces) > MAX_SIZE:
         _, index = np.unique(np.floor(vertices / cell), axis=0, return_inverse=True)

@@ -19,11 +19,11 @@ ROSBRIDGE_PORT = 9090
 
 
 def option(parser: ActionsContainer, spec: str, help: str, *more: Any) -> None:
-    """Add an option, or an argument.
+    """Add an option, or a positional argument.
 
-    spec: its name and what its value is called: "--seed N". Without a value it is a flag; with "*" it may be
-    repeated, and with "!" it is required. more: what reads the value (None: text), the default, and further
-    keywords of argparse in a dictionary.
+    spec: the option's name and the placeholder of its value in the help: "--seed N". Without a placeholder,
+    the option is a flag. With "*" it may be repeated, with "!" it is required. more: the function that parses
+    the value (None: it stays text), the default, and further keywords of argparse in a dictionary.
     """
     *values, keywords = more if more and isinstance(more[-1], dict) else (*more, {})
     kind, default, *_ = *values, None, None
@@ -42,7 +42,7 @@ def option(parser: ActionsContainer, spec: str, help: str, *more: Any) -> None:
 
 
 def chosen(arguments: Namespace, names: Iterable[str]) -> dict[str, Any]:
-    """The options of these names that were given; the others keep the defaults of the settings."""
+    """The options of these names that the user gave; for all others, the settings keep their defaults."""
     return {name: value for name, value in vars(arguments).items() if name in names and value is not None}
 
 

@@ -51,7 +51,7 @@ def _say(text: str) -> None:
 
 
 def _bench_settings(arguments: Namespace) -> list[BenchSettings]:
-    """The settings of each pass: of the preset, or one from the options."""
+    """The settings of each run of the bench: those of the preset, or a single one from the options."""
     if arguments.cluster is not None and arguments.workers is not None:
         raise InputError("--workers sets the processes on this machine; --cluster always uses all its cores")
     changes: dict[str, Any] = {"workers": HALF_OF_CORES} | chosen(
@@ -133,7 +133,7 @@ def _write(page: Report, file: Path) -> int:
 
 
 def _table1(arguments: Namespace) -> tuple[paper.Table1Settings, Bench]:
-    """The settings of table 1, and its calls, of which the missing ones are made."""
+    """The settings of table 1, and the records of its calls; calls that the folder lacks are made first."""
     changes: dict[str, Any] = {"workers": HALF_OF_CORES}
     changes |= chosen(arguments, paper.Table1Settings.__dataclass_fields__)
     changes["out"] = Path(arguments.out)

@@ -191,7 +191,7 @@ PLANNING = (
         "demo",
         "plan a bundled problem and draw the motion",
         "Plan a bundled problem with obstacles, and write demo.png and demo.html to the current folder; with "
-        "--explore, see the obstacles by cameras on the way.",
+        "--explore, observe the obstacles by cameras on the way.",
         "demo:run_demo",
         (
             Group(
@@ -204,8 +204,8 @@ PLANNING = (
                     ),
                     (
                         "--explore",
-                        "simulate an arm that sees the shelf by a camera at its tip and looks before it "
-                        "moves; writes explore.png and explore.html",
+                        "simulate an arm with a camera at its tip, which takes views of the shelf before it "
+                        "moves to the goal; writes explore.png and explore.html",
                     ),
                 ),
             ),
@@ -234,11 +234,12 @@ PLANNING = (
             ("--confidence P", "minimum confidence for policy probabilistic (default: 0.98)", float, 0.98),
             (
                 "--see-goal",
-                "go only to goals at which all of the arm's surface was seen to be free (policy strict)",
+                "go to a goal only if cameras saw that the arm's surface will be in free space there (policy "
+                "strict)",
             ),
             ("--time-limit S", "time limit of each search [s] (default: 1)", float, 1.0),
             ("--noise", "simulate the noise of depth cameras"),
-            ("--seed N", "random seed", int, 0),
+            ("--seed N", "random seed (default: 0)", int, 0),
             (
                 "--out FILE *",
                 "replay with what was known at each time (.html), or a strip of pictures, one a step (.png); "
@@ -267,7 +268,7 @@ PLANNING = (
         "live",
         "plan interactively in the browser",
         "Serve an interactive page until Ctrl-C. Drag the target, the start and obstacles: the page plans "
-        "again after each change and shows at once whether the current motion is still valid. Without "
+        "again after each change, and shows at once whether the current motion is still valid. Without "
         "PROBLEM, it shows the demo problem.",
         "live:run_live",
         (
@@ -366,9 +367,9 @@ CHECKS = (
     Command(
         "view",
         "draw results and problems as a replay (.html) or a picture (.png)",
-        "Draw the motions of result files, of several in one picture; of a problem, or a result without a "
-        "motion, the start, the goal and the links that collide. Without --out, write a page and open it in "
-        "the browser.",
+        "Draw the motions of one result file, or of several in one picture. For a problem file, or a result "
+        "without a motion, draw the start, the goal and the links that collide. Without --out, write a page "
+        "and open it in the browser.",
         "view:run_view",
         (
             (
@@ -383,8 +384,8 @@ CHECKS = (
             ),
             (
                 "--shell M",
-                "with several results: thickness of the safety shell that pictures show about the arm [m] "
-                "(default: 0, none)",
+                "with several results: thickness of a layer that pictures show around the arm as a safety "
+                "distance [m] (default: 0, none)",
                 not_negative,
                 0.0,
             ),
@@ -411,7 +412,11 @@ CHECKS = (
         (
             RESULT,
             ("--out FILE * !", "file to write; repeatable"),
-            ("--rate HZ", "resample the motion, and validate it so, for a controller", float),
+            (
+                "--rate HZ",
+                "resample the motion at this rate for a controller, and validate the resampled motion",
+                float,
+            ),
         ),
     ),
     Command(
@@ -454,7 +459,7 @@ ROBOTS = (
                 "name.",
                 "robot:run_add",
                 (
-                    ("urdf URDF", "URDF of an arm, or xacro file, which is compiled: this runs code in it"),
+                    ("urdf URDF", "URDF of an arm, or xacro file; compiling xacro runs the code in it"),
                     ("--name NAME", "name that problems use (default: the URDF's)"),
                     ("--out FOLDER", "folder to write (default: one in the user's robots)"),
                     (
@@ -781,8 +786,8 @@ BENCH = Command(
                 ("--count N", "problems per set (default: 100; all of a folder)", count),
                 (
                     "--equal-time",
-                    "also call planners that end early again until the time limit, as extra rows, to compare "
-                    "lengths",
+                    "call planners that end early again until the time limit is used up, and report the best "
+                    "of these calls in extra rows, to compare lengths",
                 ),
                 CPU_TIME,
                 HALF_OF_CORES,
@@ -793,8 +798,8 @@ BENCH = Command(
         Command(
             "report",
             "write tables, plots and replays of a run",
-            "Write report.md with its plots as .svg, the same as index.html, and replays.html (motions in "
-            "3D), and print the table of each problem set.",
+            "Write report.md with its plots as .svg, the same report as index.html, and replays.html "
+            "(motions in 3D), and print the table of each problem set.",
             "bench:run_report",
             (
                 ("folder FOLDER", "folder of `robotdiffuse bench run`"),
@@ -825,11 +830,11 @@ BENCH = Command(
 TABLE_1 = (
     ("--out FOLDER !", "folder for problems, results, page"),
     ("--problems N", "problems of each kind of goal that are not trivial (default: 60)", count, 60),
-    ("--time-limit S", "of a call [s] (default: 10)", positive, 10.0),
+    ("--time-limit S", "time limit of a call [s] (default: 10)", positive, 10.0),
     (
         "--paper-weights FOLDER",
-        "weights of `train planner --config paper`, or points, for rows of single samples without "
-        "clearances, with and without guidance (default: a note says how to train them)",
+        "weights of `train planner --config paper` or `--config points`, whose single samples get two rows, "
+        "with and without guidance (default: no such rows; a note says how to train the weights)",
     ),
     ("--data FOLDER", "data set, for a row of its nearest motions"),
     CPU_TIME,
@@ -838,14 +843,14 @@ TABLE_1 = (
 )
 REPRODUCE = Command(
     "reproduce",
-    "make the paper's tables and figures again, beside the printed ones",
+    "make the paper's tables and figures again, and show the printed ones beside them",
     "Draw the paper's problems, plan, validate, and write one page. Ctrl-C stops; run the same command "
     "again to continue.",
     (
         Command(
             "table1",
             "planners on ROP, with poses and with configurations as goals",
-            "Write table1.md in the folder, which is one of `bench run` too.",
+            "Write table1.md in the folder; `bench report` and `bench confirm` work on this folder too.",
             "bench:run_table1",
             TABLE_1,
         ),
@@ -874,8 +879,8 @@ REPRODUCE = Command(
         Command(
             "figures",
             "denoising, success over time, motions of two planners",
-            "Write figures.md and its pictures in the folder of `reproduce table1`; calls that are missing "
-            "there are made first.",
+            "Write figures.md and its pictures in the folder of `reproduce table1`. Calls that this folder "
+            "lacks are made first.",
             "bench:run_figures",
             TABLE_1,
         ),

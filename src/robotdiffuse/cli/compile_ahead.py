@@ -22,16 +22,16 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere
 
 PICTURE = "picture"
-"""Argument that asks for the code that draws pictures, too."""
+"""Argument with which the code that draws pictures is compiled too."""
 BALL = Sphere([0.0, 0.0, -5.0], 0.1)
-"""Out of reach of any arm that ships."""
+"""An obstacle out of reach of all bundled arms."""
 
 
 @contextmanager
 def compiling_ahead(picture: bool) -> Iterator[None]:
     """While the block runs, the first compilation in this process starts the second process.
 
-    picture: whether it compiles the code that draws pictures, too.
+    picture: whether the second process also compiles the code that draws pictures.
     """
 
     def start() -> None:
@@ -39,8 +39,8 @@ def compiling_ahead(picture: bool) -> Iterator[None]:
         nothing = subprocess.DEVNULL
         subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing)
 
-    alone = (os.cpu_count() or 1) < 2
-    loading.on_first_compilation = None if alone else start
+    single_core = (os.cpu_count() or 1) < 2
+    loading.on_first_compilation = None if single_core else start
     try:
         yield
     finally:
@@ -48,7 +48,8 @@ def compiling_ahead(picture: bool) -> Iterator[None]:
 
 
 def steps(robot: Robot, picture: bool) -> Iterator[Callable[[], object]]:
-    """Calls that compile the end of a plan, for any robot, what takes longest first."""
+    """Calls that compile the code of the last stages of a plan, the slowest first. The compiled code serves
+    all robots."""
     middle = 0.5 * (robot.lower + robot.upper)
     rows = np.stack([middle, middle + 0.01, middle])
     path = Path(robot.joint_names, rows)

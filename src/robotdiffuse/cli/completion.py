@@ -41,8 +41,8 @@ SCRIPT = """_robotdiffuse() {{
 }}
 complete -o default -F _robotdiffuse robotdiffuse
 """
-"""A function of bash; zsh runs it by bashcompinit, where `path` is not a plain variable.
-Where no word fits, the shell completes names of files."""
+"""A completion function for bash; zsh runs it by bashcompinit. It has no variable `path`, which is special in
+zsh. Where no word fits, the shell completes names of files."""
 
 
 def run_schema(arguments: Namespace) -> None:
@@ -64,7 +64,8 @@ def run_completion(arguments: Namespace) -> None:
 
 
 def _words(parser: ArgumentParser, path: str) -> Iterator[tuple[str, tuple[list[str], list[str]]]]:
-    """Each command by its path, such as " data info", with its subcommands or choices, and its options."""
+    """Yields for each command its path, such as " data info", and two lists: the words that may follow
+    (subcommands or choices), and its options."""
     words: list[str] = []
     options: list[str] = []
     below: dict[str, ArgumentParser] = {}

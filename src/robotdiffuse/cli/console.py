@@ -23,7 +23,7 @@ SPINNER_DELAY = 2.0
 STATUS_INTERVAL = 0.2
 LOG_INTERVAL = 5.0
 CAP_TOLERANCE = 1e-4
-"""A clearance this close to the largest one that is measured is printed as larger [m]."""
+"""Clearances are measured up to CLEARANCE_CAP; within this tolerance of it [m], "> 1 m" is printed."""
 COUNT_INTERVAL = 60.0
 """Time between two lines of `progress` where there is no terminal [s]."""
 ASSUMPTION_TEXTS = {"as seen": "what was seen", "unknown is occupied": "all that was not seen free"}
@@ -31,10 +31,11 @@ ASSUMPTION_TEXTS = {"as seen": "what was seen", "unknown is occupied": "all that
 
 
 class Spinner:
-    """A context manager that shows a text on standard error while the block runs, and what is compiled.
+    """A context manager that shows a text, and which functions are compiled, on standard error while its
+    block runs.
 
-    It appears after SPINNER_DELAY, so that short commands need not import rich. Where standard error is not a
-    terminal, it prints a line while code is compiled, every LOG_INTERVAL.
+    It appears after SPINNER_DELAY, so that short commands need not import rich. If standard error is not a
+    terminal, it prints a line every LOG_INTERVAL once code is compiled.
     """
 
     def __init__(self, text: str) -> None:
@@ -79,8 +80,8 @@ class Spinner:
 
 @contextmanager
 def progress(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A function of the numbers done and in all, which moves a bar on standard error or, where that is no
-    terminal, prints a line first and every COUNT_INTERVAL."""
+    """Yields a function `update(done, total)` that moves a progress bar on standard error. If standard error
+    is not a terminal, the function prints a line at its first call and then every COUNT_INTERVAL."""
     from rich.console import Console
     from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
@@ -103,7 +104,8 @@ def progress(what: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def clearances(motion: "PlanResult | Report | Certificate", target: float | None = None) -> str:
-    """The certified clearances to the scene, beside the requested one [m], and between links."""
+    """A text with the certified clearances to the scene and between links. target: the requested clearance to
+    the scene [m], which is shown too; None: it is not shown."""
     if motion.scene_clearance is None or motion.self_clearance is None:
         return _certified(getattr(motion, "min_clearance", None) or 0.0)
     requested = "" if target is None else f" (asked: {1e3 * target:g} mm)"
@@ -120,7 +122,7 @@ def _certified(clearance: float) -> str:
 def print_result(result: "PlanResult", requested: float | None = None) -> None:
     """Print the result of plan() as a table; without a plan, its status and reason.
 
-    asked: the requested clearance, or the default one [m]; None: the planner keeps none.
+    requested: the clearance that was requested, or the default one [m]; None: the planner keeps none.
     """
 
     rows = [

@@ -89,31 +89,35 @@ def run_add(arguments: Namespace) -> None:
 
 
 def print_preparation(report: "AddReport") -> None:
-    """Print links, the pairs with most false collisions, and the time and memory of preparation; warnings go
-    to standard error."""
+    """Print the links, the pairs of links with the most false collisions, and the time and memory of the
+    preparation; warnings go to standard error."""
 
     columns = ("link", "convex parts", "spheres", Column("stick-out", "mm", ".1f", scale=1e3), "covered")
     links = [
-        (of.link, of.parts, of.spheres, of.stick_out, "yes" if of.covered else "no") for of in report.links
+        (link.link, link.parts, link.spheres, link.stick_out, "yes" if link.covered else "no")
+        for link in report.links
     ]
-    share = [
+    fractions = [
         Column(name, "%", ".1f", scale=100.0)
         for name in ("colliding", "falsely by parts", "falsely by spheres")
     ]
+    falsely = report.false_collisions
     pairs = [
-        (", ".join(of.links), of.colliding, of.by_parts, of.by_spheres)
-        for of in report.false_collisions.pairs[:MAX_PAIRS]
+        (", ".join(pair.links), pair.colliding, pair.by_parts, pair.by_spheres)
+        for pair in falsely.pairs[:MAX_PAIRS]
     ]
-    of = report.false_collisions
     parts = sum(link.parts for link in report.links)
+    by_method = f"{falsely.by_parts:.1%}, {falsely.by_spheres:.1%}"
     summary = [
         ("convex parts, spheres", f"{parts}, {report.sphere_count}"),
-        ("configurations free of self-collision", f"{of.free:.1%}"),
-        ("of these false collisions by convex parts, by spheres", f"{of.by_parts:.1%}, {of.by_spheres:.1%}"),
+        ("configurations free of self-collision", f"{falsely.free:.1%}"),
+        ("of these false collisions by convex parts, by spheres", by_method),
         ("processor time, memory", f"{report.seconds:.0f} s, {report.memory / 2**20:.0f} MiB"),
     ]
     show(
-        Table.of("", columns, links), Table.of("", ("pair of links", *share), pairs), Table.pairs("", summary)
+        Table.of("", columns, links),
+        Table.of("", ("pair of links", *fractions), pairs),
+        Table.pairs("", summary),
     )
     for warning in report.warnings:
         print(f"warning: {warning}", file=sys.stderr)

@@ -30,7 +30,8 @@ def run(arguments: Namespace) -> None:
 
 
 def served_robots(names: Sequence[str]) -> dict[str, Robot]:
-    """The bundled robots and those named, by the names for requests; a robot from a URDF has its own name.
+    """The bundled robots and the named ones, by the names that requests use; a robot from a URDF has the name
+    in the URDF.
 
     Raises InputError if two robots have the same name.
     """

@@ -87,16 +87,16 @@ def run_planner(arguments: Namespace) -> None:
     if arguments.data is None:
         if arguments.robot is None:
             raise InputError("give --robot to generate data for an arm, or --data to use existing data")
-        make = partial(planner_training, arguments.config)
-        source = arguments.robot, options, make, arguments.out
-        report, weights = train_for_robot(*source, arguments.trajectories, arguments.workers)
+        make_settings = partial(planner_training, arguments.config)
+        common = arguments.robot, options, make_settings, arguments.out
+        report, weights = train_for_robot(*common, arguments.trajectories, arguments.workers)
         return _print_report(report, str(weights))
     if arguments.out is None:
         raise InputError("--data needs --out, a folder for the weights")
     for name in ("trajectories", "workers"):
         if getattr(arguments, name) is not None:
             raise InputError(f"--{name} is for data to be generated; --data names existing data")
-    # several processes would write it at once
+    # with several processes, all would write the bundled encoder at once
     bundled = "encoder" not in options and int(os.environ.get("WORLD_SIZE", "1")) == 1
     if bundled:
         options["encoder"] = str(Path(arguments.out) / "encoder")
@@ -133,15 +133,15 @@ the training sees each seven times."""
 SAMPLES = 2_400_000
 """Number of training samples, as for the bundled Panda weights: one to two hours on one core."""
 MIX = {"rop": 0.2, "rop_dense": 0.3, "shelf": 0.2, "crate": 0.15, "table": 0.15}
-"""Fractions of the problem families: more furniture than for the Panda's weights, where a network helps
-most."""
+"""Fractions of the problem families. They contain more furniture than the data of the Panda's weights, since
+a network helps most there."""
 WAYPOINTS = 96
 """Number of waypoints of a motion, twice as many as the network's."""
 SAFETY_DISTANCE = 0.05
 """Distance of the motions to obstacles for an arm of the Panda's reach [m]; scaled with the reach."""
 BYTES_PER_MOTION = 8_000
-"""Disk space reserved for each motion, including scene codes and rotated copies; about twice what it
-needs."""
+"""Disk space reserved for each motion with its scene embedding and rotated copies; about twice what they
+need."""
 BYTES_PER_TRAINING = 100_000_000
 """Disk space reserved for checkpoints and weights."""
 
@@ -164,8 +164,8 @@ def data_settings(source: str, robot: Robot, motions: int | None, seed: int | No
 
 def train_for_robot(
     source: str,
-    given: dict[str, Any],
-    make: Callable[[dict[str, Any]], PlannerTraining],
+    options: dict[str, Any],
+    make_settings: Callable[[dict[str, Any]], PlannerTraining],
     out: str | None = None,
     motions: int | None = None,
     workers: int | None = None,
@@ -173,10 +173,12 @@ def train_for_robot(
     """Generate the data, train, and install the weights; returns the training's figures and the weights'
     folder.
 
-    source: the robot, as for `load_robot`. given: training settings from the command line, which `make`
-    completes. out: working folder; None: beside the user's robots. motions, workers: for the data.
+    source: the robot, as for `load_robot`. options: training settings from the command line, which
+    `make_settings` completes. out: working folder; None: beside the user's robots. motions: number of motions
+    to generate; workers: number of processes that generate them.
 
-    Raises InputError for an unknown robot, a folder of other settings, and too little disk space.
+    Raises InputError for an unknown robot, a folder that was made with other settings, and too little disk
+    space.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise InputError("torchrun only trains: generate the data first, then give --data")
@@ -184,11 +186,12 @@ def train_for_robot(
     source = str(Path(source).resolve()) if Path(source).exists() else source
     weights_dir = user_weights(robot)
     work = weights_dir.with_name("training") if out is None else Path(out)
-    data = data_settings(source, robot, motions, given.get("seed"))
+    data = data_settings(source, robot, motions, options.get("seed"))
     _check_disk(work, data.trajectories)
-    defaults: dict[str, Any] = {"samples": SAMPLES} if given.get("minutes") is None else {}
+    defaults: dict[str, Any] = {"samples": SAMPLES} if options.get("minutes") is None else {}
     defaults |= {"encoder": str(work / "encoder")}
-    settings: PlannerTraining = make(defaults | given | {"data": str(work / "data"), "robot": source})
+    fixed = {"data": str(work / "data"), "robot": source}
+    settings: PlannerTraining = make_settings(defaults | options | fixed)
     print(
         f"{robot.name}: {data.trajectories:,} motions, then training; all in {work}",
         file=sys.stderr,
@@ -196,7 +199,7 @@ def train_for_robot(
     )
     with progress("trajectories") as update:
         generate(data, work / "data", workers or os.cpu_count() or 1, progress=update)
-    if "encoder" not in given:
+    if "encoder" not in options:
         copy_bundled_encoder(work / "encoder")
     report = train_planner(settings, str(work))
     network = "trajectory_prior" if settings.encoder is None else "model"

@@ -58,7 +58,8 @@ def _validated(problem: Problem, what: str, motion: Waypoints | Trajectory, ever
 
 
 def _jerk(share: float) -> str:
-    """The largest jerk beside its limit, in words."""
+    """A text that compares the largest jerk with its limit. share: the largest fraction of a joint's
+    limit."""
     if math.isinf(share):
         return "accelerations jump at the ends, which some controllers refuse"
     return f"jerk at most {100 * share:.0f} % of the limits"
@@ -103,33 +104,33 @@ def _read(
     """The problem, the motions to validate by name, and notes on changes made to read them."""
     if (arguments.scene is None) != (arguments.robot is None):
         raise InputError("--scene and --robot belong together: a planning scene does not name its robot")
-    alone = arguments.problem is None and arguments.scene is None
-    if alone and arguments.motion.lower().endswith(".json"):
+    only_motion = arguments.problem is None and arguments.scene is None
+    if only_motion and arguments.motion.lower().endswith(".json"):
         result, problem = read_solved(arguments.motion)
-        both = {"path": result.path, "trajectory": result.trajectory}
-        return problem, {label: motion for label, motion in both.items() if motion is not None}, ()
+        motions = {"path": result.path, "trajectory": result.trajectory}
+        return problem, {label: motion for label, motion in motions.items() if motion is not None}, ()
     recorded = read_motion(arguments.motion, arguments.topic)
-    more = ()
-    if alone:
+    scene_notes = ()
+    if only_motion:
         problem = _stored_problem(arguments.motion)
     elif arguments.problem is not None:
         problem = load_problem(arguments.problem, arguments.index, arguments.ignore_joints)
     else:
         robot = load_robot(arguments.robot)
-        scene, more = read_moveit_scene(str(arguments.scene), robot, arguments.ignore_joints)
+        scene, scene_notes = read_moveit_scene(str(arguments.scene), robot, arguments.ignore_joints)
         problem = problem_of_motion(recorded, robot, scene)
     try:
-        fit = motion_of_robot(recorded, problem.robot)
+        converted = motion_of_robot(recorded, problem.robot)
     except InputError as error:
         raise InputError(f"{arguments.motion}: {error}") from None
-    label = "trajectory" if isinstance(fit.motion, Trajectory) else "path"
-    return problem, {label: fit.motion}, (*more, *fit.notes)
+    label = "trajectory" if isinstance(converted.motion, Trajectory) else "path"
+    return problem, {label: converted.motion}, (*scene_notes, *converted.notes)
 
 
 HOLDS = 0
 FAILS = 1
 MAX_CHANGES = 4
-"""Largest number of differences from the bundled robot in a line."""
+"""Largest number of differences from the bundled robot that one line of output lists."""
 
 
 def run_check(arguments: Namespace) -> int:

@@ -50,7 +50,7 @@ def draw_several(problem: Problem, results: Mapping[str, PlanResult], file: Path
     """Draw the motions of several solved results, by name, in the scene of one problem: in one picture, or as
     replays side by side.
 
-    shell: thickness of the safety shell about the arm in pictures [m].
+    shell: thickness of the layer that pictures show around the arm as a safety distance [m]; 0: none.
     """
     robot, scene = _shown(problem)
     motions = {name: _motion(result) for name, result in results.items()}
@@ -86,7 +86,7 @@ def open_in_browser(file: Path) -> None:
 
 
 def _read(file: str) -> tuple[PlanResult | None, Problem]:
-    """The result in a file, and its problem; of a problem file, the problem alone."""
+    """The result in a file, and its problem; for a problem file, None and the problem."""
     ending = Path(file).suffix.lower()
     record = read_json(file) if ending == ".json" else {}
     is_problem = isinstance(record, dict) and "scene" in record and "status" not in record
@@ -112,8 +112,8 @@ def run_view(arguments: Namespace) -> None:
 
 
 def _read_several(files: list[str]) -> tuple[Problem, dict[str, PlanResult]]:
-    """The solved results in several files, by name, and the problem of the first. Raises InputError for other
-    scenes and for equal names."""
+    """The problem of the first of several result files, and the solved results by the names of the files.
+    Raises InputError if the results are for different robots or scenes, or if two names are equal."""
 
     names = [Path(file).stem for file in files]
     (result, problem), *further_results = map(read_solved, files)
@@ -142,8 +142,8 @@ def run_simulate(arguments: Namespace) -> int:
     rms = float((executed.tip_errors**2).mean() ** 0.5)
     joints = zip(executed.joint_names, executed.max_errors, executed.rms_errors, strict=True)
     rows = [
-        (f"error of {name}", f"{1e3 * most:.3f} mrad", f"{1e3 * mean:.3f} mrad")
-        for name, most, mean in joints
+        (f"error of {name}", f"{1e3 * maximum:.3f} mrad", f"{1e3 * root_mean_square:.3f} mrad")
+        for name, maximum, root_mean_square in joints
     ]
     rows.append(("error of the tip", f"{1e3 * executed.tip_errors.max():.3f} mm", f"{1e3 * rms:.3f} mm"))
     verdict = "free" if executed.free else "contact"

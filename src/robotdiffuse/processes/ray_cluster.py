@@ -19,9 +19,9 @@ MAX_RETRIES = 20
 
 
 def on_ray(call: Callable[..., Any], calls: Sequence[tuple]) -> Results:
-    """Run the calls on a Ray cluster, one core each; calls of a lost node are repeated on another.
+    """Run the calls on a Ray cluster, one core each; calls of a lost node are repeated on another node.
 
-    See `ray_cluster`. The nodes need this package, and files under the same paths.
+    See `ray_cluster`. Each node needs this package, and the files that the calls read under the same paths.
     """
     pending = list(enumerate(calls))[::-1]
     running = {}

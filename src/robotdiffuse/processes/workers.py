@@ -38,7 +38,7 @@ PREPARE_TIMEOUT = 600.0
 CANCEL_TIMEOUT = 1.0
 """Time for a worker to leave a cancelled call, until it is killed [s]."""
 CHECK_INTERVAL = 0.05
-"""Time between two looks at whether a call takes too long or is cancelled [s]."""
+"""Time between two checks whether a call takes too long or is cancelled [s]."""
 RESTART_DELAY = 1.0
 """Time between two attempts to start a worker that is kept ready [s]."""
 RERUN_HINT = "run the same command again"
@@ -99,8 +99,8 @@ class Worker:
     """Whether `Workers` runs a call in it."""
 
     def __init__(self, prepare: Callable[..., object] = _nothing, arguments: tuple = ()) -> None:
-        """`prepare(*arguments)` runs once in each new process. If it returns True, the process is replaced
-        once, for example by one that loads what the first has compiled."""
+        """`prepare(*arguments)` runs once in each new process. If it returns True, a second process replaces
+        this one, for example to load the code that the first has compiled."""
         self._prepare = prepare
         self._arguments = arguments
         self._running: tuple[BaseProcess, Connection] | None = None
@@ -123,11 +123,11 @@ class Worker:
 
     def _start(self) -> object:
         _check_script()
-        connection, theirs = _SPAWN.Pipe()
-        process = _SPAWN.Process(target=_main, args=(theirs,))
+        connection, child_end = _SPAWN.Pipe()
+        process = _SPAWN.Process(target=_main, args=(child_end,))
         with block_interrupts_in_children():
             process.start()
-        theirs.close()
+        child_end.close()
         self._running = (process, connection)
         self._number = 0
         _started.add(self)
@@ -152,7 +152,8 @@ class Worker:
         """The result of `call(*arguments)` in the process; its exceptions are raised here.
 
         timeout: the process is killed if the call takes longer [s], unless it calls `allow`.
-        stop: whether the call is cancelled; then it must end soon, see `cancelled`.
+        stop: called every CHECK_INTERVAL; once it returns True, `cancelled` is true in the process, which is
+        killed if the call does not end within CANCEL_TIMEOUT.
 
         Raises EndedError if the process ends or is closed, OverrunError after the timeout, and
         NotStartedError if it could not start.
@@ -161,7 +162,7 @@ class Worker:
         self.start()
         return self._ask(message, timeout, stop)
 
-    def _ask(self, given: bytes, timeout: float, stop: Callable[[], bool] = lambda: False) -> Any:
+    def _ask(self, message: bytes, timeout: float, stop: Callable[[], bool] = lambda: False) -> Any:
         if self._running is None:
             raise EndedError("closed")
         process, connection = self._running
@@ -169,7 +170,7 @@ class Worker:
         stop_sent = False
         self._number += 1
         try:
-            connection.send((self._number, given))
+            connection.send((self._number, message))
             while True:
                 remaining = due - time.monotonic()
                 if remaining <= 0:
@@ -236,7 +237,7 @@ def _end_all() -> None:
 
 
 class Call(Future):
-    """The result of a call that waits for a worker, or runs in one."""
+    """The future result of a call that waits for a worker or runs in one."""
 
     def __init__(self, call: Callable[..., Any], arguments: tuple, timeout: float) -> None:
         super().__init__()
@@ -246,13 +247,13 @@ class Call(Future):
         self._stop = False
 
     def cancel(self) -> bool:
-        """Cancel it, also if it runs: then its worker leaves it, or is killed. Returns whether it has not
-        begun."""
+        """Cancel the call. If it runs already, its worker leaves the call or is killed. Returns True if the
+        call had not begun."""
         self._stop = True
         return super().cancel()
 
     def run(self, worker: Worker) -> None:
-        """Run it in a worker."""
+        """Run the call in a worker, and set its result or exception."""
         if not self.set_running_or_notify_cancel():
             return
         worker.busy = True
@@ -267,7 +268,7 @@ class Call(Future):
 
 
 class Workers:
-    """Worker processes that take calls from one queue, in order; they end at the end of the `with` block."""
+    """Worker processes that take calls from one queue, in order. They end at the end of the `with` block."""
 
     def __init__(
         self,
@@ -297,8 +298,8 @@ class Workers:
         self.close()
 
     def start(self) -> None:
-        """Start to take calls. With `keep_ready`, returns when the first process is prepared, and raises what
-        prevents that; the others follow."""
+        """Start to take calls. With `keep_ready`, waits until the first process is prepared, and raises the
+        error if that fails; the other processes are prepared in the background."""
         self._begun = True
         if self._keep_ready:
             self.workers[0].start()
@@ -321,7 +322,7 @@ class Workers:
             call = self._calls.get()
             if call is None:
                 return
-            if self._not_started is not None:  # nor would the next process
+            if self._not_started is not None:  # the next process would not start either
                 _fail(call, self._not_started)
                 continue
             call.run(worker)
@@ -359,8 +360,8 @@ class Workers:
     def each(self, call: Callable[..., Any], calls: Sequence[tuple]) -> Results:
         """Results of `call(*arguments)` for each of `calls`.
 
-        At most one call more than there are processes is running or queued. Raises InputError if a process is
-        killed from outside, e.g. when memory runs out.
+        The number of calls that run or wait is at most the number of processes plus one. Raises InputError if
+        a process is killed from outside, e.g. when memory runs out.
         """
         pending = list(enumerate(calls))[::-1]
         running = {}
@@ -386,7 +387,7 @@ def _fail(call: Call, error: Exception) -> None:
 
 
 def on_this_machine(call: Callable[..., Any], calls: Sequence[tuple], workers: int) -> Results:
-    """`Workers.each` with processes for these calls only; one worker is this process."""
+    """`Workers.each` with processes for these calls only; with one worker, the calls run in this process."""
     with Workers(min(workers, len(calls)) if workers > 1 else 0) as pool:
         yield from pool.each(call, calls)
 

@@ -84,8 +84,8 @@ PlanBody = create_model(
             None,
             gt=0,
             le=MAX_SAMPLE_RATE,
-            description="rows per second of the answer's motion, which is validated so [Hz]; null: its own "
-            "rows",
+            description="rows per second of the answer's motion [Hz], which is validated again with these "
+            "rows; null: the rows of the plan",
         ),
     ),
     **_ARGUMENTS,
@@ -100,7 +100,7 @@ class PathMotion(_Request):
 
 
 class TrajectoryMotion(PathMotion):
-    """A timed motion; each array has a row for each time [s]."""
+    """A timed motion; positions, velocities and accelerations have a row for each time [s]."""
 
     times: list[float]
     velocities: Rows
@@ -206,7 +206,7 @@ class Cancelled(BaseModel):
 
 
 ABOUT = (
-    "Motion planning for redundant robot arms; every motion in an answer passed the validator.\n\n"
+    "Motion planning for robot arms; every motion in an answer passed the validator.\n\n"
     "Units: meters, radians, seconds; quaternions wxyz. Problems are those of problem files in JSON. They "
     "name a robot of /robots and contain all other data, because the server reads no files.\n\n"
     'An error is one line of JSON: {"error": "..."}. The header X-Request-ID names a request, so that '
@@ -364,7 +364,7 @@ def _add_requests(app: FastAPI, pool: WorkerPool, settings: ServeSettings) -> No
         openapi_extra=_body(PlanBody, "a problem, and arguments of plan"),
     )
     async def plan(request: Request, name: RequestID = "") -> Response:
-        """Any status of a result is answered with code 200, also if there is no plan."""
+        """The answer has code 200 for every status of the result, even if no motion was found."""
         return await single(request, PLAN, name)
 
     @app.post(
@@ -387,8 +387,8 @@ def _add_requests(app: FastAPI, pool: WorkerPool, settings: ServeSettings) -> No
         response_class=Response,
     )
     async def batch(request: Request, name: RequestID = "") -> Response:
-        """Each line of the answer is what /plan answers to that line, in the same order; a line is sent as
-        soon as it and all before it are done."""
+        """Each line of the answer is the answer of /plan to one line of the request, in the same order; a
+        line is sent as soon as it and all lines before it are done."""
 
         async def write(send: Send) -> None:
             body = await read_body(request, pool, LINES)
@@ -584,11 +584,11 @@ def plan_tasks(pool: WorkerPool, lines: list[bytes], at_once: int) -> list[async
     """A task for each line; at most `at_once` of them are in the pool at a time."""
     limit = asyncio.Semaphore(at_once)
 
-    async def one(line: bytes) -> Answer:
+    async def answer_line(line: bytes) -> Answer:
         async with limit:
             return await pool.run(PLAN, line)
 
-    return [asyncio.ensure_future(one(line)) for line in lines]
+    return [asyncio.ensure_future(answer_line(line)) for line in lines]
 
 
 async def send_lines(

@@ -13,7 +13,7 @@ from robotdiffuse.server.worker import failed
 
 LOG = logging.getLogger("robotdiffuse.server")
 REFUSED = "refused"
-"""State of a request whose connection has answered it: with this status code."""
+"""Key in the state of a request that the connection itself has answered; the value is the status code."""
 
 
 def log_access(

@@ -47,8 +47,8 @@ class _Server(uvicorn.Server):
 
 
 def serve(robots: dict[str, Robot], settings: ServeSettings, say: Callable[[str], None] = print) -> None:
-    """Answer requests until SIGTERM or Ctrl-C. `say` receives a line with the address, and one when ready;
-    standard error gets a line for each request.
+    """Answer requests until SIGTERM or Ctrl-C. `say` receives a line with the address, and a line when the
+    server is ready; standard error gets a line for each request.
 
     Raises InputError if the address cannot be listened on or no worker can be started.
     """
@@ -91,10 +91,8 @@ async def _serve(
             server.should_exit = True
         else:
             remaining = settings.workers - 1
-            starting_too = (
-                f"; {remaining} more {'is' if remaining == 1 else 'are'} starting" if remaining else ""
-            )
-            say(f"ready, with 1 worker{starting_too}")
+            others = f"; {remaining} more {'is' if remaining == 1 else 'are'} starting" if remaining else ""
+            say(f"ready, with 1 worker{others}")
 
     say(f"listening on {_address(listener)}; loading compiled code (about a minute on a new machine)")
     starting = asyncio.ensure_future(pool.start())

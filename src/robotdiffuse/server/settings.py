@@ -31,7 +31,7 @@ MAX_ENTRIES = {
     "attached": 50,
 }
 """Largest number of entries of the lists of a problem."""
-# Most rows of a motion in a request, and in an answer at its rate.
+# Largest number of rows of a motion in a request, and in the answer to a request with `rate`.
 MAX_ROWS = 100_000
 MAX_ANSWER_ROWS = 20_000
 MAX_SEED = 2**32 - 1

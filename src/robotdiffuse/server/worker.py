@@ -101,7 +101,7 @@ def warm_up() -> bool:
     assert _state is not None
     name, robot = next(iter(_state.robots.items()))
     start = (robot.lower + robot.upper) / 2
-    start[1:2] += 0.3  # an arm that points up does not move its tip by its first joint
+    start[1:2] += 0.3  # if the arm pointed straight up, turning its first joint would not move its tip
     goal = start.copy()
     goal[0] += (robot.upper[0] - start[0]) / 2
     far = Scene([Box([2.0, 2.0, 2.0], [0.1, 0.1, 0.1])])

@@ -51,7 +51,7 @@ class WorkerPool:
     def __init__(self, robots: dict[str, Robot], settings: ServeSettings) -> None:
         self.settings, self.metrics = settings, Metrics()
         self.admitted = self.arriving = 0
-        """Requests admitted; data of incomplete requests [bytes]."""
+        """Number of admitted requests; received data of requests that are still incomplete [bytes]."""
         self.stopping = False
         bare = {name: replace(robot) for name, robot in robots.items()}  # without compiled arrays
         self._workers = Workers(settings.workers, worker.prepare, (bare, settings), 0.0, keep_ready=True)
@@ -71,8 +71,8 @@ class WorkerPool:
 
     @contextmanager
     def admit(self, count: int) -> Iterator[None]:
-        """Count `count` requests as admitted within the block. Raises RequestError if the queue lacks
-        room."""
+        """Count `count` requests as admitted while the block runs. Raises RequestError if the queue is too
+        full for them."""
         capacity = self.settings.workers + self.settings.queue
         if self.admitted + count > capacity:
             waiting = self.admitted / self.settings.workers
@@ -115,7 +115,7 @@ class WorkerPool:
         return answer
 
     def _count_worker(self, call: Future[Answer]) -> None:
-        """Count a worker that is replaced after a call. Called by its thread."""
+        """Count the call's worker if it was lost or is renewed. The worker's thread calls this function."""
         if call.cancelled():
             return
         if isinstance(call.exception(), EndedError):
