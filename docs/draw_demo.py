@@ -15,18 +15,18 @@ from robotdiffuse.visualization.picture import PictureSettings, render
 ROOT = Path(__file__).parents[1]
 SIZE = PictureSettings(width=720, height=450, ghosts=1)
 WHOLE_MOTION = PictureSettings(width=720, height=450, ghosts=10)
-"""So many poses are kept in the picture by the camera."""
+"""Settings for the choice of the camera: these many poses along the motion must be in the picture."""
 FRAME_TIME = 0.05
 """How long a frame is shown [s]; a multiple of 10 ms, in which GIF counts."""
 SLOWDOWN = 2.0
-# The motion rests at its ends for so long [s].
+# How long the first and the last frame are shown [s].
 FIRST_FRAME_TIME = 0.5
 LAST_FRAME_TIME = 1.5
 COLORS = 256
 
 
 def frames(problem: rd.Problem, trajectory: rd.Trajectory) -> list[Image.Image]:
-    """The arm along the motion: where it began as a ghost, and the way of the cup so far."""
+    """A frame for each moment: the arm, its start as a ghost, and the path of the cup so far."""
     robot, scene = problem.standing()
     _, camera = render(robot, scene, trajectory, WHOLE_MOTION)
     count = int(np.ceil(SLOWDOWN * trajectory.times[-1] / FRAME_TIME)) + 1

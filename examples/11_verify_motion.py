@@ -1,4 +1,5 @@
-"""A motion that another planner wrote as CSV: is it free between its waypoints too? If so, a proof of it."""
+"""Validates a motion of another planner, from CSV, between its waypoints too; certifies a motion of our
+own."""
 
 import numpy as np
 

@@ -1,6 +1,6 @@
 """Make motions, train the diffusion model on them, and plan with the new network under guidance.
 
-So few motions and samples make no good network: the bundled one was trained on 31,000 motions.
+So few motions and samples do not make a good network: the bundled network was trained on 31,000 motions.
 """
 
 import robotdiffuse as rd

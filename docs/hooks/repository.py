@@ -24,7 +24,7 @@ LINK = re.compile(r"\]\(([^)#\s]+)((?:#[^)]*)?)\)")
 
 
 def site_path(file: str) -> str:
-    """Path of a file of the repository among the site's sources; text files become pages."""
+    """Path of a file of the repository among the sources of the site; .txt files become .md pages."""
     if file in ROOT_PAGES:
         return ROOT_PAGES[file]
     if file.startswith("docs/"):
@@ -34,9 +34,9 @@ def site_path(file: str) -> str:
 
 def outside_files() -> list[str]:
     """Files outside of docs/ that belong to the site, by their path in the repository."""
-    found = [path for path in (ROOT / REPORTS).rglob("*") if path.is_file() and path.suffix != ".xz"]
+    reports = [path for path in (ROOT / REPORTS).rglob("*") if path.is_file() and path.suffix != ".xz"]
     examples = [path for path in (ROOT / "examples").iterdir() if path.is_file()]
-    return [*ROOT_PAGES, *sorted(path.relative_to(ROOT).as_posix() for path in (*found, *examples))]
+    return [*ROOT_PAGES, *sorted(path.relative_to(ROOT).as_posix() for path in (*reports, *examples))]
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:

@@ -1,1 +1,2 @@
-"""The interfaces of other planners, so that programs written for them plan with this package."""
+"""Interfaces of other planners, so that programs that were written for these planners can use this
+package."""

@@ -1,8 +1,8 @@
 """MPlib's planner: `from robotdiffuse.adapters.mplib import Planner` in place of `from mplib import Planner`.
 
-Methods, arguments and results are those of MPlib 0.1 and 0.2, over `rd.Workspace`. Poses are seven numbers
-(x, y, z, and a quaternion w, x, y, z), objects with `p` and `q` such as `sapien.Pose`, or 4 x 4 matrices.
-Where MPlib reports that a plan failed, `status` holds the reason.
+Methods, arguments and results are those of MPlib 0.1 and 0.2, on top of `rd.Workspace`. A pose is seven
+numbers (x, y, z, and a quaternion w, x, y, z), an object with `p` and `q` such as `sapien.Pose`, or a 4 x 4
+matrix. If a plan fails, `status` contains the reason too.
 """
 
 import hashlib
@@ -35,12 +35,18 @@ from robotdiffuse.validation.tolerances import DEFAULT
 SUCCESS = "Success"
 CLOUD = "point_cloud"
 HELD = "attached"
-RAMP_TIME = 0.01  # in which accelerations build up [s]; MPlib has no limits of jerk
-SETTLING_TIME = 0.24  # of controllers that are given positions alone: so long the last one is repeated [s]
-LOOSE_TOLERANCE = 0.002  # of lines that are followed without turning evenly [m]
-TILT_WEIGHT = 0.01  # of rotation beside position, where poses are out of reach [m/rad]
-TILT_MARGIN = 1.25  # of the least tilt with which a position is in reach: there the arm is stretched
-HELD_JOINT_STEP = 0.002  # grippers are held at multiples of this [rad] or [m]
+# Jerk limits let the acceleration reach its limit within this time [s], since MPlib has no jerk limits.
+RAMP_TIME = 0.01
+# The last row is repeated for this time [s], in which position controllers reach it.
+SETTLING_TIME = 0.24
+# Distance that lines with uneven rotation may have from the straight line [m].
+LOOSE_TOLERANCE = 0.002
+# Weight of the rotation error against the position error, for poses that are out of reach [m/rad].
+TILT_WEIGHT = 0.01
+# The tilt is this factor larger than the smallest one that reaches the position, where the arm is stretched.
+TILT_MARGIN = 1.25
+# Grippers are held at multiples of this [rad] or [m].
+HELD_JOINT_STEP = 0.002
 
 
 class Planner:
@@ -48,13 +54,14 @@ class Planner:
 
     Args:
         urdf: The robot's URDF, prepared on first use, in about a minute; or the name of a bundled robot.
-        move_group: The link that poses are of.
-        package_keyword_replacement: What stands in place of `package://` in the URDF.
-        srdf: SRDF with pairs of links that need no check; "": they are sampled.
+        move_group: The link that goal poses refer to.
+        package_keyword_replacement: The folder that replaces `package://` in the URDF.
+        srdf: SRDF with pairs of links that need no check; "": these pairs are found by sampling.
         user_link_names: Ignored: links have the names of the URDF.
         user_joint_names: Joints in the order of `qpos`; none: the planned joints.
         joint_vel_limits: Velocity limits of the planned joints [rad/s]; none: 1, as in MPlib.
-        joint_acc_limits: Their acceleration limits [rad/s²]; none: those of the robot (MPlib: 1).
+        joint_acc_limits: Acceleration limits of the planned joints [rad/s²]; none: those of the robot (MPlib:
+            1).
 
     Raises:
         InputError: For files that cannot be read, unknown links and joints, and limits of the wrong number.
@@ -86,7 +93,7 @@ class Planner:
             acceleration if len(acceleration) else robot.acceleration,
         )
         self.workspace = Workspace(self.robot, move_group)
-        """Robot and obstacles; other obstacles than a point cloud are added here."""
+        """The robot and its obstacles; obstacles that are no point clouds are added to it."""
 
     @property
     def joint_vel_limits(self) -> ndarray:
@@ -138,12 +145,12 @@ class Planner:
         return present
 
     def update_attached_box(self, size: ArrayLike, pose: Any, link_id: int = -1) -> None:
-        """Hold a box, in place of what was held.
+        """Hold a box instead of the object that was held before.
 
         Args:
-            size: Its edges [m].
-            pose: Its pose in the frame of the link.
-            link_id: Ignored: the move group holds it.
+            size: Edge lengths of the box [m].
+            pose: Pose of the box in the frame of the move group.
+            link_id: Ignored: the move group holds the box.
         """
         T = matrix(pose)
         self._hold(Box(np.zeros(3), size, name=HELD).moved(T))
@@ -157,7 +164,8 @@ class Planner:
         self._hold(Mesh.from_file(mesh_path, name=HELD).moved(matrix(pose)))
 
     def detach_object(self, name: str = HELD, also_remove: bool = True) -> bool:
-        """Hold nothing; returns whether something was held."""
+        """Release the held object, without adding it to the obstacles (`also_remove` is ignored). Returns
+        whether an object was held."""
         present = any(body.name == name for body in self.workspace.robot.attached)
         if present:
             self.workspace.robot = self.workspace.robot.detach(name)
@@ -166,7 +174,7 @@ class Planner:
     def IK(
         self, goal_pose: Any, start_qpos: ArrayLike, mask: Any = None, n_init_qpos: int = 20, **_: Any
     ) -> tuple[str, list[ndarray] | None]:
-        """Configurations that reach a pose and are free, those nearest to the start first.
+        """Collision-free configurations that reach a pose, the nearest to the start first.
 
         Returns:
             "Success" and the configurations, or the reason and None.
@@ -187,14 +195,14 @@ class Planner:
 
         Args:
             goal_pose: The pose, in the frame of the world, or of the base if `wrt_world` is False.
-            current_qpos: Where the robot is, as `user_joint_names` orders it.
+            current_qpos: The present joint values, in the order of `user_joint_names`.
             mask: Ignored.
-            options: `time_step` [s] between rows (0.1), `planning_time` [s] (1), `wrt_world`; others of MPlib
-                are ignored.
+            options: `time_step` [s] between rows (0.1), `planning_time` [s] (1), `wrt_world`; other options
+            of MPlib are ignored.
 
         Returns:
-            `status`, "Success" or the reason; and `time`, `position`, `velocity`, `acceleration`,
-            `duration`, `note`.
+            A dictionary with `status`: "Success", or the reason for the failure. If the plan succeeded, also
+            with `time`, `position`, `velocity`, `acceleration`, `duration` and `note`.
         """
         goal = self._in_world(goal_pose, options)
         return self._planned("planning failed", partial(self.workspace.plan, goal), current_qpos, options)
@@ -207,10 +215,11 @@ class Planner:
         return self._planned("planning failed", plan, current_qpos, options)
 
     def plan_screw(self, target_pose: Any, qpos: ArrayLike, *_: Any, **options: Any) -> dict[str, Any]:
-        """Move along a straight line, turning evenly; see `plan_pose`.
+        """Move along a straight line while turning at a constant rate; see `plan_pose`.
 
-        Where no motion does so, one along the line that turns otherwise is tried. Where the arm reaches the
-        position only with a tilt of less than 15 degrees, it moves there so. `note` says which.
+        If there is no such motion, a motion along the line that turns unevenly is tried. If the pose is out
+        of reach, but the arm can reach its position when tilted by less than 15 degrees, the motion ends
+        there, tilted. In both cases `note` says so.
         """
         T = self._in_world(target_pose, options)
 
@@ -237,13 +246,13 @@ class Planner:
     plan_qpos_to_qpos = plan_qpos
 
     def check_for_self_collision(self, qpos: ArrayLike) -> list[str]:
-        """What is wrong with a configuration without obstacles: no entry if it is free."""
+        """A list with the reason why a configuration is not free without obstacles; empty if it is free."""
         start = self._start(qpos)
         state = Workspace(self.workspace.robot, self.workspace.tip).is_free(start)
         return [] if state else [state.reason]
 
     def check_for_env_collision(self, qpos: ArrayLike, *_: Any, **_options: Any) -> list[str]:
-        """What is wrong with a configuration among the obstacles: no entry if it is free."""
+        """A list with the reason why a configuration is not free among the obstacles; empty if it is free."""
         start = self._start(qpos)
         state = self.workspace.is_free(start)
         return [] if state else [state.reason]
@@ -251,9 +260,9 @@ class Planner:
     def _planned(
         self, failed: str, plan: Callable[..., PlanResult], qpos: ArrayLike, options: dict[str, Any]
     ) -> dict[str, Any]:
-        """A planned motion as MPlib returns it: a row every `time_step`. The first is one step after the
-        start, and the last is repeated until controllers have settled, since scripts grasp and release
-        right after it."""
+        """A planned motion as MPlib returns it, with a row every `time_step`. The first row is one step after
+        the start. The last row is repeated for SETTLING_TIME, since scripts grasp and release right after
+        the motion."""
         start = self._start(qpos)
         try:
             result = plan(start, time_limit=options.get("planning_time", 1.0))
@@ -276,26 +285,28 @@ class Planner:
         }
 
     def _tilt(self, T_world_tip: ndarray, start: ndarray) -> ndarray:
-        """Rotation vector, a little longer than necessary, with which the position is in reach."""
+        """The rotation, as a rotation vector, by which the pose must be tilted so that the arm reaches its
+        position, times TILT_MARGIN. Infinite if the arm cannot reach the position with any tilt."""
 
-        def off(q: ndarray) -> ndarray:
+        def errors(q: ndarray) -> ndarray:
             T = self.workspace.pose(q)
             turn = rotation_vector(T[:3, :3] @ T_world_tip[:3, :3].T)
             return np.append(T[:3, 3] - T_world_tip[:3, 3], TILT_WEIGHT * turn)
 
         robot = self.robot
         solution = least_squares(
-            off, np.clip(start, robot.lower, robot.upper), bounds=(robot.lower, robot.upper)
+            errors, np.clip(start, robot.lower, robot.upper), bounds=(robot.lower, robot.upper)
         )
-        near = np.linalg.norm(solution.fun[:3]) < 1e-3
-        return TILT_MARGIN * solution.fun[3:] / TILT_WEIGHT if near else np.full(3, np.inf)
+        in_reach = np.linalg.norm(solution.fun[:3]) < 1e-3
+        return TILT_MARGIN * solution.fun[3:] / TILT_WEIGHT if in_reach else np.full(3, np.inf)
 
     def _in_world(self, pose: Any, options: dict[str, Any]) -> ndarray:
         T = matrix(pose)
         return T if options.get("wrt_world", True) else self.workspace.T_world_base @ T
 
     def _start(self, qpos: ArrayLike) -> ndarray:
-        """The planned joints of `qpos`. The other ones, such as fingers, are held where it has them."""
+        """The planned joints of `qpos`. Its other joints, such as fingers, are locked at their values in
+        `qpos`."""
         q = np.ravel(np.asarray(qpos, float))
         if len(q) == self.robot.dof:
             return q
@@ -312,9 +323,9 @@ class Planner:
         self.workspace.robot = robot.with_locked(locked)
         return q[self._places]
 
-    def _qpos(self, q: ndarray, like: ArrayLike) -> ndarray:
-        """A configuration in the order of `qpos`, with its other joints."""
-        qpos = np.ravel(np.array(like, float))
+    def _qpos(self, q: ndarray, start_qpos: ArrayLike) -> ndarray:
+        """A configuration of the planned joints as a `qpos`; the other joints are as in `start_qpos`."""
+        qpos = np.ravel(np.array(start_qpos, float))
         if len(qpos) == len(q):
             return q
         qpos[self._places] = q
@@ -326,7 +337,7 @@ class Planner:
 
 
 def matrix(value: Any) -> ndarray:
-    """A pose as a homogeneous transform: of an object with `p` and `q`, seven numbers, or 4 x 4 numbers."""
+    """The homogeneous transform of a pose: an object with `p` and `q`, seven numbers, or 4 x 4 numbers."""
     if hasattr(value, "p") and hasattr(value, "q"):
         value = [*np.ravel(value.p), *np.ravel(value.q)]
     numbers = np.asarray(value, float)
@@ -341,7 +352,7 @@ def matrix(value: Any) -> ndarray:
 
 
 def _robot(urdf: str | Path, tip: str, srdf: str | Path, package: str) -> Robot:
-    """The prepared robot; prepared and stored, by the content of its files, if it is new."""
+    """The prepared robot. A URDF with new content is prepared first, and stored in the user's robots."""
     if str(urdf) in ROBOTS:
         return load_robot(str(urdf))
     content = Path(urdf).read_bytes() + (Path(srdf).read_bytes() if srdf else b"") + tip.encode()
@@ -355,7 +366,7 @@ def _robot(urdf: str | Path, tip: str, srdf: str | Path, package: str) -> Robot:
 
 
 def _limited(robot: Robot, velocity: ndarray, acceleration: ndarray) -> Robot:
-    """The robot with other limits of its planned joints."""
+    """The robot with these limits of its planned joints, and the jerk limits that follow from RAMP_TIME."""
     limits = dict[str, dict[str, float]]()
     jerk = acceleration / RAMP_TIME
     for field, values in (("velocity", velocity), ("acceleration", acceleration), ("jerk", jerk)):

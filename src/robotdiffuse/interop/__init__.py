@@ -38,7 +38,7 @@ READERS = Registry(
         ".yaml": Entry(
             "robotdiffuse.interop.recorded_motion:read_yaml", "ROS JointTrajectory, MoveIt RobotTrajectory"
         ),
-        ".yml": Entry("robotdiffuse.interop.recorded_motion:read_yaml", "the same"),
+        ".yml": Entry("robotdiffuse.interop.recorded_motion:read_yaml", "as .yaml"),
         ".mcap": Entry("robotdiffuse.interop.ros2:read_recording", "ROS 2 messages"),
         ".rosbag2": Entry("robotdiffuse.interop.ros2:read_recording", "a ROS 2 bag (a folder)"),
     },

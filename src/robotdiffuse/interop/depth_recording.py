@@ -1,10 +1,10 @@
 """Reads and writes depth images with camera parameters, poses and joint states in MCAP files, as ROS 2
-messages, and reads those of ROS 1 and ROS 2 bags.
+messages; reads them from ROS 1 and ROS 2 bags too.
 
 A camera NAME has its images (sensor_msgs/Image) and parameters (sensor_msgs/CameraInfo) on topics of one
 folder, such as /NAME/depth/image_rect_raw and /NAME/depth/camera_info. Its pose is the transform from the
 arm's base to the `frame_id` of the images (tf2_msgs/TFMessage on /tf and /tf_static), and the arm's
-configuration is in sensor_msgs/JointState. The bags of librealsense have images and parameters alone:
+configuration is in sensor_msgs/JointState. Bags of librealsense have only images and parameters:
 /device_0/sensor_0/Depth_0/image/data and .../info/camera_info.
 """
 
@@ -40,7 +40,7 @@ IMAGE = "sensor_msgs/msg/Image"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 ENCODINGS = {"32FC1": ("f4", 1.0), "16UC1": ("u2", 0.001), "mono16": ("u2", 0.001)}
-"""For each encoding of depth images, the type of the pixels and the length of a unit [m] (REP 118)."""
+"""For each encoding of depth images, the type of the pixels and the meters per unit (REP 118)."""
 Stamped = TypeVar("Stamped", bound=tuple[float, Any])
 MAX_SIZE = 64 * 10**9
 """Largest size of a recording [bytes]."""
@@ -56,9 +56,9 @@ class StampedView(NamedTuple):
 
 
 def write_depth_views(robot: Robot, views: Mapping[str, Sequence[StampedView]], file: str | Path) -> None:
-    """Write views of cameras by name as .mcap. Each view needs the arm's configuration.
+    """Write views as .mcap. views: for each camera name, its views, which need the arm's configuration.
 
-    Joint states and transforms are written at the stamps of images alone.
+    Joint states and transforms are written only at the stamps of the images.
     """
     stream = io.BytesIO()
     out = McapWriter(stream)
@@ -140,17 +140,17 @@ def read_depth_views(
 ) -> Iterator[StampedView]:
     """Read the depth images of a recording, as `Explorer.observe` takes them.
 
-    They come in the order of their log times. Images without joint states or transforms within 0.1 s are left
-    out. Images must be rectified. The camera's pose and the arm's
-    configuration are interpolated to the stamp of each.
+    Images are returned in the order of their log times, and must be rectified. The camera's pose and the
+    arm's configuration are interpolated to the stamp of each image. Images without joint states or transforms
+    within 0.1 s are left out.
 
     Args:
         file: An .mcap file, a ROS 1 bag (.bag, of librealsense too) or the folder of a ROS 2 bag.
-        robot: The robot whose joint states it holds.
+        robot: The robot whose joint states the file holds.
         topics: Topics of the images; None: all with depth images (32FC1 in m, 16UC1 or mono16 in mm).
         base: The frame of the arm's base in the file; None: `robot.base`.
         T_base_camera: The pose of a fixed camera [4, 4], in place of the file's transforms. Views of a file
-            without joint states have no configuration then.
+            without joint states then have no configuration.
 
     Raises:
         InputError: For a file that is damaged or holds no depth images, if no image has joint states and
@@ -182,7 +182,7 @@ def _read(
     other_topics += [name for name in kinds if _is_unit(name)]
     for topic, at, message in recording.messages(other_topics):
         kind = kinds[topic]
-        if kind == CAMERA_INFO:  # in ROS 1, K, D and P
+        if kind == CAMERA_INFO:  # the names are upper-case in ROS 1: K, D, P
             infos.setdefault(_folder(topic), {k.lower(): value for k, value in to_plain(message).items()})
         elif kind == JOINT_STATE:
             states.add(_seconds(message, at), to_plain(message))
@@ -235,7 +235,7 @@ def _folder(topic: str) -> str:
 
 
 def _is_unit(topic: str) -> bool:
-    """Whether librealsense writes the meters per unit of a sensor's images there."""
+    """Whether a topic has the meters per unit of a sensor's depth images, as librealsense writes them."""
     return topic.replace(" ", "_").endswith("/option/Depth_Units/value")
 
 
@@ -262,7 +262,7 @@ def _intrinsics(topic: str, info: Any, image: Any) -> tuple[float, float, float,
 
 
 def _depth(where: str, image: Any, unit: float | None) -> Float[ndarray, "h w"]:
-    """The image [m]. unit: meters per unit of integers, if the recording has it."""
+    """The depth image [m]. unit: meters per unit of integer pixels; None: the default of the encoding."""
     if image.encoding not in ENCODINGS:
         raise InputError(f"{where} has the encoding {image.encoding!r}; it must be {' or '.join(ENCODINGS)}")
     kind, scale = ENCODINGS[image.encoding]
@@ -275,13 +275,14 @@ def _depth(where: str, image: Any, unit: float | None) -> Float[ndarray, "h w"]:
 
 
 def insert_by_time(history: list[Stamped], stamped: Stamped) -> None:
-    """Add an entry to a history, which may contain later entries: messages may be logged in another order."""
+    """Insert an entry into a history sorted by time. Messages may be logged in another order than that of
+    their stamps."""
     insort(history, stamped, key=itemgetter(0))
 
 
 def around(history: list[Stamped], stamp: float, gap: float) -> tuple[Any, Any, float] | None:
-    """The entries before and after a time, or the same one twice, and which share of the way from the first
-    to the second the time is; None if no entry is within `gap` [s] of the time."""
+    """The entries before and after a time, and the fraction of the interval between them that has passed at
+    the time. If only one entry is within `gap` [s] of the time, this entry twice; None if there is none."""
     i = bisect_left(history, stamp, key=itemgetter(0))
     near = [history[k] for k in (i - 1, i) if 0 <= k < len(history) and abs(history[k][0] - stamp) <= gap]
     if not near:
@@ -293,7 +294,7 @@ def around(history: list[Stamped], stamp: float, gap: float) -> tuple[Any, Any, 
 
 
 class TransformHistory:
-    """Poses of frames in their parents', at the times when they were published."""
+    """Poses of frames relative to their parent frames, at the times when they were published."""
 
     def __init__(self) -> None:
         self._parent: dict[str, str] = {}
@@ -301,7 +302,7 @@ class TransformHistory:
         self._poses: dict[str, list[tuple[float, Pose]]] = {}
 
     def add(self, message: Mapping[str, Any], static: bool) -> None:
-        """Take a geometry_msgs/TransformStamped, in plain data, into account."""
+        """Add a geometry_msgs/TransformStamped, as plain data."""
         child = message["child_frame_id"].lstrip("/")
         place = message["transform"]["translation"]
         turn = message["transform"]["rotation"]
@@ -325,20 +326,20 @@ class TransformHistory:
         """
         T = np.eye(4)
         at = frame.lstrip("/")
-        passed = [at]
+        passed = [at]  # the frames on the way from `frame` to its ancestors
         while at != base.lstrip("/"):
-            if at not in self._parent or len(passed) > len(self._parent) + 1:
+            if at not in self._parent or len(passed) > len(self._parent) + 1:  # no parent, or a cycle
                 raise InputError(
                     f"no transforms lead from {base} to {frame}, the frame of {where}; from there they lead"
                     f" to {', '.join(passed[1:]) or 'nothing'}"
                 )
-            T = self._one(at, stamp, gap, where) @ T
+            T = self._pose_in_parent(at, stamp, gap, where) @ T
             at = self._parent[at]
             passed.append(at)
         return T
 
-    def _one(self, frame: str, stamp: float, gap: float, where: str) -> Pose:
-        """The pose of a frame in its parent's."""
+    def _pose_in_parent(self, frame: str, stamp: float, gap: float, where: str) -> Pose:
+        """The pose of a frame relative to its parent frame at a time."""
         poses = self._poses[frame]
         if frame in self._static:
             return poses[-1][1]
@@ -358,13 +359,15 @@ class _States:
         self._states: list[tuple[float, JointValues]] = []
 
     def add(self, stamp: float, state: Mapping[str, Any]) -> None:
-        """Take a message into account, if it holds positions of the arm's joints."""
-        at = dict(zip(state["name"], state["position"], strict=False))  # it may hold velocities alone
-        if all(name in at for name in self._robot.joint_names):
-            insert_by_time(self._states, (stamp, np.array([at[name] for name in self._robot.joint_names])))
+        """Add a message, if it has positions of all joints of the arm."""
+        positions = dict(zip(state["name"], state["position"], strict=False))  # may have velocities alone
+        if all(name in positions for name in self._robot.joint_names):
+            q = np.array([positions[name] for name in self._robot.joint_names])
+            insert_by_time(self._states, (stamp, q))
 
     def at(self, stamp: float, where: str) -> Configuration:
-        """The configuration at a time. Raises InputError, naming `where`, if none is near."""
+        """The configuration at a time, interpolated. Raises InputError, naming `where`, if there is no joint
+        state within MAX_GAP of the time."""
         near = around(self._states, stamp, MAX_GAP)
         if near is None:
             names = ", ".join(self._robot.joint_names)

@@ -1,6 +1,7 @@
-"""Motions read from files of other programs, and their conversion to motions of a robot.
+"""Reads motions from files of other programs, and converts them to motions of a robot.
 
-In JSON, YAML and CSV: ROS and MoveIt messages, and RobotDiffuse's own records; publishing by rosbridge.
+The formats are JSON, YAML and CSV, with ROS and MoveIt messages or RobotDiffuse's own records. Also publishes
+motions through rosbridge.
 """
 
 import csv
@@ -104,9 +105,9 @@ class RobotMotion:
 def motion_of_robot(motion: RecordedMotion, robot: Robot) -> RobotMotion:
     """The motion of a robot's planned joints, matched by name.
 
-    The recording may contain other joints of the robot, if they stay at their locked values. If velocities
-    are absent, they are those of the cubic spline through the rows that starts and ends at rest. If
-    accelerations are absent, each is the mean of the accelerations of the two cubics that meet at its row.
+    The recording may contain other joints of the robot, if these stay at their locked values. Missing
+    velocities are those of the cubic spline through the rows that starts and ends at rest. A missing
+    acceleration is the mean of the accelerations of the two cubics that meet at its row.
     Raises InputError for missing or unknown joints, and for other joints that leave their locked values.
     """
     notes = list(motion.notes)
@@ -185,8 +186,8 @@ def problem_of_motion(motion: RecordedMotion, robot: Robot, scene: Scene) -> Pro
     not planned are locked at their values in the first row."""
     movable = {j.name for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None}
     movable -= set(robot.joint_names)
-    at = {name: float(motion.positions[0, j]) for j, name in enumerate(motion.joint_names) if name in movable}
-    robot = robot.with_locked(at)
+    first = dict(zip(motion.joint_names, motion.positions[0].tolist(), strict=True))
+    robot = robot.with_locked({name: value for name, value in first.items() if name in movable})
     motion = replace(motion, notes=())
     q = motion_of_robot(motion, robot).motion.positions
     return Problem(robot, scene, q[0], JointGoal(q[-1:]))
@@ -263,7 +264,8 @@ def _motion(record: Any) -> RecordedMotion:
 
 
 def _only(trajectories: Any) -> RecordedMotion:
-    """The motion in the `trajectory` field of a DisplayTrajectory (a list) or a MoveIt response (one)."""
+    """The only motion in a field `trajectory`: a list in a DisplayTrajectory, one motion in a MoveIt
+    response."""
     if isinstance(trajectories, Mapping):
         return _motion(trajectories)
     if not isinstance(trajectories, list) or len(trajectories) != 1:
@@ -302,9 +304,9 @@ def _seconds(where: str, value: Any) -> float:
     """Seconds of a ROS 2 (sec, nanosec) or ROS 1 (secs, nsecs) duration, or of a plain number."""
     parts: tuple[Any, Any] = (value, 0)
     if isinstance(value, Mapping):
-        for seconds_name, rest in (("sec", "nanosec"), ("secs", "nsecs")):
+        for seconds_name, nanoseconds_name in (("sec", "nanosec"), ("secs", "nsecs")):
             if seconds_name in value:
-                parts = (value[seconds_name], value.get(rest, 0))
+                parts = (value[seconds_name], value.get(nanoseconds_name, 0))
     if not all(isinstance(part, int | float) and not isinstance(part, bool) for part in parts):
         raise InputError(f"{where} is {shown(value)}; it must be a duration: sec and nanosec")
     return float(parts[0]) + 1e-9 * float(parts[1])
@@ -337,6 +339,7 @@ def _table(text: str) -> RecordedMotion:
     if not rows:
         raise InputError("it is empty; it must have a header and rows of numbers")
     header = [cell.strip() for cell in rows[0][1]]
+    # `Trajectory.save` puts a quote before names that a spreadsheet would take for formulas
     header = [cell[1:] if cell[:1] == "'" and cell[1:2] in "=+-@" else cell for cell in header]
     if len(rows) == 1:
         raise InputError("it has a header and no rows")
@@ -379,10 +382,10 @@ def publish(
     topic: str = "/joint_trajectory",
     timeout: float = 5.0,
 ) -> None:
-    """Publish a trajectory once through rosbridge, as a JointTrajectory; the caller must have validated it.
+    """Publish a trajectory once through rosbridge, as a JointTrajectory. The caller must have validated it.
 
-    Whether a subscriber received it is not known: ROS does not confirm deliveries. Raises InputError if no
-    rosbridge answers within `timeout` [s].
+    ROS does not confirm deliveries, so the caller does not learn whether a subscriber received the message.
+    Raises InputError if no rosbridge answers within `timeout` [s].
     """
     with needs("roslibpy", "ros"):
         import roslibpy

@@ -19,15 +19,16 @@ with needs("rerun-sdk", "rerun"):
 
 TIMELINE = "time"
 FPS = 60.0
-"""Largest number of poses per second that are logged of each link."""
+"""Largest number of poses per second that are logged for each link."""
 
 
 def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
-    """Write the entities scene/NAME, robot/LINK with its meshes, joints/NAME/positions and
-    joints/NAME/velocities, in the world's frame if the problem has one; see `interop.write_motion`."""
+    """Write the entities scene/NAME, robot/LINK with its mesh, joints/NAME/positions and
+    joints/NAME/velocities; see `interop.write_motion`. Scene and robot are in the world's frame if the
+    problem has a `base`, else in the base's frame."""
     robot = problem.robot
     recording = rr.RecordingStream("robotdiffuse", recording_id=file.stem)
-    # recorded in memory: a failed write would end a thread of Rerun, with messages of several lines
+    # recorded in memory: if Rerun itself failed to write a file, its thread would print a long message
     content = recording.memory_recording()
     recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     if problem.T_world_base is not None:

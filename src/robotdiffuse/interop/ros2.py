@@ -1,9 +1,9 @@
 """ROS 2 without ROS: messages, MCAP files and bags (folders with metadata.yaml and a database); ROS 1 bags.
 
-In MCAP files, /scene and /tf hold Foxglove messages: the obstacles, the arm as triangles fixed to its links,
-and the poses of the links and of moving obstacles. /joint_trajectory, /joint_states and /robot_description
-hold ROS 2 messages; the last is the URDF, if the robot was read from one. The URDF and the problem are
-attachments, too.
+In MCAP files, /scene, /tf and /points/NAME hold Foxglove messages: the obstacles and the arm as triangles
+fixed to its links; the poses of the links and of moving obstacles; point clouds. /joint_trajectory,
+/display_planned_path, /joint_states and /robot_description hold ROS 2 messages. /robot_description is the
+URDF, if the robot was read from one. The URDF and the problem are also attached as files.
 """
 
 import bz2
@@ -159,8 +159,9 @@ def header_seconds(stamp: Mapping[str, Any]) -> float:
 def choose_topic(topics: Mapping[str, str], requested: str | None, where: str) -> str:
     """The topic to read a motion from, given all topics and their types.
 
-    This is `requested`, or else the only topic of the first type of JointTrajectory, RobotTrajectory,
-    DisplayTrajectory and JointState that occurs. Raises InputError if there is no such topic or several.
+    It is `requested` if that is given. Otherwise, the types JointTrajectory, RobotTrajectory,
+    DisplayTrajectory and JointState are tried in this order, and the first one that occurs must have a single
+    topic. Raises InputError if no topic has one of these types, or if several have the first one.
     """
     kinds = (JOINT_TRAJECTORY, ROBOT_TRAJECTORY, DISPLAY_TRAJECTORY, JOINT_STATE)
     motions = {topic: kind for topic, kind in topics.items() if kind in kinds}
@@ -181,9 +182,10 @@ def choose_topic(topics: Mapping[str, str], requested: str | None, where: str) -
 
 
 def motion_from_messages(kind: str, messages: list[tuple[int, Any]], where: str) -> RecordedMotion:
-    """The motion in messages with their log times [ns]: a single message, or a series of joint states.
+    """The motion in messages of one type: a single trajectory message, or a series of joint states.
 
-    Raises InputError, naming `where`, if the file contains no motion or several, and for damaged motions.
+    messages: log time [ns] and message. Raises InputError, naming `where`, if there is no motion or more than
+    one, and for damaged motions.
     """
     if not messages:
         raise InputError(f"{where} holds no messages")
@@ -295,7 +297,7 @@ def write_mcap(problem: Problem, trajectory: Trajectory, file: Path) -> None:
 
 
 def _urdf(source: str | None) -> bytes | None:
-    """The URDF that the robot was read from; None if there is no URDF any more."""
+    """The URDF that the robot was read from; None if it was not read from one, or the file is gone."""
     if source is None or not source.endswith(".urdf"):
         return None
     try:
@@ -310,13 +312,13 @@ def _frame(obstacle: Drawable, robot: Robot) -> str:
 
 
 def _set(vector: Any, values: Sequence[float]) -> None:
-    """Set x, y and z, or x, y, z and w."""
+    """Set the fields x, y and z of a message, and w if there is a fourth value."""
     for axis, value in zip("xyzw", values, strict=False):
         setattr(vector, axis, value)
 
 
 def _turn(T: Pose) -> list[float]:
-    """The quaternion xyzw."""
+    """The rotation of a pose as a quaternion in the order x, y, z, w."""
     return np.roll(quaternion_from_rotation(T[:3, :3]), -1).tolist()
 
 
@@ -355,7 +357,8 @@ def _scene(robot: Robot, obstacles: Sequence[Drawable]) -> SceneUpdate:
 
 
 def _add_triangles(entity: Any, surface: Surface, color: Color, opacity: float) -> None:
-    """Add a surface in the frame of an entity; equal vertices once, in single precision, to save space."""
+    """Add a surface in the frame of an entity. To save space, vertices are in single precision, and equal
+    ones are written once."""
     points, number = np.unique(surface.vertices.astype(np.float32), axis=0, return_inverse=True)
     triangles = entity.triangles.add()
     triangles.pose.orientation.w = 1.0
@@ -380,7 +383,8 @@ def _cloud(cloud: PointCloud, frame: str) -> PointCloudMessage:
 
 
 def _transforms(problem: Problem, poses: dict[str, Pose], at: int) -> FrameTransforms:
-    """poses: in the base frame, of all links but the base and of moving obstacles."""
+    """A message with the poses of frames. poses: pose in the base frame, for each link except the base and
+    each moving obstacle. at: time [ns]."""
     update = FrameTransforms()
     robot = problem.robot
     frames = {frame: (robot.base, T) for frame, T in poses.items()}
@@ -406,7 +410,7 @@ def problem_in(file: Path) -> Problem | None:
 
 
 def check_chunks(stream: io.BufferedReader, reader: McapReader, where: str) -> None:
-    """Raise InputError, naming `where`, for a file with a chunk that unpacks to more than MAX_UNPACKED bytes;
+    """Raise InputError, naming `where`, if a chunk of the file unpacks to more than MAX_UNPACKED bytes, since
     small files may unpack to gigabytes."""
     summary = reader.get_summary()
     for chunk in summary.chunk_indexes if summary else ():
@@ -425,7 +429,7 @@ def check_chunks(stream: io.BufferedReader, reader: McapReader, where: str) -> N
 
 
 def _typestore(schema: Any) -> Any:
-    """A store with the message types that the file defines."""
+    """A store with the message types of a topic, as the file defines them."""
     if schema.encoding != "ros2msg":
         return typestore()
     store = get_typestore(Stores.EMPTY)
@@ -439,9 +443,10 @@ DECOMPRESSORS: dict[Any, Any] = {
     bz2.decompress: bz2.BZ2Decompressor,
     lz4.frame.decompress: lz4.frame.LZ4FrameDecompressor,
 }
-"""Decompressors of the chunks of ROS 1 bags, by compression; each can stop before the end of a chunk."""
+"""Decompressors that can stop before the end of a chunk of a ROS 1 bag, by the function of rosbags that they
+replace."""
 VERSION = 9
-"""Version of the bag's metadata; ROS 2 Humble reads the fields that it knows."""
+"""Version of the bag's metadata. ROS 2 Humble, which is older, ignores fields that it does not know."""
 
 
 def write_bag(problem: Problem, trajectory: Trajectory, file: Path) -> None:
@@ -455,9 +460,10 @@ def write_bag(problem: Problem, trajectory: Trajectory, file: Path) -> None:
         "/display_planned_path": (DISPLAY_TRAJECTORY, display_trajectory(problem, trajectory, record)),
     }
     try:
-        with TemporaryDirectory(prefix=f".{file.name}.", dir=file.parent, ignore_cleanup_errors=True) as part:
-            new = Path(part, file.name)
-            old = Path(part, "old")
+        prefix = f".{file.name}."
+        with TemporaryDirectory(prefix=prefix, dir=file.parent, ignore_cleanup_errors=True) as folder:
+            new = Path(folder, file.name)
+            old = Path(folder, "old")
             with BagWriter(new, version=VERSION) as writer:  # it names the database after the folder
                 for topic, (kind, content) in topics.items():
                     connection = writer.add_connection(topic, kind, typestore=typestore())
@@ -484,8 +490,8 @@ def _replace(file: Path, new: Path, old: Path) -> None:
 
 @contextmanager
 def _opened_bag(file: Path) -> Iterator[AnyReader]:
-    """A reader of a ROS 1 bag or of the folder of a ROS 2 bag, whose parts unpack to MAX_UNPACKED bytes at
-    most."""
+    """A reader of a ROS 1 bag or of the folder of a ROS 2 bag. Raises InputError for chunks that unpack to
+    more than MAX_UNPACKED bytes."""
     if file.is_dir():
         if not (file / "metadata.yaml").is_file():
             raise InputError(f"{file} is not a ROS 2 bag: it has no metadata.yaml")
@@ -506,7 +512,8 @@ def _opened_bag(file: Path) -> Iterator[AnyReader]:
 
 
 def _bounded(decompressor: Callable[[bytes], bytes], packed: bytes) -> bytes:
-    """The content of a chunk of a ROS 1 bag, of MAX_UNPACKED bytes at most."""
+    """The unpacked content of a chunk of a ROS 1 bag. Raises InputError if it is larger than MAX_UNPACKED
+    bytes."""
     make = DECOMPRESSORS.get(decompressor)
     content = packed if make is None else make().decompress(packed, MAX_UNPACKED + 1)
     if len(content) > MAX_UNPACKED:
@@ -515,7 +522,8 @@ def _bounded(decompressor: Callable[[bytes], bytes], packed: bytes) -> bytes:
 
 
 def _check_unpacking(bag: Path) -> None:
-    """Refuse what may unpack to gigabytes."""
+    """Raise InputError for a ROS 2 bag that may unpack to gigabytes: a compressed one, or one with large
+    chunks."""
     information = read_yaml(bag / "metadata.yaml")["rosbag2_bagfile_information"]
     if mode := information.get("compression_mode"):
         raise InputError(f"{bag} is compressed (mode {shown(mode)}); write it anew with: ros2 bag convert")
@@ -541,7 +549,7 @@ class Recording(NamedTuple):
     def messages(self, topics: Sequence[str], allowed: int = sys.maxsize) -> Iterator[tuple[str, int, Any]]:
         """Topic, log time [ns] and message of all messages on some topics, in the order of their log times.
 
-        allowed: size of all the messages together [bytes].
+        allowed: largest size of all the messages together [bytes].
         """
         for topic, at, content, read in self.records(topics) if topics else ():
             allowed -= len(content)
@@ -576,13 +584,13 @@ def opened_recording(file: Path, largest: int = MAX_FILE_SIZE) -> Iterator[Recor
             if channel.message_encoding == "cdr" and channel.schema_id in summary.schemas
         }
 
-        kinds = {topic: one.name for topic, one in schemas.items()}
+        kinds = {topic: schema.name for topic, schema in schemas.items()}
 
         def of_file(topics: Sequence[str]) -> Iterator[Record]:
             stores = {topic: _typestore(schemas[topic]) for topic in topics}
-            for _, channel, one in reader.iter_messages(topics=topics):
+            for _, channel, message in reader.iter_messages(topics=topics):
                 read = partial(stores[channel.topic].deserialize_cdr, typename=kinds[channel.topic])
-                yield channel.topic, one.log_time, one.data, read
+                yield channel.topic, message.log_time, message.data, read
 
         yield Recording(kinds, of_file)
 
