@@ -1,4 +1,5 @@
-"""Controls: motions from neither a network nor a search, with which every learned result is compared."""
+"""Controls: candidate motions that come neither from a network nor from a search. Every learned result is
+compared with them."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -25,36 +26,39 @@ from robotdiffuse.planning.planner import Planner
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.robots.robot import Robot
 
+# values of `ControlSettings.source`
 VIAS = "vias"
 NEAREST = "nearest_motions"
 NOISE = "smooth_noise"
 LIBRARY_SHARDS = 10
 """Number of shards of a data set from which the nearest motions are taken: some thousand motions."""
 WAYPOINTS = 48
-"""Number of waypoints of a candidate, the same as of the networks' motions."""
+"""Number of waypoints of a candidate, as in the networks' motions."""
 SPREAD = 0.127
-"""Standard deviation of smooth noise, as a fraction of half the range of a joint. It is that of the noise of
-the Panda's bundled network, averaged over the joints."""
+"""Standard deviation of smooth noise, as a fraction of half the range of a joint. The Panda's bundled network
+has noise of this standard deviation, averaged over the joints."""
 MAX_HALF_RANGE = np.pi
-"""Largest value of half a joint's range in this computation [rad]: continuous joints have no limits."""
+"""Upper bound on half the range of a joint in `smooth_noise` [rad], for continuous joints, which have no
+limits."""
 WAVES = 8
-"""Number of sines in the sum; more sines would add less than a hundredth."""
+"""Number of sines that are summed; more sines would change the sum by less than 1 %."""
 VARIANCE_EXPONENT = 3.5
-"""The variance of the sine with k half waves falls as k to the power of minus this."""
+"""The variance of the sine with k half waves is proportional to k to the power of minus this."""
 EQUAL_TIME_STEPS = 110
-"""Number of gradient steps of 16 candidates that take about as long as six guided denoising steps of 16
+"""Number of gradient steps on 16 candidates that takes about as long as six guided denoising steps of 16
 samples."""
 
 
 @dataclass(frozen=True)
 class ControlSettings(Settings, name="control"):
     source: Annotated[str, OneOf((VIAS, NEAREST, NOISE))] = NOISE
-    """What candidates are: fixed vias, which only the Panda has; the motions of a data set with the nearest
-    ends, bent to start and goal; or smooth noise about the straight line."""
+    """How candidates are made: by fixed via configurations (`vias`), which only the Panda has; from the
+    motions of a data set with the nearest starts and goals, bent to start and goal (`nearest_motions`); or by
+    smooth noise added to the straight line (`smooth_noise`)."""
     samples: Count = 16
     """Number of candidates."""
     guidance_steps: Natural = EQUAL_TIME_STEPS
-    """Number of gradient steps of guidance on the candidates."""
+    """Number of gradient steps of collision guidance on the candidates."""
     data: str | None = None
     """Folder of the data set from which the nearest motions are taken."""
 
@@ -80,8 +84,8 @@ class Control(Planner[ControlSettings]):
     def candidates(
         self, start: Configuration, goals: Configurations, checker: CollisionChecker, rng: np.random.Generator
     ) -> Trajectories:
-        """Motions from the start to the nearest goals, after guidance; vias in their order, the most useful
-        first."""
+        """Candidate motions from the start to the nearest goals, after guidance. Motions through vias are in
+        the order of the vias, the most useful first."""
         settings = self.settings
         goals = nearest_goals(start, goals, settings.samples)
         robot = checker.robot
@@ -89,8 +93,8 @@ class Control(Planner[ControlSettings]):
             q = smooth_noise(start, goals, settings.samples, WAYPOINTS, robot, rng)
         elif settings.source == VIAS:
             vias = fixed_vias(robot)[: settings.samples]
-            legs = [np.linspace(*ends, WAYPOINTS // 2) for ends in ((start, vias), (vias, goals[:1]))]
-            q = np.concatenate(np.broadcast_arrays(*legs)).swapaxes(0, 1)
+            segments = [np.linspace(*ends, WAYPOINTS // 2) for ends in ((start, vias), (vias, goals[:1]))]
+            q = np.concatenate(np.broadcast_arrays(*segments)).swapaxes(0, 1)
         else:
             assert settings.data is not None
             q = bent(library(settings.data, robot), start, goals[0], settings.samples)
@@ -123,10 +127,11 @@ def smooth_noise(
 ) -> Trajectories:
     """Straight lines from the start to the goals in turn, plus smooth noise; float32.
 
-    The noise of the model that comes with the Panda has the covariance of its training trajectories about the
-    straight lines between their ends. Its eigenvectors are nearly sines of k half waves, its eigenvalues fall
-    as k^-3.5, and its standard deviation is an eighth of half the range of a joint. So the noise has a closed
-    form for any arm. All waypoints but the ends are clipped to the joint limits.
+    The noise imitates that of the Panda's bundled model, which has the covariance of the training
+    trajectories about the straight lines from start to goal. The eigenvectors of this covariance are nearly
+    sines of k half waves, its eigenvalues are proportional to k^-3.5, and its standard deviation is an eighth
+    of half the range of a joint. With these numbers, the noise can be computed for any arm. All waypoints
+    except start and goal are clipped to the joint limits.
     """
     t = np.linspace(0.0, 1.0, waypoints)
     waves = np.arange(1, WAVES + 1)
@@ -144,7 +149,8 @@ def smooth_noise(
 
 @lru_cache
 def fixed_vias(robot: Robot) -> Configurations:
-    """The vias of the Panda, the most useful first. Raises InputError for another robot."""
+    """The via configurations of the Panda [n, dof], the most useful first. Raises InputError for another
+    robot."""
     if robot.name != "panda":
         raise InputError(f"source is {VIAS} and the robot {robot.name}; only the panda has fixed vias")
     return np.loadtxt(FilePath(__file__).with_name("panda_vias.csv"), delimiter=",")
@@ -152,8 +158,8 @@ def fixed_vias(robot: Robot) -> Configurations:
 
 @lru_cache(maxsize=2)
 def library(data: str, robot: Robot) -> Trajectories:
-    """Motions of the training split from the first shards of a data set, without the trivial ones, whose
-    straight line is free."""
+    """Motions of the training split from the first shards of a data set, without trivial motions: those with
+    a free straight line from start to goal."""
     rows = islice(read_rows(data, robot, WAYPOINTS), LIBRARY_SHARDS)
     train = SPLITS.index("train")
     return np.concatenate([part.q[(part.split == train) & ~part.shard["line_free"]] for part in rows])
@@ -162,11 +168,12 @@ def library(data: str, robot: Robot) -> Trajectories:
 def bent(
     motions: Float[ndarray, "n waypoints dof"], start: Configuration, goal: Configuration, count: int
 ) -> Trajectories:
-    """The motions, forwards or backwards, whose ends are nearest to start and goal, the nearest first; the
-    difference of the ends is spread evenly along each."""
-    both = np.concatenate([motions, motions[:, ::-1]])
+    """The motions, forwards or backwards, with first and last waypoints nearest to start and goal; the
+    nearest first. They are bent to begin at the start and end at the goal: the differences there are
+    interpolated linearly along the motion and added."""
+    both_directions = np.concatenate([motions, motions[:, ::-1]])
     ends = np.stack([start, goal])
-    distance = np.square(both[:, [0, -1]] - ends).sum(axis=(1, 2))
-    nearest = both[np.argsort(distance)[:count]]
+    distance = np.square(both_directions[:, [0, -1]] - ends).sum(axis=(1, 2))
+    nearest = both_directions[np.argsort(distance)[:count]]
     share = np.linspace(0.0, 1.0, nearest.shape[1])[:, None]
     return nearest + (1 - share) * (start - nearest[:, :1]) + share * (goal - nearest[:, -1:])

@@ -1,70 +1,77 @@
-"""MPD and EDMP: batches of guided samples of a trajectory prior, until one passes validation.
+"""MPD and EDMP: planners that draw batches of guided samples from a trajectory prior until a sample passes
+validation.
 
 - *MPD*: J. Carvalho, A. Le, M. Baierl, D. Koert, J. Peters, "Motion Planning Diffusion: Learning and Planning
   of Robot Motions with Diffusion Models", IROS 2023.
 - *EDMP*: K. Saha et al., "EDMP: Ensemble-of-costs-guided Diffusion for Motion Planning", ICRA 2024.
 
-Both train the temporal U-Net of Diffuser (M. Janner et al., ICML 2022) to predict the noise. Its network
-inputs are noisy trajectories and the noise level, but no scene. Both hold start and goal at their values in
-every noisy trajectory (in-painting), and both consider the scene through gradients of costs on the mean of
-every denoising step. So both use one trained network, the diffusion model in the configuration
-`trajectory_prior`; levels, noise and guides of the sampling differ.
+Both papers train the temporal U-Net of Diffuser (M. Janner et al., ICML 2022) to predict the noise. The
+network's inputs are a noisy trajectory and the noise level; it does not see the scene. In every noisy
+trajectory, start and goal are set to their true values (in-painting). The scene enters through gradients of
+costs: they move the mean of a denoising step. Here, both planners use the same trained network, the diffusion
+model in the configuration `trajectory_prior`. They differ in the noise levels, the noise and the guides of
+sampling.
 
-Differences from the papers, with their values:
+Differences from the papers, with the papers' values:
 
-- One network for both. Waypoints: 48, as all our data (MPD 64, EDMP 50). Joint positions alone as in EDMP
-  (MPD adds velocities), scaled to the joint limits as in both.
-- T = 255 levels of the cosine schedule, as EDMP; MPD trains with 25 levels of an exponential schedule. Its
-  sampler takes the 25 of these levels that are nearest to it in signal-to-noise ratio.
-- Width 32 at resolutions 1, 2, 4 (0.7 million numbers); MPD 32 at 1, 2, 4, 8 (about 4 million). It trains at
-  1,200 samples/s on a core of a CPU. Our U-Net has layer norms over channels, and scale
-  and shift by the condition, in place of group norms and an added time embedding.
-- Trained on trajectories of all scenes mixed, as EDMP; MPD trains a prior per environment. A tenth of each
-  batch are motions with a free straight line, and half of it is reversed, as for our own model.
+- One network for both. It has 48 waypoints, as all our data (MPD 64, EDMP 50). Inputs are joint positions, as
+in EDMP
+  (MPD adds velocities), scaled to the joint limits, as in both.
+- T = 255 levels of the cosine schedule, as EDMP. MPD trains with 25 levels of an exponential schedule; its
+sampler here
+  takes the 25 of our levels that are nearest to them in signal-to-noise ratio.
+- Width 32 at resolutions 1, 2, 4 (0.7 million parameters); MPD has width 32 at 1, 2, 4, 8 (about 4 million).
+Our
+  network trains at 1,200 samples/s on a CPU core. It has layer norms over channels, and the condition scales
+  and shifts the features; the papers have group norms and add a time embedding.
+- Trained on trajectories of all scenes, as EDMP; MPD trains a prior per environment. A tenth of each batch
+are motions
+  with a free straight line, and half of each batch is reversed in time, as for our own model.
 
 **MPD**, a diffusion prior guided by cost gradients. Planning draws from the posterior given the costs: in the
 last part of the denoising steps, the mean of each step is moved by some gradient steps on the cost
 
-    collision (scene and links) + joint limits + Gaussian process prior of constant velocity,
+    collision (scene and links) + joint limits + Gaussian process prior of constant velocity.
 
-and the shortest free sample of the batch is the plan (algorithm 1 there).
+The shortest free sample of the batch is the plan (the paper's algorithm 1).
 
-Settings and the paper's or its code's values:
+Settings here, and in the paper or its code:
 
-| setting | here | there |
+| setting | here | paper |
 |---|---|---|
 | trajectories per batch | 16 | 100 (50 in the code), on a GPU |
 | denoising steps | 25 | 25 |
-| steps without noise after them | 5 | 5 |
-| part of them that is guided, the last | 0.25 | 0.25 |
+| further steps without noise | 5 | 5 |
+| guided fraction of the denoising steps (the last ones) | 0.25 | 0.25 |
 | gradient steps per denoising step | 5 | 5 |
-| factor of the noise of a step | 0.5 | 0.5 |
-| places checked per waypoint by the collision cost | 2 | 1.5 |
+| factor on the noise of a step | 0.5 | 0.5 |
+| configurations per waypoint in the collision cost | 2 | 1.5 |
 | weights of the costs | below | for other units and distances |
 
-Other differences: signed distances of covering spheres by our compiled kernel replace their grid. The
-Gaussian process is that of the positions, with the velocities integrated out; its step is implicit, so that
-long steps are stable. Batches are repeated with new noise while there is time.
+Other differences: our compiled kernel computes signed distances of covering spheres; the paper uses a
+distance grid. Our Gaussian process is over positions, with the velocities integrated out, and its gradient
+step is implicit, so that long steps are stable. Batches are repeated with new noise until time runs out.
 
 **EDMP**, one prior and many guides in parallel.
 
 No single cost, and no single choice of its parameters, fits all scenes. So a batch is divided among an
 ensemble of guides, and the best of all samples is the plan.
 
-Settings and the paper's values:
+Settings here and in the paper:
 
-| setting | here | there |
+| setting | here | paper |
 |---|---|---|
-| guides | 12: waypoints or swept motion, 3 clearances, 2 of weight and start | 12, of the same kinds |
+| guides: cost x clearance x (weight, guided fraction) | 2 x 3 x 2 = 12 | 12, of the same kinds |
 | trajectories per guide | 2 | 10, on a GPU |
 | denoising steps | 30 of the 255 levels, for a CPU | 255 |
 | gradient steps per denoising step | 1 | 1 |
 
-Differences: distances of covering spheres replace volumes of boxes. The hinge of their signed distance at the
-waypoints replaces the intersection volume of links and obstacles; the same at several places between
-waypoints replaces the swept volume. Obstacles are expanded by a margin that falls with the noise, as in the
-paper. Links must keep a distance to each other too, unlike in the paper. The parameters of the guides are
-ours, as theirs have other units. Batches are repeated with new noise while there is time.
+Other differences: the paper's costs are volumes of boxes, ours are hinges of the signed distances of covering
+spheres. Hinges at the waypoints replace the intersection volume of links and obstacles. Hinges at several
+configurations between waypoints replace the swept volume. As in the paper, obstacles are expanded by a margin
+that falls with the noise. Unlike in the paper, the links' distances to each other have a cost too. The
+parameters of the guides are ours, since those of the paper have other units. Batches are repeated with new
+noise until time runs out.
 """
 
 from abc import abstractmethod
@@ -94,10 +101,11 @@ from robotdiffuse.planning.learned import ExportedPlanner, LearnedSettings, near
 from robotdiffuse.planning.start_goal import StartGoal
 
 SAMPLE_RESOLUTION = 0.02
-"""No point of the arm moves further than this between two checks of a sample [m]."""
+"""No point of the arm moves further than this between neighboring checked configurations of a sample [m]."""
 Guide = Callable[[ndarray, int], ndarray]
-"""Maps the mean of a denoising step [count, waypoints, dof] [rad], and the number of steps to come (0 at the
-last one and in the steps without noise after it), to the mean after gradient steps on the guide's costs."""
+"""Takes the mean of a denoising step, as joint positions [count, waypoints, dof], and the number of denoising
+steps that follow. This number is 0 at the last denoising step and in the steps without noise. Returns the
+mean after gradient steps on the guide's costs."""
 
 
 @dataclass(frozen=True)
@@ -107,19 +115,19 @@ class PriorSettings(LearnedSettings):
     sampling_steps: Annotated[int, Bound(least=2.0)] = 25
     """Number of denoising steps."""
     self_margin: NotNegative = 0.01
-    """Links whose distance from each other is below this have a cost [m]."""
+    """Distance between links below which there is a cost [m]."""
     push: Positive = 0.1
-    """Longest move of a waypoint in one gradient step [rad]."""
+    """Longest move of a waypoint in one gradient step [rad, joint-space L2]."""
 
 
 GuidedPriorSettings = TypeVar("GuidedPriorSettings", bound=PriorSettings)
 
 
 class GuidedPrior(ExportedPlanner[GuidedPriorSettings]):
-    """A planner that samples batches from the prior under guidance.
+    """A planner that samples batches of trajectories from the prior under guidance.
 
     The free samples of a batch are validated, the shortest first. If none passes, the next batch is drawn
-    from new noise, until time runs out. Nothing is searched, shortened or repaired.
+    from new noise, until time runs out. There is no search, and samples are not shortened or repaired.
     """
 
     network_name = "trajectory_prior"
@@ -131,11 +139,12 @@ class GuidedPrior(ExportedPlanner[GuidedPriorSettings]):
     @staticmethod
     @abstractmethod
     def levels(schedule: NoiseSchedule, steps: int) -> NoiseLevels:
-        """The noise levels of the denoising steps, falling."""
+        """The noise levels of the denoising steps, in falling order."""
 
     @abstractmethod
     def guided(self, checker: CollisionChecker, q: Trajectories, left: int) -> Trajectories:
-        """The means of a denoising step after the gradient steps of its guides; see `Guide`."""
+        """The means `q` of a denoising step after gradient steps; `left` more denoising steps follow. See
+        `Guide`."""
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
@@ -144,7 +153,8 @@ class GuidedPrior(ExportedPlanner[GuidedPriorSettings]):
         start, goals = shared_out(*start_goal.rows(), samples)
         space = search_space(start_goal.checker, SAMPLE_RESOLUTION)
         closest: tuple[int, float, ndarray] | None = None
-        """The best sample so far that collides: its segments in collision, length [rad] and waypoints."""
+        """The best colliding sample so far: its number of segments in collision, length [rad] and
+        waypoints."""
         batches = 0
         while context.remaining > 0:
             trajectories = sample(
@@ -173,7 +183,8 @@ class GuidedPrior(ExportedPlanner[GuidedPriorSettings]):
                 result = context.finish(start_goal.complete(attempt[2]), self.name)
                 if result is not None:
                     return result
-        # so that the result says what is wrong with it; by the exact meshes it may even be free
+        # validates the best colliding sample, so that the result tells what is wrong with it; the sample was
+        # checked by covering spheres, so the exact meshes may even be free
         result = None if closest is None else context.finish(start_goal.complete(closest[2]), self.name)
         return result or context.unsolved(
             f"none of {batches * samples} samples of the network is free of collision"
@@ -197,11 +208,21 @@ def sample(
     quiet_steps: int = 0,
     stop: Callable[[], bool] = lambda: False,
 ) -> Trajectories | None:
-    """A trajectory from each start to its goal, float32, within the limits but for the ends themselves.
+    """A trajectory from each start to its goal, float32. Inner waypoints are within the joint limits.
 
-    levels, noise_scale: see `reverse_process`.
-    quiet_steps: additional steps at the last level, without noise (MPD: 5).
-    stop: called before every step; None is returned if it returns True.
+    Args:
+        prior: The trajectory prior.
+        starts: Start of each trajectory.
+        goals: Goal of each trajectory.
+        levels: See `reverse_process`.
+        rng: Source of the noise.
+        guide: Moves the mean of each denoising step.
+        noise_scale: See `reverse_process`.
+        quiet_steps: Additional steps at the last level, without noise (MPD: 5).
+        stop: Called before every step.
+
+    Returns:
+        The trajectories; None if `stop` returned True.
     """
     reference = prior.reference(starts, goals)
     condition = prior.condition(np.zeros((len(starts), 0), np.float32), starts, goals)
@@ -231,7 +252,8 @@ def sample(
 
 
 def falling(rising: NoiseLevels, most: int) -> NoiseLevels:
-    """Rising levels in reverse order, with equal ones moved apart, up to `most`."""
+    """Rising levels in reverse order, at most `most`. Equal levels are moved apart, so that all are
+    distinct."""
     at = np.arange(len(rising))
     spaced = np.maximum.accumulate(rising - at) + at
     return np.minimum(spaced, most - at[::-1])[::-1].copy()
@@ -240,7 +262,7 @@ def falling(rising: NoiseLevels, most: int) -> NoiseLevels:
 def shared_out(
     start: Configuration, goals: Configurations, samples: int
 ) -> tuple[Configurations, Configurations]:
-    """The start and the goal of each sample: the nearest goals in turn."""
+    """Start and goal of each sample. The nearest goals are assigned to the samples in turn."""
     nearest = nearest_goals(start, goals, samples)
     return np.repeat(start[None], samples, 0), nearest[np.arange(samples) % len(nearest)]
 
@@ -252,35 +274,36 @@ def collision_gradient(
     self_margin: float,
     between: int,
 ) -> tuple[Values, Trajectories]:
-    """Collision cost of trajectories [m] and its gradient by their waypoints [m/rad], of the ends too.
+    """Collision cost of trajectories [m], and its gradient by all waypoints [m/rad], including start and
+    goal.
 
-    The cost of a configuration is the root of the sum of h² over the covering spheres and pairs of links,
-    with the hinges h of their signed distances (see `learning.guidance`): how far the arm is within the
-    margins. The cost of a trajectory is the sum over the waypoints, and over `between` places in each
-    segment, which together count as one more waypoint.
+    The cost of a configuration is sqrt(sum of h²) over the covering spheres and pairs of links, where h is
+    the hinge of a signed distance (see `learning.guidance`). It measures how far the arm violates the
+    margins. The cost of a trajectory is the sum of the costs of its waypoints, plus, for each segment, the
+    mean cost of `between` configurations on it.
     """
     count, waypoints, dof = q.shape
     shares = np.arange(1, between + 1, dtype=np.float32) / (between + 1)
     step = np.diff(q, axis=1)[:, :, None]
     between_waypoints = q[:, :-1, None] + shares[:, None] * step
-    every = np.concatenate([q.reshape(-1, dof), between_waypoints.reshape(-1, dof)])
-    squares, gradients = checker.cost_gradients(every, margin, self_margin)
+    all_q = np.concatenate([q.reshape(-1, dof), between_waypoints.reshape(-1, dof)])
+    squares, gradients = checker.cost_gradients(all_q, margin, self_margin)
     depth = np.sqrt(2 * squares)
     gradients = gradients / np.maximum(depth, np.float32(1e-6))[:, None]
     at_waypoints = count * waypoints
     costs = depth[:at_waypoints].reshape(q.shape[:2]).sum(1)
-    by_frame = gradients[:at_waypoints].reshape(q.shape)
+    by_waypoint = gradients[:at_waypoints].reshape(q.shape)
     if between:
         weight = np.float32(1 / between)
         costs = costs + weight * depth[at_waypoints:].reshape(count, -1).sum(1)
-        by_place = weight * gradients[at_waypoints:].reshape(between_waypoints.shape)
-        by_frame[:, :-1] += ((1 - shares)[:, None] * by_place).sum(2)
-        by_frame[:, 1:] += (shares[:, None] * by_place).sum(2)
-    return costs, by_frame
+        by_configuration = weight * gradients[at_waypoints:].reshape(between_waypoints.shape)
+        by_waypoint[:, :-1] += ((1 - shares)[:, None] * by_configuration).sum(2)
+        by_waypoint[:, 1:] += (shares[:, None] * by_configuration).sum(2)
+    return costs, by_waypoint
 
 
 def limited(moves: Trajectories, most: float) -> Trajectories:
-    """Moves of waypoints, none longer than `most` [rad, joint-space L2]."""
+    """Moves of waypoints, shortened to at most `most` [rad, joint-space L2]."""
     lengths = np.linalg.norm(moves, axis=2, keepdims=True)
     return moves * np.minimum(1.0, most / np.maximum(lengths, 1e-9)).astype(moves.dtype)
 
@@ -288,34 +311,36 @@ def limited(moves: Trajectories, most: float) -> Trajectories:
 GUIDE_STEPS = 5
 """Number of gradient steps at each guided denoising step."""
 LIMIT_MARGIN = 0.02
-"""Joints nearer to their limits than this are moved away from them [rad]."""
+"""Joints closer than this to a limit are moved away from it to this distance [rad]."""
 COLLISION_WEIGHT = 0.1
-"""Weight of the collision cost [rad²/m]: a waypoint that is too close moves by about this times 0.5
+"""Weight of the collision cost [rad²/m]. A waypoint that violates a margin moves by about this times 0.5
 m/rad."""
 PRIOR_WEIGHT = 2.0
-"""Weight of the Gaussian process cost, with waypoints one unit of time apart and a power spectrum of 1
+"""Weight of the Gaussian process cost, for waypoints one unit of time apart and a power spectral density of 1
 rad²."""
 EXPONENTIAL_BETAS = (1e-4, 1.0)
-"""Variances that the first and the last step of MPD's exponential schedule add."""
+"""Variances of the noise that the first and the last step of MPD's exponential schedule add."""
 
 
 @dataclass(frozen=True)
 class MPDSettings(PriorSettings, name="mpd"):
-    """Settings of MPD. The noise levels are spaced as in MPD's exponential schedule."""
+    """Settings of MPD. The noise levels are spaced as in the paper's exponential schedule."""
 
     guided_share: Share = 0.25
-    """Fraction of the denoising steps that are guided: the last ones. The quiet steps are always guided."""
+    """Fraction of the denoising steps that are guided: the last ones. The steps without noise are always
+    guided."""
     margin: NotNegative = 0.04
-    """Spheres whose distance to obstacles is below this have a collision cost [m]."""
+    """Distance of spheres to obstacles below which there is a collision cost [m]."""
     between: Natural = 1
-    """Number of places between two waypoints at which the collision cost is evaluated."""
+    """Number of configurations between two waypoints at which the collision cost is evaluated."""
 
 
 def exponential_levels(schedule: NoiseSchedule, steps: int) -> NoiseLevels:
-    """The levels nearest to those of MPD's exponential schedule in log signal-to-noise ratio, falling from T.
+    """The levels of `schedule` that are nearest to MPD's exponential schedule in log signal-to-noise ratio,
+    in falling order from T.
 
-    Its betas grow by a constant factor; levels that would fall together are moved apart. Raises InputError
-    unless there are that many levels.
+    The betas of an exponential schedule grow by a constant factor. Levels that would coincide are moved
+    apart. Raises InputError if the schedule has fewer levels than `steps`.
     """
     schedule.sampling_levels(steps)
     betas = np.geomspace(*EXPONENTIAL_BETAS, steps)
@@ -337,7 +362,7 @@ class MPD(GuidedPrior[MPDSettings]):
     levels = staticmethod(exponential_levels)
 
     def guided(self, checker: CollisionChecker, q: Trajectories, left: int = 0) -> Trajectories:
-        """Trajectories after the gradient steps of one denoising step; their ends stay fixed."""
+        """Trajectories after the gradient steps of one denoising step. Start and goal stay fixed."""
         settings = self.settings
         if left >= ceil(settings.guided_share * settings.sampling_steps):
             return q
@@ -346,8 +371,8 @@ class MPD(GuidedPrior[MPDSettings]):
             _, gradient = collision_gradient(
                 checker, q, settings.margin, settings.self_margin, settings.between
             )
-            near = np.minimum(LIMIT_MARGIN, (robot.upper - robot.lower) / 2)
-            inside = np.clip(q, robot.lower + near, robot.upper - near)
+            limit_margin = np.minimum(LIMIT_MARGIN, (robot.upper - robot.lower) / 2)
+            inside = np.clip(q, robot.lower + limit_margin, robot.upper - limit_margin)
             moves = limited(-COLLISION_WEIGHT * gradient, settings.push) + (inside - q)
             moves[:, [0, -1]] = 0.0
             q = implicit_step((q + moves).astype(np.float32), PRIOR_WEIGHT)
@@ -355,14 +380,14 @@ class MPD(GuidedPrior[MPDSettings]):
 
 
 def state_precision(waypoints: int) -> Float[ndarray, "states states"]:
-    """The precision of the states of one joint, (position, velocity) of each waypoint in turn, under the
-    prior of constant velocity over trajectories (M. Mukadam et al., IJRR 2018, section 3).
+    """Precision matrix of one joint's states, (position, velocity) of each waypoint in turn, under the
+    Gaussian process prior of constant velocity (M. Mukadam et al., IJRR 2018, section 3).
 
-    The states follow white noise on acceleration: between waypoints one unit of time apart,
+    The acceleration is white noise, so that for waypoints one unit of time apart
 
-        state' = F state + noise,  F = [[1, 1], [0, 1]],  covariance Q = [[1/3, 1/2], [1/2, 1]],
+        state' = F state + noise,  F = [[1, 1], [0, 1]],  covariance Q = [[1/3, 1/2], [1/2, 1]].
 
-    for every joint alike, so the precision is block tri-diagonal.
+    The precision matrix is therefore block tri-diagonal. It is the same for every joint.
     """
     transition = np.array([[1.0, 1.0], [0.0, 1.0]])
     inverse = np.linalg.inv(np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]]))
@@ -374,22 +399,23 @@ def state_precision(waypoints: int) -> Float[ndarray, "states states"]:
 
 
 def position_precision(waypoints: int) -> Float[ndarray, "waypoints waypoints"]:
-    """P, the precision of the positions of one joint, with the velocities integrated out: a Schur complement.
+    """P, the precision matrix of one joint's positions: the velocities are integrated out by a Schur
+    complement.
 
-    The cost q P q / 2 is the least integral of squared accelerations through the waypoints over 2, so that of
-    natural cubic splines; straight lines cost nothing.
+    The cost q P q / 2 is half the least integral of squared acceleration over all curves through the
+    waypoints, which the natural cubic spline attains. Straight lines cost nothing.
     """
-    every = state_precision(waypoints)
+    precision = state_precision(waypoints)
     position = slice(0, None, 2)
     velocity = slice(1, None, 2)
-    mixed = every[position, velocity]
-    return every[position, position] - mixed @ np.linalg.solve(every[velocity, velocity], mixed.T)
+    mixed = precision[position, velocity]
+    return precision[position, position] - mixed @ np.linalg.solve(precision[velocity, velocity], mixed.T)
 
 
 def implicit_step(q: Trajectories, weight: float) -> Trajectories:
-    """One implicit gradient step down weight q P q / 2 on all waypoints but the ends.
+    """One implicit gradient step on the cost weight q P q / 2; first and last waypoint stay fixed.
 
-    It solves x = q - weight P x, the minimum of |x - q|² / 2 + weight x P x / 2 with fixed ends.
+    The result x solves x = q - weight P x: it minimizes |x - q|² / 2 + weight x P x / 2.
     """
     interior_map, end_map = _implicit(q.shape[1], weight)
     moved = q.copy()
@@ -399,7 +425,8 @@ def implicit_step(q: Trajectories, weight: float) -> Trajectories:
 
 @cache
 def _implicit(waypoints: int, weight: float) -> tuple[ndarray, ndarray]:
-    """The matrices that `implicit_step` multiplies the inner waypoints and the ends with."""
+    """The matrices by which `implicit_step` multiplies the inner waypoints, and the first and last
+    waypoint."""
     precision = position_precision(waypoints)
     inverse = np.linalg.inv(np.eye(waypoints - 2) + weight * precision[1:-1, 1:-1])
     return inverse, -weight * inverse @ precision[1:-1][:, [0, -1]]
@@ -410,19 +437,21 @@ class GuideSettings(Settings, name="edmp.guides"):
     """One guide of the ensemble."""
 
     between: Natural
-    """Number of places between two waypoints at which the cost is evaluated: 0 for the intersection cost,
-    more for the swept-volume cost."""
+    """Number of configurations between two waypoints at which the cost is evaluated: 0 for the intersection
+    cost, more for the swept-volume cost."""
     far_margin: NotNegative
     """Margin by which obstacles are expanded at the first guided step [m]."""
     near_margin: NotNegative
-    """Margin at the last guided step [m]; the margin falls linearly from `far_margin` to this."""
+    """Margin at the last guided step [m]. The margin falls linearly from `far_margin` to `near_margin`."""
     weight: NotNegative
-    """Weight of the cost [rad²/m]: a waypoint that is too close moves by about this times 0.5 m/rad."""
+    """Weight of the cost [rad²/m]. A waypoint that violates the margin moves by about this times 0.5
+    m/rad."""
     guided_share: Share
     """Fraction of the denoising steps that are guided: the last ones."""
 
     def margin(self, left: int, steps: int) -> float | None:
-        """The margin where `left` of `steps` denoising steps are still to come [m]; None: not guided yet."""
+        """The margin at a denoising step after which `left` of `steps` steps follow [m]; None if the step is
+        not guided."""
         guided = self.guided_share * steps
         if left >= guided:
             return None
@@ -435,7 +464,7 @@ ENSEMBLE = tuple(
         (0, 2), ((0.02, 0.02), (0.08, 0.03), (0.15, 0.05)), ((0.1, 0.9), (0.2, 0.4))
     )
 )
-"""Twelve guides: two costs, three clearances, and two pairs of weight and start."""
+"""Twelve guides: two costs, three pairs of margins, and two pairs of weight and guided fraction."""
 
 
 @dataclass(frozen=True)
@@ -445,7 +474,7 @@ class EDMPSettings(PriorSettings, name="edmp"):
     sampling_steps: Annotated[int, Bound(least=2.0)] = 30
     """Number of denoising steps; the noise levels are closer together where there is little noise."""
     push: Positive = 0.15
-    """Longest move of a waypoint in one gradient step [rad]."""
+    """Longest move of a waypoint in one gradient step [rad, joint-space L2]."""
     guides: Annotated[tuple[GuideSettings, ...], Filled()] = ENSEMBLE
 
     def __post_init__(self) -> None:
@@ -462,11 +491,11 @@ class EDMPSettings(PriorSettings, name="edmp"):
 
 
 def quadratic_levels(schedule: NoiseSchedule, steps: int) -> NoiseLevels:
-    """`steps` of the levels, falling from T, closer together where there is little noise (Song et al. 2021,
-    D.2).
+    """`steps` levels of the schedule in falling order from T, closer together where there is little noise
+    (Song et al. 2021, D.2).
 
-    Evenly spaced levels would end at a high noise level, and leave the network's error there in the samples.
-    Raises InputError unless there are that many levels.
+    Evenly spaced levels would end at a high noise level, so that the network's error at that level would stay
+    in the samples. Raises InputError if the schedule has fewer levels than `steps`.
     """
     schedule.sampling_levels(steps)
     targets = schedule.steps * (np.arange(1, steps + 1) / steps) ** 2
@@ -482,7 +511,7 @@ class EDMP(GuidedPrior[EDMPSettings]):
     levels = staticmethod(quadratic_levels)
 
     def guided(self, checker: CollisionChecker, q: Trajectories, left: int) -> Trajectories:
-        """The batch after a gradient step of every guide on its rows; the ends of trajectories stay fixed."""
+        """The batch after one gradient step of each guide on the guide's rows. Start and goal stay fixed."""
         settings = self.settings
         moved = q.copy()
         for share, guide in zip(settings.shares(), settings.guides, strict=True):

@@ -1,17 +1,19 @@
-"""A* and D* Lite on a lattice of configurations: the classical graph searches, as baselines.
+"""A* and D* Lite on a lattice of configurations: classical graph searches as baselines.
 
 A*: P. Hart, N. Nilsson and B. Raphael, "A formal basis for the heuristic determination of minimum cost
 paths", IEEE Trans. SSC 1968. D* Lite: S. Koenig and M. Likhachev, "D* Lite", AAAI 2002.
 
-In each planned joint, nodes lie whole steps of `spacing` from the start. Edges change one joint by a step (or
-up to `joints_per_move` joints); their cost is joint-space length. Goals are nodes too, with edges to the
-corners of the cell around them. The result is the path along the lattice, without shortcuts. Heuristics
-ignore obstacles, so a search fills a pocket before it leaves it. Passages narrower than a step stay unseen.
+In each planned joint, a node differs from the start by a multiple of `spacing`. An edge moves up to
+`joints_per_move` joints by one step each; its cost is its length in joint space. Goals are nodes too, with
+edges to the corners of the lattice cell around them. The result is the path along the lattice, without
+shortcuts. The heuristic ignores obstacles, so a search fills a dead end completely before it leaves it.
+Passages that are narrower than a step may be missed.
 
-Both planners are one compiled search from the goals to the start. A* inflates the heuristic; D* Lite does
-not, so that its search can be repaired when obstacles or the start have moved. Unlike D* Lite as published, a
-node and its edges are checked when it is expanded, until when its rhs is a lower bound; and a repair, which
-visits all nodes in any case, computes their keys anew, where k_m would correct old ones.
+Both planners use the same compiled search from the goals to the start. A* inflates the heuristic. D* Lite
+does not, so that its search can be repaired after obstacles or the start have moved. There are two
+differences from the published D* Lite. A node and its edges are checked for collision only when the node is
+expanded; until then, its rhs is a lower bound. And a repair computes the keys of all nodes again, which it
+visits anyway; the published algorithm corrects old keys by k_m.
 """
 
 from collections import namedtuple
@@ -37,28 +39,33 @@ from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.planner import Planner, ever_finer
 from robotdiffuse.planning.start_goal import StartGoal
 
-CLOCK_INTERVAL = 4000  # about so many edges between two readings of the clock
-MAX_MOVES = 100_000  # edges of a node
-MAX_NODES = 2**62  # of a lattice
-STRICTNESS = 0.999  # lowers the heuristic, so that keys rise along every path in spite of rounding
+CLOCK_INTERVAL = 4000  # approximate number of edges between two readings of the clock
+MAX_MOVES = 100_000  # largest number of edges of a node
+MAX_NODES = 2**62  # largest number of nodes of a lattice, since a node's place is an int64
+STRICTNESS = 0.999  # factor on the heuristic, so that keys rise along every path in spite of rounding
 HASH_FACTOR = 0x1E3779B97F4A7C15
-Outcome = IntEnum("Outcome", "GOING FOUND EXHAUSTED FULL", start=0)  # of a call of the search
-# `at`: the sum of a node's coordinates times strides; -1 for a goal. g: the cost from the goals by the last
-# expansion; rhs: by the neighbors' g [steps]. parent: the node that gives rhs.
+Outcome = IntEnum("Outcome", "GOING FOUND EXHAUSTED FULL", start=0)  # result of a call of `search`
+# A node. at: its place, the sum of its lattice coordinates times strides; -1 for a goal. g: its cost from the
+# goals as of its last expansion [steps]. rhs: its cost from the goals by the neighbors' g [steps]. parent:
+# the neighbor that gives rhs.
 NODE = np.dtype([("at", "i8"), ("g", "f8"), ("rhs", "f8"), ("parent", "i8")])
-# origin[dof]: the lowest node [rad]. counts[dof]: nodes along each joint, two of them outside of the limits.
-# moves, costs: what moves add to `at`, and cost [steps]. corners: `at` of the nodes around the goals.
-# inflation: of the heuristic; above 1, nodes are expanded once, as in ARA* (M. Likhachev et al., NIPS 2003).
-# slots: a hash table. nodes, q: one that stands for none, the goals, then those of the lattice. queue: a tree
-# of maxima; its leaves are 1 / (1 + key), or 0. offers: costs of one node by its moves and goals [steps].
+# The arrays of a search. origin[dof]: the node with the lowest coordinates [rad]. counts[dof]: number of
+# nodes along each joint; the first and the   last are outside the limits. strides[dof]: change of `at` per
+# step of each joint. moves, costs: what each edge adds to `at`, and its cost [steps]. goals: number of goals.
+# corners: `at` of the nodes   around the goals. inflation: factor on the heuristic; above 1, nodes are
+# expanded only once, as in ARA* (M. Likhachev et al., NIPS 2003). slots: hash table from `at` to the index of
+# a node. nodes, q: index 0 stands for no node, then the goals, then the nodes   of the lattice. queue:
+# priority queue as a binary tree of maxima; its leaves are 1 / (1 + key), or 0 if not queued. values:
+# counters, see below. offers: costs of one node by each of its moves and goals [steps].
 FIELDS = "origin spacing counts strides moves costs goals corners inflation slots nodes q queue "
 Search = namedtuple("Search", FIELDS + "values offers block space work", defaults=(None, ()))
-NODES, EXPANSIONS, START = range(3)  # in `values`: how many nodes and expansions, and the start's node
+NODES, EXPANSIONS, START = range(3)  # in `values`: number of nodes, number of expansions, index of the start
 
 
 @allocation_free()
 def find(s, at, add):
-    """The node at a place, added if it is new and `add`; 0 for none, outside of limits, or full memory."""
+    """Index of the node at a place. With `add`, a new node is added. Returns 0 if there is no node, if the
+    place is outside the limits, or if memory is full."""
     i = (at * HASH_FACTOR >> 32) & (len(s.slots) - 1)
     while s.slots[i] > 0 and s.nodes[s.slots[i]].at != at:
         i = (i + 1) & (len(s.slots) - 1)
@@ -79,7 +86,8 @@ def find(s, at, add):
 
 @allocation_free()
 def _distance(s, u, v):
-    """The distance of two nodes, the sum of those of their joints, and the largest of these [steps]."""
+    """Euclidean distance of two nodes, the sum of their differences over the joints, and the largest
+    difference [steps]."""
     square = total = largest = 0.0
     for j in range(s.q.shape[1]):
         d = abs(np.float64(s.q[u, j]) - s.q[v, j]) / s.spacing
@@ -91,7 +99,9 @@ def _distance(s, u, v):
 
 @allocation_free()
 def _update_vertex(s, v):
-    """UpdateVertex of D* Lite, with a heuristic: distance, or the sum over joints by the largest moves."""
+    """UpdateVertex of D* Lite: sets the key of a node in the queue. The heuristic is the larger of two lower
+    bounds on the cost to the start: the Euclidean distance, and the sum over the joints if every move changes
+    as many as possible."""
     node = s.nodes[v]
     queue = s.queue
     i = len(queue) // 2 + v
@@ -106,7 +116,8 @@ def _update_vertex(s, v):
 
 @allocation_free()
 def _choose_parent(s, v):
-    """rhs(v) = min over s' of c(v, s') + g(s'), with edges checked in the order of these sums."""
+    """Sets rhs(v) = min over neighbors s' of c(v, s') + g(s'), and the parent. Edges are checked for
+    collision in the order of these sums, until one is free."""
     node = s.nodes[v]
     q = s.q[v]
     node.rhs = np.inf
@@ -130,7 +141,9 @@ def _choose_parent(s, v):
 
 @allocation_free()
 def _offer(s, u):
-    """Let neighbors take a node as parent, unchecked until they are expanded, or leave it if it rose."""
+    """Offers node u, after its g has changed, to its neighbors as parent. A neighbor takes a cheaper parent
+    without a collision check, which follows when the neighbor is expanded. A neighbor with parent u chooses a
+    new parent if u has become more expensive."""
     for m in range(len(s.moves)):
         v = find(s, s.nodes[u].at + s.moves[m], True)
         node = s.nodes[v]
@@ -149,7 +162,7 @@ def _offer(s, u):
 
 @kernel(nogil=True)
 def search(s, expansions):
-    """ComputeShortestPath of D* Lite, for up to `expansions` expansions; returns an Outcome."""
+    """ComputeShortestPath of D* Lite, for up to `expansions` iterations; returns an Outcome."""
     start = s.nodes[s.values[START]]
     q = s.q[s.values[START]]
     blocked = not motion_free(s.space, q, q, s.block, s.work)
@@ -158,6 +171,7 @@ def search(s, expansions):
             return Outcome.FULL
         if blocked or (s.queue[1] <= 1 / (1 + start.rhs) and start.rhs == start.g):
             return Outcome.FOUND if start.rhs == start.g < np.inf else Outcome.EXHAUSTED
+        # the node with the lowest key: follow the maxima from the root of the queue to a leaf
         u = 1
         while 2 * u < len(s.queue):
             u = 2 * u + (s.queue[2 * u] < s.queue[2 * u + 1])
@@ -176,7 +190,8 @@ def search(s, expansions):
 
 @kernel(nogil=True)
 def update(s, start):
-    """Adapt to a new scene or start: check goals, expanded nodes and their parents, and compute all keys."""
+    """Adapts a search to a new scene or start: checks goals, expanded nodes and the edges to their parents,
+    and computes all keys again."""
     s.values[START] = find(s, start, True)
     for goal in range(1, s.goals + 1):
         s.nodes[goal].g = 0.0 if motion_free(s.space, s.q[goal], s.q[goal], s.block, s.work) else np.inf
@@ -192,14 +207,17 @@ def update(s, start):
 @dataclass(frozen=True)
 class DStarLiteSettings(Settings, name="d_star_lite"):
     spacing: Positive = 0.4
-    """Step of the lattice [rad], [m] for prismatic joints."""
+    """Step of the lattice [rad], or [m] for prismatic joints."""
     joints_per_move: Count = 1
-    """Largest number of joints that an edge moves, each by one step. More make paths shorter (with 1, 2, 3
-    and 7 they are 2.1, 1.6, 1.35 and 1.2 times the straight line on ROP problems) and the search slower."""
+    """Largest number of joints that an edge moves, each by one step. Larger numbers make paths shorter and
+    the search slower: with 1, 2, 3 and 7 joints, paths are 2.1, 1.6, 1.35 and 1.2 times as long as the
+    straight line on problems of the family rop."""
     max_nodes: Annotated[int, Bound(least=1.0, most=2e9)] = 2_000_000
-    """Largest number of nodes in memory, besides those around the goals; each takes about 100 bytes."""
+    """Largest number of nodes in memory, in addition to the nodes around the goals. A node takes about 100
+    bytes."""
     resolution: Positive = 0.05
-    """No point of the arm moves further than this between two checks [m]; halved after a refused path."""
+    """No point of the arm moves further than this between neighboring checked configurations [m]. It is
+    halved after the validator refused a path."""
     clearance: NotNegative = 0.002
     """Distance to obstacles that paths keep where start and goal allow it [m]."""
 
@@ -208,16 +226,17 @@ class DStarLiteSettings(Settings, name="d_star_lite"):
 class AStarSettings(DStarLiteSettings, name="a_star"):
     joints_per_move: Count = 2
     inflation: Annotated[float, Bound(least=1.0, most=1000.0)] = 1.5
-    """Factor on the heuristic (weighted A*): paths are at most this much longer than the shortest of the
-    lattice; 1 finds the shortest, with seven joints often not in time."""
+    """Factor on the heuristic (weighted A*). Paths are at most this factor longer than the shortest path on
+    the lattice; with 1, the shortest path is found, but for seven joints often not in time."""
 
 
 class LatticeSearch:
-    """Weighted A* with `AStarSettings`; D* Lite, which can be repaired, with `DStarLiteSettings`."""
+    """A search on the lattice: weighted A* with `AStarSettings`; D* Lite, which can be repaired, with
+    `DStarLiteSettings`."""
 
     expansions = 0
     cost = np.inf
-    """Length of the path that `run` found [rad]; infinite without one."""
+    """Length of the path that `run` found [rad]; infinite if it found none."""
 
     def __init__(
         self,
@@ -227,7 +246,8 @@ class LatticeSearch:
         settings: DStarLiteSettings,
         padding: float = 0.0,
     ) -> None:
-        """`padding`: kept distance to obstacles [m]. Raises InputError for a lattice that is too large."""
+        """`padding` is the distance to obstacles that paths keep [m]. Raises InputError for a lattice that is
+        too large."""
         self.checker = checker
         self.goals = goals
         self.settings = settings
@@ -235,6 +255,7 @@ class LatticeSearch:
         robot = checker.robot
         name = settings.settings_name
         spacing = settings.spacing
+        # lattice coordinates: nodes along each joint, and one beyond each limit
         below, above = np.floor(np.array([start - robot.lower, robot.upper - start]) / spacing).clip(0) + 1
         counts = (below + above + 1).astype(np.int64)
         nodes = counts.prod(dtype=float)
@@ -250,6 +271,7 @@ class LatticeSearch:
                 f"{name}.joints_per_move is {settings.joints_per_move}; on {robot.name} that makes {most} "
                 f"edges of a node; it must be at most {sum(edges <= MAX_MOVES)}"
             )
+        # edges: all combinations of joints and signs
         sizes = range(1, min(settings.joints_per_move, robot.dof) + 1)
         moving = [joints for size in sizes for joints in combinations(range(robot.dof), size)]
         signed = [(joints, signs) for joints in moving for signs in product((1, -1), repeat=len(joints))]
@@ -261,6 +283,7 @@ class LatticeSearch:
         corners = cells[((cells > 0) & (cells < counts - 1)).all(axis=2)].astype(np.int64) @ strides
         inflation = getattr(settings, "inflation", 1.0) * STRICTNESS
         lattice = origin, spacing, counts, strides, moves @ strides, costs, len(goals), corners, inflation
+        # memory, with the goals as the first nodes
         first = len(goals) + 1
         capacity = settings.max_nodes + len(corners) + first + 1
         size = 2 << capacity.bit_length()
@@ -274,8 +297,8 @@ class LatticeSearch:
         self.update(checker, start)
 
     def update(self, checker: CollisionChecker, start: Configuration | None = None) -> None:
-        """Take over a changed scene, and a new start at another node of the lattice; `run` then repairs the
-        search, of D* Lite only. Raises InputError for another robot, and for a start that is no node."""
+        """Take over a changed scene, and a new start at a node of the lattice. For D* Lite, `run` then
+        repairs the search. Raises InputError for another robot, and for a start that is not a node."""
         s = self._search
         if checker.robot is not self.checker.robot:
             raise InputError(f"the robot is {checker.robot.name}; it must be that of the search")
@@ -291,7 +314,8 @@ class LatticeSearch:
         update(self._search, self._start)
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> Outcome:
-        """Search until there is a path, there is none, memory is full, or `stop` returns True."""
+        """Search until a path is found (FOUND), it is certain that there is none (EXHAUSTED), memory is full
+        (FULL), or `stop` returns True (GOING)."""
         s = self._search
         while True:
             outcome = Outcome(search(s, max(CLOCK_INTERVAL // len(s.moves), 1)))
@@ -302,7 +326,8 @@ class LatticeSearch:
                 return outcome
 
     def path(self) -> Configurations | None:
-        """The start, the nodes at which the path that `run` found turns, and the goal; None without one."""
+        """The path that `run` found: the start, the nodes at which its direction changes, and the goal. None
+        if `run` found no path."""
         s = self._search
         if self.cost == np.inf:
             return None
@@ -314,7 +339,8 @@ class LatticeSearch:
 
 
 class AStar(Planner[DStarLiteSettings]):
-    """Weighted A* on a lattice. The path depends on the seed only by the configurations of a goal pose."""
+    """Weighted A* on a lattice. The path depends on the seed only through the goal configurations of a goal
+    pose."""
 
     name = "a_star"
     settings_class = AStarSettings

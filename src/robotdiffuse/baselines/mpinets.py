@@ -1,19 +1,22 @@
-"""MPiNets: roll-outs of a policy, step by step (A. Fishman et al., "Motion Policy Networks", CoRL 2022).
+"""MPiNets: rolls out a policy, step by step (A. Fishman et al., "Motion Policy Networks", CoRL 2022).
 
-The network inputs of the policy (`learning.mpinets`) are points of the scene, of the arm and of the
-goal. It is rolled out from the start for at most 150 steps, the paper's number. The first roll-out is the
-paper's planner: one cloud, no noise, no repetition. While there is time, others follow with new clouds and
-noise.
+The policy is a network (`learning.mpinets`). Its inputs are points of the scene, of the arm and of the arm at
+the goal. It is rolled out from the start for at most 150 steps, as in the paper. The first roll-out is the
+paper's planner: one point cloud, no noise, no repetition. Until time runs out, further roll-outs follow with
+new point clouds and noise.
 
-Differences from the paper, besides those of the network:
+Differences from the paper, in addition to those of the network:
 
-- The paper ends a roll-out within 1 cm and 15 degrees of the target pose. A goal here is a configuration, to
-  be reached to 1e-4 rad: near it, a straight edge leads there if it is free; else the policy goes on. For a
-  pose the goals are configurations by inverse kinematics.
-- The paper has one roll-out. The repetitions cannot lower its success and use the time that all planners get.
-  They are spread over the goals, the nearest first, and end where the arm collides.
-- Nothing is repaired or shortened. A motion that the validator refuses is not a result. If nothing better was
-  found, the best one is validated once more, so that the result says what was wrong.
+- The paper ends a roll-out within 1 cm and 15 degrees of the target pose. Here, a goal is a configuration
+that must be
+  reached exactly. Near the goal, the motion continues on the straight line to it if that line is free; else
+  the policy goes on. For a goal pose, the goals are configurations from inverse kinematics.
+- The paper has one roll-out. The repetitions cannot lower the success rate, and they use the time that all
+planners get.
+  They are distributed over the goals, the nearest first, and end where the arm collides.
+- Motions are not repaired or shortened, and a motion that the validator refuses is not a result. If there is
+no valid
+  motion, the best one is validated at the end, so that the result tells what is wrong with it.
 """
 
 from dataclasses import dataclass
@@ -36,8 +39,7 @@ if TYPE_CHECKING:
     from robotdiffuse.learning.mpinets import MPiNetsNetwork
 
 STANDSTILL = 1e-4
-"""A roll-out ends when no joint moves further than this in a step [rad]: the policy would stand still
-forever."""
+"""A roll-out ends when no joint moves further than this in a step [rad]: the policy would not move again."""
 
 
 @dataclass(frozen=True)
@@ -45,14 +47,14 @@ class MPiNetsSettings(LearnedSettings, name="mpinets"):
     steps: Count = 150
     """Largest number of steps of a roll-out (the paper's)."""
     near: NotNegative = 0.3
-    """A straight edge to the goal is tried if no joint is further from the goal than this [rad]."""
+    """The straight line to the goal is tried if no joint is further from the goal than this [rad]."""
     batch: Count = 8
-    """Number of roll-outs at once; the first one runs alone."""
+    """Number of roll-outs that run at once; the very first one runs alone."""
     noise: NotNegative = 0.015
-    """Standard deviation of the noise on the arm's configuration in the network inputs, as in training [rad];
-    none in the first roll-out."""
+    """Standard deviation of the noise on the arm's configuration in the network inputs, as in training [rad].
+    The very first roll-out has no noise."""
     resolution: Positive = 0.02
-    """No point of the arm moves further than this between two checks [m]."""
+    """No point of the arm moves further than this between neighboring checked configurations [m]."""
 
 
 class MPiNets(LearnedPlanner[MPiNetsSettings]):
@@ -77,8 +79,8 @@ class MPiNets(LearnedPlanner[MPiNetsSettings]):
                 if best is None or motion.arrived > best.arrived:
                     best = motion
             roll_outs += count
-        # the validator checks the meshes, which are smaller than the covering spheres: it may be valid after
-        # all
+        # the validator checks the meshes, which are smaller than the covering spheres: the best motion may be
+        # valid after all
         outcome = "reached the goal, but not free of collision" if best.arrived else "did not reach the goal"
         return context.finish(best.path(start_goal), "policy") or context.unsolved(
             f"{roll_outs} roll-outs of the policy, the best of which {outcome}"
@@ -93,9 +95,10 @@ class MPiNets(LearnedPlanner[MPiNetsSettings]):
         count: int,
         rng: np.random.Generator,
     ) -> "list[_Motion]":
-        """`count` roll-outs, complete unless one is free all the way or time runs out.
+        """Runs `count` roll-outs until all have ended, one has reached the goal without a collision, or time
+        runs out.
 
-        tried: number of roll-outs before; the very first one goes on even if it collides.
+        `tried` is the number of earlier roll-outs. The very first roll-out goes on even if it collides.
         """
         settings = self.settings
         first = tried == 0
@@ -127,7 +130,7 @@ class MPiNets(LearnedPlanner[MPiNetsSettings]):
 
 
 class _Motion:
-    """The motion of a roll-out so far."""
+    """The motion of a roll-out up to its current step."""
 
     def __init__(self, start: Float32[ndarray, "dof"], goal: Float32[ndarray, "dof"]) -> None:
         self.waypoints = [start]
@@ -138,7 +141,7 @@ class _Motion:
 
     @property
     def free(self) -> bool:
-        """Whether it reaches the goal without a collision by the compiled check."""
+        """Whether the motion reaches the goal without a collision of the covering spheres."""
         return self.arrived and not self.collided
 
     def go(self, space: Space, q: Float32[ndarray, "dof"]) -> None:
@@ -148,8 +151,8 @@ class _Motion:
         self.waypoints.append(q)
 
     def try_to_arrive(self, space: Space, near: float) -> None:
-        """Add the straight edge to the goal if no joint is farther from it than `near` [rad] and it is
-        free."""
+        """Adds the straight line to the goal if no joint is farther from the goal than `near` [rad], and the
+        line is free."""
         edge = np.stack([self.waypoints[-1], self.goal])
         if self.moving and np.ptp(edge, axis=0).max() < near and motions_free(space, edge)[0]:
             self.waypoints.append(self.goal)
@@ -157,7 +160,8 @@ class _Motion:
             self.moving = False
 
     def path(self, start_goal: StartGoal) -> Configurations:
-        """The waypoints of the motion, with the exact start, and the exact goal if it was reached."""
+        """The waypoints of the motion in float64, with the exact start, and the exact goal if it was
+        reached."""
         if self.arrived:
             return start_goal.complete(np.stack(self.waypoints))
         return np.concatenate(

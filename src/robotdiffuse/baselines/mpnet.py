@@ -1,21 +1,23 @@
-"""MPNet: a network proposes states from the start and the goal in turn until a free straight line connects
-them; then it proposes new states for those that collide.
+"""MPNet: a network proposes states from the start and from the goal in turn, until a free straight line
+connects both sides. Then it proposes new states in place of states that collide.
 
 A. Qureshi, Y. Miao, A. Simeonov and M. Yip, "Motion Planning Networks: Bridging the Gap Between
-Learning-based and Classical Motion Planners", T-RO 2020. The networks are in `learning.mpnet`. The
-parts, by the paper's names:
+Learning-based and Classical Motion Planners", T-RO 2020. The networks are in `learning.mpnet`. The algorithm
+has these parts, by the paper's names:
 
-- *Bidirectional neural planning* (`NeuralPlanning.between`): both ends step towards each other, unchecked
-  (the states are "beacons"), until the straight line between them is free.
-- *Lazy states contraction*: states that a free straight line can skip are removed.
-- *Replanning*: states in collision are removed, and neural planning runs between neighboring states without
-  a free straight line, up to `replanning` times. The network's dropout makes each time different.
-- *Hybrid replanning*, if `hybrid` is on: a classical planner repairs what still collides, RRT-Connect here
+- *Bidirectional neural planning* (`NeuralPlanning.between`): start and goal side grow towards each other,
+until the
+  straight line between their last states is free. Motions between earlier states are not checked.
+- *Lazy states contraction*: states that a free straight line can skip are removed. - *Replanning*: states in
+collision are removed, and neural planning runs again between neighboring states without a free
+  straight line, up to `replanning` times. The network's dropout makes each run different.
+- *Hybrid replanning*, if `hybrid` is on: a classical planner replaces the parts that still collide, here
+RRT-Connect
   (paper: RRT*). It is off by default, as in the paper's MPNetPath:NR, so that benchmarks measure the network.
 
 Differences from the paper: `attempts` paths are planned at once, in one batch of the network, until one of
-them is free, and new ones are begun as long as there is time (the paper plans one). Where the network finds
-nothing between two states, the next replanning tries again; the paper's attempt ends there. Several goals are
+them is free; the paper plans one path. New attempts begin until time runs out. If the network does not
+connect two states, the next replanning tries again; in the paper, the attempt ends there. Several goals are
 divided evenly among the attempts.
 """
 
@@ -45,6 +47,7 @@ if TYPE_CHECKING:
 SEARCH_ITERATIONS = 500
 """Number of iterations of RRT-Connect between two readings of the clock, in hybrid replanning."""
 SEARCH_CAPACITY = 20_000
+"""Largest number of states in a tree of RRT-Connect, in hybrid replanning."""
 SEARCH_RANGE = np.float32(1.0)
 """Longest extension of a tree of RRT-Connect, in hybrid replanning [rad, joint-space L2]."""
 
@@ -54,14 +57,15 @@ class MPNetPlannerSettings(LearnedSettings, name="mpnet"):
     attempts: Count = 16
     """Number of paths that are planned at once (paper: 1)."""
     steps: Count = 24
-    """Largest number of steps of bidirectional neural planning between two states; a step is 0.7 rad."""
+    """Largest number of steps of bidirectional neural planning between two states; a step is 0.7 rad long."""
     replanning: Natural = 10
-    """N_r, how often colliding parts are replanned before the attempts are given up."""
+    """The paper's N_r: how often colliding parts are replanned before the attempts are given up."""
     hybrid: bool = False
-    """Whether RRT-Connect repairs what the network leaves in collision."""
+    """Whether RRT-Connect replaces the parts that still collide after replanning."""
     resolution: Positive = 0.03
-    """No point of the arm moves further than this between two checks of a motion [m]; the validator's
-    certificate covers the rest. The resolution is halved after each path that the validator refuses."""
+    """No point of the arm moves further than this between neighboring checked configurations [m]; the
+    validator certifies the motion in between. The resolution is halved after each path that the validator
+    refuses."""
     clearance: NotNegative = 0.002
     """Distance to obstacles that paths keep where start and goal allow it [m]."""
 
@@ -101,13 +105,13 @@ class Attempt(NamedTuple):
     broken: float
     """Number of segments in collision; infinite if there is no path."""
     length: float
-    """[rad]"""
+    """Length of the path [rad]."""
     path: Configurations
-    """[rad]"""
+    """Waypoints of the path."""
 
 
 class NeuralPlanning:
-    """One round of attempts."""
+    """One round: several attempts that are planned together."""
 
     def __init__(
         self,
@@ -164,15 +168,14 @@ class NeuralPlanning:
     ) -> list[Configurations]:
         """Bidirectional neural planning of many motions at once.
 
-        one_will_do: stop as soon as one of them is free.
-
-        A motion whose ends were not connected has a segment in collision. Connected motions may have one too,
-        since their states are not checked.
+        With `one_will_do`, planning stops as soon as one motion is free. A motion that was not connected
+        contains a segment in collision. Connected motions may also contain collisions, since their other
+        segments are not checked.
         """
-        forth = [[q] for q in starts]
-        back = [[q] for q in goals]
-        near = forth
-        far = back
+        start_sides = [[q] for q in starts]
+        goal_sides = [[q] for q in goals]
+        near = start_sides
+        far = goal_sides
         unconnected = list(range(len(starts)))
         for _ in range(self.settings.steps):
             if not unconnected or self.context.remaining <= 0:
@@ -181,15 +184,17 @@ class NeuralPlanning:
             for i, state in zip(unconnected, self.next_states(q, goal), strict=True):
                 near[i].append(state)
             connected = [i for i in unconnected if self.segments_free(np.stack([near[i][-1], far[i][-1]]))[0]]
-            if one_will_do and any(self.segments_free(_joined(forth[i], back[i])).all() for i in connected):
+            if one_will_do and any(
+                self.segments_free(_joined(start_sides[i], goal_sides[i])).all() for i in connected
+            ):
                 break
             unconnected = [i for i in unconnected if i not in connected]
             near, far = far, near
-        return [_joined(*rows) for rows in zip(forth, back, strict=True)]
+        return [_joined(*rows) for rows in zip(start_sides, goal_sides, strict=True)]
 
     def replan(self, paths: list[Configurations]) -> list[Configurations]:
-        """The paths without their states in collision; where the straight line between two remaining states
-        is not free, with new states of the network."""
+        """The paths without their states in collision. Where the straight line between two remaining states
+        is not free, the network proposes new states between them."""
         free_states = [self.without_collisions(path) for path in paths]
         broken = [
             (a, int(i))
@@ -212,8 +217,8 @@ class NeuralPlanning:
         ]
 
     def search(self, path: Configurations) -> Configurations:
-        """The path without its states in collision; where the straight line between two remaining states is
-        not free, with a path of RRT-Connect, as far as time allows."""
+        """The path without its states in collision. Where the straight line between two remaining states is
+        not free, RRT-Connect plans a path between them, as long as time allows."""
         self.searched = True
         path = self.without_collisions(path)
         segments = [path[:1]]
@@ -222,7 +227,7 @@ class NeuralPlanning:
         return np.concatenate(segments)
 
     def searched_between(self, a: Configuration, b: Configuration) -> Configurations:
-        """A free path from a to b by RRT-Connect; the straight line if time runs out."""
+        """A free path from a to b by RRT-Connect; the straight line if time or SEARCH_CAPACITY runs out."""
         trees = rrt_kernel.make_trees(a, b[None], SEARCH_CAPACITY)
         while self.context.remaining > 0 and trees.sizes.max() < SEARCH_CAPACITY:
             path = rrt_kernel.search(
@@ -233,7 +238,7 @@ class NeuralPlanning:
         return np.stack([a, b])
 
     def without_collisions(self, path: Configurations) -> Configurations:
-        """The path without its inner states in collision."""
+        """The path without its colliding states; the first and the last state are kept."""
         # a motion from a state to itself checks that state
         free = np.array([self.segments_free(np.stack([q, q]))[0] for q in path[1:-1]], bool)
         return np.concatenate([path[:1], path[1:-1][free], path[-1:]])
@@ -246,7 +251,7 @@ class NeuralPlanning:
         return motions_free(self.space, path)
 
     def next_states(self, q: Configurations, goal: Configurations) -> Configurations:
-        """The states that Pnet proposes, with dropout."""
+        """The next states from q towards the goal that the paper's Pnet proposes, with dropout."""
         return self.network.proposals(self.z, q, goal, self.generator)
 
 

@@ -1,23 +1,23 @@
 """Planners of the Open Motion Planning Library (OMPL 2, Python bindings) over our collision kernel.
 
 I. Sucan, M. Moll and L. Kavraki, "The Open Motion Planning Library", IEEE Robotics and Automation Magazine
-2012. Every setting is OMPL's own default, read off the planner, unless `OmplSettings` says otherwise.
+2012. Settings that are not in `OmplSettings` have OMPL's defaults.
 
-*Collision.* States are points of a RealVectorStateSpace with the joint limits as bounds. OMPL asks Python
-about every state and every motion; the answers come from the compiled kernel that `rrt_connect` uses.
+*Collision.* States are points of a RealVectorStateSpace with the joint limits as bounds. OMPL calls Python
+for each state and each motion that it checks. Python calls the compiled kernel that `rrt_connect` uses.
 
-*First-solution planners* (RRT, RRT-Connect, PRM) end with their first path; OMPL's PathSimplifier shortens
-it, as in its SimpleSetup and in MoveIt. *Anytime planners* (RRT*, Informed RRT*, BIT*, AORRTC) minimize
-joint-space length until time runs out, or until the path is as short as the straight line. Whenever a path is
-IMPROVEMENT shorter than the last one, it is validated, so that a late path that is refused does not cost the
-plan.
+*First-solution planners* (RRT, RRT-Connect, PRM) end with their first path, which OMPL's PathSimplifier
+shortens, as in OMPL's SimpleSetup and in MoveIt. *Anytime planners* (RRT*, Informed RRT*, BIT*, AORRTC)
+minimize joint-space length until time runs out, or until the path is as short as the straight line. A path is
+validated whenever it is shorter than the last validated one by the fraction IMPROVEMENT. So there is still a
+valid plan if the validator refuses a later path.
 
 *Seeds.* OMPL has one source of seeds for the whole process. It is set for each search, so the same seed gives
-the same path as long as time does not run out (anytime planners mostly end when it does). The exception is
-PRM: a second thread searches for the path while the roadmap grows, so its path varies from run to run.
+the same path unless time runs out; anytime planners usually run until then. The exception is PRM: a second
+thread searches for the path while the roadmap grows, so its path varies from run to run.
 
 *Threads.* OMPL's bindings hold Python's global lock while they search, and searches in several threads would
-mix their seeds. Use processes.
+mix their seeds. Use processes for parallel planning.
 """
 
 from collections.abc import Iterator
@@ -45,22 +45,22 @@ with needs("OMPL's Python bindings", "baselines"):
     from ompl import util as ou
 
 IMPROVEMENT = 0.01
-"""An anytime planner has a path validated when the path is shorter than the last validated one by this
+"""A path of an anytime planner is validated when it is shorter than the last validated path by this
 fraction."""
 OPTIMAL = 1e-4
 """A path counts as optimal if it is longer than the straight line by at most this fraction."""
 SAME_STATE_DISTANCE = 1e-6
-"""A start and a goal whose distance is below this count as the same [rad]."""
+"""Distance between start and goal below which both count as equal [rad]."""
 
 
 @dataclass(frozen=True)
 class OmplSettings(Settings, name="ompl"):
     resolution: Positive = 0.05
-    """No point of the arm moves further than this between two checks of a motion [m]; the validator's
-    certificate covers the rest. After a path that the validator refuses, the search starts again at half the
-    distance."""
+    """No point of the arm moves further than this between neighboring checked configurations [m]; the
+    validator certifies the motion in between. After a path that the validator refuses, the search starts
+    again with half the resolution."""
     clearance: NotNegative = 0.002
-    """Distance to obstacles that paths keep where start and goal allow it [m], as with rrt_connect."""
+    """Distance to obstacles that paths keep where start and goal allow it [m], as for `rrt_connect`."""
     range: Positive | None = None
     """Longest extension of a tree [rad, joint-space L2]; None: OMPL's default, 0.2 of the space's diameter.
     PRM and BIT* have no such setting."""
@@ -69,8 +69,8 @@ class OmplSettings(Settings, name="ompl"):
 
 
 class Watch:
-    """Ends a search of OMPL, and keeps exceptions that Python code raised in it: none may pass through
-    C++."""
+    """Ends a search of OMPL. Stores exceptions that Python code raises during the search, since no exception
+    may pass through C++."""
 
     def __init__(self, context: PlanningContext) -> None:
         self.context = context
@@ -81,13 +81,16 @@ class Watch:
 
     @contextmanager
     def until_time_is_over(self) -> Iterator[ob.PlannerTerminationCondition]:
-        """A context manager that re-raises at its end an exception that was kept."""
-        # not a Python callback: PRM's second thread would wait forever for the lock that the first one holds
+        """A condition that ends the search when time runs out. At the end of the context, a stored exception
+        is raised."""
+        # not a Python callback: PRM's second thread would wait forever for Python's lock, which the first
+        # thread holds
         yield from self._while(ob.timedPlannerTerminationCondition(max(self.context.remaining, 0.0)))
 
     @contextmanager
     def until_shorter(self, planner: Any, than: float) -> Iterator[ob.PlannerTerminationCondition]:
-        """A condition that also ends the search once the planner has a path shorter than this [rad]."""
+        """A condition that ends the search when time runs out, or the planner has a path shorter than `than`
+        [rad]. At the end of the context, a stored exception is raised."""
         self._planner = planner
         self._shorter_than = than
         yield from self._while(ob.PlannerTerminationCondition(self._is_over))
@@ -98,7 +101,8 @@ class Watch:
             self._condition.terminate()
 
     def raise_caught(self) -> None:
-        """Raise the kept exception and drop it, as its traceback refers to the validity checkers."""
+        """Raises the stored exception and deletes it, since its traceback keeps the validity checkers
+        alive."""
         error = self._error
         self._error = None
         try:
@@ -146,7 +150,7 @@ class StateChecks(ob.StateValidityChecker):
 
 
 class MotionChecks(ob.MotionValidator):
-    """Validity of straight motions; the start is not checked, as OMPL knows it to be free."""
+    """Validity of straight motions. The first state is not checked, since OMPL has already found it valid."""
 
     def __init__(self, information: ob.SpaceInformation, space: Space, watch: Watch) -> None:
         super().__init__(information)
@@ -167,7 +171,8 @@ class MotionChecks(ob.MotionValidator):
 
 
 class OmplPlanner(Planner[OmplSettings]):
-    """Base class of OMPL's planners; each is a class of ompl.geometric and a line in PLANNERS."""
+    """Base class of OMPL's planners. A subclass names a class of ompl.geometric; the table PLANNERS lists
+    it."""
 
     settings_class = OmplSettings
     algorithm: ClassVar[type[ob.Planner]]
@@ -177,7 +182,7 @@ class OmplPlanner(Planner[OmplSettings]):
     """Whether OMPL searches from the goals to the start."""
 
     def __init__(self, settings: OmplSettings | None = None) -> None:
-        """Raises InputError for a `range` if the planner has no such setting."""
+        """Raises InputError if `range` is set but the planner has no such setting."""
         super().__init__(settings)
         if self.settings.range is not None and not hasattr(self.algorithm, "setRange"):
             raise InputError(
@@ -202,7 +207,8 @@ class OmplPlanner(Planner[OmplSettings]):
         return context.unsolved()
 
     def _best(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
-        """The shortest valid path when time runs out or a path is optimal."""
+        """Runs an anytime planner until time runs out or a path is optimal; returns its shortest valid
+        path."""
         problem = context.problem
         settings = self.settings
         attempt = 0
@@ -258,8 +264,9 @@ class OmplPRM(OmplPlanner):
 
     name = "ompl_prm"
     algorithm = og.PRM
-    # a second thread adds all goals but the first, and holds the roadmap's lock while it waits for Python's,
-    # which the first thread holds while it waits for the roadmap's; with a single goal it adds none
+    # OMPL's second thread adds further goals to the roadmap. It would cause a deadlock: it holds the
+    # roadmap's lock while it waits for Python's lock, and the first thread does the reverse. Searching
+    # backwards, there is a single goal.
     backwards = True
 
 
@@ -298,7 +305,7 @@ class OmplAORRTC(OmplPlanner):
 
 
 class _Search:
-    """One search of OMPL, which can be continued. Its paths are not validated yet."""
+    """One search of OMPL, which can be continued. Its paths are not validated."""
 
     def __init__(
         self,
@@ -308,7 +315,7 @@ class _Search:
         settings: OmplSettings,
         attempt: int,
     ) -> None:
-        # OMPL seeds every generator that it creates from here on from this source; 0 is not a seed
+        # seeds all generators that OMPL creates from here on; 0 is not a valid seed
         ou.RNG.setSeed(int(np.random.SeedSequence([context.request.seed, attempt]).generate_state(1)[0]) or 1)
         self._call = context
         self._robot = context.problem.robot
@@ -335,7 +342,7 @@ class _Search:
             self._definition.addStartState(self._state(q))
         self._definition.setGoal(self._goals)
         if planner.anytime:
-            # first-solution planners would go on after their first path if they had an objective
+            # with an objective, first-solution planners would go on after their first path
             self._definition.setOptimizationObjective(ob.PathLengthOptimizationObjective(self._information))
         self._anytime = planner.anytime
         # bestCost, setRange and the constructor are not part of a common base class
@@ -356,14 +363,15 @@ class _Search:
 
     @property
     def gave_up(self) -> str:
-        """The reason why there is no path if OMPL ended before the time limit; else ""."""
+        """The reason why there is no path, if OMPL ended before the time limit; else an empty string."""
         return f"OMPL ended without a path: {self._status}" if self._call.remaining > 0 else ""
 
     def run(self, shorter_than: float = np.inf) -> bool:
-        """Search for a path, anytime planners for one shorter than this [rad], until time runs out.
+        """Search for a path until time runs out; an anytime planner searches for a path shorter than
+        `shorter_than` [rad].
 
-        Returns whether there is a path, which may be as long as before. What a validator
-        raised is raised here.
+        Returns whether there is a path; it may be as long as before. An exception that was raised in a
+        collision check is raised here.
         """
         watch = self._watch
         until = (
@@ -392,7 +400,7 @@ class _Search:
     def _state(self, q: Configuration) -> ob.RealVectorStateType:
         state = self._information.allocState()
         assert isinstance(state, ob.RealVectorStateType)
-        # rounding to float32 may exceed a limit, which OMPL would refuse
+        # values rounded to float32 may exceed a limit; OMPL would refuse the state
         for joint, value in enumerate(np.clip(q.astype(np.float64), self._robot.lower, self._robot.upper)):
             state[joint] = float(value)
         return state
@@ -410,8 +418,8 @@ def _state_space(robot: Robot) -> ob.RealVectorStateSpace:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """A context manager that silences OMPL's console output, such as that setting a seed again has no
-    effect."""
+    """A context manager that silences OMPL's console output, such as its warning about setting a seed
+    again."""
     level = ou.getLogLevel()
     ou.setLogLevel(ou.LogLevel.LOG_NONE)
     try:

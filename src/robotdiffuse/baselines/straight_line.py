@@ -1,4 +1,4 @@
-"""No planner: the straight line in joint space, as a control for every planner."""
+"""The straight line in joint space, without planning: a control for every planner."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -20,13 +20,13 @@ ANY = "any"
 @dataclass(frozen=True)
 class StraightLineSettings(Settings, name="straight_line"):
     goals: Annotated[str, OneOf((NEAREST, ANY))] = ANY
-    """Goal configurations that are tried: the nearest one, or all, the nearest first."""
+    """Goal configurations that are tried: only the nearest one, or all of them, the nearest first."""
 
 
 def first_accepted(
     context: PlanningContext, paths: Iterable[Configurations], stage: str, reason: str
 ) -> PlanResult | None:
-    """The result of the first path that the validator accepts; None if it accepts none in time."""
+    """The result of the first path that the validator accepts; None if it accepts no path in time."""
     for path in paths:
         result = context.finish(path, stage, reason)
         if result is not None or context.ended:
@@ -35,7 +35,7 @@ def first_accepted(
 
 
 class StraightLine(Planner[StraightLineSettings]):
-    """The shortest straight line from the start to a goal configuration that passes the validator."""
+    """Returns the shortest straight line from the start to a goal configuration that passes the validator."""
 
     name = "straight_line"
     settings_class = StraightLineSettings

@@ -1,8 +1,8 @@
 """The paper's Table 2: every row is trained with the same budget and evaluated on the same held-out problems.
 
-Collision guidance alone, without a network, solves many problems. So the contribution of a network is
-measured without guidance, and by comparison with controls: motions through fixed configurations (vias), the
-nearest motions of the data, and smooth noise, with and without guidance.
+Collision guidance solves many problems even without a network. So the contribution of a network is measured
+in two ways: without guidance, and by comparison with controls. The controls are motions through fixed
+configurations (vias), the nearest motions of the data, and smooth noise, each with and without guidance.
 """
 
 import json
@@ -53,7 +53,7 @@ from robotdiffuse.robots import load_robot
 
 ENCODER = "compression_autoencoder"
 STOP_TIMEOUT = 20.0
-"""A stopped training writes a checkpoint; it is killed after this time [s]."""
+"""A stopped training has this time to write a checkpoint before it is killed [s]."""
 
 
 class Row(NamedTuple):
@@ -63,7 +63,7 @@ class Row(NamedTuple):
     """Whether samples are drawn under collision guidance."""
     paper: tuple[float | None, ...]
     """The paper's success [%], collision [%], length and time [s]; None for numbers that the paper does not
-    have."""
+    report."""
 
 
 ROWS: dict[str, Row] = {
@@ -103,9 +103,10 @@ class AblationSettings(Settings):
     data: str
     """Folder of a data set."""
     out: str
-    """Folder for the trained networks; existing ones are kept, interrupted trainings continue."""
+    """Folder for the trained networks. Networks that exist there are used, and interrupted trainings
+    continue."""
     samples: Count = 300_000
-    """Number of training samples of each row: all rows have the same budget."""
+    """Number of training samples of each row; equal for all rows."""
     encoder_samples: Count = 300_000
     """Number of point clouds on which an encoder is trained before it is frozen."""
     problems: Count = 500
@@ -120,14 +121,14 @@ class AblationSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Figures of a network, one value for each problem."""
+    """Figures of a network or control, one value for each problem."""
 
     single: Values
-    """Share of the sampled trajectories that passed the validator."""
+    """Fraction of the sampled trajectories that passed the validator."""
     best: Values
     """1 if any sampled trajectory passed the validator, else 0."""
     collided: Values
-    """Share of the sampled trajectories in collision."""
+    """Fraction of the sampled trajectories in collision."""
     length: Values
     """Link path length of the shortest trajectory that passed [m]; NaN if none passed."""
     seconds: Values
@@ -141,7 +142,7 @@ class Evaluation:
 
     @classmethod
     def mean(cls, trainings: "list[Evaluation]") -> "Evaluation":
-        """For each problem, the mean over several trainings; NaN lengths do not count."""
+        """For each problem, the mean over several trainings; NaN lengths are left out."""
         values = [np.stack([getattr(each, f.name) for each in trainings]) for f in fields(cls)]
         return cls(*(np.ma.masked_invalid(x).mean(axis=0).filled(np.nan) for x in values))
 
@@ -153,8 +154,8 @@ class RowResult(NamedTuple):
     guided: Evaluation
     """Evaluation with guidance."""
     by_seed: tuple[float, ...] = ()
-    """For each training, the share of samples that pass the validator, with guidance if the paper's row has
-    it."""
+    """For each training, the fraction of samples that pass the validator, with guidance if the paper's row
+    has guidance."""
 
     @property
     def as_in_paper(self) -> Evaluation:
@@ -167,7 +168,8 @@ def run_ablation(
     workers: int = 1,
     report: Callable[[str], None] = lambda text: None,
 ) -> list[RowResult]:
-    """Train the networks of the rows and evaluate every row. After an interruption, the same call continues.
+    """Train the networks of the rows and evaluate every row. After an interruption, the same call continues
+    the work.
 
     Raises InputError for an unknown row, listing the known ones, and for data of another robot.
     """
@@ -233,8 +235,8 @@ class Training(NamedTuple):
 
 
 def _training(file: FilePath, name: str, budget: int) -> dict[str, Any]:
-    """What the file of a network says about the training. Raises InputError if the training had another
-    budget."""
+    """The entry about the training in the file of a network. Raises InputError if the network was trained
+    with another number of samples than `budget`."""
     about = json.loads(file.read_text())["training"]
     samples = about["settings"]["samples"]
     if samples != budget:
@@ -258,7 +260,7 @@ def _train(settings: AblationSettings, training: Training) -> Training:
 def _evaluate(
     settings: AblationSettings, which: Training | str, guided: bool, cases: list[Case]
 ) -> Evaluation:
-    """Evaluate a network or a control on problems. which: a training, or a name in CONTROLS."""
+    """Evaluate a network or a control on problems. `which` is a training, or a name in CONTROLS."""
     robot = load_robot("panda")
     out = FilePath(settings.out)
     if isinstance(which, str):
@@ -291,26 +293,26 @@ def _evaluate(
 
 
 NOTES = (
-    "single: share of samples that pass the validator; best: share of problems with at least one such "
+    "single: share of samples that pass the validator; best: share of problems with at least one valid "
     "sample.",
-    "length: mean length of the shortest such sample, over the problems that have one; to first: mean ratio "
-    "of this length to that of the first row, over the problems that both rows solve. Intervals are over "
-    "problems, not over trainings: another seed may change a row by more.",
+    "length: mean length of the shortest valid sample, over the problems that have one; to first: mean ratio "
+    "of this length to the length in the first row, over the problems that both rows solve. Intervals are "
+    "over problems, not over trainings: another seed may change a row by more.",
     "no network: motions through fixed configurations, without guidance; the nearest motions of the data, "
-    "bent to start and goal; smooth noise, which networks start from. The last two get "
-    f"{EQUAL_TIME_STEPS} gradient steps, as many as take the time of a network. Problems that the straight "
-    "line solves were left out.",
+    "bent to start and goal; smooth noise, which networks start from. Nearest motions and smooth noise get "
+    f"{EQUAL_TIME_STEPS} gradient steps, which take as long as a network. Problems that the straight line "
+    "solves were left out.",
 )
 LINE_FAMILIES = {"spheres and cubes": ROP, "spheres alone": Rop(kinds=("sphere",))}
 LINE_NOTES = (
-    "The straight line in joint space, under the authors' own draw of problems, with inverse kinematics of "
-    "the position alone: share of problems on which it is free. The paper's rows are over all problems, also "
-    "those that the straight line solves: a row near these shares does not show that its planner plans.",
+    "Share of problems on which the straight line in joint space is free, drawn as the authors draw them, "
+    "with inverse kinematics of the position only. The paper's rows include problems that the line solves, "
+    "so a success rate near these shares does not show that a planner avoids obstacles.",
 )
 
 
 def table2(settings: AblationSettings, results: list[RowResult]) -> Report:
-    """The report of Table 2, with a second table that compares its rows with the straight line."""
+    """The report of Table 2, with a second table that compares the paper's rows with the straight line."""
     command = (
         f"robotdiffuse reproduce table2 --data DATA --out FOLDER --samples {settings.samples} "
         f"--encoder-samples {settings.encoder_samples} --problems {settings.problems} "
@@ -327,7 +329,7 @@ def table(settings: AblationSettings, results: list[RowResult]) -> Table:
     names = ("samples", "encoder_samples", "problems", "candidates")
     budget = ", ".join(f"{name} {getattr(settings, name):,}" for name in names)
     title = f"Table 2 on {settings.family}: {budget}"
-    several = settings.seeds > 1
+    several_seeds = settings.seeds > 1
     columns = (
         *("row", "guided"),
         Column("single", "%", better="more"),
@@ -337,7 +339,7 @@ def table(settings: AblationSettings, results: list[RowResult]) -> Table:
         Column("to first", "", ".3f", "less"),
         Column("CPU", "ms", ".0f", "less", scale=1000.0),
         Column("unguided", "%", better="more"),
-        *(("each seed",) if several else ()),
+        *(("each seed",) if several_seeds else ()),
         *("paper: suc", "col", "len", "s"),
     )
     first = results[0].as_in_paper
@@ -356,7 +358,7 @@ def table(settings: AblationSettings, results: list[RowResult]) -> Table:
             Mean.of(evaluation.length / first.length).value,
             float(np.median(evaluation.seconds)),
             _share(result.alone.single),
-            *((by_seed,) if several else ()),
+            *((by_seed,) if several_seeds else ()),
             *paper,
         )
         rows.append(row)
@@ -364,10 +366,12 @@ def table(settings: AblationSettings, results: list[RowResult]) -> Table:
 
 
 def straight_line_table(problems: int) -> Table:
-    """Success of the straight line on problems drawn as the authors draw them, among the paper's rows of
-    Table 2."""
-    printed = {name: row.paper[0] or 0.0 for name, row in ROWS.items()}
-    rows = [(f"paper: {name}", Figure(f"{success}", success / 100)) for name, success in printed.items()]
+    """The success rates of the paper's Table 2 and of the straight line, sorted. Problems are drawn as the
+    authors draw them."""
+    paper_success = {name: row.paper[0] or 0.0 for name, row in ROWS.items()}
+    rows = [
+        (f"paper: {name}", Figure(f"{success}", success / 100)) for name, success in paper_success.items()
+    ]
     for obstacles, family in LINE_FAMILIES.items():
         for goals, free in straight_line_counts(problems, family).items():
             name = f"no planner: straight line to {goals}, {obstacles}"
@@ -380,5 +384,5 @@ def straight_line_table(problems: int) -> Table:
 
 
 def _share(values: Values) -> Figure:
-    """Mean of shares, with its 95 % interval."""
+    """The mean of fractions, as a percentage with its 95 % interval."""
     return share_cell(float(values.mean()), bootstrap_interval(values))

@@ -1,8 +1,8 @@
-"""The bench: calls planners on problems and stores a record of each call, so that none is repeated.
+"""The bench: calls planners on problems and stores a record of each call, so that no call is repeated.
 
-Each planner under test runs in its own process, so that a crash, an endless loop or a leak affects no other
-planner. Processes run on this machine or on a Ray cluster. Warming up (compiled code, imports) is not timed.
-Presets are named comparisons of planners, such as the tables of docs/results.md.
+Each planner under test runs in its own process, so that a crash, an endless loop or a memory leak affects no
+other planner. Processes run on this machine or on a Ray cluster. Warming up (compilation, imports) is not
+timed. Presets are named comparisons of planners, such as the tables of docs/results.md.
 """
 
 import os
@@ -53,12 +53,13 @@ from robotdiffuse.processes.workers import EndedError, NotStartedError, OverrunE
 from robotdiffuse.robots.robot import Robot
 
 CALL_ARGUMENTS = [field.name for field in fields(PlanRequest) if field.name not in ("time_limit", "seed")]
-"""Arguments of a planner's calls that a planner under test may set; the bench sets the others."""
+"""Arguments of `Planner.plan` that the text of a planner under test may set; the bench sets time limit and
+seed."""
 
 
 @dataclass(frozen=True)
 class PlannerSpec:
-    """A planner as the bench loads and calls it."""
+    """How the bench loads and calls a planner."""
 
     name: str
     """Name of the planner in `planning.PLANNERS`."""
@@ -99,13 +100,13 @@ class PlannerSpec:
         return {name: read_description(folder, name).get("weights_sha256") for name in names}
 
     def request(self) -> dict[str, Any]:
-        """Arguments of the planner's calls: until, clearance, ..."""
+        """Arguments of the planner's calls, by name: until, clearance, ..."""
         request = PlanRequest().changed(text for text in self.settings if _of_call(text))
         return {name: getattr(request, name) for name in CALL_ARGUMENTS}
 
     def load(self) -> Planner:
-        """Load the planner. Raises InputError as `load_planner` does, and for a planner that another process
-        cannot import."""
+        """Load the planner. Raises InputError in the cases in which `load_planner` raises it, and for a
+        planner that another process cannot import."""
         if PLANNERS.entry(self.name).location.startswith("__main__:"):
             raise InputError(
                 f"planner {self.name} is in the program that was started, which the processes of a bench do "
@@ -126,27 +127,28 @@ def _of_call(text: str) -> bool:
 
 
 START_TIMEOUT = 300.0
-"""Timeout for starting a process, and for warming it up [s]: on a new machine, kernels are compiled."""
+"""Timeout for starting a process, and for warming it up [s]. It is long because on a new machine kernels are
+compiled."""
 GRACE = 20.0
-"""A process that has not answered this long after the time limit is killed [s]. This time includes the
-validation and timing of the motion."""
+"""A process that has not answered this long after the time limit is killed [s]. In this time, the motion is
+validated and timed."""
 RESTARTS_TIMEOUT_FACTOR = 20.0
-"""Timeout of planners that restart, as a multiple of the time limit. It is long because the limit does not
-include the timing of each path."""
+"""Timeout of planners that restart, as a multiple of the time limit. It is long because computing the
+trajectory of each path does not count for the limit."""
 RUNS_PER_TASK = 20
-"""Number of runs of a planner that a node of a cluster makes before its process is started again."""
+"""Number of runs in a task of a cluster. Each task starts the planner's process again."""
 
 
 class PlannerProcess:
-    """A planner in another process, which starts with the first run and again after it died."""
+    """A planner in another process. The process starts with the first run, and again after it has died."""
 
     def __init__(self, spec: PlannerSpec, log: FilePath, cpu_time: bool = False) -> None:
-        """`log`: the process's output is appended to this file. cpu_time: see `BenchSettings`."""
+        """The output of the process is appended to the file `log`. For `cpu_time` see `BenchSettings`."""
         self._log = log
         self._worker = Worker(_prepare, (spec, str(log), cpu_time))
 
     def warm(self, run: Run) -> None:
-        """Warm up for a run's robot. If the process dies while it warms up, `plan` will report it. Raises
+        """Warm up for the robot of a run. If the process dies while it warms up, `plan` reports this. Raises
         InputError if the program cannot start processes."""
         try:
             self._worker.start()
@@ -157,9 +159,9 @@ class PlannerProcess:
         self._ask(START_TIMEOUT, _warm_up, problem_record(run.problem))
 
     def plan(self, run: Run, restarts: bool = False) -> list[Fields]:
-        """The fields of a run's records. A crash or an overrun is a record too."""
+        """The fields of a run's records. A crash and an overrun also give a record."""
         problem = problem_record(run.problem)
-        # a robot that is new to the process is warmed up first
+        # warm up first if the robot is new to the process
         answer = self._ask(START_TIMEOUT, _warm_up, problem)
         if answer is not None:
             return [answer]
@@ -177,7 +179,8 @@ class PlannerProcess:
         self._worker.close(0.0)
 
     def _ask(self, timeout: float, call: Callable[..., Fields | None], *arguments: Any) -> Fields | None:
-        """The answer of a call in the process; if the process gave no answer, a record that says why."""
+        """The answer of a call in the process; if the process gave no answer, the fields of a record with the
+        reason."""
         try:
             return self._worker.call(call, *arguments, timeout=timeout)
         except OverrunError:
@@ -189,19 +192,19 @@ class PlannerProcess:
             return {"status": CRASHED, "reason": reason[:300], "time": 0.0}
 
 
-# In the process
+# State and functions of the planner's process
 
 _planner: Planner
 _request: Fields
 """Further arguments of the planner's calls."""
 _answers: Iterator[Fields]
-"""Answers of the current run that were not sent yet."""
+"""Answers of the current run that have not been sent yet."""
 _warm: set[Robot] = set()
-"""Robots for which the planner is warmed up."""
+"""Robots for which the planner has been warmed up."""
 
 
 def _prepare(spec: PlannerSpec, log: str, cpu_time: bool) -> None:
-    """Load the planner; all output goes to the log."""
+    """Load the planner, and redirect all output of the process to the log."""
     global _planner, _request
     if cpu_time:
         time.perf_counter = time.process_time
@@ -235,8 +238,8 @@ def _first_answer(record: Fields, seed: int, limit: float, restarts: bool) -> Fi
 
 
 def _next_answer() -> Fields | None:
-    """The fields of the run's next record, with memory of the process and load of the machine; None after the
-    last."""
+    """The fields of the run's next record, with the memory of the process and the load of the machine; None
+    after the last record."""
     answer = next(_answers, None)
     if answer is None:
         return None
@@ -248,10 +251,10 @@ def _next_answer() -> Fields | None:
 
 
 def on_this_machine(settings: "BenchSettings", runs: Sequence[Run], session: str) -> Results:
-    """Make runs, with one process for each planner; `settings.workers` of them work at the same time.
+    """Make runs, with one process for each planner; up to `settings.workers` processes plan at the same time.
 
-    All processes are warmed up before the first call is timed. They take turns, so that other work on the
-    machine affects all planners alike.
+    All processes are warmed up before the first call is timed. The planners take turns, so that other work on
+    the machine affects all of them alike.
     """
     first = {run.method: run for run in reversed(runs)}
     specs = settings.specs
@@ -283,15 +286,15 @@ def on_this_machine(settings: "BenchSettings", runs: Sequence[Run], session: str
 
 
 def on_cluster(settings: "BenchSettings", runs: Sequence[Run], session: str) -> Results:
-    """Make runs on a cluster; each task starts a process for some runs.
+    """Make runs on a cluster; each task starts a process and makes up to RUNS_PER_TASK runs.
 
-    The nodes need this package, and weights and files at the same paths.
+    The nodes need this package, and weights and other files at the same paths as this machine.
     """
     tasks: list[tuple[PlannerSpec, list[Run], bool]] = []
     assert settings.cluster is not None
     for label, spec in settings.specs.items():
-        of_planner = [run for run in runs if run.method == label]
-        parts = (of_planner[i : i + RUNS_PER_TASK] for i in range(0, len(of_planner), RUNS_PER_TASK))
+        planner_runs = [run for run in runs if run.method == label]
+        parts = (planner_runs[i : i + RUNS_PER_TASK] for i in range(0, len(planner_runs), RUNS_PER_TASK))
         tasks += [(spec, part, settings.equal_time) for part in parts]
     for number, (answers, output) in CLUSTERS[settings.cluster](_run_task, tasks):
         _, part, _ = tasks[number]
@@ -304,7 +307,7 @@ def on_cluster(settings: "BenchSettings", runs: Sequence[Run], session: str) -> 
 
 
 def records_of(run: Run, answers: Sequence[Fields], about: Fields) -> list[Record]:
-    """The records of a run: of the first call and, if there were restarts, of all its calls together."""
+    """The records of a run: one of the first call and, if there were restarts, one of all calls together."""
     labels = (run.method, run.method + RESTARTED)
     pairs = zip(labels, answers, strict=False)
     return [run.record({"planner": label, **about, **answer}) for label, answer in pairs]
@@ -337,25 +340,25 @@ class BenchSettings(Settings):
     planners: Annotated[tuple[str, ...], Filled()]
     """Planners, each as text for `PlannerSpec.parse`; or only `all`."""
     problems: Annotated[tuple[str, ...], Filled()]
-    """Problem sets: families (rop, rop_dense, ...; FAMILY_nontrivial has no trivial problems), files or
-    folders."""
+    """Problem sets: families (rop, rop_dense, ...), FAMILY_nontrivial for a family without trivial problems,
+    files or folders."""
     out: FilePath
     """Folder for problems and results."""
     time_limit: Positive = 1.0
-    """ALL Time limit of a call [s]."""
+    """Time limit of a call [s]."""
     seeds: Count = 1
     """Number of calls on each problem, with seeds 0, 1, ..."""
     count: Count | None = None
-    """Number of problems of each set; None: 100 of a family, all of a file or folder."""
+    """Number of problems of each set; None: 100 for a family, all for a file or folder."""
     workers: Count = 1
     """Number of planners that run at the same time, each in its own process."""
     cluster: Annotated[str, OneOf(CLUSTERS)] | None = None
-    """ray: on the cluster that RAY_ADDRESS names; None: this machine."""
+    """"ray" for the cluster that RAY_ADDRESS names; None for this machine."""
     equal_time: bool = False
     """Whether planners that end early are called again with other seeds until the limit, so that lengths can
-    be compared at equal time. Such calls have their own rows in results."""
+    be compared at equal time. Planners with repeated calls have their own rows in results."""
     cpu_time: bool = False
-    """Whether limits and times are CPU time of the planner's process; not on a cluster."""
+    """Whether limits and times are CPU time of the planner's process; not possible on a cluster."""
 
     def __post_init__(self) -> None:
         if self.planners == ("all",):
@@ -371,13 +374,13 @@ class BenchSettings(Settings):
 
     @property
     def logs(self) -> FilePath:
-        """Folder of the files with what the planners print."""
+        """Folder of the files with the planners' output."""
         return self.out / "logs"
 
     @cached_property
     def specs(self) -> dict[str, PlannerSpec]:
-        """The planners by their names in results. Raises InputError for an unknown planner or two of one
-        name."""
+        """The planners by their names in results. Raises InputError for an unknown planner, and if two
+        planners have the same name."""
         specs = {spec.label: spec for spec in map(PlannerSpec.parse, self.planners)}
         if len(specs) < len(self.planners):
             raise InputError(f"planners is {', '.join(self.planners)!r}; two have the same name in results")
@@ -385,15 +388,15 @@ class BenchSettings(Settings):
 
 
 Done = Callable[[int, int], None]
-"""Called with the number of finished calls and the number of all calls."""
+"""Called with the number of finished calls and the total number of calls."""
 
 
 def run_bench(settings: BenchSettings, report: Progress, done: Done) -> int:
-    """Make the calls that are missing in the folder; returns how many were made.
+    """Make the calls that have no record in the folder; returns how many were made.
 
-    A call that ended before a shorter time limit is not repeated, since more time would not change it. Raises
-    InputError, before any call, for bad settings or a planner that cannot be loaded, and KeyboardInterrupt on
-    Ctrl-C; another call with the same settings continues.
+    A call with a shorter time limit is not repeated if it ended before its limit, since more time would not
+    change it. Raises InputError, before any call, for bad settings or a planner that cannot be loaded, and
+    KeyboardInterrupt on Ctrl-C. Running again with the same settings then continues.
     """
     with lock_folder(settings.out):
         specs = settings.specs
@@ -416,7 +419,7 @@ def run_bench(settings: BenchSettings, report: Progress, done: Done) -> int:
 def open_runs(
     records: Mapping[str, Sequence[Record]], cases: Sequence[Case], settings: BenchSettings
 ) -> list[Run]:
-    """The runs that have no record yet; `records` are given by planner."""
+    """The runs that have no record yet. `records` are the existing records by planner."""
     answered: set[tuple[str, str, str, int]] = set()
     for label in settings.specs:
         restarted = {record.key for record in records.get(label + RESTARTED, ())}
@@ -432,8 +435,8 @@ def open_runs(
 
 
 def _check_weights(settings: BenchSettings, sessions: Sequence[Mapping[str, Any]]) -> None:
-    """Raise InputError if a planner of the same name was run in this folder with other weights: the records
-    of different weights would be mixed."""
+    """Raise InputError if a planner of the same name was run in this folder with other weights: records of
+    different weights would be mixed."""
     for label, spec in settings.specs.items():
         recorded_hashes = [
             session["weights"][label] for session in sessions if label in session.get("weights", {})
@@ -446,8 +449,8 @@ def _check_weights(settings: BenchSettings, sessions: Sequence[Mapping[str, Any]
 
 
 def _note_session(settings: BenchSettings, sessions: JsonLines) -> str:
-    """Append machine, versions and settings of this session to runs.jsonl. Returns the session's name, which
-    its records contain."""
+    """Append machine, versions and settings of this session to runs.jsonl. Returns the name of the session,
+    its starting time, which is stored in the records."""
     now = datetime.now(UTC)
     session = now.strftime("%Y-%m-%d %H:%M:%S")
     note = {
@@ -473,7 +476,7 @@ def _note_session(settings: BenchSettings, sessions: JsonLines) -> str:
 
 # Presets
 
-# For the shortest paths.
+# planners that search for the shortest path
 AORRTC = "aorrtc:objective=length"
 RRT_CONNECT = "rrt_connect:objective=length"
 ROP = ("rop_nontrivial", "rop_dense_nontrivial")
@@ -481,13 +484,14 @@ ROP = ("rop_nontrivial", "rop_dense_nontrivial")
 
 @dataclass(frozen=True)
 class Preset:
-    """A named comparison: planners run on the first problems of each set, once with each time limit."""
+    """A named comparison: planners that run on the first `count` problems of each set, with each of the time
+    limits."""
 
     description: str
     planners: tuple[str, ...]
     problems: tuple[str, ...]
     limits: tuple[float, ...]
-    """ALL Time limit of a call [s]."""
+    """Time limits of a call [s]."""
     count: int
     """Number of problems of each set."""
     equal_time: bool = True
@@ -506,14 +510,14 @@ PRESETS: dict[str, Preset] = {
         30,
     ),
     "learning": Preset(
-        "the network alone beside search, with 0.1 and 0.3 s",
+        "the diffusion network against search, with 0.1 and 0.3 s",
         ("diffusion", AORRTC, "shared_tree_rrt_star"),
         (*ROP, "shelf_nontrivial"),
         (0.1, 0.3),
         150,
     ),
     "durations": Preset(
-        "durations of motions with 0.1 and 1 s: by time, by length, and the timed paths of OMPL",
+        "durations of motions with 0.1 and 1 s: minimizing time, minimizing length, and OMPL's timed paths",
         (
             "aorrtc",
             "diffusion",
@@ -527,14 +531,14 @@ PRESETS: dict[str, Preset] = {
         equal_time=False,
     ),
     "anytime": Preset(
-        "anytime search beside OMPL's: Shared-Tree Informed RRT*, AORRTC, Informed RRT*",
+        "anytime search against OMPL's: Shared-Tree Informed RRT*, AORRTC, Informed RRT*",
         ("shared_tree_rrt_star", AORRTC, "ompl_aorrtc", "ompl_informed_rrt_star"),
         ROP,
         (1.0,),
         100,
     ),
     "restarts": Preset(
-        "AORRTC beside restarts of RRT-Connect until the same limit",
+        "AORRTC against restarts of RRT-Connect until the same limit",
         (AORRTC, RRT_CONNECT),
         (*ROP, "shelf_nontrivial"),
         (1.0,),
@@ -546,19 +550,24 @@ PRESETS: dict[str, Preset] = {
 def preset_settings(
     preset: str, out: FilePath, problems: Sequence[str] = (), count: int | None = None, **more: Any
 ) -> list[BenchSettings]:
-    """The settings of a preset, by name, for each of its time limits.
+    """The bench settings of a preset, one for each of its time limits.
 
-    problems: further problem sets, besides those of the preset.
-    count: largest number of problems of each set; None: the preset's.
-    more: further `BenchSettings`.
+    Args:
+        preset: Name of the preset.
+        out: Folder for problems and results.
+        problems: Problem sets in addition to those of the preset.
+        count: Largest number of problems of each set; None: the preset's number.
+        more: Further `BenchSettings`.
 
-    Raises InputError for an unknown preset, and lists the known ones.
+    Raises:
+        InputError: For an unknown preset; the message lists the known ones.
     """
     if preset not in PRESETS:
         raise unknown_name("preset", preset, PRESETS)
-    entry = PRESETS[preset]
-    fixed = {"count": min(count or entry.count, entry.count), "equal_time": entry.equal_time}
-    sets = (*entry.problems, *problems)
+    chosen = PRESETS[preset]
+    preset_values = {"count": min(count or chosen.count, chosen.count), "equal_time": chosen.equal_time}
+    sets = (*chosen.problems, *problems)
     return [
-        BenchSettings(entry.planners, sets, out, time_limit=limit, **fixed, **more) for limit in entry.limits
+        BenchSettings(chosen.planners, sets, out, time_limit=limit, **preset_values, **more)
+        for limit in chosen.limits
     ]

@@ -1,8 +1,9 @@
-"""The report of a bench: planners beside each other for every problem set and time limit, as tables, plots
-and the motions to replay.
+"""The report of a bench: comparisons of planners for every problem set and time limit, as tables, plots and
+motions to replay.
 
-A time limit needs no calls of its own. Records of a longer limit show what a planner had found by then; a
-call that ended before its limit shows what a longer limit would have given.
+Results for a time limit can come from calls with other limits. The record of a call with a longer limit shows
+what the planner had found by the shorter limit. A call that ended before its own limit shows the result for
+longer limits.
 """
 
 import re
@@ -40,12 +41,12 @@ from robotdiffuse.problems.held_out import Case
 from robotdiffuse.problems.problem import JointGoal
 
 LIMITS = (0.1, 1.0, 10.0, 60.0)
-"""Time limits that a report evaluates in addition to the limits of its records, up to the longest of these
-[s]."""
+"""Time limits that a report evaluates in addition to the limits of its records [s]; only those below the
+longest limit of the records."""
 NONTRIVIAL_LABEL = ", non-trivial"
 LATE_SHARE = 0.1
-"""A late motion still counts if it is late by at most this fraction of the time limit, or by LATE_SECONDS:
-planners stop searching in time, but then the motion is validated."""
+"""A motion still counts if it is late by at most this fraction of the time limit, or by LATE_SECONDS:
+planners stop searching in time, but validation of the motion follows."""
 LATE_SECONDS = 0.05
 """See LATE_SHARE [s]."""
 RAN_OUT = "time ran out"
@@ -57,10 +58,18 @@ FAILURES = (
     *REFUSED.values(),
     *("other refusal", "ends refused", CRASHED, OVERRAN, RAISED),
 )
-"""Reasons of failures, in this order. There was no path by the end of the limit, the planner ended without a
-path long before it, or found one after it. The last path hit an obstacle, or the arm itself, or it broke
-limits, missed the goal or twitched. Start or goal were refused. The process died, or did not answer and was
-killed. The planner raised an exception."""
+"""Reasons of failures, in the order of tables:
+
+- time ran out: there was no path at the end of the limit.
+- gave up before: the planner ended without a path long before the limit.
+- found one later: the planner found a path after the limit.
+- scene collision, self-collision: the validator refused the last path for this reason.
+- other refusal: the validator refused the last path for another reason, such as limits or a missed goal.
+- ends refused: start or goal were invalid.
+- crashed: the planner's process died.
+- overran: the process did not answer and was killed.
+- exception: the planner raised an exception.
+"""
 
 Key = tuple[str, int]
 """Name of a problem in its set, and a seed."""
@@ -77,14 +86,14 @@ class Bench:
 
     folder: FilePath
     sessions: tuple[dict[str, Any], ...]
-    """A note on each call of `bench run`: machine, versions, settings."""
+    """One entry for each call of `bench run`: machine, versions, settings."""
     records: dict[str, list[Record]]
-    """Records by planner, in the order of PLANNERS; the rows of a planner with restarts follow those
-    without."""
+    """Records by planner, in the order of PLANNERS. A planner with restarts follows the same planner without
+    restarts."""
 
     @property
     def reference(self) -> str:
-        """The planner that the others are compared with; its restarts if it has any."""
+        """The planner that all others are compared with; with restarts, if it has such records."""
         plain = DEFAULT_PLANNER if DEFAULT_PLANNER in self.records else next(iter(self.records))
         return plain + RESTARTED if plain + RESTARTED in self.records else plain
 
@@ -94,17 +103,17 @@ class Bench:
 
 
 def plain_name(planner: str) -> str:
-    """The name without the suffix of restarts."""
+    """The name of a planner without the suffix of restarts."""
     return planner.removesuffix(RESTARTED)
 
 
 def base_name(planner: str) -> str:
-    """The name in PLANNERS: without weights, settings and restarts."""
+    """The name of a planner in PLANNERS, without weights, settings and the suffix of restarts."""
     return re.split("[@:+]", planner, maxsplit=1)[0]
 
 
 def read_bench(folder: FilePath, planners: Sequence[str] | None = None) -> Bench:
-    """Read the records of all planners, or of some, with their restarts.
+    """Read the records of all planners, or of the given planners, including those with restarts.
 
     Raises InputError for a folder without a bench, damaged files and planners without records.
     """
@@ -118,7 +127,7 @@ def read_bench(folder: FilePath, planners: Sequence[str] | None = None) -> Bench
     )
     for name in names:
         if name.endswith(RESTARTED):
-            # calls that used up the limit were not repeated: for them the calls without restarts count
+            # calls that used up the limit were not repeated: their records without restarts count here too
             repeated = {record.key for record in records[name]}
             plain = [record for record in records.get(plain_name(name), ()) if record.key not in repeated]
             records[name] = records[name] + [replace(record, planner=name) for record in plain]
@@ -132,30 +141,32 @@ def read_bench(folder: FilePath, planners: Sequence[str] | None = None) -> Bench
     return Bench(folder, tuple(sessions), {name: records[name] for name in names})
 
 
-# What a call had found by a time limit
+# Results of a call by a time limit
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a call had found by a time limit."""
+    """The result of a call by a time limit."""
 
     record: Record
     found: float
     """Time of the first path [s]; infinite if there was no path by the limit."""
     returned: float
-    """Time at which the planner returns [s]; the time limit for anytime planners, and if there is no path."""
+    """Time at which the planner returned, at most the time limit [s]; the time limit if there is no path."""
     joint_length: float
     """Length of the best path found by the time limit [rad]; NaN without a path."""
     link_length: float
-    """The paper's path length of this path [m]; NaN if there is none. If it is not the path that was returned
-    later, the length of that path, scaled by the ratio of their joint lengths."""
+    """The paper's path length of this path [m]; NaN without a path. If the call later returned a shorter
+    path, it is estimated: the length of the returned path, scaled by the ratio of both paths' joint
+    lengths."""
 
     @property
     def solved(self) -> bool:
         return self.found < np.inf
 
     def full(self, limit: float, shortest: float) -> bool:
-        """Whether the planner used up the limit, or no shorter path exists."""
+        """Whether the planner used up the limit [s], or no shorter path exists. `shortest` is the length of
+        the shortest path of any planner [rad]."""
         nothing_shorter = self.record.trivial and self.joint_length <= SHORTEST_FACTOR * shortest
         return self.record.restarts is not None or self.returned >= ENDED_EARLY * limit or nothing_shorter
 
@@ -175,12 +186,10 @@ class Outcome:
 
 
 def deciding_record(records: Sequence[Record], limit: float) -> Record | None:
-    """The record that shows what a planner finds within a limit [s]: the record with the shortest time limit
-    that is at least as long, else the last record of a call that ended by itself.
+    """The record that shows what a planner finds within a limit [s]; None if there is none.
 
-    records: of one problem and seed, shorter limits first.
-
-    records: records of one problem and seed, shorter limits first.
+    It is the record with the shortest time limit of at least `limit`, else the last record of a call that
+    ended by itself. `records` are those of one problem and seed, shorter limits first.
     """
     for record in records:
         if record.time_limit >= limit:
@@ -189,7 +198,7 @@ def deciding_record(records: Sequence[Record], limit: float) -> Record | None:
 
 
 def outcome(record: Record, limit: float) -> Outcome:
-    """Returns what a recorded call had found by a time limit [s]."""
+    """The result of a recorded call by a time limit [s]."""
     late = max(LATE_SHARE * limit, LATE_SECONDS) if record.time_limit == limit else 0.0
     paths = [(at, length) for at, length in record.progress if record.solved and at <= limit + late]
     if not paths:
@@ -213,7 +222,7 @@ def calls_on(records: Iterable[Record], problem_set: str) -> Calls:
 
 
 class Mean(NamedTuple):
-    """The mean over the motions that have a metric; NaN without any."""
+    """The mean over the motions that have a metric; NaN if no motion has it."""
 
     value: float
     half: float
@@ -221,7 +230,7 @@ class Mean(NamedTuple):
 
     @classmethod
     def of(cls, values: Iterable[float | None]) -> "Mean":
-        """The mean of the values that are neither None nor NaN."""
+        """The mean of the values, leaving out None and NaN."""
         finite = np.array([value for value in values if value is not None and value == value])
         if not len(finite):
             return cls(np.nan, np.nan)
@@ -229,7 +238,7 @@ class Mean(NamedTuple):
         return cls(float(finite.mean()), half)
 
     def cell(self, metric: Metric) -> Figure | None:
-        """The mean of a metric with its interval."""
+        """The cell of a table: the mean of a metric with its interval; None without a mean."""
         value, half = (f"{metric.scale * x:{metric.format}}" for x in self)
         text = value if np.isnan(self.half) else f"{value} ± {half}"
         return None if np.isnan(self.value) else Figure(text.replace("-", "−"), self.value)
@@ -243,19 +252,20 @@ class Row:
     outcomes: tuple[Outcome, ...]
     """Outcomes of all problems and seeds of the table."""
     figures: Indicators
-    """The paper's four indicators. The length is the mean over the solved problems, NaN if there are none;
-    the time is the mean until the planner returns, where an unsolved problem counts with the time limit."""
+    """The paper's four indicators. The length is the mean over the solved problems, NaN if no problem is
+    solved. The time is the mean until the planner returns; an unsolved problem counts with the time limit."""
     interval: tuple[float, float]
     """The 95 % interval of the share of solved problems, by E. B. Wilson's method over problems."""
     comscore: float
-    """ComScore, normalized over the rows of this table."""
+    """ComScore, normalized over the rows of this table; NaN with restarts."""
     paired: Paired | None
-    """Comparison with the reference planner by joint-space lengths; None for the reference itself, and if
-    there is none."""
+    """Comparison with the reference planner by joint-space lengths; None for the reference itself, and if the
+    reference has no results."""
     full: bool
-    """Whether all solved calls used up the limit, with restarts or without."""
+    """Whether every solved call used up the limit (possibly with restarts), or found a path that cannot be
+    shorter."""
     timed: str
-    """The sessions in which the calls were made, with the number of simultaneous calls in each."""
+    """The sessions in which the calls were made, with the number of simultaneous calls in each session."""
 
     @property
     def solved(self) -> list[Outcome]:
@@ -268,7 +278,7 @@ class Row:
 
     @property
     def failures(self) -> Counter[str]:
-        """How often each of FAILURES occurred."""
+        """The number of failures by reason, see FAILURES."""
         return Counter(o.failure for o in self.outcomes if not o.solved)
 
     def mean(self, metric: Metric) -> Figure | None:
@@ -278,19 +288,25 @@ class Row:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Planners at a time limit, on the problems for which all of them have results with that limit."""
+    """Planners at a time limit, on the problems for which all of these planners have results with this
+    limit."""
 
     limit: float
+    """Time limit [s]."""
     problems: int
+    """Number of these problems."""
     section_problems: int
-    """Number of problems in the section."""
+    """Number of all problems in the section."""
     seeds: int
+    """Number of seeds per problem."""
     rows: tuple[Row, ...]
+    """One row for each planner."""
     missing: tuple[str, ...]
     """Planners without results for this limit."""
     keys: tuple[Key, ...]
+    """The problems and seeds, in the order of the rows' outcomes."""
     loads: tuple[float, ...]
-    """Load averages of the machine after the calls, as far as they were recorded."""
+    """Load averages of the machine after the calls, where they were recorded."""
 
     @property
     def alike(self) -> bool:
@@ -299,7 +315,7 @@ class Comparison:
 
     @property
     def metrics(self) -> list[Metric]:
-        """The metrics that some row has."""
+        """The metrics that at least one row has."""
         return [m for m in METRICS.values() if any(row.mean(m) is not None for row in self.rows)]
 
 
@@ -309,15 +325,18 @@ class Curve:
 
     planner: str
     calls: int
+    """Number of calls."""
     end: float
-    """Until this time, results are known for all problems; later ones for some problems only [s]."""
+    """Until this time, the results of all calls are known [s]."""
     found: Values
     """Times of first paths [s], sorted."""
     times: Values
-    """Times at which the median ratio is computed: half of these problems are solved by then [s]."""
+    """Times at which the median ratio is finite: at least half of the problems of `ratios` are solved by then
+    [s]."""
     ratios: Values
-    """At each of `times`, the median ratio of joint-space length to the best known length, on the non-trivial
-    problems that the planner solves in the end; problems that are not solved yet count as infinite."""
+    """At each of `times`, the median over problems of the ratio of joint-space length to the best known
+    length. The problems are the non-trivial ones that the planner solves by `end`; before it solves a
+    problem, the ratio is infinite."""
 
 
 @dataclass(frozen=True)
@@ -332,17 +351,17 @@ class Section:
 
     @property
     def main(self) -> Comparison:
-        """The comparison with the most planners and problems; if there are several, the one with the longest
-        limit."""
+        """The comparison with the largest number of planners times problems; among equal ones, that with the
+        longest limit."""
         return max(self.comparisons, key=lambda c: (len(c.rows) * c.problems, c.limit))
 
 
 def sections(bench: Bench, limits: Sequence[float] | None = None) -> list[Section]:
-    """The results on all problem sets; for sets of random problems also without the trivial problems.
+    """The results on all problem sets. Sets of random problems get a second section without the trivial
+    problems.
 
-    limits: time limits to report [s]; None: the limits of the records, and those LIMITS that are below them.
-
-    Raises InputError if no planner has results for any of these.
+    `limits` are the time limits to report [s]; None: the limits of the records, and all LIMITS below the
+    longest of them. Raises InputError if no planner has results for any of the limits.
     """
     results = []
     for problem_set in bench.problem_sets:
@@ -380,10 +399,10 @@ def sections(bench: Bench, limits: Sequence[float] | None = None) -> list[Sectio
 def _counted(
     bench: Bench, planner: str, problem_set: str, calls: Calls, places: dict[str, int], limit: float
 ) -> dict[Key, Record]:
-    """The records that count for a limit.
+    """The records of a planner that count for a limit.
 
-    If a planner was run with this limit on the first problems only, the other problems do not count. For
-    them, only calls that ended by themselves would be known, and those are the easy ones.
+    If the planner was run with this limit on the first problems only, the other problems are left out. For
+    these, only calls that ended before a shorter limit have results, which would select easy problems.
     """
     counted = {key: record for key, of in calls.items() if (record := deciding_record(of, limit)) is not None}
     if len(counted) == len(calls):
@@ -410,8 +429,11 @@ def _comparison(
     places: dict[str, int],
     limit: float,
 ) -> Comparison:
-    counted = {name: _counted(bench, name, problem_set, of, places, limit) for name, of in calls.items()}
-    counted = {name: of for name, of in counted.items() if of}
+    counted = {
+        name: _counted(bench, name, problem_set, planner_calls, places, limit)
+        for name, planner_calls in calls.items()
+    }
+    counted = {name: planner_calls for name, planner_calls in counted.items() if planner_calls}
     shared = set.intersection(*map(set, counted.values())) if counted else set()
     keys = sorted(shared, key=lambda key: (places[key[0]], key[1]))
     outcomes = {
@@ -436,8 +458,7 @@ def _comparison(
             planner,
             tuple(results),
             figures,
-            # results with several seeds on one problem are not independent, so the number of trials is that
-            # of problems
+            # results of several seeds on one problem are not independent, so a trial is a problem
             wilson_interval(round(figures.success / 100 * len(names)), len(names)),
             scores.get(planner, np.nan),
             None if planner == bench.reference or reference is None else compare(lengths[planner], reference),
@@ -464,8 +485,8 @@ def _indicators(outcomes: Sequence[Outcome]) -> Indicators:
 
 
 def _problem_lengths(keys: Sequence[Key], outcomes: Sequence[Outcome]) -> Values:
-    """The joint-space length of each problem [rad]: the median over the seeds, NaN if the planner failed with
-    half or more of them."""
+    """The joint-space length of each problem [rad]: the median over the seeds; NaN if the planner failed with
+    half or more of the seeds."""
     lengths: dict[str, list[float]] = {}
     for (name, _), o in zip(keys, outcomes, strict=True):
         lengths.setdefault(name, []).append(o.joint_length)
@@ -474,7 +495,7 @@ def _problem_lengths(keys: Sequence[Key], outcomes: Sequence[Outcome]) -> Values
 
 
 def curves(calls: dict[str, Calls]) -> tuple[Curve, ...]:
-    """The curves on the problems that every planner was called on."""
+    """The curves of all planners, on the problems that every planner was called on."""
     with_calls = {name: by_key for name, by_key in calls.items() if by_key}
     keys = sorted(set.intersection(*map(set, with_calls.values()))) if with_calls else []
     if not keys:
@@ -487,7 +508,8 @@ def curves(calls: dict[str, Calls]) -> tuple[Curve, ...]:
 
 
 def _curve(planner: str, records: dict[Key, Record], best: dict[Key, float], longest: float) -> Curve:
-    """The curve of a planner. `longest`: the longest limit of any planner [s], where the plot ends."""
+    """The curve of a planner. `best` are the best known lengths [rad]; `longest` is the longest limit of any
+    planner [s], where the plot ends."""
     end = min([longest, *(r.time_limit for r in records.values() if not r.ended_by_itself)])
     solved = {key: r for key, r in records.items() if outcome(r, r.time_limit).found <= end}
     first_times = np.sort([min(r.progress[0][0], end) for r in solved.values()])
@@ -511,40 +533,49 @@ UNEQUAL_NOTE = (
     "† not at equal time: this planner or the reference ended before the limit. `bench run --equal-time` "
     "repeats such calls until the limit."
 )
-NOTES = """\
-- A call counts for a limit if its own limit was at least as long, or if it ended by itself before: more
+NOTES = """\ - A call counts for a limit if its own limit was at least as long, or if it ended by itself
+before its limit, since more
   time would change nothing. A table compares the problems on which all its planners have such a call.
-- success: verified motions found by the limit, with the 95 % interval over problems (Wilson). A motion that
-  a call returned up to 10 % or 50 ms after its own limit counts: planners stop in time, and validation
-  follows.
-- collision: share of problems on which the validator refused the planner's last path because it collides.
-- link length: the paper's, the path lengths of the links that joints move together, mean over the problems
-  that the planner itself solved; planners that solve only easy problems seem short. If a call continued and
-  returned a shorter path, its length by the limit is that of the returned path, scaled by the lengths in
-  joint space.
-- ratio: median of the length in joint space over that of the reference, on problems that both solve, with
-  its 95 % interval (bootstrap over problems), at equal time: for planners that use up the limit. restarted:
-  a planner that ends earlier is called again with other seeds until its calls have used up the limit
-  together, and the shortest path counts; the time for timing the other motions does not.
-- first: median time to the first path of solved problems. returns: mean time until the planner returns;
-  anytime planners use up the limit, and unsolved problems count with it.
-- ComScore: as in the paper, from success, collision, length and time until the planner returns, each from 0
-  for the worst row of the table to 1 for the best. It depends on the rows of the table; those with restarts
+- success: share of problems with a verified motion found by the limit, with the 95 % interval over problems
+(Wilson). A
+  motion that a call returned up to 10 % or 50 ms after its own limit counts: planners stop in time, and
+  validation follows.
+- collision: share of problems on which the validator refused the planner's last path because it collides. -
+link length: the paper's path length, the sum of the path lengths of all links that joints move. It is the
+mean over
+  the problems that the planner itself solved, so planners that solve only easy problems have short paths. If
+  a call continued after the limit and returned a shorter path, the length at the limit is estimated by the
+  length of the returned path, scaled by the ratio of the joint lengths.
+- joint length / a planner: median ratio of the length in joint space to that of the reference planner, on
+problems that
+  both solve, with its 95 % interval (bootstrap over problems). Both planners must use up the limit, so that
+  the ratio is at equal time. restarted: a planner that ends earlier is called again with other seeds until
+  all its calls together have used up the limit, and its shortest path counts. Computing trajectories of the
+  other paths is not counted.
+- first: median time to the first path of solved problems. returns: mean time until the planner returns.
+Anytime planners
+  use up the limit, and unsolved problems count with the limit.
+- ComScore: as in the paper, the mean of success, collision, length and time until the planner returns, each
+scaled from 0
+  for the worst row of the table to 1 for the best. It depends on the rows of the table; rows with restarts
   are left out. `robotdiffuse reproduce table1` computes it among the paper's rows.
-- Quality: means with 95 % intervals of the returned motions, over the solved problems. clearance: a lower
-  bound, to obstacles (scene), of the arm to itself (self), and the smaller of the two. over straight line:
-  duration over the least time along the straight line, obstacles and limits of jerk aside. stops: times
-  that the whole arm rests on the way. peak and mean jerk: of the joint where it is largest. bending: the
-  integral of the squared second derivative of the path, over its squared length. jerk: logarithm of the
-  dimensionless jerk, lower is smoother; sparc: spectral arc length of the joints' and the tip's speed,
-  closer to 0 is smoother.
-- p of success: McNemar's exact test; p of joint length: Wilcoxon's signed ranks; neither is corrected for
-  the number of comparisons. With several seeds, a problem counts as solved if more than half of them are."""
+- Quality: means of the returned motions over the solved problems, with 95 % intervals. clearance: a lower
+bound of the
+  distance to obstacles (scene), between links of the arm (self), and the smaller of the two (min). over
+  straight line: duration divided by the shortest time along the straight line without obstacles and jerk
+  limits. stops: how often the whole arm stops on the way. peak and mean jerk: of the joint with the largest
+  jerk. bending: integral of the squared second derivative of the path, divided by the squared length. jerk:
+  logarithm of the dimensionless jerk, lower is smoother. sparc: spectral arc length of the speed of the
+  joints or of the tip, closer to 0 is smoother.
+- p of success: McNemar's exact test. p of joint length: Wilcoxon's signed-rank test. Neither is corrected for
+the number
+  of comparisons. With several seeds, a problem counts as solved if it is solved with more than half of the
+  seeds."""
 """Notes below the tables, in Markdown."""
 
 
 def named(planner: str) -> str:
-    """The name of a planner in tables: with its settings, and whether it was restarted."""
+    """The name of a planner in tables: with its settings, and with "restarted" for restarts."""
     restarted = ["restarted"] if planner.endswith(RESTARTED) else []
     return ", ".join([*plain_name(planner).split(":"), *restarted])
 
@@ -611,14 +642,14 @@ def tables(section: Section, comparison: Comparison, reference: str) -> list[Tab
 
 
 def _success_in(family: str, row: Row) -> Figure:
-    """The share of a family's calls that are solved."""
+    """The share of solved calls among the calls on a family's problems."""
     calls = [o.solved for o in row.outcomes if o.record.family == family]
     return share_cell(sum(calls) / len(calls), wilson_interval(sum(calls), len(calls)))
 
 
 def main_table(section: Section, comparison: Comparison, reference: str) -> Table:
-    """The table with the paper's columns, with intervals and with the ratio of lengths to the reference
-    planner's."""
+    """The table with the paper's columns, intervals, and the ratio of path lengths to the reference
+    planner."""
     spec: Spec = (
         (Column("success", "%", better="more"), lambda row: row.success),
         (Column("collision", "%", ".1f", "less"), lambda row: row.figures.collision),
@@ -650,8 +681,8 @@ def _table(heading: str, rows: Sequence[Row], spec: Spec) -> Table:
 
 
 def _ratio(comparison: Comparison, reference: str) -> PlannerColumn:
-    """A column with the ratio of path lengths to those of the reference planner, and its interval; empty for
-    a planner whose row with restarts has this ratio."""
+    """A column with the ratio of path lengths to those of the reference planner, and its interval. It is
+    empty for a planner that ended early and also has a row with restarts, which shows the ratio."""
     full = {row.planner: row.full for row in comparison.rows}
 
     def ratio(row: Row) -> Cell:
@@ -674,7 +705,7 @@ def _metric(metric: Metric) -> PlannerColumn:
 
 
 def _of_pair(heading: str, cell: Callable[[Paired], Cell]) -> PlannerColumn:
-    """A column of comparisons with the reference on the same problems."""
+    """A column of the paired comparison with the reference planner."""
     return Column(heading), lambda row: row.paired and cell(row.paired)
 
 
@@ -686,7 +717,7 @@ def probability(p: float) -> str:
 
 
 def success_over_time(section: Section, planners: Sequence[str]) -> str:
-    """Draw the share of problems solved over time, as in the paper's figure."""
+    """Draw the share of solved problems over time, as in the paper's figure 3a; returns SVG."""
 
     def steps(curve: Curve) -> tuple[ndarray, ndarray]:
         solved = np.arange(len(curve.found) + 1)
@@ -697,7 +728,7 @@ def success_over_time(section: Section, planners: Sequence[str]) -> str:
 
 
 def length_over_time(section: Section, planners: Sequence[str]) -> str:
-    """Draw the median length over time."""
+    """Draw the median ratio of path length to the best known length over time; returns SVG."""
     label = "joint length / best known"
     return _over_time(section.curves, planners, label, lambda curve: (curve.times, curve.ratios))
 
@@ -708,7 +739,8 @@ def _over_time(
     label: str,
     data: Callable[[Curve], tuple[ndarray, ndarray]],
 ) -> str:
-    """Curves of planners, solid with a network and dashed for search; restarts have the planner's color."""
+    """Draws curves: solid for planners with a network, dashed for search. A planner with restarts has the
+    same color as without."""
     names = list(dict.fromkeys(map(plain_name, planners)))
 
     def fill(figure: "PlotFigure") -> None:
@@ -734,9 +766,10 @@ def _over_time(
 
 
 def bench_report(bench: Bench, parts: Sequence[Section], replays: str | None = None) -> Report:
-    """The report of a bench. `replays`: file name of a page with replays, in the same folder.
+    """The report of a bench. `replays` is the file name of a page with replays in the same folder, to which
+    the report links.
 
-    Raises InputError without matplotlib.
+    Raises InputError if matplotlib is not installed.
     """
     planners = list(bench.records)
     report = Report(f"Bench {bench.folder.resolve().name}")
@@ -770,7 +803,7 @@ def bench_report(bench: Bench, parts: Sequence[Section], replays: str | None = N
 
 
 def missing_line(comparison: Comparison) -> str:
-    """A line that names the planners missing from the table; empty if there are none."""
+    """A line that names the planners missing from the table; an empty string if none is missing."""
     if not comparison.missing:
         return ""
     return (
@@ -779,7 +812,7 @@ def missing_line(comparison: Comparison) -> str:
 
 
 def about(bench: Bench) -> list[str]:
-    """Machine, dates and versions of the sessions, a line for each combination."""
+    """Machine, dates and versions of the sessions: one line for each combination of machine and versions."""
     dates: dict[str, list[str]] = {}
     for run in bench.sessions:
         versions = ", ".join(f"{name} {version}" for name, version in run["versions"].items())
@@ -787,14 +820,14 @@ def about(bench: Bench) -> list[str]:
         text = f"{machine}, {run.get('workers', '?')} at once; Python {run.get('python', '?')}, {versions}"
         dates.setdefault(text, []).append(run["date"])
     return [
-        f"{of[0] if min(of) == max(of) else f'{min(of)} to {max(of)}'} UTC: {text}"
-        for text, of in dates.items()
+        f"{days[0] if min(days) == max(days) else f'{min(days)} to {max(days)}'} UTC: {text}"
+        for text, days in dates.items()
     ]
 
 
 def facts(bench: Bench) -> list[str]:
-    """How much was run."""
-    records = [record for of_planner in bench.records.values() for record in of_planner]
+    """Numbers of planners, problems and calls."""
+    records = [record for planner_records in bench.records.values() for record in planner_records]
     problems = {(record.problem_set, record.name) for record in records}
     minutes = sum(record.time for record in records) / 60
     solved = sum(record.solved for record in records)
@@ -805,7 +838,7 @@ def facts(bench: Bench) -> list[str]:
 
 
 def crashes(bench: Bench) -> list[str]:
-    """The reasons of crashes, overruns and exceptions with their numbers."""
+    """One line for each reason of crashes, overruns and exceptions, with its count."""
     counts = Counter(
         f"{planner}, {record.status}: {record.reason}"
         for planner, records in bench.records.items()
@@ -819,7 +852,8 @@ def crashes(bench: Bench) -> list[str]:
 
 MAX_REPLAYS = 12
 SOLVED_PROBLEMS = 2
-"""Number of solved problems in the replays, each with two planners. The other replays show failures."""
+"""Number of solved problems in the replays, each with the motions of two planners. The other replays show
+failures."""
 
 
 class Replay(NamedTuple):
@@ -832,11 +866,12 @@ class Replay(NamedTuple):
 
 
 def motions_to_replay(bench: Bench, parts: Sequence[Section]) -> list[Replay]:
-    """The shortest and the longest motion for the problems with the longest detours, then motions for
-    problems on which the reference, or else another planner, failed.
+    """Motions to replay: for the problems with the longest detours, the shortest and the longest motion.
+    Then, for problems on which planners failed, motions that solve them; failures of the reference planner
+    come first.
 
-    The motions are those of the main time limit of their problem set; only problems that are stored in the
-    folder count.
+    Motions are those of the main comparison of each problem set. Only problems that are stored in the folder
+    are considered.
     """
     tries: list[tuple[Case, list[Record], dict[str, str]]] = []
     for section in (section for section in parts if section.name == section.problem_set):
@@ -845,7 +880,7 @@ def motions_to_replay(bench: Bench, parts: Sequence[Section]) -> list[Replay]:
         for case in read_cases(bench.folder, section.problem_set):
             key = case.name, main.keys[0][1]
             if key in main.keys:
-                records = (deciding_record(of_planner[key], main.limit) for of_planner in calls)
+                records = (deciding_record(planner_calls[key], main.limit) for planner_calls in calls)
                 outcomes = [outcome(record, main.limit) for record in records if record is not None]
                 solved = [o.record for o in outcomes if o.solved]
                 solved.sort(key=lambda record: record.joint_length or 0.0)
@@ -858,21 +893,22 @@ def motions_to_replay(bench: Bench, parts: Sequence[Section]) -> list[Replay]:
             extreme = "shortest" if record is solved[0] else "longest"
             caption = f"{record.joint_length:.2f} rad, {extreme}, in {seconds(record.time)} s"
             replays.append(Replay(f"{record.planner} · {case.name}", caption, case, record.waypoints))
-    rest = sorted(
+    further_tries = sorted(
         tries[SOLVED_PROBLEMS:], key=lambda attempt: (bench.reference not in attempt[2], len(attempt[1]))
     )
-    replays += [replay for attempt in rest for replay in _failure(*attempt, bench.reference)]
+    replays += [replay for attempt in further_tries for replay in _failure(*attempt, bench.reference)]
     return replays[:MAX_REPLAYS]
 
 
 def _detour(record: Record) -> float:
-    """Length of a motion divided by the length of the straight line between its ends."""
+    """Length of a motion divided by the length of the straight line from its start to its goal."""
     straight = float(np.linalg.norm(record.waypoints[-1] - record.waypoints[0]))
     return (record.joint_length or 0.0) / max(straight, 1e-6)
 
 
 def _failure(case: Case, solved: list[Record], failed: dict[str, str], reference: str) -> Iterator[Replay]:
-    """A motion that solves a problem on which planners failed, or the straight line."""
+    """A replay of a problem on which a planner failed: another planner's motion, or the straight line if none
+    solved it. Yields nothing if no planner failed."""
     goal = case.problem.goal
     if failed and solved:
         loser = reference if reference in failed else next(iter(failed))

@@ -1,6 +1,8 @@
-"""Checks of motions. Of a data set: every shard is complete, and motions pass the validator and PyBullet on
-meshes; problems are rebuilt from their rows alone, results of the generation are not trusted. Of a bench: its
-motions pass PyBullet, a second validator with its own kinematics.
+"""Checks the motions of data sets and benches.
+
+In a data set, every shard must be complete, and motions must pass the validator and PyBullet's collision
+check of meshes. Problems are rebuilt from the stored rows, and results that the generation of data stored are
+measured again. In a bench, motions must pass PyBullet, a second validator with its own kinematics.
 """
 
 import sys
@@ -55,32 +57,32 @@ EXAMPLES_PER_KIND = 5
 """Number of findings of each kind that are listed."""
 
 LIMIT_SLACK = 1e-6
-"""Tolerance of limits [rad], as waypoints are in single precision."""
+"""Tolerance of joint limits [rad], since waypoints have single precision."""
 CLEARANCE_TOLERANCE = 1e-4
-"""Largest difference between the recorded clearance and the minimum over the waypoints of the clearance of
-the covering spheres [m]."""
+"""Largest difference between the recorded clearance and the measured one: the smallest clearance of the
+covering spheres over the waypoints [m]."""
 COST_TOLERANCE = 0.05
-"""Largest fraction by which the path through the waypoints, which cuts corners, may be shorter than the
-recorded length."""
+"""Largest fraction by which the path through the stored waypoints, which cuts corners, may be shorter than
+the recorded length."""
 ROUNDING = 1e-4
-"""Largest fraction by which the path through the waypoints may be longer than the recorded length; also the
-tolerance of the detour."""
+"""Largest fraction by which the path through the stored waypoints may be longer than the recorded length;
+also the tolerance of the detour."""
 PYBULLET_STEP = 0.01
-"""PyBullet checks every waypoint, and configurations between them at most this far apart [rad, joint-space
-L2]."""
+"""PyBullet checks the waypoints, and configurations between them that are at most this far apart [rad,
+joint-space L2]."""
 PYBULLET_TOLERANCE = 0.001
-"""Contacts of less depth are rounding errors of Bullet [m]."""
+"""Contacts of smaller depth count as rounding errors of Bullet [m]."""
 MOTIONS_PER_TASK = 100
-"""Number of motions of a shard that a process checks in one task."""
+"""Largest number of motions that a process checks in one task; all are of the same shard."""
 
 
 Defects = Iterator[tuple[str, str]]
-"""Defects, each as kind and message."""
+"""Defects of a motion, each as kind and message."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A defect."""
+    """A defect of a data set."""
 
     kind: str
     """One of KINDS."""
@@ -96,7 +98,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class DataCheck:
-    """The result of a check."""
+    """The result of checking a data set."""
 
     robot: str
     shards: int
@@ -108,23 +110,23 @@ class DataCheck:
     checked: int
     """Number of motions that were validated."""
     pybullet: bool
-    """Whether PyBullet checked too."""
+    """Whether PyBullet checked the motions too."""
     findings: tuple[Finding, ...]
-    """Findings, ordered by shard and row."""
+    """Damaged shards first, then findings by shard and row."""
     least_clearance: float
-    """Smallest recorded distance between arm and obstacles over all validated motions [m]; NaN if there are
-    none."""
+    """Smallest recorded distance between arm and obstacles over all validated motions [m]; NaN without
+    motions."""
     seconds: float
     """Wall time of the check [s]."""
 
     @property
     def counts(self) -> Counter[str]:
-        """Findings by kind."""
+        """Number of findings by kind."""
         return Counter(finding.kind for finding in self.findings)
 
     @property
     def tables(self) -> list[Table]:
-        """A table of the result, and one of the first examples of each kind."""
+        """A table of the result and, if there are findings, a table with the first findings of each kind."""
         planned = f" of {self.planned:,} planned" if self.motions < self.planned else ""
         rate = self.checked / max(self.seconds, 1e-9)
         counts = {kind: f"{self.counts[kind]:,}" for kind in KINDS if self.pybullet or kind != "pybullet"}
@@ -157,16 +159,23 @@ def check_data(
 ) -> DataCheck:
     """Check the structure of every shard, and `count` random motions (all by default).
 
-    The problem of each motion is rebuilt from its row. The validator checks ends, limits and collisions;
-    PyBullet checks collisions on meshes at and between the waypoints. Recorded values are compared with
-    measured ones.
+    The problem of each motion is rebuilt from its row. The validator checks start, goal, limits and
+    collisions. PyBullet checks the meshes for collisions at and between the waypoints. Recorded values are
+    compared with measured values.
 
-    robot: that of the data; None: found by the name in the manifest.
-    workers: processes; motions and findings do not depend on the number of workers.
-    progress: called with the numbers of motions done and in all, first with 0.
+    Args:
+        folder: Folder of the data set.
+        robot: The robot of the data; None: the robot with the name in the manifest.
+        count: Number of motions to check.
+        seed: Seed for choosing the motions.
+        workers: Number of processes. Motions and findings do not depend on it.
+        pybullet: Whether PyBullet checks the motions.
+        progress: Called with the number of checked motions and the total number, first with 0.
 
-    Raises InputError if there is no data set, for another robot than that of the data, and if PyBullet is
-    asked for but not installed.
+    Raises:
+        InputError: If there is no data set, for another robot than that of the data, and if PyBullet is
+        required but not
+            installed.
     """
     began = time.perf_counter()
     manifest = read_manifest(folder)
@@ -212,7 +221,7 @@ def check_data(
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """The work of a process; it is pickled."""
+    """The work of a process. Objects are pickled to be sent to processes."""
 
     folder: str
     manifest: Manifest
@@ -220,14 +229,14 @@ class _Task:
     pybullet: bool
 
     def size(self, index: int) -> int | str:
-        """Number of rows of a shard, or the defect of the shard."""
+        """Number of rows of a shard, or a message about its defect."""
         try:
             return len(check_shard(self.folder, index, self.manifest))
         except InputError as error:
             return str(error)
 
     def validate(self, index: int, rows: Int[ndarray, "n"]) -> tuple[list[Finding], float]:
-        """Findings in some rows of a shard, and the least clearance recorded."""
+        """Findings in some rows of a shard, and the smallest clearance that these rows record [m]."""
         shard = read_shard(self.folder, index)
         findings = [
             Finding(kind, index, row, text)
@@ -247,7 +256,7 @@ class _Task:
                 try:
                     oracle.set_scene(scenes_of(self.manifest, shard, slice(row, row + 1)).scene(0))
                 except InputError:
-                    continue  # already a finding
+                    continue  # `_defects` reports a scene that cannot be built
                 path = path_of(self.robot, shard, row)
                 contact = oracle.check_path(path, PYBULLET_STEP, PYBULLET_TOLERANCE)
                 if contact is not None:
@@ -258,7 +267,7 @@ class _Task:
 
 
 def _defects(task: _Task, shard: Shard, row: int) -> Defects:
-    """Kind and message of each defect of a motion, without PyBullet."""
+    """The defects of a motion, without those that PyBullet finds."""
     robot = task.robot
     path = path_of(robot, shard, row)
     yield from _ends(shard, row)
@@ -332,29 +341,32 @@ class Confirmation:
     checked: dict[str, int]
     """Number of checked motions by planner."""
     refuted: "list[tuple[Record, OracleContact]]"
-    """Records of motions that were returned as solved but collide according to PyBullet, each with the first
-    contact."""
+    """Records of motions that planners returned as solved but that collide according to PyBullet, each with
+    the first contact."""
 
 
 def confirm(out: FilePath, count: int | None, progress: Callable[[int, int], None]) -> Confirmation:
-    """Check the returned motions in a folder of `bench run`.
+    """Check the returned motions in a folder of `bench run` with PyBullet.
 
-    count: first problems of each set; None: all.
-    progress: called with the numbers of problems done and in all.
+    Args:
+        out: The folder.
+        count: Number of problems of each set to check, from the first on; None: all.
+        progress: Called with the number of checked problems and the total number.
 
-    Raises InputError if the folder holds no records or is damaged, and without PyBullet.
+    Raises:
+        InputError: If the folder has no records or is damaged, or PyBullet is not installed.
     """
     from robotdiffuse.simulation.validator import PyBulletOracle
 
-    records = [record for of_planner in read_records(out).values() for record in of_planner]
+    records = [record for planner_records in read_records(out).values() for record in planner_records]
     solved: dict[tuple[str, str], list[Record]] = {}
     for record in records:
         if record.solved:
             solved.setdefault((record.problem_set, record.name), []).append(record)
     sets = {name: read_cases(out, name) for name in sorted({record.problem_set for record in records})}
-    lost = solved.keys() - {case.key for cases in sets.values() for case in cases}
-    if lost:
-        problem_set, name = min(lost)
+    missing_problems = solved.keys() - {case.key for cases in sets.values() for case in cases}
+    if missing_problems:
+        problem_set, name = min(missing_problems)
         raise InputError(f"{out}/problems lacks {name} of {problem_set}, which has results")
     chosen = [case for cases in sets.values() for case in cases[:count] if case.key in solved]
     checked = {record.planner: 0 for record in records}

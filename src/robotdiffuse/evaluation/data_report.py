@@ -1,4 +1,4 @@
-"""The report of a data set: its figures as tables and plots."""
+"""The report of a data set: its statistics as tables and plots."""
 
 from collections import Counter
 from dataclasses import dataclass, field
@@ -35,9 +35,10 @@ QUANTITIES = {
 SPREAD = {"least": 0.0, "5 %": 0.05, "median": 0.5, "95 %": 0.95, "most": 1.0}
 """Quantiles of each quantity over the motions."""
 SAMPLED_MOTIONS = 20_000
-"""Number of motions, spread evenly over the data set, whose larger arrays are kept for the plots."""
+"""Approximate number of motions, spread evenly over the data set, for plots of larger arrays
+(ARRAYS_OF_SAMPLE)."""
 SAMPLED_WAYPOINTS = 24
-"""Number of waypoints that are kept of each of these motions, spread evenly."""
+"""Number of waypoints that are read of each of these motions, spread evenly."""
 ARRAYS_OF_ALL = ("cost", "clearance", "end_clearance", "safety_distance", "line_free", "detour", "family")
 """Arrays that are read for all motions."""
 ARRAYS_OF_SAMPLE = ("goal_costs", "trajectories")
@@ -45,7 +46,8 @@ ARRAYS_OF_SAMPLE = ("goal_costs", "trajectories")
 ARRAYS_OF_SCENES = ("obstacle_kinds", "obstacle_params")
 """Arrays from which the split of a row is computed."""
 OUTCOMES = ("solved", "unsolved", "refused", "thinned")
-"""Outcomes of problems."""
+"""Outcomes of problems that the generation of data tried; thinned problems were left out because they are
+trivial."""
 DETOURS = {
     "trivial": (0.0, 0.5),
     "up to 5 % longer": (0.5, 1.05),
@@ -58,22 +60,23 @@ CLEARANCES = {
     "2 to 5": (0.02, 0.05),
     "over 5": (0.05, np.inf),
 }
-"""Classes of motions: those with a free line, by detour, and by clearance [m]."""
+"""Classes of motions by detour (path length over straight-line length; "trivial" if the straight line is
+free), and by clearance [m]: lower bound, and exclusive upper bound."""
 SAFETY_TOLERANCE = 0.002
-"""A motion may come closer than the safety distance by this much [m], since straight lines between waypoints
-cut corners."""
+"""A motion may come closer to obstacles than the safety distance by this much [m], since straight lines
+between waypoints cut corners."""
 
 
 @dataclass(frozen=True, eq=False)
 class DataFigures:
-    """Arrays of a data set, in the order of its shards, and figures computed from them."""
+    """Arrays of a data set, in the order of its shards, and statistics computed from them."""
 
     manifest: Manifest
     shards: int
     bytes: int
-    """Size on disk."""
+    """Size of the data set on disk [bytes]."""
     counts: Counter[str]
-    """Number of problems over all shards: all that were `tried`, and by outcome (see OUTCOMES)."""
+    """Numbers of problems over all shards: "tried" for all problems, and one number for each of OUTCOMES."""
     splits: dict[str, int]
     """Number of trajectories, by split."""
     all: dict[str, ndarray] = field(repr=False)
@@ -88,19 +91,20 @@ class DataFigures:
 
     @cached_property
     def families(self) -> dict[str, Mask]:
-        """The motions of each family that occurs."""
+        """Mask of the motions of each family that occurs in the data."""
         masks = {name: self.all["family"] == i for i, name in enumerate(self.manifest.families)}
         return {name: chosen for name, chosen in masks.items() if chosen.any()}
 
     @property
     def safety_distance(self) -> float:
-        """The safety distance with which searches begin [m]: the largest one in the data."""
+        """The safety distance with which searches of the data generation begin [m]: the largest one in the
+        data."""
         return float(self.all["safety_distance"].max())
 
 
 def read_figures(folder: str | FilePath) -> DataFigures:
-    """Read the arrays of figures and plots, one shard at a time. Raises InputError if there is no data set,
-    or it is damaged or empty."""
+    """Read the arrays for tables and plots, one shard at a time. Raises InputError if there is no data set,
+    or if it is damaged or empty."""
     manifest = read_manifest(folder)
     indices = existing_shards(folder)
     step = max(1, manifest.trajectories // SAMPLED_MOTIONS)
@@ -131,7 +135,7 @@ def read_figures(folder: str | FilePath) -> DataFigures:
 
 
 def facts(data: DataFigures) -> list[tuple[str, str]]:
-    """Captions and figures."""
+    """The main statistics of a data set, as pairs of caption and text."""
     manifest = data.manifest
     counts = data.counts
     planned = f" of {manifest.trajectories:,}" if data.trajectories < manifest.trajectories else ""
@@ -203,15 +207,15 @@ def tables(data: DataFigures) -> list[Table]:
 
 BINS = 50
 LAST_QUANTILE = 0.995
-"""Histograms end at this quantile; the last bar holds all larger values."""
+"""Histograms end at this quantile of the values; the last bar includes all larger values."""
 
 
 def write_page(folder: str | FilePath, file: str | FilePath, robot: Robot | None = None) -> DataFigures:
-    """Write tables and plots as .html and return the figures.
+    """Write tables and plots of a data set to an .html file, and return the statistics.
 
-    robot: that of the data; None: found by the name in the manifest.
-
-    Raises InputError without matplotlib, for a file that cannot be written, and as `read_figures` does.
+    `robot` is the robot of the data; None: the robot with the name in the manifest. Raises InputError if
+    matplotlib is not installed, for a file that cannot be written, and in the cases in which `read_figures`
+    raises it.
     """
     target = check_output(file, (".html", ".htm"))
     data = read_figures(folder)
@@ -252,7 +256,7 @@ def data_report(data: DataFigures, name: str) -> Report:
 
 
 def _motions(data: DataFigures) -> Histograms:
-    """The quantities by family; detours of motions whose straight line is not free."""
+    """Histograms of the quantities by family; detours without trivial motions."""
     panels: Histograms = {}
     for name, column in QUANTITIES.items():
         low = float(name == "detour")
@@ -265,7 +269,8 @@ def _motions(data: DataFigures) -> Histograms:
 
 
 def _goals(data: DataFigures) -> Histograms:
-    """The numbers of given and reached goals, and the excess cost of those that are not the best."""
+    """Histograms of the numbers of given and reached goals, and of the excess cost of all reached goals
+    except the best."""
     costs = data.sample["goal_costs"].astype(np.float64)
     numbers = {"given": (~np.isnan(costs)).sum(axis=1), "reached": np.isfinite(costs).sum(axis=1)}
     excess = 100 * (costs / np.nanmin(np.where(np.isinf(costs), np.nan, costs), axis=1, keepdims=True) - 1)

@@ -1,7 +1,7 @@
-"""Methods that can be run: planners, and networks that sample. Each yields its records with the validator's
-verdict.
+"""Methods for `runs`: planners, and networks or controls that sample trajectories. Each method yields the
+fields of its records, including the validator's verdict.
 
-The validator's time counts only where it is part of a planner's call.
+The time of a planner's call includes its validation; the time of sampling does not.
 """
 
 import hashlib
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from robotdiffuse.learning.motion_model import ClearanceFn
 
 NETWORK_ALONE = DiffusionSettings(sampling_steps=6, guidance_steps=4)
-"""Planner settings with which the samples of networks are measured."""
+"""Planner settings for measuring single samples of networks, without search."""
 UNSOLVED = Status.NO_PATH.value
 
 
@@ -53,7 +53,7 @@ UNSOLVED = Status.NO_PATH.value
 
 
 def planned(planner: Planner, **request: Any) -> Method:
-    """A planner in this process, as a method; `request` holds further arguments of its `plan`."""
+    """A method that calls a planner in this process; `request` are further arguments of `Planner.plan`."""
 
     def call(run: Run) -> Iterator[Fields]:
         yield from planner_calls(planner, run.problem, run.seed, run.limit, False, request)
@@ -69,8 +69,8 @@ def planner_calls(
     restarts: bool,
     request: Mapping[str, Any],
 ) -> Iterator[Fields]:
-    """Yield the fields of a call's record; with `restarts`, if the call ended early, also those of
-    `restarted`. An exception is a record too."""
+    """Yields the fields of a call's record. With `restarts`, if the call ended early, it also yields the
+    fields of the record of all calls together (`restarted`). An exception gives a record too."""
     began = time.perf_counter()
     try:
         with Clock() as clock:
@@ -93,11 +93,11 @@ def restarted(
     first: PlanResult,
     request: Mapping[str, Any],
 ) -> tuple[int, PlanResult]:
-    """Call a planner again with fresh seeds until its calls have used up the time limit together.
+    """Call a planner again with new seeds until all its calls together have used up the time limit.
 
-    Returns the number of further calls and the shortest path of all, with the times at which paths were
-    found. Stops early if no shorter path exists. The time for timing the other paths does not count: a single
-    call times its answer only.
+    Returns the number of further calls and the result with the shortest path. Its `progress` has the times at
+    which paths were found, over all calls. Stops early if no shorter path can exist. Time that calls spend on
+    computing trajectories is not counted.
     """
     straight = 0.0
     if isinstance(problem.goal, JointGoal):
@@ -121,12 +121,12 @@ def restarted(
 
 
 def _length(result: PlanResult) -> float:
-    """Length of the path [rad]; infinite if there is no motion."""
+    """Length of the path [rad]; infinite if there is no path."""
     return np.inf if result.path_length is None else result.path_length
 
 
 def fields_of(result: PlanResult, robot: Robot) -> Fields:
-    """The fields of a result's record."""
+    """The fields of the record of a planner's result."""
     record: dict[str, Any] = {
         "status": result.status.value,
         "reason": result.reason,
@@ -156,11 +156,12 @@ class Validated(NamedTuple):
     """Which trajectories are in collision."""
     reports: list[Report]
     waypoints: Trajectories
-    """The trajectories; their first and last waypoints are exactly start and goal."""
+    """The trajectories, with exact start and goal as first and last waypoint."""
 
 
 def validated(problem: Problem, q: Trajectories) -> Validated:
-    """Validate trajectories as they are, except that their ends are made exact."""
+    """Validate trajectories without repairing them; only first and last waypoint are set to the exact start
+    and goal."""
     validator = verifier(problem, VerifySettings())
     exact = q.astype(np.float64)
     exact[:, 0], exact[:, -1] = problem.start, goal_of(problem)
@@ -172,12 +173,13 @@ def validated(problem: Problem, q: Trajectories) -> Validated:
 
 
 def path_lengths(q: Trajectories) -> Values:
-    """Joint-space lengths [rad]."""
+    """Joint-space length of each trajectory [rad]."""
     return np.linalg.norm(np.diff(q, axis=1), axis=2).sum(axis=1)
 
 
 def sampled(draw: Draw, lengths: Callable[[ndarray], ndarray] = path_lengths) -> Method:
-    """A method that validates a batch of trajectories as they are and measures the shortest that passes."""
+    """A method that validates a batch of sampled trajectories, and measures the shortest valid one by
+    `lengths`."""
 
     def call(run: Run) -> Iterator[Fields]:
         problem = run.problem
@@ -202,8 +204,8 @@ def sampled(draw: Draw, lengths: Callable[[ndarray], ndarray] = path_lengths) ->
 
 
 def sampling_digest(settings: DiffusionSettings | ControlSettings, folder: FilePath | None) -> str:
-    """Identifies in the names of methods what samples depend on: the settings, and the network's weights in a
-    folder, if there is a network."""
+    """A hash of everything that samples depend on: the settings, and the weights in the folder of a network,
+    if there is a network. It is part of the names of methods."""
     weights = None if folder is None else json.loads((folder / "model.json").read_text())["weights_sha256"]
     about = json.dumps(asdict(settings) | {"weights": weights}, sort_keys=True)
     return hashlib.sha256(about.encode()).hexdigest()[:12]
@@ -214,10 +216,12 @@ def from_network(
     encoded: Callable[[Run], Problem] | None = None,
     clearances: "ClearanceFn | None" = None,
 ) -> Draw:
-    """Samples of the network: no refinement, no search, no shortcuts.
+    """Draws samples of the network, without refinement, search or shortcuts.
 
-    encoded: the problem whose obstacles are encoded, in place of the run's own.
-    clearances: a function whose result replaces the true inputs of the denoiser.
+    Args:
+        sampler: The planner with the network. encoded: Returns a problem for a run; the scene of this problem
+        is encoded in place of the scene of the run. clearances: Replaces the function that computes the
+        clearances, inputs of the denoiser.
     """
 
     def draw(run: Run, checker: CollisionChecker) -> ndarray:
@@ -232,7 +236,7 @@ def from_network(
 
 
 def from_control(settings: ControlSettings) -> Draw:
-    """Candidates of a control."""
+    """Draws the candidates of a control."""
     control = Control(settings)
 
     def draw(run: Run, checker: CollisionChecker) -> ndarray:

@@ -1,4 +1,4 @@
-"""Metrics of motions. A metric that is added to _METRICS appears in records, tables, plots and pages."""
+"""Metrics of motions. A metric that is added to _METRICS appears in all records and tables."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,33 +20,33 @@ from robotdiffuse.validation.report import Report
 from robotdiffuse.validation.tolerances import sample_path
 
 STEP = 0.02
-"""Longest step along a path when the lengths of link paths are measured [rad, joint-space L2]. Arcs then come
-out too short by at most 0.002 %."""
+"""Longest step along a path for measuring lengths of link paths [rad, joint-space L2]. Measured arcs are too
+short by at most 0.002 %."""
 SAMPLE_TIME = 0.01
-"""Time between the rows that smoothness is measured at [s]."""
+"""Time between the states at which smoothness is measured [s]."""
 STANDSTILL = 1e-6
-"""A motion shorter than this [rad] or [m] stands still."""
+"""A motion shorter than this counts as standing still [rad] or [m]."""
 CUTOFF = 10.0
 THRESHOLD = 0.05
 PADDING = 4
-"""Parameters of the spectral arc length, from its paper. CUTOFF: highest frequency [Hz]. THRESHOLD: least
+"""Parameters of the spectral arc length, from its paper. CUTOFF: highest frequency [Hz]. THRESHOLD: smallest
 amplitude, as a fraction of the amplitude at frequency 0. PADDING: zeros are appended until the number of
 samples is a power of two and has grown by a factor of 2^PADDING to 2^(PADDING + 1)."""
 BENDING_SAMPLES = 129
-"""Number of evenly spaced places of a path at which bending is measured."""
+"""Number of evenly spaced samples of a path for measuring bending."""
 DIGITS = 7
 """Number of significant digits of values in records."""
 
 
 Verdict = Report | PlanResult
-"""Holds the clearances of a motion that passed the validator."""
+"""A result with the clearances of a motion that passed the validator."""
 
 
 def link_length(robot: Robot, q: Float[ndarray, "n waypoints dof"]) -> Values:
-    """The paper's path length: the sum over the links that joints move, such as links 1 to 7 of the Panda, of
-    the path lengths of their origins [m].
+    """The paper's path length: the path lengths of the origins of all links that joints move, such as links 1
+    to 7 of the Panda, added up [m].
 
-    Links that are fixed to these, such as hand and fingers, are left out: they would count the last link
+    Links that are fixed to these links, such as the hand, are left out, since they would count the last link
     several times. The paper's arm has no hand.
     """
     at = forward_frames(robot, q.reshape(-1, q.shape[-1]))[:, 1:, :3, 3]
@@ -56,21 +56,22 @@ def link_length(robot: Robot, q: Float[ndarray, "n waypoints dof"]) -> Values:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A motion to be measured; values that several metrics need are computed once."""
+    """A motion to be measured. Values that several metrics need are computed once."""
 
     robot: Robot
     path: Path
     trajectory: Trajectory | None
-    """The timed motion; None for a path alone, which has no metrics of time."""
+    """The timed motion; None for a path without times, for which metrics of time are None."""
     verdict: Verdict | None
 
     @cached_property
     def fine(self) -> Configurations:
+        """The path, sampled with steps of at most STEP."""
         return sample_path(self.path.positions, STEP)[1]
 
 
 Measure = Callable[[Motion], float | None]
-"""Returns the value in SI units, as in records; None if the motion has none."""
+"""Returns the value of a metric in SI units, as in records; None if the motion does not have it."""
 
 
 @dataclass(frozen=True)
@@ -78,15 +79,16 @@ class Metric:
     """A number that is computed for each motion."""
 
     name: str
-    """Name of the metric in records; in tables with spaces."""
+    """Name of the metric in records. Tables show it with spaces in place of underscores."""
     unit: str
     """Unit in tables."""
     better: Literal["more", "less", ""]
+    """Whether larger or smaller values are better."""
     format: str
     """Format of numbers, such as `.2f`."""
     measure: Measure
     scale: float = 1.0
-    """Units of tables per SI unit."""
+    """Factor from SI units to the unit of tables."""
 
     @property
     def heading(self) -> str:
@@ -94,18 +96,18 @@ class Metric:
 
 
 def _clearance(name: str) -> Measure:
-    """A metric that reads a field of the verdict: a lower bound of distances along the motion [m]."""
+    """A metric that reads a field of the verdict: a lower bound of the clearance along the motion [m]."""
     return lambda motion: getattr(motion.verdict, name, None)
 
 
 def _timed(measure: Callable[[Trajectory, Robot], float | None]) -> Measure:
-    """A metric of timed motions."""
+    """A metric that only timed motions have."""
     return lambda motion: None if motion.trajectory is None else measure(motion.trajectory, motion.robot)
 
 
 def _over_straight_line(trajectory: Trajectory, robot: Robot) -> float | None:
-    """The duration, divided by the least time for the straight line from the first row to the last, without
-    obstacles and limits of jerk."""
+    """The duration of the motion, divided by the shortest time along the straight line from its first to its
+    last configuration. For the straight line, obstacles and jerk limits are ignored."""
     if min(robot.velocity.min(), robot.acceleration.min()) <= 0:
         return None
     q = trajectory.positions
@@ -114,8 +116,8 @@ def _over_straight_line(trajectory: Trajectory, robot: Robot) -> float | None:
 
 
 def _joint_jerk(statistic: Callable[[ndarray, ndarray], float]) -> Measure:
-    """A metric that `statistic` computes from two arrays: for each step between rows, the largest jerk of any
-    joint and the duration of the step."""
+    """A metric that `statistic` computes from two arrays: the largest jerk of any joint in each step between
+    rows, and the durations of the steps."""
 
     def value(trajectory: Trajectory, _: Robot) -> float | None:
         steps = np.diff(trajectory.times)
@@ -128,7 +130,8 @@ def _joint_jerk(statistic: Callable[[ndarray, ndarray], float]) -> Measure:
 
 
 def _sparc(tip: bool) -> Measure:
-    """A metric of the spectral arc length of the speed of the joints, or of the tip."""
+    """The metric spectral arc length, of the speed of the tip or of the joints (the norm of their
+    velocities)."""
 
     def value(trajectory: Trajectory, robot: Robot) -> float:
         state, step = _evenly(trajectory)
@@ -142,8 +145,7 @@ def _sparc(tip: bool) -> Measure:
 
 
 _METRICS = (
-    # joint_length: Euclidean in joint space. link_length: the paper's, summed over the origins of all moving
-    # links
+    # joint_length: Euclidean length in joint space; link_length: see the function
     Metric("joint_length", "rad", "less", ".3f", lambda m: m.path.length),
     Metric("link_length", "m", "less", ".2f", lambda m: link_length(m.robot, m.fine[None])[0]),
     Metric(
@@ -177,8 +179,7 @@ METRICS = {metric.name: metric for metric in _METRICS}
 def measured(
     robot: Robot, path: Path, trajectory: Trajectory | None = None, verdict: Verdict | None = None
 ) -> dict[str, float]:
-    """Values of METRICS by name, without those that the motion does not have; lengths are 0 for a motion that
-    stands still."""
+    """Values of METRICS by name, without metrics that the motion does not have."""
     motion = Motion(robot, path, trajectory, verdict)
     values = {name: metric.measure(motion) for name, metric in METRICS.items()}
     return {name: float(f"{x:.{DIGITS}g}") for name, x in values.items() if x is not None}
@@ -186,7 +187,8 @@ def measured(
 
 def bending(positions: Configurations) -> float:
     """The integral of |q''(u)|^2 du for u in [0, 1], divided by the squared length of the path; 0 for a
-    straight line. The path is sampled at BENDING_SAMPLES places."""
+    straight line. u is the fraction of the path length; the path is sampled at BENDING_SAMPLES values of
+    u."""
     length = Path((), positions).length
     if length < STANDSTILL:
         return 0.0
@@ -200,7 +202,7 @@ def turning(positions: Configurations) -> float:
     steps = np.diff(positions, axis=0)
     steps = steps[np.linalg.norm(steps, axis=1) > STANDSTILL]
     steps /= np.linalg.norm(steps, axis=1, keepdims=True)
-    # Unlike the arc cosine of their product, this is accurate for small angles.
+    # unlike the arc cosine of the unit vectors' dot product, this is accurate for small angles
     half = np.linalg.norm(np.diff(steps, axis=0), axis=1) / 2
     return float(2 * np.arcsin(np.minimum(half, 1.0)).sum())
 
@@ -209,10 +211,11 @@ def log_dimensionless_jerk(trajectory: Trajectory) -> float:
     """ln(T^5 / L^2 * integral of |q'''|^2 dt) with duration T and joint-space length L (N. Hogan and D.
     Sternad, "Sensitivity of smoothness measures to movement duration, amplitude, and arrests", 2009).
 
-    6.579 = ln 720 for a straight minimum-jerk motion, 0 for one that stands still. Jerk is the difference of
-    successive accelerations, which are zero before and after the motion, divided by the time between them
-    (SAMPLE_TIME). If accelerations jump, as in time-optimal motions, the integral is inversely proportional
-    to SAMPLE_TIME: compare only values computed with the same SAMPLE_TIME.
+    It is 6.579 = ln 720 for a straight minimum-jerk motion, and set to 0 for a motion that stands still. Jerk
+    is computed as the difference of successive accelerations divided by the time between them (SAMPLE_TIME);
+    before and after the motion, the acceleration is zero. If accelerations jump, as in time-optimal motions,
+    the integral is inversely proportional to SAMPLE_TIME, so only values with the same SAMPLE_TIME can be
+    compared.
     """
     length = Path((), trajectory.positions).length
     if length < STANDSTILL:
@@ -224,25 +227,26 @@ def log_dimensionless_jerk(trajectory: Trajectory) -> float:
 
 
 def spectral_arc_length(speed: Values, step: float) -> float:
-    """SPARC of a speed profile with rows `step` [s] apart (S. Balasubramanian, A. Melendez-Calderon, A.
+    """SPARC of a speed profile with samples `step` [s] apart (S. Balasubramanian, A. Melendez-Calderon, A.
     Roby-Brami and E. Burdet, "On the analysis of movement smoothness", 2015).
 
-    The amplitude of the Fourier spectrum of the speed is scaled to 1 at frequency 0. Frequencies count up to
-    the last one, at most CUTOFF, whose amplitude is at least THRESHOLD; they are scaled to [0, 1]. The result
-    is minus the length of the curve of amplitude over frequency: -1.4 for a minimum-jerk motion, less for
-    less smooth ones; 0 for one that stands still.
+    The amplitude of the Fourier spectrum of the speed is scaled to 1 at frequency 0. The spectrum ends at the
+    last frequency up to CUTOFF that has an amplitude of at least THRESHOLD, and frequencies are scaled to [0,
+    1]. The result is minus the length of the curve of amplitude over frequency. It is -1.4 for a minimum-jerk
+    motion, lower for less smooth motions, and set to 0 for a motion that stands still.
     """
     if speed.sum() * step < STANDSTILL:
         return 0.0
     count = 2 ** (int(np.ceil(np.log2(len(speed)))) + PADDING)
     amplitude = np.abs(np.fft.rfft(speed, count)) / speed.sum()
     frequency = np.arange(len(amplitude)) / (count * step)
-    # For motions of a few milliseconds the first frequency above 0 exceeds the cut-off.
+    # at least one frequency above 0: for motions of a few milliseconds, the first one exceeds CUTOFF
     last = max(int(np.flatnonzero((amplitude >= THRESHOLD) & (frequency <= CUTOFF))[-1]), 1)
     return -float(np.hypot(1 / last, np.diff(amplitude[: last + 1])).sum())
 
 
 def _evenly(trajectory: Trajectory) -> tuple[State, float]:
-    """The states at even times about SAMPLE_TIME apart, and the time between them [s]."""
+    """States of the trajectory at evenly spaced times about SAMPLE_TIME apart, and the time between them
+    [s]."""
     count = max(round(trajectory.duration / SAMPLE_TIME), 1)
     return trajectory.at(np.linspace(0.0, trajectory.duration, count + 1)), trajectory.duration / count

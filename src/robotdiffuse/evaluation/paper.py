@@ -1,9 +1,9 @@
-"""The paper's problems, its Table 1 and its figures, beside ours.
+"""The paper's problems, its Table 1 and its figures, compared with results of this package.
 
 Start and goal points are drawn as the authors draw them: uniformly in a box. Inverse kinematics of the
-position alone finds a start configuration and a goal configuration. The goal of a problem is this goal
-configuration, or the pose of the tip in it; for a pose, planners find up to ten configurations. A motion
-succeeds if it ends within 1 cm and 15 degrees.
+position only finds a start configuration and a goal configuration. The goal of a problem is either this
+configuration or the tip's pose at this configuration. For a goal pose, planners find up to ten
+configurations. A motion succeeds if it ends within 1 cm and 15 degrees of the pose.
 """
 
 import itertools
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 
 
 def paper_report(title: str, command: str) -> Report:
-    """A report of a part of the paper; `command` makes it again."""
+    """A report that reproduces a part of the paper; `command` is the command for it."""
     report = Report(f"{title} of the paper, beside ours")
     report.add(f"```sh\n{command}\n```")
     return report
@@ -70,14 +70,15 @@ def add_notes(report: Report, notes: Sequence[str]) -> None:
 
 POSE = "rop_pose"
 JOINT = "rop_joint"
-"""Problem sets: the same scenes and starts, with a pose or one configuration as the goal."""
+"""Problem sets. Both have the same scenes and starts; the goal is a pose (POSE) or one configuration
+(JOINT)."""
 GOALS = {POSE: "a pose with ten configurations", JOINT: "one configuration"}
 STREAM = 1_000
-"""The stream of random numbers, apart from those of the held-out problems of the families."""
+"""Part of the random seed, different from that of the families' held-out problems."""
 
 
 def draw_problem(number: int) -> dict[str, Problem]:
-    """The Panda's problem of this number, by problem set."""
+    """The problem with this number for the Panda, by problem set."""
     robot = load_robot("panda")
     rng = np.random.default_rng([SEED, STREAM, number])
     sample = ROP.draw(robot, rng, 1, POSITION)
@@ -88,8 +89,8 @@ def draw_problem(number: int) -> dict[str, Problem]:
 
 
 def goal_configurations(problem: Problem) -> Configurations:
-    """The configurations of a problem's goal; for a pose, at most ten collision-free ones, the same that a
-    planner finds when it is called with seed 0."""
+    """The goal configurations of a problem. For a pose, these are at most ten collision-free configurations:
+    those that a planner finds when it is called with seed 0."""
     if isinstance(problem.goal, JointGoal):
         return problem.goal.positions
     assert isinstance(problem.goal, PoseGoal)
@@ -98,22 +99,21 @@ def goal_configurations(problem: Problem) -> Configurations:
 
 
 def free_lines(problem: Problem, goals: Configurations) -> list[float | None]:
-    """Lengths of the straight lines from the start to goal configurations [rad], the nearest first; None for
-    those that the validator refuses."""
+    """Lengths of the straight lines from the start to goal configurations [rad], the nearest goal first; None
+    for lines that the validator refuses."""
     order = np.argsort(np.linalg.norm(goals - problem.start, axis=1))
     lines = [Path(problem.robot.joint_names, np.stack([problem.start, q])) for q in goals[order]]
     return [line.length if validator(problem, line) else None for line in lines]
 
 
 def problem_file(out: FilePath, problem_set: str) -> FilePath:
-    """The file of a problem set in the folder of a bench; `bench run` takes this path as the name of the
-    set."""
+    """The file of a problem set in the folder of a bench. `bench run` takes this path as a problem set."""
     return out / "problems" / f"{problem_set}.jsonl"
 
 
 def write_problems(out: FilePath, count: int, report: Progress) -> None:
     """Draw the first `count` non-trivial problems of both sets and write them into the folder of a bench,
-    unless it has them."""
+    unless it has as many already."""
     files = {name: CaseFile(problem_file(out, name)) for name in GOALS}
     if min(map(len, files.values())) < count:
         cases: dict[str, list[Case]] = {name: [] for name in GOALS}
@@ -129,16 +129,16 @@ def write_problems(out: FilePath, count: int, report: Progress) -> None:
 
 
 def trivial_share(out: FilePath, problem_set: str) -> float:
-    """The share of trivial problems among all that were drawn until the set was complete."""
+    """The fraction of trivial problems among all problems that were drawn to complete the set."""
     cases = CaseFile(problem_file(out, problem_set)).cases()
     return 1 - len(cases) / (1 + int(cases[-1].name.partition("/")[2]))
 
 
 def straight_line_counts(count: int, family: Rop = ROP) -> dict[str, int]:
-    """Number of problems, of `count`, in which the straight line is free: to one goal configuration, to the
-    nearest of ten, and to any of ten.
+    """Numbers of problems out of `count` in which the straight line is free: to a single goal configuration,
+    to the nearest of ten, and to any of ten.
 
-    As in the authors' code, goal configurations reach a position with any orientation. family: the
+    As in the authors' code, goal configurations reach a position with any orientation. `family` gives the
     distribution of the obstacles.
     """
     robot = load_robot("panda")
@@ -160,14 +160,14 @@ def straight_line_counts(count: int, family: Rop = ROP) -> dict[str, int]:
 AS_IN_PAPER = "diffusion, as the paper says"
 WITHOUT_CLEARANCES = "diffusion, no clearances, one sample"
 PAPER_PARTS = "compression_autoencoder", "transformer", 254
-"""Encoder, denoiser and waypoints of the paper's method."""
+"""Encoder, denoiser and number of waypoints of the paper's method."""
 PAPER_SAMPLES = 1_600_000
 """Number of samples of the paper's training: 25,000 batches of 64."""
 GUIDED_SAMPLE = ("samples=1", "repeat=false")
-"""One sample, and no further batches if the validator refuses it."""
+"""Planner settings for a single sample, without further samples if the validator refuses it."""
 ONE_SAMPLE = ("samples=1", "guidance_steps=0", "repeat=false")
-"""One sample without guidance by distances: the row JPC of the paper's Table 2 (losses of joints, points and
-collision)."""
+"""Planner settings for a single sample without collision guidance, as in the row JPC of the paper's Table 2
+(losses of joints, points and collision)."""
 NO_WEIGHTS = (
     f"The row *{AS_IN_PAPER}* is missing: there are no weights of the paper's size with its encoder. Train "
     "them with `robotdiffuse train planner --config paper --data FOLDER --encoder FOLDER --out FOLDER` and "
@@ -183,7 +183,7 @@ class PaperRow:
 
     name: str
     indicators: Indicators
-    """Success and collision in per cent, time in seconds."""
+    """Success and collision in percent, time in seconds."""
     comscore: float
 
 
@@ -194,7 +194,7 @@ PAPER_TABLE_1 = (
     PaperRow("MPD", Indicators(79.7, 12.4, 14.142, 9.0), 0.645),
     PaperRow("RobotDiffuse", Indicators(84.9, 9.8, 14.218, 15.0), 0.765),
 )
-"""By the paper's own formulas, the figures of its Table 1 give these scores instead of the printed ones:
+"""The paper's own formulas, applied to the figures of its Table 1, give other scores than the printed ones:
 
 | row          | success | collision | length | time  | ComScore | printed | difference |
 |--------------|---------|-----------|--------|-------|----------|---------|------------|
@@ -204,32 +204,36 @@ PAPER_TABLE_1 = (
 | MPD          | 0.454   | 0.133     | 1      | 1     | 0.6467   | 0.645   | +0.002     |
 | RobotDiffuse | 0.823   | 0.315     | 0.983  | 0.990 | 0.7774   | 0.765   | +0.012     |
 
-The order of the rows is the printed one, except for RRT* and MPiNets, which are equal in print. The cause of
-the differences is unknown. These explanations were tried:
+The order of the rows is as printed, except for RRT* and MPiNets, which have equal printed scores. The cause
+of the differences is unknown. These explanations were tried:
 
 - Rounding: four times each printed score has no more than two decimals (1.67, 0.76, 1.67, 2.58, 3.06), so
-  normalized values were probably first rounded to two. Then MPD is 0.645 exactly; MPiNets is 0.4150, and
-  MPNet 0.1975, of which 0.19 is the first two decimals; RRT* (0.4475) and RobotDiffuse (0.7750) are one digit
-  away from print. So slips of the pen in RRT*, MPiNets and RobotDiffuse, and a truncated score of MPNet,
-  would explain all differences.
-- Columns normalized otherwise (shares of the maximum, logarithms, ranks; all combinations): the largest
-  difference stays at 0.025 or more.
+normalized
+  values were probably first rounded to two decimals. Then MPD has 0.645 exactly, MPiNets 0.4150, and MPNet
+  0.1975, which is 0.19 if truncated. RRT* (0.4475) and RobotDiffuse (0.7750) differ from the printed scores
+  by one digit. So typing errors in RRT*, MPiNets and RobotDiffuse, and a truncated score of MPNet, would
+  explain all differences.
+- Other normalizations of the columns (fractions of the maximum, logarithms, ranks; all combinations): the
+largest
+  difference is still 0.025 or more.
 - Other weights: with the best weights that sum to 1, the largest difference is 0.011. With (0.2418, 0.1870,
-  0.2929, 0.2196), which sum to 0.94, it is 0.002 (0.005 if they are rounded to two decimals); four free
-  numbers for five scores prove little, and the paper says that its weights are equal.
-- Other numbers than the printed ones, as from an earlier state of the table: with any change of a single
-  cell, the largest difference is at least 0.012. With RRT*'s length 15.6 in place of 15.037, and MPiNets'
-  success 88.0 in place of 87.4, it is 0.004. RRT* is worst in success and time (0) and best in collision (1),
-  so with equal weights its score requires a normalized length of 0.67.
+0.2929,
+  0.2196), which sum to 0.94, it is 0.002 (0.005 if the weights are rounded to two decimals). But four free
+  weights for five scores prove little, and the paper states equal weights.
+- Other figures than the printed ones, perhaps from an earlier version of the table: with any change of a
+single cell, the
+  largest difference is at least 0.012. With 15.6 in place of 15.037 as the length of RRT*, and 88.0 in place
+  of 87.4 as the success of MPiNets, it is 0.004. RRT* is worst in success and time (0) and best in collision
+  (1), so with equal weights its printed score requires a normalized length of 0.67.
 """
 
 
 class Row(NamedTuple):
     name: str
     planner: str
-    """As for `bench run`."""
+    """The planner, as text for `bench run`."""
     paper: str = ""
-    """Name of the paper's row; empty if it has none."""
+    """Name of the corresponding row of the paper; empty if there is none."""
 
 
 ROWS = (
@@ -266,24 +270,25 @@ class Table1Settings:
     out: FilePath
     """Folder of the bench."""
     problems: int = 60
-    """Number of problems of each kind of goal, none of them trivial."""
+    """Number of non-trivial problems for each kind of goal."""
     time_limit: float = 10.0
     """Time limit of a call [s]; RRT* uses all of it."""
     cpu_time: bool = False
     """See `BenchSettings`."""
     paper_weights: str | None = None
-    """Folder with weights of config `paper`, `points` or another one without clearances as inputs. They get
-    two rows of single samples: one with guidance and one without."""
+    """Folder with weights of a network without clearances as inputs, such as the configs `paper` and
+    `points`. They get two rows of single samples: one with guidance and one without."""
     data: str | None = None
-    """Folder of a data set, for a row of its nearest motions."""
+    """Folder of a data set, for a row with the nearest motions of the data."""
     workers: int = 1
+    """See `BenchSettings`."""
     cluster: str | None = None
-    """As for `BenchSettings`."""
+    """See `BenchSettings`."""
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """The rows of the table: ROWS; if `paper_weights` is given, two rows of these weights; if `data` is
-        given, a row of nearest motions."""
+        """The rows of the table: ROWS, two rows for `paper_weights` if given, and a row of nearest motions if
+        `data` is given."""
         nearest = Row(
             "no network: line, else nearest motions with guidance",
             f"control:source={NEAREST}:data={self.data}",
@@ -312,10 +317,10 @@ class Table1Settings:
 
 
 def run_table1(settings: Table1Settings, report: Progress, done: Done) -> Bench:
-    """Make the calls that are missing in the folder; returns the bench with all calls.
+    """Make the calls that have no record in the folder; returns the bench with all calls.
 
-    Raises InputError for paper weights with clearances as inputs or with more steps than fit into the time
-    limit, and the errors of `run_bench`.
+    Raises InputError for paper weights with clearances as inputs, for paper weights with which a sample takes
+    longer than the time limit, and in the cases in which `run_bench` raises it.
     """
     if settings.paper_weights is not None:
         _check_paper_weights(settings.paper_weights, settings.time_limit)
@@ -325,8 +330,8 @@ def run_table1(settings: Table1Settings, report: Progress, done: Done) -> Bench:
 
 
 def _title(folder: str) -> str:
-    """Name of the row for the weights of a folder: it says their encoder, denoiser and number of training
-    samples. Raises InputError if there are none."""
+    """Name of the row for the weights in a folder, with their encoder, denoiser and number of training
+    samples. Raises InputError if the folder has no weights."""
     about = read_description(folder_of(folder), "model")
     settings = MotionModelSettings.from_json(about.get("settings"), f"{folder}/model.json: settings")
     parts = settings.encoder, settings.denoiser, settings.waypoints
@@ -337,8 +342,8 @@ def _title(folder: str) -> str:
 
 
 def _check_paper_weights(folder: str, time_limit: float) -> None:
-    """Raises InputError for weights that get the clearances of the scene as inputs, and for weights with
-    which a single sample takes longer on this machine than the time limit [s]."""
+    """Raises InputError for networks with clearances as inputs, and for networks that need longer for a
+    single sample on this machine than the time limit [s]."""
     from robotdiffuse.learning.exported_model import exported_model
 
     model = exported_model("model", folder, load_robot("panda"))
@@ -360,7 +365,7 @@ def _check_paper_weights(folder: str, time_limit: float) -> None:
 
 
 def table1(settings: Table1Settings, bench: Bench) -> Report:
-    """Table 1: for each kind of goal, on problems that are not trivial."""
+    """The report of Table 1, with one table for each kind of goal, on non-trivial problems."""
     weights = "" if settings.paper_weights is None else " --paper-weights FOLDER"
     weights += "" if settings.data is None else " --data DATA"
     command = (
@@ -369,7 +374,7 @@ def table1(settings: Table1Settings, bench: Bench) -> Report:
     )
     report = paper_report("Table 1", command)
     rows = dict(zip(settings.bench.specs, settings.rows, strict=True))
-    # the folder may have more problems
+    # the folder may contain more problems than are required
     names = {
         case.name
         for problem_set in GOALS
@@ -385,7 +390,7 @@ def table1(settings: Table1Settings, bench: Bench) -> Report:
         report.table(_table(section, rows), level=2)
     shares = [f"{100 * trivial_share(settings.out, name):.0f} % with {kind}" for name, kind in GOALS.items()]
     trivial = (
-        "Trivial problems, in which the straight line to some goal configuration is free, are left out: "
+        "Trivial problems, in which the straight line to a goal configuration is free, are left out: "
         f"{' and '.join(shares)} as the goal. The paper's figures include them."
     )
     lines = [trivial, *notes(settings), *about(bench), *crashes(bench)]
@@ -396,8 +401,8 @@ def table1(settings: Table1Settings, bench: Bench) -> Report:
 
 
 def scores(rows: Sequence[Row], indicators: dict[str, Indicators]) -> dict[str, float]:
-    """ComScores of the rows, normalized over the five rows that the paper has. The score of any further row
-    is computed with that row in place of the paper's method."""
+    """ComScores of the rows, normalized over the five rows of the paper. The score of any further row is
+    computed with this row in place of the paper's method."""
     ours = next(row.name for row in rows if row.paper == PAPER_METHOD)
     other_rows = [row.name for row in rows if row.paper and row.paper != PAPER_METHOD]
     scores_with = {
@@ -411,7 +416,7 @@ def scores(rows: Sequence[Row], indicators: dict[str, Indicators]) -> dict[str, 
 
 
 def _table(section: Section, rows: dict[str, Row]) -> Table:
-    """The table of a problem set; `rows` by planner."""
+    """The table of a problem set. `rows` are given by planner."""
     comparison = section.main
     title = f"Goal: {GOALS[section.problem_set]}; {comparison.problems} problems that are not trivial"
     indicators = {}
@@ -458,17 +463,17 @@ def notes(settings: Table1Settings) -> list[str]:
     texts = [
         f"Every call has {settings.time_limit:g} s{' of CPU time' * settings.cpu_time}; in the paper up to "
         "600 s. RRT* always uses the whole limit.",
-        "success: the motion passes the validator and ends within 1 cm and 15° of the pose, with the 95 % "
-        "interval by Wilson. collision: share of problems on which the validator refused the planner's last "
-        "path because it collides. RRT*, MPNet, MPiNets, MPD and diffusion as it ships try again until time "
-        "runs out; the rows of a single sample have one motion a problem, as in the paper, whose training "
-        "saw 1.6 M samples.",
-        "Means are over the problems that a row solves, with 95 % intervals: rows that solve only easy "
-        "problems seem short. length of links 1 to 7: path lengths of the origins of the links that joints "
-        "move, which the paper calls path length (its arm has no hand; it names no unit). log jerk: "
+        "success: share of problems with a motion that passes the validator and ends within 1 cm and 15° of "
+        "the pose, with the 95 % interval by Wilson. collision: share of problems on which the validator "
+        "refused the planner's last path because it collides. RRT*, MPNet, MPiNets, MPD and diffusion with "
+        "default settings try again until time runs out. The rows of a single sample have one motion per "
+        "problem, as in the paper. The paper's network was trained on 1.6 M samples.",
+        "Means are over the problems that a row solves, with 95 % intervals. So rows that solve only easy "
+        "problems have short motions. length of links 1 to 7: path lengths of the origins of the links that "
+        "joints move, which the paper calls path length (its arm has no hand; it gives no unit). log jerk: "
         "logarithm of the dimensionless jerk; turning: sum of the angles between segments.",
-        "ComScore: normalized as in the paper, over its five rows as measured here. The score of any further "
-        "row is computed with that row in place of the paper's method.",
+        "ComScore: normalized as in the paper, over the paper's five rows as measured here. The score of any "
+        "further row is computed with this row in place of the paper's method.",
         "robotdiffuse minimizes the duration, its default. time: mean until the planner returns"
         f"{' (CPU time of its process)' * settings.cpu_time}; the machine may do other work.",
     ]
@@ -481,22 +486,23 @@ STEPS = (1, 2, 5, 10, 50, 200)
 """Numbers of denoising steps in the plot of success."""
 SHOWN_STEPS = 20
 SHOWN = (0, 10, 15, 18)
-"""SHOWN_STEPS: number of denoising steps of the drawn motion. SHOWN: indices of the steps before which it is
-drawn."""
+"""SHOWN_STEPS: number of denoising steps of the drawn motion. SHOWN: indices of the denoising steps before
+which the motion is drawn."""
 COMPARED = ("diffusion", "mpinets")
 """Planners of figure 3b, as in the paper."""
 
 
 class Noisy(NamedTuple):
-    """A motion on its way from noise."""
+    """An intermediate state of denoising."""
 
     level: float
-    """Noise level as a fraction of T; 0 for the motion itself."""
+    """Noise level as a fraction of T; 0 for the finished motion."""
     path: Path
 
 
 def denoising(problem: Problem) -> list[Noisy]:
-    """One motion of the bundled network at several noise levels, without guidance, the noisiest first."""
+    """One motion of the bundled network at several noise levels, from the noisiest to the finished motion;
+    without guidance."""
     planner = Diffusion()
     rng = np.random.default_rng(0)
     robot = problem.robot
@@ -528,8 +534,8 @@ def denoising(problem: Problem) -> list[Noisy]:
 
 
 def success_by_steps(out: FilePath, count: int) -> dict[str, dict[int, list[Record]]]:
-    """Records of 16 samples of the network on `count` problems that the straight line does not solve, by
-    guidance and denoising steps; the folder keeps them."""
+    """Records of batches of 16 samples of the network on `count` problems that the straight line does not
+    solve, by guidance and number of denoising steps. They are stored in the folder."""
     cases = hard_cases("rop", count, out / "problems")
     weights = weights_for("model", load_robot("panda"))
     records: dict[str, dict[int, list[Record]]] = {}
@@ -545,16 +551,15 @@ def success_by_steps(out: FilePath, count: int) -> dict[str, dict[int, list[Reco
 
 
 def plot_success_by_steps(records: dict[str, dict[int, list[Record]]]) -> str:
-    """Plot of the share of single samples that pass the validator, over the number of denoising steps, as
-    SVG."""
+    """Plot of the share of single samples that pass the validator over the number of denoising steps; SVG."""
 
     def fill(figure: "PlotFigure") -> None:
         axes = figure.subplots()
-        for name, of_steps in records.items():
-            shares = [np.array([r.passed for r in values]) for values in of_steps.values()]
+        for name, by_steps in records.items():
+            shares = [np.array([r.passed for r in values]) for values in by_steps.values()]
             mean = np.array([x.mean() for x in shares])
             bars = np.abs(np.array([bootstrap_interval(x) for x in shares]).T - mean)
-            axes.errorbar(list(of_steps), mean, bars, fmt="o-", markersize=4, label=name)
+            axes.errorbar(list(by_steps), mean, bars, fmt="o-", markersize=4, label=name)
         axes.set(xscale="log", xlabel="denoising steps T", ylabel="single samples that pass the validator")
         axes.legend()
 
@@ -562,24 +567,24 @@ def plot_success_by_steps(records: dict[str, dict[int, list[Record]]]) -> str:
 
 
 def plot_success_over_time(bench: Bench) -> str:
-    """Figure 3a: success over time on the problems with poses, as SVG. The lines are the planners with their
-    default settings, among them `diffusion` as it ships."""
+    """Figure 3a: success over time on the problems with goal poses, for planners with default settings;
+    SVG."""
     plain_rows = {name: records for name, records in bench.records.items() if ":" not in name}
     parts = sections(replace(bench, records=plain_rows))
     return success_over_time(next(part for part in parts if part.name == POSE), list(plain_rows))
 
 
 class Compared(NamedTuple):
-    """Motions of one problem."""
+    """Motions of several planners on one problem."""
 
     case: Case
     motions: dict[str, Path]
-    """By planner."""
+    """Motions by planner."""
 
 
 def compared_motions(bench: Bench) -> Compared | None:
-    """Of the non-trivial problems that both planners of figure 3b solve, the one on which the lengths of
-    their paths differ most; None if there is none."""
+    """The problem for figure 3b: among the non-trivial problems that both planners of the figure solve, the
+    problem on which their path lengths differ most. None if there is no such problem."""
     solved = {
         planner: {
             (r.problem_set, r.name): r for r in bench.records.get(planner, ()) if r.solved and not r.trivial

@@ -1,5 +1,5 @@
-"""Problem sets by name: held-out problems of the families, and those of files and folders, checked once and
-kept."""
+"""Problem sets by name: held-out problems of the families, and problems from files and folders. Problems are
+checked once and then stored."""
 
 import hashlib
 import itertools
@@ -19,10 +19,10 @@ from robotdiffuse.problems.problem import Problem
 from robotdiffuse.validation.validator import VerifySettings, verifier
 
 NONTRIVIAL_SUFFIX = "_nontrivial"
-"""Suffix of a family's name for the set of its problems that a search solves and the straight line does
-not."""
+"""Suffix of a family's name for the set of its non-trivial problems: a search solves them, the straight line
+does not."""
 SEARCH_TIME = 10.0
-"""A problem counts as unsolvable if the search does not solve it in this time [s]."""
+"""A problem is left out of such a set if the search does not solve it in this time [s]."""
 REFERENCE_ITERATIONS = 20_000
 """Minimum number of iterations of the search for the reference length."""
 
@@ -33,27 +33,29 @@ def validator(problem: Problem, path: Path) -> bool:
 
 
 def search(problem: Problem) -> float | None:
-    """The reference length of a problem, which is the length of a short path [rad]; None if search does not
-    solve it in time."""
+    """The reference length of a problem: the length of a short path that a search finds [rad]; None if the
+    search does not solve the problem in time."""
     planner = AORRTC(AORRTCSettings(gain=0.001, patience=REFERENCE_ITERATIONS))
     return planner.plan(problem, SEARCH_TIME, seed=1, clearance=0.0, objective=LENGTH).path_length
 
 
 def case_file(folder: FilePath | None, name: str) -> CaseFile:
-    """The file that keeps the cases of a set in a folder; without a folder, in memory."""
+    """The file that stores the cases of a problem set in a folder. Without a folder, cases are kept in
+    memory."""
     return CaseFile(None if folder is None else folder / f"{name}.jsonl")
 
 
 def hard_cases(
     family: str, count: int, folder: FilePath | None = None, report: Progress = lambda text: None
 ) -> list[Case]:
-    """The first hard held-out problems of a family; the folder keeps the problems with the results of
-    validator and search."""
+    """The first `count` non-trivial held-out problems of a family. The folder stores the problems with the
+    results of validator and search."""
     return case_file(folder, family).held_out(family, count, validator, search, report)
 
 
 def problem_set_name(text: str) -> str:
-    """The name of a set in results. Raises InputError for a text that is no family, file or folder."""
+    """The name of a problem set in results. Raises InputError for a text that is neither a family nor a file
+    or folder."""
     family = text.removesuffix(NONTRIVIAL_SUFFIX)
     if family in FAMILIES:
         return text
@@ -72,18 +74,18 @@ def problem_set_name(text: str) -> str:
 def gather_cases(names: list[str], count: int | None, out: FilePath, report: Progress) -> list[Case]:
     """The first `count` problems of each set (None: all of a file or folder, 100 of a family).
 
-    They are kept in `out`/problems, one file for each set, and read from there next time; with a larger
-    `count`, problems are added. `report` is called with lines on the progress. Raises InputError for unknown
-    names and empty sets.
+    Problems are stored in `out`/problems, one file for each set, and read from there next time. With a larger
+    `count`, problems are added. `report` is called with lines of text about the progress. Raises InputError
+    for unknown names and empty sets.
     """
-    twice = repeated(problem_set_name(text) for text in names)
-    if twice:
-        raise InputError(f"problems name {', '.join(sorted(twice))} twice; rename a file or folder")
+    repeated_names = repeated(problem_set_name(text) for text in names)
+    if repeated_names:
+        raise InputError(f"problems name {', '.join(sorted(repeated_names))} twice; rename a file or folder")
     return [case for text in names for case in _set(text, count, out / "problems", report)]
 
 
 def read_cases(out: FilePath, problem_set: str) -> list[Case]:
-    """All cases of a set in a folder. Raises InputError if their file is damaged."""
+    """All cases of a problem set that are stored in a folder. Raises InputError if their file is damaged."""
     family = problem_set.removesuffix(NONTRIVIAL_SUFFIX)
     name = family if family in FAMILIES else problem_set
     return _of_set(case_file(out / "problems", name).cases(hard=name != problem_set), problem_set)
@@ -115,7 +117,7 @@ def _set(text: str, count: int | None, folder: FilePath, report: Progress) -> li
 
 
 def _content_hash(place: FilePath) -> str:
-    """SHA-256 of the problem files of a set, without the scenes and meshes that they name."""
+    """SHA-256 of the problem files of a set. Scene and mesh files that these refer to are not included."""
     digest = hashlib.sha256()
     for part in _parts(place):
         for file in [part] if part.is_file() else sorted(part.glob("*.yaml")):
@@ -129,7 +131,8 @@ def _of_set(cases: list[Case], problem_set: str) -> list[Case]:
 
 
 def _read_place(place: FilePath, name: str, report: Progress) -> list[Case]:
-    """The cases of a file, of a MotionBenchMaker folder, or of all files and such folders in a folder."""
+    """The cases of a problem file, of a MotionBenchMaker folder, or of all problem files and MotionBenchMaker
+    folders in a folder."""
     cases = []
     for part in _parts(place):
         family = part.resolve().stem
@@ -157,7 +160,8 @@ def _parts(place: FilePath) -> list[FilePath]:
 
 
 def _interleaved(cases: list[Case]) -> list[Case]:
-    """Cases of all families in turn, so that the first few are of all."""
+    """The cases, ordered by taking one of each family in turn, so that the first cases are of all
+    families."""
     families: dict[str, list[Case]] = {}
     for case in cases:
         families.setdefault(case.family, []).append(case)

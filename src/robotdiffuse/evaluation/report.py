@@ -1,4 +1,4 @@
-"""A report: texts, tables and plots as Markdown, and the same as an HTML page that works offline.
+"""A report: texts, tables and plots, written as Markdown or as an HTML page that works offline.
 
 Plots are SVG. They need matplotlib, which is not part of the core install.
 """
@@ -37,7 +37,7 @@ svg { max-width: 100%; height: auto; }
 
 
 class Report:
-    """Blocks of Markdown in their order, and plots."""
+    """A report as blocks of Markdown, and plots."""
 
     def __init__(self, title: str) -> None:
         self.title = title
@@ -54,18 +54,18 @@ class Report:
         self.add("\n".join(f"- {text}" for text in texts))
 
     def table(self, table: Table, level: int = 3) -> None:
-        """Add a table below its title, a heading of this level."""
+        """Add a table, with its title as a heading of this level."""
         if table.title:
             self.add(f"{level * '#'} {plain(table.title)}")
         self.add("\n".join(markdown(table)))
 
     def plot(self, file: str, caption: str, svg: str) -> None:
-        """Add a plot; `write` writes it to a file in the folder of the report."""
+        """Add a plot. `write` writes it to a file with this name in the folder of the report."""
         self.plots[file] = svg
         self.picture(file, caption)
 
     def picture(self, file: str, caption: str) -> None:
-        """Add a picture that is in a file in the folder of the report."""
+        """Add a picture: a file in the folder of the report."""
         self.add(plain(caption), f"![{FilePath(file).stem}]({file})")
 
     @property
@@ -79,7 +79,8 @@ class Report:
 
         body = MarkdownIt().enable("table").render(self.markdown)
         for file, svg in self.plots.items():
-            # plots use the same ids, and a reference to one in another plot draws nothing: make them unique
+            # make the ids unique: plots use the same ids, and a reference to an id in another plot draws
+            # nothing
             svg = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{FilePath(file).stem}-", svg)
             body = re.sub(rf'<img src="{re.escape(file)}"[^>]*>', lambda _, svg=svg: svg, body)
         titles = re.findall("<h2>(.*?)</h2>", body)
@@ -98,17 +99,17 @@ class Report:
         """Write the report as Markdown, and the plots as files in the same folder."""
         write_atomically(file, self.markdown, make_folder=True)
         for name, svg in self.plots.items():
-            # dark text needs a white background, also in a viewer with a dark one
+            # dark text needs a white background, also in a viewer with a dark background
             write_atomically(file.with_name(name), svg.replace("<svg ", '<svg style="background: white" ', 1))
 
 
 def interval(low: float, high: float, digits: int = 1, scale: float = 1.0) -> str:
-    """The ends of an interval as a text."""
+    """An interval as text, such as "1.2 to 3.4"; both ends are multiplied by `scale`."""
     return f"{scale * low:.{digits}f} to {scale * high:.{digits}f}"
 
 
 def share_cell(value: float, ends: tuple[float, float]) -> Figure:
-    """A share with its interval, in per cent."""
+    """A cell with a fraction and its interval, in percent."""
     return Figure(f"{100 * value:.1f} ({interval(*ends, scale=100.0)})", value)
 
 
@@ -156,12 +157,12 @@ PANEL_HEIGHT = 2.4
 """Height of histograms [inch]."""
 
 Histograms = dict[str, tuple[ndarray, Mapping[str, ndarray]]]
-"""For each panel by its label, the edges of bins and the values by name."""
+"""For each panel, by its label: the edges of the bins, and the values of each line by name."""
 
 
 def draw_plot(fill: "Callable[[Plot], object]", width: float = 6.25, height: float = 3.7) -> str:
-    """The SVG element of a figure of about this size [inch] that `fill` draws on. Raises InputError if
-    matplotlib is missing."""
+    """Lets `fill` draw on a figure of about this size [inch], and returns its SVG element. Raises InputError
+    if matplotlib is not installed."""
     with needs("matplotlib", "data"):
         import matplotlib
         from matplotlib.figure import Figure as Plot
@@ -175,8 +176,9 @@ def draw_plot(fill: "Callable[[Plot], object]", width: float = 6.25, height: flo
 
 
 def histograms(panels: Histograms, across: int) -> str:
-    """Panels in rows of `across`, each with a line for each name, in percent of its values; outliers are in
-    the outer bins. The names of the first panel are in the legend."""
+    """Draws histograms as panels, `across` in a row; returns SVG. A panel has a line for each name, in
+    percent of the values of that name. Outliers are counted in the outer bins. The legend has the names of
+    the first panel."""
     down = -(-len(panels) // across)
 
     def fill(figure: "Plot") -> None:

@@ -1,8 +1,10 @@
-"""Runs: every case with every method and seed. Each run is validated and stored as a record, a JSON line.
+"""Runs: every case (a problem of a problem set) with every method and seed. The result of each run is
+validated and stored as a record, a line of JSON.
 
-A method takes a run and yields the fields of its records, with the validator's verdict; `methods` has those
-of planners and networks. An executor calls methods: in this process, one after the other (`in_this_process`),
-or in the processes of a bench. Runs whose records are kept are not made again.
+A method takes a run and yields the fields of its records, including the validator's verdict.
+`evaluation.methods` has methods for planners and networks. Methods are called one after the other in this
+process (`in_this_process`), or in the processes of a bench. Runs that already have a record are not made
+again.
 """
 
 import os
@@ -28,23 +30,22 @@ SOLVED = Status.SOLVED.value
 CRASHED = "crashed"
 OVERRAN = "overran"
 RAISED = "exception"
-"""Statuses of records in addition to `types.Status`: the process died (crashed), it did not answer (overran),
-or the planner raised an exception."""
+"""Statuses of records in addition to `types.Status`: the planner's process died (crashed), it did not answer
+in time (overran), or the planner raised an exception."""
 ENDED_EARLY = 0.9
-"""A call that took less than this fraction of its time limit ended by itself: a longer limit would change
-nothing."""
+"""A call that took less than this fraction of its time limit ended by itself: a longer limit would give the
+same result."""
 SHORTEST_FACTOR = 1 + 1e-6
-"""A path counts as the shortest if it is at most this factor longer than the shortest known or possible
-one."""
+"""A path counts as shortest if it is at most this factor longer than the shortest known or possible path."""
 RESTARTABLE = {SOLVED, Status.TIMEOUT.value, Status.NO_PATH.value}
-"""Statuses that another seed can change."""
+"""Statuses of calls for which another seed can give another result."""
 RESTARTED = "+restarts"
 """Suffix of the name of a planner whose calls were repeated until the time limit."""
 
 
 @dataclass(frozen=True)
 class Record:
-    """One call on one problem."""
+    """The result of one call on one problem."""
 
     planner: str
     """Name of the planner or other method."""
@@ -52,38 +53,43 @@ class Record:
     name: str
     """Name of the problem in its set."""
     family: str
+    """Family of the problem."""
     trivial: bool
+    """Whether the straight line from the start to a goal configuration passes the validator."""
     seed: int
     time_limit: float
     """Time limit of the call [s]."""
     status: str
     """A value of `types.Status`, or crashed, overran, exception."""
     reason: str
+    """Explanation of the status."""
     time: float
-    """Planning time, with validation and without timing the trajectory [s]."""
+    """Planning time [s], including validation, but not computing the trajectory."""
     cpu: float | None = None
-    """CPU time [s], where it was measured."""
+    """CPU time [s]; None if it was not measured."""
     restarts: int | None = None
-    """How often the planner was called again; None if it should not be called again."""
+    """How often the planner was called again within the time limit; None for a single call without
+    restarts."""
     refused: str = ""
-    """Why the validator refused the last path, see PlanResult."""
+    """Why the validator refused the last path, see `PlanResult`."""
     stage: str = ""
+    """The part of the planner that found the path, see `PlanResult`."""
     progress: tuple[tuple[float, float], ...] = ()
-    """Each path that was shorter than the ones before: the time when it was found [s] and its joint-space
-    length [rad]."""
+    """For each path that was shorter than all earlier paths: the time at which it was found [s], and its
+    joint-space length [rad]."""
     passed: float | None = None
-    """Share of the samples of a batch that passed the validator."""
+    """Fraction of the samples of a batch that passed the validator."""
     collided: float | None = None
-    """Share of the samples of a batch that collide."""
+    """Fraction of the samples of a batch that collide."""
     reference: float | None = None
     """Length of the shortest known path [rad], see `held_out.Case`."""
     measures: dict[str, float] = field(default_factory=dict)
-    """Measures of the returned motion, by the names of `metrics.METRICS`; in files they are fields of the
-    line."""
+    """Metrics of the returned motion by name (`metrics.METRICS`). In files they are fields like all
+    others."""
     memory: float | None = None
-    """Peak memory of the planner's process so far [MB]."""
+    """Peak memory of the planner's process up to the end of the call [MB]."""
     run: str = ""
-    """Start of the session that made the call; empty if it was not noted."""
+    """Name of the session that made the call, its starting time; empty if unknown."""
     workers: int | str = ""
     """Number of simultaneous calls, or the name of the cluster."""
     load: float | None = None
@@ -93,7 +99,8 @@ class Record:
 
     @property
     def key(self) -> tuple[str, str, int, float]:
-        """Identifies the record among all records of its planner."""
+        """Identifies the record among all records of its planner: problem set, problem, seed and time
+        limit."""
         return *self.case, self.time_limit
 
     @property
@@ -112,13 +119,14 @@ class Record:
 
     @property
     def ended_by_itself(self) -> bool:
-        """Whether a longer time limit would give the same."""
+        """Whether the call ended clearly before its time limit, so that a longer limit would give the same
+        result."""
         cut_off = self.status in (CRASHED, OVERRAN) or bool(self.restarts)
         return not cut_off and self.time < ENDED_EARLY * self.time_limit
 
     @property
     def restartable(self) -> bool:
-        """Whether there was time for a call with another seed."""
+        """Whether there was time left for a call with another seed, which could change the result."""
         return self.ended_by_itself and self.status in RESTARTABLE
 
     @property
@@ -131,7 +139,7 @@ class Record:
         return np.array(self.positions, np.float64)
 
     def row(self) -> dict[str, Any]:
-        """The record as JSON data, without fields that have their defaults."""
+        """The record as JSON data, without fields that have their default values."""
         defaults = {f.name: f.default for f in fields(self)}
         values = asdict(self)
         measures = values.pop("measures")
@@ -139,7 +147,8 @@ class Record:
 
 
 def record_of_row(row: dict[str, Any]) -> Record:
-    """The record of JSON data. Unknown numbers are measures; raises TypeError for other unknown fields."""
+    """The record from JSON data. Unknown fields become `measures`; raises TypeError if their values are not
+    numbers."""
     measures = dict(row)
     values = {f.name: measures.pop(f.name) for f in fields(Record) if f.name in row}
     for name, value in measures.items():
@@ -151,11 +160,11 @@ def record_of_row(row: dict[str, Any]) -> Record:
 
 
 class RecordFile:
-    """The records of one method in the order of their making, in a file or in memory."""
+    """The records of one method in the order in which they were made, in a file or in memory."""
 
     def __init__(self, file: FilePath | None) -> None:
-        """Read the file without a last line that was cut off. Raises InputError, naming file and line, for
-        any other line that is no record."""
+        """Read the file; an incomplete last line is ignored. Raises InputError with file and line for any
+        other line that is not a record."""
         self._lines = JsonLines(file)
         self.records: list[Record] = []
         for number, row in enumerate(self._lines.rows, start=1):
@@ -166,7 +175,8 @@ class RecordFile:
         self._keys = {record.key for record in self.records}
 
     def append(self, record: Record) -> None:
-        """Write a record, which is on the disk when this returns, unless one with its key exists."""
+        """Append a record, unless a record with the same key exists. When the call returns, the record is on
+        disk."""
         if record.key not in self._keys:
             self._lines.append(record.row())
             self.records.append(record)
@@ -184,9 +194,9 @@ def recorded(folder: FilePath) -> dict[str, FilePath]:
 
 
 def read_records(folder: FilePath, methods: Sequence[str] | None = None) -> dict[str, list[Record]]:
-    """Read the records of all methods, or of some, by name.
+    """Read the records of all methods, or of the given methods, by name.
 
-    Raises InputError for a folder without records, for methods without any, and for damaged files.
+    Raises InputError for a folder without records, for a method without records, and for damaged files.
     """
     files = recorded(folder)
     if not files:
@@ -203,7 +213,7 @@ class Run:
 
     case: Case
     index: int
-    """Place of the case among all cases."""
+    """Index of the case among all cases."""
     method: str
     """Name of the planner or method in records."""
     seed: int
@@ -220,11 +230,11 @@ class Run:
         return self.case.problem_set, self.case.name, self.seed, self.limit
 
     def rng(self) -> np.random.Generator:
-        """Random numbers, the same ones for all methods."""
+        """A random number generator that gives the same numbers for all methods."""
         return np.random.default_rng([SEED, self.seed, self.index])
 
     def record(self, values: "Fields") -> Record:
-        """The record of this run with these fields."""
+        """The record of this run with the fields `values`, which take precedence over those of the run."""
         about = {
             "planner": self.method,
             "problem_set": self.case.problem_set,
@@ -240,11 +250,11 @@ class Run:
 
 
 Fields = dict[str, Any]
-"""Fields of a record; the run provides the others."""
+"""Fields of a record that a method computes; the run provides the other fields."""
 Method = Callable[[Run], Iterable[Fields]]
-"""Yields the fields of one record, or of several if one call answers for several time limits."""
+"""Makes a run and yields the fields of its record, or of several records."""
 Results = Generator[tuple[Run, list[Record]], None, None]
-"""Runs with their records, in the order in which they end."""
+"""Runs with their records, in the order in which the runs end."""
 
 
 class Clock:
@@ -269,8 +279,8 @@ class Clock:
 def runs_of(
     cases: Sequence[Case], methods: Iterable[str], seeds: Iterable[int] = (0,), limit: float = np.inf
 ) -> list[Run]:
-    """All runs in their order: methods take turns on each case, so that other work on the machine affects
-    them alike."""
+    """All runs in the order in which they are made: methods take turns on each case, so that other work on
+    the machine affects all methods alike."""
     names = list(methods)
     return [
         Run(case, i, name, seed, limit) for seed in seeds for i, case in enumerate(cases) for name in names
@@ -288,9 +298,9 @@ def keep_records(
     files: Mapping[str, RecordFile],
     on_progress: Callable[[int], None] = lambda remaining: None,
 ) -> int:
-    """Keep the records of runs as they come; returns the number of runs made.
+    """Store the records of runs as the runs end; returns the number of runs that were made.
 
-    on_progress: called with the number of remaining runs.
+    `on_progress` is called with the number of remaining runs.
     """
     remaining = len(runs)
     with closing(results):  # Ctrl-C ends the processes of runs too
@@ -319,10 +329,18 @@ def run_all(
     title: str = "runs",
     bar: bool = True,
 ) -> dict[str, list[Record]]:
-    """Make all runs in this process; the records of each method in the order of the cases.
+    """Make all runs in this process.
 
-    folder: keeps the records; the names of methods must then contain everything that the records depend on.
-    title: of the progress bar, which `bar` switches off.
+    Args:
+        cases: The cases. methods: Methods by name. seeds: Seeds of the runs. limit: Time limit of a run [s].
+        folder: Folder that stores the records. The name of a method must then identify everything that its
+        records depend
+            on, since existing records are used again.
+        title: Title of the progress bar.
+        bar: Whether a progress bar is shown.
+
+    Returns:
+        The records of each method, in the order of the cases.
     """
     files = {name: RecordFile(None if folder is None else record_path(folder, name)) for name in methods}
     recorded = {(name, record.key) for name, file in files.items() for record in file.records}

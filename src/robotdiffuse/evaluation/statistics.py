@@ -11,14 +11,17 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Values
 
 RESAMPLES = 2000
+"""Number of resamples of a bootstrap interval."""
 TIE = 1e-6
-"""Lengths below this [rad] or [m] count as this; logarithms of ratios within this of 0 are ties."""
+"""Smaller lengths are replaced by this value [rad] or [m]; also, two lengths are tied if the logarithm of
+their ratio is closer to 0 than this."""
 
 
 def wilson_interval(successes: int, n: int) -> tuple[float, float]:
-    """The 95 % interval of a share by its score test (E. B. Wilson 1927); (0, 1) without trials.
+    """The 95 % interval of a proportion by the score test (E. B. Wilson 1927); (0, 1) for n = 0.
 
-    Unlike the interval by the standard error it stays within 0 and 1 and has a width at shares of 0 and 1.
+    Unlike the interval by the standard error, it stays within 0 and 1, and its width is not 0 for proportions
+    of 0 and 1.
     """
     from scipy.stats import binomtest
 
@@ -29,9 +32,9 @@ def wilson_interval(successes: int, n: int) -> tuple[float, float]:
 
 
 def bootstrap_interval(values: Values, statistic: Callable[..., ndarray] = np.mean) -> tuple[float, float]:
-    """The 95 % interval of a statistic of independent values, by resampling them (B. Efron 1979).
+    """The 95 % bootstrap interval of a statistic of independent values (B. Efron 1979).
 
-    statistic: as np.mean or np.median, with an argument `axis`.
+    `statistic` is a function with an argument `axis`, such as np.mean or np.median.
     """
     picked = np.random.default_rng(0).integers(0, len(values), (RESAMPLES, len(values)))
     low, high = np.percentile(statistic(values[picked], axis=1), (2.5, 97.5))
@@ -40,31 +43,33 @@ def bootstrap_interval(values: Values, statistic: Callable[..., ndarray] = np.me
 
 @dataclass(frozen=True)
 class Paired:
-    """Planner A against planner B on the same problems."""
+    """Comparison of planner A with planner B on the same problems."""
 
     a_only: int
     """Number of problems that only A solves."""
     b_only: int
+    """Number of problems that only B solves."""
     both: int
     neither: int
     p_success: float
-    """Probability of a split of `a_only` and `b_only` this uneven or more if both planners were equally good:
-    exact test of Q. McNemar 1947, two-sided; 1.0 if they solve the same problems."""
+    """p-value of the hypothesis that both planners solve equally many problems: the exact two-sided test of
+    Q. McNemar (1947) on `a_only` and `b_only`; 1.0 if both planners solve the same problems."""
     ratio: float | None
-    """Median of the ratio of A's length to B's over the problems that both solve; None if there are none."""
+    """Median ratio of A's length to B's length, over the problems that both solve; None if there are no such
+    problems."""
     ratio_interval: tuple[float, float] | None
-    """The 95 % interval of the ratio, by resampling the problems."""
+    """The 95 % bootstrap interval of the ratio, by resampling the problems."""
     p_length: float
-    """Probability that the logarithms of these ratios lie this much to one side or more if neither planner's
-    motions were longer: signed ranks (F. Wilcoxon 1945), two-sided, without ties; 1.0 if all are ties."""
+    """p-value of the hypothesis that neither planner's motions are longer: the two-sided signed-rank test of
+    F. Wilcoxon (1945) on the logarithms of the ratios, without ties; 1.0 if all lengths are tied."""
 
 
 def compare(a: Values, b: Values) -> Paired:
     """Compare two planners by the lengths of their motions [rad] or [m] on the same problems in the same
-    order; NaN without a solution.
+    order. A length is NaN if the planner does not solve the problem.
 
-    The tests assume that problems are independent: merge several seeds of one problem into one row first, or
-    the p-values are too small. Raises InputError if the arrays differ in length.
+    The tests assume that the values are independent: merge several seeds of one problem into one value first,
+    or the p-values are too small. Raises InputError if the arrays differ in length.
     """
     from scipy.stats import binomtest, wilcoxon
 
@@ -96,12 +101,12 @@ def compare(a: Values, b: Values) -> Paired:
 
 @dataclass(frozen=True)
 class Indicators:
-    """The four figures of a planner that ComScore weighs; NaN if unknown."""
+    """The four figures of a planner from which ComScore is computed; NaN if unknown."""
 
     success: float
-    """Share of problems solved, in any unit that all rows share (the paper: per cent)."""
+    """Share of solved problems, in the same unit in all rows (in the paper: percent)."""
     collision: float
-    """Share of motions in collision."""
+    """Share of motions in collision, in the same unit in all rows."""
     length: float
     """Path length; in the paper the sum over all links, without a unit."""
     time: float
@@ -109,15 +114,15 @@ class Indicators:
 
 
 HIGHER_IS_BETTER = np.array([True, False, False, False])
-"""For each field of Indicators, whether higher values are better."""
+"""Whether higher values are better, for each field of Indicators."""
 
 
 def normalized(rows: Sequence[Indicators]) -> Float[ndarray, "n 4"]:
-    """V_norm of every row and indicator: 1 for the best of these rows, 0 for the worst, linear in between.
+    """The paper's V_norm of every row and indicator: 1 for the best row, 0 for the worst, linear in between.
 
-    If all rows have the same indicator, where the paper's formulas give 0 / 0, it is 1 for all: each row is
-    as good as the best. An unknown indicator (NaN, such as the length if nothing was solved) is 0, as for the
-    worst.
+    If an indicator is equal in all rows, the paper's formula gives 0 / 0; here all rows get 1, since each is
+    as good as the best. An unknown indicator (NaN, such as the length if no problem was solved) gets 0, as
+    the worst row.
     """
     values = np.array([astuple(row) for row in rows], dtype=np.float64).reshape(len(rows), 4)
     if not len(rows):
@@ -132,6 +137,6 @@ def normalized(rows: Sequence[Indicators]) -> Float[ndarray, "n 4"]:
 
 
 def comscores(rows: Sequence[Indicators]) -> Values:
-    """The ComScore of each row, in [0, 1], with the paper's equal weights. It depends on which rows are
+    """The ComScore of each row, in [0, 1], with the paper's equal weights. Scores depend on which rows are
     compared."""
     return normalized(rows).mean(axis=1)

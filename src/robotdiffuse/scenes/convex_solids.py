@@ -1,4 +1,4 @@
-"""Convex meshes that enclose shapes, for robots that hold them."""
+"""Convex meshes that enclose shapes, used when a robot holds a shape."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -10,16 +10,16 @@ from robotdiffuse.robots.bodies import ConvexMesh, polygon_around_circle
 from robotdiffuse.robots.fitting.convex_parts import Surface, convex_hull, convex_parts
 
 SPHERE_RINGS = 7
-"""Number of rings of vertices on a sphere, and on the caps of a capsule."""
+"""Number of rings of vertices on a sphere, and on a capsule's caps together."""
 
 
 def capsule_polyhedron(radius: float, height: float) -> ConvexMesh:
-    """A polyhedron around a capsule about the z axis, or around a sphere if the height is 0 [m]."""
+    """A polyhedron around a capsule along the z axis [m]; with a height of 0, around a sphere."""
     angles = np.pi * np.arange(1, SPHERE_RINGS + 1) / (SPHERE_RINGS + 1) - np.pi / 2
     rings = [np.insert(polygon_around_circle(np.cos(a)), 2, np.sin(a), axis=1) for a in angles]
     corners = np.concatenate([*rings, [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]])
     hull = convex_hull(corners)
-    # scaled up until the sphere is inside all faces
+    # scale the polyhedron up until the sphere is inside all faces
     a, b, c = np.moveaxis(hull.vertices[hull.faces], 1, 0)
     normals = np.cross(b - a, c - a)
     inradius = (np.einsum("fd,fd->f", normals, a) / np.linalg.norm(normals, axis=1)).min()
@@ -32,9 +32,9 @@ def capsule_polyhedron(radius: float, height: float) -> ConvexMesh:
 
 @lru_cache(maxsize=64)
 def mesh_parts(vertices: bytes, faces: bytes) -> tuple[ConvexMesh, ...]:
-    """Convex parts of a triangle mesh, whose float64 vertices and int64 faces are given as bytes.
+    """Convex parts that cover a triangle mesh. Its float64 vertices and int64 faces are given as bytes.
 
-    Cached, because decomposing a mesh that is not convex takes seconds.
+    The result is cached, because decomposing a mesh that is not convex takes seconds.
     """
     points = np.frombuffer(vertices).reshape(-1, 3)
     return convex_parts((Surface(points, np.frombuffer(faces, np.int64).reshape(-1, 3)),))
@@ -59,5 +59,4 @@ SOLIDS: dict[str, Callable[[Any], tuple[ConvexMesh, ...]]] = {
     "capsule": lambda shape: (capsule_polyhedron(shape.radius, shape.height),),
     "mesh": lambda shape: mesh_parts(shape.vertices.tobytes(), shape.faces.tobytes()),
 }
-"""Functions by kind of shape; each returns convex meshes that enclose the shape, in the frame of the
-shape."""
+"""Functions by kind of shape. Each returns convex meshes that enclose the shape, in the shape's frame."""

@@ -1,4 +1,5 @@
-"""Reads and writes the scenes of problem files: plain dictionaries to shapes and back."""
+"""Reads and writes the scenes of problem files: converts plain dictionaries to shapes, and shapes to
+dictionaries."""
 
 from collections.abc import Iterable
 from dataclasses import MISSING, fields
@@ -30,15 +31,15 @@ SHAPES: dict[str, type[Shape]] = {
     shape.kind: shape for shape in (Sphere, Box, Cylinder, Capsule, Mesh, PointCloud, HeightMap)
 }
 FILE_CONTENT = {"mesh": ("vertices", "faces"), "point_cloud": ("points",), "height_map": ("heights",)}
-"""For each shape that may be read from a file, the fields that the file contains."""
+"""For each kind of shape that may be read from a file, the fields that the file contains."""
 
 
 def check_fields(
     where: str, data: object, required: Iterable[str], optional: Iterable[str] = ()
 ) -> dict[str, Any]:
-    """The data, with a field `rpy` as `wxyz`.
+    """The data, with a field `rpy` converted to `wxyz`.
 
-    Raises InputError unless it is a mapping with all required and no unknown fields.
+    Raises InputError unless `data` is a mapping with all required fields and without unknown fields.
     """
     required = tuple(required)
     field_names = tuple(dict.fromkeys((*required, *optional)))
@@ -64,11 +65,11 @@ def check_fields(
 def read_scene(
     entries: object, folder: Path, contacts: object = (), field: str = "scene"
 ) -> tuple[Scene, tuple[str, ...]]:
-    """The scene of a list in a problem file, and notes on changes to it; `contacts` is its
-    `allowed_contacts`.
+    """The scene that a list of shapes in a problem file describes, and notes on changes that were made to it.
 
-    File names are relative to `folder`. Raises InputError for unknown shapes and fields, values of the wrong
-    type and files that cannot be read; the message starts with the place in the file, e.g. scene[2].
+    `contacts` are the scene's allowed contacts. File names are relative to `folder`. Raises InputError for
+    unknown shapes and fields, values of the wrong type and files that cannot be read. The message starts with
+    the place in the problem file, e.g. scene[2].
     """
     if not isinstance(entries, list):
         raise InputError(
@@ -92,7 +93,7 @@ def read_scene(
 
 
 def required_fields(kind: Any) -> list[str]:
-    """The names of a dataclass's fields without a default."""
+    """The names of the fields of a dataclass that have no default."""
     return [field.name for field in fields(kind) if field.default is field.default_factory is MISSING]
 
 
@@ -123,7 +124,7 @@ def _shape(where: str, kind: type[Shape], values: object, folder: Path, notes: l
 
 
 def _content(kind: type[Shape], file: str, notes: list[str]) -> tuple[ndarray, ...]:
-    """The arrays of FILE_CONTENT in a file."""
+    """The arrays that a file contains, in the order of FILE_CONTENT."""
     if kind is Mesh:
         return read_triangles(file, notes=notes)
     if kind is HeightMap:
@@ -136,8 +137,8 @@ def _content(kind: type[Shape], file: str, notes: list[str]) -> tuple[ndarray, .
 
 
 def scene_entries(scene: Scene, folder: Path | None) -> list[dict[str, dict[str, object]]]:
-    """The scene as `read_scene` reads it, exactly. Shapes that were read from files are written as file
-    names."""
+    """The scene as entries from which `read_scene` restores it exactly. For shapes that were read from files,
+    the file name is written."""
     entries = []
     for shape in scene.shapes:
         file = getattr(shape, "file", None)
@@ -156,12 +157,13 @@ def scene_entries(scene: Scene, folder: Path | None) -> list[dict[str, dict[str,
 
 
 def contacts_entry(scene: Scene) -> dict[str, object]:
-    """The allowed contacts as problem files hold them."""
+    """The allowed contacts in the form of problem files."""
     return {name: links if isinstance(links, str) else list(links) for name, links in scene.allowed_contacts}
 
 
 def name_from(folder: Path | None, file: Path) -> str:
-    """The file's name, relative to the folder if it is in or below it, so that the folder can be moved."""
+    """The path of a file as it is written: relative to `folder` if the file is in or below it, so that the
+    folder can be moved, else absolute."""
     file = file.resolve()
     if folder is None:
         return str(file)

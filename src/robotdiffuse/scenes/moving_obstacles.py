@@ -1,6 +1,6 @@
 """Moving obstacles: with a known trajectory, or with an unknown motion of limited speed.
 
-As with shapes, the constructor checks its arguments itself: see `no_type_check` in scenes/shapes.py.
+As with shapes, the constructor checks its arguments itself; scenes/shapes.py explains `no_type_check`.
 """
 
 from dataclasses import dataclass, replace
@@ -24,13 +24,14 @@ from robotdiffuse.core.types import ArrayOrNone, Pose, Poses, Values, VectorOrNo
 from robotdiffuse.scenes.shapes import Shape
 
 MAX_POINT_SPEED = 100.0
-"""Speed limit of every point of an obstacle [m/s]; anything faster between two poses is a jump."""
+"""Largest allowed speed of a point of an obstacle [m/s]; a faster motion between two poses counts as a
+jump."""
 MAX_DURATION = 1e5
-"""Duration of a motion with constant velocity [s], about a day: no longer motion is validated."""
+"""Duration for which a constant velocity lasts [s], about a day: longer motions are not validated."""
 RIGID_SLACK = 1e-6
 """Largest deviation of a pose from a rigid transform."""
 POSE_TOLERANCE = 1e-6
-"""Tolerance between the first pose and the pose of the shape [m], [rad]."""
+"""Largest difference between the first pose and the pose of the shape [m], [rad]."""
 
 
 @no_type_check
@@ -38,14 +39,14 @@ POSE_TOLERANCE = 1e-6
 class MovingObstacle(Value):
     """A shape with its pose at time 0, in the frame of the robot's base, and one of three motions.
 
-    velocity: the shape keeps its orientation and moves at a constant velocity for ever.
-    times and poses: the pose of its frame at each time. In between, it moves on straight lines at constant
-    speed and turns at a constant rate; before the first and after the last time it stands still.
-    max_speed: its motion is unknown, but none of its points is faster than this.
+    velocity: the shape keeps its orientation and moves at a constant velocity forever. times and poses: the
+    pose of the shape's frame at each time. Between these times, the shape moves on straight lines at constant
+    speed and turns at a constant rate. Before the first and after the last time it stands still. max_speed:
+    the motion is unknown, but no point of the shape is faster than this.
 
-    Raises InputError for none or several of these motions, values that are not finite, times that do not
-    increase, poses that jump (a point faster than MAX_POINT_SPEED) or do not begin at the pose of the shape,
-    negative speeds, and point clouds, which have no frame of their own.
+    Raises InputError unless exactly one of these motions is given, and for values that are not finite, times
+    that do not increase, poses that jump (a point is faster than MAX_POINT_SPEED), a first pose that is not
+    the pose of the shape, negative speeds, and point clouds, which have no frame of their own.
     """
 
     shape: Shape
@@ -56,7 +57,7 @@ class MovingObstacle(Value):
     poses: ArrayOrNone = None  # pyright: ignore[reportAssignmentType]
     """T_base_shape at each time."""
     max_speed: float | None = None
-    """Speed limit of all points of an obstacle whose motion is unknown [m/s]."""
+    """Upper bound on the speed of all points of an obstacle with unknown motion [m/s]."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.shape, Shape):
@@ -90,8 +91,8 @@ class MovingObstacle(Value):
         super().__post_init__()
 
     def _check_track(self) -> None:
-        """Sets times and poses. Raises InputError unless times increase, and poses are rigid transforms,
-        begin at the pose of the shape and do not jump."""
+        """Sets `times` and `poses` to arrays. Raises InputError unless times increase, all poses are rigid
+        transforms, the first is the pose of the shape, and there are no jumps."""
         times = numbers(self.times)
         poses = numbers(self.poses)
         if times is None or times.ndim != 1 or len(times) < 2 or not within(times, MAX_DURATION):
@@ -113,8 +114,11 @@ class MovingObstacle(Value):
             rigid_transform(f"{self.name}.poses[{i}]", T, RIGID_SLACK)
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "poses", poses)
-        off = inverse(self.shape.T_base_shape) @ poses[0]
-        if np.linalg.norm(off[:3, 3]) > POSE_TOLERANCE or rotation_angle(off[:3, :3]) > POSE_TOLERANCE:
+        T_shape_first = inverse(self.shape.T_base_shape) @ poses[0]
+        if (
+            np.linalg.norm(T_shape_first[:3, 3]) > POSE_TOLERANCE
+            or rotation_angle(T_shape_first[:3, :3]) > POSE_TOLERANCE
+        ):
             raise InputError(
                 f"{self.name}.poses[0] is at {shown(poses[0, :3, 3])}; it must be the pose of the shape, "
                 f"whose position is {shown(self.shape.T_base_shape[:3, 3])}"
@@ -136,21 +140,22 @@ class MovingObstacle(Value):
 
     @property
     def known(self) -> bool:
-        """Whether its motion is known."""
+        """Whether the obstacle's motion is known."""
         return self.max_speed is None
 
     @cached_property
     def radius(self) -> float:
-        """Bound of the distance of its points from the origin of its frame [m]."""
+        """Upper bound on the distance of the shape's points from the origin of its frame [m]."""
         low, high = self.shape.bounds
         center = self.shape.T_base_shape[:3, 3]
         return float(np.linalg.norm(np.maximum(np.abs(low - center), np.abs(high - center))))
 
     @cached_property
     def track(self) -> tuple[Values, Poses]:
-        """Times, and poses between which it moves at constant rates; it stands still before and after.
+        """Times [s], and the poses T_base_shape at these times. Between them, the obstacle moves at constant
+        rates; before the first and after the last it stands still.
 
-        If its motion is unknown, only its pose at time 0.
+        If the motion is unknown, the track is the pose at time 0 only.
         """
         T = self.shape.T_base_shape
         if self.velocity is not None:
@@ -174,7 +179,7 @@ class MovingObstacle(Value):
             time: Time since the motion begins [s].
 
         Returns:
-            The pose [4, 4]; the one at time 0 if the motion is unknown.
+            The pose [4, 4]; if the motion is unknown, the pose at time 0.
         """
         times, poses = self.track
         i = int(np.clip(np.searchsorted(times, time, side="right") - 1, 0, max(len(times) - 2, 0)))
@@ -188,15 +193,17 @@ class MovingObstacle(Value):
         return transform(xyz, rotation_from_quaternion(_slerp(a, b, fraction)))
 
     def at(self, time: float) -> Shape:
-        """The shape where it is at a time.
+        """The shape at its pose at a time.
 
         Args:
-            time: Time since the motion begins [s]. If the motion is unknown, the shape is where it begins.
+            time: Time since the motion begins [s]. If the motion is unknown, the shape is returned at its
+            pose at time
+                0.
         """
         return self.shape.moved(self.pose(time) @ inverse(self.shape.T_base_shape))
 
     def moved(self, T: Pose) -> "MovingObstacle":
-        """The obstacle and its motion after a rigid motion.
+        """The obstacle, moved by a rigid motion together with its own motion.
 
         Args:
             T: The rigid motion, a homogeneous transform [4, 4].
@@ -207,14 +214,15 @@ class MovingObstacle(Value):
 
 
 def track_speeds(times: Values, poses: Poses, radius: float) -> Float[ndarray, "intervals"]:
-    """Bounds of the speed between the times [m/s], for points up to `radius` [m] from the origin."""
+    """Upper bounds on the speed between successive times [m/s], for points up to `radius` [m] from the origin
+    of the moving frame."""
     distances_between = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     turns = [rotation_angle(a.T @ b) for a, b in zip(poses[:-1, :3, :3], poses[1:, :3, :3], strict=True)]
     return (distances_between + radius * np.array(turns)) / np.diff(times)
 
 
 def _slerp(a: Float[ndarray, "4"], b: Float[ndarray, "4"], fraction: float) -> Float[ndarray, "4"]:
-    """The quaternion at a fraction of the shorter way from a to b."""
+    """The unit quaternion at a fraction of the shorter rotation from a to b."""
     b = b if a @ b >= 0 else -b
     angle = 2 * np.arctan2(np.linalg.norm(a - b), np.linalg.norm(a + b))
     if angle < 1e-9:

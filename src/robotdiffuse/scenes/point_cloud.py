@@ -1,8 +1,8 @@
-"""Reads point clouds and OctoMap's binary files (.bt), downsamples and crops them.
+"""Reads, downsamples and crops point clouds; reads OctoMap's binary files (.bt).
 
-The format of OctoMap: a header of text up to the line `data`, then the tree, depth first. Each inner node
-has two bytes, two bits for each of its eight children: 0 unknown, 1 free, 2 occupied, 3 an inner node that
-follows. Bits 0, 1 and 2 of a child's number say whether it is the upper one in x, y and z. See
+OctoMap's binary format is a header of text up to the line `data`, then the tree, depth first. Each inner node
+is two bytes, with two bits for each of its eight children: 0 unknown, 1 free, 2 occupied, 3 an inner node,
+which follows. Bit 0, 1 or 2 of a child's number is set if the child is in the upper half along x, y or z. See
 OccupancyOcTreeBase::writeBinaryNode of https://github.com/OctoMap/octomap.
 """
 
@@ -20,17 +20,18 @@ from robotdiffuse.core.types import Points, Vector
 FIRST_LINE = b"# Octomap OcTree binary file"
 TREE_DEPTH = 16
 """Number of levels of the tree below the root; the edge of the root is 2^16 voxels."""
-# Values of a child's two bits.
+# values of a child's two bits
 OCCUPIED = 2
 INNER = 3
 MAX_VOXELS = 5_000_000
+"""Largest number of occupied voxels that are read from a tree."""
 
 
 def read_octomap(file: str | Path) -> tuple[Points, float]:
-    """The centers of a .bt file's occupied voxels [m], and their edge [m].
+    """The centers of a .bt file's occupied voxels [m], and the edge of a voxel [m].
 
-    An occupied leaf above the lowest level is a cube of voxels; only those at its surface are returned.
-    Raises InputError for a file that is not of this format, or damaged.
+    An occupied leaf above the lowest level is a cube of voxels, of which only the voxels at the surface are
+    returned. Raises InputError for a file that is not of this format, or damaged.
     """
     content = read_bytes(file, "octomap")
     header, separator, data = content.partition(b"\ndata\n")
@@ -51,12 +52,13 @@ def read_octomap(file: str | Path) -> tuple[Points, float]:
 
 
 def cover_radius(edge: float) -> float:
-    """Radius of the sphere around a voxel [m]."""
+    """Radius of the sphere around a voxel with this edge [m]."""
     return edge * np.sqrt(3) / 2
 
 
 def occupied_voxels(data: bytes, edge: float) -> Points:
-    """The centers of the occupied voxels of a tree in OctoMap's binary format [m].
+    """The centers of the occupied voxels of a tree in OctoMap's binary format [m]; as in `read_octomap`, of
+    larger cubes only the voxels at the surface.
 
     Raises InputError for data that end too soon, a tree that is too deep or has too many voxels, and an edge
     that is not positive.
@@ -66,7 +68,7 @@ def occupied_voxels(data: bytes, edge: float) -> Points:
     centers: list[ndarray] = []
     count = 0
     at = 0
-    waiting = [(np.zeros(3), TREE_DEPTH)]  # inner nodes to read: center and level, the next one last
+    waiting = [(np.zeros(3), TREE_DEPTH)]  # stack of inner nodes to read: center and level
     while waiting and data:
         center, level = waiting.pop()
         if at + 2 > len(data) or level == 0:
@@ -93,7 +95,8 @@ def occupied_voxels(data: bytes, edge: float) -> Points:
 
 
 def _shell(level: int) -> Points:
-    """Centers of the voxels at the surface of a cube of 2^level voxels, about its middle, in voxels."""
+    """Centers of the voxels at the surface of a cube with an edge of 2^level voxels, relative to the cube's
+    middle [voxels]."""
     n = 2**level
     if 6 * n**2 > MAX_VOXELS:
         raise InputError(f"the tree has more than {MAX_VOXELS:,} occupied voxels")
@@ -105,15 +108,15 @@ def _shell(level: int) -> Points:
 
 
 POINT_RADIUS = 0.01
-"""Radius of points, unless another is given [m]."""
+"""Default radius of points [m]."""
 MIXERS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
-"""Odd numbers with many bits, by which coordinates are mixed into a hash."""
+"""Odd factors with many bits, for a hash of a point: the sum of its coordinates' bits times these factors."""
 
 
 def voxel_thin(points: Points, voxel: float) -> Points:
     """The first point of every occupied cell of a grid with cells `voxel` wide [m], in the original order.
 
-    Every removed point is less than sqrt(3) * voxel away from a remaining one.
+    Every removed point is less than sqrt(3) * voxel away from a remaining point.
     """
     if len(points) == 0:
         return points
@@ -122,7 +125,8 @@ def voxel_thin(points: Points, voxel: float) -> Points:
     extent = cells.max(axis=0) + 1
     bits = len(points).bit_length()
     if extent.prod() * 2.0**bits < 2.0**62 and extent.prod() < 2.0**53:
-        # Sorting cell and point numbers packed into one integer is several times faster than np.unique.
+        # Cell and point numbers are packed into one integer: sorting these is several times faster than
+        # np.unique.
         cell = (cells @ np.array([extent[1] * extent[2], extent[2], 1.0])).astype(np.int64)
         packed = np.sort((cell << bits) | np.arange(len(points)))
         first = np.flatnonzero(np.diff(packed >> bits, prepend=-1))
@@ -133,15 +137,18 @@ def voxel_thin(points: Points, voxel: float) -> Points:
 
 
 def distinct(points: Points) -> Points:
-    """The points without repetitions, in the old order; the same array if there are none."""
+    """The points without repetitions, in the original order. If no point is repeated, the same array is
+    returned."""
     if len(points) == 0:
         return points
-    # To sort one number for each point is ten times faster than to sort points.
+    # Sorting one hash per point is ten times faster than sorting points.
     hashes = (np.ascontiguousarray(points, np.float64) + 0.0).view(np.uint64) @ MIXERS
     if len(np.unique(hashes)) == len(points):
         return points
     first_indices, inverse_indices = np.unique(hashes, return_index=True, return_inverse=True)[1:]
-    if not np.array_equal(points[first_indices][inverse_indices], points):  # two points have one hash
+    if not np.array_equal(
+        points[first_indices][inverse_indices], points
+    ):  # different points have the same hash
         first_indices = np.unique(points, axis=0, return_index=True)[1]
     return points[np.sort(first_indices)]
 
@@ -192,7 +199,8 @@ def _read_ply(file: Path) -> ndarray:
 
 
 def _read_text(file: Path) -> ndarray:
-    """Columns of numbers, separated by commas or blanks; the first line may be a header of names."""
+    """Columns of numbers, separated by commas or blanks. The first line may be a header with the names of the
+    columns."""
     with file.open(encoding="utf-8") as stream:
         first = stream.readline()
     delimiter = "," if "," in first else None
@@ -246,7 +254,7 @@ def _read_pcd(file: Path) -> ndarray:
     if storage == "binary":
         points = np.frombuffer(content, record, count=total, offset=at)
         columns = [points[str(i)][:, 0] for i in places]
-    else:  # one field after the other
+    else:  # all values of one field, then all of the next
         packed, size = struct.unpack_from("<II", content, at)
         if size != total * record.itemsize:
             raise InputError(f"point cloud file {file} unpacks to {size:,} bytes, not to {total:,} points")
@@ -260,20 +268,22 @@ def _read_pcd(file: Path) -> ndarray:
 
 
 def lzf_unpacked(packed: bytes, size: int) -> bytes:
-    """Data that LibLZF packed, of a size [bytes]: https://oldhome.schmorp.de/marc/liblzf.html
+    """Unpacks data that LibLZF packed; `size` is the unpacked size [bytes].
+    https://oldhome.schmorp.de/marc/liblzf.html
 
-    Raises ValueError if the data unpack to another size (unpacking stops once it is exceeded), and IndexError
-    if they end too soon.
+    Raises ValueError if the unpacked size differs, and IndexError if the data end too soon. Unpacking stops
+    when the size is exceeded.
     """
     out = bytearray()
     at = 0
     while at < len(packed) and len(out) <= size:
         control = packed[at]
         at += 1
-        if control < 32:  # so many bytes and one more as they are
+        if control < 32:  # control + 1 bytes follow unpacked
             out += packed[at : at + control + 1]
             at += control + 1
             continue
+        # a repetition of earlier output: its length, and how far back it starts
         length = (control >> 5) + 2
         if length == 9:
             length += packed[at]
@@ -301,6 +311,6 @@ READERS: dict[str, Callable[[Path], ndarray]] = {
 
 
 def default_radius(file: str | Path) -> float:
-    """Radius of the points of a file [m]: POINT_RADIUS, or the radius of the spheres around the voxels of an
-    octomap."""
+    """Default radius of the points of a file [m]: the radius of the sphere around a voxel for an octomap,
+    else POINT_RADIUS."""
     return cover_radius(read_octomap(file)[1]) if Path(file).suffix.lower() == ".bt" else POINT_RADIUS

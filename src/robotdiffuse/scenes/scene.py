@@ -17,7 +17,7 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
 
 SHOWN_NAMES = 5
-"""Largest number of names of shapes in the text that describes a scene."""
+"""Largest number of names of shapes in the text of a scene (`repr`)."""
 ALL_LINKS = "all"
 """Stands for all links of a robot in `Scene.allowed_contacts`."""
 MAX_CONTACT_LINKS = 1000
@@ -34,12 +34,12 @@ PLANE_DEPTH = 0.1
 class Scene(Value):
     """Obstacles in the frame of the robot's base. A number is appended to names that are not unique.
 
-    allowed_contacts: for obstacles by name, the links that may touch them, or "all", such as
-    {"mug": ["panda_hand", "panda_leftfinger"], "table": "all"}. Held objects and tools are links too. A name
-    that several shapes were given stands for all of them. Contact that is allowed is no collision to
-    searches, validators and certificates, and does not count for clearances.
+    allowed_contacts: for obstacles by name, the links that may touch the obstacle, or "all", such as {"mug":
+    ["panda_hand", "panda_leftfinger"], "table": "all"}. Held objects and tools are links too. If several
+    shapes were given the same name, the name stands for all of them. Allowed contacts are not collisions for
+    searches, validators and certificates, and are left out of clearances.
 
-    Raises InputError for anything but shapes, and for allowed contacts with unknown obstacles.
+    Raises InputError for values that are not shapes, and for allowed contacts with unknown obstacles.
     """
 
     shapes: tuple[Shape, ...] = ()
@@ -81,16 +81,18 @@ class Scene(Value):
 
     @classmethod
     def from_mujoco(cls, model: Any, data: Any = None, base: str = "world") -> "Scene":
-        """The obstacles of a MuJoCo model: all geoms that collide and are no part of the robot.
+        """The obstacles of a MuJoCo model: all colliding geoms that are not part of the robot.
 
         Args:
-            model: A compiled model, such as `mujoco.MjModel.from_xml_path` returns.
-            data: State of the model, which says where free bodies are; None: as the model places them.
-            base: The body that is the base of the robot; scenes are in its frame. A robot that
-                `load_robot` reads from a model has the base "world".
+            model: A compiled model, such as `mujoco.MjModel.from_xml_path` returns. data: State of the model,
+            which gives the poses of free bodies; None: their poses in the model. base: The body that is the
+            base of the robot; the scene is in its frame. A robot that `load_robot` reads
+                from a model has the base "world".
 
         Returns:
-            Scene: Planes are boxes of 10 m, or of their size; meshes are convex, as for MuJoCo.
+            Scene: Planes become boxes of their size; an infinite plane becomes a box of 10 m. Meshes are
+            replaced by
+                their convex hulls, as MuJoCo does.
 
         Raises:
             InputError: For an unknown body, and for height fields and signed distance fields.
@@ -106,11 +108,11 @@ class Scene(Value):
         return self.with_shapes([shape.moved(T) for shape in self.shapes])
 
     def with_shapes(self, shapes: Iterable[Shape]) -> "Scene":
-        """A scene of other shapes. A shape with the same name as one of this scene keeps the contacts that
-        are allowed for it.
+        """A scene with other shapes. Allowed contacts are kept for shapes with the name of a shape of this
+        scene.
 
         Args:
-            shapes: The obstacles.
+            shapes: The obstacles of the new scene.
         """
         scene = Scene(shapes)
         if self.allowed_contacts:
@@ -120,7 +122,7 @@ class Scene(Value):
         return scene
 
     def may_touch(self, link: str, obstacle: str) -> bool:
-        """Whether a contact is allowed.
+        """Whether contact between a link and an obstacle is allowed.
 
         Args:
             link: Name of a link or held object.
@@ -141,20 +143,20 @@ class Scene(Value):
         link: str | None = None,
         touch_links: Sequence[str] = (),
     ) -> tuple["Scene", Robot]:
-        """The robot takes an obstacle of the scene.
+        """Lets the robot grasp an obstacle of the scene.
 
         Args:
-            name: The obstacle.
+            name: Name of the obstacle.
             robot: The robot.
-            q: Configuration at which it grasps the obstacle [dof].
-            link: The link that holds it; None: the tip of the robot.
-            touch_links: Further links that it may touch.
+            q: Configuration at which the robot grasps the obstacle [dof].
+            link: The link that holds the obstacle; None: the tip of the robot.
+            touch_links: Further links that the obstacle may touch.
 
         Returns:
-            The scene without the obstacle, and the robot holding it.
+            The scene without the obstacle, and the robot holding the obstacle.
 
         Raises:
-            InputError: For an unknown obstacle, and where `Robot.attach` does.
+            InputError: For an unknown obstacle, and in the cases in which `Robot.attach` raises it.
         """
         names = [shape.name for shape in self.shapes]
         if name not in names:
@@ -168,28 +170,28 @@ class Scene(Value):
         return remaining_scene, robot.attach(taken_shape, link, touch_links)
 
     def detach(self, name: str, robot: Robot, q: Configuration) -> tuple["Scene", Robot]:
-        """The robot puts a held object down.
+        """Lets the robot release a held object.
 
         Args:
-            name: The held object.
-            robot: The robot that holds it.
-            q: Configuration at which it releases the object [dof].
+            name: Name of the held object.
+            robot: The robot that holds the object.
+            q: Configuration at which the robot releases the object [dof].
 
         Returns:
-            The scene with the object, and the robot without it.
+            The scene with the object, and the robot without the object.
 
         Raises:
             InputError: For an unknown name.
         """
-        freed = robot.detach(name)
+        robot_without = robot.detach(name)
         [body] = [body for body in robot.attached if body.name == name]
         T_base_link = link_pose(robot, np.asarray(q, float), body.link)
         released = [shape.moved(T_base_link) for shape in body.shapes if isinstance(shape, Shape)]
-        return self.with_shapes([*self.shapes, *released]), freed
+        return self.with_shapes([*self.shapes, *released]), robot_without
 
 
 def contact_notes(scene: Scene) -> tuple[str, ...]:
-    """A note on each obstacle that links may touch."""
+    """One note per obstacle that links may touch."""
     return tuple(
         f"contact of {name} with {'all links' if links == ALL_LINKS else joined(links)} is allowed"
         for name, links in scene.allowed_contacts
@@ -199,8 +201,8 @@ def contact_notes(scene: Scene) -> tuple[str, ...]:
 def _contacts(
     allowed: object, given: dict[str, list[str]], names: set[str]
 ) -> tuple[tuple[str, tuple[str, ...] | str], ...]:
-    """Checked `Scene.allowed_contacts`. `given` maps the names that shapes were given to their unique
-    names."""
+    """Checks allowed contacts and returns `Scene.allowed_contacts`. `given` maps each name that was given to
+    shapes to the unique names of these shapes."""
     try:
         entries = allowed.items() if isinstance(allowed, Mapping) else [(a, b) for a, b in allowed]  # type: ignore
     except (TypeError, ValueError):

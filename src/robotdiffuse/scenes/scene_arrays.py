@@ -1,4 +1,4 @@
-"""Scenes of spheres and boxes as arrays, for data sets and for batches in training."""
+"""Scenes of spheres and boxes, packed in arrays for data sets and for training batches."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from robotdiffuse.core.transforms import rotation_from_quaternion
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Shape, Sphere
 
-# Kinds of packed shapes; NONE is an empty row.
+# values of `PackedScenes.kinds`; NONE is an empty row
 NONE = 0
 SPHERE = 1
 BOX = 2
@@ -22,17 +22,19 @@ PARAMETERS = 10
 
 @dataclass(frozen=True, eq=False)
 class PackedScenes:
-    """n scenes of at most k spheres and boxes each, and their floors. Lengths in [m].
+    """n scenes of at most k spheres and boxes each, with an optional floor. Lengths are in [m].
 
-    `surface_clouds` makes point clouds of them.
+    `surface_clouds` samples point clouds on the spheres and boxes.
     """
 
     kinds: Int8[ndarray, "n k"]
+    """SPHERE, BOX or NONE."""
     params: Float32[ndarray, "n k 10"]
-    """Parameters of a sphere: center, radius; of a box: center, size, wxyz; padded with zeros."""
+    """Parameters of a sphere: center, radius. Of a box: center, size, wxyz. Other entries are zero."""
     floors: Float[ndarray, "n 6"] | None = None
-    """Center and size of each floor, zeros for scenes without a floor; None: no scene has one. Floors are
-    not obstacles: point clouds do not contain them, and `turned` does not turn them."""
+    """Center and size of each scene's floor, zeros for a scene without a floor; None if no scene has one.
+    Floors do not count as obstacles: point clouds and `distances` leave them out, and `turned` does not turn
+    them."""
 
     def __len__(self) -> int:
         return len(self.kinds)
@@ -43,9 +45,11 @@ class PackedScenes:
 
     @staticmethod
     def pack(scenes: Sequence[Scene], slots: int, floor: bool = False) -> "PackedScenes":
-        """The scenes as arrays with `slots` rows each. floor: whether the first shape of each is its floor.
+        """Packs scenes, with room for `slots` shapes in each. With `floor`, the first shape of each scene is
+        its floor.
 
-        Raises InputError for other shapes than spheres and boxes, and for more shapes than slots.
+        Raises InputError for shapes other than spheres and boxes, and for scenes with more than `slots`
+        shapes.
         """
         kinds = np.full((len(scenes), slots), NONE, np.int8)
         params = np.zeros((len(scenes), slots, PARAMETERS), np.float32)
@@ -69,7 +73,7 @@ class PackedScenes:
 
     @staticmethod
     def joined(parts: Sequence["PackedScenes"]) -> "PackedScenes":
-        """All scenes of the parts, in order. Either all parts or none must have floors."""
+        """All scenes of several PackedScenes, in order. Either all of them or none must have floors."""
         kinds, params = (np.concatenate([getattr(p, name) for p in parts]) for name in ("kinds", "params"))
         floors = [p.floors for p in parts if p.floors is not None]
         return PackedScenes(kinds, params, np.concatenate(floors) if floors else None)
@@ -81,7 +85,7 @@ class PackedScenes:
         return Box(self.floors[i, :3], self.floors[i, 3:], name="floor")
 
     def scene(self, i: int) -> Scene:
-        """Scene i, its floor first; exact up to float32. Names are lost."""
+        """Scene i, with its floor as the first shape. Values are rounded to float32, and names are lost."""
         floor = self.floor(i)
         shapes: list[Shape] = [] if floor is None else [floor]
         for kind, row in zip(self.kinds[i], self.params[i], strict=True):
@@ -100,7 +104,7 @@ class PackedScenes:
         y = params[..., 1].copy()
         params[..., 0] = c * x - s * y
         params[..., 1] = s * x + c * y
-        # quaternion of the rotation, (cos, 0, 0, sin) of half the angle, times that of the obstacle
+        # quaternion product of the turn, (cos, 0, 0, sin) of half the angle, and the obstacle's orientation
         c = np.cos(angle / 2)[:, None]
         s = np.sin(angle / 2)[:, None]
         w, i, j, k = np.moveaxis(params[..., 6:].copy(), -1, 0)
@@ -112,14 +116,16 @@ class PackedScenes:
         obstacles."""
         nearest = np.full((len(self), len(at)), np.inf)
         for kind, p in zip(self.kinds.T, self.params.transpose(1, 0, 2).astype(np.float64), strict=True):
-            box = kind == BOX
-            some = kind != NONE
-            away = at - p[:, None, :3]
-            distance = np.linalg.norm(away, axis=-1) - p[:, 3, None]
-            local = np.abs(away[box] @ rotation_from_quaternion(p[box, 6:])) - p[box, None, 3:6] / 2
+            is_box = kind == BOX
+            is_shape = kind != NONE
+            offsets = at - p[:, None, :3]
+            distance = np.linalg.norm(offsets, axis=-1) - p[:, 3, None]
+            local = (
+                np.abs(offsets[is_box] @ rotation_from_quaternion(p[is_box, 6:])) - p[is_box, None, 3:6] / 2
+            )
             outside = np.linalg.norm(local.clip(min=0), axis=-1)
-            distance[box] = outside + local.max(-1).clip(max=0)
-            nearest[some] = np.minimum(nearest[some], distance[some])
+            distance[is_box] = outside + local.max(-1).clip(max=0)
+            nearest[is_shape] = np.minimum(nearest[is_shape], distance[is_shape])
         return nearest
 
 

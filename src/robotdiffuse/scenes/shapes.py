@@ -1,7 +1,7 @@
 """Obstacle shapes in the frame of the robot's base.
 
-The constructors check their arguments themselves and raise InputError. `no_type_check` therefore keeps the
-run-time type checks of the tests off these classes.
+The constructors check their arguments and raise InputError. The tests check the types of all arguments at run
+time; `no_type_check` turns this off for these classes, so that the constructors' own errors are raised.
 """
 
 import warnings
@@ -38,13 +38,13 @@ from robotdiffuse.scenes.point_cloud import POINT_RADIUS, default_radius, distin
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 Corners = Float[ndarray, "2 3"]
-"""Lower and upper corner of a box along the axes [m]."""
+"""Lower and upper corner of an axis-aligned box [m]."""
 
 
 class Shape(Value, ABC):
-    """Base class of all obstacles. `kind` is its name in problem files.
+    """Base class of all shapes of obstacles. `kind` is the name of the class in problem files.
 
-    The constructors take anything that NumPy reads as numbers and raise InputError for everything else.
+    The constructors take all values that NumPy can convert to numbers, and raise InputError for other values.
     """
 
     kind: ClassVar[str]
@@ -67,16 +67,17 @@ class Shape(Value, ABC):
         raise self._not_solid()
 
     def moved(self, T: Pose) -> "Shape":
-        """The shape after the rigid motion T. A point cloud forgets the file that it was read from.
+        """The shape after the rigid motion T. For a moved point cloud, `file` is None.
 
-        Raises InputError for shapes that do not implement it.
+        Raises InputError for kinds of shapes that do not support motions.
         """
         raise InputError(f"a {self.kind} cannot be moved; write it as a mesh")
 
     def solid(self) -> tuple[Pose, tuple[ConvexMesh, ...]]:
-        """T_base_shape, and convex meshes in the shape's own frame that enclose it, for a robot to hold.
+        """T_base_shape, and convex meshes in the shape's own frame that enclose the shape; used when a robot
+        holds it.
 
-        The mesh of a box is exact; round shapes get a polyhedron around them. Raises InputError for point
+        The mesh of a box is exact; round shapes are enclosed by a polyhedron. Raises InputError for point
         clouds and height maps.
         """
         from robotdiffuse.scenes.convex_solids import SOLIDS  # SciPy, which few problems need
@@ -91,7 +92,7 @@ class Shape(Value, ABC):
         )
 
     def __post_init__(self) -> None:
-        """Checks the fields that `CHECKS` names. Raises InputError for the first that is wrong."""
+        """Checks the fields that `CHECKS` names. Raises InputError for the first wrong value."""
         for name in (field.name for field in fields(self)):  # type: ignore[arg-type]
             if name in CHECKS:
                 object.__setattr__(self, name, CHECKS[name](self.kind, name, getattr(self, name)))
@@ -130,8 +131,8 @@ CHECKS: dict[str, Callable[[str, str, Any], Any]] = {
     "point_radius": positive,
     "name": _name,
 }
-"""Checks of fields of shapes by name: functions of a shape's kind, the field's name and value that return the
-value to keep, or raise InputError."""
+"""Checks of shapes' fields, by name of the field. Each check takes the shape's kind, the field's name and its
+value. It returns the value to store, or raises InputError."""
 
 
 @no_type_check
@@ -139,9 +140,8 @@ value to keep, or raise InputError."""
 class Sphere(Shape):
     """A ball.
 
-    center: its middle, x y z in the frame of the robot's base [m].
-    radius: [m].
-    name: by which results and commands refer to it; a scene appends a number to names that are not unique.
+    center: x y z in the frame of the robot's base [m]. radius: [m]. name: name in results, commands and
+    allowed contacts; a scene appends a number to names that are not unique.
     """
 
     center: GivenVector
@@ -174,7 +174,7 @@ class _Posed(Shape):
     """A shape with a frame of its own."""
 
     origin: ClassVar[str] = "center"
-    """The field that holds the frame's position."""
+    """Name of the field with the position of the shape's frame."""
     wxyz: GivenArray
 
     @cached_property
@@ -196,10 +196,10 @@ class _Posed(Shape):
 class Box(_Posed):
     """A box of any orientation.
 
-    center: its middle, x y z in the frame of the robot's base [m].
-    size: full edge lengths along its own x, y and z [m].
-    wxyz: its orientation as a quaternion, scalar first; default: along the axes of the base.
-    name: by which results and commands refer to it; a scene appends a number to names that are not unique.
+    center: middle of the box, x y z in the frame of the robot's base [m]. size: full edge lengths along the
+    box's own x, y and z [m]. wxyz: orientation as a quaternion, scalar first; default: along the axes of the
+    base. name: name in results, commands and allowed contacts; a scene appends a number to names that are not
+    unique.
     """
 
     center: GivenVector
@@ -223,7 +223,7 @@ class Box(_Posed):
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class _Axial(_Posed):
-    """A shape about its own z axis."""
+    """A shape that is symmetric about its own z axis."""
 
     center: GivenVector
     radius: float
@@ -236,10 +236,10 @@ class _Axial(_Posed):
 class Cylinder(_Axial):
     """A cylinder about its own z axis.
 
-    center: its middle, x y z in the frame of the robot's base [m].
+    center: middle of the cylinder, x y z in the frame of the robot's base [m].
     radius, height: [m].
-    wxyz: its orientation as a quaternion, scalar first; default: upright.
-    name: as of Box.
+    wxyz: orientation as a quaternion, scalar first; default: axis along z of the base.
+    name: see `Box`.
     """
 
     name: str = "cylinder"
@@ -261,11 +261,11 @@ class Cylinder(_Axial):
 class Capsule(_Axial):
     """A cylinder about its own z axis with a half sphere at each end.
 
-    center: its middle, x y z in the frame of the robot's base [m].
-    radius: of the cylinder and its ends [m].
-    height: of the cylinder, without its ends [m].
-    wxyz: its orientation as a quaternion, scalar first; default: upright.
-    name: as of Box.
+    center: middle of the capsule, x y z in the frame of the robot's base [m].
+    radius: of the cylinder and the half spheres [m].
+    height: of the cylinder, without the half spheres [m].
+    wxyz: orientation as a quaternion, scalar first; default: axis along z of the base.
+    name: see `Box`.
     """
 
     name: str = "capsule"
@@ -284,11 +284,12 @@ class Capsule(_Axial):
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class PointCloud(Shape):
-    """Points, each a small sphere. The cloud may be empty. `PointCloud.from_file` reads one.
+    """A point cloud; each point is a small sphere. The cloud may be empty. `PointCloud.from_file` reads a
+    file.
 
     points: n x 3, in the frame of the robot's base [m].
     point_radius: radius of the sphere around each point [m].
-    name: as of Box.
+    name: see `Box`.
     """
 
     points: GivenArray
@@ -306,15 +307,17 @@ class PointCloud(Shape):
         scale: float = 1.0,
         name: str = "point_cloud",
     ) -> "PointCloud":
-        """The cloud of a file.
+        """Reads a point cloud from a file.
 
         Points that are not finite are left out, with a warning.
 
         Args:
-            file: A .ply, .pcd, .xyz, .csv, .npy or .npz file, or an octomap (.bt), of which the occupied
-                voxels are taken; in the frame of the base.
-            point_radius: Radius of the sphere around each point [m]; None: 1 cm, or around a voxel of the
-                octomap.
+            file: A .ply, .pcd, .xyz, .csv, .npy or .npz file, or the occupied voxels of an octomap (.bt), in
+            the frame
+                of the base.
+            point_radius: Radius of the sphere around each point [m]; None: 1 cm, or for an octomap the radius
+            of the
+                sphere around a voxel, both times `scale`.
             scale: Meters for each unit of the file: 0.001 for millimeters.
             name: Name of the obstacle, for messages and allowed contacts.
 
@@ -328,16 +331,18 @@ class PointCloud(Shape):
         point_radius = scale * default_radius(file) if point_radius is None else point_radius
         if scale == 1:
             return cls(points, point_radius, str(Path(file).absolute()), name)
-        return cls(scale * points, point_radius, name=name)  # files of problems have no scale
+        # without `file`, since problem files cannot state its scale
+        return cls(scale * points, point_radius, name=name)
 
     @cached_property
     def distinct_points(self) -> Points:
-        """Without repetitions, each of which takes as long as a point of its own in Coal's tree."""
+        """The points without repetitions, since repeated points would slow down Coal's distances."""
         return distinct(self.points)
 
     @cached_property
     def area(self) -> float:
-        """An estimate [m^2]: one face of each occupied cell of a grid with cells as wide as a point."""
+        """An estimate [m^2]: the area of one face for each occupied cell of a grid, with cells as wide as a
+        point."""
         width = 2 * self.point_radius
         return len(voxel_thin(self.points, width)) * width**2
 
@@ -359,12 +364,12 @@ class PointCloud(Shape):
 
 
 class Triangulated(Shape):
-    """A shape whose triangles are used for planning, validation, sampling and drawing."""
+    """A shape that is represented by triangles in planning, validation, sampling and drawing."""
 
     @property
     @abstractmethod
     def mesh(self) -> "Mesh":
-        """Triangles around the shape, in the base frame."""
+        """The shape's triangles."""
 
     @property
     def area(self) -> float:
@@ -378,12 +383,13 @@ class Triangulated(Shape):
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class Mesh(_Posed, Triangulated):
-    """A triangle mesh. Only its surface counts for collision. `Mesh.from_file` reads one.
+    """A triangle mesh. Only its surface is checked for collision, not the space inside. `Mesh.from_file`
+    reads a file.
 
     vertices: n x 3, in the mesh's own frame [m].
     faces: n x 3 indices of vertices, from 0.
     xyz, wxyz: pose of the mesh's frame in the frame of the robot's base.
-    name: as of Box.
+    name: see `Box`.
     """
 
     vertices: GivenArray
@@ -392,7 +398,7 @@ class Mesh(_Posed, Triangulated):
     xyz: GivenVector = (0.0, 0.0, 0.0)  # type: ignore[assignment]
     wxyz: GivenArray = IDENTITY  # type: ignore[assignment]
     file: str | None = None
-    """ALL The file that the shape was read from; files that are written refer to it."""
+    """The file that the shape was read from. Problem files that are written refer to it."""
     name: str = "mesh"
     kind: ClassVar[str] = "mesh"
     origin: ClassVar[str] = "xyz"
@@ -418,12 +424,12 @@ class Mesh(_Posed, Triangulated):
         scale: float = 1.0,
         name: str = "mesh",
     ) -> "Mesh":
-        """The mesh of a file that trimesh reads (.stl, .obj, .ply, .dae, .glb, ...).
+        """Reads a mesh from a file of a format that trimesh reads (.stl, .obj, .ply, .dae, .glb, ...).
 
         Args:
             file: The file.
             xyz: Position of the file's frame in the frame of the base [m].
-            wxyz: Its orientation, a quaternion.
+            wxyz: Orientation of the file's frame, a quaternion.
             scale: Meters for each unit of the file: 0.001 for millimeters.
             name: Name of the obstacle, for messages and allowed contacts.
 
@@ -434,7 +440,8 @@ class Mesh(_Posed, Triangulated):
         scale = positive("mesh", "scale", scale)
         if scale == 1:
             return cls(vertices, faces, xyz, wxyz, str(Path(file).absolute()), name)
-        return cls(scale * vertices, faces, xyz, wxyz, name=name)  # files of problems have no scale
+        # without `file`, since problem files cannot state its scale
+        return cls(scale * vertices, faces, xyz, wxyz, name=name)
 
     @property
     def mesh(self) -> "Mesh":
@@ -461,13 +468,16 @@ class Mesh(_Posed, Triangulated):
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class HeightMap(_Posed, Triangulated):
-    """Terrain: heights at the points of a grid, joined by triangles. Only this surface counts for collision.
+    """Terrain: heights at the points of a grid, joined by triangles. Only this surface is checked for
+    collision.
 
-    heights: rows along y, columns along x, above `xyz` along z [m]; cells with a height that is not a number
-        are holes.
-    cell: distance between neighboring points [m].
-    xyz, wxyz: pose of the first height's point at height 0 in the frame of the robot's base.
-    name: as of Box.
+    heights: heights along z [m], with rows along y and columns along x. Cells with a height that is not a
+    number are
+        holes.
+    cell: distance between neighboring points of the grid [m]. xyz, wxyz: pose of the height map's frame in
+    the frame of the robot's base. Its origin is the first point of the
+        grid, at height 0.
+    name: see `Box`.
     """
 
     heights: GivenArray
@@ -475,7 +485,7 @@ class HeightMap(_Posed, Triangulated):
     xyz: GivenVector = (0.0, 0.0, 0.0)  # type: ignore[assignment]
     wxyz: GivenArray = IDENTITY  # type: ignore[assignment]
     file: str | None = None
-    """ALL The file that the shape was read from; files that are written refer to it."""
+    """The file that the shape was read from. Problem files that are written refer to it."""
     name: str = "height_map"
     kind: ClassVar[str] = "height_map"
     origin: ClassVar[str] = "xyz"

@@ -1,6 +1,6 @@
-"""Samples points on the surfaces of obstacles, the network input of a scene.
+"""Samples points on the surfaces of obstacles: the form in which networks receive a scene.
 
-See `surface_clouds` for many scenes at once.
+`surface_clouds` does this for many scenes at once.
 """
 
 from dataclasses import dataclass
@@ -18,17 +18,18 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere
 
 MAX_SAMPLING_ROUNDS = 6
-"""Largest number of rounds in which `sample_surface` draws points; then it repeats points."""
+"""Largest number of rounds in which `sample_surface` draws points. If these are too few, it repeats
+points."""
 
 
 @dataclass(frozen=True)
 class VisibleRegion(Settings, name="region"):
-    """The region whose surface points are network inputs: within the arm's reach, above its mounting
-    plane."""
+    """The region from which surface points become network inputs: within the arm's reach and above its
+    mounting plane."""
 
     floor: float = 0.02
-    """Points must be higher than this [m]: points of the mounting plane carry no information, since nearly
-    all scenes contain it."""
+    """Points must be higher than this [m]: the mounting plane carries no information, since nearly all scenes
+    contain it."""
     center: tuple[float, float, float] = (0.0, 0.0, 0.3)
     """Center of the region in the base frame [m]: on the base axis, near a Panda's shoulder."""
     reach: Positive = 1.2
@@ -52,8 +53,8 @@ PANDA_REGION = VisibleRegion()
 
 @singledispatch
 def draw(shape: Any, n: int, rng: Generator) -> ndarray:
-    """n points on a shape, uniform by area, in the base frame. This default samples the triangles of the
-    shape's mesh; classes with a registered function are sampled by it."""
+    """n points on a shape, uniform by area, in the base frame [m]. This default samples the triangles of the
+    shape's mesh; other kinds of shapes register their own functions."""
     mesh = shape.mesh
     edges = np.cumsum(mesh.face_areas)
     face = np.searchsorted(edges[:-1], rng.random(n) * edges[-1], side="right")
@@ -115,8 +116,8 @@ def sample_surface(
 ) -> Float[ndarray, "count 3"]:
     """`count` points on the shapes, in random order, uniform by area within the region [m].
 
-    Points repeat if only a small part of the surface lies in the region. If no part does, the array has shape
-    (0, 3).
+    Points repeat if only a small part of the surface is in the region. The array has shape (0, 3) if no part
+    of the surface is.
     """
     shapes = [shape for shape in scene.shapes if shape.area > 0 and _may_intersect(shape, region)]
     if not shapes or count == 0:
@@ -131,7 +132,7 @@ def sample_surface(
         samples = [draw(shape, int(n), rng) for shape, n in zip(shapes, parts, strict=True) if n > 0]
         points = np.concatenate(samples)
         points = points[region.holds(points)]
-        # The points are ordered by shape: without the permutation, the first ones would all be on the first
+        # The points are ordered by shape: without the permutation, the first points would all be on the first
         # shape.
         points = points[rng.permutation(len(points))[:missing]]
         batches.append(points)
