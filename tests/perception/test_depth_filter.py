@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
-from robotdiffuse.perception.depth_filter import empty_regions, filtered, measured_share, patch_noise
+from robotdiffuse.perception.depth_filter import (
+    empty_regions,
+    filtered,
+    measured_share,
+    median_filter,
+    patch_noise,
+)
 from robotdiffuse.perception.depth_view import DepthNoise
 from robotdiffuse.perception.observed_volume import ARM_MARGIN, FREE, carve_view, observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
@@ -50,6 +56,29 @@ def test_noise_is_measured_on_images_of_a_still_scene() -> None:
     assert margin == pytest.approx(filtered(replace(stated, noise=None)).spread, rel=0.5)
     with pytest.raises(rd.InputError, match="at least two"):
         rd.measure_noise(images[:1])
+
+
+@pytest.mark.parametrize("correlation", (0.0, 1.5))
+def test_flat_surfaces_are_smoothed_and_edges_and_thin_things_stay(correlation: float) -> None:
+    """Noise that is correlated as recorded passes the median; planned motions kept away from it."""
+    v, u = np.mgrid[:120, :160]
+    clean = 1 / (0.4 + 0.001 * u + 0.0005 * v)
+    clean[40:80, 60:110] = 1.0
+    clean[:, 30:33] = 1.2
+    view = rd.DepthView(clean, (150, 150, 80, 60), np.eye(4))
+    noise = DepthNoise(spread=0.004, stray=0.0, flying=0.0, edge_missing=0.0, correlation=correlation)
+    noisy = replace(noise.applied(view, np.random.default_rng(0)), noise=noise)
+    smooth, spread, edge_spread = filtered(noisy)
+    seen = (noisy.depth > 0) & (smooth > 0)
+    errors = np.where(seen, smooth - clean, 0.0) / clean**2
+    inner = np.zeros(clean.shape, np.bool_)
+    for rows, columns in ((slice(46, 74), slice(66, 104)), (slice(86, 114), slice(40, 154))):
+        inner[rows, columns] = True
+    assert errors[inner].std() < 0.55 * edge_spread
+    moved = np.where(seen, smooth - median_filter(noisy.depth), 0.0) / clean**2
+    assert np.abs(moved).max() < 4 * noise.spread, "no pixel gets between two surfaces"
+    same_surface = seen & (np.abs(errors) < 6 * noise.spread)  # the median takes corners from objects
+    assert 0.6 < spread / errors[same_surface].std() < 1.6
 
 
 def test_zeros_are_told_from_nothing_in_range() -> None:
@@ -135,7 +164,7 @@ def test_the_filter_takes_the_median_of_the_returns_and_adds_none_but_in_single_
     rng = np.random.default_rng(2)
     depth = rng.uniform(1.0, 2.0, (120, 100)).astype(np.float32)
     depth[rng.random(depth.shape) < 0.2] = 0.0
-    found = filtered(rd.DepthView(depth, (80.0, 80.0, 50.0, 60.0), np.eye(4))).depth
+    found = median_filter(depth)
     for v, u in np.ndindex(depth.shape):
         around = depth[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2]
         returns = np.sort(around[around > 0])

@@ -12,7 +12,7 @@ from helpers.sphere_oracles import depth_of_balls
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.perception import seen_points as shown
-from robotdiffuse.perception.depth_filter import points_error
+from robotdiffuse.perception.depth_filter import point_errors
 from robotdiffuse.perception.depth_view import SeenPoints
 from robotdiffuse.problems.files import problem_from_record, problem_record, save_problem
 from robotdiffuse.robots.kinematics import placed_spheres
@@ -123,27 +123,31 @@ def test_points_of_a_pose_that_may_be_off_are_larger_and_leave_start_and_goals_f
     spheres = placed_spheres(PANDA, START)
     rng = np.random.default_rng(0)
     points = spheres[rng.integers(len(spheres), size=4000), :3] + rng.uniform(-0.3, 0.3, (4000, 3))
-    shapes = shown.point_shapes(points, PANDA, rd.Scene([]), START, START[None], np.full(len(points), error))
+    errors = np.tile([error, 0.0], (len(points), 1))
+    shapes = shown.point_shapes(points, PANDA, rd.Scene([]), START, START[None], errors)
     distances = np.linalg.norm(points[:, None] - spheres[None, :, :3], axis=2) - spheres[:, 3]
     kept = np.concatenate([shape.points for shape in shapes])
     assert max(shape.point_radius for shape in shapes) == shown.POINT_RADIUS + error
     assert len(kept) == ((distances.min(axis=1) >= shown.MIN_POINT_RADIUS) | (distances.min(axis=1) < -error)).sum()
     apart = points[distances.min(axis=1) > 0]
-    outside = shown.point_shapes(apart, PANDA, rd.Scene([]), START, START[None], np.full(len(apart), error))
+    outside = shown.point_shapes(apart, PANDA, rd.Scene([]), START, START[None], errors[: len(apart)])
     assert CollisionChecker(PANDA, rd.Scene(outside)).free(START[None])[0]
+    noisy = shown.point_shapes(points, PANDA, rd.Scene([]), START, START[None], errors[:, ::-1])
+    assert {shape.point_radius for shape in noisy} == {shown.POINT_RADIUS, shown.MIN_POINT_RADIUS}
+    assert sum(len(shape.points) for shape in noisy) == len(kept), "noise may put points of the arm this deep"
 
 
 def test_each_point_is_larger_by_what_its_own_view_may_be_off() -> None:
     """Regression: all points were as large as those seen from farthest away, and left no way between them."""
     points = np.random.default_rng(0).uniform(1.5, 2.5, (500, 3))
-    errors = points_error([replace(view(BALL_ROW), pose_deviation=(0.005, 0.02))], points)
+    errors = point_errors([replace(view(BALL_ROW), pose_deviation=(0.005, 0.02))], points)
     by_hand = 0.005 + 0.02 * np.linalg.norm(points - T[:3, 3], axis=1)
-    np.testing.assert_allclose(errors, by_hand)
+    np.testing.assert_allclose(errors, np.column_stack([by_hand, np.zeros(len(points))]))
     shapes = shown.point_shapes(points, PANDA, rd.Scene([]), START, START[None], errors)
     single = points.astype(np.float32)
     for shape in shapes:
         of_shape = np.isin(single, shape.points.astype(np.float32)).all(axis=1)
-        own = errors[of_shape]
+        own = errors[of_shape, 0]
         grown = shape.point_radius - shown.POINT_RADIUS
         assert len(own) == len(shape.points)
         assert grown - shown.ERROR_STEP < own.min() and own.max() <= grown + 1e-9

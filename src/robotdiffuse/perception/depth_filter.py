@@ -47,6 +47,35 @@ def median_filter(depth):
     return out
 
 
+SQUARE = 11
+"""Edge of the squares in which surfaces are smoothed [pixels]."""
+FLATNESS = 3.0
+"""A square is flat if the variance of inverse depth about a plane is at most this many times that of the
+noise."""
+
+
+def smoothed(depth: Float32[ndarray, "h w"], spread: float) -> tuple[Float32[ndarray, "h w"], float]:
+    """The image with each pixel in the middle of a flat square at the depth of the plane through the square,
+    and the share of these pixels among those with a return.
+
+    On a plane, inverse depth is a linear function of the pixel: in the middle it is the mean of the square.
+    """
+    from scipy.ndimage import correlate1d, uniform_filter, uniform_filter1d
+
+    seen = np.isfinite(depth) & (depth > 0)
+    inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=seen)
+    whole = uniform_filter(seen.astype(np.float32), SQUARE, mode="constant") > 1 - 0.5 / SQUARE**2
+    mean = uniform_filter(inverse, SQUARE)
+    variance = uniform_filter(inverse**2, SQUARE) - mean**2
+    ramp = np.arange(SQUARE) - SQUARE // 2
+    for axis in (0, 1):
+        slope = uniform_filter1d(correlate1d(inverse, ramp / (ramp**2).sum(), axis), SQUARE, 1 - axis)
+        variance -= slope**2 * (ramp**2).mean()
+    flat = whole & (variance < FLATNESS * spread**2)
+    smooth = np.divide(1.0, mean, out=depth.astype(np.float64), where=flat).astype(np.float32)
+    return smooth, float(flat.sum() / max(seen.sum(), 1))
+
+
 PATCH = 20
 """Edge of the patches on which noise is estimated [pixels]: a few times the correlation length of the errors
 of recorded sensors."""
@@ -67,37 +96,48 @@ MARGIN_SPREADS = 3.75
 """Points within this many standard deviations of the filtered depth from the arm may be points of the arm."""
 MEDIAN_SPREAD = 0.4
 """Standard deviation of the median of nine independent numbers, relative to theirs."""
+MEDIAN_LENGTH = 0.85
+"""Correlation length of their medians in an image [pixels], as of `DepthNoise`."""
 
 
 class FilteredDepth(NamedTuple):
-    """A depth image to use, and its noise."""
+    """A depth image to use, and its noise: standard deviations at a distance of 1 m, which grow with the
+    square of the distance [m]."""
 
     depth: Float32[ndarray, "h w"]
     """Distance along the optical axis, as in DepthView [m]."""
     spread: float
-    """Standard deviation of a filtered pixel's depth at a distance of 1 m [m]; it grows with the square of
-    the distance."""
+    """Of all pixels with a return."""
+    edge_spread: float
+    """Of those that are not on a flat surface."""
 
 
 @lru_cache(maxsize=32)
 def filtered(view: DepthView) -> FilteredDepth:
-    """The view's image; if it is noisy, filtered by `median_filter`.
+    """The view's image; if it is noisy, filtered by `median_filter` and `smoothed`.
 
     Images made from clouds count as images without noise, since their pixels are not those of a sensor. The
     last results are cached: a call with views uses the same ones several times.
     """
     depth = np.maximum(for_kernels(view.depth, np.float32), np.float32(0.0))
     if view.cloud is not None:
-        return FilteredDepth(depth, 0.0)
-    spread = patch_noise(depth)[0] if view.noise is None else view.noise.spread
+        return FilteredDepth(depth, 0.0, 0.0)
+    noise = view.noise
+    spread = patch_noise(depth)[0] if noise is None else noise.spread
     if spread < MIN_SPREAD:
-        return FilteredDepth(depth, 0.0)
+        return FilteredDepth(depth, 0.0, 0.0)
     depth = median_filter(depth)
-    if view.noise is None:
-        return FilteredDepth(depth, patch_noise(depth)[0])
-    # the correlated part of the errors of near pixels is not filtered out
-    together = np.exp(-1 / view.noise.correlation**2) if view.noise.correlation > 0 else 0.0
-    return FilteredDepth(depth, spread * (MEDIAN_SPREAD + (1 - MEDIAN_SPREAD) * float(together)))
+    if noise is None:
+        spread, neighbor_correlation = patch_noise(depth)
+        squared_length = correlation_length(neighbor_correlation) ** 2
+    else:
+        # the correlated part of the errors of near pixels is not filtered out by the median
+        together = np.exp(-1 / noise.correlation**2) if noise.correlation > 0 else 0.0
+        spread *= MEDIAN_SPREAD + (1 - MEDIAN_SPREAD) * float(together)
+        squared_length = noise.correlation**2 + MEDIAN_LENGTH**2
+    smooth, flat_share = smoothed(depth, spread)
+    left = min(1.0, 2 * np.pi * squared_length / SQUARE**2)  # of the variance: errors are alike in this area
+    return FilteredDepth(smooth, spread * float(np.sqrt(1 - flat_share * (1 - left))), spread)
 
 
 def patch_noise(depth: Float32[ndarray, "h w"]) -> tuple[float, float]:
@@ -136,6 +176,13 @@ def patch_noise(depth: Float32[ndarray, "h w"]) -> tuple[float, float]:
     products = (of_flat[:, :, 1:] * of_flat[:, :, :-1])[both]
     squares = (0.5 * (of_flat[:, :, 1:] ** 2 + of_flat[:, :, :-1] ** 2))[both]
     return float(spreads[order[-1]]), float(products.sum() / max(squares.sum(), 1e-30))
+
+
+def correlation_length(neighbor_correlation: float) -> float:
+    """The correlation length of errors, as of `DepthNoise`, from the correlation of neighbors [pixels]."""
+    if neighbor_correlation <= np.exp(-2):
+        return 0.0
+    return float(1 / np.sqrt(-2 * np.log(min(neighbor_correlation, 0.98))))
 
 
 EMPTY_EDGE = 6
@@ -232,7 +279,7 @@ nothing."""
 def measured_share(view: DepthView) -> float:
     """The fraction of an image's pixels that measure something: a surface, or that nothing is in range. 0 if
     hardly a pixel measures a surface."""
-    depth, _ = filtered(view)
+    depth = filtered(view).depth
     measured = depth >= NEAREST
     if (measured & np.isfinite(depth)).mean() < MIN_RETURN_SHARE:
         return 0.0
@@ -271,10 +318,9 @@ def measure_noise(images: Sequence[ArrayLike]) -> DepthNoise:
     correlated = products / max((clipped**2)[:, always].mean() * len(stack) * both.sum(), 1e-30)
     still = [patch_noise(image) for image in arrays]
     spread, neighbor_correlation = max((over_time, float(correlated)), *still)
-    neighbor_correlation = min(neighbor_correlation, 0.98)
-    length = 1 / np.sqrt(-2 * np.log(neighbor_correlation)) if neighbor_correlation > np.exp(-2) else 0.0
+    length = correlation_length(neighbor_correlation)
     missing = 1 - seen.sum() / max(len(stack) * int((seen.sum(axis=0) > 0).sum()), 1)
-    return DepthNoise(spread=spread, missing=float(missing), correlation=float(length))
+    return DepthNoise(spread=spread, missing=float(missing), correlation=length)
 
 
 def pose_error(view: DepthView, distance: ArrayLike) -> Values:
@@ -283,22 +329,27 @@ def pose_error(view: DepthView, distance: ArrayLike) -> Values:
     return position + angle * np.asarray(distance)
 
 
-def points_error(views: Iterable[DepthView], points: Points) -> Values:
-    """How far inexact poses and noise may displace each observed point [m]: the maximum over all views."""
-    errors = np.zeros(len(points))
+PointErrors = Float[ndarray, "n 2"]
+"""How far each point may be displaced [m]: by the camera's inexact pose, with its neighbors, and by noise."""
+
+
+def point_errors(views: Iterable[DepthView], points: Points) -> PointErrors:
+    """The errors of observed points: the maxima over all views."""
+    errors = np.zeros((len(points), 2))
     for view in views:
         distance = np.linalg.norm(points - view.T_base_camera[:3, 3], axis=1)
-        error = pose_error(view, distance) + filtered(view).spread * distance**2
-        errors = np.maximum(errors, error)
+        noise = filtered(view).spread * distance**2
+        errors = np.maximum(errors, np.column_stack([pose_error(view, distance), noise]))
     return errors
 
 
-def grown_for_errors(spheres: Float[ndarray, "n 4"], view: DepthView, spread: float) -> Float[ndarray, "n 4"]:
+def grown_for_errors(spheres: Float[ndarray, "n 4"], view: DepthView) -> Float[ndarray, "n 4"]:
     """The arm's spheres, in the base frame, enlarged by the noise of depth at their distance and by the error
     of the camera's pose."""
     T = view.T_base_camera
     offset = spheres[:, :3] - T[:3, 3]
     forward = np.maximum(offset @ T[:3, 2], 0.0)
     grown = spheres.copy()
-    grown[:, 3] += MARGIN_SPREADS * spread * forward**2 + pose_error(view, np.linalg.norm(offset, axis=1))
+    noise = MARGIN_SPREADS * filtered(view).edge_spread * forward**2
+    grown[:, 3] += noise + pose_error(view, np.linalg.norm(offset, axis=1))
     return grown

@@ -138,9 +138,10 @@ def usable_image(
     Where nothing seems to be in range, the image is infinite if the view states its range, else EMPTY. Pixels
     on the arm are excepted. Beside surfaces, nothing is before them.
     """
-    T, (depth, spread) = view.T_base_camera, filtered(view)
+    T = view.T_base_camera
+    depth, spread, _ = filtered(view)
     arm = placed_spheres(robot, q)
-    spheres = grown_for_errors(arm, view, spread)
+    spheres = grown_for_errors(arm, view)
     spheres[:, :3] = (spheres[:, :3] - T[:3, 3]) @ T[:3, :3]
     spheres[:, 3] += margin
     spheres = spheres.astype(np.float32)

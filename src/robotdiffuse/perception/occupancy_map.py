@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.locked import locked
 from robotdiffuse.core.types import Configuration, Points, Values
-from robotdiffuse.perception.depth_filter import filtered, points_error
+from robotdiffuse.perception.depth_filter import PointErrors, filtered, point_errors
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import (
     ARM_MARGIN,
@@ -203,8 +203,8 @@ class _Kept:
         return seen_points([self.view], self._robot, self._configuration)
 
     @cached_property
-    def errors(self) -> Values:
-        return points_error([self.view], self.points)
+    def errors(self) -> PointErrors:
+        return point_errors([self.view], self.points)
 
     @property
     def _configuration(self) -> Configuration:
@@ -247,9 +247,9 @@ class ViewMemory:
         """What the kept views together tell of each voxel of 4 cm."""
         return merged([memory.volume for memory in self._kept])
 
-    def points(self, free: Voxels) -> tuple[Points, Values]:
+    def points(self, free: Voxels) -> tuple[Points, PointErrors]:
         """The mean of the points that the kept views observed in each cell of a grid [m], see `seen_points`,
-        and how far off each may be [m].
+        and their errors.
 
         Stray points are left out: those in the free voxels of a map, which more views see through, and, if
         images are noisy, points of a single view with no other point near, since a surface gives several.
@@ -258,7 +258,7 @@ class ViewMemory:
         _, cell, counts = np.unique(_cells(every), return_inverse=True, return_counts=True)
         sums = [np.bincount(cell, every[:, axis], len(counts)) for axis in range(3)]
         points = np.stack(sums, axis=1) / counts[:, None]
-        errors = np.zeros(len(counts))
+        errors = np.zeros((len(counts), 2))
         np.maximum.at(errors, cell, np.concatenate([memory.errors for memory in self._kept]))
         at = MAP.indices(points)
         inside = MAP.contains(at)

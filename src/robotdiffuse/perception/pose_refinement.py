@@ -183,7 +183,7 @@ class PoseRefinement:
         points = _block_points(view)
         normals, flat = _normals(points)
         spread = filtered(view).spread
-        spheres = grown_for_errors(placed_spheres(self._robot, q), view, spread).astype(np.float32)
+        spheres = grown_for_errors(placed_spheres(self._robot, q), view).astype(np.float32)
         on_arm = sphere_distances(placed(T, points), spheres) < ARM_DISTANCE
         stands = self._cameras[camera].link is None
         arm = on_arm if stands else np.zeros(len(points), np.bool_)

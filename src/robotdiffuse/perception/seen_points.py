@@ -9,8 +9,8 @@ from robotdiffuse.collision.kernel_arrays import compile_scene_for, reach_bound
 from robotdiffuse.collision.kernels.collision_cost import scene_distance
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.kernels import kernel
-from robotdiffuse.core.types import Configuration, Configurations, Points, Values
-from robotdiffuse.perception.depth_filter import filtered, grown_for_errors, points_error
+from robotdiffuse.core.types import Configuration, Configurations, Points
+from robotdiffuse.perception.depth_filter import PointErrors, filtered, grown_for_errors, point_errors
 from robotdiffuse.perception.depth_view import NEAREST, DepthView, SeenPoints
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
@@ -268,8 +268,8 @@ def seen_points(
         count = 0
         for view in views:
             spheres = placed_spheres(robot, start if view.configuration is None else view.configuration)
-            depth, spread = filtered(view)
-            spheres = grown_for_errors(spheres, view, spread)
+            depth = filtered(view).depth
+            spheres = grown_for_errors(spheres, view)
             spheres = (spheres + np.array([0, 0, 0, ARM_DISTANCE])).astype(np.float32)
             if view.cloud is not None:
                 points = for_kernels(view.cloud.T, np.float32)
@@ -302,7 +302,7 @@ def seen_shapes(
 ) -> tuple[SeenPoints, ...]:
     """The points that views observed as obstacles; see `point_shapes`."""
     points = seen_points(views, robot, start)
-    return point_shapes(points, robot, known, start, goals, points_error(views, points))
+    return point_shapes(points, robot, known, start, goals, point_errors(views, points))
 
 
 ERROR_STEP = 0.005
@@ -315,32 +315,34 @@ def point_shapes(
     known: Scene,
     start: Configuration,
     goals: Configurations,
-    errors: Values,
+    errors: PointErrors,
     enlarged: bool = True,
 ) -> tuple[SeenPoints, ...]:
     """Observed points as obstacles, without those of known shapes.
 
-    Points get POINT_RADIUS and their error, but those that the arm's spheres at start or goals would then
-    touch get less, at least MIN_POINT_RADIUS: this safety margin must not make a free start or goal invalid.
-    Points that are no deeper than their error within the arm there, and those within KNOWN_DISTANCE and their
-    error of a known shape, are left out.
+    Points get POINT_RADIUS and the error of their camera's pose, but those that the arm's spheres at start or
+    goals would then touch get less, at least MIN_POINT_RADIUS: this safety margin must not make a free start
+    or goal invalid. Noise enlarges no point: the nearest of the points of a surface lie before it anyway.
+    Points that are no deeper within the arm there than both of their errors, and those within KNOWN_DISTANCE
+    and their errors of a known shape, are left out.
 
-    errors: how far off each point may be [m], see `points_error`. enlarged: whether points get their error.
+    errors: see `point_errors`. enlarged: whether points get the error of the pose.
     """
     points = points.astype(np.float32)
-    errors = ERROR_STEP * np.ceil(errors / ERROR_STEP)
+    shifts = ERROR_STEP * np.ceil(errors[:, 0] / ERROR_STEP)
     ends = np.concatenate([placed_spheres(robot, q) for q in (start, *goals)]).astype(np.float32)
     arrays = compile_scene_for(robot, known) if known.shapes else None
     shapes = list[SeenPoints]()
-    for error in np.unique(errors):
-        alike = points[errors == error]
+    for shift in np.unique(shifts):
+        alike = points[shifts == shift]
+        error = shift + errors[shifts == shift, 1].max()
         if arrays is not None:
             alike = alike[~near_scene(arrays, alike, np.float32(KNOWN_DISTANCE + error))]
         distances = sphere_distances(alike, ends)
         outside = np.ones(len(alike), np.bool_)
         if error:
             outside = (distances >= MIN_POINT_RADIUS) | (distances < -error)
-        padded = POINT_RADIUS + enlarged * error * np.array((1.0, 2 / 3, 1 / 3, 0.0))
+        padded = POINT_RADIUS + enlarged * shift * np.array((1.0, 2 / 3, 1 / 3, 0.0))
         name = "seen"
         for radius in (*dict.fromkeys(padded.tolist()), MIN_POINT_RADIUS):
             distance = (JOINED if radius > POINT_RADIUS else 1.0) * radius + MIN_POINT_RADIUS

@@ -193,7 +193,7 @@ class Explorer:
         goals = self._goal.positions if isinstance(self._goal, JointGoal) else q[None]
         self._views.refine(self._poses.refined)
         points, errors = self._views.points(self.map.free)
-        self.map.doubt(points, errors)
+        self.map.doubt(points, errors.sum(axis=1))
         self._free = self.map.free
         self._seed += TENTATIVE_MOTIONS  # what one step's searches did not find, those of the next one may
         policies = (

@@ -18,7 +18,7 @@ from robotdiffuse.collision.kernel_arrays import reach_ball
 from robotdiffuse.collision.motions import with_covering_spheres
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Configuration, Configurations, Path, Points
-from robotdiffuse.perception.depth_filter import MARGIN_SPREADS
+from robotdiffuse.perception.depth_filter import MARGIN_SPREADS, filtered
 from robotdiffuse.perception.depth_view import AssumedPoints, DepthView
 from robotdiffuse.perception.observed_volume import usable_image
 from robotdiffuse.perception.occupancy_map import COVER_RADIUS, OccupancyMap, ViewMemory
@@ -202,7 +202,7 @@ class GoalSeen:
         """The balls that no view shows to be free: none sees through them, and the arm was elsewhere."""
         for view in views:
             assert view.configuration is not None  # the map takes no other views
-            depth, spread, _ = usable_image(view, self._robot, view.configuration, 0.0)
+            depth, _, _ = usable_image(view, self._robot, view.configuration, 0.0)
             seen = self._distances(balls, view.configuration) < -BALL_RADIUS
             see_through(
                 depth,
@@ -210,8 +210,8 @@ class GoalSeen:
                 view.T_base_camera.astype(np.float32),
                 balls,
                 np.float32(BALL_RADIUS),
-                np.array([*view.pose_deviation, MARGIN_SPREADS * spread], np.float32),
-                BORDER if spread else np.float32(0),
+                np.array([*view.pose_deviation, MARGIN_SPREADS * filtered(view).edge_spread], np.float32),
+                BORDER if filtered(view).spread else np.float32(0),
                 seen,
             )
             balls = balls[~seen]
