@@ -1,4 +1,4 @@
-"""Unknown space: motions planned on depth views, validated in the true scene; and where to look next.
+"""Unknown space: motions planned on depth views and validated in the true scene; the choice of the next view.
 
     python benchmarks/cameras.py [--problems 300] [--views 1] [--images real] [--walls]
         [--cameras far] [--records FILE]
@@ -9,25 +9,25 @@
     python benchmarks/cameras.py --fit --records FILE
     python benchmarks/cameras.py --times
 
-Prints benchmarks/results/unseen.txt. Problems are held-out ones of the families, or those of folders of
-MotionBenchMaker, that the straight line does not solve and a search in the true scene does. Cameras stand
+Prints benchmarks/results/unseen.txt. Problems are held-out problems of the families, or problems of folders
+of MotionBenchMaker. The straight line does not solve them, and a search in the true scene does. Cameras stand
 where a person would place them, 1.4 to 1.8 m away (--cameras: near, 0.8 to 1.2 m; far, 2.4 to 3 m; overhead),
-in front more often than behind; the floor is known, all else must be seen. Every method plans with AORRTC and
+in front more often than behind. Only the floor is known without views. Every method plans with AORRTC and
 has the same CPU time. A motion is free if the validator accepts path and timed motion in the true scene.
 Records are kept in FILE and not made again; --report prints their tables.
 
---images says what cameras get wrong, and what is stated of it: see IMAGES. --walls puts the scene into a
-room; without it, what is beyond the obstacles and the floor gives no return.
+--images chooses the errors of the images and camera poses, and which errors the views state: see IMAGES.
+--walls puts the scene into a room; without it, rays that miss the obstacles and the floor have no return.
 
 --weights adds the method 'predicted' with other weights of the occupancy completion network, folders of
-`train completion`; methods are named by the folder. Those of a training that left families out are tried on
-these families. --fit prints the rates of perception/confidence.py, from problems with even numbers;
-settings were chosen on these too, and --odd leaves them out of the report. --times prints the CPU time of the
-network.
+`train completion`; such methods are named by the folder. Weights that were trained without some families are
+tried on these families. --fit prints the constants RATES of perception/unknown_space.py, from problems with
+even numbers. Settings were chosen on these problems too, and --odd leaves them out of the report. --times
+prints the CPU time of the network.
 
---next-view plans a motion from one view, and plans again with a second view: from the pose that `next_view`
-proposes, from a random one of the poses that it chooses among, and from the first camera's pose turned by
-half a turn about the base.
+--next-view plans a motion from one view, and again with a second view: from the pose that `next_view`
+proposes, from a random one of the poses that `next_view` can choose, and from the first camera's pose turned
+by half a turn about the base.
 """
 
 import argparse
@@ -74,7 +74,7 @@ from robotdiffuse.validation.validator import verify, verify_trajectory
 LIMIT = 1.0
 """CPU time of every method on every problem [s]."""
 SEARCH_LIMIT = 1.0
-"""CPU time of the search that says whether a problem can be solved in the true scene [s]."""
+"""CPU time of the search that decides whether a problem can be solved in the true scene [s]."""
 RING = "ring"
 CAMERAS = {
     RING: CameraPlaces(distance=(1.4, 1.8), height=(0.5, 1.4), target_spread=0.1, roll=0.0),
@@ -90,37 +90,38 @@ METHODS = {
     "predicted": PREDICTED,
 }
 TRUE = "true voxels"
-"""As `predicted`, with the voxels of 2 cm that obstacles fill in the true scene."""
+"""Method `predicted` with the true occupancy of the voxels of 2 cm in place of the network's prediction."""
 BY = "predicted by "
-"""As `predicted`, with the weights of the folder of this name."""
-# Of the network.
+"""Method `predicted` with other weights: this text and the name of the folder with the weights."""
+# Number of timed calls of the network, and of calls before them.
 TIMED_CALLS = 140
 WARM_UP_CALLS = 7
 SECOND_VIEWS = ("next_view", "random", "opposite")
 UNSURE = 0.9
-"""Another view is most wanted if the motion of one view has a stated confidence below this."""
+"""Motions planned from one view with a stated confidence below this are reported separately: they need a
+second view most."""
 PLANNER = load_planner("aorrtc")
 Row = dict[str, Any]
 RECORDED = DepthNoise(spread=0.004, correlation=1.5, missing=0.01, zeros=True)
-"""As recorded sensors have it: errors of neighboring pixels have a correlation of 0.8, and 0 stands for no
-return and for nothing in range."""
+"""Noise as in recordings of sensors: errors of neighboring pixels have a correlation of 0.8, and 0 stands for
+"no return" and for "nothing in range"."""
 OFF = (0.005, float(np.radians(1.0)))
-"""By how much a calibration is off: position [m] and angle [rad]."""
+"""Error of a camera's calibration: position [m] and angle [rad]."""
 POSE, NOISE, RANGE, FAR = "pose not stated", "noise not stated", "range not stated", "0 taken as far"
 """Steps of docs/how_to/real_camera.md that are skipped."""
 
 
 class Images(NamedTuple):
-    """What cameras get wrong, and what is stated of it in their views."""
+    """Errors of images and camera poses, and which of these errors the views state."""
 
     noise: DepthNoise | None = None
     off: bool = False
     """Whether the stated pose of each camera is off by OFF, in a direction and about an axis drawn once."""
     skipped: str = ""
-    """What is not stated, or mistaken."""
+    """The error that is not stated, or the mistake: one of POSE, NOISE, RANGE and FAR; "": none."""
 
     def stated(self, view: DepthView, seed: int) -> DepthView:
-        """A view with noise, with the pose and the errors that are stated of it."""
+        """The view with an inexact pose and the errors that it states. view: with the exact pose."""
         T = view.T_base_camera.copy()
         if self.off:
             rng = np.random.default_rng([seed, view.depth.size])
@@ -148,7 +149,8 @@ IMAGES = {
 }
 WALL = "wall"
 ROOM = 2.2
-"""Distance of the walls from the base's axis [m]: ring cameras stand within, and see the opposite one."""
+"""Distance of the walls from the base's axis [m]. Cameras of the ring stand inside and see the opposite
+wall."""
 
 
 def with_walls(problem: Problem) -> Problem:
@@ -159,8 +161,9 @@ def with_walls(problem: Problem) -> Problem:
 
 
 def problems(family: str, count: int, known: set[int]) -> Iterator[tuple[int, Problem]]:
-    """Problems of a family, held out, or of a folder, with their numbers, that are neither trivial nor
-    unsolved in the true scene. Up to the largest of the `known` numbers, these are all."""
+    """Held-out problems of a family, or problems of a folder, with their numbers. The straight line does not
+    solve them, and a search in the true scene does. known: numbers of such problems that are known already;
+    up to the largest of these, no other problem is tried."""
     numbered = (
         ((i, held_out_problem(family, i)) for i in itertools.count())
         if family in FAMILIES
@@ -171,11 +174,12 @@ def problems(family: str, count: int, known: set[int]) -> Iterator[tuple[int, Pr
 
 
 def known_scene(problem: Problem) -> Scene:
-    """What is known without views: the floor."""
+    """The obstacles that are known without views: the floor."""
     return Scene([shape for shape in problem.scene.shapes if shape.name == "floor"])
 
 
 def unknown_scene(problem: Problem) -> Scene:
+    """The obstacles that only views show: all but the floor."""
     return Scene([shape for shape in problem.scene.shapes if shape.name != "floor"])
 
 
@@ -202,17 +206,18 @@ def views(
 
 
 def plan(problem: Problem, partial: Problem, method: str, network: Completion | None = None) -> Row:
-    """A record of a method that plans on `partial`, what was seen, and is validated in the true scene.
+    """A record of a motion that a method plans and that is validated in the true scene.
 
-    `network` predicts in place of the bundled one.
+    problem: with the true scene. partial: with the known scene and the views. network: a completion network
+    in place of the bundled one.
     """
     voxels = true_voxels(unknown_scene(problem)).astype(np.float32) if method == TRUE else None
     began = time.process_time()
     if network is not None:
         voxels = predict(observe(partial.views, partial.robot, partial.start), network)
-    asked = replace(partial, unknown=METHODS.get(method, PREDICTED))
-    left = LIMIT if network is None else LIMIT - (time.process_time() - began)
-    result = plan_with_unknown_space(PLANNER, asked, PlanRequest(left), voxels)
+    with_policy = replace(partial, unknown=METHODS.get(method, PREDICTED))
+    time_left = LIMIT if network is None else LIMIT - (time.process_time() - began)
+    result = plan_with_unknown_space(PLANNER, with_policy, PlanRequest(time_left), voxels)
     spent = time.process_time() - began
     return {
         "method": method,
@@ -270,7 +275,8 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def table(rows: list[Row], title: str) -> None:
-    """Print the methods on the same problems: free in the true scene, plans, assumption, times, families."""
+    """Print a table of the methods on the same problems: motions free in the true scene, plans found, the
+    assumption used, times, and motions free in each family."""
     families = list(dict.fromkeys(row["family"] for row in rows))
     lines = []
     others = dict.fromkeys(row["method"] for row in rows if row["method"].startswith(BY))
@@ -313,7 +319,7 @@ def table(rows: list[Row], title: str) -> None:
 
 FIRST_PREDICTED = "predicted, p > 0.1"
 FIRST_ASSUMPTIONS = {"as seen": None, "occupied": None, "padded": "points padded by 9 cm"}
-"""Of the methods that do not predict; of the others FIRST_PREDICTED."""
+"""First assumption of each method without a network; for the other methods it is FIRST_PREDICTED."""
 
 
 def _free(rows: list[Row], method: str) -> dict[tuple[str, int], bool]:
@@ -321,7 +327,8 @@ def _free(rows: list[Row], method: str) -> dict[tuple[str, int], bool]:
 
 
 def calibration(rows: list[Row], of: str) -> None:
-    """Print the stated confidence against the share that is free; `of`: where the problems come from."""
+    """Print the stated confidence against the fraction of motions that are free, for each method. of: the
+    source of the problems, for the title."""
     for method in METHODS:
         mine = [row for row in rows if row["method"] == method and row["solved"]]
         if not mine:
@@ -338,8 +345,8 @@ def calibration(rows: list[Row], of: str) -> None:
 
 
 def fifths(stated: Values, free: Values) -> list[tuple[int, int, float, float]]:
-    """Of each fifth of the stated confidences that has motions: its place, their number, their mean
-    confidence and the share that is free."""
+    """For each fifth of the range of confidences that has motions: its index, the number of its motions,
+    their mean stated confidence, and the fraction of them that is free."""
     at = np.minimum(5 * stated, 4).astype(int)
     return [
         (i, int((at == i).sum()), float(stated[at == i].mean()), float(free[at == i].mean()))
@@ -353,7 +360,7 @@ def expected_error(stated: Values, free: Values) -> float:
 
 
 def report(rows: list[Row]) -> None:
-    """Print the tables of each number and kind of views."""
+    """Print the tables for each combination of number of views, images, walls and cameras."""
     places = dict.fromkeys(tuple(row[name] for name in PLACE) for row in rows)
     for place in places:
         some = [row for row in rows if tuple(row[name] for name in PLACE) == place]
@@ -387,7 +394,7 @@ def times(families: list[str]) -> None:
 
 
 def fit(rows: list[Row]) -> None:
-    """Print the constants RATES of perception/confidence.py."""
+    """Print the constants RATES of perception/unknown_space.py."""
     rows = [r for r in rows if r["solved"] and r["number"] % 2 == 0 and r["views"] == 1]
     rows = [row for row in rows if row["images"] == IDEAL and not row["walls"]]
     plain = [row for row in rows if row["risk"] is None]
@@ -410,16 +417,16 @@ def run_next_view(records: str, families: list[str], count: int) -> None:
 
 
 def plan_with_second_views(problem: Problem, family: str, number: int) -> Row:
-    """A record of the motion from one view, and of those from each second view."""
+    """A record of the motion planned from one view, and of the motions with each second view."""
     [view] = views(problem, family, number, 1, None)
-    one = _plan_on(problem, view)
-    row: Row = {"one": is_free(problem, one[1]), "confidence": one[1].confidence}
-    if one[1].path is None:
+    partial, first = _plan_on(problem, view)
+    row: Row = {"one": is_free(problem, first), "confidence": first.confidence}
+    if first.path is None:
         return row
     rng = np.random.default_rng([SEED, number, 15])
     poses = poses_around()
     chosen = {
-        "next_view": next_view(*one, poses).T_base_camera,
+        "next_view": next_view(partial, first, poses).T_base_camera,
         "random": poses[rng.integers(len(poses))],
         "opposite": np.diag([-1.0, -1.0, 1.0, 1.0]) @ view.T_base_camera,
     }
@@ -437,7 +444,8 @@ def _plan_on(problem: Problem, *seen: DepthView) -> tuple[Problem, PlanResult]:
 
 
 def report_next_view(rows: list[Row]) -> None:
-    """Print the shares free in the true scene, of all motions and of those that one view leaves unsure."""
+    """Print the fraction of motions that are free in the true scene, for all problems and for those whose
+    motion from one view has a confidence below UNSURE."""
     rows = [row for row in rows if SECOND_VIEWS[0] in row]
     unsure = [row for row in rows if row["confidence"] < UNSURE]
     for title, some in (("All", rows), (f"Stated confidence of one view below {UNSURE}", unsure)):

@@ -1,14 +1,14 @@
-"""Certificates: whether they catch motions that collide between waypoints, and what they cost.
+"""Whether the validator and certificates catch motions that collide between waypoints, and what they cost.
 
     python benchmarks/certificates.py [--motions 100] [--resolution 0.01] [--commands 3]
 
 Prints benchmarks/results/certificates.txt. Planners of OMPL plan held-out problems of furniture and dense
-obstacles, without simplification, with a checker that looks at states a share of the space's extent apart
-(0.01 is OMPL's default). Their paths are cut into waypoints as far apart as the checker looked, as MoveIt
-does: each waypoint is free on the exact meshes. The truth is Coal on those meshes every 0.002 rad. The
-validator checks each motion; valid ones are timed, certified and checked again. Times are CPU times of warm
-calls, the least of three, in one process; commands are wall times of processes of their own, `verify` and
-`certificate check` in turn.
+obstacles, without simplification. Their checker tests states that are a fraction of the space's extent apart
+(0.01 is OMPL's default). Their paths are cut into waypoints at this distance, as MoveIt does, so each
+waypoint is free on the exact meshes. The reference is Coal on these meshes every 0.002 rad. The
+validator checks each motion; valid motions are certified, and the certificates checked. Times are CPU times
+of warm calls in one process, the least of three. Commands are timed by wall time, each in a process of its
+own, `verify` and `certificate check` alternating.
 """
 
 import argparse
@@ -47,11 +47,12 @@ PLANNERS = {
     "BKPIECE1": og.BKPIECE1,
 }
 FAMILIES = ("shelf", "table", "crate", "rop_dense")
-# Wall time of a call [s]; largest joint motion between two configurations of the truth [rad].
+# Time limit of a planner's call (wall time) [s]; largest joint motion between two configurations that the
+# reference checks [rad].
 LIMIT = 4.0
-TRUTH_STEP = 0.002
+REFERENCE_STEP = 0.002
 LENIENT = VerifySettings(reversals=1000)
-"""OMPL's raw paths go back and forth, which is no collision."""
+"""Settings that allow many sharp reversals: OMPL's raw paths go back and forth."""
 
 
 class Motion(NamedTuple):
@@ -63,20 +64,23 @@ class Motion(NamedTuple):
 class Checked(NamedTuple):
     planner: str
     waypoints_free: bool
-    truth_free: bool
+    """Whether all waypoints are free on the exact meshes."""
+    reference_free: bool
+    """Whether the configurations between them, every REFERENCE_STEP, are free too."""
     report: Report
+    """Of the validator."""
 
 
 def motions(count: int, resolution: float) -> Iterator[Motion]:
-    """Solved motions, planners and families in turn, each problem for all planners."""
-    found = 0
+    """`count` motions. Each problem is planned by all planners; problems of the families alternate."""
+    solved = 0
     number = 0
-    while found < count:
+    while solved < count:
         problem = held_out_problem(FAMILIES[number % len(FAMILIES)], number)
         for k, name in enumerate(PLANNERS):
             path = _planned(problem, name, resolution, 1 + len(PLANNERS) * number + k)
-            if path is not None and found < count:
-                found += 1
+            if path is not None and solved < count:
+                solved += 1
                 yield Motion(name, problem, path)
         number += 1
 
@@ -117,16 +121,16 @@ def _planned(problem: Problem, name: str, resolution: float, seed: int) -> Joint
 
 
 def check(motion: Motion) -> Checked:
-    """Check a motion by the truth and by the validator."""
+    """Check a motion by the reference and by the validator."""
     exact = ExactCollision(motion.problem.robot, motion.problem.scene)
     q = motion.path.positions
     report = verify(motion.problem, motion.path, LENIENT)
     free = not exact.collides(q).any()
-    return Checked(motion.planner, free, not exact.collides(dense(q, TRUTH_STEP)).any(), report)
+    return Checked(motion.planner, free, not exact.collides(dense(q, REFERENCE_STEP)).any(), report)
 
 
 def least(act: Callable[[], object]) -> float:
-    """CPU time of a warm call [ms]."""
+    """CPU time of a warm call [ms]: the least of three."""
     act()
     times = []
     for _ in range(3):
@@ -137,7 +141,7 @@ def least(act: Callable[[], object]) -> float:
 
 
 class Cost(NamedTuple):
-    """Of one certificate; times are CPU times [ms]."""
+    """Costs of one certificate; times are CPU times [ms]."""
 
     validator: float
     write: float
@@ -147,7 +151,7 @@ class Cost(NamedTuple):
     stretches: int
     planes: int
     share: float
-    """Proved clearance over the validator's."""
+    """Clearance that the certificate proves, as a fraction of the clearance that the validator certifies."""
 
 
 def cost(problem: Problem, motion: rd.Path | rd.Trajectory, folder: Path) -> Cost:
@@ -177,13 +181,13 @@ def cost(problem: Problem, motion: rd.Path | rd.Trajectory, folder: Path) -> Cos
 def commands(
     problem: Problem, result: PlanResult, folder: Path, count: int
 ) -> tuple[list[float], list[float]]:
-    """Wall times [s] of `robotdiffuse verify` and `robotdiffuse certificate check`, in turn."""
+    """Wall times [s] of `robotdiffuse verify` and of `robotdiffuse certificate check`, `count` of each."""
     result.save(folder / "result.json", problem_record(problem))
     rd.certify(problem, result.trajectory or result.path).save(folder / "certificate.json")  # type: ignore[arg-type]
-    found: tuple[list[float], list[float]] = ([], [])
+    wall_times: tuple[list[float], list[float]] = ([], [])
     for _ in range(count):
         for times, words in zip(
-            found,
+            wall_times,
             (["verify", "result.json"], ["certificate", "check", "certificate.json"]),
             strict=True,
         ):
@@ -195,7 +199,7 @@ def commands(
                 capture_output=True,
             )
             times.append(time.perf_counter() - begun)
-    return found
+    return wall_times
 
 
 def main() -> None:
@@ -210,18 +214,18 @@ def main() -> None:
     validated = [check(motion) for motion in progress(drawn, "validating")]
     rows = []
     for name in (*PLANNERS, "all"):
-        of = [one for one in validated if name in (one.planner, "all")]
-        defects = [one for one in of if one.waypoints_free and not one.truth_free]
-        refused = [one for one in of if not one.report.valid]
+        chosen = [motion for motion in validated if name in (motion.planner, "all")]
+        defects = [motion for motion in chosen if motion.waypoints_free and not motion.reference_free]
+        refused = [motion for motion in chosen if not motion.report.valid]
         rows.append(
             [
                 name,
-                len(of),
-                sum(one.waypoints_free for one in of),
+                len(chosen),
+                sum(motion.waypoints_free for motion in chosen),
                 len(defects),
-                sum(not one.report.valid for one in defects),
+                sum(not motion.report.valid for motion in defects),
                 len(refused),
-                sum(one.report.valid and not one.truth_free for one in of),
+                sum(motion.report.valid and not motion.reference_free for motion in chosen),
             ]
         )
     print_table(
@@ -239,7 +243,7 @@ def main() -> None:
         [
             "collide between: by Coal every 0.002 rad, though every waypoint is free",
             "missed: accepted by the validator, in collision by Coal",
-            "also refused: contact between two looks of Coal, bodies nearer than 0.1 mm",
+            "also refused: contact between two checks of Coal, bodies nearer than 0.1 mm",
         ],
     )
     with tempfile.TemporaryDirectory() as name:
@@ -260,20 +264,20 @@ REQUESTS: dict[str, dict[str, Any]] = {
 
 
 def of_requests(folder: Path, count: int) -> None:
-    """Print what the proof of one motion over a table costs, for each kind of request."""
+    """Print what the certificate of one motion over a table costs, for each kind of request."""
     robot = rd.load_robot("panda")
     rows = []
-    for name, asked in REQUESTS.items():
-        problem = Problem(robot, rd.Scene([TABLE]), LOW, FAR, **asked)
+    for name, fields in REQUESTS.items():
+        problem = Problem(robot, rd.Scene([TABLE]), LOW, FAR, **fields)
         result = rd.load_planner("aorrtc").plan(problem, time_limit=20.0)
         assert result.trajectory is not None, result.reason
-        one = cost(problem, result.trajectory, folder)
+        costs = cost(problem, result.trajectory, folder)
         verified, checked = (float(np.median(times)) for times in commands(problem, result, folder, count))
         numbers = [
-            f"{one.validator:.1f}",
-            f"{one.write:.0f}",
-            f"{one.check:.1f}",
-            f"{one.check / one.write:.2f}",
+            f"{costs.validator:.1f}",
+            f"{costs.write:.0f}",
+            f"{costs.check:.1f}",
+            f"{costs.check / costs.write:.2f}",
         ]
         rows.append([name, *numbers, f"{verified:.2f}", f"{checked:.2f}", f"{checked / verified:.2f}"])
     columns = ["", "validator ms", "certify ms", "check ms", "of certify", "verify s", "check s", "of verify"]
@@ -285,7 +289,8 @@ def of_requests(folder: Path, count: int) -> None:
 
 
 def measure(drawn: list[Motion], validated: list[Checked], folder: Path, count: int) -> None:
-    """Print the costs of valid motions of OMPL, and of what this package plans for the same problems."""
+    """Print the costs of certificates: for the valid motions of OMPL, and for motions that this package plans
+    for the same problems."""
     rough = []
     smooth = []
     failed = 0
@@ -293,8 +298,8 @@ def measure(drawn: list[Motion], validated: list[Checked], folder: Path, count: 
     checked = list[float]()
     of_requests(folder, count)
     problems = list({id(motion.problem): motion.problem for motion in drawn}.values())
-    for motion, one in progress(list(zip(drawn, validated, strict=True)), "certifying"):
-        if one.report.valid:
+    for motion, checks in progress(list(zip(drawn, validated, strict=True)), "certifying"):
+        if checks.report.valid:
             try:
                 rough.append(cost(motion.problem, motion.path, folder))
             except InputError:

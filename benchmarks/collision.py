@@ -1,4 +1,4 @@
-"""Collision checking of the Panda: how fast, whether colliding configurations pass, how many free ones fail.
+"""Collision checking of the Panda: speed, colliding configurations called free, free ones called colliding.
 
     python benchmarks/collision.py [--problems FOLDER] [--configurations 1000000] [--each 8]
 
@@ -40,19 +40,19 @@ from robotdiffuse.scenes.surface_points import sample_surface
 
 SEED = 20261121
 SCENES = 20
-"""Scenes that a speed is averaged over."""
+"""Number of scenes over which a speed is averaged."""
 EDGES = 500
-"""Edges of 1 rad in each of them."""
+"""Number of edges of 1 rad in each scene."""
 PASSES = 5
-"""The fastest one counts."""
-# Of clouds; [m].
+"""Number of timed calls, of which the fastest counts."""
+# Number of points of a cloud, and their radius [m].
 POINTS = 100_000
 POINT_RADIUS = 0.01
 CONFIGURATIONS_PER_SCENE = 2_000
 RESOLUTION = RRTConnectSettings().resolution
-"""Of searches [m]."""
+"""Resolution of the collision checks of searches [m]."""
 PATH_REPEATS = 50
-"""Times that each path is checked in `along_paths`, in both directions."""
+"""How often each path is checked in `along_paths`, in both directions."""
 
 Place = tuple[Robot, Scene]
 
@@ -89,22 +89,23 @@ def check_edges(space: Space, starts: ndarray, ends: ndarray) -> ndarray:
 
 
 def random_edges(checker: CollisionChecker, rng: Generator) -> tuple[ndarray, ndarray]:
-    """Edges of 1 rad from free configurations in random directions, within the limits."""
+    """Starts and ends of edges of 1 rad from free configurations in random directions, clipped to the
+    limits."""
     robot = checker.robot
-    found = np.zeros((0, checker.robot.dof))
+    starts = np.zeros((0, checker.robot.dof))
     for _ in range(1000):
         q = rng.uniform(robot.lower, robot.upper, (EDGES, robot.dof))
-        found = np.concatenate([found, q[checker.free(q)]])
-        if len(found) >= EDGES:
+        starts = np.concatenate([starts, q[checker.free(q)]])
+        if len(starts) >= EDGES:
             break
-    found = found[:EDGES]
-    step = rng.normal(size=found.shape)
-    ends = found + step / np.linalg.norm(step, axis=1, keepdims=True)
-    return found.astype(np.float32), np.clip(ends, robot.lower, robot.upper).astype(np.float32)
+    starts = starts[:EDGES]
+    step = rng.normal(size=starts.shape)
+    ends = starts + step / np.linalg.norm(step, axis=1, keepdims=True)
+    return starts.astype(np.float32), np.clip(ends, robot.lower, robot.upper).astype(np.float32)
 
 
 def checked_configurations(space: Space, starts: ndarray, ends: ndarray) -> Int[ndarray, "n"]:
-    """How many configurations of each edge a full check looks at."""
+    """The number of configurations of each edge that are checked if the edge is free."""
     travel = np.abs(ends - starts) @ space.motion_radii
     return W * np.maximum(np.ceil(travel / space.resolution / W), 1).astype(int)
 
@@ -121,7 +122,8 @@ def fastest(call: Callable[[], object]) -> float:
 
 
 def kernel_speed(title: str, places: list[Place]) -> list[str]:
-    """One row: mean times over some scenes."""
+    """A row of the table of speeds, averaged over the scenes: along free edges, all edges, random
+    configurations; and the time to prepare a scene."""
     rng = np.random.default_rng(SEED)
     along = []
     every = []
@@ -156,8 +158,10 @@ def without_pairs(robot: Robot) -> Robot:
 
 
 def soundness(title: str, places: list[Place], configurations: int) -> tuple[ndarray, list[list[str]]]:
-    """Counts [scene, self, both; free on meshes, of these refused, colliding on meshes, of these called
-    free], and their rows."""
+    """Compares covering spheres with meshes at random configurations. Returns counts [3, 4] and their table
+    rows. The rows of the counts are collisions with the scene, between links, and both; the columns are the
+    configurations that are free on meshes, those of them that spheres refuse, those colliding on meshes, and
+    those of them that spheres call free."""
     rng = np.random.default_rng(SEED)
     counts = np.zeros((3, 4), int)
     per_scene = min(CONFIGURATIONS_PER_SCENE, -(-configurations // len(places)))
@@ -193,7 +197,7 @@ def count_row(title: str, counts: Int[ndarray, "4"]) -> list[str]:
 
 @njit
 def place_along(space, starts, ends, counts):
-    """The forward kinematics of a check of these edges, with so many configurations each."""
+    """Computes the forward kinematics of a check of edges. counts: number of configurations of each edge."""
     work = make_workspace(space.robot, space.scene)
     block = lanes_array(starts.shape[1], 1)
     for i in range(len(starts)):
@@ -214,7 +218,7 @@ def free_edges(path: ndarray, space: Space) -> tuple[ndarray, ndarray]:
 
 
 def along_paths(robot: Robot, families: list[str], each: int) -> None:
-    """Print what a configuration costs along the paths of aorrtc, and which part of the check takes it."""
+    """Print the time that the check of a configuration takes along paths of aorrtc, split into its parts."""
     planner = load_planner("aorrtc")
     rows = []
     rng = np.random.default_rng(SEED)

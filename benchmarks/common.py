@@ -1,4 +1,4 @@
-"""What the benchmarks share: the head of a report, tables, problems, processor time, and checks on meshes."""
+"""Code that the benchmarks share: header of a report, tables, problems, processor time, checks on meshes."""
 
 import argparse
 import os
@@ -30,9 +30,9 @@ from robotdiffuse.trajectories.speed_limits import jerk_limits
 
 Item = TypeVar("Item")
 WIDTH = 120
-"""Of printed tables [characters]."""
+"""Width of printed tables [characters]."""
 FIRST, CONVERGED, TIME_LIMIT = UNTIL
-"""Values of `until`: stop at the first path, when more time stops paying, or at the time limit."""
+"""Values of `until`: stop at the first path, when more time hardly improves it, or at the time limit."""
 CHECK_STEP = 1e-4
 """Time between the checks of a motion's limits [s]."""
 ORACLE_TOLERANCE = 0.001
@@ -47,7 +47,7 @@ def header(*packages: str) -> str:
 
 
 def print_table(title: str, columns: Sequence[Column | str], rows: Rows, notes: Sequence[str] = ()) -> None:
-    """Print a table whose columns line up, all but the first to the right."""
+    """Print a table. All columns but the first are aligned to the right."""
     show(Table.of(title, columns, rows, notes), width=WIDTH)
 
 
@@ -57,7 +57,8 @@ def progress(items: Sequence[Item], title: str) -> Iterable[Item]:
 
 
 def parse(parser: argparse.ArgumentParser, **smallest: object) -> argparse.Namespace:
-    """Parse the command line; with `--smoke` the arguments named in `smallest` get these values."""
+    """Parse the command line. With `--smoke`, the arguments named in `smallest` get the values given
+    there."""
     parser.add_argument("--smoke", action="store_true", help="the smallest size, to see that the script runs")
     arguments = parser.parse_args()
     if arguments.smoke:
@@ -76,19 +77,20 @@ def parts_of(text: str, known: Iterable[str]) -> list[str]:
 
 
 def use_processor_time() -> None:
-    """Make time limits those of this process's CPU time, so that other work on the machine does not count."""
+    """Measure time limits in CPU time of this process, so that other work on the machine does not count."""
     time.perf_counter = time.process_time
 
 
 def draw_hard_cases(family: str, count: int, folder: Path | None = None) -> list[Case]:
-    """Held-out problems that the straight line does not solve and ten seconds of search do; `folder` keeps
-    what is known of them."""
+    """Held-out problems that the straight line does not solve and a search of ten seconds does. `folder`
+    caches which problems these are."""
     with Console(stderr=True).status(f"problems of {family}") as status:
         return hard_cases(family, count, folder, status.update)
 
 
 def dense(q: Float[ndarray, "n dof"], step: float) -> Float[ndarray, "m dof"]:
-    """Configurations along the segments, no joint moving more than `step` [rad] between two of them."""
+    """Configurations along the segments of a path, such that no joint moves by more than `step` [rad] between
+    two of them."""
     parts = [q[:1]]
     for a, b in pairwise(q):
         count = max(int(np.ceil(np.abs(b - a).max() / step)), 1)
@@ -97,7 +99,8 @@ def dense(q: Float[ndarray, "n dof"], step: float) -> Float[ndarray, "m dof"]:
 
 
 def limit_shares(robot: Robot, motion: Trajectory) -> Float[ndarray, "3"]:
-    """The largest shares of the limits of velocity, acceleration and jerk, every CHECK_STEP."""
+    """The largest velocity, acceleration and jerk of any joint, as fractions of the joint's limits, checked
+    every CHECK_STEP."""
     at = motion.at(np.arange(0.0, motion.duration, CHECK_STEP))
     limits = robot.velocity, robot.acceleration, jerk_limits(robot)
     rates = at.velocities, at.accelerations, motion.peak_jerks
@@ -105,11 +108,12 @@ def limit_shares(robot: Robot, motion: Trajectory) -> Float[ndarray, "3"]:
 
 
 class MeshContacts(NamedTuple):
-    """How many configurations of a motion collide on the meshes."""
+    """Collisions of a motion's configurations on the meshes."""
 
     coal: int
+    """Number of configurations in collision by Coal."""
     pybullet: bool
-    """Whether any does."""
+    """Whether any configuration is in collision by PyBullet."""
 
 
 def contacts_on_meshes(
@@ -117,7 +121,8 @@ def contacts_on_meshes(
 ) -> MeshContacts:
     """Check configurations by Coal and by PyBullet; a robot with a base or tool stands as in the world.
 
-    `oracle`: of the same robot; it is kept open and gets the scene. Loading a robot takes 30 ms.
+    tolerance: PyBullet ignores contacts that are less deep than this [m]. oracle: PyBullet with the same
+    robot, which is reused because loading a robot takes 30 ms; None: a new one.
     """
     robot, scene = problem.standing()
     coal = int(ExactCollision(problem.robot, problem.scene).collides(q).sum())

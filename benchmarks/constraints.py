@@ -1,20 +1,21 @@
-"""Path constraints: a cup held upright, and straight Cartesian lines, beside sscbirrt.
+"""Path constraints: a cup held upright and straight Cartesian lines, compared with sscbirrt.
 
     python benchmarks/constraints.py [--number 200] [--kinds upright,line] [--without-peer]
 
 Prints benchmarks/results/constraints.txt. Problems are drawn in the scenes of the held-out families shelf and
 table, with a cup in the hand that points down, at random places above the ground. Upright: from one place to
 another, the cup's axis within 10 degrees of the vertical. Line: to a place 15 to 40 cm away in the same
-orientation, the hand's origin within 2 mm of the segment and its orientation within 0.05 rad; drawn again
-until a free configuration exists at nine places of the segment. Goals are up to ten configurations, the same
-ones for all planners.
+orientation, the hand's origin within 2 mm of the segment and its orientation within 0.05 rad. Lines are drawn
+again until a free configuration exists at nine places of the segment. Goals are up to ten configurations,
+identical for all planners.
 
-aorrtc searches on what the constraints allow; diffusion draws from the network, which knows no constraints,
-under guidance by their cost, and projects every waypoint.
+aorrtc searches among configurations that it projects onto the constraints. diffusion draws from the network,
+which knows no constraints, under guidance by the violation of the constraints, and projects every waypoint.
 
-sscbirrt (PyPI) plans with this project's compiled projection and collision check as its callbacks, in its
-Python core: its native one takes MuJoCo's scenes, analytical inverse kinematics and its own sets. It returns
-waypoints, checked every 0.05 rad; ours are timed motions that the validator proved.
+sscbirrt (PyPI) runs in its Python core, with this project's compiled projection and collision check as
+callbacks, since its native core takes only MuJoCo's scenes, analytical inverse kinematics and its own
+constraint sets. It returns waypoints, checked every 0.05 rad; this package returns timed motions that the
+validator proved.
 
 Coal on the exact meshes and PyBullet check every motion, the hand moving at most 1 mm between two checks;
 PyBullet's own kinematics measure the constraint there. Time limits are of CPU time.
@@ -59,31 +60,35 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.simulation.world import World
 from robotdiffuse.validation.validator import verifier
 
-# Time limits [s]; the longer one says what can be solved.
+# Time limits [s]. A problem counts as solvable if it is solved within the longer one.
 SHORT = 1.0
 LONG = 10.0
 HAND, CUP = "panda_hand", rd.Cylinder([0, 0, 0.14], 0.03, 0.06, name="cup")
 LOW, HIGH = np.array([0.25, -0.5, 0.25]), np.array([0.7, 0.5, 0.8])
-"""Where the hand is drawn [m]."""
-# Tolerances of the constraints [rad], [m], [rad].
+"""Corners of the box from which the hand's position is drawn [m]."""
+# Tolerances: tilt of the cup [rad], distance from the line [m], rotation along the line [rad].
 UPRIGHT = np.radians(10)
 OFF_LINE = 0.002
 TURNED = 0.05
-# Goal configurations of a problem; places of a line at which some configuration must be free.
+# Number of goal configurations of a problem; number of places of a line that need a free configuration.
 GOALS = 10
 LINE_PLACES = 9
 STEP = 0.001
-"""Between two checks of a motion [rad]; links reach less than 1 m, so that the hand moves less than 1 mm."""
+"""Largest joint motion between two checks of a motion [rad]. The arm reaches less than 1 m, so the hand moves
+by less than 1 mm for each joint."""
 CONTACT_FRAMES = 600
-"""Of a motion, that are checked for collisions."""
+"""About how many configurations of a motion are checked for collisions."""
 ROUNDING = 1e-6
 """Error of PyBullet's kinematics [m], [rad]."""
 
 
 class Answer(NamedTuple):
+    """A planner's answer to a problem."""
+
     seconds: float
+    """CPU time of the call [s]."""
     first: float
-    """When the search had a free path [s]; for sscbirrt when it answered."""
+    """CPU time until the first path [s]; for sscbirrt until the answer. Infinite without a motion."""
     positions: ndarray | None
     """Rows of the timed motion, or waypoints."""
     length: float
@@ -96,19 +101,19 @@ class Checked(NamedTuple):
     coal: int
     pybullet: bool
     excess: float
-    """The largest violation of a tolerance, as a share of it; negative within."""
+    """The largest violation of a tolerance, as a fraction of the tolerance; negative if none is violated."""
 
 
 def drawn(kind: str, number: int) -> Iterator[Problem]:
     """Held-out problems with a cup in the hand and a constraint."""
-    found = 0
+    count = 0
     i = 0
-    while found < number:
+    while count < number:
         rng = np.random.default_rng([SEED, 2, i])
-        given = held_out_problem(("shelf", "table")[i % 2], i // 2)
+        held_out = held_out_problem(("shelf", "table")[i % 2], i // 2)
         i += 1
-        robot = given.robot.attach(CUP, HAND)
-        checker = CollisionChecker(robot, given.scene)
+        robot = held_out.robot.attach(CUP, HAND)
+        checker = CollisionChecker(robot, held_out.scene)
         ends = _ends(kind, robot, checker, rng)
         if ends is None:
             continue
@@ -118,8 +123,8 @@ def drawn(kind: str, number: int) -> Iterator[Problem]:
             if kind == "upright"
             else rd.CartesianLine(HAND, OFF_LINE, TURNED)
         )
-        yield Problem(robot, given.scene, start, JointGoal(goals), constraints=[constraint])
-        found += 1
+        yield Problem(robot, held_out.scene, start, JointGoal(goals), constraints=[constraint])
+        count += 1
 
 
 def _ends(
@@ -159,7 +164,7 @@ def _reached(
 
 
 def ours(planner: Planner, problem: Problem, seed: int) -> Answer:
-    """The answer of a planner of this project."""
+    """The answer of a planner of this package."""
     result = planner.plan(problem, time_limit=LONG, seed=seed)
     if result.path is None or result.trajectory is None:
         return Answer(result.planning_time, np.inf, None, np.inf, False)
@@ -168,7 +173,7 @@ def ours(planner: Planner, problem: Problem, seed: int) -> Answer:
 
 
 class _Arm:
-    """This project's kinematics and collision check behind sscbirrt's interface."""
+    """This package's kinematics and collision check, with the interface that sscbirrt expects."""
 
     def __init__(self, problem: Problem) -> None:
         self.robot, self.checker = problem.robot, CollisionChecker(problem.robot, problem.scene)
@@ -183,12 +188,12 @@ class _Arm:
 
 
 class _Set:
-    """This project's projection onto constraints behind sscbirrt's interface."""
+    """This package's projection onto constraints, with the interface that sscbirrt expects."""
 
     def __init__(self, problem: Problem) -> None:
         self.ready = PathConstraints(problem)
         self.rows, self.work = self.ready.rows, kernel.make_work(self.ready.rows)
-        self.kept = self.rows.limit - 0.05 * self.rows.tolerance
+        self.projection_limit = self.rows.limit - 0.05 * self.rows.tolerance
 
     def contains(self, q: ndarray) -> bool:
         kernel.evaluate(self.rows, q, 0, self.work)
@@ -196,7 +201,7 @@ class _Set:
 
     def project(self, q_previous: ndarray, q_proposed: ndarray) -> ndarray | None:
         q = q_proposed.copy()
-        return q if project(self.rows, self.kept, q, self.work) else None
+        return q if project(self.rows, self.projection_limit, q, self.work) else None
 
 
 def peer(problem: Problem, seed: int) -> Answer:
@@ -234,22 +239,23 @@ def checked(problem: Problem, rows: ndarray) -> Checked:
 
 
 def _excess(problem: Problem, frames: ndarray) -> float:
-    """The largest violation of the constraint by PyBullet's kinematics, as a share of its tolerance."""
-    [one] = problem.constraints
+    """The largest violation of the problem's only constraint by PyBullet's kinematics, as a fraction of its
+    tolerance."""
+    [constraint] = problem.constraints
     with World(problem.robot, rd.Scene()) as world:
 
         def pose(q: ndarray) -> ndarray:
             world.place(q)
-            link = world.links[one.frame]
+            link = world.links[constraint.frame]
             state = world.bullet.getLinkState(world.body, link, computeForwardKinematics=1)
             x, y, z, w = state[5]
             return transform(np.array(state[4]), rotation_from_quaternion(np.array([w, x, y, z])))
 
         poses = [pose(q) for q in frames]
-    if isinstance(one, rd.AxisCone):
-        cosines = [T[:3, :3] @ one.axis @ one.direction for T in poses]
-        return float((np.arccos(np.clip(cosines, -1, 1)).max() - ROUNDING) / one.angle - 1)
-    assert isinstance(one, rd.CartesianLine)
+    if isinstance(constraint, rd.AxisCone):
+        cosines = [T[:3, :3] @ constraint.axis @ constraint.direction for T in poses]
+        return float((np.arccos(np.clip(cosines, -1, 1)).max() - ROUNDING) / constraint.angle - 1)
+    assert isinstance(constraint, rd.CartesianLine)
     first = poses[0]
     last = poses[-1]
     way = last[:3, 3] - first[:3, 3]

@@ -3,13 +3,13 @@
     python benchmarks/data.py cost [--problems 1000]
     python benchmarks/data.py loader [--trajectories 20000] [--threads 1 2]
 
-`cost` prints benchmarks/results/generation.txt: CPU time of a problem on one core, and the share of each
-stage. The shares are those of a second run under the profiler, which makes Python look slower than it is
-beside compiled code.
+`cost` prints benchmarks/results/generation.txt: CPU time of a problem on one core, and the fraction of each
+stage. The fractions come from a second run under the profiler, which overstates the time of Python code
+against that of compiled code.
 
-`loader` prints loader.txt: trajectories a second, with point clouds made on the fly. The data set has the
-form of generated ones with two families: 85 % of the scenes have two obstacles, the others 3 to 12. Times are
-of one epoch of shuffled batches of 256 after a few for warming up; files are in the system's cache.
+`loader` prints loader.txt: trajectories per second, with point clouds made on the fly. The data set looks
+like a generated one with two families: 85 % of the scenes have two obstacles, the others 3 to 12. One epoch
+of shuffled batches of 256 is timed, after a few batches for warming up; files are in the system's cache.
 """
 
 import argparse
@@ -39,7 +39,7 @@ STAGES = {
     "search": ("search/shared_tree.py", "run"),
     "validator": ("validator.py", "path"),
 }
-"""Files and functions of the profile."""
+"""For each stage, the file and the function whose cumulative time the profile reports."""
 WAYPOINTS = 254
 SLOTS = 12
 GOALS = 10
@@ -51,7 +51,7 @@ WARM_UP_BATCHES = 8
 
 
 def cost(count: int) -> None:
-    """Print the CPU time of a problem, and the share of each stage."""
+    """Print the CPU time of a problem, and the fraction of each stage."""
     settings = GenerationSettings()
     robot = load_robot("panda")
     for number in range(5):
@@ -144,7 +144,7 @@ def write_store(folder: str, robot: Robot, trajectories: int) -> None:
 
 
 def rate(data: RopDataset) -> float:
-    """Trajectories a second, over one epoch."""
+    """Trajectories per second, over one epoch."""
     for _batch in itertools.islice(data.batches(BATCH), WARM_UP_BATCHES):
         pass
     start = time.perf_counter()
@@ -154,7 +154,7 @@ def rate(data: RopDataset) -> float:
 
 
 def loader(trajectories: int, threads_tried: list[int]) -> None:
-    """Print trajectories a second."""
+    """Print trajectories per second, for each number of threads."""
     cases = {
         "full": {},
         "full, sorted": {"sort_points": True},

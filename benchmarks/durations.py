@@ -3,11 +3,12 @@
     python benchmarks/durations.py best --problems shelf_nontrivial,FOLDER [--seconds 30] [--seed 0]
     python benchmarks/durations.py compare --problems shelf_nontrivial,FOLDER [--count 12] [--limits 0.1,1]
 
-`best` makes a long call for each problem and keeps the least duration known of each, with the planner, the
-seed and the time that found it, in benchmarks/results/best_durations.json; run it with several seeds and
-planners. `compare` prints benchmarks/results/durations.txt: planners and objectives beside these best known
-durations and the least time along the straight line, and what the limits of velocity, acceleration and jerk
-are kept to. Time limits are of CPU time. A folder holds problems of MotionBenchMaker.
+`best` makes a long call for each problem. The best known duration of each problem, with the planner, the
+seed and the time limit that found it, is kept in benchmarks/results/best_durations.json; run `best` with
+several seeds and planners. `compare` prints benchmarks/results/durations.txt: durations by planner and
+objective, relative to the best known ones and to the least time along the straight line, and the largest
+velocity, acceleration and jerk relative to their limits. Time limits are of CPU time. A folder holds problems
+of MotionBenchMaker.
 """
 
 import argparse
@@ -58,7 +59,7 @@ def known() -> dict[str, dict]:
 
 
 def find_best(cases: list[Case], planner: str, seed: int, seconds: float) -> None:
-    """Long calls; each better duration is written at once."""
+    """Make a long call for each problem; a duration better than the best known one is written at once."""
     loaded = load_planner(planner)
     for case in progress(cases, f"{planner}, seed {seed}"):
         result = loaded.plan(case.problem, seconds, seed, until=TIME_LIMIT)
@@ -79,7 +80,7 @@ def key(case: Case) -> str:
 
 
 def straight(problem: Problem, motion: Trajectory) -> float:
-    """Least time along the straight line between the ends of a motion, without limits of jerk [s]."""
+    """Least time along the straight line between start and end of a motion, without jerk limits [s]."""
     robot = problem.robot
     q = motion.positions
     return float(straight_line_time(q[0], q[-1], robot.velocity, robot.acceleration))
@@ -96,8 +97,8 @@ def compare(cases: list[Case], limits: list[float]) -> None:
                 (case, planner.plan(case.problem, limit, seed=i, until=until, objective=objective))
                 for i, case in enumerate(progress(cases, f"{name}, {objective}, {limit:g} s"))
             ]
-            more = (", length" if objective == LENGTH else "") + (", full" if until == TIME_LIMIT else "")
-            rows.append(row(name + more, limit, results, best))
+            suffix = (", length" if objective == LENGTH else "") + (", full" if until == TIME_LIMIT else "")
+            rows.append(row(name + suffix, limit, results, best))
     columns = [
         *("planner", "limit s", "solved", "duration s", "of best", "median", "of line", "length", "stops"),
         *("velocity", "accel.", "jerk"),
@@ -125,14 +126,14 @@ def row(name: str, limit: float, results: list[tuple[Case, PlanResult]], best: d
     least = np.array([best.get(key(case), {"duration": np.nan})["duration"] for case, _, _ in moved])
     lines = np.array([straight(case.problem, motion) for case, motion, _ in moved])
     shares = np.max([limit_shares(case.problem.robot, motion) for case, motion, _ in moved], axis=0)
-    have = np.isfinite(least)
+    known_best = np.isfinite(least)
     return [
         name,
         f"{limit:g}",
         f"{len(moved)} of {len(results)}",
         f"{durations.mean():.3f}",
-        f"{durations[have].sum() / least[have].sum():.4f}" if have.any() else "–",
-        f"{np.median(durations[have] / least[have]):.4f}" if have.any() else "–",
+        f"{durations[known_best].sum() / least[known_best].sum():.4f}" if known_best.any() else "–",
+        f"{np.median(durations[known_best] / least[known_best]):.4f}" if known_best.any() else "–",
         f"{(durations / lines).mean():.3f}",
         f"{np.mean([path.length for _, _, path in moved]):.3f}",
         f"{np.mean([len(motion.stops) > 0 for _, motion, _ in moved]):.3f}",

@@ -2,9 +2,9 @@
 
     python benchmarks/first_paths.py [--sets shelf baxter:shelf FOLDER ...] [--problems 100] [--seeds 2]
 
-Prints benchmarks/results/first_paths.txt. A set is a family, for the Panda, ROBOT:FAMILY or a folder of
-MotionBenchMaker. Problems without usable ends and those that a straight line solves are left out. The time is
-that of the search alone, without inverse kinematics, validation and timing.
+Prints benchmarks/results/first_paths.txt. A set is a family (for the Panda), ROBOT:FAMILY, or a folder of
+MotionBenchMaker. Problems are left out if the search cannot use their start or goal, or if a straight line
+solves them. Only the search is timed, not inverse kinematics, validation and timing.
 """
 
 import argparse
@@ -32,7 +32,7 @@ from robotdiffuse.robots import load_robot
 FAMILIES = ("rop", "rop_dense", "shelf", "crate", "table", "clutter", "kitchen", "cabinet")
 OTHER_ARMS = ("ur5e:shelf", "so101:shelf", "baxter_left:shelf", "baxter:shelf", "baxter:table")
 SEED = 5
-"""Of the problems."""
+"""Seed of the problems."""
 LIMIT = 1.0
 """CPU time after which a search ends [s]."""
 
@@ -54,12 +54,13 @@ def problems(name: str) -> Iterator[Problem]:
     robot = load_robot(robot_name or "panda")
     rng = np.random.default_rng(SEED)
     while True:
-        with suppress(InputError):  # no free ends in some scenes
+        with suppress(InputError):  # in some scenes, no free start and goal are found
             yield family_for(family, robot).draw(robot, rng).problem(robot)
 
 
 def first_path(problem: Problem, seed: int) -> FirstPath | None:
-    """None if the ends cannot be used, or a straight line is free."""
+    """Search until there is a path, or for LIMIT. None if the start or the goals cannot be used, or if a
+    straight line is free."""
     assert isinstance(problem.goal, JointGoal)
     checker = CollisionChecker(problem.robot, problem.scene)
     start_goal = StartGoal(checker, problem.start, problem.goal.positions)
