@@ -5,22 +5,22 @@
     python benchmarks/exploring.py --families FOLDER ... --records FILE
     python benchmarks/exploring.py --report --records FILE
 
-Prints benchmarks/results/exploring.txt. Problems are those of benchmarks/cameras.py whose scene leaves the
-arm's pose "ready" free: from there the arm goes to the problem's start, and on to its goal, with one memory.
-Settings and the stated confidence were chosen on the first 12 of each of seven families (not `cabinet`);
---skip 12 leaves them out.
+Prints benchmarks/results/exploring.txt. Problems are those of benchmarks/cameras.py in whose scene the arm's
+pose "ready" is free. A run has two legs: from "ready" to the problem's start, and on to the problem's goal;
+the map is kept between them. Settings and the stated confidence were chosen on the first 12 problems of each
+of seven families (not `cabinet`); --skip 12 leaves these out.
 
---images and --walls: see benchmarks/cameras.py. The camera on the arm and the one beside it are off in
-different ways.
+--images and --walls: see benchmarks/cameras.py. The camera on the arm and the camera beside it have different
+pose errors.
 
-A camera beside the arm takes one image at first and one after each motion; the one on the arm (320 x 240
-pixels, 70 x 55 degrees, 0.15 to 2 m) one every 0.25 s of a motion, up to eight. Every executed motion is
-checked by the validator in the true scene, and the loop ends at a collision. Looks and times are those of a
-leg; times are the Explorer's own.
+A camera beside the arm takes one image at first and one after each motion. The camera on the arm (320 x 240
+pixels, 70 x 55 degrees, 0.15 to 2 m) takes one image every 0.25 s of a motion, at most eight. The validator
+checks every executed motion in the true scene, and the run ends at a collision. Looks (motions to a
+viewpoint) and times are reported per leg; times are CPU times of the Explorer alone.
 
-Controls: motions as planned once with unknown space taken as free, and once with the prediction, from the
-first images and one at the start of each leg; an Explorer without the network, without the box that is
-declared free, without the camera beside the arm, and one whose looks show the border of what is known.
+Baselines: plans from the first image and one at the start of each leg, with unknown space taken as free, or
+with predicted occupancy; an Explorer without the network, without the box that is declared free, without the
+camera beside the arm, and one whose looks aim at the frontier of known space.
 """
 
 import argparse
@@ -80,14 +80,15 @@ Row = dict[str, Any]
 TIME_LIMIT = 0.5
 """CPU time of each search [s]."""
 ZONE_SIDES = np.arange(0.12, 0.37, 0.04)
-"""Distances of the sides of the box that is declared free from the base's axis [m]."""
+"""Candidate distances from the base's axis to the sides of the box that is declared free [m]."""
 ZONE_HEIGHT = 0.7
+"""Height of this box above the base [m]."""
 ONCE = {"unknown is free, once": OPTIMISTIC, "predicted, once": PREDICTED}
 
 
 @dataclass(frozen=True)
 class Method:
-    """An Explorer and what it is given."""
+    """Settings of an Explorer, and what it knows and sees."""
 
     policy: str
     predict: bool = True
@@ -95,9 +96,9 @@ class Method:
     standing: bool = True
     """Whether a camera stands beside the arm."""
     frontier: bool = False
-    """Whether looks are to show the frontier of known space, not what a motion sweeps."""
+    """Whether looks aim at the frontier of known space instead of the unknown space that a motion sweeps."""
     see_goal: bool = False
-    """Whether the goal must be seen."""
+    """Whether cameras must have seen that the goal is free."""
 
 
 METHODS = {
@@ -115,19 +116,20 @@ METHODS = {
     "probabilistic, no standing camera": Method(PROBABILISTIC, standing=False),
 }
 MAX_PROBLEMS = 10_000
-"""Of a family."""
+"""Largest number of problems of a family that are tried."""
 HOME = "ready"
 """Name of the pose that the arm begins in."""
 
 
 class TimedExplorer(Explorer):
-    """Counts the CPU time of the Explorer, without that of simulated images and of the validation."""
+    """Measures the CPU time of the Explorer, without simulating images and validating motions."""
 
     spent = 0.0
-    """[s]"""
+    """CPU time so far [s]."""
     images = Images()
+    """Errors that the observed views get."""
     number = 0
-    """Of the problem."""
+    """Number of the problem, which seeds these errors."""
 
     def observe(self, view: DepthView, stamp: float = 0.0) -> None:
         view = self.images.stated(view, self.number)
@@ -143,14 +145,15 @@ class TimedExplorer(Explorer):
 
 
 class FrontierExplorer(TimedExplorer):
-    """Looks at unknown voxels beside free ones, not at what a motion sweeps."""
+    """Looks at unknown voxels beside free ones, instead of the unknown voxels that a motion sweeps."""
 
     def wanted(self, path: JointPath) -> Bool[ndarray, "nx ny nz"]:
         return self.map.unknown & binary_dilation(self.map.free)
 
 
 def play(problem: Problem, family: str, number: int, method: str, images: Images) -> Row:
-    """A record of one problem and method: from the arm's pose "ready" to the start, and on to the goal."""
+    """A record of a run of one method on one problem: from the arm's pose "ready" to the start, and on to the
+    goal."""
     noise = images.noise
     rng = np.random.default_rng([number, 16])
     camera = wrist_camera(problem.robot)
@@ -201,7 +204,8 @@ def play(problem: Problem, family: str, number: int, method: str, images: Images
 
 
 def free_zone(problem: Problem) -> Corners | None:
-    """The largest box around the base without obstacles, as a person who knows the cell would declare it."""
+    """The largest box around the base without obstacles, as a user who knows the work cell would declare it;
+    None if there is none."""
     filled = true_voxels(unknown_scene(problem))[:, :, : round((ZONE_HEIGHT - LOW[2]) / FINE_VOXEL_SIZE)]
     columns = np.asarray(filled.any(axis=2))
 
@@ -218,8 +222,8 @@ def free_zone(problem: Problem) -> Corners | None:
 
 
 def usable(problem: Problem, clearance: float) -> bool:
-    """Whether the arm's pose "ready" is free in the scene, and the start and all goals have a clearance to it
-    [m]."""
+    """Whether the arm's pose "ready" is free in the scene, and the start and all goals have at least this
+    clearance to obstacles [m]."""
     home = replace(problem, start=HOME).start
     assert isinstance(problem.goal, JointGoal)
     if not CollisionChecker(problem.robot, problem.scene).free(home[None])[0]:
@@ -255,8 +259,8 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def report(rows: list[Row]) -> None:
-    """Print reached goals, collisions, looks and times of the methods, by where problems come from and what
-    cameras get wrong."""
+    """Print reached goals, collisions, looks and times of the methods, in a table for each source of problems
+    and each kind of image."""
     places = dict.fromkeys((row["images"], row["walls"]) for row in rows)
     for own, (images, walls) in product((True, False), places):
         lines = []

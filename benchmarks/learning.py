@@ -1,19 +1,19 @@
-"""The diffusion model alone, with and without its inputs, and beside smooth noise.
+"""The diffusion model alone, with and without its inputs, and compared with smooth noise.
 
     python benchmarks/learning.py [--parts alone] [--families rop,shelf] [--problems 500]
         [--cases FOLDER] [--weights FOLDER]
 
-Prints benchmarks/results/network.txt and network_inputs.txt. FOLDER of cases keeps what is known of the
-problems. Problems are held out; the straight line does not solve them, and ten seconds of search do. What
-counts as solved passed the validator.
+Prints benchmarks/results/network.txt and network_inputs.txt. --cases FOLDER caches which problems are drawn.
+Problems are held out; the straight line does not solve them, and ten seconds of search do. A motion counts as
+solved if it passed the validator.
 
-- alone: 16 samples, straight from the sampler. The model's inputs on obstacles are the code of their point
-  cloud and the clearances of the links along the noisy motion. Rows take each away: the code of another scene
-  of the family; the whole condition, which is code, start and goal; clearances as if there were no obstacles.
-  Guidance, where there is some, knows the obstacles in any case. The controls are guidance of smooth noise,
-  which is what the model starts from: with as many gradient steps, and with as many as fit in the network's
-  CPU time.
-- controls: of `alone`, the guided network and the controls; prints benchmarks/results/network_equal_time.txt.
+- alone: 16 samples as the sampler returns them. The model's inputs about obstacles are the embedding ("code")
+  of their point cloud and the clearances of the links along the noisy motion. Rows of the table change one
+  input: the code is that of another scene of the family; the whole condition (code, start and goal) is
+  hidden; the clearances are computed without obstacles. Guidance knows the obstacles in every row. The
+  controls apply guidance to smooth noise, from which the model starts too: with as many gradient steps as the
+  network, and with as many as fit in the network's CPU time. - controls: only the guided network and the
+  controls of `alone`; prints benchmarks/results/network_equal_time.txt.
 """
 
 import argparse
@@ -49,14 +49,15 @@ from robotdiffuse.robots import load_robot
 
 PANDA = load_robot("panda")
 PARTS = ("alone", "controls")
-# Problems and rounds that the equal number of gradient steps is measured on.
+# The number of gradient steps that take equal CPU time: measured on this many problems and rounds, between
+# these two numbers of steps.
 TIMED = 10
 TIMED_ROUNDS = 4
 TIMED_STEPS = (10, 60)
 
 
 class Summary(NamedTuple):
-    """A column, and its figure of some records."""
+    """A column of a table, and the function that computes its figure from the records of a method."""
 
     column: Column
     of: Callable[[Sequence[Record]], Cell]
@@ -67,7 +68,7 @@ def _solved(records: Sequence[Record]) -> Cell:
 
 
 def share(passed: Sequence[bool]) -> Cell:
-    """A share in per cent with its 95 % interval."""
+    """The fraction of true values in per cent with its 95 % interval."""
     low, high = wilson_interval(int(np.sum(passed)), len(passed))
     text = f"{100 * np.mean(passed):.1f} % ({100 * low:.1f} to {100 * high:.1f})"
     return tables.Figure(text, float(np.mean(passed)))
@@ -92,9 +93,9 @@ def _cpu(records: Sequence[Record]) -> Cell:
 
 
 SINGLE = Summary(Column("single", better="more"), _single)
-"""Share of the samples that pass the validator."""
+"""Fraction of the samples that pass the validator."""
 BEST = Summary(Column("best", better="more"), _solved)
-"""Share of problems with such a sample."""
+"""Fraction of the problems with at least one sample that passes the validator."""
 SOLVED = Summary(Column("solved", better="more"), _solved)
 LENGTH = Summary(Column("length*", "", ".3f", "less"), _ratio)
 """Mean ratio to the cases' reference lengths."""
@@ -102,13 +103,14 @@ CPU = Summary(Column("CPU ms median / p95", better="less"), _cpu)
 
 
 def summary(title: str, of: Mapping[str, Sequence[Record]], figures: Sequence[Summary]) -> Table:
-    """The table of each method's records."""
+    """A table with a row for each method. of: the records of each method."""
     rows = [(name, *(figure.of(records) for figure in figures)) for name, records in of.items()]
     return Table.of(title, [Column(""), *(figure.column for figure in figures)], rows)
 
 
 def clearances_without_obstacles(model: MotionModel) -> ClearanceFn:
-    """The clearance inputs of a model in a scene without obstacles; guidance knows the obstacles."""
+    """A function for the clearance inputs of a model as in a scene without obstacles. Guidance still knows
+    the obstacles."""
     links = len(model.robot.links)
     width = model.dof if model.settings.clearance_gradients else 0
 
@@ -158,12 +160,13 @@ def controls(planner: Diffusion, cases: list[Case]) -> dict[str, Draw]:
 
 
 def noise(planner: Diffusion, steps: int) -> Draw:
-    """Smooth noise, as many candidates as the planner's, after gradient steps."""
+    """Smooth noise after some gradient steps, with as many candidates as the planner draws samples."""
     return from_control(ControlSettings(samples=planner.settings.samples, guidance_steps=steps))
 
 
 def equal_time_steps(planner: Diffusion, cases: list[Case]) -> int:
-    """Gradient steps on smooth noise that take as much CPU time as a batch of the network under guidance."""
+    """The number of gradient steps on smooth noise that take as much CPU time as a batch of the network under
+    guidance."""
     few, many = TIMED_STEPS
     draws = [from_network(planner), noise(planner, few), noise(planner, many)]
     seconds = np.zeros((TIMED_ROUNDS, len(cases), len(draws)))
@@ -178,7 +181,8 @@ def equal_time_steps(planner: Diffusion, cases: list[Case]) -> int:
 
 
 def print_worth_of_inputs(found: dict[str, list[Record]]) -> None:
-    """Print what each input of the network is worth on all families together."""
+    """Print how much single-sample success falls if an input of the network is changed, on all families
+    together."""
     rows = []
     for name in ("guided", "without guidance"):
         own = np.array([record.passed or 0.0 for record in found[name]])
@@ -192,7 +196,8 @@ def print_worth_of_inputs(found: dict[str, list[Record]]) -> None:
 def report_alone(
     family: str, cases: list[Case], weights: str | None, inputs: bool
 ) -> dict[str, list[Record]]:
-    """Print how the network does alone, and with `inputs` also without each of them; its records."""
+    """Print the success of the network alone, and if `inputs` is true also with each input changed. Returns
+    the records of each method."""
     planner = Diffusion(replace(NETWORK_ALONE, weights=weights))
     draws = (network_methods(planner, cases) if inputs else {}) | controls(planner, cases)
     methods = {name: sampled(draw) for name, draw in draws.items()}

@@ -1,13 +1,14 @@
-"""Straight lines and screws of the tool in furniture, beside a plain seeded follower and the search.
+"""Straight lines and screw motions of the tool among furniture, compared with a plain follower and the
+search.
 
     python benchmarks/lines.py [--lines 200] [--screws 100] [--searched 20]
 
 Prints benchmarks/results/lines.txt. Scenes are those of the held-out families shelf and table. A line leads
-15 to 40 cm in a random direction, a screw 5 to 25 cm and turns by 0.3 to 1.2 rad about a random axis; both
-begin at a free configuration with the hand pointing down. Only those count that a plain follower can follow:
-poses 5 mm or 0.02 rad apart, each reached by damped least squares from the configuration before, and the path
-accepted by the validator. The search is that of aorrtc on the constraint, until it converges, best of eight
-seeds. Times are CPU time, limits are 1 s of it.
+15 to 40 cm in a random direction, a screw motion 5 to 25 cm and turns by 0.3 to 1.2 rad about a random axis;
+both begin at a free configuration with the hand pointing down. Only motions count that a plain follower can
+follow: poses are 5 mm or 0.02 rad apart, damped least squares reaches each from the configuration before, and
+the validator accepts the path. The search is aorrtc's search under the constraint, until it converges, the
+best of eight seeds. Times and limits (1 s) are CPU time.
 """
 
 import argparse
@@ -29,32 +30,33 @@ from robotdiffuse.robots.robot import Robot
 
 HAND = "panda_hand"
 LOW, HIGH = np.array([0.25, -0.5, 0.25]), np.array([0.7, 0.5, 0.8])
-"""Where the hand is drawn [m]."""
+"""Corners of the box from which the hand's position is drawn [m]."""
+# Tolerances of the line: distance [m], angle [rad].
 TOLERANCE, ANGLE = 0.001, 0.05
 TIME_LIMIT = 1.0
 SEEDS = 8
-# Of the plain follower: distance between poses [m], [rad], and its damping.
+# The plain follower: distance between poses [m], [rad]; damping and iterations of its least squares.
 STEP, TURN_STEP = 0.005, 0.02
 DAMPING = 1e-4
 MAX_ITERATIONS = 20
 LONGEST_STEP = 0.25
-"""A follower whose joints move by more from pose to pose has jumped [rad]."""
+"""If a joint moves by more than this from pose to pose, the follower has jumped and fails [rad]."""
 
 
 def drawn(kind: str) -> Iterator[tuple[rd.Problem, ndarray]]:
-    """Problems of lines or screws, each with the end pose."""
+    """Yields problems of lines or screw motions, each with the end pose T_base_hand."""
     i = 0
     while True:
         rng = np.random.default_rng([SEED, 5, i])
-        given = held_out_problem(("shelf", "table")[i % 2], i // 2)
+        held_out = held_out_problem(("shelf", "table")[i % 2], i // 2)
         i += 1
-        robot = given.robot
-        free = CollisionChecker(robot, given.scene).free
+        robot = held_out.robot
+        free = CollisionChecker(robot, held_out.scene).free
         T = transform(rng.uniform(LOW, HIGH), rotation_from_rpy(np.pi, 0.0, rng.uniform(-np.pi, np.pi)))
-        found = inverse_kinematics(robot, HAND, T, 1, rng=rng, accept=free)
-        if not len(found):
+        starts = inverse_kinematics(robot, HAND, T, 1, rng=rng, accept=free)
+        if not len(starts):
             continue
-        T = link_pose(robot, found[0], HAND)
+        T = link_pose(robot, starts[0], HAND)
         way, axis = rng.normal(size=(2, 3))
         length, angle = (rng.uniform(0.15, 0.4), 0.0)
         if kind == "screw":
@@ -62,11 +64,11 @@ def drawn(kind: str) -> Iterator[tuple[rd.Problem, ndarray]]:
         turn = rotation_about(axis / np.linalg.norm(axis), angle)
         end = transform(T[:3, 3] + length * way / np.linalg.norm(way), turn @ T[:3, :3])
         line = rd.CartesianLine(HAND, TOLERANCE, ANGLE)
-        yield rd.Problem(robot, given.scene, found[0], rd.PoseGoal(HAND, end), constraints=[line]), end
+        yield rd.Problem(robot, held_out.scene, starts[0], rd.PoseGoal(HAND, end), constraints=[line]), end
 
 
 def followed(robot: Robot, start: ndarray, end: ndarray) -> ndarray | None:
-    """Configurations along the line by a plain follower; None if it does not get to the end."""
+    """Configurations along the line by a plain follower; None if the follower does not reach the end."""
     T = link_pose(robot, start, HAND)
     way = end[:3, 3] - T[:3, 3]
     turn = rotation_vector(end[:3, :3] @ T[:3, :3].T)
@@ -94,7 +96,8 @@ def followed(robot: Robot, start: ndarray, end: ndarray) -> ndarray | None:
 
 
 def measured(kind: str, number: int, searched: int) -> None:
-    """Plan and print."""
+    """Plan `number` lines or screw motions, the first `searched` of them also by search, and print a
+    table."""
     aorrtc = rd.load_planner("aorrtc")
     search = rd.load_planner("aorrtc")
     search.follows_lines = False  # type: ignore[misc]
@@ -147,7 +150,7 @@ def measured(kind: str, number: int, searched: int) -> None:
 
 
 def reversed_accelerations(trajectory: rd.Trajectory) -> int:
-    """How often the joint that moves furthest changes the sign of its acceleration."""
+    """How often the acceleration of the joint that moves furthest changes its sign."""
     joint = int(np.ptp(trajectory.positions, axis=0).argmax())
     a = trajectory.accelerations[:, joint]
     signs = np.sign(a[np.abs(a) > 0.02 * np.abs(a).max()])

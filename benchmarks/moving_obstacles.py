@@ -1,12 +1,12 @@
-"""Moving obstacles: the reactive loop among balls that cross its workspace, checked by PyBullet.
+"""Moving obstacles: `rd.Replanner` among balls that cross the arm's workspace, checked by PyBullet.
 
     python benchmarks/moving_obstacles.py [--runs 100] [--lattice-runs 5]
 
 Prints benchmarks/results/moving.txt. A Panda goes from one side to the other while balls of 10 cm radius fly
-through its workspace on straight lines, each at 50 to 100 % of the speed that the loop assumes at most (0.4
-m/s), turning round twice. None comes near the shoulder, which cannot move out of the way. Runs count if a way
-is known to exist: `plan`, given the balls' trajectories, finds a certified motion from start to goal. The
-loop knows only where the balls are, every 20 ms. PyBullet checks the meshes every 5 ms.
+through its workspace on straight lines, each at 50 to 100 % of the `max_speed` that the loop assumes (0.4
+m/s), and turn round twice. No ball comes near the shoulder, which cannot move out of the way. A run counts
+only if a solution is known: `plan`, given the balls' trajectories, finds a certified motion from start to
+goal. The loop observes only the positions of the balls, every 20 ms. PyBullet checks the meshes every 5 ms.
 """
 
 import argparse
@@ -30,7 +30,7 @@ RADIUS = 0.1
 START = [-1.0, 0.3, 0, -1.8, 0, 2.1, 0.8]
 GOAL = [1.0, 0.3, 0, -1.8, 0, 2.1, 0.8]
 FLOOR = rd.Box([0, 0, -0.06], [2, 2, 0.1], name="floor")
-# Of the loop, and of PyBullet's checks; runs end after the last [s].
+# Period of the loop; period of PyBullet's checks; time after which a run ends [s].
 PERIOD = 0.02
 CHECK_PERIOD = 0.005
 RUN_LIMIT = 30.0
@@ -38,7 +38,7 @@ RUN_LIMIT = 30.0
 BASE_DISTANCE = 0.45
 START_DISTANCE = 0.2
 LATTICE_LIMIT = 1.0
-"""For a search of D* Lite [s]."""
+"""CPU time limit of a search of D* Lite [s]."""
 
 
 def scene(robot: Robot, count: int, seed: int) -> tuple[rd.MovingObstacle, ...]:
@@ -82,13 +82,13 @@ class Run:
 
     arrived: bool = False
     took: float = 0.0
-    """[s] until the arm rests at the goal."""
+    """Time until the arm rests at the goal [s]."""
     moving: bool = False
-    """Whether the arm touched anything while it moved."""
+    """Whether the arm was in contact while it moved."""
     resting: bool = False
-    """Whether it touched anything while it rested."""
+    """Whether the arm was in contact while it was at rest."""
     steps: list[float] = field(default_factory=list)
-    """CPU time of each step but the first, which does not search yet [ms]."""
+    """CPU time of each step except the first, which does not search yet [ms]."""
 
 
 def check(
@@ -99,7 +99,7 @@ def check(
     at: float,
     moves: bool,
 ) -> None:
-    """Note contacts at one moment."""
+    """Record in `run` whether the arm is in contact at a time `at` [s]. moves: whether the arm moves then."""
     oracle.set_scene(rd.Scene([FLOOR, *(ball.at(at) for ball in balls)]))
     if oracle.check_frames(q[None]) is not None:
         run.moving = run.moving or moves
@@ -107,7 +107,7 @@ def check(
 
 
 def looped(settings: rd.ReplannerSettings) -> Callable[[rd.Problem, PyBulletOracle, int], Run]:
-    """A function that runs the loop."""
+    """A function that runs the loop with these settings on a problem."""
 
     def go(problem: rd.Problem, oracle: PyBulletOracle, seed: int) -> Run:
         run = Run()
@@ -136,7 +136,7 @@ def looped(settings: rd.ReplannerSettings) -> Callable[[rd.Problem, PyBulletOrac
 
 
 def played(problem: rd.Problem, oracle: PyBulletOracle, seed: int) -> Run:
-    """Plan as if nothing moved, and play the motion."""
+    """Plan as if the balls stood still, and execute the motion."""
     run = Run()
     still = replace(problem, moving=())
     trajectory = rd.load_planner("rrt_connect").plan(still, 5.0, seed, until=FIRST).trajectory
@@ -215,18 +215,18 @@ def main() -> None:
     with PyBulletOracle(robot, rd.Scene()) as oracle:
         for count in arguments.balls:
             every = [problem_of(robot, scene(robot, count, seed)) for seed in range(arguments.runs)]
-            ways = [planner.plan(problem, 5.0, until=FIRST) for problem in progress(every, f"{count} balls")]
-            kept = [
-                (seed, problem) for seed, problem in enumerate(every) if ways[seed].trajectory is not None
+            plans = [planner.plan(problem, 5.0, until=FIRST) for problem in progress(every, f"{count} balls")]
+            solvable = [
+                (seed, problem) for seed, problem in enumerate(every) if plans[seed].trajectory is not None
             ]
-            took = [way.trajectory.duration for way in ways if way.trajectory is not None]
-            spent = [1e3 * way.planning_time for way in ways if way.trajectory is not None]
+            took = [plan.trajectory.duration for plan in plans if plan.trajectory is not None]
+            spent = [1e3 * plan.planning_time for plan in plans if plan.trajectory is not None]
             notes.append(
-                f"{count} balls: a way is known in {len(kept)} of {len(every)} runs; it takes "
+                f"{count} balls: a motion is known in {len(solvable)} of {len(every)} runs; it takes "
                 f"{np.median(took):.2f} s (median), found in {np.median(spent):.0f} ms (median)"
             )
             for name, go in methods.items():
-                runs = [go(problem, oracle, seed) for seed, problem in progress(kept, name)]
+                runs = [go(problem, oracle, seed) for seed, problem in progress(solvable, name)]
                 rows.append(row(name, count, runs))
     columns = [
         "",

@@ -1,14 +1,14 @@
-"""Robots from MuJoCo models beside MuJoCo: frames, contacts, problems, and motions that MuJoCo executes.
+"""Robots from MuJoCo models compared with MuJoCo: frames, contacts, and planned motions that MuJoCo executes.
 
     python benchmarks/mujoco_models.py MODEL.xml ... [--prepared FOLDER] [--motions 40]
 
-Prints benchmarks/results/mujoco_models.txt. FOLDER keeps the prepared robots. At random configurations the
-frames of all bodies and sites are compared with MuJoCo's, and contacts among random boxes, cylinders,
-capsules and spheres: a disagreement is a configuration in which one of the two has a contact deeper than 1 mm
-and the other none. Then problems are drawn in such scenes, between free configurations that the straight line
-does not join, and planned; MuJoCo executes each motion with position actuators, one for each joint, and
-gravity compensated. An unexpected contact is any of the robot's during a motion, except between links that
-may touch or do not move relative to each other.
+Prints benchmarks/results/mujoco_models.txt. FOLDER keeps the prepared robots. At random configurations, the
+frames of all bodies and sites are compared with MuJoCo's, and so are contacts with random boxes, cylinders,
+capsules and spheres. In a disagreement, one of the two has a contact deeper than 1 mm and the other no
+contact. Then problems are drawn in such scenes and planned, between free configurations that the straight
+line does not join. MuJoCo executes each motion with one position actuator for each joint and compensated
+gravity. Every contact of the robot during a motion is unexpected, except between links that may touch or do
+not move relative to each other.
 """
 
 # MuJoCo has no types for type checkers:
@@ -36,17 +36,18 @@ DEPTH = 0.001
 """Contacts deeper than this count as disagreements [m]."""
 OBSTACLES = 4
 CLEAR = 0.02
-"""Distance of starts and goals to all else [m]."""
+"""Smallest distance of starts and goals to obstacles [m]."""
 TURN = 1.5
-"""Most motion of a joint from the start to the goal [rad], since others need not be connected."""
+"""Largest motion of a joint from the start to the goal [rad]; with larger ones, a problem may have no
+solution."""
 TIME_LIMIT = 5.0
-"""[s] of CPU time."""
-# Of the position actuators: stiffness [Nm/rad], damping [Nm s/rad]; and inertia of the motors [kg m²].
+"""Time limit of planning, in CPU time [s]."""
+# Stiffness [Nm/rad] and damping [Nm s/rad] of the position actuators; inertia of the motors [kg m²].
 STIFFNESS = 4000.0
 DAMPING = 200.0
 ARMATURE = 0.1
 TIME_STEP = 0.002
-"""[s]"""
+"""Time step of the simulation [s]."""
 SEED = 20261127
 EXAMPLE = Path(__file__).parents[1] / "examples" / "data" / "mujoco_scene.xml"
 
@@ -58,7 +59,7 @@ class World(NamedTuple):
     data: Any
     scene: rd.Scene
     links: dict[int, str]
-    """Names of the robot's links by MuJoCo's bodies."""
+    """Name of each of MuJoCo's bodies, by its number."""
 
     def place(self, robot: Robot, q: ndarray) -> None:
         values = dict(zip(robot.joint_names, q, strict=True)) | robot.locked
@@ -88,7 +89,7 @@ def world_of(file: Path, robot: Robot, rng: np.random.Generator) -> World:
     for body in spec.bodies:
         body.gravcomp = 1.0
     for first, second in map(sorted, robot.allowed_collisions):
-        spec.add_exclude(bodyname1=first, bodyname2=second)  # geoms that always overlap would rub
+        spec.add_exclude(bodyname1=first, bodyname2=second)  # their contact forces would brake the joints
     for joint in spec.joints:
         joint.armature = ARMATURE
         if joint.name in robot.joint_names or joint.name in robot.locked:
@@ -114,7 +115,7 @@ def world_of(file: Path, robot: Robot, rng: np.random.Generator) -> World:
 
 
 def draw(robot: Robot, rng: np.random.Generator, count: int) -> ndarray:
-    """Configurations within the limits, and within half a turn where there are none."""
+    """Random configurations within the limits, and within half a turn for joints without limits."""
     return rng.uniform(np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi), (count, robot.dof))
 
 
@@ -136,16 +137,17 @@ def frame_error(world: World, robot: Robot, rows: ndarray) -> float:
 
 
 def disagreements(world: World, robot: Robot, rows: ndarray) -> tuple[int, int, int]:
-    """Configurations in collision by MuJoCo; deep there and free here; deep here and free there."""
+    """Numbers of configurations: in collision by MuJoCo; deeper than DEPTH by MuJoCo but free by this
+    package; deeper than DEPTH by this package but free by MuJoCo."""
     exact = ExactCollision(robot, world.scene)
     hits = missed = extra = 0
     for q in rows:
         world.place(robot, q)
         depths = [distance for *_, distance in world.contacts(robot)]
-        mine = min(d.distance for d in (*exact.link_distances(q), *exact.pair_distances(q)))
+        least = min(d.distance for d in (*exact.link_distances(q), *exact.pair_distances(q)))
         hits += any(depth < 0 for depth in depths)
-        missed += min(depths, default=1.0) < -DEPTH and mine > 0
-        extra += mine < -DEPTH and not any(depth < 0 for depth in depths)
+        missed += min(depths, default=1.0) < -DEPTH and least > 0
+        extra += least < -DEPTH and not any(depth < 0 for depth in depths)
     return hits, missed, extra
 
 
@@ -169,7 +171,8 @@ def problems(file: Path, robot: Robot, rng: np.random.Generator) -> Iterator[tup
 
 
 def executed(world: World, robot: Robot, motion: rd.Trajectory) -> tuple[set[tuple[str, str]], float]:
-    """Unexpected contacts while MuJoCo executes a motion, and the largest error of a joint on the way."""
+    """The pairs of bodies with unexpected contacts while MuJoCo executes a motion, and the largest error of a
+    joint on the way [rad]."""
     model, data = world.model, world.data
     mujoco.mj_resetData(model, data)
     world.place(robot, motion.positions[0])
@@ -181,7 +184,7 @@ def executed(world: World, robot: Robot, motion: rd.Trajectory) -> tuple[set[tup
     worst = 0.0
     rows = motion.resample(1 / TIME_STEP)
     for q, v in zip(rows.positions, rows.velocities, strict=True):
-        data.ctrl[drives] = q + v * DAMPING / STIFFNESS  # so the damping costs no lag
+        data.ctrl[drives] = q + v * DAMPING / STIFFNESS  # compensates the lag by the actuators' damping
         mujoco.mj_step(model, data)
         touched |= {(a, b) for a, b, distance in world.contacts(robot) if distance < 0}
         worst = max(worst, float(np.abs(data.qpos[addresses] - q).max()))

@@ -2,15 +2,15 @@
 
     python benchmarks/network_controls.py [--families rop,shelf] [--problems 60] [--cases FOLDER]
 
-It prints the last table of benchmarks/results/network_controls.txt: the free ones of 16 samples of
-`diffusion`, beside 16 first paths of `aorrtc` with different seeds, brought to as many waypoints even in
-arc length. Problems are held out; the straight line does not solve them, and ten seconds of search
-do.
+Prints the last table of benchmarks/results/network_controls.txt. It compares the collision-free ones of 16
+samples of `diffusion` with 16 first paths of `aorrtc`, with different seeds. All motions are resampled to the
+same number of waypoints, evenly spaced in arc length. Problems are held out; the straight line does not solve
+them, and ten seconds of search do.
 
-apart: mean over the pairs of the root mean square of their distances in joint space at the same part of their
-lengths. classes: number of different sides on which the tip passes the obstacles, of which there are four for
-each (left, right, above, below, as seen along the line between the ends of the tip's way); then smoothness of
-the motions that both return.
+apart: the root mean square distance of two motions in joint space, at equal fractions of their lengths, as
+the mean over all pairs. classes: number of different ways to pass the obstacles; the tip passes each obstacle
+on one of four sides (left, right, above, below, as seen along the line from the tip's start to its end). The
+other columns are the smoothness of the motion that each planner returns.
 """
 
 import argparse
@@ -46,7 +46,7 @@ from robotdiffuse.scenes.shapes import Box, Cylinder, Sphere
 
 PANDA = load_robot("panda")
 PLANNER_LIMIT = 20.0
-"""Of planners that end by themselves, for diversity [s]."""
+"""Time limit of calls; both planners end earlier by themselves [s]."""
 MOTIONS = 16
 WAYPOINTS = 48
 SMOOTHNESS = ("turning", "jerk", "duration")
@@ -54,7 +54,7 @@ SMOOTHNESS = ("turning", "jerk", "duration")
 
 
 COLUMNS = ("paths", "apart", "classes", *SMOOTHNESS)
-"""Of the table of diversity."""
+"""Figures in the table of diversity."""
 
 
 def even(path: Float[ndarray, "n dof"]) -> Float[ndarray, "waypoints dof"]:
@@ -72,22 +72,23 @@ def sides(problem: Problem, path: Float[ndarray, "waypoints dof"]) -> tuple[int,
     left = np.cross([0.0, 0.0, 1.0], along)
     left = left / np.linalg.norm(left) if np.linalg.norm(left) > 1e-6 else np.array([0.0, 1.0, 0.0])
     axes = np.stack([left, np.cross(along, left)])
-    found = []
+    passed = []
     for shape in problem.scene.shapes:
         if shape.name != "floor" and isinstance(shape, Sphere | Box | Cylinder):
             center = shape.center
             away = axes @ (tip[np.linalg.norm(tip - center, axis=1).argmin()] - center)
             axis = int(np.abs(away).argmax())
-            found.append(2 * axis + int(away[axis] < 0))
-    return tuple(found)
+            passed.append(2 * axis + int(away[axis] < 0))
+    return tuple(passed)
 
 
 def spread(problem: Problem, paths: Sequence[ndarray]) -> Fields:
     """How much motions of one problem differ."""
-    same = [even(path) for path in paths]
-    apart = [float(np.sqrt(((a - b) ** 2).sum(1).mean())) for a, b in combinations(same, 2)]
-    found: Fields = {"paths": float(len(same)), "classes": float(len({sides(problem, q) for q in same}))}
-    return found | ({"apart": float(np.mean(apart))} if apart else {})
+    resampled = [even(path) for path in paths]
+    apart = [float(np.sqrt(((a - b) ** 2).sum(1).mean())) for a, b in combinations(resampled, 2)]
+    classes = float(len({sides(problem, q) for q in resampled}))
+    measures: Fields = {"paths": float(len(resampled)), "classes": classes}
+    return measures | ({"apart": float(np.mean(apart))} if apart else {})
 
 
 def of_network(planner: Diffusion) -> Method:
@@ -128,11 +129,11 @@ def report_diversity(every: dict[str, list[Case]]) -> None:
     rows = []
     for family, cases in every.items():
         found = run_all(cases, methods, limit=PLANNER_LIMIT, title=f"{family}, diversity")
-        # of problems on which both have several motions
+        # only problems on which both planners have several motions
         both = [i for i in range(len(cases)) if all("apart" in of[i].measures for of in found.values())]
         for name, records in found.items():
-            kept = [records[i] for i in both]
-            rows.append((family, name, len(kept), *(_mean(kept, key) for key in COLUMNS)))
+            compared = [records[i] for i in both]
+            rows.append((family, name, len(compared), *(_mean(compared, key) for key in COLUMNS)))
     print_table(
         f"Diversity of {MOTIONS} motions and smoothness of the returned one, means over problems",
         ["family", "planner", "problems", *(key.replace("_", " ") for key in COLUMNS)],

@@ -1,4 +1,4 @@
-"""The bundled networks as ONNX Runtime runs them beside PyTorch.
+"""The bundled networks run by ONNX Runtime, compared with PyTorch.
 
     python benchmarks/networks.py [--calls 40]
 
@@ -24,7 +24,7 @@ BATCH = 16
 
 
 def median_time(call: Callable[[], object], calls: int) -> float:
-    """CPU time of a call [ms]: the median, after two that do not count."""
+    """CPU time of a call [ms]: the median, after two calls that are not counted."""
     spent = []
     for _ in range(calls + 2):
         began = time.process_time()
@@ -34,7 +34,7 @@ def median_time(call: Callable[[], object], calls: int) -> float:
 
 
 def speed(calls: int) -> None:
-    """The networks, run both ways."""
+    """Print the time of each network by ONNX Runtime and by PyTorch, and how far their outputs differ."""
     torch.set_num_threads(1)
     panda = load_robot("panda")
     rng = np.random.default_rng(0)
@@ -44,8 +44,8 @@ def speed(calls: int) -> None:
         network = load_network(name, None, panda)
         features = rng.normal(size=(BATCH, exported.waypoints, exported.feature_count)).astype(np.float32)
         condition = rng.normal(size=(BATCH, exported.condition_count)).astype(np.float32)
-        given = features, np.ones(BATCH, np.float32), condition
-        pair = [partial(model.denoised, *given) for model in (exported, network)]
+        inputs = features, np.ones(BATCH, np.float32), condition
+        pair = [partial(model.denoised, *inputs) for model in (exported, network)]
         rows.append((f"denoiser of {name}, batch of {BATCH}", *pair))
         if exported.settings.encoder is not None:
             cloud = rng.uniform(-0.6, 0.6, (320, 3)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Beside the peers: MPlib, roboplan, sscbirrt, OMPL with Pinocchio, and RobotDiffuse on the same problems.
+"""Comparison with peers: MPlib, roboplan, sscbirrt, OMPL with Pinocchio and RobotDiffuse on equal problems.
 
     python benchmarks/peers.py --problems FOLDER --environments FOLDER
         [--families bookshelf_small_panda,box_panda,cage_panda] [--each 10] [--peers mplib,roboplan,...]
@@ -11,12 +11,12 @@ files), the second an environment for each peer, made once, outside the reposito
     python -m venv FOLDER/sscbirrt && FOLDER/sscbirrt/bin/pip install "sscbirrt[mujoco,ssik]"
     python -m venv FOLDER/ompl && FOLDER/ompl/bin/pip install ompl pin toppra
 
-A peer without one is left out, and the report says so. Each runs in a process of its own
+A peer without an environment is left out, and the report says so. Each peer runs in a process of its own
 (benchmarks/workers/peer.py), on the URDF and the convex meshes of this package's Panda, with the same
-pairs of links, the same scene and the same limits of position, velocity and acceleration; RobotDiffuse
-keeps limits of jerk besides. Each goal is given as a configuration, and as the pose of the hand there.
-Solved is what takes at most TIME_LIMIT seconds of CPU time. The validator and Coal judge the motions
-along straight lines between their rows, which are 4 ms apart.
+checked pairs of links, the same scene and the same limits of position, velocity and acceleration;
+RobotDiffuse also keeps jerk limits. Each goal is given as a configuration, and as the pose of the hand in
+this configuration. A problem counts as solved if the answer takes at most TIME_LIMIT seconds of CPU time. The
+validator and Coal check the motions along straight lines between their rows, which are 4 ms apart.
 """
 
 import argparse
@@ -57,14 +57,14 @@ from robotdiffuse.scenes.shapes import Box, Cylinder
 from robotdiffuse.simulation.world import write_urdf
 
 TIME_LIMIT = 1.0
-"""[s] of CPU time."""
+"""CPU time of an answer that counts as solved [s]."""
 WALL_SHARE = 10.0
-"""Peers watch the wall clock: it gets so many times the limit, so that other work on the machine does not end
-their searches early."""
+"""Peers limit wall time. Their limit is this factor times TIME_LIMIT, so that other work on the machine does
+not end their searches early."""
 MESH_STEP = 0.005
-"""Most motion of a joint between two configurations that are checked on meshes [rad]."""
+"""Largest motion of a joint between two configurations that are checked on meshes [rad]."""
 ROW = 0.004
-"""Time between the rows of a motion [s]; RobotDiffuse's default."""
+"""Time between the rows of a motion [s], as by default in RobotDiffuse."""
 PEERS = ("mplib", "roboplan", "sscbirrt", "ompl")
 GOALS = ("configuration", "pose")
 WORKER = Path(__file__).parent / "workers" / "peer.py"
@@ -72,14 +72,18 @@ WORKER = Path(__file__).parent / "workers" / "peer.py"
 
 class Answer(NamedTuple):
     cpu: float
+    """CPU time of the call [s]."""
     duration: float | None
-    """None without a motion [s]."""
+    """Duration of the motion [s]; None without a motion."""
     rows: ndarray | None
+    """Configurations of the motion, every ROW; None without a motion."""
     reason: str = ""
+    """Why there is no motion."""
 
 
 def robot_files(robot: Robot, folder: Path) -> dict[str, Any]:
-    """Writes the robot as a URDF, with joints that are not planned fixed where they are held, and an SRDF."""
+    """Writes the robot as a URDF and an SRDF, and returns the description that workers read. In the URDF,
+    joints that are not planned are fixed at their locked values."""
     urdf = write_urdf(robot, folder)
     tree = ET.parse(urdf)
     for element, joint in zip(tree.iter("joint"), robot.joints, strict=True):
@@ -166,7 +170,7 @@ def ours(cases: Sequence[ProblemEntry], goal: str, until: str) -> list[Answer]:
 
 
 def of_peer(name: str, python: Path, robot: dict[str, Any], problems: list[dict]) -> tuple[list[Answer], str]:
-    """The answers of a peer, and its versions, or why there are none."""
+    """The answers of a peer and the versions of its packages; or no answers and the reason."""
     with TemporaryDirectory() as folder:
         task = Path(folder, "task.json")
         answers = Path(folder, "answers.json")

@@ -4,10 +4,10 @@
         [--problems FOLDER --lengths FILE] [--limits 0.01,0.05,0.1,1] [--seeds 1] [--motions 400] [--cpu]
 
 Prints benchmarks/results/core.txt. FOLDER holds MotionBenchMaker families (scene and request files), FILE the
-reference lengths {"length": {"family/number": {"best_known": ...}}}; without one, the best known length of a
-problem is the shortest of all rows here. One thread; times are CPU times of the process unless wall time is
-said; with --cpu time limits are of CPU time too. Clearance 0, so that lengths compare with those of planners
-that keep none.
+reference lengths {"length": {"family/number": {"best_known": ...}}}; without FILE, the best known length of a
+problem is the shortest one that any planner finds in this run. One thread is used. Times are CPU times of the
+process unless a table says wall time; with --cpu, time limits are of CPU time too. The clearance is 0, so
+that lengths can be compared with those of planners that keep no clearance.
 """
 
 import argparse
@@ -58,28 +58,30 @@ PLANNERS = ("aorrtc", "rrt_connect")
 JERK = 100.0
 """[rad/s³]"""
 FIRST_CALLS = 5
-"""Equal calls until the first motion; the one of least CPU time counts, since other work only adds to it."""
+"""Number of equal calls until the first motion. The least CPU time counts, since other work on the machine
+only adds to it."""
 OVERRUN_LIMITS = (0.001, 0.01, 0.05, 0.1, 1.0)
 """Time limits whose overrun is measured [s]."""
 TIMED_PATHS = 500
 MESH_STEP = 0.005
-"""Most motion of a joint between two configurations that are checked on meshes [rad]."""
+"""Largest motion of a joint between two configurations that are checked on meshes [rad]."""
 
 
 def gather(folder: Path | None, families: Sequence[str], each: int) -> list[Case]:
-    """So many problems of each family; those of MotionBenchMaker are spread evenly over its families."""
-    with TemporaryDirectory() as kept:
-        own = gather_cases([f"{name}_nontrivial" for name in families], each, Path(kept), print)
-        given = [] if folder is None else gather_cases([str(folder)], None, Path(kept), print)
-    for family in dict.fromkeys(case.family for case in given):
-        of = [case for case in given if case.family == family]
-        own += of[:: max(len(of) // each, 1)][:each]
-    return own
+    """`each` problems of each family, and of each family of MotionBenchMaker in `folder`; the latter are
+    evenly spaced in the list of problems."""
+    with TemporaryDirectory() as cache:
+        cases = gather_cases([f"{name}_nontrivial" for name in families], each, Path(cache), print)
+        published = [] if folder is None else gather_cases([str(folder)], None, Path(cache), print)
+    for family in dict.fromkeys(case.family for case in published):
+        of_family = [case for case in published if case.family == family]
+        cases += of_family[:: max(len(of_family) // each, 1)][:each]
+    return cases
 
 
 def best_known(cases: Sequence[Case], lengths: dict, found: Sequence[Record]) -> dict[str, float]:
-    """The shortest known length of each problem, by its name [rad]: the given one, else the shortest
-    found."""
+    """The best known length of each problem, by its name [rad]: that of `lengths`, else the shortest length
+    in the records `found`."""
     best: dict[str, float] = {}
     for case in cases:
         name = f"{case.family.removesuffix('_panda')}/{case.name[-4:]}"
@@ -94,7 +96,7 @@ def best_known(cases: Sequence[Case], lengths: dict, found: Sequence[Record]) ->
 
 
 def warm(name: str, cases: Sequence[Case]) -> Planner:
-    """A planner that has loaded its compiled code, Coal and network."""
+    """A planner whose compiled code, Coal and network are loaded."""
     planner = load_planner(name)
     planner.warm_up(cases[0].problem, TIME_LIMIT)
     return planner
@@ -107,7 +109,8 @@ def by_family(cases: Sequence[Case]) -> Iterator[tuple[str, list[Case]]]:
 
 
 def first(cases: Sequence[Case]) -> None:
-    """Print when aorrtc has its first path, and when its call returns, each the least of several calls."""
+    """Print the CPU time until aorrtc has its first path, and until its call returns, for the fastest of
+    several calls."""
     method = {"aorrtc": planned(warm("aorrtc", cases), until=FIRST, clearance=0.0)}
     calls = [run_all(cases, method, limit=5.0, title="first")["aorrtc"] for _ in range(FIRST_CALLS)]
     found = {of[0].name: min(of, key=lambda r: r.cpu or np.inf) for of in zip(*calls, strict=True)}
@@ -126,7 +129,7 @@ def first(cases: Sequence[Case]) -> None:
 
 
 def lengths(cases: Sequence[Case], known: dict, limits: Sequence[float], seeds: int) -> None:
-    """Print path lengths at equal time limits, over the best known ones."""
+    """Print path lengths at equal time limits, relative to the best known ones."""
     found: dict[tuple[str, float], list[Record]] = {}
     for limit in limits:
         methods = {name: planned(warm(name, cases), until=TIME_LIMIT, clearance=0.0) for name in PLANNERS}
@@ -168,7 +171,8 @@ def limits(cases: Sequence[Case]) -> None:
 
 
 def timing(cases: Sequence[Case], count: int = TIMED_PATHS) -> None:
-    """Print how long the time parameterization takes, and what limits it keeps."""
+    """Print how long the time parameterization takes, and the largest velocities, accelerations and jerks as
+    fractions of their limits."""
     planner = load_planner("aorrtc")
     worst = [0.0, 0.0]
     times = []
@@ -205,8 +209,8 @@ def timing(cases: Sequence[Case], count: int = TIMED_PATHS) -> None:
 
 
 def with_thin_obstacles(problem: Problem, rng: np.random.Generator) -> Problem:
-    """The problem with plates of 1 mm and rods of 2 mm across at random places that leave start and goal
-    free."""
+    """The problem with up to six more obstacles, plates of 1 mm thickness and rods of 2 mm diameter, at
+    random places that leave start and goal free."""
     shapes = list(problem.scene.shapes)
     ends = np.stack([problem.start, goal_of(problem)])
     for _ in range(6):
@@ -221,8 +225,9 @@ def with_thin_obstacles(problem: Problem, rng: np.random.Generator) -> Problem:
 
 
 def collisions(motions: int, seed: int) -> None:
-    """Print how many returned motions collide on meshes, half of them in scenes with thin obstacles, how many
-    stop on the way, and the largest shares of the limits of velocity, acceleration and jerk."""
+    """Print how many returned motions collide on meshes, how many stop on the way, and the largest
+    velocities, accelerations and jerks as fractions of their limits. Half of the scenes have thin
+    obstacles."""
     rng = np.random.default_rng(seed)
     families = [load_family(name) for name in FAMILIES]
     planner = load_planner("aorrtc")

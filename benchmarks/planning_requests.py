@@ -1,28 +1,27 @@
-"""What people ask planners for: carried objects, tools, bases, tolerances, waypoints, both hands, payloads.
+"""Kinds of requests: carried objects, tools, bases, tolerances, waypoints, both hands, payloads.
 
     python benchmarks/planning_requests.py --scenes FOLDER [--places 1] [--number 120] [--planner aorrtc]
     python benchmarks/planning_requests.py --parts blended,payloads [--number 20]
 
 `carried`, `together` and `both_hands` print benchmarks/results/requests.txt, the others one_motion.txt.
 
-- carried: MotionBenchMaker's table_pick (FOLDER), with the can in the hand where its problems end, to random
-  places on the table: upright, at any turn about the vertical, 5 mm above the top. A place that the can
-  itself occupies, or that no free configuration reaches, is drawn again.
-- together: held-out problems of the families shelf and table, with the base turned and moved, a tool of 6 cm,
-a
-  held box of random size, a pose of that box with tolerances as the goal, and a waypoint; problems that start
+- carried: scenes of MotionBenchMaker's table_pick (FOLDER). The arm holds the can where the scene's problem
+  ends, and carries it to random places on the table: upright, at any angle about the vertical, 5 mm above the
+  top. A place that another object occupies, or that no free configuration reaches, is drawn again.
+- together: held-out problems of the families shelf and table, with a moved and turned base, a tool of 6 cm, a
+  held box of random size, a pose of this box with tolerances as the goal, and a waypoint. Problems that start
   in collision are left out.
-- both_hands: Baxter, with a post on a table before it, from a random free configuration to the poses that
-both
-  hands have at another one.
-- blended: from the start of a held-out problem by three random free configurations to its goal, half of them
-  given as configurations, half as poses of the hand. The arm stops at each, or passes within the blend; same
-  seed, so that the segments are the same.
-- payloads: held-out problems with masses 10 cm before the hand's frame; torques at every row of the motion.
+- both_hands: Baxter with a post on a table in front of it, from a random free configuration to the poses of
+  both hands in another free configuration.
+- blended: from the start of a held-out problem through three random waypoints to its goal. In half of the
+  problems, waypoints are configurations, in the others poses of the hand. The arm stops at each waypoint, or
+  passes it within the blend; the seed is equal, so that the segments are equal too.
+- payloads: held-out problems with masses 10 cm in front of the hand's frame; torques are computed at every
+row of the motion.
 
 Time limits are of CPU time. Coal on the exact meshes and PyBullet check every returned motion: its path every
-0.01 rad, and each row of the timed motion; PyBullet has robot and tool as a URDF of its own and, where the
-problem has a base, all in the world's frame. PyBullet's own kinematics say where the held object ends.
+0.01 rad, and each row of the timed motion. PyBullet loads robot and tool from a URDF; if the problem has a
+base, everything is in the world's frame. PyBullet's own kinematics tell where the held object ends.
 """
 
 import argparse
@@ -67,17 +66,17 @@ from robotdiffuse.robots.kinematics import link_origins, link_pose
 from robotdiffuse.simulation.world import World
 from robotdiffuse.validation.tolerances import goal_error
 
-# Time limits [s]; the longer one says which problems can be solved.
+# Time limits [s]. A problem counts as solvable if it is solved within the longer one.
 SHORT = 1.0
 LONG = 10.0
 CAN = "Can1"
 HAND = "panda_hand"
 PLACE_GAP = 0.005
-"""Between the can and the table where it is put [m]."""
+"""Height above the table at which the can is put down [m]."""
 PLACE_REACH = 0.75
 """Largest distance of a place from the base's axis [m]."""
 PLACE_TRIES = 40
-"""Places that are drawn until one can be reached."""
+"""Largest number of places that are drawn until `places` of them can be reached."""
 PLACE_LIMIT = 0.15
 """Time limit of a call that looks for configurations at a place [s]."""
 PATH_STEP = 0.01
@@ -89,7 +88,7 @@ MASSES = (0.0, 1.0, 2.0, 3.0)
 MOTION_LIMIT = 5.0
 """Time limit of calls with blends and payloads [s]."""
 CURVE_SAMPLES = 20_000
-"""Of a motion, at which its distance to waypoints is measured."""
+"""Number of times of a motion at which its distance to waypoints is measured."""
 
 
 class NamedProblem(NamedTuple):
@@ -101,8 +100,9 @@ class Checked(NamedTuple):
     """A motion as Coal and PyBullet see it."""
 
     coal: int
-    """Configurations in collision."""
+    """Number of configurations in collision by Coal."""
     pybullet: bool
+    """Whether any configuration is in collision by PyBullet."""
     off: float
     """How far the held object or a hand ends off its goal beyond the tolerances [m]."""
 
@@ -116,16 +116,16 @@ def carried(folder: Path, places: int) -> Iterator[NamedProblem]:
         robot = entry.problem.robot
         q = entry.problem.goal.positions[0]
         scene, holding = entry.problem.scene.attach(CAN, robot, q)
-        kept = 0
+        reachable = 0
         for _ in range(PLACE_TRIES):
             goal = PoseGoal(CAN, _place(scene, entry.problem.scene, rng), [0, 0, 0], [0, 0, np.pi])
             problem = Problem(holding, scene, q, goal)
             if not isinstance(
                 usable_start_goal(PlanningContext("places", problem, PlanRequest(PLACE_LIMIT))), PlanResult
             ):
-                yield NamedProblem(f"{entry.name}-{kept}", problem)
-                kept += 1
-            if kept == places:
+                yield NamedProblem(f"{entry.name}-{reachable}", problem)
+                reachable += 1
+            if reachable == places:
                 break
 
 
@@ -195,7 +195,7 @@ def both_hands(number: int) -> Iterator[NamedProblem]:
 
 
 def checked(named: NamedProblem, result: PlanResult) -> Checked:
-    """The motion before Coal and PyBullet."""
+    """Check the motion of a result by Coal and PyBullet."""
     problem = named.problem
     assert result.path is not None and result.trajectory is not None
     path = dense(result.path.positions, PATH_STEP)
@@ -210,7 +210,7 @@ def checked(named: NamedProblem, result: PlanResult) -> Checked:
 
 
 def _off(problem: Problem, pose: PoseGoal, simulated: World) -> float:
-    """How far a link of the simulated robot is off its pose beyond the tolerance [m]."""
+    """How far the position of a link of the simulated robot is off its goal, beyond the tolerance [m]."""
     state = simulated.bullet.getLinkState(
         simulated.body,
         simulated.links[pose.frame],
@@ -223,7 +223,7 @@ def _off(problem: Problem, pose: PoseGoal, simulated: World) -> float:
 
 
 def measured(title: str, every: list[NamedProblem], name: str) -> None:
-    """Plan, check on meshes, and print."""
+    """Plan all problems with the planner `name`, check the motions on meshes, and print a table."""
     planner = rd.load_planner(name)
     planner.warm_up(every[0].problem, TIME_LIMIT)
     results = []
@@ -283,7 +283,7 @@ def attaching() -> None:
 
 
 def sequences(number: int) -> Iterator[Problem]:
-    """Problems with three waypoints, configurations and poses in turn."""
+    """Problems with three waypoints each: configurations in half of the problems, poses in the others."""
     for i in range(number):
         rng = np.random.default_rng([SEED, 2, i])
         given = held_out_problem(("shelf", "table")[i % 2], i // 2)
@@ -314,7 +314,7 @@ def nearest(problem: Problem, motion: Trajectory) -> list[float]:
 
 
 def blended(number: int, name: str) -> None:
-    """Plan with stops and with blends, check on meshes, and print."""
+    """Plan with stops and with each blend, check the motions on meshes, and print a table."""
     planner = rd.load_planner(name)
     every = list(sequences(number))
     planner.warm_up(every[0], TIME_LIMIT)

@@ -1,11 +1,11 @@
-"""Goals as poses: motions beside the nearest configuration, arms of few joints, several goals.
+"""Pose goals: motions compared with the nearest goal configuration, arms of few joints, several goals.
 
     python benchmarks/pose_goals.py [--robots iiwa14 ...] [--starts 60]
 
-Prints a report that is kept in benchmarks/results/pose_goals.txt. There are no obstacles, but the links must
-not touch each other. The nearest configuration comes from a search of its own: Gauss-Newton steps from many
-seeds, drawn towards the start. It is a reference for the length of motions, not a bound, because it may miss
-a configuration.
+Prints benchmarks/results/pose_goals.txt. There are no obstacles, but the links must not touch each other. The
+nearest configuration comes from a separate search: Gauss-Newton steps from many seeds, which also pull
+towards the start. Its distance is a reference for the length of motions, not a bound, because this search may
+miss a nearer configuration.
 """
 
 import argparse
@@ -28,15 +28,16 @@ from robotdiffuse.robots.parsing.urdf import UrdfTree
 from robotdiffuse.robots.robot import Robot
 
 ROBOTS = ("iiwa14", "gen3", "xarm7", "panda", "ur5e", "fr3")
-# Of the search for the nearest configuration.
+# Number of seeds and steps of the search for the nearest configuration.
 SEEDS = 150
 STEPS = 80
 PULL = 0.3
-"""Part of the way to the start that a step of this search goes, as far as the pose allows."""
+"""Fraction of the distance to the start by which a step of this search moves within the null space of the
+pose."""
 EXACT = 1e-4
 """Largest error of a pose [m], [rad]."""
 SHORTEST = 0.01
-"""Distances below this count as this, so that ratios near 0 have a meaning [rad]."""
+"""Smaller distances are raised to this value, so that ratios of distances near 0 are meaningful [rad]."""
 FEW_JOINTS = Path(__file__).parents[1] / "docs" / "how_to" / "robot.md"
 """The page whose first URDF is an arm of four joints."""
 
@@ -52,7 +53,8 @@ def rotation_vectors(rotations: Float[ndarray, "n 3 3"]) -> Float[ndarray, "n 3"
 def nearest_distance(
     robot: Robot, frame: str, T: Float[ndarray, "4 4"], start: Float[ndarray, "dof"], rng: np.random.Generator
 ) -> float:
-    """Distance from the start to the nearest configuration that reaches the pose without a collision."""
+    """Distance from the start to the nearest configuration that reaches the pose without a collision [rad];
+    infinite if none is found."""
     continuous = np.array(robot.continuous)
     lower = np.where(continuous, -np.inf, robot.lower)
     upper = np.where(continuous, np.inf, robot.upper)
@@ -95,7 +97,8 @@ def free_configurations(robot: Robot, count: int, rng: np.random.Generator) -> F
 
 
 def length_rows(name: str, starts: int) -> list[list[str]]:
-    """Lengths and durations of motions to poses where the hand is, 5 cm away, and anywhere."""
+    """Rows with lengths and durations of motions to three kinds of poses: that of the hand at the start, 5 cm
+    away from it, and that at a random configuration."""
     robot = rd.load_robot(name)
     rng = np.random.default_rng(7)
     configurations = free_configurations(robot, 2 * starts, rng)
@@ -144,7 +147,7 @@ def four_joints() -> Robot:
 
 
 def few_joints_rows(poses: int) -> list[list[str]]:
-    """Poses near those of a random configuration, with tolerances, for arms of four and five joints."""
+    """Rows for arms of four and five joints: poses near that of a random configuration, with tolerances."""
     rows = []
     for robot in (rd.load_robot("so101"), four_joints()):
         for label, xyz, rpy in (
@@ -175,7 +178,7 @@ def few_joints_rows(poses: int) -> list[list[str]]:
 
 
 def several_rows(problems: int) -> list[list[str]]:
-    """Twenty poses of the hand, half of them in an obstacle, and a limit of 0.1 s."""
+    """Rows for goals of twenty poses of the hand, half of them in an obstacle, with a limit of 0.1 s."""
     robot = rd.load_robot("panda")
     rng = np.random.default_rng(3)
     rows = []
@@ -186,13 +189,14 @@ def several_rows(problems: int) -> list[list[str]]:
         for k in range(problems):
             configurations = free_configurations(robot, 200, rng)
             start = configurations[0]
-            rest = configurations[1:]
-            balls = [rd.Sphere(link_pose(robot, q, robot.tip)[:3, 3], 0.06) for q in rest[:10]]
+            candidates = configurations[1:]
+            blocked = candidates[:10]
+            balls = [rd.Sphere(link_pose(robot, q, robot.tip)[:3, 3], 0.06) for q in blocked]
             exact = ExactCollision(robot, rd.Scene(balls))
             if exact.collides(start[None])[0]:
                 continue
-            free = rest[~exact.collides(rest)][:10]
-            goals = [rd.PoseGoal(robot.tip, link_pose(robot, q, robot.tip)) for q in [*rest[:10], *free]]
+            free = candidates[~exact.collides(candidates)][:10]
+            goals = [rd.PoseGoal(robot.tip, link_pose(robot, q, robot.tip)) for q in [*blocked, *free]]
             problem = rd.Problem(robot, rd.Scene(balls), start, rd.AnyGoal(tuple(goals)))
             if k == 0:
                 rd.plan(problem, 1.0, until=until)

@@ -1,17 +1,15 @@
-"""The robots that come with the package: problems of furniture and clutter, and inverse kinematics.
+"""The bundled robots: problems of furniture and clutter, and inverse kinematics.
 
     python benchmarks/robots.py [--robots ur5e fr3 ...] [--problems 200] [--out FILE] [--cpu]
     python benchmarks/robots.py --inverse-kinematics [--poses 1000]
 
-The first prints benchmarks/results/shipped_arms.txt; --out is written anew as each robot ends, and --cpu
-makes time limits those of CPU time. First motions of `robotdiffuse` with a limit of 1 s, and with 10 s where
-that is not enough. On every tenth problem its path is compared with that of `aorrtc` after the same time: for
-robots without weights this is what batches of smooth noise add to search. Coal and PyBullet check the
-returned motions every 5 mrad on the robots' meshes. 200 problems take a robot about a minute of one core, and
-11 s more for each that is not solved.
+The first command prints benchmarks/results/shipped_arms.txt. FILE is written again after each robot. With
+--cpu, time limits are of CPU time. `robotdiffuse` plans first motions with a limit of 1 s, and of 10 s if
+that is not enough. Coal and PyBullet check the returned motions every 5 mrad on the robots' meshes. 200
+problems take about a minute of one core for each robot, and 11 s more for each problem that is not solved.
 
-The second prints inverse_kinematics.txt: poses of panda_hand at uniform random configurations; NumPy
-kinematics measure the errors.
+The second prints inverse_kinematics.txt: poses of panda_hand at uniform random configurations; kinematics in
+NumPy measure the errors.
 """
 
 import argparse
@@ -37,16 +35,14 @@ from robotdiffuse.simulation.validator import PyBulletOracle
 
 FAMILIES = ("shelf", "crate", "table", "clutter", "kitchen")
 SEED = 11
-"""Of the problems; no setting was chosen on them."""
+"""Seed of the problems; no setting was chosen on them."""
 # Time limits [s].
 SHORT = 1.0
 LONG = 10.0
-COMPARED_EVERY = 10
-"""Of so many problems, one is planned for all of SHORT by both planners."""
 STEP = 0.005
 """Largest joint motion between two checked configurations [rad]."""
 FRAME = "panda_hand"
-"""Of inverse kinematics."""
+"""Link whose poses inverse kinematics gets."""
 
 
 @dataclass
@@ -59,11 +55,15 @@ class Tally:
     long: int = 0
     """... and within LONG."""
     times: list[float] = field(default_factory=list)
+    """Planning times of the problems solved within SHORT [ms]."""
     hard: list[str] = field(default_factory=list)
-    """Problems not solved within SHORT, and when they were."""
+    """Problems not solved within SHORT, each with the time that it took, or "never"."""
     configurations: int = 0
+    """Number of checked configurations."""
     by_coal: int = 0
+    """Number of motions in collision by Coal."""
     by_pybullet: int = 0
+    """Number of motions in collision by PyBullet."""
 
 
 def check(problem: Problem, result: PlanResult, oracle: PyBulletOracle, tally: Tally) -> None:
@@ -77,16 +77,17 @@ def check(problem: Problem, result: PlanResult, oracle: PyBulletOracle, tally: T
 
 
 def draw(family: str, robot: Robot, count: int) -> list[tuple[str, Problem]]:
-    """Problems of a family with their names; fewer than `count` if its furniture rarely suits the arm."""
+    """Problems of a family with their names; fewer than `count` if the arm has no start and goal in most of
+    the drawn scenes."""
     rng = np.random.default_rng(SEED)
-    found = list[tuple[str, Problem]]()
+    drawn = list[tuple[str, Problem]]()
     for _ in range(2 * count):
-        with suppress(InputError):  # no free ends in many scenes
+        with suppress(InputError):  # no free start and goal in this scene
             problem = family_for(family, robot).draw(robot, rng).problem(robot)
-            found.append((f"{family} {len(found)}", problem))
-        if len(found) == count:
+            drawn.append((f"{family} {len(drawn)}", problem))
+        if len(drawn) == count:
             break
-    return found
+    return drawn
 
 
 def measure(name: str, problems: int) -> Tally:
@@ -140,7 +141,7 @@ def report(head: str, tallies: dict[str, Tally]) -> None:
 
 
 def measure_inverse_kinematics(poses: int) -> None:
-    """Print the share solved, errors and times of inverse kinematics of the Panda."""
+    """Print the fraction solved, the errors and the times of inverse kinematics of the Panda."""
     robot = load_robot("panda")
     rng = np.random.default_rng(0)
     start = time.perf_counter()

@@ -1,15 +1,17 @@
 """Robustness: damaged inputs of every kind, and data generation that is killed at random moments.
 
-    python benchmarks/robustness.py fuzz [--seconds 600] [--seed 0] [--only problem,urdf] python
-    benchmarks/robustness.py faults [--trajectories 1000] [--shard 10] [--kills 10] [--workers 2] [--seed 0]
+    python benchmarks/robustness.py fuzz [--seconds 600] [--seed 0] [--only problem,urdf]
+    python benchmarks/robustness.py faults [--trajectories 1000] [--shard 10] [--kills 10] [--workers 2]
+        [--seed 0]
 
 `fuzz` prints benchmarks/results/fuzz.txt: each input of tests/helpers/fuzz must give an answer or a one-line
-error, in bounded time. Where no compiled code is cached yet, run it a minute before: compiling counts as time
-and memory.
+error, in bounded time. If no compiled code is cached yet, first run it for a minute, since compiling would
+count as time and memory of inputs.
 
-`faults` prints faults.txt. The command `data generate` is killed with SIGKILL and started again; its files
-must be those of a run that nothing disturbed. Moments are uniform, half of them in the first six seconds of a
-start, when processes start and the manifest is written, half in the three seconds after the first new shard.
+`faults` prints faults.txt. The command `data generate` is killed with SIGKILL and started again; in the end,
+its files must be equal to those of an undisturbed run. The moments of the kills are uniformly distributed:
+half of them in the first six seconds after a start, when processes start and the manifest is written, half in
+the three seconds after the first new shard.
 """
 
 import argparse
@@ -57,7 +59,7 @@ def wait_for_shard(run: subprocess.Popen[bytes], out: Path) -> None:
 
 
 def wait_for_workers(group: int) -> float:
-    """Wait until no process of a killed command's group is left; seconds."""
+    """Wait until no process of a killed command's group is left; returns how long that took [s]."""
     begun = time.monotonic()
     while any(_runs_in(group, stat) for stat in Path("/proc").glob("[0-9]*/stat")):
         time.sleep(0.02)
@@ -120,24 +122,24 @@ def faults(arguments: argparse.Namespace) -> None:
 
 
 CPU_LIMIT = 5.0
-"""Most processor time of an input [s]; inputs of kind `socket` have a limit of their own, `server.LIMIT`."""
+"""Largest CPU time of an input [s]; inputs of kind `socket` have a limit of their own, `server.LIMIT`."""
 HANG_TIMEOUT = 60.0
-"""An input that has not ended by then is given up [s]."""
+"""Time after which an input that has not ended is given up [s]."""
 MEMORY_LIMIT = 12 * 2**30
-"""Of the process that runs inputs [bytes]."""
+"""Memory limit of the process that runs inputs [bytes]."""
 
 
 class Campaign(NamedTuple):
     counts: Counter[tuple[str, str]]
-    """Inputs by kind and outcome."""
+    """Number of inputs by kind and outcome."""
     faults: list[str]
-    """What ended in anything but an answer or one line: kind, seed and what happened."""
+    """Inputs that led to anything but an answer or a one-line error: kind, seed and what happened."""
     slowest: dict[str, float]
     """Longest time of an input, by kind [s]."""
 
 
 def run_inputs(pipe: Connection, seed: int, kinds: tuple[str, ...]) -> None:
-    """Run inputs from a seed on, kinds in turn, and send one message for each."""
+    """Run inputs numbered from `seed` on, with alternating kinds, and send a message for each."""
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_LIMIT, MEMORY_LIMIT))
     quiet = os.open(os.devnull, os.O_WRONLY)
     os.dup2(quiet, 2)
@@ -161,18 +163,18 @@ def run_campaign(seconds: float, seed: int, kinds: tuple[str, ...]) -> Campaign:
     until = time.monotonic() + seconds
     number = seed
     while time.monotonic() < until:
-        ours, theirs = context.Pipe()
-        worker = context.Process(target=run_inputs, args=(theirs, number, kinds), daemon=True)
+        pipe, worker_end = context.Pipe()
+        worker = context.Process(target=run_inputs, args=(worker_end, number, kinds), daemon=True)
         worker.start()
-        theirs.close()
+        worker_end.close()
         ended = False
         first = True
         while not ended and time.monotonic() < until:
             kind = kinds[number % len(kinds)]
             took = 0.0
             try:
-                ended = not ours.poll(HANG_TIMEOUT)
-                result, said, took = ("fault", "it does not end", HANG_TIMEOUT) if ended else ours.recv()
+                ended = not pipe.poll(HANG_TIMEOUT)
+                result, said, took = ("fault", "it does not end", HANG_TIMEOUT) if ended else pipe.recv()
             except EOFError:
                 worker.join()
                 ended = True

@@ -1,21 +1,21 @@
-"""Whether a code of the whole scene can matter to the diffusion model: true obstacles beside clouds.
+"""Whether an embedding ("code") of the whole scene helps the diffusion model: true obstacles or point clouds.
 
     python benchmarks/scene_code.py [--parts data,train,report] [--rows oracle,tokens] [--out FOLDER]
         [--samples 1600000] [--plot scene_code.png]
 
 Prints benchmarks/results/scene_code.txt and draws scene_code.png. After an interruption the same command
-continues; parts and rows can run side by side. Problems and motions are of the family rop. The networks
-have no clearances as inputs and are sampled without guidance, so all they know of the scene is its code:
+continues; parts and rows can run at the same time. Problems and motions are of the family rop. The networks
+have no clearances as inputs and are sampled without guidance, so they know the scene only by its code. Rows:
 
-- oracle: kind, center, size and turn of each true obstacle, through a perceptron that sums over obstacles and
-  is trained along;
+- oracle: the code of the true obstacles (kind, center, size and turn of each), by a perceptron that sums over
+  obstacles and is trained together with the denoiser;
 - tokens: points of the cloud, which the waypoints attend to, in place of one vector (config `points`);
-- pointnet: PointNet, trained along;
+- pointnet: PointNet, trained together with the denoiser;
 - cae: the paper's auto-encoder, trained alone first, then frozen.
 
-Each network is tried with the code of the problem's own scene, that of another problem's scene, the mean
-code, and with its condition hidden, as in a tenth of its training. Start and goal stay visible in the noisy
-motion.
+Each network is sampled with the code of the problem's own scene, with the code of another problem's scene,
+with the mean code, and with a hidden condition, as in a tenth of its training. Start and goal stay visible in
+the noisy motion.
 """
 
 import argparse
@@ -71,25 +71,27 @@ SEARCH_TIME = 3.0
 SAMPLING_STEPS = 6
 BEST_OF = 16
 """Samples for each problem in the report."""
-# Problems that a checkpoint of a training is tried on, and samples for each.
+# Number of problems on which a checkpoint is tried during training, and of samples for each problem.
 CURVE_PROBLEMS = 100
 CURVE_SAMPLES = 4
 WAYPOINTS = 48
 ERROR_LEVELS = (200, 150, 100, 50)
-"""Noise levels at which predictions are compared; 200 is noise alone."""
+"""Noise levels at which predictions are compared; level 200 is pure noise."""
 CODES = ("own", "another scene's", "mean", "hidden")
 CHUNK = 256
 """Samples that go through a network together."""
 DECISIVE = 10.0
-"""Points by which the oracle's own code must beat the mean code, for a code of the scene to be worth it."""
+"""A code of the scene counts as useful if the oracle's own code beats its mean code by this [percentage
+points]."""
 
 
 # What the networks see of a scene
 
 
 def obstacle_numbers(scenes: PackedScenes) -> Float32[Tensor, "n slots 9"]:
-    """Of each obstacle: whether it is a sphere, whether it is a cube, center, half width [m], sine and cosine
-    of four times its turn about the vertical, and 1 if it exists; a cube is the same after a quarter turn."""
+    """Nine numbers for each obstacle: whether it is a sphere, whether it is a cube, its center and half width
+    [m], sine and cosine of four times its turn about the vertical, and 1 if the obstacle exists. Four times,
+    since a cube looks the same after a quarter turn."""
     kinds = scenes.kinds
     params = scenes.params
     sphere = kinds == SPHERE
@@ -112,7 +114,8 @@ class ObstacleCode(Encoder):
     """z = MLP(sum over obstacles of MLP(numbers of the obstacle)): the order of obstacles does not matter."""
 
     OCTAVES = 3
-    """Wavelengths (4 m, 2 m, 1 m) of the sines and cosines of the center that are further inputs."""
+    """Number of wavelengths (4 m, 2 m, 1 m) of the sines and cosines of the center, which are further
+    inputs."""
 
     def __init__(self, settings: EncoderSettings) -> None:
         super().__init__(settings)
@@ -129,9 +132,9 @@ class ObstacleCode(Encoder):
 class Row(NamedTuple):
     title: str
     encoder: str | None
-    """Encoder of the package that stands in this place in settings; None: the frozen one of this study."""
+    """Name of the encoder in the training settings; None: the auto-encoder that this script trains."""
     settings: EncoderSettings | None = None
-    """Its settings."""
+    """Settings of this encoder."""
     denoiser: str = "transformer"
     denoiser_settings: DenoiserSettings = TransformerSettings(patch=8)
 
@@ -156,7 +159,7 @@ def with_parts_of(row: str, model: MotionNetwork) -> MotionNetwork:
 
 
 def seen(row: str, encoder: Encoder, scenes: PackedScenes, rng: np.random.Generator) -> Tensor:
-    """What the encoder of a row is given of scenes."""
+    """The inputs of the encoder of a row, for scenes."""
     return obstacle_numbers(scenes) if row == "oracle" else scene_clouds(encoder, scenes, rng)
 
 
@@ -185,7 +188,7 @@ class Study:
         return self.out / "encoder"
 
     def generate(self) -> None:
-        """Make the motions; they keep 6 cm to obstacles where start and goal allow it."""
+        """Make the motions; they keep a distance of 6 cm to obstacles where start and goal allow it."""
         search = AORRTCSearchSettings(safety_distance=0.06, patience=500, tries=500, gain=0.03)
         settings = GenerationSettings(
             trajectories=self.trajectories,
@@ -200,9 +203,9 @@ class Study:
         )
         generate(settings, self.data)
 
-    def cases(self, most: int | None = None) -> list[Case]:
+    def cases(self, max_count: int | None = None) -> list[Case]:
         """Held-out problems that the straight line does not solve and a search does."""
-        count = self.problems if most is None else min(most, self.problems)
+        count = self.problems if max_count is None else min(max_count, self.problems)
         return case_file(self.out / "problems", FAMILY).held_out(FAMILY, count, validator, first_length)
 
     def training(self, row: str) -> PlannerTraining:
@@ -234,7 +237,8 @@ class Study:
         train(SceneTask(row, self, settings, processes), str(self.folder(row)))
 
     def trained(self, row: str) -> tuple[MotionNetwork, int]:
-        """The averaged weights of the newest checkpoint, and the samples that it saw."""
+        """The network with the averaged weights of the newest checkpoint, and the number of samples that its
+        training saw."""
         settings = self.training(row)
         if settings.jointly:
             assert settings.encoder is not None
@@ -288,10 +292,10 @@ class SceneTask(PlannerTask):
         return Validation(super().validate(fraction).loss, shares["own"])
 
     def success(self, rng: np.random.Generator) -> None:
-        """Not measured on the data: `validate` takes held-out problems."""
+        """Does nothing: `validate` measures success on held-out problems."""
 
     def save(self, folder: Path, training: dict[str, Any]) -> None:
-        """Nothing more: `validate` keeps the weights."""
+        """Does nothing: `validate` saves the weights."""
 
 
 # Evaluation
@@ -299,7 +303,7 @@ class SceneTask(PlannerTask):
 
 class Results(NamedTuple):
     samples: int
-    """Training samples that the network saw."""
+    """Number of training samples that the network saw."""
     passed: dict[str, Float[ndarray, "n count"]]
     """For each kind of code, which samples for each problem pass the validator."""
 
@@ -325,7 +329,7 @@ def no_clearances(q: ndarray) -> ndarray:
 
 
 def codes_of(row: str, encoder: Encoder, scenes: PackedScenes) -> dict[str, Float32[ndarray, "n code"]]:
-    """z of each scene of each kind in CODES; where it is hidden any will do."""
+    """The code of each scene, for each kind of CODES; for "hidden" it is not used."""
     with torch.no_grad():
         z = encoder(seen(row, encoder, scenes, np.random.default_rng(5))).numpy().astype(np.float32)
     return dict(zip(CODES, (z, np.roll(z, 1, 0), np.repeat(z.mean(0)[None], len(z), 0), z), strict=True))
@@ -353,7 +357,7 @@ def sampled_motions(
 
 
 def results(row: str, study: Study, cases: Sequence[Case], codes: Sequence[str]) -> Results:
-    """Tries the newest checkpoint with each code; what a folder has is not tried again."""
+    """The results of the newest checkpoint with each code. They are cached in the folder of the row."""
     model, samples = study.trained(row)
     found = {}
     for name in codes:
@@ -366,7 +370,7 @@ def results(row: str, study: Study, cases: Sequence[Case], codes: Sequence[str])
 
 
 def errors(row: str, study: Study) -> list[tuple[str, ...]]:
-    """Rows of the table of `report`: how far predicted motions are off, with each code, by noise level."""
+    """Rows of the table of errors: the squared error of predicted motions, for each noise level and code."""
     model, _ = study.trained(row)
     q, scenes = validation_motions(study.data)
     assert model.encoder is not None
@@ -409,7 +413,7 @@ def without_network(cases: Sequence[Case]) -> Float[ndarray, "n count"]:
 
 
 def in_points(values: Float[ndarray, "n"], sign: str = "") -> str:
-    """A mean in per cent or points, with its 95 % interval over problems."""
+    """A mean in per cent, or a difference in percentage points, with its 95 % interval over problems."""
     low, high = (100 * x for x in bootstrap_interval(values))
     return f"{100 * values.mean():{sign}.1f} ({low:{sign}.1f} to {high:{sign}.1f})"
 
@@ -472,7 +476,8 @@ def report(study: Study, rows: Sequence[str], plot: Path) -> None:
 
 
 def curve(study: Study, row: str) -> list[dict[str, Any]]:
-    """The checkpoints of a training in their order; after an interruption the later of two counts."""
+    """The learning curve of a row, by training samples. If an interruption led to two entries for one number
+    of samples, the later one counts."""
     found = {at["samples"]: at for at in JsonLines(study.folder(row) / "curve.jsonl").rows}
     return [found[samples] for samples in sorted(found)]
 

@@ -1,12 +1,12 @@
-"""A server under load: answers lost or mixed up, memory, and throughput beside the planner alone.
+"""A server under load: lost or mixed-up answers, memory, and throughput compared with the planner alone.
 
     python benchmarks/server.py [--seconds 600] [--clients 8] [--workers 1] [--kills 5]
 
-Prints benchmarks/results/serve.txt. The planner plans held-out problems of four families in this process, a
-quarter of them with a box of their own in the hand, each with two seeds. Then clients ask the server for them
-at random and compare every answer with the planner's path, bit for bit. At last workers are killed while
-clients ask. With one core more than workers, the workers have their cores to themselves; CPU times need no
-quiet machine.
+Prints benchmarks/results/serve.txt. First, the planner plans held-out problems of four families in this
+process, each with two seeds; in a quarter of the problems, the hand holds a box of random size. Then clients
+request these plans from the server in random order, and compare every answer with the planner's path, bit for
+bit. Finally, workers are killed while clients send requests. With one core more than workers, each worker has
+a core of its own; CPU times do not depend on other work on the machine.
 """
 
 import argparse
@@ -35,9 +35,9 @@ from robotdiffuse.problems.held_out import SEED, held_out_problem
 FAMILIES = ("rop", "shelf", "crate", "table")
 SEEDS = (0, 1)
 TIME_LIMIT = 10.0
-"""Long enough that no answer depends on the clock [s]."""
+"""Time limit of requests, long enough that no answer depends on the clock [s]."""
 ROUNDS = 3
-"""Of the planner alone, before and after the load."""
+"""How often the planner alone plans all requests, before and after the load."""
 
 
 @dataclass
@@ -55,9 +55,13 @@ class ClientCounts:
     """What the clients saw."""
 
     answers: Counter = field(default_factory=Counter)
+    """Number of answers by HTTP status code."""
     wrong: int = 0
+    """Number of answers with code 200 that are not the planner's path."""
     lost: int = 0
+    """Number of requests without an answer."""
     seconds: list[float] = field(default_factory=list)
+    """Time until each answer [s]."""
 
 
 def requests(planner: str, count: int) -> list[PlanRequest]:
@@ -79,19 +83,20 @@ def requests(planner: str, count: int) -> list[PlanRequest]:
 
 
 def plan_alone(plan_requests: list[PlanRequest], planner: str) -> tuple[float, float]:
-    """Wall and CPU time of the planner alone for all requests [s]; keeps its answers in these."""
+    """Wall and CPU time of the planner alone for all requests [s]; sets the expected answer of each
+    request."""
     loaded = rd.load_planner(planner)
     loaded.warm_up(plan_requests[0].problem)
-    for one in plan_requests:
-        result = loaded.plan(one.problem, TIME_LIMIT, one.seed)
+    for request in plan_requests:
+        result = loaded.plan(request.problem, TIME_LIMIT, request.seed)
         waypoints = None if result.path is None else result.path.positions.tolist()
-        assert one.expected is None or one.expected == waypoints, "the planner contradicts itself"
-        one.expected = waypoints
+        assert request.expected is None or request.expected == waypoints, "the planner contradicts itself"
+        request.expected = waypoints
     wall = time.perf_counter()
     spent = time.process_time()
     for _ in range(ROUNDS):
-        for one in plan_requests:
-            loaded.plan(one.problem, TIME_LIMIT, one.seed)
+        for request in plan_requests:
+            loaded.plan(request.problem, TIME_LIMIT, request.seed)
     return (time.perf_counter() - wall) / ROUNDS, (time.process_time() - spent) / ROUNDS
 
 
@@ -109,16 +114,16 @@ def run_client(
     kind = {"Content-Type": "application/json"}
     with httpx.Client(base_url=url, timeout=60.0) as http:
         while time.monotonic() < until:
-            one = rng.choice(plan_requests)
+            request = rng.choice(plan_requests)
             begun = time.monotonic()
             try:
-                answer = http.post("/plan", content=one.body, headers=kind)
+                answer = http.post("/plan", content=request.body, headers=kind)
             except httpx.HTTPError:
                 with lock:
                     counts.lost += 1
                 continue
             record = orjson.loads(answer.content)
-            right = record.get("waypoints") == one.expected and record.get("seed") == one.seed
+            right = record.get("waypoints") == request.expected and record.get("seed") == request.seed
             with lock:
                 counts.answers[answer.status_code] += 1
                 counts.wrong += answer.status_code == 200 and not right
@@ -128,7 +133,8 @@ def run_client(
 def load(
     url: str, plan_requests: list[PlanRequest], clients: int, seconds: float, meanwhile: Any
 ) -> ClientCounts:
-    """What clients see in this time; `meanwhile` is called every second with the seconds since the start."""
+    """Run clients for some seconds; returns what they saw. `meanwhile` is called every second with the
+    seconds since the start."""
     counts = ClientCounts()
     lock = threading.Lock()
     begun = time.monotonic()
@@ -160,7 +166,7 @@ def cpu_time(process: int) -> float:
 
 
 def workers_of(process: int) -> list[int]:
-    """The server's worker processes."""
+    """The process ids of the server's workers."""
     found = subprocess.run(["pgrep", "-P", str(process), "-f", "spawn_main"], capture_output=True, text=True)
     return [int(line) for line in found.stdout.split()]
 

@@ -1,14 +1,14 @@
-"""Compiled code from a cold cache, from a warm one, and loaded in another order: whether results are the same
-bits; and what a first plan costs.
+"""Whether compiled code gives bit-identical results from a cold cache, from a warm cache, and if it is loaded
+in another order; and the cost of a first plan.
 
     python benchmarks/startup.py [--seed 0] [--only clearances,gradients]
     python benchmarks/startup.py --first-plan
 
 The first command prints benchmarks/results/cold_cache.txt, the second the CPU time of a process that plans.
 
-Each part of the first runs in a process of its own: first with an empty cache,
-which compiles; then twice with the cache that this left, in the same order and in reverse. Every number that
-a part returns is compared.
+The first command runs all parts in three processes: first with an empty cache, so that the process compiles;
+then twice with the cache that the first process left, in the same order of parts and in reverse. Every number
+that a part returns is compared.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from numpy import ndarray
 
 RUNS = ("cold", "warm", "warm, in the other order")
 ROWS = 2000
-"""Configurations that each part gets."""
+"""Number of configurations that each part gets."""
 
 
 def parts(seed: int) -> dict[str, Callable[[], ndarray]]:
@@ -94,7 +94,7 @@ def parts(seed: int) -> dict[str, Callable[[], ndarray]]:
 
 
 def work(file: str, seed: int, names: list[str]) -> None:
-    """Call the parts in this order and save what they return."""
+    """Call the parts in this order and save the numbers that they return."""
     from robotdiffuse.core.loading import compile_seconds
 
     known = parts(seed)
@@ -115,7 +115,8 @@ print(len(compiled), compile_seconds(), loading_seconds())
 
 
 def first_plan() -> None:
-    """Print the CPU time of a process that plans: with an empty cache, and with the cache that it left."""
+    """Print the CPU time of a process that plans, with an empty cache and with the cache that the first
+    process left."""
     from common import print_table
 
     rows = []
@@ -155,7 +156,7 @@ def main() -> None:
     if arguments.first_plan:
         first_plan()
         return
-    kept: dict[str, dict[str, ndarray]] = {}
+    returned: dict[str, dict[str, ndarray]] = {}
     with tempfile.TemporaryDirectory() as folder:
         for i, run in enumerate(RUNS):
             file = str(Path(folder, f"{i}.npz"))
@@ -174,14 +175,14 @@ def main() -> None:
                 env=os.environ | {"NUMBA_CACHE_DIR": str(Path(folder, "cache"))},
                 check=True,
             )
-            with np.load(file) as found:
-                kept[run] = dict(found)
+            with np.load(file) as arrays:
+                returned[run] = dict(arrays)
     rows = []
     for name in names:
-        first = kept[RUNS[0]][name]
+        first = returned[RUNS[0]][name]
         row = [name, f"{first.size:,}"]
         for run in RUNS[1:]:
-            other = kept[run][name]
+            other = returned[run][name]
             changed = first != other if first.shape == other.shape else np.ones(1, bool)
             most = np.abs(first - other).max() if first.shape == other.shape else np.inf
             row.append(
@@ -189,7 +190,7 @@ def main() -> None:
             )
         rows.append(row)
     print_table("Against the run that compiled", ["part", "numbers", *RUNS[1:]], rows)
-    compiled = ", ".join(f"{run} {float(kept[run]['seconds']):.0f} s" for run in RUNS)
+    compiled = ", ".join(f"{run} {float(returned[run]['seconds']):.0f} s" for run in RUNS)
     print(f"\nCompiling took: {compiled}.")
 
 

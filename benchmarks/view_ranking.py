@@ -1,18 +1,20 @@
-"""One view: does a model of P(free in the true scene | view, motion), trained on labels from the true scene,
-choose better among several motions than the confidence that the package states?
+"""Planning from one view: a model of P(free in the true scene | view, motion) is trained on labels from the
+true scene. Does it choose better among several motions than the confidence that the package states?
 
     python benchmarks/view_ranking.py [--rounds 40] [--families NAME or FOLDER ...] --records FILE
     python benchmarks/view_ranking.py --report --records FILE
 
 Prints benchmarks/results/view_ranking.txt. Problems and cameras are those of `benchmarks/cameras.py` at its
-ring, one problem of each family a round. Two of four are seen with ideal depth, one with white noise and one
-with correlated noise and zeros where nothing is in range. Candidates are made as a call makes them: AORRTC's
-first motions with eight seeds and one of more time, among the voxels above the lowest threshold that leaves a
-motion; and with three seeds above CAREFUL. The validator labels each in the true scene. Records are kept in
-FILE and not made again; folders hold problems of MotionBenchMaker.
+ring, one problem of each family per round. Of four problems, two are seen with ideal depth, one with white
+noise, and one with correlated noise and zeros where nothing is in range. Candidate motions are made as in a
+call of the planner: AORRTC's first motions with eight seeds and one converged motion, among the voxels above
+the lowest threshold for which there is a motion. Three more candidates are first motions among the voxels
+above CAREFUL. The validator labels each candidate in the true scene. Records are kept in FILE and not made
+again; folders hold problems of MotionBenchMaker.
 
---report compares what a call chooses with other rules and with models. These are trained on families alone:
-for other problems on all of them, else on four fifths, by the numbers of the problems.
+--report compares the motion that a call chooses with other rules and with models. Models are trained only on
+problems of the families: to score other problems, on all of them; to score problems of the families, on the
+four fifths of them (by number) that do not contain the problem.
 """
 
 import argparse
@@ -63,31 +65,32 @@ DEPTHS = {
     CORRELATED: DepthNoise(correlation=2.0, missing=0.01, zeros=True),
 }
 ORDER = (IDEAL, WHITE, IDEAL, CORRELATED)
-"""Depths of the problems of a family, again and again."""
+"""Kinds of depth of the problems of a family, repeated."""
 SENSOR_RANGE = 6.0
-"""Stated of views with zeros [m]."""
+"""`range` of views with zeros [m]."""
 CAREFUL = 0.03
-"""Threshold of occupancy below the package's."""
+"""A threshold of occupancy below those of the package."""
 CAREFUL_KIND = "careful"
 CAREFUL_SEEDS = 3
 AS_SEEN = 1.0
-"""Threshold of motions among what was seen alone."""
-# CPU time of a first motion, of the one of more time, and of a first motion above CAREFUL [s].
+"""Threshold above which no voxel is an obstacle: motions avoid only seen points."""
+# CPU time limits of a first motion, of the converged motion, and of a first motion above CAREFUL [s].
 FIRST_LIMIT, CONVERGED_LIMIT, CAREFUL_LIMIT = 0.1, 0.17, 0.06
 GROWN = 0.03
 """Margin around the swept space, for features [m]."""
 BINS = (0.003, 0.01, 0.03, 0.06, 0.1, 0.2, 0.35, 0.5, 0.8, 1.01)
-"""Of the probabilities of voxels, for features."""
+"""Edges of the bins of histograms of voxel probabilities, for features."""
 FOLDS = 5
-# Of the models.
+# Training of the models: hidden units, dropout, steps, batch size, learning rate and weight decay.
 HIDDEN, DROPOUT, STEPS, BATCH, RATE, DECAY = 128, 0.3, 400, 256, 1e-3, 0.3
 LINEAR_INPUTS = 7
-"""The first inputs: the stated confidence, and what the sweep itself meets in unseen voxels."""
+"""Number of inputs of the linear model: the stated confidence, and figures of the unseen voxels that the
+motion sweeps."""
 STATED = "confidence"
 UNSEEN_NEAR = 16
-"""Place of the unseen share of the grown sweep among the features."""
+"""Index of a feature: the unseen fraction of the swept space with its margin."""
 Scores = dict[int, Float[ndarray, "motions"]]
-"""Of the motions of each record, by its place."""
+"""Scores of the motions of each record, by the record's index."""
 
 
 def record(problem: Problem, family: str, number: int, depth: str) -> Row:
@@ -167,7 +170,7 @@ def record(problem: Problem, family: str, number: int, depth: str) -> Row:
 
 
 def _log_free(p: ndarray) -> float:
-    """Minus the logarithm of the probability that voxels are free, were they independent."""
+    """Minus the logarithm of the probability that all voxels are free, as if they were independent."""
     return float(-np.log1p(-np.minimum(p, 0.999)).sum())
 
 
@@ -196,13 +199,13 @@ def _acceptable(motions: int) -> float:
 
 
 def shortest_of_best(motions: list[Row], score: str = STATED) -> Row:
-    """As a call chooses."""
+    """The motion that a call chooses: the shortest one whose score is about the highest."""
     least = max(motion[score] for motion in motions) - CONFIDENCE_TOLERANCE
     return min((m for m in motions if m[score] >= least), key=lambda motion: motion["length"])
 
 
 def inputs(row: Row, motion: Row) -> list[float]:
-    """Of a model: the stated confidence first."""
+    """The inputs of a model for one motion; the first is the log odds of the stated confidence."""
     share = float(np.clip(motion[STATED], 0.002, 0.998))
     kind = [motion["kind"] == CAREFUL_KIND, motion["kind"] == CONVERGED, motion["threshold"] > THRESHOLDS[0]]
     features = np.array(motion["features"])
@@ -215,8 +218,11 @@ def inputs(row: Row, motion: Row) -> list[float]:
 
 
 def scores(rows: list[Row], hidden: int, columns: int | None) -> Scores:
-    """What models give that were not trained on the problem: with a hidden layer, or linear; of the first
-    columns of the inputs."""
+    """Scores of motions by models that were not trained on their problem.
+
+    hidden: units of the two hidden layers; 0: a linear model. columns: number of inputs that the model uses;
+    None: all.
+    """
     x = [np.array([inputs(row, m)[:columns] for m in row["motions"]], np.float32) for row in rows]
     y = [np.array([m["free"] for m in row["motions"]], np.float32) for row in rows]
     own = [i for i, row in enumerate(rows) if row["family"] in FAMILIES]
@@ -234,7 +240,7 @@ def scores(rows: list[Row], hidden: int, columns: int | None) -> Scores:
 
 
 def trained(x: ndarray, y: ndarray, weights: ndarray, hidden: int) -> Callable[[ndarray], ndarray]:
-    """A model of the probability that a motion is free."""
+    """Train a model of the probability that a motion is free; returns the function from inputs to it."""
     import torch
     from torch import nn
 
@@ -251,10 +257,10 @@ def trained(x: ndarray, y: ndarray, weights: ndarray, hidden: int) -> Callable[[
     layers = [*layer(x.shape[1]), *layer(hidden)] if hidden else []
     net = nn.Sequential(*layers, nn.Linear(hidden or x.shape[1], 1))
     optimizer = torch.optim.AdamW(net.parameters(), RATE if hidden else 10 * RATE, weight_decay=DECAY)
-    given, labels, each = normal(x), torch.tensor(y), torch.tensor(weights / weights.mean())
+    normalized, labels, weight = normal(x), torch.tensor(y), torch.tensor(weights / weights.mean())
     for _ in range(STEPS):
         i = torch.randint(len(x), (BATCH,))
-        loss = nn.functional.binary_cross_entropy_with_logits(net(given[i])[:, 0], labels[i], each[i])
+        loss = nn.functional.binary_cross_entropy_with_logits(net(normalized[i])[:, 0], labels[i], weight[i])
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -266,8 +272,8 @@ CALL = "a call"
 
 
 def choices(models: list[str]) -> dict[str, Callable[[Row], tuple[list[Row], Row, str]]]:
-    """By name: from a record to the motions that are compared, the one that is chosen, and what states its
-    confidence."""
+    """Rules for choosing a motion, by name: functions from a record to the motions that are compared, the
+    chosen motion, and the name of the score that states its confidence."""
 
     def by(score: str, of: Callable[[Row], list[Row]]) -> Callable[[Row], tuple[list[Row], Row, str]]:
         return lambda row: (of(row), shortest_of_best(of(row), score), score)
@@ -300,7 +306,8 @@ def _of(row: Row, kind: str) -> list[Row]:
 
 
 def report(rows: list[Row]) -> None:
-    """Print how well each score orders the motions, and what choosing by it comes to."""
+    """Print how well each score orders the motions of a problem, and how often the motions chosen by it are
+    free."""
     solved = [row for row in rows if row["motions"]]
     print(f"{len(rows)} problems, of them {len(rows) - len(solved)} without a motion, left out")
     models = {
@@ -338,7 +345,7 @@ def report(rows: list[Row]) -> None:
 
 
 def compared(title: str, rows: list[Row], models: list[str]) -> None:
-    """Print a table of the choices on some problems."""
+    """Print a table that compares the rules of `choices` on some problems."""
     base = np.array([_chosen_free(row) for row in rows])
     lines = []
     for name, choice in choices(models).items():
@@ -370,7 +377,7 @@ def _chosen_free(row: Row) -> bool:
 
 
 def cpu_time(row: Row, motions: list[Row]) -> float:
-    """Of making and comparing these motions of a record [s]."""
+    """CPU time of making and comparing these motions of a record [s]."""
     kinds = {motion["kind"] for motion in motions} | {FIRST}
     own = sum(motion["time"] + motion["stating"] for motion in motions)
     return row["spent"]["view"] + sum(row["spent"][kind] for kind in kinds) + own

@@ -1,11 +1,11 @@
-"""A workspace that is called again and again, and goals of 20 grasp poses.
+"""Repeated calls of a workspace with a moved obstacle, and goals of 20 grasp poses.
 
     python benchmarks/workspace.py [--calls 3000] [--grasps 30]
 
-Prints benchmarks/results/workspace.txt. Calls: among 12 obstacles one is moved before each call, which plans
-to a pose until the first motion. The overhead is the CPU time of the move and of what `Workspace.plan` takes
-beyond `rd.plan` for the same problem. Grasps: of 20 poses above a table, 10 are free and 10 blocked, in
-random order; limit 0.1 s of CPU time.
+Prints benchmarks/results/workspace.txt. Calls: one of 12 obstacles is moved before each call, which plans
+to a pose until the first motion. The overhead is the CPU time of moving the obstacle and making the problem.
+Grasps: of 20 poses above a table, 10 are free and 10 blocked, in random order; the limit is 0.1 s of CPU
+time.
 """
 
 import argparse
@@ -84,7 +84,7 @@ def grasp_poses(space: rd.Workspace, rng: np.random.Generator) -> list[ndarray]:
 
 
 def grasps(number: int) -> None:
-    """Plan to any of 20 poses, and print."""
+    """Plan to any of 20 poses, for `number` sets of poses, and print a table."""
     space = rd.Workspace(rd.load_robot("panda"), HAND)
     space.add(
         rd.Box([0.55, 0.0, -0.05], [0.8, 1.4, 0.1], name="table"),

@@ -4,11 +4,11 @@
 
 NAME is a key of PEERS. Each planner has its own environment, because they need different versions of NumPy;
 this file imports nothing of RobotDiffuse. TASK.json holds the robot, the limits, and the problems, as
-`benchmarks/peers.py` writes them; ANSWERS.json gets, for each problem, the CPU time, the duration and the
-rows of the timed motion, or why there is none.
+`benchmarks/peers.py` writes them. The answers in ANSWERS.json have, for each problem, the CPU time, and the
+duration and rows of the timed motion or the reason why there is no motion.
 
 Each planner is used as its documentation shows: its own inverse kinematics for poses, its search until the
-first path, its simplification, its timing. CPU time counts all of that, but not building the scene.
+first path, its simplification, its timing. CPU time includes these steps, but not building the scene.
 """
 
 # The libraries have no types, or are installed elsewhere:
@@ -26,12 +26,13 @@ import numpy as np
 ROW = 0.004
 """Time between the rows of a motion [s]."""
 IK_TRIES = 100
-"""Random starts of inverse kinematics, where the planner leaves them to its user or has few."""
+"""Number of random starts of inverse kinematics, for planners that leave this to the user or use few."""
 IK_STEPS = 200
+"""Number of iterations from each start."""
 
 
 class UnsolvedError(Exception):
-    """Why the planner has no motion."""
+    """The planner found no motion; the message is its reason."""
 
 
 class MPlib:
@@ -47,9 +48,9 @@ class MPlib:
         self.fcl = fcl
         self.robot = robot
         self.limit = limit
-        given = Path(robot["urdf"])
-        urdf = given.with_name("relative.urdf")  # MPlib looks for meshes below the folder of the URDF
-        urdf.write_text(given.read_text().replace(f"{given.parent}/", ""))
+        absolute = Path(robot["urdf"])
+        urdf = absolute.with_name("relative.urdf")  # MPlib looks for meshes below the folder of the URDF
+        urdf.write_text(absolute.read_text().replace(f"{absolute.parent}/", ""))
         self.planner = mplib.Planner(
             urdf,
             robot["tip"],
@@ -226,7 +227,8 @@ class Sscbirrt:
 
 
 class OmplPinocchio:
-    """OMPL's RRT-Connect and simplification over Pinocchio's kinematics and collisions; toppra times it."""
+    """OMPL's RRT-Connect and simplification with Pinocchio's kinematics and collision check; timing by
+    toppra."""
 
     packages = ("ompl", "pin", "toppra", "numpy")
 
@@ -288,7 +290,8 @@ class OmplPinocchio:
         return not self.pin.computeCollisions(*arguments)
 
     def configurations(self, T, start):
-        """A free configuration that brings the tip to a pose, from the start and then from random ones."""
+        """A free configuration that brings the tip to a pose; inverse kinematics begins at the start, then at
+        random configurations."""
         pin = self.pin
         lower = self.model.lowerPositionLimit
         upper = self.model.upperPositionLimit
