@@ -1,8 +1,9 @@
 """Data sets of motions that were made elsewhere: `rd.write_dataset`, and the layout of the paper's authors.
 
-In the authors' robot.npz `x_train` [n, 254, 7] are joint values [rad], and `y_train` [n, 23]: start 7, goal
-that was reached 7, centers of two spheres 6, position of the target 3 [m]. The authors' viewer sends the
-first 20; that the last three are the target's position is our interpretation of the 23. float32.
+In the authors' robot.npz, `x_train` [n, 254, 7] holds joint values [rad]. A row of `y_train` [n, 23] holds
+the start (7 numbers), the goal that was reached (7), the centers of two spheres (6) and the position of the
+target (3) [m]. The authors' viewer sends only the first 20 of the 23 numbers; that the last three are the
+target's position is our interpretation. Both arrays are float32.
 """
 
 import sys
@@ -73,24 +74,24 @@ def write_dataset(
 ) -> int:
     """Make a data set of motions, to train on.
 
-    Motions are not validated: `robotdiffuse data check` does. The target is the pose of the robot's tip at
-    the last waypoint. Training, validation and test are split by scene, so give many.
+    Motions are not validated here; `robotdiffuse data check` validates them. The target is the pose of the
+    robot's tip at the last waypoint. Training, validation and test are split by scene, so give many scenes.
 
     Args:
         paths: Joint values of each motion [n, dof], in the order of the robot's planned joints [rad] or [m];
             or paths and trajectories, whose positions are taken. They are resampled evenly in joint space.
-        scenes: The scene of each motion, of spheres and boxes; or one for all. A first box named "floor" that
-            all scenes share is what the arm stands on, not an obstacle.
+        scenes: The scene of each motion, of spheres and boxes; or one scene for all motions. If all scenes
+            begin with the same box named "floor", the arm stands on it, and it is not an obstacle.
         folder: An empty folder.
-        robot: A robot, or what `load_robot` takes.
-        waypoints: Rows of a stored motion.
+        robot: A robot, or an argument of `load_robot`.
+        waypoints: Number of waypoints of a stored motion.
 
     Returns:
         The number of motions.
 
     Raises:
-        InputError: For joint values of the wrong shape or out of limits, other shapes, a folder that holds
-            data, and scenes of which none falls into the training split.
+        InputError: For joint values of the wrong shape or out of limits, obstacles that are no spheres or
+            boxes, a folder that holds data, and if no scene falls into the training split.
     """
     arm = robot if isinstance(robot, Robot) else load_robot(robot)
     if waypoints < 2:
@@ -125,8 +126,10 @@ def _write(
     about: dict[str, Any],
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> int:
-    """Write a data set into an empty folder; returns the number of its motions. about: further fields of the
-    manifest."""
+    """Write a data set into an empty folder; returns the number of its motions.
+
+    source: the robot's name or URDF, for the manifest. about: further fields of the manifest.
+    """
     manifest = Manifest.of(
         robot,
         source,
@@ -154,10 +157,10 @@ def _write(
 def measured_row(
     robot: Robot, scene: Scene, packed: PackedScenes, q: Float32[ndarray, "waypoints dof"], number: int
 ) -> Row:
-    """The row of a motion that was made elsewhere, by its number.
+    """The row of a motion that was made elsewhere. number: stands in place of the problem's seed.
 
-    Clearances, its length and whether the straight line is free are measured; the safety distance is unknown
-    and 0.
+    Clearances, length and whether the straight line is free are measured; the safety distance is unknown and
+    set to 0.
     """
     ends = q[[0, -1]]
     checker = CollisionChecker(robot, scene)
@@ -212,12 +215,12 @@ def _shared_floor(scenes: Sequence[Scene]) -> Box | None:
 
 
 def export_npz(folder: str | FilePath, file: str | FilePath) -> tuple[int, int]:
-    """Write the trajectories of all scenes with exactly two spheres, atomically.
+    """Write the motions of all scenes with exactly two spheres and nothing else to a robot.npz, atomically.
 
     Returns the number of written motions and the number of motions that were left out.
 
-    Raises InputError if there is no data set, it has no such scene, other numbers of waypoints or joints, or
-    the file cannot be written.
+    Raises InputError if there is no data set, if it has no such scene or other numbers of waypoints or
+    joints, and if the file cannot be written.
     """
     manifest = read_manifest(folder)
     file = FilePath(file)
@@ -257,11 +260,11 @@ def import_npz(
 ) -> int:
     """Make a data set from a robot.npz in an empty folder; returns the number of its motions.
 
-    Scenes are two spheres of this radius [m] on ROP's floor. Motions are not validated; `robotdiffuse data
-    check` does. Clearances, lengths and whether the straight line is free are measured. The target is the
-    pose of the robot's tip at the last waypoint: the target in the file is that of the authors' arm, which
-    has no hand. The safety distance is unknown and set to 0. `progress` is called with the numbers of motions
-    done and in all.
+    Scenes are two spheres of this radius [m] on ROP's floor. Motions are not validated here; `robotdiffuse
+    data check` validates them. Clearances, lengths and whether the straight line is free are measured. The
+    target is the pose of the robot's tip at the last waypoint; the file's targets are not used, since the
+    authors' arm has no hand. The safety distance is unknown and set to 0. `progress` is called with the
+    number of motions that are done and the number of all.
 
     Raises InputError if the file is no robot.npz, or the folder holds data or cannot be written.
     """

@@ -55,10 +55,10 @@ class RopBatch:
 
 
 class RopDataset(Dataset[dict[str, Tensor]]):
-    """Trajectories with their scenes and newly drawn point clouds; trajectories are mapped from the disk.
+    """Trajectories, memory-mapped, with their scenes and newly drawn point clouds.
 
-    `batches` is the fast way. With a standard DataLoader an item is a dict of the tensors in RopBatch; its
-    workers make the clouds, so use `device="cpu"` with `num_workers > 0`.
+    `batches` is the fastest way to read them. A standard DataLoader works as well: an item is a dict of the
+    tensors in RopBatch. The DataLoader's workers make the clouds, so `num_workers > 0` needs `device="cpu"`.
     """
 
     def __init__(
@@ -74,13 +74,20 @@ class RopDataset(Dataset[dict[str, Tensor]]):
     ) -> None:
         """Open a data set.
 
-        split: train, validation or test; no scene is in two of them. points: of each cloud. sort_points:
-        whether points are sorted by x, then y, then z. seed: of clouds and order. robot: the robot that the
-        data are used for. waypoints: number of waypoints to which trajectories are resampled in memory,
-        evenly spaced along each path; None: the stored waypoints.
+        Args:
+            folder: The data set.
+            split: train, validation or test; no scene is in two splits.
+            points: Number of points of each cloud.
+            sort_points: Whether points are sorted by x, then y, then z.
+            device: Device of the tensors.
+            seed: Seed of the clouds and the order.
+            robot: The robot that the data are used for; None: any.
+            waypoints: Number of waypoints to which trajectories are resampled in memory, evenly spaced along
+                each path; None: the stored waypoints.
 
-        Raises InputError for unknown names, a folder without data or with damaged shards, and data of
-        another robot.
+        Raises:
+            InputError: For unknown names, a folder without data or with damaged shards, and data of another
+                robot.
         """
         if split not in SPLITS:
             raise unknown_name("split", split, SPLITS)
@@ -131,7 +138,7 @@ class RopDataset(Dataset[dict[str, Tensor]]):
         return self.__getitems__([index % len(self)])[0]
 
     def __getitems__(self, indices: list[int]) -> list[dict[str, Tensor]]:
-        """Items for a DataLoader, whose clouds are made together."""
+        """Several items for a DataLoader; their clouds are made in one call."""
         worker = get_worker_info()
         number = -1 if worker is None else worker.id
         if number not in self._generators:
@@ -150,10 +157,10 @@ class RopDataset(Dataset[dict[str, Tensor]]):
         Rows are shuffled within blocks of 16 shards, and shards among blocks, so that reads are local.
 
         Args:
-            batch_size: Motions of a batch; the last batch may be smaller.
+            batch_size: Number of motions in a batch; the last batch may be smaller.
             shuffle: Whether the order is random.
-            generator: Draws order and clouds, on the CPU: the same state gives the same batches for any
-                number of threads. None: a generator made from `seed`, so that every call gives the same
+            generator: CPU generator of the order and the clouds; the same state gives the same batches for
+                any number of threads. None: a new generator from `seed`, so that every call gives the same
                 epoch.
         """
         if batch_size < 1:

@@ -1,9 +1,9 @@
 """Converts rows of a data set to motions and problems, and reads them for training, with rotated copies.
 
-If the first joint rotates about the base's z axis, a scene and its motion can be rotated about that axis
-together: the angle is added to the first joint. Such copies need no planning. The base link does not rotate
-with them, so copies that would touch it are left out. The corners of the floor do not rotate either, but they
-are out of reach.
+If the first joint rotates about the base's z axis, a scene and its motion can be rotated together about this
+axis: the angle is added to the first joint. Such copies need no planning. The base link does not rotate, so
+copies in which the arm would touch it are left out. The floor does not rotate either, but its corners are out
+of reach.
 """
 
 from collections.abc import Iterator
@@ -58,9 +58,9 @@ def row_of(
 ) -> Row:
     """The row of a motion q in a packed scene.
 
-    clearances: of the waypoints [m].
+    clearances: clearance of each waypoint [m].
     T_base_tip: the target.
-    most_goals: number of goals in a row of the data set; values of missing entries are NaN.
+    most_goals: number of goals that a row of the data set has room for; unused entries are NaN.
 
     The other arguments are the values of the arrays with their names, see `shards.ARRAYS`.
     """
@@ -93,7 +93,7 @@ def row_of(
 def scenes_of(manifest: Manifest, shard: Shard, rows: slice = slice(None)) -> PackedScenes:
     """The scenes of some rows, with the floors of their families.
 
-    Raises InputError for a family that the manifest does not have.
+    Raises InputError if a row's family is not in the manifest.
     """
     family = shard["family"][rows]
     names = list(manifest.families)
@@ -191,14 +191,14 @@ def read_rows(
 
 
 def resample(q: Float[ndarray, "n stored dof"], waypoints: int) -> Float[ndarray, "n {waypoints} dof"]:
-    """Resample each motion to `waypoints` places evenly spaced in joint-space length; the ends are kept
-    exactly.
+    """Resample each motion to `waypoints` waypoints, evenly spaced in joint-space length; the first and the
+    last are kept exactly.
     """
     n, stored = q.shape[:2]
     steps = np.linalg.norm(np.diff(q, axis=1), axis=2)
     lengths = np.concatenate([np.zeros((n, 1)), np.cumsum(steps, axis=1, dtype=np.float64)], axis=1)
     target_lengths = np.linspace(0.0, lengths[:, -1], waypoints, axis=1)
-    # offsets that make all rows together one ascending array, for a single call of searchsorted
+    # Row offsets make the lengths of all rows one ascending array, for a single call of searchsorted.
     row_offsets = 2.0 * lengths.max(initial=0.0) * np.arange(n)[:, None]
     after = np.searchsorted(
         (lengths + row_offsets).reshape(-1), (target_lengths + row_offsets).reshape(-1), side="right"
@@ -229,7 +229,7 @@ def turned(
 ) -> tuple[Float32[ndarray, "n waypoints dof"], PackedScenes, Mask]:
     """Turn each motion and its scene by a random angle, uniform within the limits of the first joint.
 
-    Returns the motions, the scenes and which motions are free of collision with the base.
+    Returns the turned motions, the turned scenes, and which motions do not collide with the base.
     `turns_about_vertical` must hold for the robot.
     """
     first = q[:, :, 0]

@@ -53,7 +53,7 @@ class Manifest(Settings):
     timing: str
     """How waypoints are spaced: "arc", evenly in joint-space length, or "time"."""
     families: dict[str, dict[str, Any]]
-    """Settings of each family of scenes; their order gives the numbers of the array `family`."""
+    """Settings of each family of scenes. The array `family` contains indices into this mapping."""
     floors: dict[str, dict[str, list[float]] | None]
     """By family, `center` and `size` of the box on which its scenes stand [m]; None for a family without a
     floor."""
@@ -87,8 +87,8 @@ class Manifest(Settings):
     def of(
         cls, robot: Robot, source: str, *, floors: Mapping[str, Box | None], timing: str = "arc", **rest: Any
     ) -> "Manifest":
-        """The manifest of data of a robot, named by `source`; other arguments are fields, with boxes as
-        floors."""
+        """The manifest of data of a robot. source: the field `robot`. floors: the floor of each family. rest:
+        the other fields."""
         records = {
             name: None if floor is None else {"center": floor.center.tolist(), "size": floor.size.tolist()}
             for name, floor in floors.items()
@@ -109,7 +109,7 @@ class Manifest(Settings):
         return len(self.joint_names)
 
     def floor(self, family: int) -> Box | None:
-        """The box that the scenes of a family stand on; None without one."""
+        """The floor of a family, given by its index in `families`; None if its scenes have no floor."""
         floor = list(self.floors.values())[family]
         return None if floor is None else Box(**floor, name="floor")
 
@@ -180,13 +180,19 @@ ARRAYS: dict[str, tuple[str, tuple[str | int, ...]]] = {
 """Type and row shape of each array; names in shapes are fields of the manifest. `times` exists only if
 `timing` is "time".
 
-Joint values [rad], times [s], lengths [m]. `trajectories` begin exactly at `start` and end at
-`goals[goal_index]`. Unused rows of `goals` and `goal_costs` are NaN; the cost of a goal that was not reached
-is inf. `target_pose` is wxyz_xyz of the tip in the base frame. Obstacles are packed as in `PackedScenes`,
-without the floor. `cost` is the joint-space length of the path [rad], `clearance` a lower bound of its
-distance to obstacles [m], `end_clearance` that of start and reached goal alone, `safety_distance` the
-distance that the search kept, except near a start or goal that is closer [m], `line_free` whether the
-straight line is free, `detour` the cost over that of the straight line, `seed` the number of the problem.
+Joint values are in [rad], times in [s], lengths in [m].
+
+- `trajectories` begin exactly at `start` and end exactly at `goals[goal_index]`.
+- `goals`, `goal_costs`: unused rows are NaN; the cost of a goal that was not reached is inf.
+- `target_pose`: wxyz_xyz of the tip in the base frame.
+- `obstacle_kinds`, `obstacle_params`: as in `PackedScenes`, without the floor.
+- `cost`: joint-space length of the path [rad].
+- `clearance`: lower bound of the waypoints' distance to obstacles [m]; `end_clearance`: of the start and of
+  the reached goal.
+- `safety_distance`: distance to obstacles that the search kept, except near a start or goal that is closer.
+- `line_free`: whether the straight line from start to the reached goal is free.
+- `detour`: the cost divided by the length of this straight line.
+- `seed`: the number of the problem.
 """
 UNBOUNDED = {"goals", "goal_costs"}
 """Arrays that may hold NaN or inf."""
@@ -217,13 +223,13 @@ def shard_path(folder: str | FilePath, index: int) -> FilePath:
 
 
 def shard_indices(folder: str | FilePath) -> list[int]:
-    """Numbers of the shards in a folder, in ascending order."""
+    """Indices of the shards in a folder, in ascending order."""
     matches = (_SHARD_NAME.fullmatch(path.name) for path in FilePath(folder).glob("shard_*.zarr"))
     return sorted(int(match[1]) for match in matches if match)
 
 
 def existing_shards(folder: str | FilePath) -> list[int]:
-    """As `shard_indices`, but raises InputError if there are none."""
+    """The result of `shard_indices`. Raises InputError if the folder has no shards."""
     indices = shard_indices(folder)
     if not indices:
         raise InputError(
@@ -249,10 +255,10 @@ def _zarr() -> ModuleType:
 def write_shard(
     folder: str | FilePath, index: int, arrays: dict[str, ndarray], counts: dict[str, int]
 ) -> None:
-    """Write a shard atomically, replacing one of the same number.
+    """Write a shard atomically; an existing shard of this index is replaced.
 
-    `arrays` are all of ARRAYS, without `times` if the timing is "arc". Raises InputError if the arrays do not
-    match, or the shard cannot be written: OutputError if the disk is full.
+    arrays: all arrays of ARRAYS, without `times` if the timing is "arc". Raises InputError if the arrays do
+    not match, or if the shard cannot be written (OutputError if the disk is full).
     """
     zarr = _zarr()
     target = shard_path(folder, index)
@@ -400,7 +406,10 @@ def split_of(scenes: PackedScenes) -> Int8[ndarray, "n"]:
 
 
 def pick_rows(sizes: dict[int, int], count: int | None, seed: int) -> dict[int, Int[ndarray, "n"]]:
-    """Random rows, without repetition, of each of the shards with these sizes; all if `count` is None."""
+    """`count` random rows of a data set, without repetition; all rows if `count` is None.
+
+    sizes: number of rows of each shard, by its index. Returns the rows of each shard, by its index.
+    """
     ends = np.cumsum([0, *sizes.values()])
     total = int(ends[-1])
     rows = np.arange(total)
@@ -411,7 +420,7 @@ def pick_rows(sizes: dict[int, int], count: int | None, seed: int) -> dict[int, 
 
 
 def random_rows(folder: str | FilePath, count: int, seed: int) -> Iterator[tuple[Shard, Int[ndarray, "n"]]]:
-    """Shards and random rows of each. Raises InputError for a damaged shard."""
+    """Yields shards with random rows of each, `count` rows in all. Raises InputError for a damaged shard."""
     sizes = {index: len(read_shard(folder, index, ("family",))) for index in shard_indices(folder)}
     for index, rows in pick_rows(sizes, count, seed).items():
         if len(rows):

@@ -1,7 +1,7 @@
 """Samples point clouds of many packed scenes at once, during training.
 
 As in `sample_surface`, points are uniform by area over the spheres and boxes of a scene. This compiled
-version is written for speed; it releases the interpreter, so that threads sample at the same time.
+version is faster, and it releases Python's global interpreter lock, so that threads sample in parallel.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from robotdiffuse.core.kernels import kernel
 from robotdiffuse.scenes.scene_arrays import NONE, SPHERE, PackedScenes
 from robotdiffuse.scenes.surface_points import VisibleRegion
 
-# Points sampled at most for each requested one, if some may be outside the region.
+# Maximum number of samples for each requested point, if there is a region in which points must be.
 _OVERSAMPLING = 8
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
@@ -37,8 +37,8 @@ def surface_clouds(
 ) -> Float32[Tensor, "n count 3"]:
     """`count` points on the obstacles of each scene [m], independent and uniform by area.
 
-    The result is on the generator's device. Points repeat if few of the samples qualify; a scene without any
-    is all zeros.
+    The result is on the generator's device. If too few samples are inside the region, points are repeated;
+    the cloud of a scene without any is all zeros.
 
     region: only points inside it.
     ordered: sorted by x, then y, then z, for encoders that depend on the order.
@@ -74,8 +74,8 @@ def _next(x):
 def fill_clouds(kinds, params, seeds, region, out):
     """Writes points that are uniform by area over the shapes of each scene to out[n, count, 3].
 
-    Scenes without shapes get zeros. kinds [n, k] and params [n, k, 10] as in `PackedScenes`; seeds uint64[n];
-    region: center, reach and floor, or empty.
+    Scenes without shapes get zeros. kinds: [n, k], and params: [n, k, 10], as in `PackedScenes`. seeds:
+    uint64[n]. region: x, y and z of its center, its reach and its floor [m], or empty.
     """
     n, k = kinds.shape
     count = out.shape[1]
@@ -104,11 +104,13 @@ def fill_clouds(kinds, params, seeds, region, out):
         for _ in range(draws):
             if filled == count:
                 break
+            # choose a shape j with a probability in proportion to its area
             x = _next(x)
             pick = np.float32(x >> np.uint64(40)) * _UNIT * total
             j = 0
             while j < last and pick >= ends[j]:
                 j += 1
+            # a point (u, v) of the unit square around 0; for a sphere, of the disc in it
             while True:
                 x = _next(x)
                 u = np.float32(x >> np.uint64(40)) * _UNIT - _HALF
@@ -117,13 +119,14 @@ def fill_clouds(kinds, params, seeds, region, out):
                 if kinds[i, j] != SPHERE or s < _QUARTER:
                     break
             if kinds[i, j] == SPHERE:
-                # G. Marsaglia 1972: a direction from a point of the disc
+                # the direction that belongs to a point of the disc (G. Marsaglia 1972)
                 ring = _FOUR * np.sqrt(_ONE - _FOUR * s)
                 radius = params[i, j, 3]
                 out[i, filled, 0] = params[i, j, 0] + radius * ring * u
                 out[i, filled, 1] = params[i, j, 1] + radius * ring * v
                 out[i, filled, 2] = params[i, j, 2] + radius * (_ONE - _TWO * _FOUR * s)
             else:
+                # (u, v) on one of the six faces, chosen by area
                 offset = pick - (ends[j - 1] if j > 0 else _ZERO)
                 side = _HALF if x & np.uint64(1) else -_HALF
                 face = int(offset >= faces[j, 0]) + int(offset >= faces[j, 1])
@@ -142,8 +145,8 @@ def fill_clouds(kinds, params, seeds, region, out):
 
 @kernel(error_model="numpy")
 def _prepare(kind, row, faces, axes):
-    """Area of a shape [m^2]. Also writes its axes times sizes, and the cumulative areas of a box's face
-    pairs."""
+    """Area of a shape [m^2]. Writes to `axes` the shape's axes times its sizes, and to `faces` the cumulative
+    areas of the first one and two pairs of a box's faces."""
     if kind == NONE:
         return _ZERO
     if kind == SPHERE:

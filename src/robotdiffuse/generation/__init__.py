@@ -1,5 +1,5 @@
-"""Data generation: random problems solved by Shared-Tree Informed RRT* or AORRTC, validated, and kept in
-shards."""
+"""Data generation: random problems are solved by Shared-Tree Informed RRT* or AORRTC, validated, and written
+to shards."""
 
 from robotdiffuse.generation.factory import GenerationSettings, generate
 

@@ -1,8 +1,8 @@
 """AORRTC for data generation: the anytime loop of the planner `aorrtc`, limited by iterations instead of
 time.
 
-As in Shared-Tree Informed RRT*, paths keep a safety distance to obstacles, except near ends that are closer.
-It is lowered in steps if no path is found.
+As in Shared-Tree Informed RRT*, paths keep a safety distance to obstacles, except near a start or goal that
+is closer to them. The safety distance is lowered in steps if no path is found.
 """
 
 from collections.abc import Callable
@@ -29,7 +29,7 @@ class AORRTCSearchSettings(Settings, name="aorrtc"):
     """Distance to obstacles that paths keep [m]; the default follows from the authors' scenes."""
     tries: Count = 1_500
     """The safety distance is lowered after this many iterations without a path. At the lowest distance, the
-    search ends after three times as many."""
+    search gives up after three times as many iterations."""
     range: Positive = 1.0
     """Longest extension of a tree [rad, joint-space L2]."""
     resolution: Positive = 0.02
@@ -42,7 +42,7 @@ class AORRTCSearchSettings(Settings, name="aorrtc"):
 
 
 class AORRTCSearch:
-    """One search and its results so far. The same state gives the same search."""
+    """A search and its present results. The same random state gives the same search."""
 
     def __init__(
         self,
@@ -52,15 +52,15 @@ class AORRTCSearch:
         settings: AORRTCSearchSettings,
         state: ndarray,
     ) -> None:
-        """Start and goals must be free of collision. `state` is one of `random_state`."""
+        """Start and goals must be free of collision. `state`: a random state, see `random_state`."""
         self.settings = settings
         self.goals = goals.astype(np.float32)
         self._robot = checker.robot
-        self._ends = StartGoal(checker, start.astype(np.float64), goals.astype(np.float64))
+        self._start_goal = StartGoal(checker, start.astype(np.float64), goals.astype(np.float64))
         states = np.stack([start, *goals]).astype(np.float32)
         self._distances = falling_clearances(settings.safety_distance, checker, states)
         self._search = AnytimeSearch(
-            self._ends,
+            self._start_goal,
             SearchSettings(range=settings.range, resolution=settings.resolution),
             "aorrtc",
             int(state[0] >> np.uint64(32)),
@@ -71,8 +71,8 @@ class AORRTCSearch:
         """Index of the goal to which the path leads; -1 if there is no path."""
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> None:
-        """Search until no path can be shorter, more iterations do not pay, there seems to be no path, or
-        `stop` returns True."""
+        """Search until no path can be shorter, further iterations hardly shorten the path (`gain`), the
+        iterations without a path are used up, or `stop` returns True."""
         settings = self.settings
         search = self._search
         iteration_limit = settings.tries * (len(self._distances) + 2)
@@ -83,8 +83,8 @@ class AORRTCSearch:
                 break
             search.improve(ITERATIONS_PER_STEP)
         if search.best is not None:
-            # a continuous joint may end whole turns from its given value
-            end = self._ends.complete(search.best)[-1]
+            # find the goal that was reached; a continuous joint may end whole turns from the goal's value
+            end = self._start_goal.complete(search.best)[-1]
             turns = np.abs(self.goals - end) / TURN
             distances = np.where(self._robot.continuous, np.abs(turns - np.round(turns)), turns)
             self.best_goal = int(distances.max(axis=1).argmin())
@@ -97,7 +97,7 @@ class AORRTCSearch:
 
     @property
     def goal_costs(self) -> Values:
-        """Length of the best path for its goal [rad]; infinite for the others."""
+        """For each goal, the length of the best path if it ends at this goal, otherwise infinity [rad]."""
         costs = np.full(len(self.goals), np.inf)
         if self.best_goal >= 0:
             costs[self.best_goal] = self.cost
@@ -105,10 +105,10 @@ class AORRTCSearch:
 
     @property
     def safety_distance(self) -> float:
-        """Distance to obstacles that the path keeps except near closer ends [m]."""
+        """Distance to obstacles that the path keeps, except near a start or goal that is closer [m]."""
         return self._search.clearance
 
     def path(self) -> Configurations | None:
         """Waypoints of the best path; None if there is no path."""
         best = self._search.best
-        return None if best is None else self._ends.complete(best).astype(np.float32)
+        return None if best is None else self._start_goal.complete(best).astype(np.float32)

@@ -1,6 +1,7 @@
-"""Data generation into a folder of shards: draws random problems, solves and validates them, here or on Ray.
+"""Data generation into a folder of shards: draws random problems, solves and validates them, on this machine
+or on a Ray cluster.
 
-A shard depends on the settings and its number alone.
+The content of a shard depends only on the settings and on the shard's number.
 """
 
 import json
@@ -83,14 +84,14 @@ class GenerationSettings(Settings):
     """Number of solved and validated motions, each in its own scene (the paper: 0.14 million)."""
     seed: Natural = 0
     mix: dict[str, float] = field(default_factory=lambda: {"rop": 1.0})
-    """Relative share of the problems of each family of scenes; the default is the paper's. A row of the data
-    contains the number of its family in this order."""
+    """Relative number of problems of each family of scenes; the default is the paper's. A row of the data
+    contains the index of its family in this order."""
     trivial_share: Share = 1.0
-    """Share of the trivial problems (those that the straight line solves) that is kept; 1 is the paper's
+    """Probability that a trivial problem, which a straight line solves, is used; 1 is the paper's
     distribution."""
     target: Annotated[str, OneOf(TARGETS)] = POSITION
-    """Goal of the tip: its position alone, as in the paper, or its pose. Families of furniture always use the
-    pose."""
+    """What a target states of the tip: its position, as in the paper, or its pose. Families of furniture
+    always use the pose."""
     goals: Annotated[int, Bound(least=1.0, most=127.0)] = 10
     """Largest number of goal configurations of a target, found by inverse kinematics (the paper's k)."""
     waypoints: Annotated[int, Bound(least=2.0)] = 254
@@ -107,8 +108,8 @@ class GenerationSettings(Settings):
             resolution=0.02, improvement=0.01, patience=6, step_rounds=5, connect_iterations=800
         )
     )
-    """Settings of the planner. With the default settings of this field, the paper's planner is faster than
-    with its own defaults, and paths are 1 % longer."""
+    """Settings of the planner. The default of this field makes the paper's planner faster than the planner's
+    own defaults do, at the cost of paths that are 1 % longer."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -144,7 +145,7 @@ class GenerationSettings(Settings):
 
 MAX_PROBLEMS_PER_ROW = 50
 EXTRA_PROBLEMS = 1_000
-"""A shard fails after MAX_PROBLEMS_PER_ROW problems for each of its rows, and EXTRA_PROBLEMS more."""
+"""A shard with n rows fails after MAX_PROBLEMS_PER_ROW n + EXTRA_PROBLEMS problems."""
 PROBLEMS_PER_SHARD = 2**32
 """Number of problem numbers that are reserved for each shard, so that no two shards contain the same
 problem."""
@@ -156,9 +157,9 @@ Counts = dict[str, int]
 def make_shard(settings: GenerationSettings, index: int) -> tuple[Arrays, Counts]:
     """Arrays and counts of a shard in the form of `datasets.shards`.
 
-    Counts are of problems: `tried` of all; `solved` are in the shard; `thinned` are trivial and left out; for
-    `unsolved` the search found no path; the validator rejected the motions of `refused`. Raises InputError if
-    hardly any problem can be solved.
+    The counts are numbers of problems: `tried`: all; `solved`: those in the shard; `thinned`: trivial ones
+    that were left out; `unsolved`: those without a path; `refused`: those whose motions the validator
+    rejected. Raises InputError if hardly any problem can be solved.
     """
     robot = load_robot(settings.robot)
     rows = settings.rows(index)
@@ -185,7 +186,7 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
     """Solve the problem with a number. Returns its row, or "thinned", "unsolved" or "refused"."""
     rng = np.random.default_rng([settings.seed, number])
     family, sample = draw(settings, robot, rng)
-    # goals of continuous joints are moved by whole turns as near to the start as possible
+    # joints with limits and a range above one turn are turned as near to the start as possible
     goals = np.stack([robot.equivalent_configurations(q, sample.start)[0] for q in sample.goals])
     sample = replace(sample, goals=goals)
     checker = CollisionChecker(robot, sample.scene)
@@ -193,7 +194,7 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
     lines_free = [bool(motions_free(space, np.stack([sample.start, goal]))[0]) for goal in goals]
     thinned = rng.random() >= settings.trivial_share
     if thinned and all(lines_free):
-        return "thinned"  # the straight line is free whichever goal a search would choose
+        return "thinned"  # trivial, whichever goal a search would choose
     search: SharedTreeSearch | AORRTCSearch = SEARCHES.load(settings.planner)(
         checker, sample.start, sample.goals, settings.search, random_state(settings.seed, number)
     )
@@ -234,7 +235,7 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
 
 
 def draw(settings: GenerationSettings, robot: Robot, rng: np.random.Generator) -> tuple[int, SampledProblem]:
-    """A random problem and the number of its family in the mix; it depends on the state of `rng` alone."""
+    """A random problem, after the index of its family in the mix; both depend only on the state of `rng`."""
     shares = np.array(list(settings.mix.values()))
     number = int(rng.choice(len(shares), p=shares / shares.sum()))
     family = list(settings.families.values())[number]
@@ -269,15 +270,15 @@ def generate(
     cluster: str | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> int:
-    """Make the shards that the folder lacks; returns the number of trajectories in all.
+    """Make the shards that the folder lacks. Returns the number of trajectories in the whole data set.
 
-    After an interruption at any moment, another call continues, and the finished folder is the same, bit for
-    bit, as that of an uninterrupted call with any number of workers. With `cluster` "ray" the Ray cluster
-    that RAY_ADDRESS names, or one started here, makes the shards. `progress` is called with the numbers of
-    trajectories done and in all.
+    After an interruption at any moment, another call continues. The finished folder is bit for bit that of an
+    uninterrupted call with any number of workers. If `cluster` is "ray", the shards are made by the Ray
+    cluster that RAY_ADDRESS names, or by a cluster started here. `progress` is called with the number of
+    trajectories that are done and the number of all.
 
-    Raises InputError for a folder of other settings, of another version or robot, for one that cannot be
-    written, and for one that another process is filling.
+    Raises InputError if the folder's data have other settings or are of another version or robot, if the
+    folder cannot be written, and if another process is filling it.
     """
     if workers < 1:
         raise InputError(f"workers is {workers}; it must be at least 1")
@@ -313,11 +314,11 @@ def _fill(
             settings = replace(settings, robot=str(FilePath(settings.robot).resolve()))
         local_record = _reproducibility_record(settings)
         shards = CLUSTERS[cluster](_make_on_node, [(settings, index, local_record) for index in missing])
-    # close it at once, so that workers stop when this is interrupted
+    # closing the iterator stops the workers at once if this is interrupted
     with closing(shards):
         for number, (arrays, counts) in shards:
             index = missing[number]
-            # else zarr's threads would write files after the clean-up
+            # without the delay, zarr's threads could write files after the clean-up
             with delay_interrupts():
                 write_shard(out, index, arrays, counts)
             finished += settings.rows(index)
@@ -336,7 +337,7 @@ def _make_on_node(settings: GenerationSettings, index: int, wanted: dict[str, st
 
 
 def _reproducibility_record(settings: GenerationSettings) -> dict[str, str]:
-    """Versions and robot that must be the same on two machines for the same data."""
+    """Versions and robot fingerprint; machines with equal records generate the same data."""
     return versions() | {f"robot {settings.robot}": robot_fingerprint(load_robot(settings.robot))}
 
 
@@ -366,7 +367,7 @@ def manifest_of(settings: GenerationSettings) -> Manifest:
 
 
 def _claim(wanted: Manifest, out: FilePath) -> None:
-    """Write the manifest, or raise InputError if the folder's manifest is of other data."""
+    """Write the manifest into a new folder; raise InputError if the folder has a manifest of other data."""
     if not (out / MANIFEST).exists():
         if shard_indices(out):
             raise InputError(f"{out} holds shards but no {MANIFEST}; use another folder")
@@ -390,7 +391,8 @@ def _claim(wanted: Manifest, out: FilePath) -> None:
 
 
 def _by_name(settings: dict[str, Any]) -> dict[str, str]:
-    """Settings as JSON texts, in which the order of a mix counts; those of the search as search.NAME."""
+    """Settings by name as JSON texts, which preserve the order of a mix; the search's settings are named
+    search.NAME."""
     search = settings.get("search")
     search_settings = search if isinstance(search, dict) else {}
     named = settings | {f"search.{name}": value for name, value in search_settings.items()}

@@ -6,7 +6,10 @@ from robotdiffuse.core.errors import InputError, joined
 
 
 def need_packages(what: str, *packages: str) -> None:
-    """Raises InputError, naming the extra `train`, unless these packages are installed. what: needs them."""
+    """Raises InputError, which names the extra `train`, unless these packages are installed.
+
+    what: what needs the packages, for the message.
+    """
     missing = [package for package in packages if find_spec(package) is None]
     if missing:
         raise InputError(f'{what} needs {joined(missing)}, not installed: pip install "robotdiffuse[train]"')

@@ -1,8 +1,8 @@
-"""Trained networks in files, as training writes and reads them; `weight_files` describes their content.
+"""Writes and reads files of trained networks with PyTorch; `weight_files` describes their content.
 
 All networks are written and read in the same way: the diffusion model, the baselines' networks, the encoder
-that is trained alone and the completion network; the last two belong to no robot. A file is written whole or
-not at all.
+that is trained alone and the completion network. Encoder and completion network belong to no robot. Files are
+written atomically.
 """
 
 import copy
@@ -71,7 +71,7 @@ def fingerprint(module: nn.Module) -> str:
 def save_network(name: str, network: Any, folder: str | FilePath, training: dict[str, Any]) -> None:
     """Write NAME.safetensors and NAME.json; `name` as in NETWORKS, or encoder or completion.
 
-    training: the data's fingerprint, the number of samples and so on, for readers.
+    training: information for people, such as the data's fingerprint and the number of samples.
     """
     about: dict[str, Any] = {"network": encoder_name(network) if isinstance(network, Encoder) else name}
     if isinstance(network, Network):
@@ -82,13 +82,13 @@ def save_network(name: str, network: Any, folder: str | FilePath, training: dict
 
 def _save(module: SavedModule, folder: FilePath, stem: str, about: dict[str, Any]) -> None:
     """Write STEM.safetensors, the exported parts, and last STEM.json with the SHA-256 of all."""
-    # matrices of layers in fp16, others unchanged
+    # weight matrices of layers in fp16, other tensors unchanged
     kinds = (nn.Linear, nn.Conv3d)
     half = {f"{name}.weight" for name, part in module.named_modules() if isinstance(part, kinds)}
     packed = {name: t.half() if name in half else t for name, t in module.state_dict().items()}
     digest = write_tensors(folder / f"{stem}.safetensors", packed, {})
     stored = copy.deepcopy(module).cpu()
-    stored.load_state_dict(packed)  # exported as it will be read
+    stored.load_state_dict(packed)  # export the rounded weights, which a reader of the file gets
     parts = stored.exports()
     for ending, data in parts.items():
         write_atomically(folder / f"{stem}{ending}", data)
@@ -133,18 +133,18 @@ def load_encoder(folder: str | FilePath) -> Encoder:
 
 
 def load_completion(folder: str | FilePath | None = None) -> CompletionNetwork:
-    """The occupancy completion network of a folder, frozen; None: the one that comes with the package.
+    """The occupancy completion network of a folder, frozen; None: the network that comes with the package.
 
-    Raises InputError for damaged files, and if there is none, naming the command that trains it.
+    Raises InputError for damaged files, and if there is no network, naming the command that trains it.
     """
     return _load("completion", completion_folder(folder))
 
 
 def load_network(name: str, folder: str | FilePath | None, robot: Robot) -> Any:
-    """The trained network of a folder, ready to use; None: the weights found for the robot by `weights_for`.
+    """The trained network of a folder, ready to use; None: with the weights that `weights_for` finds.
 
-    Raises InputError if there is none, naming the command that trains it, and for files that are damaged or
-    made for another robot.
+    Raises InputError if there is no network, naming the command that trains it, and for files that are
+    damaged or made for another robot.
     """
     place = weights_folder(name, folder, robot)
     network = _loaded(name, place)
@@ -156,9 +156,10 @@ _loaded = kept_by_stamp(_load)
 
 
 def load_model(folder: str | FilePath, robot: Robot | None = None) -> MotionNetwork:
-    """The diffusion model of a folder, or the bundled one of a robot with this name, as a PyTorch module.
+    """The diffusion model of a folder of weights, as a PyTorch module.
 
-    Raises InputError, naming the file, if it is missing, damaged, or made for another robot than `robot`.
+    folder: its path, or the name of a folder that comes with the package, such as "panda". Raises InputError,
+    naming the file, if it is missing, damaged, or made for another robot than `robot`.
     """
     folder = folder_of(folder)
     model = _load("model", folder)
@@ -171,7 +172,7 @@ def load_model(folder: str | FilePath, robot: Robot | None = None) -> MotionNetw
 def export_weights(folder: str | FilePath) -> list[str]:
     """Export all networks in a folder again from their weights. Returns the names of the networks.
 
-    Raises InputError if the folder holds none, or one is damaged.
+    Raises InputError if the folder holds no network, or a damaged one.
     """
     place = FilePath(folder)
     written = list[str]()

@@ -1,4 +1,4 @@
-"""The occupancy completion network, which predicts obstacles where no camera saw.
+"""The occupancy completion network, which predicts obstacles in space that no camera saw.
 
 This module defines the network's voxels, runs the network with ONNX Runtime, and draws its training samples:
 random scenes seen by cameras that are placed as a person would place them.
@@ -70,13 +70,13 @@ def reachable() -> Bool[ndarray, "56 56 32"]:
 
 
 REACH_SAMPLES = 256
-"""Number of random configurations that are tried. The farthest point that they reach is within 1 cm of the
-farthest that thousands reach."""
+"""Number of random configurations by which an arm's reach is estimated; the result is within 1 cm of that of
+thousands of configurations."""
 
 
 @once_per_robot
 def covers(robot: Robot) -> bool:
-    """Whether the network predicts wherever the arm can reach, as random configurations show."""
+    """Whether the network predicts all voxels that the arm can reach, judged by random configurations."""
     lower, upper = (
         np.where(robot.prismatic, limit, np.clip(limit, -np.pi, np.pi))
         for limit in (robot.lower, robot.upper)
@@ -111,14 +111,14 @@ class CameraPlaces(Settings, name="cameras"):
     height: Range = (0.4, 1.6)
     """Height of the camera above the base."""
     front_share: float = 0.75
-    """Share of the cameras whose bearing from the base is drawn about the direction away from the obstacles;
-    the bearings of the others are drawn from the whole circle."""
+    """Share of the cameras that stand opposite to the obstacles, as seen from the base. All other cameras may
+    be in any direction from the base."""
     front: float = 2.0
-    """Largest difference between such a bearing and the direction that, seen from the base, is opposite to
-    the obstacles."""
+    """Largest angle, at the base, between such a camera and the direction exactly opposite to the
+    obstacles."""
     target_spread: float = 0.2
-    """Standard deviation, along each axis, of the point that a camera looks at. Its mean is 0.3 m high,
-    halfway between the base and the middle of the obstacles."""
+    """Standard deviation, along each axis, of the point that a camera looks at. The mean of this point is
+    0.3 m high, halfway between the base and the middle of the obstacles."""
     field_of_view: Range = (0.75, 1.1)
     """Vertical field of view."""
     roll: float = 0.05
@@ -140,19 +140,19 @@ class CameraPlaces(Settings, name="cameras"):
 
 
 VIEW_COUNTS = (1, 1, 1, 2)
-"""The number of views of a sample is one of these, each with the same probability."""
+"""The number of views of a sample is a random item of this list."""
 IMAGE_SIZE = (160, 120)
 """Width and height of images [pixels]."""
 NOISE_SHARE = 0.5
-"""Share of the samples that have noise, of up to twice the usual strength."""
+"""Share of the samples that have noise, of up to twice the strength of the default `DepthNoise`."""
 CAMERA_CLEARANCE = 0.05
-"""Distance of cameras from obstacles [m]. If none of the first `CAMERA_DRAWS` poses keeps it, the last of
-them is used."""
+"""Minimum distance of cameras from obstacles [m]. If none of `CAMERA_DRAWS` poses keeps it, the last pose is
+used."""
 CAMERA_DRAWS = 8
 OUT_OF_RANGE_SHARE = 0.5
 """Share of the noisy samples in which surfaces out of range return no depth, as with most real cameras."""
 MISSING_SHARE = 0.02
-"""Share of the pixels, anywhere in the image, that return no depth if noise has its usual strength."""
+"""Share of all pixels that have no return, at the default strength of the noise."""
 NOISE_FIELDS = ("spread", "missing", "stray", "flying", "edge_missing", "grazing")
 """Fields of `DepthNoise` that are multiplied by the strength of the noise."""
 NO_FLOOR_SHARE = 0.1
@@ -167,7 +167,8 @@ class Samples(NamedTuple):
     behind: UInt8[ndarray, "n 56 56 32"]
     """Depth behind the nearest surface, in units of DEPTH_STEP."""
     truth: UInt8[ndarray, "n 56 56 32"]
-    """Whether each of a voxel's eight voxels of 2 cm holds an obstacle: bit 4 x + 2 y + z."""
+    """Whether each of a voxel's eight fine voxels holds an obstacle: bit 4 x + 2 y + z, with x, y and z the
+    index of the fine voxel, 0 or 1."""
 
 
 def pack(volume: ObservedVolume) -> tuple[Packed, Packed]:
@@ -183,7 +184,7 @@ def true_voxels(scene: Scene) -> Bool[ndarray, "112 112 64"]:
 
 
 def pack_fine(fine: Bool[ndarray, "112 112 64"]) -> Packed:
-    """`Samples.truth` of an occupancy."""
+    """`Samples.truth` of the occupancy of fine voxels."""
     out = np.zeros(SHAPE, np.uint8)
     for bit in range(8):
         out |= fine[bit >> 2 :: 2, bit >> 1 & 1 :: 2, bit & 1 :: 2] * np.uint8(1 << bit)
@@ -221,8 +222,8 @@ def draw_sample(families: Sequence[str], robot: Robot, rng: Generator) -> tuple[
     if rng.random() < NOISE_SHARE:
         strength = 2 * rng.random()
         hide_far = rng.random() < OUT_OF_RANGE_SHARE
-        usual = replace(DepthNoise(), missing=MISSING_SHARE)
-        noise = replace(usual, **{name: strength * getattr(usual, name) for name in NOISE_FIELDS})
+        default = replace(DepthNoise(), missing=MISSING_SHARE)
+        noise = replace(default, **{name: strength * getattr(default, name) for name in NOISE_FIELDS})
         views = [noise.applied(_without_infinity(view) if hide_far else view, rng) for view in views]
     return *pack(observe(views, robot, q)), pack_fine(true_voxels(scene))
 
@@ -247,17 +248,17 @@ def predict(volume: ObservedVolume, network: Completion | None = None) -> Float3
     """The probability that each voxel of 2 cm holds an obstacle.
 
     It is 0 in voxels that were seen free. It is also 0 farther than 1 m from a Panda's shoulder, since
-    training did not cover these voxels. The grid begins at the volume's LOW. network: None for the one that
+    training did not cover these voxels. The lower corner of the grid is LOW. network: None: the network that
     comes with the package.
     """
     return (network or exported_completion())(*pack(volume))
 
 
 def exported_completion(folder: str | FilePath | None = None) -> Completion:
-    """The network of a folder, loaded once, and again if it was trained anew; None: the one that comes with
-    the package.
+    """The network of a folder, loaded once, and again if it was trained anew; None: the network that comes
+    with the package.
 
-    Raises InputError for damaged files, and if there is none, naming the command that trains it.
+    Raises InputError for damaged files, and if there is no network, naming the command that trains it.
     """
     return _exported("completion", completion_folder(folder))
 

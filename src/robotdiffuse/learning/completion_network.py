@@ -1,10 +1,10 @@
 """The occupancy completion network: from an observed volume to the probability that each voxel of 2 cm is
 occupied.
 
-A U-Net of residual blocks. The input's voxels of 4 cm are folded into blocks of 2 x 2 x 2, so that nothing is
-computed at their full resolution: the finest cells have 8 cm, and each predicts its 4 x 4 x 4 voxels of 2 cm.
-There is no normalization, nor anything else that needs single precision: one such layer would slow training
-in bf16 several times. Features are the last axis in memory, which is the fast layout for bf16.
+A U-Net of residual blocks. The input's voxels of 4 cm are folded into blocks of 2 x 2 x 2, to avoid computing
+at their full resolution: the finest cells have 8 cm, and each predicts its 4 x 4 x 4 voxels of 2 cm. There is
+no normalization, because a layer that needs single precision would make training in bf16 several times
+slower. Features are the last axis in memory, which is the fast layout for bf16.
 """
 
 import numpy as np
@@ -28,7 +28,7 @@ CHANNELS = 7
 """Number of input channels: occupied, free, shadow of the arm, out of view, depth behind a surface, height,
 distance from the base's axis."""
 DEPTH_SCALE = DEPTH_STEP / 0.5
-"""Stored depths behind surfaces are multiplied by this: half a meter becomes 1."""
+"""Stored depths behind surfaces, multiples of DEPTH_STEP, are multiplied by this: half a meter becomes 1."""
 
 
 def _position_inputs() -> Float[Tensor, "28 28 16 16"]:
@@ -39,14 +39,15 @@ def _position_inputs() -> Float[Tensor, "28 28 16 16"]:
 
 
 def folded(x: Shaped[Tensor, "n i j k"]) -> Shaped[Tensor, "n i//2 j//2 k//2 8"]:
-    """Voxels grouped into blocks of 2 x 2 x 2; the last axis is the number in the block, 4 x + 2 y + z."""
+    """Voxels grouped into blocks of 2 x 2 x 2; the last axis is the index in the block, 4 x + 2 y + z."""
     n, i, j, k = x.shape
     blocks = x.reshape(n, i // 2, 2, j // 2, 2, k // 2, 2).permute(0, 1, 3, 5, 2, 4, 6)
     return blocks.reshape(n, i // 2, j // 2, k // 2, 8)
 
 
 def unfolded(x: Shaped[Tensor, "n i j k c"]) -> Shaped[Tensor, "n 2*i 2*j 2*k c//8"]:
-    """The inverse of `folded`: a pixel shuffle in three dimensions, of features grouped by block."""
+    """The inverse of `folded`: a pixel shuffle in three dimensions. The first factor of the features is the
+    index in the block."""
     n, i, j, k, c = x.shape
     blocks = x.reshape(n, i, j, k, 2, 2, 2, c // 8).permute(0, 1, 4, 2, 5, 3, 6, 7)
     return blocks.reshape(n, 2 * i, 2 * j, 2 * k, c // 8)
@@ -110,14 +111,12 @@ class CompletionNetwork(SavedModule):
     def forward(self, seen: Packed, behind: Packed) -> Float[Tensor, "n 28 28 16 64"]:
         """Logits of the voxels of 2 cm, grouped by cells of 8 cm and within them by voxels of 4 cm."""
         features = self.features(seen, behind)
-        features_2cm = self.before[0](self.first(features))
-        middle = self.before[1](self.down[0](torch.relu(features_2cm)))
-        bottleneck = self.middle(self.down[1](torch.relu(middle)))
-        middle = self.after[0](middle + _shuffled(self.up[0](torch.relu(bottleneck))))
-        features_2cm = self.after[1](
-            features_2cm + _shuffled(self.up[1](torch.relu(middle))) + self.skip(features)
-        )
-        return self.last(torch.relu(features_2cm)).permute(0, 2, 3, 4, 1)
+        at_8cm = self.before[0](self.first(features))
+        at_16cm = self.before[1](self.down[0](torch.relu(at_8cm)))
+        at_32cm = self.middle(self.down[1](torch.relu(at_16cm)))
+        at_16cm = self.after[0](at_16cm + _shuffled(self.up[0](torch.relu(at_32cm))))
+        at_8cm = self.after[1](at_8cm + _shuffled(self.up[1](torch.relu(at_16cm))) + self.skip(features))
+        return self.last(torch.relu(at_8cm)).permute(0, 2, 3, 4, 1)
 
     def probabilities(self, seen: Packed, behind: Packed) -> Float[Tensor, "n 112 112 64"]:
         """Probability of each voxel of 2 cm; 0 in voxels that were seen free, and beyond REACH."""
@@ -129,7 +128,7 @@ class CompletionNetwork(SavedModule):
 
     def exports(self) -> dict[str, bytes]:
         """`probabilities` of one volume."""
-        # two tensors: the exporter takes one tensor for one input
+        # two tensors, because the exporter would take one shared tensor for one input
         inputs = {name: torch.zeros(SHAPE, dtype=torch.uint8) for name in ("seen", "behind")}
         return {".onnx": exported(self, self._probabilities_of_one, inputs, {})}
 

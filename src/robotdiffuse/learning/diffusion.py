@@ -87,11 +87,11 @@ class NoiseSchedule:
 def noise_factor(
     residuals: Float[ndarray, "n waypoints dof"], smooth: bool
 ) -> Float[ndarray, "waypoints waypoints"]:
-    """The matrix L that makes noise L e of white noise e: zero at both ends, and with a mean variance of 1
-    between them.
+    """The matrix L that turns white noise e into the noise L e of the forward process, which is zero at the
+    first and the last waypoint and has a mean variance of 1 between them.
 
-    smooth: L Lᵀ is the covariance of the residuals over the waypoints, plus a little white noise so that
-    every direction has some; else L is `white_noise_factor`. residuals: scaled to unit variance.
+    residuals: scaled to unit variance. smooth: whether L Lᵀ is the covariance of the residuals over the
+    waypoints, plus a little white noise so that it has full rank; otherwise L is `white_noise_factor`.
     """
     waypoints = residuals.shape[1]
     white = white_noise_factor(waypoints)
@@ -107,7 +107,7 @@ def noise_factor(
 
 
 def white_noise_factor(waypoints: int) -> Float[ndarray, "waypoints waypoints"]:
-    """L of noise that is white between the first and the last waypoint, and zero at these."""
+    """L for noise that is white between the first and the last waypoint, and zero at these two."""
     return np.diag(np.r_[0.0, np.ones(waypoints - 2), 0.0])
 
 
@@ -126,11 +126,11 @@ class Objective:
     """
 
     def target(self, clean: Array, noise: Array, signal: Any, noise_level: Any) -> Array:
-        """The output that the network is trained towards for x_t = signal clean + noise_level noise."""
+        """The output that the network should have for x_t = signal * clean + noise_level * noise."""
         return clean
 
     def clean(self, x_t: Array, output: Array, signal: Any, noise_level: Any) -> Array:
-        """The clean trajectory that an output of the network for x_t stands for."""
+        """The clean trajectory that follows from an output of the network for x_t."""
         return output
 
     def clean_per_output(self, signal: Any, noise_level: Any) -> Any:
@@ -140,9 +140,9 @@ class Objective:
     def weight(self, schedule: NoiseSchedule, t: Int[ndarray, "n"], limit: float | None) -> Values:
         """Weight of the squared error of the output at levels t >= 1, at most `limit`; None: 1 everywhere.
 
-        The weight of `NoiseSchedule.weight` on x_0, converted to the output, so that objectives differ in
-        what the network outputs and not in the levels that they emphasise (Salimans and Ho 2022, section 4;
-        Hang et al. 2023, who convert their weights in the same way). For the noise the converted weight is
+        It is the weight of `NoiseSchedule.weight` on x_0, converted to the output, so that objectives differ
+        only in what the network outputs, not in the levels that they emphasize (Salimans and Ho 2022, section
+        4; Hang et al. 2023 convert their weights in this way). For the noise, the converted weight is
         unbounded where little signal is left, so it is limited once more.
         """
         if limit is None:
@@ -190,7 +190,7 @@ def ddim(
 ) -> Samples:
     """Samples by DDIM (Song et al. 2021): deterministic, or with a share of fresh noise at every step.
 
-    The predictor is called once per step, first at level T with pure noise.
+    `predict` is called once per step, first at level T with pure noise.
 
     steps: calls of the predictor, 1 to T.
     eta: share of the noise that is drawn afresh at every step: 0 is the deterministic probability flow, 1 the
@@ -220,15 +220,15 @@ def reverse_process(
     """Samples at any levels (Ho et al. 2020, algorithm 2); the means of the steps may be moved.
 
     Each x at a lower level is drawn about its mean given x_level and the predicted x_0 (Song et al. 2021, eq.
-    12): the noise found in x is kept, except for the share that is drawn afresh (eq. 16). With eta 1 that is
-    q(x_lower | x_level, x_0), of variance beta tilde (Ho et al. 2020, eq. 7; between any two levels, Kingma
-    et al. 2021, eq. 25).
+    12): the noise in x is kept, except for the share that is drawn afresh (eq. 16). With eta = 1, x_lower is
+    drawn from q(x_lower | x_level, x_0), whose variance is beta tilde (Ho et al. 2020, eq. 7; between any two
+    levels, Kingma et al. 2021, eq. 25).
 
-    levels: falling. Sampling begins with standard noise at the first and ends with the clean x_0 below the
-        last.
-    move: replaces the mean of a step, for example by one further down the costs of a guide (MPD, algorithm
-        1).
+    levels: in descending order. Sampling begins with standard noise at the first level; the step after the
+        last level gives the clean x_0.
+    move: replaces the mean of a step, for example by a mean with lower costs (MPD, algorithm 1).
     noise_scale: factor of the standard deviation of the noise that is added to the means (MPD: 0.5).
+    eta: see `ddim`.
     """
     x = draw_noise()
     remaining = len(levels)

@@ -1,4 +1,4 @@
-"""The diffusion model of trained weights, as planning runs it: by ONNX Runtime, without PyTorch."""
+"""The trained diffusion model as planning runs it: by ONNX Runtime, without PyTorch."""
 
 from pathlib import Path as FilePath
 
@@ -30,15 +30,16 @@ from robotdiffuse.learning.weight_files import (
 from robotdiffuse.robots.robot import Robot
 
 EXTERNAL_DATA = b"\x0a\x08location"
-"""Bytes by which an ONNX file says that a tensor is in another file: the key of an entry of `external_data`.
-ONNX Runtime would look for that file in the current folder."""
+"""Bytes in an ONNX file that keeps a tensor in another file: the key of an entry of `external_data`. ONNX
+Runtime would look for that file in the current folder."""
 
 
 class OnnxNetwork:
     """An exported network with one output."""
 
     def __init__(self, data: bytes, name: str) -> None:
-        """data: of an .onnx file. name: of the file. Raises InputError if ONNX Runtime cannot run it."""
+        """data: contents of an .onnx file. name: the file's name, for messages. Raises InputError if ONNX
+        Runtime cannot run the network."""
         if EXTERNAL_DATA in data:
             raise InputError(
                 f"{name} keeps weights in another file, which is not read; export it in one file"
@@ -64,7 +65,7 @@ class ExportedModel(MotionModel):
     """The model of a folder with weights."""
 
     def __init__(self, folder: FilePath, name: str) -> None:
-        """name: in NETWORKS. Raises InputError, naming the file, if one is missing or damaged."""
+        """name: a name in NETWORKS. Raises InputError, naming the file, for a missing or damaged file."""
         about = read_description(folder, name)
         location = str(folder / f"{name}.json")
         robot = RobotIdentity.from_json(about.get("robot"), f"{location}: robot")
@@ -118,10 +119,10 @@ class ExportedModel(MotionModel):
 
 
 def exported_model(name: str, folder: str | FilePath | None, robot: Robot) -> MotionModel:
-    """The model of a folder, loaded once; None: of the weights found for the robot by `weights_for`.
+    """The model of a folder, loaded once; None: with the weights that `weights_for` finds.
 
-    name: "model" or "trajectory_prior". Raises InputError if there is none, naming the command that trains
-    it, and for files that are damaged or made for another robot.
+    name: "model" or "trajectory_prior". Raises InputError if there is no model, naming the command that
+    trains it, and for files that are damaged or made for another robot.
     """
     place = weights_folder(name, folder, robot)
     model = _loaded(name, place)

@@ -48,21 +48,23 @@ class Steps(NamedTuple):
     margin: np.float32
     """Margin to obstacles [m], or OFF."""
     self_margin: np.float32
+    """Margin between links [m], or OFF."""
     push: np.float32
-    """[rad]"""
+    """Longest push of a waypoint [rad]."""
     kernel: Float[ndarray, "waypoints waypoints"]
     """Weights by which pushes spread over neighboring waypoints."""
     length: np.float32
+    """Fraction of the way to the middle of its neighbors by which a waypoint moves."""
 
 
 @kernel(nogil=True)
 def descend(robot, scene, q, lower, upper, steps, rounds):
-    """Moves trajectories q [batch, waypoints, dof] by some rounds, in place; the first and the last waypoint
-    stay. Returns the costs of the margins [batch] that the last round found.
+    """Moves the waypoints of trajectories q [batch, waypoints, dof], in place, except the first and the last.
+    Returns the margin costs [batch] of the waypoints at the beginning of the last round.
 
-    Each waypoint within a margin is pushed out of it, the pushes are spread over its neighbors, then the
-    step of length follows. A trajectory without a waypoint within a margin is left as it is,
-    unless no margin is enabled.
+    In each of the `rounds`, each waypoint within a margin is pushed out of it, the pushes are spread over the
+    neighboring waypoints, and then a step shortens the trajectory. If margins are enabled, a trajectory
+    without a waypoint within a margin is not changed.
     """
     batch, n, dof = q.shape
     first = 1
@@ -96,13 +98,14 @@ def descend(robot, scene, q, lower, upper, steps, rounds):
 
 
 @inner_kernel()
-def _push_away(cost, gradient, push, pushed):
-    """The Gauss-Newton step -g 2c / (g.g) of the collision costs, at most `push` [rad], into pushed[dof].
+def _push_away(cost, gradient, push, out):
+    """Writes to out[dof] the Gauss-Newton step -g 2c / (g.g) of the collision cost c with gradient g, at most
+    `push` [rad] long.
 
-    For a single contact this step just clears it, at any scale of the cost. Returns 1 if there is a
-    contact, else 0.
+    The step just clears a single contact, whatever the scale of the cost. Returns 1 if there is a contact,
+    else 0.
     """
-    pushed[:] = _ZERO
+    out[:] = _ZERO
     square = _ZERO
     for j in range(len(gradient)):
         square += gradient[j] * gradient[j]
@@ -111,13 +114,14 @@ def _push_away(cost, gradient, push, pushed):
     scale = np.float32(2.0) * cost / square
     scale = min(scale, push / np.sqrt(square))
     for j in range(len(gradient)):
-        pushed[j] = -scale * gradient[j]
+        out[j] = -scale * gradient[j]
     return _ONE
 
 
 @allocation_free(fastmath=True)
 def _spread(q, first, last, pushes, active, kernel, lower, upper):
-    """Moves each waypoint by a weighted mean of its neighbors' pushes, less where no neighbor is pushed."""
+    """Moves each waypoint by a weighted mean of its neighbors' pushes; by less if only distant neighbors are
+    pushed."""
     dof = q.shape[1]
     for i in range(first, last):
         weight = _ZERO
@@ -137,8 +141,9 @@ def _spread(q, first, last, pushes, active, kernel, lower, upper):
 
 @allocation_free(fastmath=True)
 def _shorten(q, first, last, share):
-    """Moves each waypoint by a fraction of the way to the middle of its neighbors, which is Newton's step in
-    that waypoint alone. Every second waypoint is moved at a time, since these share no segment."""
+    """Moves each waypoint by a fraction of the way to the middle of its neighbors. The whole way would be
+    Newton's step of the length cost in this waypoint alone. Every second waypoint is moved first, then the
+    others, so that waypoints moved together share no segment."""
     dof = q.shape[1]
     for parity in range(2):
         for i in range(first + parity, last, 2):
@@ -159,10 +164,10 @@ class GuidanceSettings(Settings, name="guidance"):
     push: Positive = 0.15
     """Longest push of a waypoint in one step [rad]."""
     width: Positive = 4.0
-    """Over how many waypoints a push spreads: the standard deviation of the kernel."""
+    """Standard deviation of the kernel that spreads pushes over neighboring waypoints [waypoints]."""
     length: Share = 0.2
-    """After the pushes, waypoints move by this fraction towards the middle of their neighbors; 0: no
-    cost."""
+    """After the pushes, waypoints move by this fraction towards the middle of their neighbors; 0: the length
+    has no cost."""
 
 
 class CollisionGuidance:
@@ -175,8 +180,8 @@ class CollisionGuidance:
         constraints: PathConstraints | None = None,
         tolerance_share: float = 1.0,
     ) -> None:
-        """constraints: path constraints, and the fraction of their tolerances within which they are to hold;
-        a step down their cost moves a waypoint by at most the setting `push`."""
+        """constraints: path constraints; a step down their cost moves a waypoint by at most the setting
+        `push`. tolerance_share: the fraction of their tolerances within which they should hold."""
         self.checker = checker
         self.settings = settings or GuidanceSettings()
         self._constraints = None
@@ -184,11 +189,11 @@ class CollisionGuidance:
             self._constraints = constraints.rows, constraints.limits(tolerance_share)
 
     def __call__(self, q: Trajectories, steps: int) -> tuple[Trajectories, Values]:
-        """The trajectories [rad] after some steps, and the costs of the margins that the last step found.
+        """The trajectories [rad] after `steps` steps, and their margin costs before the last step.
 
-        The first and the last waypoint stay where they are, and have no cost. The cost is zero if no other
-        waypoint is within a margin, or if none was before the last step. Such a trajectory is left as it is;
-        the cost of length acts on every trajectory only if no margin is enabled.
+        The first and the last waypoint are not moved and have no cost. If margins are enabled, a trajectory
+        with no other waypoint within a margin has zero cost and is not changed, not even by the cost of
+        length.
         """
         settings = self.settings
         checker = self.checker
@@ -204,20 +209,21 @@ class CollisionGuidance:
             length=np.float32(settings.length),
         )
         costs = np.zeros(len(q), np.float32)
-        # all rounds at once, unless steps towards the constraints come between them
+        # one call for all rounds, or one call for each if steps towards the constraints follow each round
         for rounds in [steps] if self._constraints is None else [1] * steps:
             arrays = checker.robot_arrays, checker.scene_arrays
             costs = descend(*arrays, moved, lower, upper, compiled, rounds)
             if self._constraints is not None:
-                nearer = moved.astype(np.float64)
-                _towards_constraints(*self._constraints, nearer.reshape(-1, q.shape[2]), settings.push)
-                moved[:, 1:-1] = np.clip(nearer.astype(np.float32)[:, 1:-1], lower, upper)
+                projected = moved.astype(np.float64)
+                _towards_constraints(*self._constraints, projected.reshape(-1, q.shape[2]), settings.push)
+                moved[:, 1:-1] = np.clip(projected.astype(np.float32)[:, 1:-1], lower, upper)
         return moved, costs
 
 
 @kernel(nogil=True)
 def _towards_constraints(rows, limits, q, max_step):
-    """Moves each configuration of q [n, dof] by a Gauss-Newton step down the cost, in place."""
+    """Moves each configuration of q [n, dof] by a Gauss-Newton step down the cost of the constraints, in
+    place; max_step: longest step [rad]."""
     work = make_work(rows)
     for i in range(len(q)):
         step(rows, limits, q[i], max_step, work)

@@ -1,4 +1,4 @@
-"""MotionModel: encoder, denoiser and sampler together, which is the learned part of planning.
+"""MotionModel: the learned part of planning, which combines encoder, denoiser and sampler.
 
 Everything here is NumPy. The encoder and the denoiser are functions that a subclass provides: exported
 networks in planning (`exported_model`), PyTorch modules in training (`motion_network`).
@@ -49,7 +49,7 @@ TARGETS = ("residual", "absolute", "limits")
 
 
 class Reference(NamedTuple):
-    """The trajectory that x is relative to, and the ends of x that stay fixed."""
+    """The trajectory that x is relative to, and the fixed first and last waypoint of x."""
 
     base: Trajectories
     """Normalized joint values; the trajectory is `base + scale * x`."""
@@ -60,7 +60,7 @@ class Reference(NamedTuple):
 
 
 class Statistics(NamedTuple):
-    """Statistics of the training data that x is scaled by; float32."""
+    """Statistics of the training data, by which x is scaled; float32."""
 
     residual_scale: Configuration
     """Standard deviation of the trajectories about their reference, in units of the joint limits."""
@@ -71,8 +71,7 @@ class Statistics(NamedTuple):
 
     @staticmethod
     def without_data(waypoints: int, dof: int) -> "Statistics":
-        """Statistics that scale nothing: statistics for the target `limits`, and for any target before
-        training."""
+        """Statistics that change nothing: for the target `limits`, and for any target before training."""
         white = white_noise_factor(waypoints).astype(np.float32)
         return Statistics(np.ones(dof, np.float32), np.zeros(dof, np.float32), white)
 
@@ -88,7 +87,7 @@ class SamplingSettings(Settings, name="sampling"):
     eta: Share = 0.0
     """Amount of new noise in each denoising step: 0 is DDIM, 1 is ancestral sampling."""
     guided_share: Share = 0.5
-    """Share of the denoising steps that are guided, which are the last ones: 0 none, 1 all (the paper's)."""
+    """Share of the denoising steps, at their end, that are guided: 0 none, 1 all (the paper's)."""
     guidance_scale: float = 1.0
     """Scale of classifier-free guidance: 1 uses the network's prediction as it is, larger values strengthen
     the condition, 0 ignores it. Values other than 1 need weights that were trained with a condition_drop
@@ -103,8 +102,8 @@ GRADIENT_MARGIN = 0.1
 GRADIENT_UNIT = 2.0
 """Gradients are divided by this and clipped to [-1, 1] before they enter the denoiser [m/rad]."""
 MAX_POINTS = 2048
-"""Larger clouds are reduced to this many random points before they are encoded. For an encoder that needs
-clouds of a fixed size, they are reduced to that size."""
+"""Clouds with more points are reduced to this many random points before they are encoded; for an encoder that
+needs clouds of a fixed size, to that size."""
 
 ClearanceFn = Callable[[ndarray], ndarray]
 """A function from joint values [count, waypoints, dof] (float32) to the clearances of the links [count,
@@ -137,10 +136,11 @@ class ModelParts(Settings):
     objective: Annotated[str, OneOf(OBJECTIVES)] = "clean"
     """What the network predicts: the clean trajectory (clean, the paper's) or the noise."""
     clearance_features: bool = True
-    """Whether the links' clearances along the noisy trajectory are network inputs (beyond the paper)."""
+    """Whether the links' clearances along the noisy trajectory are network inputs; the paper's network has no
+    such inputs."""
     clearance_gradients: bool = False
-    """Whether gradients are network inputs too: the direction in joint space that brings the arm closer to
-    obstacles, see `CollisionChecker.clearances_and_gradients`."""
+    """Whether gradients are network inputs as well: the direction in joint space that brings the arm closer
+    to obstacles, see `CollisionChecker.clearances_and_gradients`."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -153,7 +153,7 @@ class ModelParts(Settings):
 
 
 def check_points(where: str, encoder: str | None, denoiser: str) -> None:
-    """Raises InputError, naming the encoder's field, if only one of encoder and denoiser works on points."""
+    """Raises InputError if only one of encoder and denoiser works on points. where: the encoder's field."""
     if (encoder == "points") != (denoiser == "cross_attention"):
         raise InputError(
             f"{where} is {encoder} and denoiser is {denoiser}; "
@@ -219,7 +219,7 @@ class MotionModel(ABC):
         self.schedule = NoiseSchedule(settings.schedule)
         self.objective: Objective = OBJECTIVES.make(settings.objective)
         self.is_unit_joints = settings.target == "limits"
-        """Whether x is the normalized joint values themselves."""
+        """Whether x is the normalized joint values themselves, relative to nothing."""
 
     @property
     @abstractmethod
@@ -292,7 +292,7 @@ class MotionModel(ABC):
         """The denoiser's output, which `objective` converts to the clean trajectory.
 
         dropped: samples whose condition is hidden from the denoiser (Ho and Salimans 2022; paper: C is
-            randomly masked). The ends and clearances in their features stay. Only for models with
+            randomly masked). Their features still contain start, goal and clearances. Only for models with
             `null_condition`.
         """
 
@@ -319,8 +319,8 @@ class MotionModel(ABC):
     def features(
         self, x: Float[ndarray, "batch waypoints dof"], reference: Reference, clearances: ClearanceFn
     ) -> Features:
-        """The denoiser's input for a noisy x: x; the normalized joint values, unless x is these; and the
-        clearances of the links and their gradients, if the settings include them."""
+        """The denoiser's input for a noisy x: x; the normalized joint values, unless x itself is these; and,
+        if the settings include them, the clearances of the links and their gradients."""
         unit = self.unit_joints(x, reference)
         parts = [x] if self.is_unit_joints else [x, unit]
         if not self.settings.clearance_features:
@@ -355,10 +355,10 @@ class MotionModel(ABC):
         condition: Conditions,
         scale: float,
     ) -> Outputs:
-        """Classifier-free guidance: u + scale (c - u), where c is the prediction with the condition and u the
-        one without it.
+        """Classifier-free guidance: u + scale (c - u), where c and u are the outputs with and without the
+        condition.
 
-        Scales of 1 and 0 need only c or u; any other scale needs a batch of twice the size.
+        A scale of 1 needs only c, and a scale of 0 only u; any other scale needs a batch of twice the size.
         """
         if scale == 1.0:
             return self.denoised(features, level, condition)
@@ -379,13 +379,13 @@ class MotionModel(ABC):
         settings: SamplingSettings | None = None,
         guide: GuideFn | None = None,
     ) -> Float[ndarray, "samples waypoints dof"]:
-        """Trajectories from start to goal [rad], float64 with exact ends.
+        """Trajectories from start to goal [rad], float64; they begin and end exactly there.
 
         code: z of the scene, from `encode`.
         clearances: see ClearanceFn.
         settings: None: the defaults.
         guide: improves the predicted clean trajectories in the guided steps (paper, section Motion Guided
-            Generation). It need not keep the ends.
+            Generation). It may move the first and the last waypoint, which are restored.
 
         Raises InputError for more steps than the schedule has, and for a guidance_scale other than 1 if the
         model was trained without dropping its condition.
@@ -425,8 +425,8 @@ class MotionModel(ABC):
         clearances: ClearanceFn,
         guidance_scale: float = 1.0,
     ) -> Predict:
-        """The function that samplers call: it predicts the clean x from a noisy x, and fixes the ends of
-        both.
+        """The function that samplers call: it predicts the clean x from a noisy x. The first and the last
+        waypoint of both are those of the reference.
 
         guidance_scale: see `denoised_guided`.
         """
@@ -467,9 +467,12 @@ def link_clearances(checker: CollisionChecker, settings: MotionModelSettings) ->
 
 
 def _carriers(checker: CollisionChecker) -> tuple[int, list[int]]:
-    """The number of the checker's links that belong to the bare arm, and the carrier of each attached body
-    that follows them: the index of the arm's link that it is fixed to, or else of the last link that is not
-    after it in the kinematic tree."""
+    """The number of the checker's links that belong to the bare arm, and the carrier of each attached body,
+    which follow these links.
+
+    The carrier is the index of the arm's link to which the body is fixed. If that link has no clearance, it
+    is the index of the last link whose frame does not come after the body's frame in the kinematic tree.
+    """
     robot = checker.robot
     arm = [link for link in checker.links if link in robot.arm.link_names]
     fixed_to = {body.name: body.link for body in robot.attached}
@@ -485,8 +488,8 @@ def _carriers(checker: CollisionChecker) -> tuple[int, list[int]]:
 
 
 def _of_bare_arm(links: ndarray, arm_links: int, carriers: list[int]) -> ndarray:
-    """Clearances [n, links] of the links of the bare arm, for which alone a network has inputs: an attached
-    body counts as a part of the link that carries it."""
+    """Clearances [n, links] of the links of the bare arm, since networks have inputs only for these. An
+    attached body counts as a part of the link that carries it."""
     of_arm = links[:, :arm_links].copy() if carriers else links
     for body, carrier in enumerate(carriers, start=arm_links):
         of_arm[:, carrier] = np.minimum(of_arm[:, carrier], links[:, body])

@@ -32,7 +32,8 @@ def block_means(
     waypoints: int, block: int
 ) -> tuple[Float[Tensor, "blocks waypoints"], Float[Tensor, "waypoints blocks"], Float[ndarray, "blocks"]]:
     """The matrix that takes means of blocks of waypoints, the matrix that interpolates linearly between the
-    middles of the blocks, and these middles [waypoints]. The first and the last waypoint are alone."""
+    middles of the blocks, and these middles [waypoints]. The first and the last waypoint are blocks of their
+    own."""
     index = np.r_[0, 1 + np.arange(waypoints - 2) // block, 1 + (waypoints - 2) // block]
     member = np.eye(index[-1] + 1)[:, index]
     means = member / member.sum(1, keepdims=True)
@@ -70,13 +71,13 @@ class MotionNetwork(Network, MotionModel):
 
     @property
     def statistics(self) -> Statistics:
-        """See `MotionModel`; of a network on the CPU."""
+        """See `MotionModel`; the network must be on the CPU."""
         return Statistics(self.residual_scale.numpy(), self.residual_mean.numpy(), self.noise_factor.numpy())
 
     def fit_statistics(self, q: Float[ndarray, "n waypoints dof"], smooth_noise: bool) -> None:
         """Set scale, mean and covariance of the noise from trajectories [rad].
 
-        The target `limits` has no such statistics: nothing happens.
+        For the target `limits`, which has no such statistics, nothing happens.
         """
         if self.settings.target == "limits":
             return
@@ -97,7 +98,7 @@ class MotionNetwork(Network, MotionModel):
         condition: Float[Tensor, "batch condition"],
         dropped: Bool[Tensor, "batch"] | None = None,
     ) -> Float[Tensor, "batch waypoints dof"]:
-        """`MotionModel.denoised` of tensors. Raises InputError for `dropped` unless the settings have
+        """`MotionModel.denoised` for tensors. Raises InputError for `dropped` unless the settings have
         `null_condition`."""
         if dropped is not None:
             if self.null_condition is None:
@@ -112,12 +113,12 @@ class MotionNetwork(Network, MotionModel):
             return self._interpolation @ output
 
     def coarsen(self, block: int) -> None:
-        """Have the denoiser see the means of blocks of `block` waypoints; 1: single waypoints.
+        """Give the denoiser the means of blocks of `block` waypoints as its tokens; 1: single waypoints.
 
-        For white noise and a transformer with a token per waypoint. The mean of white noise over a block is
-        white noise again, with less variance. Where the motion hardly changes within a block, the mean says
-        nearly as much about it as the single waypoints. The denoiser's output is interpolated to all
-        waypoints.
+        The noise must be white, and the denoiser a transformer with a token per waypoint. The mean of white
+        noise over a block is white noise again, with less variance. If the motion hardly changes within a
+        block, the mean carries nearly as much information as the single waypoints. The denoiser's output is
+        interpolated to all waypoints.
         """
         if block == self.block:
             return
@@ -148,7 +149,7 @@ class MotionNetwork(Network, MotionModel):
             return self.encoder.code_of_ordered(torch.from_numpy(cloud)[None])[0].numpy()
 
     def exports(self) -> dict[str, bytes]:
-        """The denoiser; and the encoder, if there is one."""
+        """The denoiser, and the encoder if the model has an encoder."""
         inputs = {
             "features": torch.zeros(3, self.waypoints, self.feature_count),
             "level": torch.ones(3),

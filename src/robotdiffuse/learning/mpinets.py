@@ -18,7 +18,7 @@ Differences from the paper:
   balls of 0.2 and 0.6 m for the sparser cloud (512 and 128 of 128; 0.05 and 0.3 m); narrower layers (the
   paper's end in 1,024, then 4,096, 2,048, 2,048 features); batches of 128 at a rate of 2e-3 (10 at 1e-4);
   losses on the robot's points of the cloud (1,024).
-- *Target*: a configuration, to be reached within 1e-4 rad, where the paper's is a pose of the hand. So the
+- *Target*: a configuration, to be reached within 1e-4 rad; the paper's target is a pose of the hand. So the
   target's points are those of the whole arm at the goal, the direction to the goal configuration is a further
   input of the configuration encoder, and points are labeled by link, not only as scene, robot or target.
 - The floor, which is part of every scene, is in the collision loss but not in the cloud.
@@ -26,8 +26,8 @@ Differences from the paper:
 - The expert's motions come from our data and have 48 waypoints (paper: 50), forwards or backwards, with one
   step at rest at the end.
 - Displacements are output in units of the experts' mean step, and weights are initialized as in K. He et al.
-  (ICCV 2015): with PyTorch's defaults signals fade over the many layers, and learning takes many times as
-  long.
+  (ICCV 2015): with PyTorch's defaults, activations fade over the many layers, and training takes many times
+  as long.
 """
 
 from dataclasses import dataclass, field
@@ -73,7 +73,7 @@ COLLISION_WEIGHT = 5.0
 MARGIN = 0.03
 """Distance to the scene below which the collision loss acts [m] (the paper's)."""
 TRIVIAL_SHARE = 0.3
-"""Share of the training samples that come from trivial motions, whose straight line is free too."""
+"""Share of the training samples from trivial motions: those with a free straight line from start to goal."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class MPiNetsNetworkSettings(Settings, name="mpinets"):
     robot_points: Count = 12
     """Number of points of each moving link at the current configuration (paper: 2,048 in all)."""
     target_points: Count = 6
-    """Number of these points of each link that are given at the goal too (paper: 128 in all, of the
+    """How many of a link's `robot_points` are also given at the goal configuration (paper: 128 in all, of the
     gripper)."""
     region: VisibleRegion = field(default_factory=VisibleRegion)
     """The region in which points of the scene count."""
@@ -112,8 +112,8 @@ class MPiNetsNetworkSettings(Settings, name="mpinets"):
             )
         if self.centers[0] > self.scene_points or self.centers[1] > self.centers[0]:
             raise InputError(
-                f"mpinets.centers is {self.centers}; it must fall, from at most scene_points, "
-                f"{self.scene_points}"
+                f"mpinets.centers is {self.centers}; the first must be at most scene_points "
+                f"({self.scene_points}), and the second at most the first"
             )
         if self.cloud_widths[0] % GROUPS:
             raise InputError(
@@ -126,7 +126,7 @@ GROUPS = 16
 
 
 class PooledLayers(nn.Module):
-    """Linear layers with ReLUs on each point by itself, then the maximum over a group's points."""
+    """Linear layers with ReLUs, applied to each point separately; then the maximum over a group's points."""
 
     def __init__(self, channels: int, widths: tuple[int, ...]) -> None:
         super().__init__()
@@ -141,12 +141,11 @@ class PooledLayers(nn.Module):
 
 
 class SetAbstraction(nn.Module):
-    """Selects some of the points, with features computed from the points around each: a layer of PointNet++
-    without normalization (C. Qi et al., "PointNet++: Deep hierarchical feature learning on point sets in a
-    metric space", NeurIPS 2017).
+    """A layer of PointNet++ without normalization (C. Qi et al., "PointNet++: Deep hierarchical feature
+    learning on point sets in a metric space", NeurIPS 2017).
 
-    Around each center the nearest points of the ball are taken; the authors take the first in the cloud's
-    order.
+    It selects some of the points as centers, and computes features of each center from the nearest points in
+    a ball around it. The authors take those points of the ball that are first in the cloud's order.
     """
 
     def __init__(
@@ -174,9 +173,10 @@ def group_points(
 ) -> tuple[Int64[Tensor, "b m"], Int64[Tensor, "b m k"]]:
     """Indices of centers, by furthest point sampling, and of the points around each.
 
-    The first center is the point farthest from the mean, each further one the point farthest from the centers
-    so far. Around a center: the nearest points within the radius, beginning with the center itself; where
-    there are fewer, the center repeats. So the order of the points makes no difference.
+    The first center is the point farthest from the mean; each further center is the point farthest from the
+    centers so far. The points around a center are the nearest points within the radius, beginning with the
+    center itself; if there are too few, the center is repeated. The result does not depend on the order of
+    the points.
     """
     distances = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist")
     clouds = torch.arange(len(points))
@@ -237,7 +237,7 @@ class MPiNetsNetwork(BaselineNetwork):
         self.second = SetAbstraction(
             s.first_widths[-1], s.second_widths, s.centers[1], s.neighbors[1], RADII[1]
         )
-        # all points together; named as in the weights
+        # the layers on all points together; saved weights contain their name `layers`
         self.together = nn.ModuleDict({"layers": PooledLayers(3 + s.second_widths[-1], s.all_widths)})
         cloud_width, code = s.cloud_widths
         self.cloud_code = nn.Sequential(
@@ -261,8 +261,8 @@ class MPiNetsNetwork(BaselineNetwork):
 
     def fit_statistics(self, data: TrajectoryData) -> None:
         """Set the size of the experts' steps."""
-        some = data.q[:20_000]
-        steps = np.diff(self.normalizer.to_unit(some), axis=1)
+        motions = data.q[:20_000]
+        steps = np.diff(self.normalizer.to_unit(motions), axis=1)
         size = np.sqrt(np.square(steps).mean((0, 1)))
         self.step.copy_(torch.from_numpy(np.maximum(size, 1e-4)))
 
@@ -278,21 +278,22 @@ class MPiNetsNetwork(BaselineNetwork):
             layer = self.first(points, self._labels.expand(len(q), -1, -1))
             together = self.together["layers"](torch.cat(self.second(*layer), -1))
             cloud_code = self.cloud_code(together)
-        # bf16 would round configurations to a hundredth of a radian
+        # in fp32, since bf16 would round configurations to a hundredth of a radian
         x = self.to_unit(q)
-        way = self.to_unit(goal) - x
-        direction = 2 * way / (way.norm(dim=-1, keepdim=True) + DIRECTION_OFFSET)
+        to_goal = self.to_unit(goal) - x
+        direction = 2 * to_goal / (to_goal.norm(dim=-1, keepdim=True) + DIRECTION_OFFSET)
         code = torch.cat([cloud_code.float(), self.joint_code(torch.cat([x, direction], -1))], -1)
         return self.from_unit((x + self.step * self.decoder(code)).clamp(-1, 1))
 
     def moved(self, clouds: Float32[ndarray, "n points 3"], q: Joints, goal: Joints) -> Joints:
-        """The next configurations of arrays, in planning; q is clipped to the limits [rad]."""
+        """`forward` for arrays, in planning; q is clipped to the limits [rad]."""
         within = self.normalizer.from_unit(self.normalizer.to_unit(q).clip(-1, 1))
         with torch.inference_mode():
             return self(*map(torch.from_numpy, (clouds, within, goal))).numpy()
 
     def loss(self, data: TrajectoryData, count: int, fraction: float, rng: Generator) -> Scalar:
-        """Point match and collision of one step each of `count` motions, in units of `LOSS_UNIT`."""
+        """The losses of point match and collision on one step of each of `count` motions, in units of
+        `LOSS_UNIT`."""
         steps = self.draw(data, count, rng)
         q = self(steps.clouds, steps.q, steps.goal)
         error = self._surface(q) - self._surface(steps.expert)
@@ -304,10 +305,10 @@ class MPiNetsNetwork(BaselineNetwork):
         """Random waypoints of random motions, forwards or backwards, and the waypoints that follow them."""
         rows = data.draw(count, TRIVIAL_SHARE, rng)
         last = data.q.shape[1] - 1
-        way = np.where(rng.random(count) < 0.5, 1, -1)
+        direction = np.where(rng.random(count) < 0.5, 1, -1)
         waypoint = rng.integers(0, last + 1, count)
         waypoints = np.stack([waypoint, np.minimum(waypoint + 1, last), np.full(count, last)])
-        q, expert, goal = data.q[rows, np.where(way > 0, waypoints, last - waypoints)]
+        q, expert, goal = data.q[rows, np.where(direction > 0, waypoints, last - waypoints)]
         q = q + self.settings.noise * rng.standard_normal(q.shape, dtype=np.float32)
         q = self.normalizer.from_unit(np.clip(self.normalizer.to_unit(q), -1, 1))
         scenes = data.scenes[rows]

@@ -3,30 +3,30 @@
 A. Qureshi, Y. Miao, A. Simeonov and M. Yip, "Motion Planning Networks: Bridging the Gap Between
 Learning-based and Classical Motion Planners", T-RO 2020. Enet is a contractive auto-encoder of the obstacles'
 point cloud. Pnet is a perceptron from (z, a configuration, the goal) to the next waypoint, learned from the
-waypoints of planned paths in both directions. Its dropout stays on while it plans: that is where MPNet's
-randomness comes from. The planner around it is `baselines.mpnet`.
+waypoints of planned paths in both directions. Pnet's dropout stays on in planning, which makes MPNet's paths
+random. The planner that uses these networks is `baselines.mpnet`.
 
 Differences from the paper:
 
 - Enet and Pnet are smaller, so that they train in an hour of one core; the settings name the paper's sizes.
-- The paper trains Enet either as an auto-encoder or end to end with Pnet. Here one run does both in turn: a
-  code z that is trained only for reconstruction loses details that decide whether the arm collides, and
-  training end to end is cheap, as the waypoints of a trajectory share their z.
+- The paper trains Enet either as an auto-encoder or end to end with Pnet. Here a run begins with the first
+  and continues with the second: a code z that is trained only for reconstruction loses details that decide
+  whether the arm collides, and training end to end is cheap, as the waypoints of a trajectory share their z.
 - The paper's clouds list the obstacles in a fixed order, which a sensed cloud lacks. So points are sorted
   along a space-filling curve: neighbors in the list are neighbors in space, and a perceptron can average
   them.
 - The contractive penalty is that of S. Rifai et al., "Contractive auto-encoders", ICML 2011, as the text of
   MPNet's paper says; the equation in MPNet's paper has a sum of squared weights in place of it.
-- Pnet outputs the step to the next waypoint, in units of the data's steps, in place of the waypoint: so
-  dropout disturbs the step alone, not the arm's current configuration.
-- Dropout drops a quarter of the outputs of Pnet's hidden layers, not half: so these narrower layers keep
+- Pnet outputs the step to the next waypoint, in units of the data's steps, instead of the waypoint. So
+  dropout disturbs only the step, not the arm's current configuration.
+- Dropout drops a quarter of the outputs of Pnet's hidden layers, not half, so that these narrower layers keep
   about as many outputs as in the paper. With half, Pnet learns far less in this shorter training.
 - A training sample is a random row of one of our demonstrations and the row 0.7 rad further along the path
-  (the paper: neighboring vertices of optimized RRT* paths). On average that is a sixth of a path, and the
-  chords are 0.3 % shorter than the path. The step has the same length everywhere; if it were a fraction of
-  the path's length, the same inputs could have different targets.
-- Half of the samples have as their goal a later waypoint other than the last one: bidirectional planning and
-  replanning ask for such pairs.
+  (the paper: neighboring vertices of optimized RRT* paths). On average, 0.7 rad is a sixth of a path, and the
+  straight steps are 0.3 % shorter than the path. The step has the same length everywhere; if it were a
+  fraction of the path's length, the same inputs could have different targets.
+- Half of the samples have a random later waypoint as their goal, since bidirectional planning and replanning
+  need steps to such goals.
 """
 
 from collections.abc import Sequence
@@ -58,10 +58,9 @@ then fills the region."""
 PRETRAINING = 0.1
 """Share of the training, at its beginning, in which Enet is trained as an auto-encoder."""
 SUB_GOALS = 0.5
-"""Share of the samples whose goal is a random later waypoint of the trajectory, in place of its last one."""
+"""Share of the samples whose goal is a random later waypoint of the trajectory, instead of its last one."""
 TRIVIAL_SHARE = 0.15
-"""Share of the training trajectories that are trivial: a free straight line also joins their start and
-goal."""
+"""Share of the training trajectories that are trivial: the straight line from start to goal is free."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +70,8 @@ class MPNetSettings(Settings, name="mpnet"):
     encoder_layers: Sizes = (384, 256, 128)
     """Layers of Enet between the cloud and z (paper: 512, 256, 128)."""
     decoder_layer: Count = 128
-    """The one layer between z and the reconstruction, used in training only (paper: the mirror image of
-    Enet)."""
+    """Size of the only layer between z and the reconstruction, used only in training (paper: the mirror image
+    of Enet)."""
     code: Count = 60
     """Size of z (paper: 28, for scenes in two dimensions)."""
     contraction: NotNegative = 1e-3
@@ -80,8 +79,8 @@ class MPNetSettings(Settings, name="mpnet"):
     layers: Sizes = (768, 640, 512, 384, 320, 256, 192, 128, 128, 64, 32)
     """Layers of Pnet (paper: 1280, 1024, 896, 768, 512, 384, 256, 256, 128, 64, 32)."""
     dropout: Annotated[float, Bound(least=0.0, below=1.0)] = 0.25
-    """Share of the outputs of Pnet's layers that is dropped, in planning as in training (paper: 0.5,
-    of wider layers)."""
+    """Share of the outputs of Pnet's layers that is dropped, in planning and training (paper: 0.5, of wider
+    layers)."""
     steady_layers: Natural = 2
     """Number of Pnet's last layers without dropout (paper: nearly all have it)."""
     step: Positive = 0.7
@@ -164,10 +163,10 @@ class MPNetNetwork(BaselineNetwork):
         goal: Float32[ndarray, "n dof"],
         generator: Generator,
     ) -> Float32[ndarray, "n dof"]:
-        """`next_states` of arrays in one scene, in planning."""
+        """`next_states` for arrays in one scene, in planning."""
         with torch.inference_mode():
-            ends = torch.from_numpy(q), torch.from_numpy(goal)
-            return self.next_states(z.expand(len(q), -1), *ends, generator).numpy()
+            pairs = torch.from_numpy(q), torch.from_numpy(goal)
+            return self.next_states(z.expand(len(q), -1), *pairs, generator).numpy()
 
     def loss(self, data: TrajectoryData, count: int, fraction: float, rng: np.random.Generator) -> Scalar:
         """The auto-encoder's loss [m^2] in the first part of the training, then Pnet's, end to end through
@@ -206,8 +205,8 @@ class MPNetNetwork(BaselineNetwork):
     def training_samples(
         self, q: Float[ndarray, "scenes waypoints dof"], rng: np.random.Generator
     ) -> tuple[Float[ndarray, "n dof"], Float[ndarray, "n dof"], Float[ndarray, "n dof"]]:
-        """Configurations, the waypoints after them, and goals [rad], along trajectories in a random
-        direction."""
+        """Configurations, the waypoints one step after them, and goals [rad]. Each trajectory is used in a
+        random direction."""
         settings = self.settings
         last = q.shape[1] - 1
         spacing = np.linalg.norm(np.diff(q, axis=1), axis=2).mean(1)

@@ -1,6 +1,5 @@
-"""The base classes of trained networks, which share a checkpoint format, and the export of networks.
-
-The export is ONNX, the form in which planning runs networks.
+"""The base classes of trained networks, which share a checkpoint format, and the export of networks to ONNX,
+the format in which planning runs them.
 """
 
 import logging
@@ -29,11 +28,11 @@ LEAST_STORED_IN_HALF = 1024
 
 
 class SavedModule(nn.Module):
-    """A network in files, see `checkpoint`."""
+    """A network that is saved in files, see `checkpoint`."""
 
     def exports(self) -> dict[str, bytes]:
-        """The ONNX files that planning runs, by the ending after the network's name; empty for a network that
-        planning runs by PyTorch."""
+        """Contents of the ONNX files that planning runs, by the ending after the network's name; empty for a
+        network that planning runs with PyTorch."""
         return {}
 
 
@@ -71,13 +70,13 @@ def exported(
     inputs: Mapping[str, Tensor],
     dynamic: Mapping[str, Mapping[int, str]],
 ) -> bytes:
-    """A function of a module, called with the inputs by position, as the bytes of an ONNX file. The module is
-    frozen.
+    """A function of a module as the contents of an ONNX file. The module is frozen.
 
-    inputs: examples by the names that the inputs get in the file.
+    call: the function; it is called with the inputs by position.
+    inputs: an example of each input, by the name that the input gets in the file.
     dynamic: names of the axes whose sizes may differ from the examples, by input and axis.
 
-    Raises InputError if the packages for it are not installed.
+    Raises InputError if the packages for the export are not installed.
     """
     need_packages("saving a network", *EXPORT_PACKAGES)
     import onnx
@@ -112,9 +111,10 @@ def exported(
 
 
 def _store_in_half(graph: "GraphProto") -> None:
-    """Store large weights in fp16 where that is exact, as for weights read from a checkpoint: half the size.
+    """Store large weights in fp16 if that is exact, as it is for weights from a checkpoint. This halves the
+    file.
 
-    ONNX Runtime converts them back as it loads, so that it computes in fp32.
+    ONNX Runtime converts them back when it loads the file, so it computes in fp32.
     """
     from onnx import TensorProto, helper, numpy_helper
 
@@ -133,7 +133,8 @@ def _store_in_half(graph: "GraphProto") -> None:
 
 @contextmanager
 def _quietly() -> Iterator[None]:
-    """Without the exporter's warnings about packages that it does not need, and its own deprecations."""
+    """A context without the exporter's warnings, about packages that it does not need and about its own
+    deprecated functions."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)

@@ -1,7 +1,7 @@
 """Files of trained networks, read without PyTorch.
 
-NAME.json describes a network and holds the SHA-256 of its other files: NAME.safetensors, the weights that
-training reads, and NAME.onnx and others with that ending, the exported parts that planning runs.
+NAME.json describes a network and holds the SHA-256 of its other files. NAME.safetensors holds the weights for
+training. NAME.onnx, and further files that end in .onnx, hold the exported parts that planning runs.
 """
 
 import hashlib
@@ -41,7 +41,7 @@ class RobotIdentity(Settings):
     joint_names: tuple[str, ...]
     lower: tuple[float, ...]
     """Limits by which joint values are normalized [rad], [m] for prismatic joints. The weights can be used
-    for the robot with other limits too: validation uses the limits of the robot itself."""
+    even if the robot now has other limits: validation uses the robot's own limits."""
     upper: tuple[float, ...]
     frame_offsets: tuple[tuple[tuple[float, ...], ...], ...]
     """`Robot.frame_offsets`, to distinguish robots with the same joint names but other dimensions."""
@@ -60,8 +60,7 @@ class RobotIdentity(Settings):
     @staticmethod
     @once_per_robot
     def of(robot: Robot) -> "RobotIdentity":
-        """The identity of a robot: that of its bare arm, since attached bodies change nothing about its
-        joints."""
+        """The identity of a robot's bare arm, since attached bodies do not change the joints."""
         robot = robot.arm
         return RobotIdentity(
             source=robot.source or robot.name,
@@ -81,17 +80,17 @@ class RobotIdentity(Settings):
 
     def difference(self, robot: Robot) -> str:
         """How the robot differs from this one; "" if it is the same."""
-        its = RobotIdentity.of(robot)
-        if its.joint_names != self.joint_names:
-            return f"joints {joined(its.joint_names)}"
-        if not np.allclose(its.frame_offsets, self.frame_offsets, atol=DIMENSION_TOLERANCE):
+        other = RobotIdentity.of(robot)
+        if other.joint_names != self.joint_names:
+            return f"joints {joined(other.joint_names)}"
+        if not np.allclose(other.frame_offsets, self.frame_offsets, atol=DIMENSION_TOLERANCE):
             return "other dimensions"
-        if its.links != self.links:
-            return f"spheres on the links {joined(its.links)}, not {joined(self.links)}"
+        if other.links != self.links:
+            return f"spheres on the links {joined(other.links)}, not {joined(self.links)}"
         return ""
 
     def check(self, robot: Robot, where: str) -> None:
-        """Raises InputError unless the weights are for this robot. where: names the weights in the
+        """Raises InputError unless the weights are for this robot. where: name of the weights, for the
         message."""
         difference = self.difference(robot)
         if difference:
@@ -122,7 +121,7 @@ NETWORKS = Registry(
         ),
         "trajectory_prior": Entry(
             "robotdiffuse.learning.motion_network:MotionNetwork",
-            "the same model without an encoder, for MPD and EDMP",
+            "the diffusion model without an encoder, for MPD and EDMP",
             "robotdiffuse.learning.motion_model:MotionModelSettings",
             "planner --config trajectory_prior --data FOLDER --out FOLDER",
         ),
@@ -138,7 +137,7 @@ def stamp(folder: FilePath, name: str) -> tuple[int, int] | None:
     """Modification time [ns] and inode of NAME.json, the file that training writes last; None if there is
     none.
 
-    Cached networks are reused while it stays the same.
+    A cached network is reused as long as the stamp stays the same.
     """
     try:
         status = (folder / f"{name}.json").stat()
@@ -195,7 +194,8 @@ def exported_files(folder: FilePath, name: str, about: dict[str, Any]) -> dict[s
 def read_arrays(
     folder: FilePath, name: str, about: dict[str, Any], keys: Iterable[str]
 ) -> dict[str, ndarray]:
-    """The tensors `keys`, as far as NAME.safetensors has them. Raises InputError if it cannot be read."""
+    """The tensors of NAME.safetensors with these names, without those that the file lacks. Raises InputError
+    if the file cannot be read."""
     file = folder / f"{name}.safetensors"
     data = checked_bytes(file, about.get("weights_sha256"), f"{name}.json")
     try:
@@ -236,13 +236,13 @@ def _identity(name: str, folder: FilePath) -> RobotIdentity:
 
 
 def folder_of(folder: str | FilePath) -> FilePath:
-    """The folder of weights, given by its path or, for one that comes with the package, by its name."""
+    """The folder of weights for its path or, if the folder comes with the package, for its name."""
     place = FilePath(folder)
     return place if os.path.exists(place) or not os.path.isdir(BUNDLED / folder) else BUNDLED / folder
 
 
 def check_weights(name: str, folder: str | FilePath | None) -> None:
-    """Raises InputError if a folder is given that holds no weights of this network."""
+    """Raises InputError if the given folder holds no weights of this network; None is accepted."""
     NETWORKS.entry(name)
     if folder is not None and not is_file(folder_of(folder) / f"{name}.json"):
         message = f"{folder} holds no {name}" if os.path.isdir(folder) else f"there are no weights {folder}"

@@ -1,8 +1,8 @@
-"""The pose of a camera, estimated from views of the arm: image points are fitted to its surface.
+"""The pose of a camera, estimated from views of the arm: image points are fitted to the arm's surface.
 
-Points are matched with the nearest point of the surface, along its normal (Y. Chen and G. Medioni, "Object
-modelling by registration of multiple range images", 1992), weighted by Geman and McClure's function, whose
-width falls from round to round.
+Each image point is matched with the nearest point of the surface; its error is their distance along the
+surface's normal (Y. Chen and G. Medioni, "Object modelling by registration of multiple range images", 1992).
+Errors are weighted by Geman and McClure's function, whose width shrinks from round to round.
 """
 
 from collections.abc import Sequence
@@ -30,17 +30,16 @@ from robotdiffuse.perception.visibility import surface_balls
 from robotdiffuse.robots.robot import Robot
 
 GATES = np.geomspace(0.15, 0.012, 25)
-"""One distance for each round of the estimate, falling [m]: points farther from the arm than this are ignored
-in the round."""
+"""For each round of the estimate, the distance beyond which points are too far from the arm to count [m]."""
 MAX_POINTS = 1500
 """Approximate number of points of a view that an estimate uses."""
 MODEL_CELL = 0.01
-"""One point of the arm's surface is used for each cell of this edge [m]."""
+"""One point of the arm's surface is used in each cubic cell with this edge [m]."""
 NEIGHBORS = 10
 """Number of neighboring points of the surface from which a normal is estimated."""
 POINTS_PER_ERROR = 25
-"""Errors of neighboring points are correlated: in the covariance, this many points count as one independent
-measurement."""
+"""Number of points that count as one independent measurement in the covariance, because the errors of
+neighboring points are correlated."""
 
 
 def offset(first: Pose, second: Pose) -> tuple[float, float]:
@@ -51,14 +50,14 @@ def offset(first: Pose, second: Pose) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
-    """The pose of a camera, as views of the arm show it."""
+    """The pose of a camera, estimated from views of the arm."""
 
     T_base_camera: Pose
     covariance: Float[ndarray, "6 6"]
-    """Of the position [m] and the rotation vector [rad] of the camera, in the base frame."""
+    """Covariance of the camera's position [m] and rotation vector [rad], in the base frame."""
     agreement: float
-    """Of the image cells in which the arm should be visible, the share whose measured depth is that of the
-    arm's model."""
+    """Fraction of the image cells that should show the arm in which the measured depth is that of the arm's
+    model."""
 
     @property
     def pose_deviation(self) -> tuple[float, float]:
@@ -73,9 +72,9 @@ def calibrate_camera(views: Sequence[DepthView], robot: Robot) -> CameraCalibrat
     """Estimate the pose of a fixed camera from views of the arm in several configurations.
 
     Args:
-        views: Depth images of one camera, each with the arm's configuration. The search begins at their
-            `T_base_camera`. It must be within about 10 cm and 5 degrees of the true pose, or become so once
-            one of the usual mistakes is undone (an inverse, the axes of OpenGL, ...).
+        views: Depth images of one camera, each with the arm's configuration. The estimate begins at their
+            `T_base_camera`, which must be within about 10 cm and 5 degrees of the true pose. It may also
+            contain one of the usual mistakes (an inverse, the axes of OpenGL, ...), which is undone first.
         robot: The robot in the images.
 
     Returns:
@@ -99,14 +98,15 @@ def calibrate_camera(views: Sequence[DepthView], robot: Robot) -> CameraCalibrat
     first, q = each[0]
     if any(not np.allclose(view.T_base_camera, first.T_base_camera) for view in views):
         raise InputError("views differ in T_base_camera; calibrate_camera takes views of one fixed camera")
-    begins = [first, *(other for _, other in mistakes(first) if other.intrinsics == first.intrinsics)]
-    scores = [share * (count >= MIN_CELLS) for share, _, count in (agreement(v, robot, q) for v in begins)]
+    candidates = [first, *(view for _, view in mistakes(first) if view.intrinsics == first.intrinsics)]
+    scores = [s * (count >= MIN_CELLS) for s, _, count in (agreement(v, robot, q) for v in candidates)]
     best = int(np.argmax(scores))
-    T = begins[best if scores[best] > BETTER * scores[0] else 0].T_base_camera
+    T = candidates[best if scores[best] > BETTER * scores[0] else 0].T_base_camera
     models = [arm_surface(robot, q) for _, q in each]
     points = [_near_arm(view, T, tree) for (view, _), (tree, _, _) in zip(each, models, strict=True)]
     hessian = np.eye(6)
     spread = 0.0
+    # Gauss-Newton steps: A holds the derivatives of the errors e by the camera's position and rotation
     for gate in GATES:
         rows = list[ndarray]()
         errors = list[ndarray]()
@@ -148,8 +148,11 @@ def arm_surface(robot: Robot, q: Configuration) -> tuple[KDTree, Points, Points]
 
 
 def neighborhoods(points: Points, tree: KDTree, count: int) -> tuple[Points, Float[ndarray, "n 3 3"]]:
-    """Squared sizes of the `count` points nearest to each point, along their principal axes, the smallest
-    first; and these axes as columns, of which the first is the normal of a surface."""
+    """Extents and principal axes of the `count` points nearest to each point.
+
+    Returns the squared extents [n, 3] along the axes, the smallest first, and the axes as the columns of n
+    matrices. If the points lie on a surface, the first axis is its normal.
+    """
     around = points[tree.query(points, k=count)[1]]
     off = around - around.mean(axis=1, keepdims=True)
     sizes, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", off, off))
@@ -157,7 +160,7 @@ def neighborhoods(points: Points, tree: KDTree, count: int) -> tuple[Points, Flo
 
 
 def _near_arm(view: DepthView, T: Pose, tree: KDTree) -> Points:
-    """Points of an image in the camera's frame that are near the arm if the camera is about at T."""
+    """Points of an image that may be on the arm if the camera is at about T, in the camera's frame [m]."""
     stride = max(1, round(STEP_ANGLE * view.intrinsics[0] / 2))
     fx, fy, cx, cy = (value / stride for value in view.intrinsics)
     points = DepthView(view.depth[::stride, ::stride], (fx, fy, cx, cy), np.eye(4)).points()

@@ -1,4 +1,4 @@
-"""A camera checked against the arm that it sees: mistakes in its pose and intrinsics are named."""
+"""Checks a camera's pose and intrinsics against the arm in its image, and names mistakes in them."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -13,37 +13,42 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
 STEP_ANGLE = 0.01
-"""The arm is drawn in cells of this angle [rad]."""
+"""Angular width of the image cells in which measured depths and the arm's are compared [rad]."""
 SAME_DEPTH = 0.03
-"""Depths that differ by less than this are of the same surface [m]."""
+"""Depths that differ by less than this belong to the same surface [m]."""
 SPHERES_AHEAD = 0.01
-"""The surfaces of the arm's covering spheres are so much ahead of its own, about [m]."""
+"""How far the arm's covering spheres are in front of its surface, approximately [m]."""
 NOTHING = Scene(())
 MIN_CELLS = 40
-"""Fewer cells with the arm in them say nothing."""
+"""With fewer cells that show the arm, the camera cannot be checked."""
 MIN_AGREEMENT = 0.6
-"""Part of the arm's cells that have the arm's depth, at least, where the camera is as stated, within cm."""
+"""If at least this fraction of the arm's cells has the arm's depth, the camera is correct to centimeters."""
 MIN_NAMED = 0.4
-"""Part of them that must agree once a mistake is undone: things before the arm may hide it."""
+"""A mistake is named only if at least this fraction agrees once it is undone. The fraction is below
+MIN_AGREEMENT, since objects in front of the arm may hide it."""
 BETTER = 1.5
-"""A mistake is named if without it the agreement is this many times as high."""
+"""A mistake is named only if undoing it raises the agreement by at least this factor."""
 MIN_THROUGH = 0.35
-"""Images that see through a larger part of the arm are not from where they say."""
+"""An image that sees through at least this fraction of the arm gets a note even if no mistake explains it."""
 OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""T_link_optical: x ahead, y left and z up, as ROS has bodies, to the optical frame."""
+"""T_body_optical: maps the optical frame to a body's frame in ROS (x ahead, y left, z up)."""
 FOCAL_FACTORS = (0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0)
+"""Factors for the focal length that are tried, in case the image was resized after the calibration."""
 
 
 def agreement(view: DepthView, robot: Robot, q: Configuration) -> tuple[float, float, int]:
-    """Of the cells of an image with the arm in them, the part whose depth is the arm's, the part that sees
-    through it, and their number."""
+    """Compares an image with the arm's model at a configuration.
+
+    Returns, for the image cells in which the model shows the arm: the fraction whose depth is the arm's, the
+    fraction that sees through the arm (larger depths), and the number of these cells.
+    """
     step = max(1, round(STEP_ANGLE * view.intrinsics[0]))
     cells = view.depth[step // 2 :: step, step // 2 :: step]
     fx, fy, cx, cy = view.intrinsics
     coarse = (fx / step, fy / step, (cx - step // 2) / step, (cy - step // 2) / step)
     arm = ray_cast(NOTHING, view.T_base_camera, coarse, cells.shape[::-1], robot, q).depth
-    told = np.isfinite(arm) & (cells > 0)
-    behind = cells[told] - arm[told] - SPHERES_AHEAD
+    compared = np.isfinite(arm) & (cells > 0)
+    behind = cells[compared] - arm[compared] - SPHERES_AHEAD
     if not len(behind):
         return 0.0, 0.0, 0
     same = np.abs(behind) < SAME_DEPTH
@@ -51,7 +56,7 @@ def agreement(view: DepthView, robot: Robot, q: Configuration) -> tuple[float, f
 
 
 def mistakes(view: DepthView) -> Iterator[tuple[str, DepthView]]:
-    """Mistakes that users make, and the view without each."""
+    """Yields common mistakes, each as its description and the view with the mistake undone."""
     T = view.T_base_camera
     inverse = np.linalg.inv(T)
     flipped = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -75,8 +80,11 @@ def mistakes(view: DepthView) -> Iterator[tuple[str, DepthView]]:
 
 
 def camera_note(view: DepthView, robot: Robot, start: Configuration) -> str:
-    """What is wrong with a view's camera, as the arm in the image shows; "" if nothing is, or it shows too
-    little. The last results are cached: calls with the same views ask for them again."""
+    """What is wrong with a view's camera, judged by the arm in the image; "" if nothing is wrong, or if too
+    little of the arm is visible. The last 32 results are cached, as several calls may use the same view.
+
+    start: the arm's configuration if the view states none.
+    """
     q = start if view.configuration is None else view.configuration
     return _camera_note(view, robot, tuple(q.tolist()))
 
@@ -84,11 +92,11 @@ def camera_note(view: DepthView, robot: Robot, start: Configuration) -> str:
 @lru_cache(maxsize=32)
 def _camera_note(view: DepthView, robot: Robot, joint_values: tuple[float, ...]) -> str:
     q = np.array(joint_values)
-    found, through, count = agreement(view, robot, q)
-    if count >= MIN_CELLS and found >= MIN_AGREEMENT:
+    agreed, through, count = agreement(view, robot, q)
+    if count >= MIN_CELLS and agreed >= MIN_AGREEMENT:
         return ""
     best = ""
-    highest = max(MIN_NAMED, BETTER * found if count >= MIN_CELLS else 0.0)
+    highest = max(MIN_NAMED, BETTER * agreed if count >= MIN_CELLS else 0.0)
     for name, other in mistakes(view):
         agrees, _, cells = agreement(other, robot, q)
         if cells >= MIN_CELLS and agrees > highest:
@@ -97,6 +105,6 @@ def _camera_note(view: DepthView, robot: Robot, joint_values: tuple[float, ...])
     if best or count < MIN_CELLS or through < MIN_THROUGH:
         return best
     return (
-        f"the image sees through {100 * through:.0f} % of the arm, as its model stands there: calibrate the"
-        " camera, check the joint positions, or state pose_deviation"
+        f"the image sees through {100 * through:.0f} % of where the arm should be: calibrate the camera,"
+        " check the joint positions, or state pose_deviation"
     )

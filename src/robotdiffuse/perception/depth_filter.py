@@ -16,18 +16,19 @@ from robotdiffuse.core.types import Points, Values
 from robotdiffuse.perception.depth_view import NEAREST, DepthNoise, DepthView
 
 MIN_RETURNS = 4
-"""A pixel with fewer returns among its 3 x 3 counts as without a return."""
+"""A pixel with a return is kept if its 3 x 3 neighborhood has at least this many returns, itself included."""
 MIN_AROUND = 6
-"""A pixel without a return but with so many around it is a dropout of a surface, not a thing of its own."""
+"""A pixel without a return is filled if its 3 x 3 neighborhood has at least this many returns: it is then a
+dropout on a surface."""
 
 
 @kernel(nogil=True)
 def median_filter(depth):
-    """Each pixel with a return, and those without one among many with, as the median of the returns of its
-    3 x 3 pixels, the nearer one of two; 0 elsewhere."""
+    """The median of the returns in the 3 x 3 neighborhood of each pixel; of an even number of returns, the
+    nearer of the two in the middle. 0 where the returns are fewer than MIN_RETURNS or MIN_AROUND."""
     h, w = depth.shape
     out = np.zeros((h, w), np.float32)
-    some = np.empty(9, np.float32)
+    returns = np.empty(9, np.float32)  # sorted, the nearest first
     for v in range(h):
         for u in range(w):
             count = 0
@@ -37,28 +38,29 @@ def median_filter(depth):
                     if not d > 0:
                         continue
                     at = count
-                    while at > 0 and some[at - 1] > d:
-                        some[at] = some[at - 1]
+                    while at > 0 and returns[at - 1] > d:
+                        returns[at] = returns[at - 1]
                         at -= 1
-                    some[at] = d
+                    returns[at] = d
                     count += 1
             if count >= (MIN_RETURNS if depth[v, u] > 0 else MIN_AROUND):
-                out[v, u] = some[(count - 1) // 2]
+                out[v, u] = returns[(count - 1) // 2]
     return out
 
 
 SQUARE = 11
-"""Edge of the squares in which surfaces are smoothed [pixels]."""
+"""Edge of the squares in which flat surfaces are smoothed [pixels]."""
 FLATNESS = 3.0
-"""A square is flat if the variance of inverse depth about a plane is at most this many times that of the
-noise."""
+"""A square is flat if the variance of inverse depth about the fitted plane is at most this many times the
+variance of the noise."""
 
 
 def smoothed(depth: Float32[ndarray, "h w"], spread: float) -> tuple[Float32[ndarray, "h w"], float]:
-    """The image with each pixel in the middle of a flat square at the depth of the plane through the square,
-    and the share of these pixels among those with a return.
+    """The image, smoothed on flat surfaces, and the share of smoothed pixels among the pixels with a return.
 
-    On a plane, inverse depth is a linear function of the pixel: in the middle it is the mean of the square.
+    If the square of SQUARE pixels around a pixel is flat, the pixel gets the depth of the plane through the
+    square. On a plane, inverse depth is a linear function of the pixel, so its value in the middle is the
+    mean of the square. spread: standard deviation of depth at a distance of 1 m [m].
     """
     from scipy.ndimage import correlate1d, uniform_filter, uniform_filter1d
 
@@ -77,15 +79,16 @@ def smoothed(depth: Float32[ndarray, "h w"], spread: float) -> tuple[Float32[nda
 
 
 PATCH = 20
-"""Edge of the patches on which noise is estimated [pixels]: a few times the correlation length of the errors
-of recorded sensors."""
-# Smallest number of patches for an estimate, and largest number that is used, spread over the image.
+"""Edge of the patches on which noise is estimated [pixels]: several times the correlation length of errors
+that was measured on recorded sensors."""
+# An estimate needs at least MIN_PATCHES; at most about MAX_PATCHES, spread over the image, are used.
 MIN_PATCHES = 12
 MAX_PATCHES = 100
 MIN_PATCH_RETURNS = 0.7
 """Patches with a smaller fraction of returns are ignored."""
 FLAT_SHARE = 0.3
-"""The noise is this quantile of the patches' noise, since patches with more hold edges and objects."""
+"""The image's noise is this quantile of its patches' noise, since patches with more noise contain edges or
+objects."""
 FIT_ROUNDS = 3
 """Rounds of the fit of a plane; each round after the first ignores pixels beyond OUTLIER_SPREADS."""
 OUTLIER_SPREADS = 3.0
@@ -93,31 +96,31 @@ MIN_SPREAD = 4e-4
 """Images with less noise than this, at a distance of 1 m [m], are not filtered, since the filter removes
 objects that are one pixel wide."""
 MARGIN_SPREADS = 3.75
-"""Points within this many standard deviations of the filtered depth from the arm may be points of the arm."""
+"""Points may belong to the arm if they are this many standard deviations of the filtered depth from it."""
 MEDIAN_SPREAD = 0.4
-"""Standard deviation of the median of nine independent numbers, relative to theirs."""
+"""Standard deviation of the median of nine independent numbers, relative to that of one number."""
 MEDIAN_LENGTH = 0.85
-"""Correlation length of their medians in an image [pixels], as of `DepthNoise`."""
+"""Correlation length that the median filter gives to independent errors [pixels], as in `DepthNoise`."""
 
 
 class FilteredDepth(NamedTuple):
-    """A depth image to use, and its noise: standard deviations at a distance of 1 m, which grow with the
-    square of the distance [m]."""
+    """A filtered depth image, and the noise that it still has, as standard deviations of depth at a distance
+    of 1 m [m]. Noise grows with the square of the distance."""
 
     depth: Float32[ndarray, "h w"]
     """Distance along the optical axis, as in DepthView [m]."""
     spread: float
-    """Of all pixels with a return."""
+    """Noise of all pixels with a return."""
     edge_spread: float
-    """Of those that are not on a flat surface."""
+    """Noise of the pixels that are not on a flat surface."""
 
 
 @lru_cache(maxsize=32)
 def filtered(view: DepthView) -> FilteredDepth:
     """The view's image; if it is noisy, filtered by `median_filter` and `smoothed`.
 
-    Images made from clouds count as images without noise, since their pixels are not those of a sensor. The
-    last results are cached: a call with views uses the same ones several times.
+    Images made from clouds count as free of noise, since their pixels are not those of a sensor. The last 32
+    results are cached, because planning with views uses each image several times.
     """
     depth = np.maximum(for_kernels(view.depth, np.float32), np.float32(0.0))
     if view.cloud is not None:
@@ -131,18 +134,19 @@ def filtered(view: DepthView) -> FilteredDepth:
         spread, neighbor_correlation = patch_noise(depth)
         squared_length = correlation_length(neighbor_correlation) ** 2
     else:
-        # the correlated part of the errors of near pixels is not filtered out by the median
+        # the median does not reduce the part of the errors that neighboring pixels have in common
         together = np.exp(-1 / noise.correlation**2) if noise.correlation > 0 else 0.0
         spread *= MEDIAN_SPREAD + (1 - MEDIAN_SPREAD) * float(together)
         squared_length = noise.correlation**2 + MEDIAN_LENGTH**2
     smooth, flat_share = smoothed(depth, spread)
-    left = min(1.0, 2 * np.pi * squared_length / SQUARE**2)  # of the variance: errors are alike in this area
+    # the part of the variance that smoothing leaves: errors are alike in an area of 2 pi length^2
+    left = min(1.0, 2 * np.pi * squared_length / SQUARE**2)
     return FilteredDepth(smooth, spread * float(np.sqrt(1 - flat_share * (1 - left))), spread)
 
 
 def patch_noise(depth: Float32[ndarray, "h w"]) -> tuple[float, float]:
     """The standard deviation of an image's depth at a distance of 1 m [m], measured on flat patches, and the
-    correlation of the errors of neighboring pixels; 0, 0 for images with few returns.
+    correlation of the errors of neighboring pixels; both are 0 for images with few returns.
 
     On a flat surface, inverse depth is a linear function of the pixel. If the error of depth grows with the
     square of the depth, the error of inverse depth is the same everywhere.
@@ -162,6 +166,7 @@ def patch_noise(depth: Float32[ndarray, "h w"]) -> tuple[float, float]:
     products = (basis[:, None] * basis[None]).reshape(9, -1)
     errors = inverse
     spreads = np.zeros(len(seen))
+    # fit a linear function of the pixel to the inverse depths of each patch, robustly
     for _ in range(FIT_ROUNDS):
         normal = (seen @ products.T).reshape(-1, 3, 3) + 1e-9 * np.eye(3)
         fit = np.linalg.solve(normal, ((seen * inverse) @ basis.T)[..., None])[..., 0]
@@ -169,81 +174,86 @@ def patch_noise(depth: Float32[ndarray, "h w"]) -> tuple[float, float]:
         middle = np.nanmedian(np.where(seen, np.abs(errors), np.nan), axis=1)
         spreads = np.sqrt((seen * errors**2).sum(axis=1) / np.maximum(seen.sum(axis=1) - 3, 1))
         seen = seen & (np.abs(errors) <= OUTLIER_SPREADS * 1.4826 * middle[:, None] + 1e-7)
-    order = np.argsort(spreads)[: int(FLAT_SHARE * len(spreads)) + 1]
-    of_flat = np.where(seen[order], errors[order], 0.0).reshape(-1, PATCH, PATCH)
-    both = seen[order].reshape(-1, PATCH, PATCH)
+    # the correlation of horizontal neighbors in the flattest patches
+    flattest = np.argsort(spreads)[: int(FLAT_SHARE * len(spreads)) + 1]
+    residuals = np.where(seen[flattest], errors[flattest], 0.0).reshape(-1, PATCH, PATCH)
+    both = seen[flattest].reshape(-1, PATCH, PATCH)
     both = both[:, :, 1:] & both[:, :, :-1]
-    products = (of_flat[:, :, 1:] * of_flat[:, :, :-1])[both]
-    squares = (0.5 * (of_flat[:, :, 1:] ** 2 + of_flat[:, :, :-1] ** 2))[both]
-    return float(spreads[order[-1]]), float(products.sum() / max(squares.sum(), 1e-30))
+    products = (residuals[:, :, 1:] * residuals[:, :, :-1])[both]
+    squares = (0.5 * (residuals[:, :, 1:] ** 2 + residuals[:, :, :-1] ** 2))[both]
+    return float(spreads[flattest[-1]]), float(products.sum() / max(squares.sum(), 1e-30))
 
 
 def correlation_length(neighbor_correlation: float) -> float:
-    """The correlation length of errors, as of `DepthNoise`, from the correlation of neighbors [pixels]."""
+    """The correlation length of errors [pixels], as in `DepthNoise`, for the correlation of the errors of
+    neighboring pixels."""
     if neighbor_correlation <= np.exp(-2):
         return 0.0
     return float(1 / np.sqrt(-2 * np.log(min(neighbor_correlation, 0.98))))
 
 
 EMPTY_EDGE = 6
-"""Smallest width and height of a region without returns that may count as empty [two pixels]. Dropouts at
-edges and on surfaces at a small angle are thinner."""
+"""Smallest width and height of a region without returns that may count as empty, in pixels of an image of
+half the resolution. Dropouts at edges and on grazed surfaces are thinner."""
 CUT_SHARE = 0.25
 """If the returns end along one row or column over this fraction of the image, the image counts as cropped,
 since the edges of objects are hardly ever so straight."""
 AT_RANGE = 0.8
-"""Surfaces beyond this fraction of the range may leave the range there."""
+"""Beyond this fraction of the range, returns may end because the surface leaves the range."""
 TOO_NEAR = 0.3
-"""A region without returns may be a surface too near to be measured, if returns beside it are nearer than
-this [m]..."""
+"""A region without returns may be a surface too near to be measured. It counts as one if returns beside it
+are nearer than this [m] along at least NEAR_SHARE of its border."""
 NEAR_SHARE = 0.05
-"""... along at least this fraction of its border."""
 
 
 def empty_regions(
     depth: Float32[ndarray, "h w"], reach: float | None = None, arm: Bool[ndarray, "h w"] | None = None
 ) -> Bool[ndarray, "h w"] | None:
-    """The pixels without a return (0 or NaN) where nothing seems to be in range: large regions that reach the
-    border of the image, and whose neighbors are not near. None if there are none, or if the image is cropped.
+    """The pixels without a return (0 or NaN) where nothing seems to be in range: large regions at the border
+    of the image with no near surface beside them. None if no pixel is such, or if the image is cropped.
 
-    A region inside the image may be a dark or reflecting surface, and does not count. reach: the sensor's
-    range [m] if known; a floor may end there along one row. arm: the pixels of the arm, which may be near.
+    Regions that do not reach the border are left out, since they may be dark or reflecting surfaces. reach:
+    the sensor's range [m] if known; a floor may end there along one row. arm: the pixels of the arm, which
+    may be near.
     """
-    every = ~(depth > 0)
-    lost = every[::2, ::2]
-    if not lost.any() or every.all():
+    no_return = ~(depth > 0)
+    lost = no_return[::2, ::2]
+    if not lost.any() or no_return.all():
         return None
     from scipy.ndimage import label, maximum_filter, minimum_filter
 
     core = minimum_filter(lost.view(np.uint8), EMPTY_EDGE, mode="nearest")
     large_regions = np.asarray(maximum_filter(core, EMPTY_EDGE, mode="nearest", origin=-1) > 0) & lost
-    part = depth[::2, ::2]
-    near = ~lost & (part < AT_RANGE * (np.inf if reach is None else reach))
+    half = depth[::2, ::2]
+    near = ~lost & (half < AT_RANGE * (np.inf if reach is None else reach))
+    # cropped: the first row with a near surface, from any side, lies along a region in many columns
     kinds = large_regions + 2 * near
-    for across in (kinds, kinds.T, kinds[::-1], kinds.T[::-1]):
-        first = int((across == 2).any(axis=1).argmax())
-        if first and (across[first - 1] + across[first] == 3).mean() > CUT_SHARE:
+    for rows in (kinds, kinds.T, kinds[::-1], kinds.T[::-1]):
+        first = int((rows == 2).any(axis=1).argmax())
+        if first and (rows[first - 1] + rows[first] == 3).mean() > CUT_SHARE:
             return None
-    parts: Int32[ndarray, "h w"] = label(large_regions)[0]  # type: ignore[assignment,index]
-    inside = np.zeros(int(parts.max()) + 1, np.bool_)
-    for border in (parts[0], parts[-1], parts[:, 0], parts[:, -1]):
-        inside[border] = True
-    too_near = part < TOO_NEAR if arm is None else (part < TOO_NEAR) & ~arm[::2, ::2]
-    around = np.zeros((2, len(inside)))
-    for of, seen, close in ((parts, ~lost, too_near), (parts.T, ~lost.T, too_near.T)):
-        for one, other in ((slice(1, None), slice(-1)), (slice(-1), slice(1, None))):
-            beside = seen[other]
-            for row, weights in enumerate((None, close[other][beside])):
-                around[row] += np.bincount(of[one][beside], weights, len(inside))
-    inside &= around[1] < NEAR_SHARE * around[0]
-    inside[0] = False
+    regions: Int32[ndarray, "h w"] = label(large_regions)[0]  # type: ignore[assignment,index]
+    is_empty = np.zeros(int(regions.max()) + 1, np.bool_)
+    for border in (regions[0], regions[-1], regions[:, 0], regions[:, -1]):
+        is_empty[border] = True
+    too_near = half < TOO_NEAR if arm is None else (half < TOO_NEAR) & ~arm[::2, ::2]
+    # for each region, the number of returns beside it, and the number of near ones
+    beside = np.zeros((2, len(is_empty)))
+    for numbers, seen, close in ((regions, ~lost, too_near), (regions.T, ~lost.T, too_near.T)):
+        for own, neighbor in ((slice(1, None), slice(-1)), (slice(-1), slice(1, None))):
+            returns = seen[neighbor]
+            for row, weights in enumerate((None, close[neighbor][returns])):
+                beside[row] += np.bincount(numbers[own][returns], weights, len(is_empty))
+    is_empty &= beside[1] < NEAR_SHARE * beside[0]
+    is_empty[0] = False
     height, width = depth.shape
-    return inside[parts].repeat(2, 0).repeat(2, 1)[:height, :width] & every if inside.any() else None
+    empty = is_empty[regions].repeat(2, 0).repeat(2, 1)[:height, :width] & no_return
+    return empty if is_empty.any() else None
 
 
 GRAZED_WIDTH = 0.04
-"""Open space begins this far from a surface in the image, at its depth [m]: a board that is seen almost
-edge-on gives no return either."""
+"""A board that is seen almost edge-on gives no return either. Hence pixels without a return closer to a
+surface in the image than this, measured at the surface's depth, do not show open space behind it [m]."""
 DEPTH_FACTOR = 1.5
 """Surfaces whose depths differ by less than this factor are widened by the same number of pixels."""
 
@@ -251,14 +261,17 @@ DEPTH_FACTOR = 1.5
 def open_depth(
     depth: Float32[ndarray, "h w"], arm: Bool[ndarray, "h w"], focal: float
 ) -> Float32[ndarray, "h w"]:
-    """For pixels without a return where nothing seems to be in range: infinite, but -d within GRAZED_WIDTH of
-    a surface of depth d that is not the arm's, the nearest one, see `observed_volume`. focal: focal length
-    [pixels]."""
+    """The depths to assume for pixels without a return where nothing seems to be in range.
+
+    They are infinite, except within GRAZED_WIDTH of a surface other than the arm. There they are -d for the
+    nearest such surface, of depth d: only the space up to d is free; see `observed_volume`. focal: focal
+    length [pixels].
+    """
     from scipy.ndimage import minimum_filter
 
-    part = depth[::2, ::2]
-    surface = np.where((part > 0) & ~arm[::2, ::2], part, np.float32(np.inf))
-    opening = np.full(part.shape, np.inf, np.float32)
+    half = depth[::2, ::2]
+    surface = np.where((half > 0) & ~arm[::2, ::2], half, np.float32(np.inf))
+    opening = np.full(half.shape, np.inf, np.float32)
     nearest = float(surface.min())
     while np.isfinite(nearest):
         layer = np.where(surface < DEPTH_FACTOR * nearest, surface, np.float32(np.inf))
@@ -272,13 +285,13 @@ def open_depth(
 
 
 MIN_RETURN_SHARE = 1e-3
-"""Images with a smaller fraction of returns measure nothing: the camera is covered, broken or faces
-nothing."""
+"""An image with a smaller fraction of returns counts as measuring nothing: the camera is covered, broken or
+faces nothing."""
 
 
 def measured_share(view: DepthView) -> float:
-    """The fraction of an image's pixels that measure something: a surface, or that nothing is in range. 0 if
-    hardly a pixel measures a surface."""
+    """The fraction of an image's pixels that measure a surface, or show that nothing is in range. 0 if fewer
+    than MIN_RETURN_SHARE measure a surface."""
     depth = filtered(view).depth
     measured = depth >= NEAREST
     if (measured & np.isfinite(depth)).mean() < MIN_RETURN_SHARE:
@@ -294,8 +307,8 @@ def measure_noise(images: Sequence[ArrayLike]) -> DepthNoise:
         images: Depth images [m], at least two of the same size, of a camera and a scene at rest.
 
     Returns:
-        Spread, correlation length and dropouts: those between the images, or those within flat patches of one
-        image if they are larger.
+        The spread and the correlation length, between the images or within flat patches of one image,
+        whichever has the larger spread; and the fraction of dropouts.
 
     Raises:
         InputError: For fewer than two images, and if no pixel has a return in all images.
@@ -330,11 +343,12 @@ def pose_error(view: DepthView, distance: ArrayLike) -> Values:
 
 
 PointErrors = Float[ndarray, "n 2"]
-"""How far each point may be displaced [m]: by the camera's inexact pose, with its neighbors, and by noise."""
+"""How far each point may be displaced [m]: by the error of the camera's pose, which displaces neighboring
+points alike, and by noise."""
 
 
 def point_errors(views: Iterable[DepthView], points: Points) -> PointErrors:
-    """The errors of observed points: the maxima over all views."""
+    """The errors of observed points, each the maximum over all views."""
     errors = np.zeros((len(points), 2))
     for view in views:
         distance = np.linalg.norm(points - view.T_base_camera[:3, 3], axis=1)
@@ -344,7 +358,7 @@ def point_errors(views: Iterable[DepthView], points: Points) -> PointErrors:
 
 
 def grown_for_errors(spheres: Float[ndarray, "n 4"], view: DepthView) -> Float[ndarray, "n 4"]:
-    """The arm's spheres, in the base frame, enlarged by the noise of depth at their distance and by the error
+    """The arm's spheres in the base frame, inflated by the noise of depth at their distance and by the error
     of the camera's pose."""
     T = view.T_base_camera
     offset = spheres[:, :3] - T[:3, 3]

@@ -25,9 +25,9 @@ from robotdiffuse.scenes.shapes import PointCloud
 MIN_FOCAL_LENGTH = 1e-3
 """Minimum focal length [pixels]: smaller values underflow in float32, or are meaningless."""
 NEAREST = 0.05
-"""Nearer returns are of what covers the lens: they measure nothing [m]."""
+"""Nearer returns are ignored: they come from something that covers the lens [m]."""
 MAX_ANGLE = 0.5
-"""Largest deviation of a pose [rad]."""
+"""Largest angle that `DepthView.pose_deviation` may state [rad]."""
 INTRINSICS = ("fx", "fy", "cx", "cy")
 # Maximum size of the image that is made of a point cloud; sparse clouds get coarser images [pixels].
 MAX_CLOUD_WIDTH = 320
@@ -47,23 +47,26 @@ class DepthView(Value):
     depth: Float32[ndarray, "h w"]
     """Distance along the optical axis [m]."""
     intrinsics: tuple[float, float, float, float]
-    """fx, fy, cx, cy [pixels]; pixel centers have integer coordinates. A mapping of these names, and a camera
-    matrix of 3 x 3, are taken too."""
+    """fx, fy, cx, cy [pixels]; pixel centers have integer coordinates. A mapping from these names to values
+    and a camera matrix of 3 x 3 are accepted as well."""
     T_base_camera: Pose
-    """x to the right in the image, y down, z ahead: the optical frame of ROS and OpenCV."""
+    """Pose of the optical frame of ROS and OpenCV: x to the right in the image, y down, z ahead."""
     configuration: Configuration | None = None
     """Configuration of the arm when the image was taken; None: the problem's start."""
     cloud: Points | None = None
-    """The original points [m] of an image that was made of a cloud; the image keeps only the nearest ones."""
+    """The original points [m], if the image was made from a cloud; in the image, each pixel holds only its
+    nearest point."""
     source: dict[str, str | float] | None = None
     """The image's entry in problem files: `depth`, a file name, and its `scale`, or `cloud`, a file name."""
     range: float | None = None
-    """Farthest surface that the sensor measures [m]. If it is given, large regions of 0 that reach the border
-    of the image mean that nothing is within it, unless the image is cut there; None: 0 says nothing."""
+    """Largest distance that the sensor measures [m]. If it is given, large regions of 0 at the border of the
+    image mean that nothing is within this distance, unless the image seems to be cropped there. None: a pixel
+    of 0 has no meaning."""
     noise: "DepthNoise | None" = None
-    """Noise of the sensor, as `measure_noise` finds it; None: estimated from the image."""
+    """Noise of the sensor, as `measure_noise` returns it; None: estimated from the image."""
     pose_deviation: tuple[float, float] = (0.0, 0.0)
-    """By how much T_base_camera may be off, with the arm's own error: position [m] and angle [rad]."""
+    """Largest error of T_base_camera, with that of the arm if it carries the camera: position [m], angle
+    [rad]."""
 
     def __post_init__(self) -> None:
         depth = numbers(self.depth)
@@ -81,8 +84,9 @@ class DepthView(Value):
         deviation = vector("view", "pose_deviation", self.pose_deviation, 2)
         if min(deviation) < 0 or deviation[1] > MAX_ANGLE or (self.range is not None and not self.range > 0):
             raise InputError(
-                f"view.pose_deviation is {shown(self.pose_deviation)} and view.range {shown(self.range)};"
-                f" it must be a position [m] and an angle up to {MAX_ANGLE:g} [rad]; a range [m], positive"
+                f"view.pose_deviation is {shown(self.pose_deviation)} and view.range {shown(self.range)}; the"
+                f" deviation must be a position [m] and an angle up to {MAX_ANGLE:g} [rad]; the range,"
+                " positive"
             )
         with np.errstate(over="ignore"):  # values beyond float32 become +inf
             depth = np.ascontiguousarray(depth, np.float32)
@@ -112,8 +116,8 @@ class DepthView(Value):
         ) -> None: ...
 
     def points(self) -> Points:
-        """The points in the base frame [m]: those of the cloud, or one for each pixel with a return, row by
-        row."""
+        """The points in the base frame [m]: the original cloud, or a point for each pixel with a return, row
+        by row."""
         if self.cloud is not None:
             return self.cloud
         rows, columns = np.nonzero(np.isfinite(self.depth) & (self.depth > 0))
@@ -139,7 +143,7 @@ class DepthView(Value):
         configuration: Configuration | None = None,
         source: dict[str, str | float] | None = None,
     ) -> "DepthView":
-        """The depth image that a camera has of a point cloud.
+        """The depth image that a camera would take of a point cloud.
 
         Each pixel holds its nearest point. The image covers the cloud, and its pixels are large enough that
         most of them contain points. Points behind the camera are ignored.
@@ -147,8 +151,8 @@ class DepthView(Value):
         Args:
             points: The cloud [n, 3] in the frame of the base [m].
             T_base_camera: Pose of the optical frame [4, 4]: x right in the image, y down, z ahead.
-            configuration: Configuration of the arm at the exposure, by which its own points are removed;
-                None: the start of the problem.
+            configuration: Configuration of the arm when the cloud was recorded, to remove the arm's own
+                points; None: the start of the problem.
             source: The file of the cloud, for problem files.
 
         Raises:
@@ -179,7 +183,7 @@ class DepthView(Value):
 
 
 def _four_intrinsics(given: object) -> object:
-    """fx, fy, cx, cy of a mapping or a camera matrix; anything else is returned as it is."""
+    """fx, fy, cx, cy from a mapping or a camera matrix; anything else is returned unchanged."""
     if isinstance(given, Mapping):
         if {*given} != {*INTRINSICS}:
             raise InputError(f"view.intrinsics has {shown([*given])}; it must have {', '.join(INTRINSICS)}")
@@ -214,9 +218,9 @@ class DepthNoise(Settings, name="depth_noise"):
     spread: NotNegative = 0.0015
     """Standard deviation of depth at a distance of 1 m [m]; it grows with the square of the distance."""
     missing: ShareBelowOne = 0.0
-    """Fraction of the pixels without a return, anywhere."""
+    """Fraction of all pixels that have no return."""
     stray: ShareBelowOne = 0.01
-    """Fraction of the pixels, anywhere, with a depth between the camera and the surface."""
+    """Fraction of all pixels whose depth is somewhere between the camera and the surface."""
     flying: ShareBelowOne = 0.3
     """Fraction of the pixels at edges whose depth is between the two surfaces (flying pixels)."""
     edge_missing: ShareBelowOne = 0.3
@@ -229,13 +233,13 @@ class DepthNoise(Settings, name="depth_noise"):
     """Distance at which the correlation of the errors of two pixels has fallen to exp(-1/2) [pixels];
     recorded sensors have 1 to 3."""
     zeros: bool = False
-    """Whether pixels are 0, not infinite, where nothing is in range, as those of most sensors are."""
+    """Whether pixels without anything in range are 0, as from most sensors, instead of infinite."""
 
     def applied(self, view: DepthView, rng: Generator) -> DepthView:
-        """The view with noise."""
+        """The view with this noise added to its depths."""
         clean = view.depth
         depth = view.depth.astype(np.float64)
-        lost = self._grazed(view)
+        lost = self._grazed(view)  # pixels that will have no return
         for axis in (0, 1):
             # of two neighbors with an edge between them, the first becomes a flying pixel
             neighbor = clean.take(np.arange(1, clean.shape[axis] + 1), axis, mode="clip")
@@ -267,6 +271,6 @@ class DepthNoise(Settings, name="depth_noise"):
         for axis, focal in ((1, view.intrinsics[0]), (0, view.intrinsics[1])):
             forward = np.diff(depth, axis=axis, append=np.nan)
             backward = np.diff(depth, axis=axis, prepend=np.nan)
-            # the smaller difference: across an edge, the other one lies on the surface
+            # use the smaller difference: at an edge, the larger one belongs to two surfaces
             steepness += (focal * np.fmin(np.abs(forward), np.abs(backward)) / depth) ** 2
         return np.sqrt(steepness) * np.tan(self.grazing) > 1

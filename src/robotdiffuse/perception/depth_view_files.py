@@ -1,10 +1,11 @@
 """Reads and writes the depth views of problem files, and reads depth images.
 
 - {depth: shelf.png, scale: 0.001, intrinsics: [fx, fy, cx, cy], camera: {xyz: [...], wxyz: [...]}}
-- {depth: shelf.png, intrinsics: camera.json, camera: {...}}; without, shelf.json, .yaml, .txt or .npy
+- {depth: shelf.png, intrinsics: camera.json, camera: {...}}; without the field intrinsics, they are read from
+  shelf.json, shelf.yaml, shelf.txt or shelf.npy
 - {cloud: shelf.ply, camera: {...}, configuration: [...]}
 
-Further fields are range, noise and pose_deviation, as of DepthView.
+Further fields are range, noise and pose_deviation, with the meaning that they have in DepthView.
 """
 
 import warnings
@@ -29,13 +30,13 @@ DEPTH_FORMATS = (".png", ".npy", ".npz", ".exr")
 IMAGE_FIELDS = ("intrinsics", "scale", "range", "noise")
 INTRINSICS_FORMATS = (".json", ".yaml", ".txt", ".npy")
 MAX_PIXELS = 2**24
-"""Most pixels of a depth image, in all its channels: a small file can unpack to a huge image."""
+"""Maximum number of pixels of a depth image, in all channels: a small file can unpack to a huge image."""
 INTEGER_SCALE = 0.001
 """Meters per unit of integer depth images, unless a scale is given."""
 
 
 def read_depth(file: str | Path, scale: float | None = None) -> Float[ndarray, "h w"]:
-    """A depth image [m]: a 16 bit .png, an array in .npy or .npz (named depth, or the only one), or .exr.
+    """A depth image [m] from a 16 bit .png, a .npy, a .npz (its array `depth`, or its only array), or a .exr.
 
     scale: meters per unit; None: 0.001 for integers, 1 for floating-point numbers. Raises InputError for a
     file that is missing or is not a depth image.
@@ -66,7 +67,7 @@ def read_depth(file: str | Path, scale: float | None = None) -> Float[ndarray, "
 def _read_png(file: Path) -> ndarray:
     from PIL import Image
 
-    with warnings.catch_warnings(action="ignore"), Image.open(file) as image:  # warns of large images
+    with warnings.catch_warnings(action="ignore"), Image.open(file) as image:  # Pillow warns of large images
         if image.mode not in ("I;16", "I;16B", "I"):
             raise InputError(
                 f"depth image {file} has the mode {image.mode}; it must be grayscale with 16 bits"
@@ -106,10 +107,11 @@ def _read_exr(file: Path) -> ndarray:
 
 
 def read_intrinsics(file: Path) -> Any:
-    """The intrinsics of a camera, as DepthView takes them, of a file of numbers (.npy, .txt) or of names
-    (.json, .yaml): ROS's camera_info, librealsense's, Open3D's, or fx, fy, cx and cy.
+    """The intrinsics of a camera, in a form that DepthView accepts.
 
-    Raises InputError for a file without them.
+    A .npy or .txt file holds the camera matrix or fx, fy, cx, cy as numbers. A .json or .yaml file holds a
+    camera_info of ROS, intrinsics written by librealsense or Open3D, or fx, fy, cx and cy by name. Raises
+    InputError for a file without intrinsics.
     """
     input_file(file, "file of intrinsics")
     if file.suffix.lower() == ".npy":
@@ -197,9 +199,9 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
     if isinstance(image, str):
         file = str(folder / image)
         image = read_depth(file, scale)
-        beside = (Path(file).with_suffix(suffix) for suffix in INTRINSICS_FORMATS)
-        found = (str(one) for one in beside if one != Path(file) and one.is_file())
-        values.setdefault("intrinsics", next(found, None))
+        candidates = (Path(file).with_suffix(suffix) for suffix in INTRINSICS_FORMATS)
+        existing = (str(path) for path in candidates if path != Path(file) and path.is_file())
+        values.setdefault("intrinsics", next(existing, None))
         source = {"depth": file} | ({} if scale is None else {"scale": scale})
     elif scale is not None:
         raise InputError(
@@ -222,8 +224,8 @@ def _rows(where: str, points: Any) -> Points:
 
 
 def view_entry(view: DepthView, folder: Path | None) -> dict[str, Any]:
-    """The entry of a view, as `read_views` reads it. Data that were read from a file are written as its
-    name."""
+    """The entry of a view, in the form that `read_views` reads. Data that were read from a file are written
+    as the file's name, relative to the folder."""
     entry: dict[str, Any] = {}
     if view.source is not None:
         entry |= {

@@ -1,5 +1,5 @@
-"""ObservedVolume: voxels within an arm's reach that depth views observed occupied or free; the rest is
-unknown.
+"""ObservedVolume: which voxels within an arm's reach depth views observed as occupied or free; the other
+voxels are unknown.
 
 Each voxel is projected into the image; rays are not followed through the voxels.
 """
@@ -22,18 +22,18 @@ from robotdiffuse.perception.voxel_grid import COARSE, SHAPE, VoxelGrid
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 
-# States of a voxel in a view: not observed, entirely free, behind a surface, behind the arm, outside the
-# image, on rays without a return.
-HIDDEN = 0
-FREE = 1
-BEHIND = 2
-SHADOW = 3
-OUT = 4
-LOST = 5
-# A pixel of depth -d has no return, and nothing is within d of the camera.
+# States of a voxel in a view.
+HIDDEN = 0  # not observed, for any other reason than those below
+FREE = 1  # observed as entirely free
+BEHIND = 2  # behind a surface
+SHADOW = 3  # behind the arm
+OUT = 4  # outside the image
+LOST = 5  # on a ray without a return although something should be in range
+# Depths of pixels without a return. A depth of -d means that nothing is nearer than d to the camera.
 NO_RETURN = np.float32(0.0)
 EMPTY = np.float32(-1e-6)
-"""Depth of a pixel without a return where nothing seems to be in range, which is not stated."""
+"""Depth of a pixel without a return where nothing seems to be in range, in a view that states no range. The
+pixel shows nothing, but the voxels behind it are HIDDEN, not LOST."""
 MAX_DEPTH = np.float32(1e6)
 """Depth of a pixel without an obstacle in range, and of unknown pixels [m]."""
 POOLED_FOCAL_LENGTH = 250.0
@@ -42,16 +42,16 @@ at a distance of 2 m is then 5 pixels wide."""
 MIN_RETURN_FRACTION = np.float32(0.5)
 """Minimum fraction of a voxel's pixels with a return for it to be observed free."""
 MIN_POINT_FRACTION = np.float32(0.03)
-"""Minimum fraction of a voxel's pixels with points in it for it to be observed occupied: excludes
-outliers."""
+"""Minimum fraction of a voxel's pixels that must have points in the voxel for it to be observed occupied;
+fewer are outliers."""
 FLYING_PIXEL_STEP = np.float32(0.03)
-"""A flying pixel is nearer than one neighbor and farther than the opposite one by at least this [m]..."""
+"""A flying pixel is nearer than one neighbor and farther than the opposite neighbor by at least this [m], and
+by at least FLYING_PIXEL_WIDTHS widths of a pixel at its distance."""
 FLYING_PIXEL_WIDTHS = np.float32(4.0)
-"""... or, if that is more, by this many widths of a pixel at its distance."""
 BLOCK = 4
 """Edge of the blocks of voxels that are first tested as a whole [voxels]."""
 PIXEL_SLACK, DEPTH_SLACK = np.float32(0.01), np.float32(1e-4)
-"""More than the rounding errors of a place in the image [pixels] and of a depth [m]."""
+"""Larger than the rounding errors of image coordinates [pixels] and of depths [m]."""
 FASTMATH = {"contract", "reassoc", "arcp", "nsz"}
 """All fastmath flags except those that assume finite numbers."""
 _HALF, _ONE, _ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
@@ -60,8 +60,8 @@ _NEAREST = np.float32(NEAREST)
 
 @kernel(fastmath=FASTMATH)
 def usable_depth(depth, focal):
-    """The depths, with MAX_DEPTH for rays without an obstacle, NO_RETURN for missing returns and flying
-    pixels."""
+    """The depths, with MAX_DEPTH for rays without an obstacle, and NO_RETURN for missing returns and flying
+    pixels. Negative depths are not changed."""
     h, w = depth.shape
     out = np.empty((h, w), np.float32)
     for v in range(h):
@@ -110,8 +110,8 @@ def _arm_pixels(depth, intrinsics, spheres):
 
 @kernel(fastmath=FASTMATH)
 def _hide_arm(depth, empty, intrinsics, spheres):
-    """Set empty pixels whose rays meet one of the spheres to -NEAREST: they see nothing beyond. Spheres that
-    contain the camera are ignored."""
+    """Set empty pixels whose rays meet one of the spheres to -NEAREST: nothing is known beyond that depth.
+    Spheres that contain the camera are ignored."""
     h, w = depth.shape
     fx, fy, cx, cy = intrinsics
     for s in range(len(spheres)):
@@ -132,11 +132,12 @@ def _hide_arm(depth, empty, intrinsics, spheres):
 def usable_image(
     view: DepthView, robot: Robot, q: Configuration, margin: float
 ) -> tuple[Float32[ndarray, "h w"], float, Float32[ndarray, "n 4"]]:
-    """The view's filtered image, its noise, and the arm's spheres in the camera's frame, enlarged by the
+    """The view's filtered image, its noise, and the arm's spheres in the camera's frame, inflated by the
     margin [m], by noise and by the error of the camera's pose.
 
-    Where nothing seems to be in range, the image is infinite if the view states its range, else EMPTY. Pixels
-    on the arm are excepted. Beside surfaces, nothing is before them.
+    Pixels where nothing seems to be in range are infinite if the view states its range, otherwise EMPTY. Near
+    a surface in the image, they are -d instead of infinite, where d is the surface's depth; see `open_depth`.
+    If their rays meet the arm, they are -NEAREST.
     """
     T = view.T_base_camera
     depth, spread, _ = filtered(view)
@@ -153,7 +154,8 @@ def usable_image(
     if empty is not None:
         opening = EMPTY if view.range is None else open_depth(depth, arm_pixels, view.intrinsics[0])
         depth = np.where(empty, opening, depth)
-        # the rectangles that must be seen through are larger by the error of the angle
+        # Only the error of the camera's position is added here. `carve` accounts for the error of its angle:
+        # it enlarges the rectangles of pixels that must all be free.
         outline = np.column_stack([spheres[:, :3], arm[:, 3] + view.pose_deviation[0]]).astype(np.float32)
         _hide_arm(depth, empty, intrinsics, outline)
     return depth, spread, spheres
@@ -161,7 +163,8 @@ def usable_image(
 
 @kernel(fastmath=FASTMATH)
 def _min_pooled(depth, factor):
-    """Minimum depth of blocks of pixels, and the summed-area table of missing returns."""
+    """Minimum depth of each block of `factor` x `factor` pixels, and the summed-area table of the number of
+    missing returns in the blocks. Of negative depths, the magnitude counts."""
     h = (depth.shape[0] + factor - 1) // factor
     w = (depth.shape[1] + factor - 1) // factor
     min_depth = np.full((h, w), MAX_DEPTH, np.float32)
@@ -187,12 +190,12 @@ def _min_pooled(depth, factor):
 
 
 @kernel(fastmath=FASTMATH)
-def _minimum_table(least, levels):
-    """Sparse table for range minima: minimum depth of the square of 2^k cells below and right of each
-    cell."""
-    h, w = least.shape
+def _minimum_table(min_depth, levels):
+    """Sparse table for range minima: table[k] holds, for each cell, the minimum depth of the square of
+    2^k x 2^k cells that begins there and extends down and to the right."""
+    h, w = min_depth.shape
     table = np.empty((levels, h, w), np.float32)
-    table[0] = least
+    table[0] = min_depth
     for k in range(1, levels):
         step = 1 << (k - 1)
         before = table[k - 1]
@@ -209,7 +212,7 @@ def _minimum_table(least, levels):
 
 @kernel(fastmath=FASTMATH)
 def _rectangle_minimum(table, v0, v1, u0, u1):
-    """Minimum depth of the cells of a rectangle, whose bounds are inclusive."""
+    """Minimum depth of the cells of a rectangle with inclusive bounds, from `_minimum_table`."""
     k = 0
     while 2 << k <= min(v1 - v0, u1 - u0) + 1 and k + 1 < len(table):
         k += 1
@@ -224,7 +227,7 @@ def _rectangle_minimum(table, v0, v1, u0, u1):
 
 @kernel(fastmath=FASTMATH)
 def _count_points(depth, arm, intrinsics, T, low, voxel, counts):
-    """Counts the points in each voxel, without those of the arm."""
+    """Counts the image points in each voxel; `arm` says which pixels show the arm and do not count."""
     fx, fy, cx, cy = intrinsics
     h, w = depth.shape
     nx, ny, nz = counts.shape
@@ -266,10 +269,11 @@ def _count_points(depth, arm, intrinsics, T, low, voxel, counts):
 def carve(depth, intrinsics, T, spheres, low, voxel, errors, state, behind, counts):
     """Writes the state of each voxel [nx ny nz], its depth behind a surface [m], and its number of points.
 
-    intrinsics: fx, fy, cx, cy; T: T_base_camera [4 4]; spheres: those of the arm in the camera's frame; low:
-    lower corner of the grid; errors: by how much free space is narrowed [m], at the camera and for each meter
-    from it, the noise of depth at 1 m, and the sensor's range; counts: number of points in each voxel in
-    excess of outliers. All arrays are float32, except state, uint8, and counts, int32.
+    intrinsics: fx, fy, cx, cy. T: T_base_camera [4 4]. spheres: the arm's, in the camera's frame. low: lower
+    corner of the grid. voxel: edge of a voxel [m]. errors: four numbers: by how much free space is narrowed
+    at the camera [m] and in addition for each meter from it, the noise of depth at 1 m [m], and the sensor's
+    range [m]. counts: number of points in each voxel, less the outliers that MIN_POINT_FRACTION allows. All
+    arrays are float32, except state, uint8, and counts, int32.
     """
     nx, ny, nz = state.shape
     raw = usable_depth(depth, intrinsics[0])
@@ -312,8 +316,12 @@ def carve(depth, intrinsics, T, spheres, low, voxel, errors, state, behind, coun
 
 @kernel(fastmath=FASTMATH)
 def _half_sizes(T, x, y, half, error):
-    """Half the width and height, at a depth of 1, of the rectangle in the image around a cube, half of whose
-    edge is `half`, and which may be off by an error [m]; x, y: its center's direction."""
+    """Half the width and height of the rectangle around a cube's image, divided by the focal length and
+    multiplied by the cube's depth [m].
+
+    half: half the edge of the cube [m]. error: by how far the cube may be displaced [m]. x, y: the direction
+    (x, y, 1) of its center in the camera's frame.
+    """
     du = _ZERO
     dv = _ZERO
     u_square = _ZERO
@@ -331,9 +339,9 @@ def _half_sizes(T, x, y, half, error):
 @kernel(fastmath=FASTMATH)
 def _state_of_block(first, intrinsics, T, low, voxel, errors, size, factor, table, missing):
     """OUT or FREE if all voxels of a block have this state, judged by the rectangle that the block covers in
-    the image; else -1.
+    the image; -1 if its voxels must be tested one by one.
 
-    first: indices of its first voxel.
+    first: indices of the block's first voxel. size: height and width of the image.
     """
     fx, fy, cx, cy = intrinsics
     middle = _HALF * np.float32(BLOCK)
@@ -350,11 +358,11 @@ def _state_of_block(first, intrinsics, T, low, voxel, errors, size, factor, tabl
         return -1
     x = x / z
     y = y / z
-    # no rectangle of a voxel, which is a little larger than the voxel in the image, reaches beyond this
-    more = errors[0] + errors[1] * far
-    du, dv = _half_sizes(T, x, y, middle * voxel, more)
+    # u ± du, v ± dv: a rectangle of pixels that contains the rectangles of all voxels of the block
+    error = errors[0] + errors[1] * far
+    du, dv = _half_sizes(T, x, y, middle * voxel, error)
     wider = (_ONE + ez / near) / near
-    far = far + more * (_ONE + far / near) + errors[2] * far * far
+    far = far + error * (_ONE + far / near) + errors[2] * far * far
     u = fx * x + cx
     v = fy * y + cy
     du = fx * wider * du + PIXEL_SLACK
@@ -385,7 +393,7 @@ def _state_of_block(first, intrinsics, T, low, voxel, errors, size, factor, tabl
 def _carve_block(
     first, end, raw, arm, intrinsics, T, low, voxel, errors, factor, table, missing, state, behind, counts
 ):
-    """As `carve`, for the voxels of one block."""
+    """Does the work of `carve` for the voxels of one block."""
     fx, fy, cx, cy = intrinsics
     h, w = table.shape[1:]
     share = _ONE / np.float32(factor)
@@ -416,12 +424,13 @@ def _carve_block(
                 front = raw[row, column]
                 nothing = front
                 if front > z + ez or front <= _ZERO:
-                    # a turned camera moves things across the ray, along the optical axis only beside it
+                    # A rotation of the camera moves a point perpendicular to its ray, so it changes the
+                    # point's depth only beside the optical axis.
                     aside = errors[1] * z * np.sqrt(x * x + y * y)
                     beyond = z + ez + errors[0] + aside + errors[2] * z * z
                     du0, dv0 = _half_sizes(T, x, y, half, _ZERO)
                     du, dv = _half_sizes(T, x, y, half, errors[0] + errors[1] * z)
-                    own_share = du0 * dv0 / (du * dv)
+                    own_share = du0 * dv0 / (du * dv)  # of the rectangle, covered by the voxel itself
                     du = fx * du / (z - ez)
                     dv = fy * dv / (z - ez)
                     u0 = int((u - du + _HALF) * share)
@@ -462,7 +471,7 @@ def _carve_block(
 @kernel()
 def add_evidence(state, counts, evidence, hit, miss, largest):
     """Add the evidence of a view for each voxel [nx ny nz]: `hit` for voxels with points, -`miss` for free
-    ones. The sum is clipped to [-largest, largest]. Returns the number of voxels that had no evidence
+    voxels. The sum is clipped to [-largest, largest]. Returns the number of these voxels that had no evidence
     before."""
     state = state.ravel()
     counts = counts.ravel()
@@ -482,26 +491,26 @@ ARM_MARGIN = 0.015
 """Points within this distance of the arm's covering spheres are points of the arm [m]; more with noise: see
 `grown_for_errors`."""
 NARROWED_SHARE = 0.35
-"""Free space is narrowed by this part of what a camera's pose may be off. Surfaces that it sees are obstacles
-larger by all of it; the rest is for what hides right behind an edge."""
+"""Free space is narrowed by this fraction of the largest error of a camera's pose. Observed surfaces are
+inflated by the whole error, so narrowing only has to cover what hides right behind an edge."""
 
 
 @dataclass(frozen=True, eq=False)
 class ObservedVolume:
-    """The states of voxels according to views. Voxels observed neither occupied nor free are unknown."""
+    """The states of coarse voxels according to views. Voxels neither occupied nor free are unknown."""
 
     occupied: Bool[ndarray, "56 56 32"]
     """The voxel contains points that are not the arm's."""
     free: Bool[ndarray, "56 56 32"]
-    """A view observed all of it as free."""
+    """A view observed the whole voxel as free."""
     shadow: Bool[ndarray, "56 56 32"]
-    """Unknown, and behind the arm in some view."""
+    """The voxel is unknown, and behind the arm in some view."""
     out_of_view: Bool[ndarray, "56 56 32"]
-    """Outside all images."""
+    """The voxel is outside all images."""
     behind: Float32[ndarray, "56 56 32"]
-    """Depth behind an observed surface, the minimum over all views [m]; 0 if it is behind none."""
+    """How far the voxel is behind an observed surface, the minimum over all views [m]; 0 if behind none."""
     lost: Bool[ndarray, "56 56 32"]
-    """Unknown, on a ray of some view that has no return though something should be in range."""
+    """The voxel is unknown, on a ray of some view without a return though something should be in range."""
 
     @cached_property
     def unknown(self) -> Bool[ndarray, "56 56 32"]:
@@ -509,11 +518,11 @@ class ObservedVolume:
 
 
 def observe(views: Sequence[DepthView], robot: Robot, start: Configuration) -> ObservedVolume:
-    """The volume observed by all views: a voxel is occupied, or else free, if any view says so.
+    """The volume observed by all views. A voxel is occupied if it is in any view, else free if it is in any.
 
     A voxel is free in a view if none of the pixels that it may cover is nearer than its far side. start: the
-    arm's configuration in views without one. Raises InputError without a view, or for a configuration of the
-    wrong length.
+    arm's configuration in views that state none. Raises InputError if there are no views, or for a
+    configuration of the wrong length.
     """
     if not len(views):
         raise InputError("views is empty; at least one depth view is needed")
@@ -521,7 +530,7 @@ def observe(views: Sequence[DepthView], robot: Robot, start: Configuration) -> O
 
 
 def merged(volumes: Sequence[ObservedVolume]) -> ObservedVolume:
-    """Several volumes as one: a voxel is occupied if it is in any of them, else free if it is in any."""
+    """The union of volumes: a voxel is occupied if it is in any volume, else free if it is in any."""
     occupied, free, shadow, lost = (np.zeros(SHAPE, np.bool_) for _ in range(4))
     out = np.ones(SHAPE, np.bool_)
     depth_behind = np.full(SHAPE, np.inf, np.float32)
@@ -548,7 +557,7 @@ def _observed(view: DepthView, robot: Robot, start: Configuration) -> ObservedVo
     state, depth, counts = carve_view(view, robot, q, ARM_MARGIN, COARSE)
     occupied = counts > 0
     depth[(state != BEHIND) | occupied] = 0.0
-    free, shadow, lost = ((state == one) & ~occupied for one in (FREE, SHADOW, LOST))
+    free, shadow, lost = ((state == kind) & ~occupied for kind in (FREE, SHADOW, LOST))
     return ObservedVolume(occupied, free, shadow, state == OUT, depth, lost)
 
 
@@ -564,8 +573,8 @@ def carve_view(
     number of points; see `carve`.
 
     q: the arm's configuration in the view. arm_margin: points within this distance of its covering spheres
-    are points of the arm; more with noise [m]. narrowed: free space is narrowed by this part of what the
-    camera's pose may be off.
+    are points of the arm, plus an allowance for noise [m]. narrowed: free space is narrowed by this fraction
+    of the largest error of the camera's pose.
     """
     depth, spread, spheres = usable_image(view, robot, q, arm_margin)
     position, angle = narrowed * np.array(view.pose_deviation)

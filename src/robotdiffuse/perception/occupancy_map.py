@@ -1,5 +1,5 @@
-"""OccupancyMap: what many depth views tell of each voxel of 2 cm around the arm, view by view; and
-ViewMemory: the views that showed most, with what each of them shows, computed once.
+"""OccupancyMap: which voxels of 2 cm around the arm are free, occupied or unknown, updated view by view; and
+ViewMemory: keeps the views that showed most new voxels.
 """
 
 from collections.abc import Callable
@@ -34,10 +34,10 @@ Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
 HIT, MISS = np.float32(3.0), np.float32(2.0)
-"""Added to a voxel's evidence by a view with points in it, and taken from it by a view that sees through all
-of it."""
+"""A view with points in a voxel adds HIT to the voxel's evidence; a view that sees the whole voxel free
+subtracts MISS."""
 MOST_EVIDENCE = np.float32(8.0)
-"""Evidence stays within this, so that a voxel can change."""
+"""Evidence is clipped to ± this, so that a few views suffice to change a voxel's state."""
 COVER_RADIUS = MAP.edge * 3**0.5 / 2
 """Radius of the ball around a voxel's center that covers the voxel [m]."""
 
@@ -45,9 +45,9 @@ COVER_RADIUS = MAP.edge * 3**0.5 / 2
 class OccupancyMap:
     """Which voxels are free, occupied or unknown, from many views, each taken into account once.
 
-    A view counts as free what it sees through, and as occupied what holds points. Noisy images are filtered
-    first, so that a stray pixel neither blocks nor fills a voxel; pixels without a return say nothing; of the
-    arm, and of what it holds, nothing is kept. Where views contradict each other, the majority decides.
+    Voxels that a view sees through are free, and voxels that contain its points are occupied. Noisy images
+    are filtered first, so that stray pixels have no effect. Pixels without a return are ignored, and so are
+    points of the arm and of the objects that it holds. If views contradict each other, the majority decides.
 
     The voxels are those of `MAP`.
     """
@@ -57,22 +57,26 @@ class OccupancyMap:
         self.robot = robot
         self.max_age = max_age
         self._evidence = np.zeros(MAP.shape, np.float32)
-        """Above 0 occupied, below free, 0 unknown."""
+        """Positive: occupied; negative: free; 0: unknown."""
         self._surely_free = np.zeros(MAP.shape, np.bool_)
-        """Seen free even if the camera's pose is off by all that it may be, and without points since."""
+        """Voxels that a view sees free even with the largest error of its pose, and without points since."""
         self._doubted = np.zeros(MAP.shape, np.bool_)
         """See `doubt`."""
         self._seen_at = np.full(MAP.shape, -np.inf, np.float64)
+        """Time of the last view that observed each voxel [s]; only used with a maximum age."""
         self._declared = np.zeros(MAP.shape, np.bool_)
+        """See `declare_free`."""
         self._now = -np.inf
+        """Time of the latest view [s]."""
         self._known: tuple[Voxels, ...] | None = None
+        """Cache of `_of_evidence`; None after a change."""
 
     @locked
     def add(self, view: DepthView, stamp: float = 0.0) -> int:
-        """Take a view into account; returns the number of voxels that nothing was known of before.
+        """Take a view into account. Returns the number of voxels that it observes for the first time.
 
-        stamp: when it was taken [s]; `view.configuration` is the arm's at that time. Raises InputError for a
-        view without a configuration, or with one of the wrong length.
+        stamp: when the view was taken [s]. Its `configuration` is that of the arm at this time; without one,
+        or with one of the wrong length, InputError is raised.
         """
         q = view.configuration
         if q is None or len(q) != self.robot.dof:
@@ -89,8 +93,8 @@ class OccupancyMap:
 
     @locked
     def add_points(self, points: Points, stamp: float = 0.0) -> None:
-        """Take occupied points in the base frame into account [m], such as those of a cloud without a camera
-        or of `rd.PointCloud.from_file`. They say nothing about free space."""
+        """Take occupied points in the base frame into account [m], e.g. the points of an
+        `rd.PointCloud.from_file`. They give no information about free space."""
         at = MAP.indices(np.asarray(points))
         at = at[MAP.contains(at)]
         counts = np.zeros(MAP.shape, np.int32)
@@ -99,7 +103,8 @@ class OccupancyMap:
 
     @locked
     def declare_free(self, zone: Corners) -> None:
-        """Voxels inside a box count as seen free unless a view finds them occupied."""
+        """Voxels inside a box, given by its low and high corner, count as free unless a view finds them
+        occupied."""
         low, high = np.asarray(zone, np.float64)
         if not (low < high).all():
             raise InputError(f"free_zone is {shown(zone)}; its low corner must be below its high corner")
@@ -110,11 +115,11 @@ class OccupancyMap:
 
     @locked
     def doubt(self, points: Points, errors: Values) -> None:
-        """Until the next view, free voxels within the error of an observed point count as unknown, since an
-        obstacle may be there, unless they are declared free or a view sees them free even if its pose is off
-        by its largest error.
+        """Until the next view, free voxels within the error of an observed point count as unknown: an
+        obstacle may be there.
 
-        points: observed points [m]; errors: how far off each may be [m].
+        Voxels that are declared free stay free, and so do voxels that a view sees free even with the largest
+        error of its pose. points: observed points [m]. errors: how far each point may be displaced [m].
         """
         spheres = np.column_stack([points, POINT_RADIUS + errors])[errors > 0]
         reached = MAP.within(spheres, COVER_RADIUS)
@@ -123,7 +128,7 @@ class OccupancyMap:
 
     @property
     def is_blind(self) -> bool:
-        """Whether no view has told anything about a voxel."""
+        """Whether no view has observed any voxel."""
         return not self._evidence.any()
 
     @property
@@ -132,7 +137,7 @@ class OccupancyMap:
 
     @property
     def free(self) -> Voxels:
-        """Seen free, or declared so and not found occupied."""
+        """Voxels that were seen free, or declared free and not found occupied."""
         return self._of_evidence[1]
 
     @property
@@ -163,8 +168,7 @@ class OccupancyMap:
     def _update(
         self, state: UInt8[ndarray, "nx ny nz"], counts: Int32[ndarray, "nx ny nz"], stamp: float
     ) -> int:
-        """Take what a view shows of each voxel into account; returns the number of voxels that nothing was
-        known of before."""
+        """Add a view's evidence for each voxel. Returns the number of voxels observed for the first time."""
         self._now = max(self._now, stamp)
         self._known = None
         self._doubted[:] = False
@@ -177,16 +181,16 @@ class OccupancyMap:
 
 
 MAX_VIEWS = 12
-"""Views that are kept."""
+"""Default number of views that a ViewMemory keeps."""
 MUCH_BETTER = 0.8
-"""Views get a new pose if its deviation is less than this part of the old one's."""
+"""A kept view gets its refined pose once the deviation is below this fraction of its present deviation."""
 ALONE_DISTANCE = 0.02
-"""With noise, a point of one view with no other point within this distance is stray [m]. Of surfaces at 1 m,
-99 of 100 points have three or more there."""
+"""In noisy images, a point of one view with no other point within this distance is stray [m]. On surfaces at
+1 m, 99 of 100 points have at least three others within it."""
 
 
-class _Kept:
-    """A view, and what it shows, computed when it is first needed."""
+class _RememberedView:
+    """A view, and what it observes, computed when it is first needed."""
 
     def __init__(self, view: DepthView, robot: Robot, new_voxels: int, stated: DepthView) -> None:
         self.view = view
@@ -213,58 +217,59 @@ class _Kept:
 
 
 class ViewMemory:
-    """Keeps a number of views: a new one takes the place of the kept one that showed least."""
+    """Keeps at most `most` views: a new view replaces the kept view that showed the fewest new voxels."""
 
     def __init__(self, robot: Robot, most: int = MAX_VIEWS) -> None:
         self._robot = robot
         self._most = most
-        self._kept = list[_Kept]()
+        self._memories = list[_RememberedView]()
 
     def __len__(self) -> int:
-        return len(self._kept)
+        return len(self._memories)
 
     def add(self, view: DepthView, new_voxels: int, stated: DepthView) -> None:
-        """Keep a view with a configuration. new_voxels: the number of voxels that it showed first. stated:
-        the same view with the pose as the caller gave it."""
+        """Keep a view with a configuration. new_voxels: number of voxels that it was the first to observe.
+        stated: the same view with the pose that the caller stated."""
         if len(self) >= self._most:
-            self._kept.remove(min(self._kept, key=lambda kept: kept.new_voxels))
-        self._kept.append(_Kept(view, self._robot, new_voxels, stated))
+            self._memories.remove(min(self._memories, key=lambda memory: memory.new_voxels))
+        self._memories.append(_RememberedView(view, self._robot, new_voxels, stated))
 
     def refine(self, refined: Callable[[DepthView], DepthView]) -> None:
-        """Give the kept views refined poses where they are much better. refined: takes a view with the
-        pose as the caller gave it, and returns it with the pose as it is known now."""
-        for at, kept in enumerate(self._kept):
-            view = refined(kept.stated)
-            if sum(view.pose_deviation) < MUCH_BETTER * sum(kept.view.pose_deviation):
-                self._kept[at] = _Kept(view, self._robot, kept.new_voxels, kept.stated)
+        """Give the kept views their refined poses, if these are much better. refined: takes a view with the
+        pose that the caller stated, and returns it with the present estimate of the pose."""
+        for i, memory in enumerate(self._memories):
+            view = refined(memory.stated)
+            if sum(view.pose_deviation) < MUCH_BETTER * sum(memory.view.pose_deviation):
+                self._memories[i] = _RememberedView(view, self._robot, memory.new_voxels, memory.stated)
 
     @property
     def views(self) -> list[DepthView]:
         """The kept views."""
-        return [memory.view for memory in self._kept]
+        return [memory.view for memory in self._memories]
 
     def volume(self) -> ObservedVolume:
-        """What the kept views together tell of each voxel of 4 cm."""
-        return merged([memory.volume for memory in self._kept])
+        """The states of voxels of 4 cm according to all kept views."""
+        return merged([memory.volume for memory in self._memories])
 
     def points(self, free: Voxels) -> tuple[Points, PointErrors]:
         """The mean of the points that the kept views observed in each cell of a grid [m], see `seen_points`,
-        and their errors.
+        and how far each mean may be displaced, see `point_errors`.
 
-        Stray points are left out: those in the free voxels of a map, which more views see through, and, if
-        images are noisy, points of a single view with no other point near, since a surface gives several.
+        Stray points are left out. These are points in free voxels of the map (`free`), which more views see
+        through, and, in noisy images, points of a single view without another point nearby, since a surface
+        gives several.
         """
-        every = np.concatenate([memory.points for memory in self._kept]).astype(np.float64)
+        every = np.concatenate([memory.points for memory in self._memories]).astype(np.float64)
         _, cell, counts = np.unique(_cells(every), return_inverse=True, return_counts=True)
         sums = [np.bincount(cell, every[:, axis], len(counts)) for axis in range(3)]
         points = np.stack(sums, axis=1) / counts[:, None]
         errors = np.zeros((len(counts), 2))
-        np.maximum.at(errors, cell, np.concatenate([memory.errors for memory in self._kept]))
+        np.maximum.at(errors, cell, np.concatenate([memory.errors for memory in self._memories]))
         at = MAP.indices(points)
         inside = MAP.contains(at)
         stray = np.zeros(len(points), np.bool_)
         stray[inside] = free[tuple(at[inside].T)]
-        if any(filtered(memory.view).spread for memory in self._kept):
+        if any(filtered(memory.view).spread for memory in self._memories):
             once = counts == 1
             distances, _ = KDTree(points).query(points[once], k=2, distance_upper_bound=ALONE_DISTANCE)
             stray[once] |= np.isinf(distances[:, 1])
@@ -272,7 +277,7 @@ class ViewMemory:
 
 
 def _cells(points: Points) -> ndarray:
-    """A number for the cell of each point."""
+    """The number of the cell of CELL edge length that contains each point; equal numbers mean one cell."""
     at = np.floor(points / CELL).astype(np.int64)
     at -= at.min(axis=0, initial=0)
     _, ny, nz = at.max(axis=0, initial=0) + 1

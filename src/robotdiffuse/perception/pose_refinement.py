@@ -1,9 +1,9 @@
-"""Refines the poses of cameras that are stated inexactly, by what the cameras see: the arm, known shapes, and
-surfaces that other images show too.
+"""Refines inexact camera poses by what the cameras see: the arm, known shapes, and surfaces that several
+images show.
 
-Points are matched with the nearest point of a surface, along its normal, as in `camera_calibration`. Unknown
-are the error of each camera's pose in its own frame, the same in all of its images, and the distance between
-the arm's surface and its model. What is stated of the errors is a prior.
+Points are matched with the nearest point of a surface, along its normal, as in `camera_calibration`. The
+unknowns are the error of each camera's pose, which is constant in the camera's frame, and the distance
+between the arm's surface and its model. The stated `pose_deviation` serves as the prior.
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,129 +31,136 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
 MAX_VIEWS = 8
-"""Images of a camera that its pose is refined by."""
+"""Maximum number of images by which the pose of one camera is refined."""
 MIN_TURN = 0.1
-"""Images with the arm nearer than this to where it was in another one tell nothing new [rad]."""
+"""An image is used only if a joint of the arm differs by more than this from each earlier image [rad]."""
 COLUMNS = 80
-"""Blocks of pixels in a row of an image; their mean depths are used."""
+"""Approximate number of blocks of pixels in a row of an image. Each block gives one point, of mean depth."""
 SAME_SURFACE = 1.1
-"""Largest ratio of the depths in a block."""
+"""Largest ratio of two depths in a block that sees one surface."""
 MAX_POINTS = 600
-"""Points of an image that are matched."""
+"""Maximum numbers of points on the arm and of other points that are matched in an image."""
 NEIGHBORS = 13
-"""Points that a normal is estimated from."""
+"""Number of points from which a normal is estimated."""
 MAX_THICKNESS = 0.3
-"""Largest thickness of these, relative to their width."""
+"""Largest thickness of these points, relative to their width, on a flat surface."""
 ALIKE = 0.8
 """Smallest cosine of the angle between the normals of matched points."""
 FACING = 0.4
 """Smallest cosine of the angle between the arm's normal and the ray."""
 GATES = (1.0, 0.7, 0.5, 0.3, 0.2, 0.2)
-"""Matched points are nearer to each other than this part of what is stated of both, and NOISES standard
-deviations of their noise, in rounds."""
+"""One factor for each round. The largest distance of matched points is this factor times their stated errors,
+plus NOISES standard deviations of their noise."""
 NOISES = 3.0
 POINTS_PER_ERROR = 4
-"""So many points have about one error in common."""
+"""Number of points that count as one independent measurement."""
 KNOWN_ERROR, ARM_ERROR = 0.001, 0.004
-"""Standard deviation of the difference between surfaces of scenes, and of the arm, and their models [m]."""
+"""Standard deviations of the difference between a surface and its model: of the scene, and of the arm [m]."""
 ARM_OFFSET = 0.01
-"""Standard deviation of the distance between the arm's surface and that of its model [m]."""
+"""Standard deviation of the mean distance between the arm's surface and that of its model [m]."""
 FAR = 0.2
-"""Known shapes farther away than this are not matched [m]."""
+"""Surfaces farther from a point than this are not matched with it [m]."""
 OTHERS = 8
-"""Nearest points among which there shall be one of another image."""
+"""Number of nearest points among which a point of another image is searched for."""
 PRIOR_DEVIATIONS, DEVIATIONS = 1.5, 2.5
-"""What is stated of a pose, and what is stated after its refinement, in standard deviations."""
+"""Number of standard deviations in the `pose_deviation` that users state, and in that of a refined pose."""
 MIN_DEVIATION = (0.002, 0.002)
-"""Of refined poses: position [m] and angle [rad]. An arm is not more exact."""
+"""Smallest deviation of a refined pose: position [m] and angle [rad]. No arm is more accurate."""
 IMPLAUSIBLE = 2.0
-"""Estimates that are more than this times what is stated are mistaken."""
+"""An estimated error is rejected if it exceeds the stated deviation by more than this factor."""
 DEPTHS = np.arange(0.2, 3.0, 0.2)
-"""At which a refined pose's error is bounded [m]."""
+"""Depths at which the error of a refined pose is evaluated [m]."""
 NEAR = 0.6
-"""Up to this distance the whole error of a refined pose counts as one of position [m]."""
+"""Up to this distance, the whole error of a refined pose counts as an error of its position [m]."""
 SAME_CAMERA = 0.1
-"""Largest difference between entries of the pose of a camera on the arm and of its nominal pose [m], [1]."""
+"""Largest difference of any entry of a camera's pose from a nominal pose on the arm for it to be this camera:
+[m], or without unit for the rotation."""
 
 
 class _Match(NamedTuple):
-    """Points and the surfaces that they are matched with."""
+    """Points that are matched with surfaces."""
 
     derivatives: Float[ndarray, "n unknowns"]
-    """Of the distances."""
+    """Derivatives of the distances."""
     distances: Values
-    """Along the normals [m]."""
+    """Distances of the points from the surfaces, along their normals [m]."""
     noise: Values
     """Standard deviations of the distances [m]."""
     limits: Values
-    """Of the distances [m]."""
+    """Largest distances of matched points [m]."""
 
 
 @dataclass(eq=False)
 class _Camera:
-    """A camera, and what is known of its pose's error."""
+    """A camera, and the estimated error of its pose."""
 
     link: str | None
+    """The link that carries the camera; None: the camera stands beside the arm."""
     T: Pose
-    """In the frame of its link, or of the base: nominal."""
+    """Nominal pose, in the frame of the link or of the base."""
     stated: Float[ndarray, "6"]
-    """Standard deviations of its error, as stated."""
+    """Standard deviations of the error according to the stated `pose_deviation`."""
     error: Float[ndarray, "6"]
-    """Position [m] and rotation vector [rad], in the camera's frame."""
+    """Estimated error: position [m] and rotation vector [rad], in the camera's frame."""
     covariance: Float[ndarray, "6 6"]
+    """Covariance of the estimate."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Sight:
-    """What is used of an image."""
+class _Image:
+    """The parts of a view that the estimate uses."""
 
     camera: int
+    """Index of the camera."""
     T: Pose
-    """As stated."""
+    """T_base_camera as the view states it."""
     configuration: Configuration
     shows_scene: bool
-    """A camera that stands shows the scene once."""
+    """Whether points of the scene are used; for a camera beside the arm, only in its first image."""
     points: Points
-    """In the camera's frame [m]."""
+    """Points in the camera's frame [m]."""
     normals: Points
-    """Towards the camera."""
+    """Normals at the points, towards the camera."""
     noise: Values
+    """Standard deviations of the points' depths [m]."""
     stated: Values
-    """How far off the pose may displace the points [m]."""
+    """How far the stated error of the pose may displace each point [m]."""
     arm: Bool[ndarray, "n"]
-    """Points on the arm, which are matched with its surface."""
+    """Which points are on the arm; they are matched with the arm's surface."""
     surface: tuple[KDTree, Points, Points] | None
-    """Of the arm; None without points on it."""
+    """The arm's surface, see `arm_surface`; None without points on the arm."""
 
 
 class PoseRefinement:
-    """The poses of cameras, refined image by image. Views that state no `pose_deviation` stay as they are."""
+    """The poses of cameras, refined image by image. Views that state no `pose_deviation` are not changed."""
 
     def __init__(self, robot: Robot, known: Scene, on_arm: Sequence[tuple[str, Pose]]) -> None:
-        """known: shapes that are exact. on_arm: link and nominal pose of each camera on the arm."""
+        """known: shapes whose poses are exact. on_arm: link and nominal T_link_camera of each camera on the
+        arm."""
         self._robot = robot
         self._known = compile_scene_for(robot, known) if known.shapes else None
         self._on_arm = on_arm
         self._cameras = list[_Camera]()
-        self._sights = list[_Sight]()
+        self._images = list[_Image]()
 
     def observe(self, view: DepthView) -> DepthView:
-        """Take a view into account; the view with its refined pose."""
+        """Take a view into account, and return it with its refined pose."""
         q = view.configuration
         if not any(view.pose_deviation) or view.cloud is not None or q is None or len(q) != self._robot.dof:
             return view
         number = self._camera(view, q)
-        mine = [sight for sight in self._sights if sight.camera == number]
+        mine = [image for image in self._images if image.camera == number]
         if len(mine) < MAX_VIEWS and all(np.abs(s.configuration - q).max() > MIN_TURN for s in mine):
             shows_scene = self._cameras[number].link is not None or not mine
-            sight = self._sight(view, q, number, shows_scene)
-            if len(sight.points):
-                self._sights.append(sight)
+            image = self._image(view, q, number, shows_scene)
+            if len(image.points):
+                self._images.append(image)
                 self._fit()
         return self.refined(view)
 
     def refined(self, view: DepthView) -> DepthView:
-        """The view with the pose and the deviation that follow from all views so far."""
+        """The view with the pose and the deviation estimated from all views so far. It is returned unchanged
+        if the estimate is implausible."""
         q = view.configuration
         if not any(view.pose_deviation) or view.cloud is not None or q is None:
             return view
@@ -165,7 +172,7 @@ class PoseRefinement:
         return replace(view, T_base_camera=T, pose_deviation=_deviation(view, T, camera.covariance))
 
     def _camera(self, view: DepthView, q: Configuration) -> int:
-        """The number of a view's camera."""
+        """The index of a view's camera, which is added if it is new."""
         T = view.T_base_camera
         for number, camera in enumerate(self._cameras):
             if camera.link is None and np.allclose(T, camera.T):
@@ -173,12 +180,13 @@ class PoseRefinement:
             if camera.link is not None and is_on(self._robot, camera.link, camera.T, T, q):
                 return number
         stated = np.repeat(np.maximum(view.pose_deviation, 1e-5), 3) / PRIOR_DEVIATIONS
-        link, nominal = next((one for one in self._on_arm if is_on(self._robot, *one, T, q)), (None, T))
+        mounts = (mount for mount in self._on_arm if is_on(self._robot, *mount, T, q))
+        link, nominal = next(mounts, (None, T))
         camera = _Camera(link, nominal, stated, np.zeros(6), np.diag(stated**2))
         self._cameras.append(camera)
         return len(self._cameras) - 1
 
-    def _sight(self, view: DepthView, q: Configuration, camera: int, shows_scene: bool) -> _Sight:
+    def _image(self, view: DepthView, q: Configuration, camera: int, shows_scene: bool) -> _Image:
         T = view.T_base_camera
         points = _block_points(view)
         normals, flat = _normals(points)
@@ -188,17 +196,20 @@ class PoseRefinement:
         stands = self._cameras[camera].link is None
         arm = on_arm if stands else np.zeros(len(points), np.bool_)
         use = np.zeros(len(points), np.bool_)
-        for some in (arm, flat & ~on_arm & shows_scene):
-            at = np.flatnonzero(some)
+        for usable in (arm, flat & ~on_arm & shows_scene):
+            at = np.flatnonzero(usable)
             use[at[:: max(1, -(-len(at) // MAX_POINTS))]] = True
         points = points[use]
         noise = spread * points[:, 2] ** 2
         stated = pose_error(view, np.linalg.norm(points, axis=1))
         surface = arm_surface(self._robot, q) if arm.any() else None
-        return _Sight(camera, T, q, shows_scene, points, normals[use], noise, stated, arm[use], surface)
+        return _Image(camera, T, q, shows_scene, points, normals[use], noise, stated, arm[use], surface)
 
     def _fit(self) -> None:
-        """Estimate the errors of all poses by all images."""
+        """Estimate the errors of all poses from all images by Gauss-Newton steps.
+
+        The unknowns are six numbers for each camera, see `_Camera.error`, and the arm's offset [m].
+        """
         prior = np.concatenate([*(camera.stated for camera in self._cameras), [ARM_OFFSET]]) ** -2
         unknowns = np.concatenate([*(camera.error for camera in self._cameras), np.zeros(1)])
         hessian = np.diag(prior)
@@ -206,6 +217,7 @@ class PoseRefinement:
             hessian = np.diag(prior)
             gradient = prior * unknowns
             for match in self._matches(unknowns, gate):
+                # Geman and McClure's weights, divided by the variance of the weighted distances
                 weights = 1 / (1 + (match.distances / (0.5 * match.limits)) ** 2) ** 2
                 variance = (weights * (match.distances / match.noise) ** 2).sum() / max(weights.sum(), 1e-9)
                 weights /= match.noise**2 * max(variance, 1.0) * POINTS_PER_ERROR
@@ -214,85 +226,93 @@ class PoseRefinement:
             unknowns = unknowns - np.linalg.solve(hessian, gradient)
         covariance = np.linalg.inv(hessian)
         for i, camera in enumerate(self._cameras):
-            of = slice(6 * i, 6 * i + 6)
-            camera.error = unknowns[of]
-            camera.covariance = covariance[of, of]
+            own = slice(6 * i, 6 * i + 6)
+            camera.error = unknowns[own]
+            camera.covariance = covariance[own, own]
 
     def _matches(self, unknowns: Values, gate: float) -> Iterator[_Match]:
-        poses = [s.T @ _pose(unknowns[6 * s.camera : 6 * s.camera + 6]) for s in self._sights]
-        scene = [~sight.arm for sight in self._sights]
-        owners = np.concatenate([np.full(some.sum(), i) for i, some in enumerate(scene)])
-        numbers = np.concatenate([np.flatnonzero(some) for some in scene])
-        every = zip(self._sights, poses, scene, strict=True)
-        placed_points = [(placed(T, s.points[some]), s.normals[some] @ T[:3, :3].T) for s, T, some in every]
+        """Matches the points of each image with the arm, the known shapes, and the points of other images."""
+        poses = [s.T @ _pose(unknowns[6 * s.camera : 6 * s.camera + 6]) for s in self._images]
+        # all points of the scene, in the base frame: `owners` are their images, `numbers` their rows in them
+        scene = [~image.arm for image in self._images]
+        owners = np.concatenate([np.full(mask.sum(), i) for i, mask in enumerate(scene)])
+        numbers = np.concatenate([np.flatnonzero(mask) for mask in scene])
+        every = zip(self._images, poses, scene, strict=True)
+        placed_points = [(placed(T, s.points[mask]), s.normals[mask] @ T[:3, :3].T) for s, T, mask in every]
         points, normals = (np.concatenate(parts) for parts in zip(*placed_points, strict=True))
         tree = KDTree(points)
 
         def match(i: int, use: ndarray, n: Points, r: Values, error: float) -> _Match:
-            """Points of an image, by distance and normal of the surfaces nearest to them."""
-            sight = self._sights[i]
-            rows = np.zeros((len(use), len(unknowns)))
-            m = n @ poses[i][:3, :3]
-            of = slice(6 * sight.camera, 6 * sight.camera + 6)
-            rows[:, of] = np.hstack([m, np.cross(sight.points[use], m)])
-            noise = np.hypot(sight.noise[use], error)
-            return _Match(rows, r, noise, gate * sight.stated[use] + NOISES * noise)
+            """The match of points `use` of image i with surfaces.
 
-        for i, (sight, T) in enumerate(zip(self._sights, poses, strict=True)):
-            if sight.surface is not None:
-                use = np.flatnonzero(sight.arm)
-                at = placed(T, sight.points[use])
-                tree_of_arm, surface, surface_normals = sight.surface
+            n: the surfaces' normals in the base frame. r: the points' distances from them [m]. error:
+            standard deviation of the surfaces [m].
+            """
+            image = self._images[i]
+            rows = np.zeros((len(use), len(unknowns)))
+            m = n @ poses[i][:3, :3]  # normals in the camera's frame
+            own = slice(6 * image.camera, 6 * image.camera + 6)
+            rows[:, own] = np.hstack([m, np.cross(image.points[use], m)])
+            noise = np.hypot(image.noise[use], error)
+            return _Match(rows, r, noise, gate * image.stated[use] + NOISES * noise)
+
+        for i, (image, T) in enumerate(zip(self._images, poses, strict=True)):
+            if image.surface is not None:
+                use = np.flatnonzero(image.arm)
+                at = placed(T, image.points[use])
+                tree_of_arm, surface, surface_normals = image.surface
                 near = np.asarray(tree_of_arm.query(at)[1])
                 n = surface_normals[near]
-                off = at - surface[near]
+                offset = at - surface[near]
                 ray = T[:3, 3] - at
                 facing = (ray * n).sum(axis=1) / np.linalg.norm(ray, axis=1)
                 n = n * np.sign(facing)[:, None]
-                found = match(i, use, n, (off * n).sum(axis=1) - unknowns[-1], ARM_ERROR)
-                found.derivatives[:, -1] = -1.0
-                is_near = np.linalg.norm(off, axis=1) < found.limits + ARM_OFFSET
-                yield _some(found, is_near & (np.abs(facing) > FACING))
-            use = np.flatnonzero(~sight.arm)
+                matched = match(i, use, n, (offset * n).sum(axis=1) - unknowns[-1], ARM_ERROR)
+                matched.derivatives[:, -1] = -1.0
+                is_near = np.linalg.norm(offset, axis=1) < matched.limits + ARM_OFFSET
+                yield _selected(matched, is_near & (np.abs(facing) > FACING))
+            use = np.flatnonzero(~image.arm)
             mine = owners == i
             if self._known is not None and len(use):
                 surfaces = nearest_surfaces(self._known, points[mine].astype(np.float32)).astype(np.float64)
                 n = surfaces[:, 1:]
-                found = match(i, use, n, surfaces[:, 0], KNOWN_ERROR)
-                yield _some(found, (n * normals[mine]).sum(axis=1) > ALIKE)
-            if self._cameras[sight.camera].link is None or not len(use):
+                matched = match(i, use, n, surfaces[:, 0], KNOWN_ERROR)
+                yield _selected(matched, (n * normals[mine]).sum(axis=1) > ALIKE)
+            if self._cameras[image.camera].link is None or not len(use):
                 continue
+            # the nearest point of another image; its distance also depends on that image's pose
             distances, near = map(np.asarray, tree.query(points[mine], OTHERS, distance_upper_bound=FAR))
             other = np.isfinite(distances) & (np.append(owners, i)[near] != i)
             ok = other.any(axis=1)
             near = near[np.arange(len(near)), other.argmax(axis=1)][ok]
             n = normals[near]
-            found = match(i, use[ok], n, ((points[mine][ok] - points[near]) * n).sum(axis=1), KNOWN_ERROR)
+            matched = match(i, use[ok], n, ((points[mine][ok] - points[near]) * n).sum(axis=1), KNOWN_ERROR)
             for j in np.unique(owners[near]):
-                of = owners[near] == j
-                there = match(j, numbers[near[of]], n[of], found.distances[of], KNOWN_ERROR)
-                found.derivatives[of] -= there.derivatives
-                found.noise[of] = np.hypot(found.noise[of], there.noise)
-                found.limits[of] += there.limits
-            yield _some(found, (n * normals[mine][ok]).sum(axis=1) > ALIKE)
+                rows = owners[near] == j
+                opposite = match(j, numbers[near[rows]], n[rows], matched.distances[rows], KNOWN_ERROR)
+                matched.derivatives[rows] -= opposite.derivatives
+                matched.noise[rows] = np.hypot(matched.noise[rows], opposite.noise)
+                matched.limits[rows] += opposite.limits
+            yield _selected(matched, (n * normals[mine][ok]).sum(axis=1) > ALIKE)
 
 
 def is_on(robot: Robot, link: str, nominal: Pose, T: Pose, q: Configuration) -> bool:
-    """Whether a camera at T_base_camera is one on a link of the arm with a nominal T_link_camera."""
+    """Whether a camera at T = T_base_camera is the camera on `link` with T_link_camera = `nominal`."""
     return bool(np.abs(T - link_poses(robot, q[None], link)[0] @ nominal).max() < SAME_CAMERA)
 
 
 @kernel(nogil=True)
 def nearest_surfaces(scene, points):
-    """Signed distances of points [n, 3] to obstacles of SceneArrays, at most FAR [m], and the normals."""
+    """For points [n, 3], rows of the signed distance to the nearest obstacle of SceneArrays, at most FAR [m],
+    and the normal there."""
     out = np.empty((len(points), 4), np.float32)
     for p in range(len(points)):
         out[p] = scene_distance(scene, points[p, 0], points[p, 1], points[p, 2], np.float32(FAR))
     return out
 
 
-def _some(match: _Match, ok: Bool[ndarray, "n"]) -> _Match:
-    """The pairs of these that are near enough."""
+def _selected(match: _Match, ok: Bool[ndarray, "n"]) -> _Match:
+    """The rows of a match that are `ok` and whose distances are within their limits."""
     ok = ok & (np.abs(match.distances) < match.limits)
     return _Match(*(values[ok] for values in match))
 
@@ -302,8 +322,11 @@ def _pose(error: Float[ndarray, "6"]) -> Pose:
 
 
 def _deviation(view: DepthView, T: Pose, covariance: Float[ndarray, "6 6"]) -> tuple[float, float]:
-    """By how much a refined pose may be off, for points in the map: a distance along rays [m], and an angle
-    that stands for the rest [rad]; no more than what is stated."""
+    """The `pose_deviation` of a refined pose: a position [m] and an angle [rad] that bound how far its error
+    displaces points in the map; at most the stated deviation.
+
+    The position bounds displacements along rays and those of near points; the angle bounds the others.
+    """
     height, width = view.depth.shape
     fx, fy, cx, cy = view.intrinsics
     u, v, z = (a.ravel() for a in np.meshgrid((0, width / 2, width), (0, height / 2, height), DEPTHS))
@@ -319,11 +342,11 @@ def _deviation(view: DepthView, T: Pose, covariance: Float[ndarray, "6 6"]) -> t
     largest = DEVIATIONS * np.sqrt(np.linalg.eigvalsh(spread)[:, -1])
     position = max(float(along.max()), float(largest[far < NEAR].max(initial=MIN_DEVIATION[0])))
     angle = max(float(((largest - position) / far).max()), MIN_DEVIATION[1])
-    return min((position, angle), view.pose_deviation, key=sum)  # the error at 1 m
+    return min((position, angle), view.pose_deviation, key=sum)  # the sum is the error at 1 m
 
 
 def _block_points(view: DepthView) -> Points:
-    """A point for each block of pixels that sees one surface, in the camera's frame [m]."""
+    """A point at the mean depth of each block of pixels that sees one surface, in the camera's frame [m]."""
     size = max(2, view.depth.shape[1] // COLUMNS)
     rows, columns = (n // size for n in view.depth.shape)
     blocks = view.depth[: rows * size, : columns * size].reshape(rows, size, columns, size)
@@ -340,7 +363,8 @@ def _block_points(view: DepthView) -> Points:
 
 
 def _normals(points: Points) -> tuple[Points, Bool[ndarray, "n"]]:
-    """Normals towards the camera, and which points lie on a flat surface."""
+    """The normals at points in the camera's frame, towards the camera; and which points are on a flat
+    surface."""
     if len(points) <= NEIGHBORS:
         return np.zeros((len(points), 3)), np.zeros(len(points), np.bool_)
     sizes, axes = neighborhoods(points, KDTree(points), NEIGHBORS)

@@ -1,6 +1,6 @@
 """Renders depth images of scenes in milliseconds, and finds the voxels that scenes fill.
 
-Rays are cast through the pixels that a shape may cover.
+For each shape, rays are cast through the pixels that it may cover.
 """
 
 import numpy as np
@@ -26,7 +26,7 @@ _MISS = np.float32(1e9)
 
 @kernel(inline="always")
 def in_camera(T, x, y, z):
-    """A vector in the frame of the base, in the camera's."""
+    """A vector of the base frame, rotated into the camera's frame. T: T_base_camera."""
     return (
         T[0, 0] * x + T[1, 0] * y + T[2, 0] * z,
         T[0, 1] * x + T[1, 1] * y + T[2, 1] * z,
@@ -36,8 +36,8 @@ def in_camera(T, x, y, z):
 
 @kernel()
 def rectangle(x, y, z, r, intrinsics, h, w):
-    """First and last row, first and last column of the pixels that a sphere in the camera's frame may
-    cover."""
+    """First and last row, first and last column of the pixels that a sphere in the camera's frame may cover;
+    the last is below the first if it covers none. h, w: height and width of the image."""
     fx, fy, cx, cy = intrinsics
     if z + r <= _ZERO:
         return 0, -1, 0, -1
@@ -56,7 +56,7 @@ def rectangle(x, y, z, r, intrinsics, h, w):
 
 @kernel(fastmath={"contract", "reassoc", "arcp", "nsz"})
 def _quadratic(a, b, c, last):
-    """The smaller root, or with `last` the larger one, of a t^2 + 2 b t + c; _MISS if there is none."""
+    """The smaller root of a t^2 + 2 b t + c, or the larger root if `last`; _MISS if there is no root."""
     under = b * b - a * c
     if under < _ZERO or a <= _ZERO:
         return _MISS
@@ -82,19 +82,23 @@ def _slab(o, d, half):
 
 @kernel(fastmath={"contract", "reassoc", "arcp", "nsz"})
 def _intersect(solid, ox, oy, oz, dx, dy, dz):
-    """The parameter, in lengths of its direction, at which a ray in the frame of a solid enters it; or
-    _MISS."""
+    """The parameter t at which the ray o + t d, in the frame of a solid, enters the solid; or _MISS.
+
+    solid: a row of `SceneArrays.solids`.
+    """
+    # half edges a, solid[13] and c, and the radius r of the ball; solid[16] is 1 for a cylinder
     a = solid[12]
     c = solid[14]
     r = solid[15]
     if r > _ZERO and c <= _ZERO:
         return _sphere(ox, oy, oz, dx, dy, dz, r)
-    if r <= _ZERO and solid[16] <= _ZERO:
+    if r <= _ZERO and solid[16] <= _ZERO:  # a box
         x0, x1 = _slab(ox, dx, a)
         y0, y1 = _slab(oy, dy, solid[13])
         z0, z1 = _slab(oz, dz, c)
         enter = max(x0, y0, z0)
         return enter if enter < min(x1, y1, z1) else _MISS
+    # a cylinder, or the infinite cylinder around a capsule
     a += r
     square = dx * dx + dy * dy
     mixed = ox * dx + oy * dy
@@ -115,7 +119,7 @@ def _intersect(solid, ox, oy, oz, dx, dy, dz):
 
 @kernel(inline="always")
 def _radius(solid):
-    """The radius of a ball around a solid."""
+    """The radius of a ball around the center of a solid that contains the solid [m]."""
     return np.sqrt(solid[12] ** 2 + solid[13] ** 2 + solid[14] ** 2) + solid[15]
 
 
@@ -127,6 +131,7 @@ def render_depth(solids, intrinsics, T, depth):
     """
     h, w = depth.shape
     fx, fy, cx, cy = intrinsics
+    # the camera's rotation and position in the frame of the solid
     M = np.empty((3, 3), np.float32)
     o = np.empty(3, np.float32)
     for s in range(len(solids)):
@@ -197,7 +202,7 @@ def fill_voxels(solids, low, voxel, margin, out):
 
 
 MAX_RANGE = 4.0
-"""Range of the cameras [m]."""
+"""Range of rendered cameras [m]."""
 
 
 def looking_at(position: Float[ndarray, "3"], target: Float[ndarray, "3"], roll: float = 0.0) -> Pose:
@@ -246,7 +251,7 @@ def voxels_within(
     grid: VoxelGrid,
     margin: float = 0.005,
 ) -> Voxels:
-    """Which voxels of a grid are occupied: their center is in a shape, or at most `margin` [m] from it.
+    """Which voxels of a grid are occupied: their centers are in a shape, or at most `margin` [m] from it.
 
     With the default margin, walls of 1 cm have no holes in a grid with voxels of 2 cm. Raises
     InputError for shapes other than spheres, boxes, cylinders and capsules.

@@ -1,5 +1,5 @@
-"""Reduces depth views to few points, which are added to the scene of a problem: the mean points of the cells
-of a grid, in a hash table."""
+"""Reduces depth views to few points for the scene of a problem: the mean of the points in each cell of a
+grid. A hash table holds the cells."""
 
 from collections.abc import Sequence
 
@@ -28,7 +28,7 @@ RECENT = 256
 
 @kernel(nogil=True, inline="always")
 def _slot(keys, key):
-    """Index of a key in an open-addressing hash table, or of the slot for it."""
+    """Index of a key in an open-addressing hash table, or of the free slot to insert it."""
     mask = len(keys) - 1
     x = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     at = np.int64(x >> np.uint64(32)) & mask
@@ -51,7 +51,7 @@ def _within(x, y, z, xs, ys, zs, radii):
 
 @kernel(nogil=True, inline="always")
 def _key(x, y, z, voxel):
-    """The key of a point's cell."""
+    """The key of a point's cell: its three indices, each in 21 bits."""
     span = np.int64(1) << 20
     i = np.int64(np.floor(x / voxel))
     j = np.int64(np.floor(y / voxel))
@@ -83,12 +83,13 @@ def gather(points, reach, spheres, voxel, keys, cells, sums, count):
     """Adds points [3, n] to cells `voxel` wide. Returns the number of cells; -1 if `sums` is too small.
 
     Points beyond `reach` of the origin, NaN, and points inside one of the spheres [n, 4] are left out. keys,
-    int64, and cells, int32, are an open-addressing hash table, with keys of -1 in empty slots; sums [m, 4]
-    are the sums of coordinates and the number of points of each cell.
+    int64, and cells, int32, are an open-addressing hash table from a cell's key to its row in `sums`; empty
+    slots have the key -1. sums [m, 4]: the sums of the coordinates and the number of points of each cell.
+    count: number of cells in use.
     """
     box = _box(spheres)
     columns = _columns(spheres)
-    # of the last cells: most points are in the cell of a neighboring pixel
+    # a cache of the rows of recent cells, since most points are in the cell of a neighboring pixel
     recent = np.full(RECENT, -1, np.int64)
     rows = np.zeros(RECENT, np.int32)
     for p in range(points.shape[1]):
@@ -112,11 +113,12 @@ def gather(points, reach, spheres, voxel, keys, cells, sums, count):
 
 @kernel(nogil=True)
 def image_points(depth, intrinsics, T):
-    """The points of a depth image [3, h w] in the base frame; NaN for pixels without a return, and for flying
-    pixels: those with fewer than two of their eight neighbors on the same surface. At edges, sensors mix the
-    depths of the near and the far surface.
+    """The points of a depth image [3, h w] in the base frame; NaN for pixels without a return and for flying
+    pixels.
 
-    depth [h, w], intrinsics fx, fy, cx, cy, T: T_base_camera [4, 4]; all float32.
+    At edges, sensors mix the depths of the near and the far surface. A pixel counts as flying if fewer than
+    two of its eight neighbors are on the same surface. depth: [h, w]. intrinsics: fx, fy, cx, cy. T:
+    T_base_camera [4, 4]. All are float32.
     """
     h, w = depth.shape
     fx, fy, cx, cy = intrinsics
@@ -144,7 +146,7 @@ def image_points(depth, intrinsics, T):
                 alike += np.int32(abs(row[u] - d) < jump)
                 alike += np.int32(abs(row[u + 1] - d) < jump)
                 alike += np.int32(abs(row[u + 2] - d) < jump)
-            # the pixel itself is one of three
+            # more than two: `alike` counts the pixel itself
             d = d if (alike > 2) & (d >= _NEAREST) & (d < MAX_DEPTH) else np.float32(np.nan)
             x[u] = (T[0, 0] * a + rx) * d + T[0, 3]
             y[u] = (T[1, 0] * a + ry) * d + T[1, 3]
@@ -154,7 +156,7 @@ def image_points(depth, intrinsics, T):
 
 @kernel(nogil=True)
 def supported(keys, cells, sums, count, least):
-    """Which cells hold at least `least` points, or are next to one that does."""
+    """Which cells hold at least `least` points, or are next to a cell that does."""
     out = np.empty(count, np.bool_)
     for at in range(len(keys)):
         if keys[at] == -1:
@@ -233,19 +235,19 @@ CELL = 0.015
 POINT_RADIUS = 0.01
 """Radius of the obstacle around each point [m]."""
 MIN_POINT_RADIUS = 0.001
-"""Radius of points that would otherwise collide at start or goal [m]."""
+"""Smallest radius of points near the arm at start or goal, so that they do not collide there [m]."""
 JOINED = 1.4
-"""Collision checks join large points that are near each other to spheres that are larger by about this
-factor."""
+"""Collision checks replace large points that are near each other by spheres with about this times their
+radius."""
 ARM_DISTANCE = 0.02
-"""Points within this distance of the arm, at its configuration in the view, are points of the arm [m]; more
-with noise: see `grown_for_errors`."""
+"""Points within this distance of the arm, at its configuration in the view, are points of the arm [m];
+`grown_for_errors` adds an allowance for noise."""
 KNOWN_DISTANCE = 0.01
 """Points within this distance of a known shape are points of the shape [m]."""
 REACH_MARGIN = 0.3
 """Points are kept up to this distance beyond the robot's reach [m]."""
 MIN_CELL_POINTS = 3
-"""Minimum number of points of an isolated cell; cells with fewer are sensor errors."""
+"""Minimum number of points in an isolated cell; fewer points are sensor errors."""
 CAMERA_DISTANCE = 2.0
 """Distance at which a camera of sufficient resolution has many pixels per cell [m]."""
 INITIAL_CELLS = 1 << 16
@@ -306,7 +308,7 @@ def seen_shapes(
 
 
 ERROR_STEP = 0.005
-"""Points whose errors round up to the same multiple of this are one shape [m]."""
+"""Errors of poses are rounded up to multiples of this; points of equal error form one shape [m]."""
 
 
 def point_shapes(
@@ -320,13 +322,16 @@ def point_shapes(
 ) -> tuple[SeenPoints, ...]:
     """Observed points as obstacles, without those of known shapes.
 
-    Points get POINT_RADIUS and the error of their camera's pose, but those that the arm's spheres at start or
-    goals would then touch get less, at least MIN_POINT_RADIUS: this safety margin must not make a free start
-    or goal invalid. Noise enlarges no point: the nearest of the points of a surface lie before it anyway.
-    Points that are no deeper within the arm there than both of their errors, and those within KNOWN_DISTANCE
-    and their errors of a known shape, are left out.
+    The radius of a point is POINT_RADIUS plus the error of its camera's pose. This safety margin must not
+    make a free start or goal invalid, so points that would touch the arm's spheres there get a smaller
+    radius, at least MIN_POINT_RADIUS. Noise does not enlarge points: it puts the nearest points of a surface
+    in front of the surface anyway.
 
-    errors: see `point_errors`. enlarged: whether points get the error of the pose.
+    Two kinds of points are left out because they may be displaced by the sum of their errors: those inside
+    the arm at start or goals by less than this sum, and those nearer to a known shape than KNOWN_DISTANCE
+    plus this sum.
+
+    errors: see `point_errors`. enlarged: whether the error of the pose is added to the radius.
     """
     points = points.astype(np.float32)
     shifts = ERROR_STEP * np.ceil(errors[:, 0] / ERROR_STEP)
@@ -339,15 +344,15 @@ def point_shapes(
         if arrays is not None:
             alike = alike[~near_scene(arrays, alike, np.float32(KNOWN_DISTANCE + error))]
         distances = sphere_distances(alike, ends)
-        outside = np.ones(len(alike), np.bool_)
+        remaining = np.ones(len(alike), np.bool_)
         if error:
-            outside = (distances >= MIN_POINT_RADIUS) | (distances < -error)
+            remaining = (distances >= MIN_POINT_RADIUS) | (distances < -error)
         padded = POINT_RADIUS + enlarged * shift * np.array((1.0, 2 / 3, 1 / 3, 0.0))
         name = "seen"
         for radius in (*dict.fromkeys(padded.tolist()), MIN_POINT_RADIUS):
             distance = (JOINED if radius > POINT_RADIUS else 1.0) * radius + MIN_POINT_RADIUS
-            part = outside & (distances >= distance) if radius > MIN_POINT_RADIUS else outside
-            outside = outside & ~part
+            part = remaining & (distances >= distance) if radius > MIN_POINT_RADIUS else remaining
+            remaining = remaining & ~part
             shapes += [SeenPoints(alike[part], radius, name=name)] if part.any() else []
             name = "seen_at_ends"
     return tuple(shapes)

@@ -1,14 +1,15 @@
-"""Space that no view saw: assumptions about it, the part of it that a motion passes through, and the
-probability that this part is free.
+"""Unknown space, which no view saw: assumptions about it, the part of it that a motion passes through, and
+the probability that this part is free.
 
-Assumptions are obstacles in addition to what was seen. The space that the arm occupies at its start and goals
-is carved out of them.
+An assumption is a set of obstacles in addition to the observed ones. The space that the arm occupies at its
+start and goals is removed from them (carved out).
 
-In a sampled world, unknown space is filled at random, so that near voxels are filled together: a voxel is
-occupied where a smooth random field is below the voxel's probability. At each point the field is uniform
-between 0 and 1 over the worlds, so each voxel keeps its probability; and as obstacles are larger than voxels,
-so are the parts where the field is low. Independent voxels would call a motion through a thousand of them,
-each free with a probability of 0.999, free with one of 0.37.
+The probability that a motion is free is the share of sampled worlds in which it is free. In a sampled world,
+a voxel is occupied if a smooth random field is below the voxel's probability of being occupied. Over the
+worlds, the field at any point is uniform between 0 and 1, so each voxel is occupied with its probability.
+Since the field is smooth, near voxels are occupied together, like those of real obstacles. Independent voxels
+would be too pessimistic: a motion through 1000 voxels, each free with probability 0.999, would be free with
+probability 0.37.
 """
 
 import math
@@ -44,35 +45,35 @@ from robotdiffuse.scenes.point_cloud import voxel_thin
 from robotdiffuse.scenes.scene import Scene
 
 PADDINGS = (0.09, 0.06, 0.04)
-"""Paddings of observed points, the largest first [m]."""
-# Points nearer to the arm's covering spheres than this factor of their padding and this margin [m] are not
-# padded: thinning may enlarge them by so much.
+"""Radii to which observed points are inflated, the largest first [m]."""
+# Points nearer to the arm's covering spheres at start or goals than PADDING_FACTOR times their padding plus
+# PADDING_MARGIN [m] are left out: thinning may enlarge points by so much.
 PADDING_FACTOR = 1.3
 PADDING_MARGIN = 0.01
 THINNING_CELL = 1 / 3
-"""One point is kept of each cell of this size, as a fraction of the padding."""
+"""Thinning keeps one point in each cell of this edge length, as a fraction of the padding."""
 THRESHOLDS = (0.1, 0.2, 0.35, 0.5)
-"""Probabilities above which a predicted voxel is an obstacle, the most careful first."""
+"""Probabilities above which a predicted voxel is an obstacle, the most cautious first."""
 CARVING_MARGIN = 0.02
-"""Voxels nearer to the arm's covering spheres than this are carved out [m]."""
+"""Voxels nearer to the arm's covering spheres at start or goals than this are carved out [m]."""
 
 
 class Assumption(ABC):
-    """Obstacles in addition to what was seen."""
+    """Obstacles in unknown space, in addition to the observed ones."""
 
     name: str
 
     @abstractmethod
     def _touched(self, spheres: Float32[ndarray, "n 4"]) -> Bool[ndarray, "..."]:
-        """Which obstacles are in the way of the arm's covering spheres: x y z radius [m]."""
+        """Which obstacles touch the arm's covering spheres (x, y, z, radius [m]) at start or goals."""
 
     def touched(self, spheres: Float32[ndarray, "n 4"]) -> int:
-        """The number of obstacles that have to be carved out for these spheres."""
+        """The number of obstacles that touch these spheres and have to be carved out."""
         return int(self._touched(spheres).sum())
 
     @abstractmethod
     def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> AssumedPoints:
-        """The obstacles that are left once those in the way of these spheres are carved out."""
+        """The obstacles without those that touch these spheres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +82,7 @@ class Padded(Assumption):
 
     points: Points
     padding: float
-    """[m]"""
+    """Radius of the inflated points [m]."""
 
     @property
     def name(self) -> str:  # type: ignore[override]
@@ -103,7 +104,7 @@ class OccupiedVoxels(Assumption):
     occupied: Voxels
     robot: Robot
     known_scene: Scene
-    """What is known without views; voxels within it are left out."""
+    """Shapes that the problem states; voxels inside them are left out."""
 
     @property
     def grid(self) -> VoxelGrid:
@@ -113,8 +114,8 @@ class OccupiedVoxels(Assumption):
         return self.occupied & self.grid.within(spheres, CARVING_MARGIN + self.grid.edge / 2)
 
     def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> AssumedPoints:
-        """The voxels at the surface of what is occupied: the arm starts outside and cannot get within. Those
-        out of reach, and those in the known scene, are left out."""
+        """The occupied voxels next to voxels that are not: the arm starts outside and cannot get further in.
+        Voxels out of the arm's reach or in the known scene are left out."""
         edge = self.grid.edge
         points = self.grid.centers(surface(self.occupied & ~self._touched(spheres)))
         points = points[np.linalg.norm(points, axis=1) < reach_bound(self.robot) + edge]
@@ -123,7 +124,7 @@ class OccupiedVoxels(Assumption):
 
 
 def without_known(centers: Points, edge: float, robot: Robot, known_scene: Scene) -> Points:
-    """The centers of voxels with this edge, without those of voxels in the known scene [m]."""
+    """The centers of those voxels that are not in the known scene [m]. edge: edge of the voxels [m]."""
     if not known_scene.shapes:
         return centers
     scene = compile_scene_for(robot, known_scene)
@@ -132,13 +133,13 @@ def without_known(centers: Points, edge: float, robot: Robot, known_scene: Scene
 
 
 def padded_assumptions(points: Points) -> Iterator[Assumption]:
-    """Observed points, inflated: the largest padding first."""
+    """Assumptions of inflated observed points, the largest padding first."""
     for padding in PADDINGS:
         yield Padded(voxel_thin(points, padding * THINNING_CELL), padding)
 
 
 def predicted_assumptions(predicted: Probabilities, robot: Robot, known_scene: Scene) -> Iterator[Assumption]:
-    """Voxels that are occupied with a probability above a threshold: the lowest threshold first.
+    """Assumptions of voxels whose probability is above a threshold, the lowest threshold first.
 
     predicted: the probability that each fine voxel is occupied.
     """
@@ -147,19 +148,23 @@ def predicted_assumptions(predicted: Probabilities, robot: Robot, known_scene: S
 
 
 def occupied_assumption(volume: ObservedVolume, robot: Robot, known_scene: Scene) -> Assumption:
-    """Every voxel that no view saw is occupied."""
+    """The assumption that every unknown voxel is occupied."""
     return OccupiedVoxels("unknown is occupied", volume.unknown, robot, known_scene)
 
 
 TILE = 64
-"""Coarse voxels of the periodic field along each axis: a power of two, and more than the observed volume."""
+"""Period of the random field along each axis, in coarse voxels: a power of two, larger than the observed
+volume."""
 
 
 def highest_in_cells(
     probability: Probabilities, marked: Voxels
 ) -> tuple[Int64[ndarray, "n 3"], Float32[ndarray, "n"]]:
-    """Coarse voxels with marked fine voxels that may be occupied, and the highest probability of these in
-    each, the highest first."""
+    """The highest probability of the marked fine voxels in each coarse voxel.
+
+    Returns the indices of the coarse voxels whose highest probability is above 0, and these probabilities,
+    sorted from the highest to the lowest.
+    """
     highest = np.zeros([-(-size // 2) for size in marked.shape], np.float32)
     np.maximum.at(highest, tuple(at // 2 for at in np.nonzero(marked)), probability[marked])
     cells = np.argwhere(highest)
@@ -170,9 +175,11 @@ def highest_in_cells(
 
 @kernel(nogil=True)
 def count_free(field, shifts, cells, values):
-    """The number of shifts of the field at which it is nowhere below the values of the cells.
+    """The number of sampled worlds, each a shift of the field, in which no cell is occupied: the field is
+    nowhere below the cells' values.
 
-    field: float32[TILE, TILE, TILE], periodic; shifts int64[m, 3]; cells int64[n, 3]; values float32[n].
+    field: float32[TILE, TILE, TILE], periodic. shifts: int64[m, 3]. cells: int64[n, 3], coarse voxels.
+    values: float32[n], probabilities.
     """
     free = 0
     for s in range(len(shifts)):
@@ -190,15 +197,15 @@ def count_free(field, shifts, cells, values):
 
 CORRELATION_LENGTH = 0.25
 """Distance at which the field's correlation has fallen to exp(-1/2), before its values are made uniform [m].
-Chosen on problems of `benchmarks/cameras.py` with even numbers."""
+Chosen on the even-numbered problems of `benchmarks/cameras.py`."""
 WORLDS = 256
-"""Sampled worlds of a probability."""
+"""Number of sampled worlds."""
 
 
 def free_share(probability: Probabilities, voxels: Voxels) -> float:
-    """The part of the sampled worlds in which all of these fine voxels are free.
+    """The share of the sampled worlds in which all of these fine voxels are free.
 
-    probability: that each fine voxel is occupied. The worlds are the same in every call.
+    probability: the probability that each fine voxel is occupied. Every call uses the same worlds.
     """
     return count_free(_field(), _shifts(), *highest_in_cells(probability, voxels)) / WORLDS
 
@@ -227,8 +234,7 @@ Box = tuple[tuple[float, ...], tuple[float, ...]]
 
 
 class UnknownSpace:
-    """The voxels that no view saw, without those that the arm occupies at given configurations, and the
-    predicted probabilities there."""
+    """The unknown voxels outside the arm at its start and goals, and their predicted probabilities."""
 
     def __init__(
         self,
@@ -244,7 +250,7 @@ class UnknownSpace:
         occupied_by_arm: configurations at which the arm is known to be free: the start and the goals.
         unknown: the voxels of the grid that no view saw.
         predicted: the probability that each voxel is occupied; None without a prediction.
-        margin: voxels nearer than this to the arm at those configurations count as occupied by it [m].
+        margin: voxels nearer to the arm at these configurations than this count as occupied by it [m].
         lost: the unknown voxels on rays without a return.
         """
         self._robot = robot
@@ -269,12 +275,12 @@ class CrossedSpace:
 
     voxels: Voxels
     probability: Probabilities | None
-    """That each voxel is occupied."""
+    """Predicted probability that each voxel is occupied; None without a prediction."""
     grid: VoxelGrid = FINE
     lost_share: float = 0.0
-    """The part of all space that the motion passes through which lies on rays without a return."""
+    """Of all voxels that the motion passes through, the share that is unknown, on rays without a return."""
     unseen_share: float = 0.0
-    """The part of it that no view saw."""
+    """Of all voxels that the motion passes through, the share that no view saw."""
 
     @cached_property
     def risk(self) -> float | None:
@@ -283,13 +289,13 @@ class CrossedSpace:
 
     @cached_property
     def free_share(self) -> float | None:
-        """The part of the sampled worlds in which all of the voxels are free; None without a prediction."""
+        """The share of sampled worlds in which all of the voxels are free; None without a prediction."""
         return None if self.probability is None else free_share(self.probability, self.voxels)
 
     @property
     def region(self) -> Box | None:
-        """The bounding box of the connected part with the largest summed probability, or of the largest part
-        without a prediction; None if there are no voxels."""
+        """The bounding box of the connected part of the voxels with the largest summed probability or,
+        without a prediction, with the most voxels; None if there are no voxels."""
         if not self.voxels.any():
             return None
         weights = np.ones(self.grid.shape, np.float32) if self.probability is None else self.probability
@@ -305,24 +311,24 @@ RATES: dict[str, float] = {
     "points padded by 4 cm": 0.5,
     "unknown is occupied": 0.99,
 }
-"""Part of the motions under an assumption that were free in the true scene, without a prediction, as
-`python benchmarks/cameras.py --fit` prints it for the calibration half of its problems."""
+"""For each assumption, the fraction of the motions planned under it without a prediction that were free in
+the true scene. `python benchmarks/cameras.py --fit` prints these for the calibration half of its problems."""
 
 UNSEEN_CONFIDENCE = 0.5
-"""Most confidence of a motion of which views saw no more than ..."""
+"""Largest confidence of a motion with an unseen share above MAX_UNSEEN_SHARE."""
 MAX_UNSEEN_SHARE = 0.99
-"""... all but this part."""
 MAX_CONFIDENCE = 0.995
-"""Of a motion that is free in every sampled world: the network and 256 worlds cannot tell more."""
+"""Confidence of a motion that is free in every sampled world; the network and 256 worlds do not justify
+more."""
 
 
 def confidence(assumption: str, crossed: CrossedSpace) -> float:
     """The probability that a motion under an assumption is free in the true scene.
 
-    It is the share of sampled worlds in which the motion is free; see `sampled_worlds`. Without a prediction,
-    it is the assumption's rate. Either falls with the part of the motion of which rays should tell and do
-    not, also where the network predicts free space; where views saw nothing of it, it is at most
-    UNSEEN_CONFIDENCE.
+    It is the share of sampled worlds in which the motion is free, see `free_share`, or, without a prediction,
+    the rate of the assumption in RATES. It is at most UNSEEN_CONFIDENCE if views saw hardly any of the space
+    that the motion passes through. It is reduced in proportion to the share of this space on rays without a
+    return, even if the network predicts that this space is free.
     """
     share = crossed.free_share
     stated = RATES[assumption] if share is None else min(share, MAX_CONFIDENCE)
@@ -332,18 +338,21 @@ def confidence(assumption: str, crossed: CrossedSpace) -> float:
 
 
 EXPLORED = (4.05, -1.15)
-"""Of an Explorer's motions: the log odds of one that sweeps a summed probability of 1, and the slope of the
-log odds over its logarithm, fitted to 493 motions of `benchmarks/exploring.py`, half of them with noise; see
-its report."""
+"""The log odds that a motion of an Explorer is free are the first number plus the second times log(risk).
+
+They were fitted to 493 motions of `benchmarks/exploring.py`, half of them with noise; see its report. See
+`explored_confidence` for the risk.
+"""
 MIN_RISK = 0.2
-"""Smaller summed probabilities are raised to this."""
+"""Smaller risks are raised to this."""
 
 
 def explored_confidence(risk: float) -> float:
-    """The probability that a motion is free in the true scene, where an Explorer's views left little unknown.
+    """The probability that a motion is free in the true scene, if an Explorer's views left little unknown.
 
-    Sampled worlds, which suit the large parts that one view leaves unknown, state too little there.
-    risk: the predicted probability that the motion sweeps, summed over voxels.
+    The share of sampled worlds would be too low: these suit the large regions that a single view leaves
+    unknown. risk: the predicted probability of being occupied, summed over the voxels that the motion passes
+    through.
     """
     odds, slope = EXPLORED
     return 1 / (1 + math.exp(-(odds + slope * math.log(max(risk, MIN_RISK)))))

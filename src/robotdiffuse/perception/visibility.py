@@ -1,5 +1,5 @@
-"""What a camera would see from a pose: voxels, some of which the arm or other voxels may hide, and the small
-balls that cover the surface of the arm."""
+"""What a camera would see from a pose: the voxels that neither the arm nor other voxels hide; and which of
+the small balls that cover the arm's surface are seen to be empty."""
 
 from itertools import product
 
@@ -21,12 +21,12 @@ from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot
 
 OCCLUSION_START = np.float32(2.0)
-"""Voxels within this distance of a voxel do not hide it, since they are as unknown as it is [edges of
+"""Voxels within this distance of a voxel do not hide it, since they are likely unknown too [edges of
 voxels]."""
 MIN_VISIBILITY = np.float32(0.02)
 """Smaller probabilities that a voxel is visible count as zero."""
 ARM_CELL = 16
-"""Edge of the square cells of pixels for which it is decided whether the arm hides them [pixels]."""
+"""Edge of the square cells of pixels in which the arm's depth is computed [pixels]."""
 
 
 @kernel(nogil=True)
@@ -34,10 +34,11 @@ def seen_weights(robot, configurations, poses, intrinsics, size, reach, voxels, 
     """For each camera, the sum over the voxels of weight times the probability that the camera sees the
     voxel.
 
-    robot: RobotArrays; configurations float32[m, dof]: the arm's, one for each camera; poses [m, 4, 4]:
-    T_base_camera; intrinsics fx, fy, cx, cy; size: height and width of the image; reach: farther voxels are
-    not seen [m]; voxels int64[n, 3]; weights [n]; filled [nx, ny, nz]: probability that a voxel is occupied
-    and hides what is behind it; low: lower corner of the grid [m]; edge: that of a voxel [m].
+    robot: RobotArrays. configurations: float32[m, dof], the arm's for each camera. poses: [m, 4, 4],
+    T_base_camera. intrinsics: fx, fy, cx, cy. size: height and width of the image. reach: farther voxels are
+    not seen [m]. voxels: int64[n, 3], their indices. weights: [n]. filled: [nx, ny, nz], the probability that
+    a voxel is occupied and hides what is behind it. low: lower corner of the grid [m]. edge: edge of a voxel
+    [m].
     """
     fx, fy, cx, cy = intrinsics
     half = np.float32(0.5)
@@ -72,25 +73,28 @@ def seen_weights(robot, configurations, poses, intrinsics, size, reach, voxels, 
             dx = dx / far
             dy = dy / far
             dz = dz / far
-            chance = one
-            way = OCCLUSION_START
-            while way < far and chance > MIN_VISIBILITY:
-                i = int(np.floor(x + way * dx))
-                j = int(np.floor(y + way * dy))
-                k = int(np.floor(z + way * dz))
+            # walk from the voxel to the camera in steps of one voxel
+            visible = one
+            traveled = OCCLUSION_START
+            while traveled < far and visible > MIN_VISIBILITY:
+                i = int(np.floor(x + traveled * dx))
+                j = int(np.floor(y + traveled * dy))
+                k = int(np.floor(z + traveled * dz))
                 if not (0 <= i < nx and 0 <= j < ny and 0 <= k < nz):
                     break
-                chance *= one - filled[i, j, k]
-                way += one
-            out[c] += weights[n] * chance if chance > MIN_VISIBILITY else 0.0
+                visible *= one - filled[i, j, k]
+                traveled += one
+            out[c] += weights[n] * visible if visible > MIN_VISIBILITY else 0.0
     return out
 
 
 @kernel(nogil=True)
 def _arm_ahead(robot, q, T, intrinsics, margin, depth):
-    """Write the arm's depth in each cell of an image [m]: that of the nearest covering sphere, inflated by
-    `margin`, on the ray through the middle of the cell; infinite if the ray meets none. Spheres that contain
-    the camera are left out."""
+    """Writes the arm's depth in each cell of an image [m]: the depth of the nearest covering sphere that the
+    ray through the middle of the cell meets; infinite if it meets none.
+
+    The spheres are inflated by `margin`; spheres that contain the camera are left out.
+    """
     fx, fy, cx, cy = intrinsics
     depth[:] = np.inf
     frames = np.zeros((len(q) + 1, 12), np.float32)
@@ -126,12 +130,12 @@ def see_through(depth, intrinsics, T, balls, radius, errors, border, seen):
     """Mark the balls that are empty in an image: the projection of the ball is inside the image, and all
     returns of its pixels are behind the ball. A few of these pixels may have no return.
 
-    depth: float32[h, w], infinite where nothing is in range, 0 without a return, less if nothing is within as
-    much; intrinsics fx, fy, cx, cy; T [4, 4]: T_base_camera; balls [n, 3]: their centers [m]; radius: that of
-    all balls [m]; errors: three numbers: how much the radius grows at the camera [m], how much for each meter
-    of distance, and how far behind the ball a return must be at a distance of 1 m [m], which grows with the
-    square of the distance; border: width of the margin around the projection that is checked too [pixels].
-    All numbers are float32; seen bool[n].
+    depth: float32[h, w], infinite where nothing is in range, 0 without a return, -d without a return where
+    nothing is nearer than d. intrinsics: fx, fy, cx, cy. T: T_base_camera [4, 4]. balls: centers [n, 3] [m].
+    radius: of all balls [m]. errors: three numbers: the radius grows by the first at the camera [m] and in
+    addition by the second for each meter of distance; at a distance of 1 m, returns must be behind the ball
+    by the third [m], which grows with the square of the distance. border: width of the margin around the
+    projection that is checked as well [pixels]. seen: bool[n]. All numbers are float32.
     """
     raw = usable_depth(depth, intrinsics[0])
     h, w = raw.shape
@@ -159,14 +163,14 @@ def see_through(depth, intrinsics, T, balls, radius, errors, border, seen):
 
 
 @kernel(nogil=True)
-def _all_behind(depth, v0, v1, u0, u1, least):
-    """Whether all returns in a rectangle of pixels, with inclusive bounds, are deeper than `least`, and at
-    most MAX_LOST_FRACTION of the pixels have no return."""
+def _all_behind(depth, v0, v1, u0, u1, min_return):
+    """Whether all returns in a rectangle of pixels, with inclusive bounds, are deeper than `min_return` [m],
+    and at most MAX_LOST_FRACTION of the pixels have no return."""
     lost = 0
     max_lost = MAX_LOST_FRACTION * (v1 + 1 - v0) * (u1 + 1 - u0)
     for v in range(v0, v1 + 1):
         for u in range(u0, u1 + 1):
-            if abs(depth[v, u]) > least:
+            if abs(depth[v, u]) > min_return:
                 continue
             lost += 1
             if depth[v, u] > _ZERO or lost > max_lost:
@@ -175,7 +179,7 @@ def _all_behind(depth, v0, v1, u0, u1, least):
 
 
 def within_voxels(balls: Points, radius: float, marked: Voxels, grid: VoxelGrid) -> Bool[ndarray, "n"]:
-    """Which balls lie in marked voxels of the grid alone. radius: at most half an edge [m]."""
+    """Which balls lie entirely in marked voxels of the grid. radius: at most half a voxel's edge [m]."""
     corners = balls[:, None] + list(product((-radius, radius), repeat=3))
     at = grid.indices(corners.reshape(-1, 3))
     within = grid.contains(at)
@@ -193,8 +197,8 @@ BALL_RADIUS = BALL_CELL * 3**0.5 / 2 + SAMPLE_DISTANCE
 
 
 def surface_balls(robot: Robot, q: Configuration) -> Points:
-    """The centers of balls of BALL_RADIUS that cover the surface of moving links and of what they hold, at a
-    configuration, in the base frame [m]."""
+    """Centers of balls of BALL_RADIUS that cover the surfaces of the moving links and of the objects that
+    they hold, at a configuration, in the base frame [m]."""
     frames = forward_frames(robot, q[None])[0]
     return np.concatenate(list(map(placed, frames, _balls_by_frame(robot)))).astype(np.float32)
 
@@ -213,7 +217,7 @@ def _balls_by_frame(robot: Robot) -> list[Points]:
 
 
 def _samples(part: Part) -> Points:
-    """Points within SAMPLE_DISTANCE of each point of a part's surface."""
+    """Points such that each point of the part's surface is within SAMPLE_DISTANCE of one of them."""
     if not len(part.faces):
         return _sphere(part.center, part.radius)
     return np.concatenate([_triangle(part.vertices[face]) for face in part.faces])
@@ -228,7 +232,7 @@ def _triangle(corners: Float[ndarray, "3 3"]) -> Points:
 
 
 def _sphere(center: Float[ndarray, "3"], radius: float) -> Points:
-    """Points on a sphere, along a spiral, within about SAMPLE_DISTANCE of each other."""
+    """Points on a sphere, along a spiral, about SAMPLE_DISTANCE apart."""
     count = max(int(4 * np.pi * (radius / SAMPLE_DISTANCE) ** 2), 1)
     z = 1 - (2 * np.arange(count) + 1) / count
     angle = np.pi * (1 + 5**0.5) * np.arange(count)

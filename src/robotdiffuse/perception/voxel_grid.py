@@ -16,18 +16,18 @@ from robotdiffuse.robots.robot import Robot
 
 Voxels = Bool[ndarray, "nx ny nz"]
 Probabilities = Float32[ndarray, "nx ny nz"]
-"""That each voxel is occupied."""
+"""The probability that each voxel is occupied."""
 VOXEL = 0.04
-"""Edge length of a voxel [m]."""
+"""Edge length of a coarse voxel [m]."""
 LOW = (-1.12, -1.12, -0.1)
-"""Lower corner of the volume, in the frame of the base [m]. A floor at z = 0 is in the middle of a layer of
-these voxels."""
+"""Lower corner of the observed volume, in the frame of the base [m]. A floor at z = 0 is in the middle of a
+layer of coarse voxels."""
 SHAPE = (56, 56, 32)
-"""Number of voxels along x, y and z: the space around an arm with a reach of 1.1 m on a table."""
+"""Number of coarse voxels along x, y and z: the space around an arm with a reach of 1.1 m on a table."""
 JOINT_STEP = np.float32(0.05)
-"""Largest motion of a joint between two samples [rad], [m] for prismatic joints."""
+"""Largest motion of a joint between two sampled configurations of a path [rad], [m] for prismatic joints."""
 MIN_MOVE = np.float32(0.1)
-"""A sphere is marked again once it has moved by more than this, as a fraction of a voxel's edge."""
+"""`sweep` marks a sphere again once it has moved by more than this fraction of a voxel's edge."""
 
 
 FINE_VOXEL_SIZE = VOXEL / 2
@@ -48,19 +48,19 @@ class VoxelGrid:
 
     @property
     def frame(self) -> tuple[Float32[ndarray, "3"], np.float32]:
-        """The lower corner and the edge as compiled code takes them."""
+        """The lower corner and the edge as float32, for compiled code."""
         return np.array(self.low, np.float32), np.float32(self.edge)
 
     def centers(self, at: Int[ndarray, "n 3"]) -> Points:
-        """The centers of the voxels of these indices [m]."""
+        """The centers of the voxels with these indices [m]."""
         return (at + 0.5) * self.edge + self.low
 
     def indices(self, points: Points) -> Int[ndarray, "n 3"]:
-        """The indices of the voxels that points in the base frame lie in; they may be outside of the grid."""
+        """The indices of the voxels that contain points of the base frame; they may be outside the grid."""
         return np.floor((points - self.low) / self.edge).astype(np.int64)
 
     def contains(self, at: Int[ndarray, "n 3"]) -> Bool[ndarray, "n"]:
-        """Which of these indices are of voxels of the grid."""
+        """Which of these indices are inside the grid."""
         return np.asarray(((at >= 0) & (at < self.shape)).all(axis=1))
 
     def filled(self, robot: Robot, configurations: Iterable[Configuration], margin: float = 0.0) -> Voxels:
@@ -83,7 +83,7 @@ class VoxelGrid:
 
 
 COARSE, FINE = VoxelGrid(LOW, SHAPE, VOXEL), VoxelGrid(LOW, FINE_SHAPE, FINE_VOXEL_SIZE)
-"""The voxels of the observed volume, and those halved."""
+"""The voxels of the observed volume (4 cm), and voxels with half their edge (2 cm) in the same space."""
 
 
 LAYERS_BELOW = 20
@@ -93,21 +93,21 @@ MAP = VoxelGrid(
     (FINE_SHAPE[0], FINE_SHAPE[1], FINE_SHAPE[2] + LAYERS_BELOW),
     FINE_VOXEL_SIZE,
 )
-"""The voxels of a map: those of `ObservedVolume`, halved, and 0.4 m below it, where an arm on a stand
-reaches."""
+"""The voxels of an `OccupancyMap`: the fine ones of the observed volume, and more to 0.4 m below it, where an
+arm on a stand reaches."""
 
 
 def refined(voxels: Bool[ndarray, "mx my mz"], parts: int = 2) -> Voxels:
-    """Voxels as finer ones; by default coarse ones of the observed volume as fine ones."""
+    """Divides each voxel into `parts` along each axis; the default turns COARSE voxels into FINE ones."""
     return voxels.repeat(parts, 0).repeat(parts, 1).repeat(parts, 2)
 
 
 @kernel(nogil=True)
 def sweep(robot, path, margin, low, voxel, swept):
-    """Mark the voxels with centers that the moving covering spheres, inflated by `margin` [m], pass over;
-    `swept` is bool[nx, ny, nz].
+    """Marks in `swept`, bool[nx, ny, nz], the voxels whose centers the moving links' spheres pass over.
 
-    robot: RobotArrays; path float32[n, dof]; low [3] corner of the voxels and `voxel`, their edge [m].
+    robot: RobotArrays. path: float32[n, dof]. margin: the covering spheres are inflated by this [m]. low: the
+    lower corner of the grid [m]. voxel: edge of a voxel [m].
     """
     dof = path.shape[1]
     frames = np.zeros((dof + 1, 12), np.float32)
@@ -139,13 +139,13 @@ def sweep(robot, path, margin, low, voxel, swept):
 
 @kernel(nogil=True)
 def mark(spheres, low, voxel, marked):
-    """Mark the voxels with centers in one of the spheres [n, 4]."""
+    """Marks the voxels whose centers are in one of the spheres [n, 4]; see `sweep` for low and voxel."""
     for s in range(len(spheres)):
         _mark(spheres[s, 0], spheres[s, 1], spheres[s, 2], spheres[s, 3], low, voxel, marked)
 
 
 def surface(marked: Voxels) -> Int[ndarray, "n 3"]:
-    """Indices of the marked voxels that share a face with one that is not, in order."""
+    """Indices of the marked voxels that share a face with an unmarked voxel of the grid, in order."""
     inner = np.pad(marked, 1, constant_values=True)
     within = marked.copy()
     for axis in range(3):
@@ -167,10 +167,10 @@ def _mark(x, y, z, radius, low, voxel, marked):
         dx = np.float32(i) - x
         for j in range(max(int(np.ceil(y - r)), 0), min(int(np.floor(y + r)), ny - 1) + 1):
             dy = np.float32(j) - y
-            rest = r * r - dx * dx - dy * dy
-            if rest < 0:
+            square = r * r - dx * dx - dy * dy
+            if square < 0:
                 continue
-            reach = np.sqrt(rest)
+            reach = np.sqrt(square)
             first = max(int(np.ceil(z - reach)), 0)
             beyond = min(int(np.floor(z + reach + one)), nz)
             for k in range(first, beyond):
@@ -178,8 +178,11 @@ def _mark(x, y, z, radius, low, voxel, marked):
 
 
 def heaviest_part(marked: Voxels, weights: Probabilities) -> Int[ndarray, "2 3"]:
-    """Bounding box of the connected part of the marked voxels with the largest sum of weights: first voxel
-    and one beyond the last. Voxels that share a face are connected."""
+    """Bounding box of the connected part of the marked voxels with the largest sum of weights.
+
+    Returns the indices of its first voxel, and those of its last voxel plus one; zeros if no voxel is marked.
+    Voxels that share a face are connected.
+    """
     from scipy import ndimage
 
     parts, count = ndimage.label(marked)  # type: ignore[misc]

@@ -6,16 +6,16 @@ from contextlib import suppress
 
 from robotdiffuse.core.errors import needs
 
-# how the line begins that PyBullet prints as it is imported
+# beginning of the line that PyBullet prints when it is imported
 BUILD_TIME = b"pybullet build time"
 
 
 def _import_pybullet() -> None:
-    """Import PyBullet without the build time that it prints directly to a file descriptor; what other threads
-    print meanwhile is printed afterwards."""
+    """Import PyBullet, and suppress the build time that it prints directly to a file descriptor. Output of
+    other threads during the import is printed afterwards."""
     saved: dict[int, int] = {}
     for stream in (1, 2):
-        with suppress(OSError):  # it is closed
+        with suppress(OSError):  # the stream is closed
             saved[stream] = os.dup(stream)
     printed = {stream: tempfile.TemporaryFile() for stream in saved}  # noqa: SIM115  (closed below)
     try:

@@ -2,11 +2,11 @@
 
 Each joint has a motor that PyBullet drives towards the position of the trajectory, with the velocity as feed
 forward. Gravity acts. Links have uniform density (`World`) and motors are strong: masses and torque limits of
-the robot file are not used. So a replay shows that the motion is smooth enough to track and free of
-contacts while tracked, not that a certain motor can execute it.
+the robot file are not used. So a replay shows that the motion is smooth enough to be tracked, and free of
+contacts while it is tracked. It does not show that a certain motor can execute the motion.
 
-Bullet's meshes are 1 mm too large. A motion that passes an obstacle at less than that (2 mm between two
-links) has a contact here.
+Bullet inflates meshes by 1 mm. A motion with less than 1 mm between a link and an obstacle, or less than 2 mm
+between two links, therefore has a contact here.
 """
 
 from collections.abc import Sequence
@@ -61,7 +61,7 @@ class ReplayContact:
     depth: float
     """Largest penetration depth [m]; negative if a gap remained.
 
-    Bullet's meshes push from a distance of 1 mm, so that bodies may be pushed apart before they meet.
+    Bullet's meshes repel each other from a distance of 1 mm, so bodies may be pushed apart before they touch.
     """
 
 
@@ -88,12 +88,12 @@ class Replay:
 
     @property
     def max_errors(self) -> Configuration:
-        """Largest tracking error of each joint [rad]."""
+        """Largest tracking error of each joint [rad], [m] for prismatic joints."""
         return np.abs(self.positions - self.reference).max(axis=0)
 
     @property
     def rms_errors(self) -> Configuration:
-        """Root mean square tracking error of each joint [rad]."""
+        """Root mean square tracking error of each joint [rad], [m] for prismatic joints."""
         return np.sqrt(((self.positions - self.reference) ** 2).mean(axis=0))
 
 
@@ -107,8 +107,8 @@ def replay(
     """Simulate a trajectory, and then REST_TIME of rest.
 
     An obstacle that the arm hits blocks it; the simulation continues to the end. Moving obstacles move until
-    the trajectory ends; those of unknown motion stand still. Raises InputError for a
-    trajectory of other joints.
+    the trajectory ends; obstacles of unknown motion stand still. Raises InputError for a trajectory of other
+    joints.
     """
     if trajectory.joint_names != robot.joint_names:
         raise InputError(
@@ -149,7 +149,7 @@ def _simulate(
             body,
             world.joints,
             pybullet.POSITION_CONTROL,
-            # the position for now, and the velocity that leads to the next position
+            # the position at the beginning of the step, and the velocity that leads to the next position
             targetPositions=reference[k - 1].tolist(),
             targetVelocities=velocities[k - 1].tolist(),
             forces=[settings.force] * dof,

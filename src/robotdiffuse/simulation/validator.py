@@ -30,7 +30,8 @@ class OracleContact:
     distance: float
     """Signed distance [m], negative if they overlap."""
     at: float = 0.0
-    """For a path, waypoint index plus fraction of the segment; for frames, the row."""
+    """Place of the contact. On a path: waypoint index plus fraction of the segment; among configurations: the
+    row."""
 
 
 class PyBulletOracle:
@@ -55,12 +56,13 @@ class PyBulletOracle:
         self._world.close()
 
     def set_scene(self, scene: Scene) -> None:
-        """Replace the obstacles; a thousand times cheaper than a new oracle, because the robot stays
-        loaded."""
+        """Replace the obstacles. The robot stays loaded, so this is a thousand times faster than a new
+        oracle."""
         self._world.set_scene(scene)
 
     def nearest(self, q: Configuration, within: float = MAX_DISTANCE) -> OracleContact | None:
-        """The closest pair, link and obstacle or two links; None if its distance exceeds `within` [m]."""
+        """The closest pair of a link and an obstacle, or of two links; None if its distance exceeds `within`
+        [m]."""
         world = self._world
         world.place(q)
         best: OracleContact | None = None
@@ -113,6 +115,8 @@ class PyBulletOracle:
     def _closer(
         self, best: OracleContact | None, within: float, link: str, other: str, body: int, index: int
     ) -> OracleContact | None:
+        """The closer of `best` and of a pair, if the pair is within `within` [m]. body, index: PyBullet's
+        body and link of `other`."""
         world = self._world
         nearest = within if best is None else best.distance
         points = world.bullet.getClosestPoints(world.body, body, max(nearest, 0.0), world.links[link], index)

@@ -32,7 +32,7 @@ OTHER_LINK = 4
 DISTANCE = 8
 FORCE = 9
 MIN_MASS = 0.01
-"""Smallest mass of a link [kg]; PyBullet cannot move one without."""
+"""Smallest mass of a link [kg]; PyBullet cannot move links without mass."""
 
 
 class _Simulation:
@@ -53,7 +53,7 @@ class World:
     """
 
     def __init__(self, robot: Robot, scene: Scene, moving: Sequence[MovingObstacle] = ()) -> None:
-        """moving: further obstacles, where they are at time 0 until `move`."""
+        """moving: further obstacles, at their poses of time 0 until `move` is called."""
         self.robot = robot
         self.bullet = _Simulation()
         """PyBullet's functions for this simulation."""
@@ -68,13 +68,13 @@ class World:
     def _load(self) -> None:
         robot = self.robot
         bullet = self.bullet
-        # otherwise Bullet takes a file of the same name for the same mesh
+        # with caching, Bullet would take two files of the same name for the same mesh
         bullet.setPhysicsEngineParameter(enableFileCaching=0)
         flags = pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_SELF_COLLISION_INCLUDE_PARENT
         urdf = write_urdf(robot, Path(self._folder.name))
         self.body: int = bullet.loadURDF(str(urdf), useFixedBase=True, flags=flags)
         self.links: dict[str, int] = {robot.base: -1}
-        """PyBullet's index of each link, which is also that of the joint above it."""
+        """PyBullet's index of each link, which is also the index of the joint that moves the link."""
         indices: dict[str, int] = {}
         for index in range(bullet.getNumJoints(self.body)):
             info = bullet.getJointInfo(self.body, index)
@@ -104,8 +104,8 @@ class World:
         self.obstacles: dict[str, int] = {}
         """PyBullet's body index of each obstacle, by name."""
         self.mesh_shapes: dict[tuple[bytes, bytes], int] = {}
-        """PyBullet's collision shape of each mesh; reused because PyBullet never frees the memory of a
-        mesh."""
+        """PyBullet's collision shape of each mesh, by its vertices and faces. Shapes are reused, because
+        PyBullet never frees the memory of a mesh."""
 
     def __enter__(self) -> "World":
         return self
@@ -137,7 +137,7 @@ class World:
         self.bullet.resetJointStatesMultiDof(self.body, self.joints, q[:, None].tolist())
 
     def move(self, time: float) -> None:
-        """Place the moving obstacles where they are at a time [s]; one of unknown motion stays."""
+        """Place the moving obstacles at their poses of a time [s]; obstacles of unknown motion stay."""
         for obstacle in self._moving:
             self.bullet.resetBasePositionAndOrientation(
                 self.obstacles[obstacle.name], *_pose(obstacle.frame(time))
@@ -204,7 +204,7 @@ def _pose(T: Pose) -> tuple[list[float], list[float]]:
 
 
 def write_urdf(robot: Robot, folder: Path) -> Path:
-    """Write the robot as a URDF with its convex meshes and masses by DENSITY; returns the file in `folder`.
+    """Write the robot as a URDF with its convex meshes and masses from DENSITY; returns the file in `folder`.
 
     Joints that planning does not move keep their kind but lose their limits, because published problems open
     grippers wider than their URDF allows.
@@ -252,7 +252,7 @@ def mass_and_center(meshes: tuple[ConvexMesh, ...], density: float) -> tuple[flo
 
 
 def _add_inertia(element: Xml.Element, meshes: tuple[ConvexMesh, ...]) -> None:
-    """Add mass and center of mass; Bullet computes the inertia itself, and ignores that of the file."""
+    """Add mass and center of mass. Bullet computes the inertia itself and ignores the zeros written here."""
     mass, center = mass_and_center(meshes, DENSITY)
     inertial = Xml.SubElement(element, "inertial")
     Xml.SubElement(inertial, "origin", xyz=_numbers(center))

@@ -1,11 +1,11 @@
 """Denoisers, networks that predict the clean trajectory from a noisy one, and their settings.
 
-Nothing here loads PyTorch, so that planning can read them. The networks are in `denoisers.networks`.
+Nothing here loads PyTorch, so that planning can read the settings. The networks are in `denoisers.networks`.
 
-Millions of parameters of the defaults (48 waypoints) and of `paper_size` (254 waypoints) for a Panda, and
-the time of a forward pass of the defaults on a batch of 16, one thread, in units of the transformer's (5.8
-ms in bf16, 10.7 ms in fp32; torch 2.13, CPU with AVX-512 BF16). Other work was running, so times are
-accurate to about 20 %.
+The table gives the millions of parameters for a Panda, of the default settings (48 waypoints) and of
+`paper_size` (254 waypoints). The last two columns are the time of a forward pass with the default settings,
+relative to the transformer, which takes 5.8 ms in bf16 and 10.7 ms in fp32 (batch of 16, one thread, torch
+2.13, CPU with AVX-512 BF16). Other processes were running, so times are accurate to about 20 %.
 
 | denoiser        | default | paper's size | bf16 | fp32 |
 |-----------------|---------|--------------|------|------|
@@ -46,14 +46,14 @@ class AttentionSettings(DenoiserSettings):
     causal: ClassVar[bool] = False
     """Whether waypoints attend only to z_tk and the waypoints before them."""
     points: ClassVar[bool] = False
-    """Whether waypoints also attend to points of the scene, which replace the embedding (encoder
+    """Whether waypoints also attend to points of the scene, which replace the embedding z (encoder
     `points`)."""
     width: Count = 160
     """Size of a token; even (paper: 512)."""
     layers: Count = 6
     """Number of blocks (paper: 8)."""
     heads: Count = 5
-    """ALL Number of attention heads; a divisor of `width`."""
+    """Number of attention heads; a divisor of `width`."""
     hidden: Count = 480
     """Size of the hidden layer of each feed-forward network."""
     patch: Count = 4
@@ -100,7 +100,7 @@ class EncoderDecoderSettings(AttentionSettings, name="encoder_decoder"):
     encoder_layers: Count = 2
     """Number of blocks of the encoder."""
     heads: Count = 4
-    """ALL Number of attention heads; a divisor of `width`."""
+    """Number of attention heads; a divisor of `width`."""
     hidden: Count = 432
     """Size of the hidden layer of each feed-forward network."""
 
@@ -173,7 +173,7 @@ DENOISERS = Registry(
         ),
         "cross_attention": Entry(
             f"{_NETWORKS}:TrajectoryTransformer",
-            "transformer whose waypoints attend to points of the scene, of the encoder points",
+            "transformer whose waypoints attend to points of the scene; needs the encoder points",
             f"{__name__}:CrossAttentionSettings",
         ),
         "unet": Entry(f"{_NETWORKS}:UNet", "temporal U-Net", f"{__name__}:UNetSettings"),

@@ -22,10 +22,19 @@ from robotdiffuse.learning.denoisers import (
 from robotdiffuse.learning.encoders.networks import OCTAVES, perceptron, wave_angles
 
 MAX_UNFUSED_TOKENS = 96
-"""Up to this number of tokens, attention in fp32 on a CPU does without the fused kernel; in bf16 always.
-Measured with torch 2.13 on one thread, forward and backward [ms], unfused in bf16, unfused in fp32, fused in
-fp32. Batch 64, 4 heads of 128 numbers: 31 tokens 13, 30 and 34; 66 tokens 29, 76 and 56; 97 tokens 49, 93 and
-121; 255 tokens 274, 813 and 480. Batch 128, 5 heads of 32 numbers: 13 tokens 4.5, 8.8 and 8.1."""
+"""On a CPU, attention in fp32 uses PyTorch's fused kernel only for more tokens than this; in bf16 it never
+uses the fused kernel.
+
+Times of a forward and a backward pass [ms], torch 2.13, one thread:
+
+| batch, heads x size | tokens | unfused bf16 | unfused fp32 | fused fp32 |
+|---------------------|--------|--------------|--------------|------------|
+| 64, 4 x 128         |     31 |         13   |         30   |       34   |
+| 64, 4 x 128         |     66 |         29   |         76   |       56   |
+| 64, 4 x 128         |     97 |         49   |         93   |      121   |
+| 64, 4 x 128         |    255 |        274   |        813   |      480   |
+| 128, 5 x 32         |     13 |          4.5 |          8.8 |        8.1 |
+"""
 
 
 Features = Float[Tensor, "batch waypoints features"]
@@ -74,8 +83,8 @@ def attend(
 ) -> Float[Tensor, "batch tokens width"]:
     """Attention of tokens to others; causal: each token only to those up to itself.
 
-    Plain matrix products serve bf16 and short sequences on a CPU, where the fused kernel is slower; the fused
-    kernel serves the others and GPUs.
+    On a CPU, bf16 and short sequences use plain matrix products, which are faster there than the fused
+    kernel. Long sequences in fp32, and GPUs, use the fused kernel.
     """
     batch, heads, tokens, size = q.shape
     plain = q.dtype == torch.bfloat16 or k.shape[2] <= MAX_UNFUSED_TOKENS
@@ -86,7 +95,7 @@ def attend(
         if causal:
             later = torch.ones(tokens, tokens, dtype=torch.bool, device=q.device).triu(1)
             scores = scores.masked_fill(later, -torch.inf)
-        # padded to a multiple of 16, softmax over few tokens is eight times as fast
+        # padding to a multiple of 16 makes softmax over few tokens eight times as fast
         padded = functional.pad(scores, (0, -scores.shape[-1] % 16), value=-torch.inf)
         mixed = torch.softmax(padded, dim=-1)[..., : scores.shape[-1]] @ v
     return mixed.transpose(1, 2).reshape(batch, tokens, heads * size)
@@ -176,13 +185,13 @@ class Block(nn.Module):
 class TrajectoryTransformer(Denoiser):
     """A transformer whose tokens are patches of waypoints; its settings tell the variants apart.
 
-    - Encoder-only (the paper's motion predictor), after one more token, z_tk, that carries the condition and
-      the noise level. z_tk may also be added to every other token.
-    - Decoder-only (paper, Table 2; Radford et al. 2018): the same with causal attention. z_tk is the first
-      token, and so the only one that all waypoints attend to. One pass predicts all waypoints.
-    - With points: z_tk carries start, goal and level; each block attends to the points of the scene too.
+    - Encoder-only (the paper's motion predictor): a further token before those of the waypoints, z_tk,
+      carries the condition and the noise level. z_tk may also be added to every other token.
+    - Decoder-only (paper, Table 2; Radford et al. 2018): as encoder-only, with causal attention. z_tk is the
+      first token, so it is the only token that all waypoints attend to. One pass predicts all waypoints.
+    - With points: z_tk carries start, goal and level; each block also attends to the points of the scene.
     - Encoder-decoder (paper, Table 2; Vaswani et al. 2017, with norms first): the encoder takes the tokens z,
-      start, goal and t, and each block attends to them. There is no z_tk.
+      start, goal and t, and each block attends to the encoder's output. There is no z_tk.
     """
 
     positions: Tensor

@@ -1,6 +1,6 @@
 """Encoders of the scene, from a point cloud to a few numbers, and their settings.
 
-Nothing here loads PyTorch, so that planning can read them. The networks are in `encoders.networks`.
+Nothing here loads PyTorch, so that planning can read the settings. The networks are in `encoders.networks`.
 """
 
 from dataclasses import dataclass
@@ -29,16 +29,15 @@ class EncoderSettings(Settings, name="encoder"):
     code: Count = 96
     """Size of the scene embedding z (paper: 60, for two obstacles)."""
     cloud: Count = 512
-    """ALL Number of points of an input cloud."""
+    """Number of points of an input cloud."""
     region: VisibleRegion = PANDA_REGION
-    """Points outside this region are ignored, since the arm does not reach them. For a robot with a large
-    reach, the region contains whole surfaces."""
+    """Points outside this region are ignored, since the arm does not reach them."""
 
     def prepared(self, points: Float32[ndarray, "n 3"]) -> Float32[ndarray, "m 3"]:
         """Points within the region in the form that the exported encoder takes [m]."""
         if self.ordered:
             return in_order(points, self.cloud, self.along_curve)
-        # zeros have no effect; the exported network needs at least one point, or exactly `cloud` points
+        # padding points of zeros have no effect; the exported network needs at least one point, or `cloud`
         needed = 1 if self.any_size else self.cloud
         return np.pad(points, ((0, max(needed - len(points), 0)), (0, 0)))
 
@@ -74,10 +73,10 @@ def in_order(
     points: Float32[ndarray, "n 3"], count: int, along_curve: bool = False
 ) -> Float32[ndarray, "{count} 3"]:
     """`count` points of a cloud, sorted by x, then y, then z, or along the Z-order curve. A larger cloud is
-    thinned evenly; points of a smaller one are repeated; an empty one gives zeros.
+    thinned evenly; points of a smaller cloud are repeated; an empty cloud gives zeros.
 
-    Before sorting by x, y and z, coordinates are rounded to a millionth of the largest one. `Encoder.arrange`
-    does the same for batches of tensors.
+    Before sorting by x, y and z, coordinates are rounded to a millionth of the largest coordinate.
+    `Encoder.arrange` orders batches of tensors in this way.
     """
     if not len(points):
         return np.zeros((count, 3), np.float32)
@@ -123,7 +122,7 @@ class PointsSettings(EncoderSettings, name="points"):
     code: Count = 96
     """Size of z: three numbers for each point."""
     cloud: Count = 32
-    """ALL Number of points of an input cloud."""
+    """Number of points of an input cloud."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -136,7 +135,7 @@ class PointNetSettings(EncoderSettings):
     """Sizes for training on a CPU; the original's are in brackets."""
 
     cloud: Count = 256
-    """ALL Number of points of an input cloud (in the paper of the encoder: 1024)."""
+    """Number of points of an input cloud (in the paper of the encoder: 1024)."""
     first: Sizes = (32, 32)
     """Widths of the layers on each point before the feature transform (64, 64)."""
     second: Sizes = (32, 64, 192)
@@ -155,7 +154,7 @@ class DGCNNSettings(EncoderSettings):
 
     any_size = False  # distances to neighbors depend on the density of the cloud
     cloud: Count = 128
-    """ALL Number of points of an input cloud (in the paper of the encoder: 1024)."""
+    """Number of points of an input cloud (in the paper of the encoder: 1024)."""
     neighbors: Count = 8
     """Number of nearest points to which each point is joined (20)."""
     edges: Sizes = (32, 32, 64)
@@ -193,12 +192,12 @@ ENCODERS = Registry(
     },
 )
 """Encoders by their name in settings and checkpoints. There are two kinds. An encoder of kind "alone" is
-trained with its own loss and then frozen. One of kind "jointly" is a part of the planner's network and is
-trained with its loss, on new clouds in every batch."""
+trained with its own loss and then frozen. An encoder of kind "jointly" is a part of the planner's network and
+is trained with the planner's loss, on new clouds in every batch."""
 
 
 def make_encoder(name: str, settings: EncoderSettings | None = None) -> Any:
-    """An untrained encoder of that name; None: with its default settings."""
+    """An untrained encoder of this name; settings: None: the encoder's defaults."""
     return ENCODERS.load(name)(settings or ENCODERS.defaults(name))
 
 

@@ -1,6 +1,6 @@
 """The encoders: auto-encoders that are trained alone, and networks that are trained with the planner.
 
-PointNet and DGCNN normalize features over the channels of a point (layer norm), unlike the originals, and not
+Unlike the originals, PointNet and DGCNN normalize features over the channels of a point (layer norm), not
 over the batch: a code must not depend on the other clouds, clouds may hold points that do not count, and
 averaged weights have no averaged batch statistics.
 """
@@ -56,18 +56,17 @@ class Encoder(SavedModule, ABC):
         """
 
     def code_of_ordered(self, cloud: Cloud) -> Codes:
-        """z of clouds that already have the size and order that the settings ask for; for export."""
+        """z of clouds that already have the size and order of `EncoderSettings.prepared`; for export."""
         return self(cloud)
 
     def near(self, cloud: Cloud) -> Near:
-        """The points that count: which points are in the region and are not the zeros with which
-        `surface_clouds` pads."""
+        """Which points count: those in the region that are not the zeros with which `surface_clouds` pads."""
         region = self.settings.region
         inside = (cloud - self.center).square().sum(-1) < region.reach**2
         return inside & (cloud[..., 2] > region.floor) & (cloud != 0).any(-1)
 
     def arrange(self, cloud: Cloud) -> Ordered:
-        """The points of each cloud that count, as by `EncoderSettings.prepared`."""
+        """The points of each cloud that count, in the form of `EncoderSettings.prepared`."""
         counted = zip(cloud.cpu().numpy(), self.near(cloud).cpu().numpy(), strict=True)
         ordered = [self.settings.prepared(points[near]) for points, near in counted]
         return torch.from_numpy(np.stack(ordered)).to(cloud.device)
@@ -115,13 +114,13 @@ def fp32(tensor: Tensor) -> torch.autocast:
 
 
 OCTAVES = 4
-"""Number of wavelengths (4 m, 2 m, ...) of the sines and cosines of a point's coordinates that are additional
+"""Number of wavelengths (4 m, 2 m, ...) of the sines and cosines of a point's coordinates, which are also
 inputs."""
 
 
 def wave_angles(points: Float[Tensor, "*batch 3"], octaves: int = OCTAVES) -> list[Float[Tensor, "*batch 3"]]:
-    """Coordinates as angles at the wavelengths 4 m, 2 m, ...: with their sines and cosines a small perceptron
-    distinguishes positions."""
+    """Coordinates as angles [rad] at the wavelengths 4 m, 2 m, ... From the angles' sines and cosines, even a
+    small perceptron can distinguish positions."""
     return [points * (torch.pi / 2 * 2**octave) for octave in range(octaves)]
 
 
@@ -149,9 +148,9 @@ class CompressionAutoencoder(Autoencoder):
 
     A perceptron on 1,400 points in a fixed order, 4200 -> 786 -> 512 -> 256 -> 60, and its mirror image. The
     paper states neither the order nor the activation. Here the points are sorted along a space-filling curve,
-    so that a place in the order belongs to a small part of the surfaces. Sorted by x, then y, then z, its y
-    and z could be those of any obstacle. The activation is PReLU, as in MPNet (Qureshi et al. 2019), whose
-    encoder has the same form and loss.
+    so that an input belongs to a small part of the surfaces. If points were sorted by x, then y, then z, an
+    input's y and z could be those of any obstacle. The activation is PReLU, as in MPNet (Qureshi et al.
+    2019), whose encoder has this form and this loss.
     """
 
     settings: CompressionAutoencoderSettings
@@ -177,8 +176,8 @@ class CompressionAutoencoder(Autoencoder):
     def loss(self, cloud: Cloud, rng: Generator) -> Loss:
         """The first term of l_AE: the mean over points of the squared distance to the reconstruction [m^2].
 
-        The equation does not define K: it is taken as the number of points, and i-hat as the text's x-hat.
-        The error `reconstruction` is the root of the loss [m].
+        The equation in the paper does not define K; here it is the number of points, and i-hat is the text's
+        x-hat. The error `reconstruction` is the root of the loss [m].
         """
         with fp32(cloud):
             points = self.arrange(cloud.float())
@@ -188,8 +187,8 @@ class CompressionAutoencoder(Autoencoder):
     def penalized(self) -> Iterable[Tensor]:
         """The encoder's weights.
 
-        The equation has (theta^2_ij)^2, which literally is a sum of fourth powers. MPNet's equation has the
-        square of theta^e_ij, the encoder's weights, in that place; this is taken to be meant.
+        The equation in the paper has (theta^2_ij)^2, literally a sum of fourth powers. We assume that it
+        means the square of theta^e_ij, the encoder's weights, as in MPNet's equation.
         """
         return (layer.weight for layer in self.encoder if isinstance(layer, nn.Linear))
 
@@ -197,8 +196,7 @@ class CompressionAutoencoder(Autoencoder):
 DISTANCE_QUERIES = 96
 """Number of positions for each cloud at which the distance field is reconstructed."""
 DISTANCE_WEIGHT = 4.0
-"""Weight in the training loss of the error of the distance field relative to the Chamfer distance, both in
-meters."""
+"""Weight of the distance field's error [m] in the training loss, relative to the Chamfer distance [m]."""
 DISTANCE_CAP = 0.5
 """Reconstructed distances are capped at this [m]."""
 
@@ -234,7 +232,7 @@ class PointAutoencoder(Autoencoder):
             x = functional.relu(self.points[0](self._waves(cloud)))
         for layer in list(self.points)[1:]:
             x = functional.relu(layer(x))
-        x = x * near  # features are not negative, so zeros never change a maximum
+        x = x * near  # zeros do not change the maximum, because features are not negative
         count = near.sum(1)
         pooled = torch.cat([x.amax(1).float(), x.float().sum(1) / count.clamp(min=1)], -1)
         return self.head(torch.where(count > 0, pooled, self.empty)).float()
@@ -257,8 +255,8 @@ class PointAutoencoder(Autoencoder):
     def loss(self, cloud: Cloud, rng: Generator) -> Loss:
         """Chamfer distance plus the weighted error of the distance field.
 
-        Errors: `chamfer`, both ways added; `distance`, mean error of the distance field;
-        `distance_of_constant`, that of a constant, all [m].
+        Errors [m]: `chamfer`, the sum of both directions; `distance`, mean error of the distance field;
+        `distance_of_constant`, mean error of a constant field.
         """
         near = self.near(cloud)
         at = self._query_positions(cloud, rng)
@@ -310,7 +308,7 @@ def nearest(
     """
     with torch.no_grad(), fp32(a):
         b = torch.where(allowed[..., None], b, 100.0).float()
-        # |a - b|^2 without |a|^2, which is constant over b, and so is needed for the reverse only
+        # |a - b|^2 without |a|^2, which is constant over b, so only the reverse direction needs it
         squared = torch.baddbmm(b.square().sum(-1)[:, None], a.float(), b.mT, alpha=-2.0)
         forth = squared.argmin(2)
         return forth, squared.add_(a.float().square().sum(-1)[..., None]).argmin(1)
@@ -411,9 +409,9 @@ def neighbors(x: Features, near: Near, count: int) -> Int64[Tensor, "batch point
 class EdgeConvolution(nn.Module):
     """max over neighbors j of h(x_i, x_j - x_i).
 
-    The original's h is a linear layer, batch norm and leaky ReLU. Here the norm comes after the maximum. So
-    the maximum commutes with the rest: with h = W [x_i, x_j - x_i] = (A - B) x_i + B x_j, it is over B x_j
-    alone, and the layer costs two matrix products per point instead of one per edge.
+    The original's h is a linear layer, batch norm and leaky ReLU. Here the norm comes after the maximum, so h
+    is linear: h = W [x_i, x_j - x_i] = (A - B) x_i + B x_j. Only B x_j depends on the neighbor, so the
+    maximum is over B x_j, and the layer costs two matrix products per point instead of one per edge.
     """
 
     def __init__(self, channels: int, out: int, count: int) -> None:

@@ -32,22 +32,25 @@ Trajectories = Float[ndarray, "n waypoints dof"]
 
 
 def random_scenes(count: int, max_obstacles: int, rng: Generator, rop: bool = False) -> PackedScenes:
-    """Random scenes for training an encoder, of three kinds in equal parts: two large obstacles as in ROP;
-    several obstacles with the sizes of dense ROP; any number of boxes and spheres of any size and
-    orientation. rop: only scenes of the first kind."""
-    family = rng.integers(0, 1 if rop else 3, count)
+    """Random scenes for training an encoder.
+
+    They are of three kinds in equal parts: two large obstacles as in ROP; several obstacles with the sizes of
+    dense ROP; any number of boxes and spheres of any size and orientation. rop: only scenes of the first
+    kind.
+    """
+    family = rng.integers(0, 1 if rop else 3, count)  # the kind of each scene
     number = np.where(family == 0, 2, rng.integers(0, max_obstacles + 1, count))
     shape = (count, max_obstacles)
     kinds = np.where(rng.random(shape) < 0.5, SPHERE, BOX).astype(np.int8)
     kinds[np.arange(max_obstacles) >= number[:, None]] = NONE
     center = rng.uniform([-1.0, -1.0, 0.1], [1.0, 1.0, 1.0], (*shape, 3))
     center[family == 2] *= rng.uniform([0.5, 0.5, 0.3], [1.0, 1.0, 1.2], (int((family == 2).sum()), 1, 3))
-    free = (family == 2)[:, None, None]
+    third = (family == 2)[:, None, None]
     radius = np.where(family == 0, rng.uniform(0.18, 0.27, count), rng.uniform(0.06, 0.2, count))
-    radius = np.where(free[..., 0], rng.uniform(0.04, 0.3, shape), radius[:, None])
+    radius = np.where(third[..., 0], rng.uniform(0.04, 0.3, shape), radius[:, None])
     edge = np.where(family == 0, 0.2, rng.uniform(0.08, 0.3, count))[:, None, None]
-    size = np.where(free, np.exp(rng.uniform(np.log(0.03), np.log(0.9), (*shape, 3))), edge)
-    turned = free & (rng.random((*shape, 1)) < 0.5)
+    size = np.where(third, np.exp(rng.uniform(np.log(0.03), np.log(0.9), (*shape, 3))), edge)
+    turned = third & (rng.random((*shape, 1)) < 0.5)
     wxyz = np.where(turned, rng.standard_normal((*shape, 4)), np.array([1.0, 0.0, 0.0, 0.0]))
     wxyz /= np.linalg.norm(wxyz, axis=-1, keepdims=True)
     size = np.where((kinds == SPHERE)[..., None], radius[..., None], size)
@@ -64,13 +67,13 @@ class TrajectoryData:
     """Joint values of the waypoints [rad], float32, evenly spaced along the path."""
     scenes: PackedScenes
     trivial: Mask
-    """Whether the straight line from start to goal is free too."""
+    """Whether the straight line from start to goal is free."""
     codes: Float[ndarray, "n code"] | None
     """Embedding z of each scene, float16; None if there is no frozen encoder."""
     digest: str
     """The first 16 digits of the SHA-256 of the shards."""
     validation: int
-    """Number of rows of the validation split, which come last; the others are of the training split."""
+    """Number of rows of the validation split. They come last; all other rows are of the training split."""
 
     def __len__(self) -> int:
         return len(self.q)
@@ -82,7 +85,7 @@ class TrajectoryData:
 
     @cached_property
     def pools(self) -> tuple[Int[ndarray, "m"], Int[ndarray, "k"]]:
-        """Indices of the trivial rows, and of the others."""
+        """Indices of the trivial rows, and of the rows that are not trivial."""
         return np.flatnonzero(self.trivial), np.flatnonzero(~self.trivial)
 
     def draw(self, count: int, trivial_share: float, rng: Generator) -> Int[ndarray, "count"]:
@@ -121,24 +124,25 @@ def load_data(
     """The rows of a data set for training and validation, resampled to `waypoints`, with codes of their
     scenes.
 
-    turned_copies: copies of each training row that are turned by random angles, see `datasets.rows.turned`;
-        none if the robot's first joint does not rotate about the vertical.
+    encoder: computes the codes; None: there are no codes.
+    turned_copies: number of copies of each training row, turned by random angles, see `datasets.rows.turned`;
+        no copies are made if the robot's first joint does not rotate about the vertical.
     report: called with messages about the progress.
 
     Codes are cached beside the shards, in files named by shard and encoder; if the folder cannot be written,
-    they are computed at every call. Without an encoder there are none. Raises InputError, naming the file, if
-    there is no data set, a shard is damaged, or the robot is another.
+    they are computed at every call. Raises InputError, naming the file, if there is no data set, a shard is
+    damaged, or the data are of another robot.
     """
     if turned_copies and not turns_about_vertical(robot):
         report(f"data: no turned copies, as {robot.joint_names[0]} does not turn about the base's vertical")
         turned_copies = 0
     parts: dict[str, list[_Part]] = {"train": [], "validation": []}
     encoder_fingerprint = "" if encoder is None else fingerprint(encoder)
-    prints: list[str] = []
+    fingerprints: list[str] = []
     count = 0
     shards = len(shard_indices(folder))
     for rows in read_rows(folder, robot, waypoints, turned_copies):
-        prints += [rows.shard.fingerprint] * (rows.turn == 0)
+        fingerprints += [rows.shard.fingerprint] * (rows.turn == 0)
         key = f"{rows.shard.fingerprint}-{encoder_fingerprint}" + (f"-turn{rows.turn}" if rows.turn else "")
         codes = _codes(FilePath(folder), rows.scenes, encoder, key)
         for name, collected in parts.items():
@@ -148,14 +152,14 @@ def load_data(
             )
             count += int(chosen.sum())
         if rows.turn == turned_copies:
-            report(f"data: {len(prints)} of {shards} shards, {count:,} trajectories")
+            report(f"data: {len(fingerprints)} of {shards} shards, {count:,} trajectories")
     q, scenes, trivial, codes = zip(*parts["train"], *parts["validation"], strict=True)
     return TrajectoryData(
         np.concatenate(q),
         PackedScenes.joined(scenes),
         np.concatenate(trivial),
         None if encoder is None else np.concatenate(codes),
-        hashlib.sha256("".join(prints).encode()).hexdigest()[:16],
+        hashlib.sha256("".join(fingerprints).encode()).hexdigest()[:16],
         sum(len(part[0]) for part in parts["validation"]),
     )
 
@@ -188,7 +192,7 @@ def _codes(
 
 
 def encode_scenes(encoder: Encoder, scenes: PackedScenes, rng: Generator) -> Float[ndarray, "n code"]:
-    """z of each scene from a random cloud, float16."""
+    """The code z of each scene, from a random cloud; float16."""
     codes = [np.zeros((0, encoder.settings.code), np.float16)]
     for i in range(0, len(scenes), 256):
         clouds = scene_clouds(encoder, scenes[i : i + 256], rng)
@@ -200,13 +204,13 @@ def encode_scenes(encoder: Encoder, scenes: PackedScenes, rng: Generator) -> Flo
 def scene_clouds(
     encoder: Encoder, scenes: PackedScenes, rng: Generator, points: int | None = None
 ) -> Float32[Tensor, "n points 3"]:
-    """A random cloud of each scene [m], of `points` points; None: of the encoder's number."""
+    """A random cloud of each scene [m], of `points` points; None: of the encoder's `cloud` points."""
     settings = encoder.settings
     return surface_clouds(scenes, points or settings.cloud, torch_generator(rng), region=settings.region)
 
 
 def torch_generator(rng: Generator) -> torch.Generator:
-    """Random numbers for PyTorch, from the next number of NumPy's."""
+    """A PyTorch generator, seeded with the next number of a NumPy generator."""
     return torch.Generator().manual_seed(int(rng.integers(2**63)))
 
 
@@ -234,7 +238,7 @@ class Batch:
     clean: Trajectories
     noisy: Trajectories
     target: Trajectories
-    """The output that the network is trained towards, by the model's objective."""
+    """The output that the network should have, by the model's objective."""
     weight: Values
     """Weight of the squared error of the output, by level."""
     clean_weight: Values
@@ -260,7 +264,7 @@ class Batches:
     def draw(self, count: int, rng: Generator) -> Batch:
         """A random batch."""
         rows = self.data.draw(count, self.trivial_share, rng)
-        # one level from each of `count` equal parts of the range: less variance than independent draws
+        # stratified: one level from each of `count` equal parts of the range
         parts = (np.arange(count) + rng.random(count)) / count
         levels = 1 + (parts * self.model.schedule.steps).astype(np.int64)
         return self.at(rows, np.minimum(levels, self.model.schedule.steps), rng)

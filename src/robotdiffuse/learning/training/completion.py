@@ -54,12 +54,13 @@ SEED_LIMIT = 2**62
 class SamplePrefetcher:
     """Draws batches of samples in advance, in worker processes.
 
-    The seeds of the next batches are drawn from a copy of the training's random number generator, which must
-    serve nothing else. Thus a resumed run has the same batches.
+    The seeds of the next batches are drawn from a copy of the training's random number generator, so that a
+    resumed run has the same batches. The training must use this generator for nothing else.
     """
 
     def __init__(self, families: Sequence[str], robot: Robot, batch: int, workers: int) -> None:
-        """workers: number of worker processes; 0: `next` draws the samples itself."""
+        """batch: number of samples in a batch. workers: number of worker processes; 0: `next` draws the
+        samples itself."""
         self._families = tuple(families)
         self._robot = robot
         self._batch = batch
@@ -239,8 +240,8 @@ class CompletionTask(TrainingTask):
         return Samples(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     def _logits_and_truth(self, samples: Samples) -> tuple[Tensor, Tensor, Tensor]:
-        """Logits [m 8] and truth [m 8] of the voxels that the network predicts, and their indices [m]: the
-        voxels within the arm's reach that no view observed free."""
+        """Logits [m 8] and truth [m 8] of the fine voxels that the network predicts, and the indices [m] of
+        their coarse voxels: those within the arm's reach that no view observed free."""
         predicted = ((samples.seen & FREE) == 0) & self._reachable
         indices = folded(torch.from_numpy(predicted)).reshape(-1).nonzero()[:, 0]
         truth = folded(torch.from_numpy(samples.truth)).reshape(-1)[indices].numpy()
@@ -256,7 +257,8 @@ class CompletionTask(TrainingTask):
         return binary_cross_entropy_with_logits(logits, truth.float())
 
     def _predictions(self, samples: Samples) -> tuple[Probabilities, Truth, Truth]:
-        """Logits and truth of the predicted voxels, and which of them are unknown and above the ground."""
+        """Logits and truth of the predicted fine voxels, and which of these are unknown and above the
+        ground."""
         predictions: list[tuple[ndarray, ndarray, ndarray]] = []
         for part in _split(samples):
             hidden = ((part.seen & OCCUPIED) == 0) & self._above
@@ -269,7 +271,7 @@ class CompletionTask(TrainingTask):
 
 
 def _split(samples: Samples) -> list[Samples]:
-    """Batches of at most four."""
+    """The samples in batches of at most four."""
     return [Samples(*(array[i : i + 4] for array in samples)) for i in range(0, len(samples.seen), 4)]
 
 

@@ -104,8 +104,8 @@ class EncoderTraining(TrainingSettings):
     max_obstacles: Natural = 12
     """Largest number of obstacles in a mixed training scene."""
     points: Count = 256
-    """Largest number of points of a training cloud; each step takes between an eighth and all of them. An
-    encoder for clouds of a fixed size gets that size."""
+    """Largest number of points of a training cloud; the clouds of a step have between an eighth of this
+    number and all of it. An encoder for clouds of a fixed size gets clouds of that size."""
     encoder: Annotated[EncoderSettings | None, SettingsOf("name", ENCODERS)] = None
     """Settings of the encoder; None: its defaults."""
 
@@ -139,10 +139,9 @@ class PlannerTraining(MotionTraining, ModelParts):
     """Training of the diffusion model."""
 
     encoder: str | None
-    """Folder with a trained encoder, which stays frozen; or the name of an encoder, for example pointnet or
-    dgcnn, that is trained jointly, by the planner's loss, on fresh clouds for every batch; points, for the
-    denoiser cross_attention, has nothing to train. None for a prior, whose inputs do not include the
-    scene."""
+    """Folder with a trained encoder, which stays frozen; or the name of an encoder that is trained jointly,
+    by the planner's loss, on new clouds for every batch: pointnet or dgcnn, or points, which has nothing to
+    train, for the denoiser cross_attention. None for a prior, whose inputs do not include the scene."""
     minutes: Positive | None = 70.0
     learning_rate: Positive = 6e-4
     """Peak learning rate of AdamW (paper: 3e-4)."""
@@ -156,11 +155,11 @@ class PlannerTraining(MotionTraining, ModelParts):
     """Share of each batch whose straight line from start to goal is free, so that the network learns to keep
     straight lines."""
     smooth_noise: bool = True
-    """Whether the noise has the covariance of the trajectories over the waypoints; otherwise white (the
+    """Whether the noise has the covariance of the trajectories over the waypoints; otherwise it is white (the
     paper's)."""
     progressive: bool = False
-    """Whether the denoiser's tokens are means of blocks of waypoints in most of the training, which takes a
-    fraction of the time, and single waypoints at the end of the training; see `STAGES`."""
+    """Whether the denoiser's tokens are means of blocks of waypoints in most of the training, and single
+    waypoints only at its end; see `STAGES`. Steps with fewer tokens take a fraction of the time."""
     validation_problems: Natural = 32
     """Number of held-out problems that are sampled without guidance at every checkpoint."""
     encoder_settings: Annotated[EncoderSettings | None, SettingsOf("encoder", ENCODERS)] = None
@@ -175,7 +174,7 @@ class PlannerTraining(MotionTraining, ModelParts):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.target == "limits" and self.smooth_noise:
-            raise InputError("target is limits and smooth_noise is True; in units of the limits it is white")
+            raise InputError("target is limits and smooth_noise is True; smooth_noise must be False then")
         if self.encoder_settings is not None:
             ENCODERS.entry(self.encoder)  # a folder holds a trained encoder with its own settings
         check_points("encoder", self.encoder, self.denoiser)
@@ -213,8 +212,8 @@ class BaselineTraining(MotionTraining):
 JOINT = LossSettings()
 JOINT_POINT = LossSettings(point=0.3, waypoints=4)
 JOINT_POINT_COLLISION = LossSettings(point=0.3, collision=0.05, begin=0.3, waypoints=4)
-"""Weights of the losses; the paper gives none. With these, the three losses are about equally large when
-predictions are off by 5 cm."""
+"""Weights of the losses; the paper gives none. With these weights, the three losses are about equally large
+for predictions with an error of 5 cm."""
 
 _TABLE2_ROW = {"clearance_features": False, "condition_drop": 0.1, "losses": JOINT_POINT_COLLISION}
 

@@ -87,12 +87,12 @@ class Processes:
     def average(self, parameters: Iterable[nn.Parameter], loss: float) -> float:
         """Replace the gradients by their means over the processes; returns the mean of the losses.
 
-        With a single process, the values stay unchanged. Values that are not finite in one process are so in
-        all afterwards.
+        With a single process, nothing changes. A gradient or loss that is not finite in one process becomes
+        so in all processes.
         """
         if self.count == 1:
             return loss
-        # the parameters that have gradients do not depend on the batch: they are the same in all processes
+        # the same parameters have gradients in all processes, since this does not depend on the batch
         gradients = [p.grad for p in parameters if p.grad is not None]
         mean = self._mean(
             torch.cat([parameters_to_vector(gradients), torch.tensor([loss], device=self.device)])
@@ -118,8 +118,8 @@ class Processes:
         return self.gather(value)[0]
 
     def first_goes_first(self) -> AbstractContextManager[None]:
-        """A context that the first process of each machine passes before the others, which read what it
-        writes."""
+        """A context that the first process of each machine enters and leaves before the others enter it, so
+        that they can read what it wrote."""
         return self._accelerator.local_main_process_first()
 
 
@@ -138,8 +138,8 @@ def on_cpu(module: Module) -> Module:
 FREE_SETTINGS = ("minutes", "samples", "threads", "checkpoint_seconds", "data", "encoder", "device")
 """Settings that may differ between the parts of one run."""
 BAR_WIDTH = 24
-"""Width of the progress bar [characters]: with its figures it fits into 80; a line that
-wraps is printed again."""
+"""Width of the progress bar [characters]. Bar and figures then fit into 80 columns; a line that wraps would
+be printed again at every update."""
 LOG_EVERY = 50
 """Number of training steps between two rows of log.csv."""
 MAX_ROLLBACKS = 5
@@ -156,7 +156,7 @@ class Validation(NamedTuple):
 
 
 class TrainingTask(ABC):
-    """A network in training: its loss, its validation, and the files that it leaves."""
+    """A network in training: its loss, its validation, and the files that are written at the end."""
 
     settings: Any
     """Settings, of a subclass of `TrainingSettings`."""
@@ -166,7 +166,7 @@ class TrainingTask(ABC):
     module: nn.Module
     """The network, on the device of the processes."""
     identity: dict[str, str]
-    """What must be the same when a run is resumed besides the settings, for example the robot."""
+    """What must be unchanged when a run is resumed, besides the settings: for example the robot."""
 
     @abstractmethod
     def loss(self, fraction: float, rng: Generator) -> Scalar:
@@ -182,7 +182,7 @@ class TrainingTask(ABC):
         return {"validation": loss} | ({} if success is None else {"success": success})
 
     def about(self) -> dict[str, Any]:
-        """What the checkpoint says about the training, besides settings and figures."""
+        """Further information on the training for the description of the weights."""
         return {}
 
     @abstractmethod
@@ -198,7 +198,9 @@ class Position:
     samples: int = 0
     seconds: float = 0.0
     skipped: int = 0
+    """Number of steps that were skipped because loss or gradient was not finite."""
     rollbacks: int = 0
+    """Number of returns to a checkpoint after such steps."""
 
 
 class TrainingRun:
@@ -207,9 +209,9 @@ class TrainingRun:
     A resumed run gives the same result as an uninterrupted one: weights, their average, moments of the
     optimizer and the random states come from the checkpoint.
 
-    Several processes, started by torchrun, are one run: each draws its own batches of the settings' size, and
-    all step by their mean gradient. The first one validates, shows progress and writes all files; the others
-    read the folder too. They stop, skip and roll back together.
+    Several processes, started by torchrun, are one run: each draws its own batches of the size in the
+    settings, and all step by their mean gradient. The first process validates, shows progress and writes all
+    files; all processes read the folder. They stop, skip and roll back together.
     """
 
     def __init__(self, task: TrainingTask, out: str) -> None:
@@ -255,8 +257,8 @@ class TrainingRun:
         threads = torch.get_num_threads()
         torch.set_num_threads(self.settings.threads)
         try:
-            alone = lock_folder(self.out) if self.processes.first else nullcontext()
-            with alone, _stop_requested() as stop, _progress(self.processes.first) as progress:
+            lock = lock_folder(self.out) if self.processes.first else nullcontext()
+            with lock, _stop_requested() as stop, _progress(self.processes.first) as progress:
                 bar = progress.add_task(self.task.title, total=1.0, rate="", loss="")
                 last = saved = time.monotonic()
                 stopped = 0.0
@@ -309,6 +311,7 @@ class TrainingRun:
         return self.settings.batch * self.processes.count
 
     def _lr(self) -> float:
+        """The learning rate, as a fraction of its peak."""
         warmup = min(1.0, (self.at.step + 1) / max(1, self.settings.warmup_steps))
         share = self.settings.decay_share
         decay = max(0.0, (self.fraction - 1 + share) / share)
@@ -385,9 +388,9 @@ class TrainingRun:
         )
 
     def save(self) -> None:
-        """Write training.safetensors and log.csv, each whole or not at all.
+        """Write training.safetensors and log.csv, each atomically.
 
-        All processes return only after the checkpoint is written.
+        All processes wait until the checkpoint is written.
         """
         states = self.processes.gather(self.rng.bit_generator.state)
         if self.processes.first:
@@ -456,9 +459,9 @@ class TrainingRun:
     def _check_same(self, notes: dict) -> None:
         now = json.loads(json.dumps(self.settings.to_json()))
         before = notes["settings"]
-        alone = {"processes": "1"}
-        now = now | alone | self.identity
-        before = before | alone | notes["identity"]
+        default = {"processes": "1"}
+        now = now | default | self.identity
+        before = before | default | notes["identity"]
         for name, value in now.items():
             if name not in FREE_SETTINGS and before.get(name) != value:
                 raise InputError(
@@ -493,11 +496,11 @@ def _progress(shown: bool) -> Progress:
 def train(task: TrainingTask, out: str) -> dict[str, float]:
     """Train to the end and write the files into the folder `out`; returns the figures.
 
-    The same call continues a run that was interrupted. If torchrun started several processes, all call this
-    and get the same result, see `TrainingRun`. Raises InputError if the folder holds a different run, and
-    KeyboardInterrupt, after a checkpoint, on Ctrl-C.
+    The same call continues a run that was interrupted. If torchrun started several processes, all of them
+    call this function and get the same result, see `TrainingRun`. Raises InputError if the folder holds a
+    different run, and KeyboardInterrupt, after a checkpoint, on Ctrl-C.
     """
-    need_packages("training", *EXPORT_PACKAGES)  # now, and not after hours of training
+    need_packages("training", *EXPORT_PACKAGES)  # checked now, not after hours of training
     run = TrainingRun(task, out)
     run.loop()
     if not task.processes.first:
@@ -515,7 +518,7 @@ def train(task: TrainingTask, out: str) -> dict[str, float]:
 MAX_VALIDATION_TRAJECTORIES = 2000
 """Largest number of trajectories of the validation split that are used."""
 VALIDATION_BATCHES = 8
-"""Number of batches of these trajectories in a validation."""
+"""Number of batches in a validation."""
 
 
 class MotionTask(TrainingTask):
@@ -549,7 +552,7 @@ class MotionTask(TrainingTask):
         """The loss of a random batch of these data."""
 
     def success(self, rng: Generator) -> float | None:
-        """Share of some held-out problems that the network solves by itself; None: not measured."""
+        """Share of held-out problems that the network solves by itself; None: not measured."""
         return None
 
     def loss(self, fraction: float, rng: Generator) -> Scalar:

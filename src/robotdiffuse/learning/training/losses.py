@@ -23,11 +23,11 @@ from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
 class ForwardKinematics:
     """Poses of a robot's frames at batches of configurations; differentiable any number of times.
 
-    Configurations `q` [rad], or [m] for prismatic joints, have any batch shape. They are converted to the
-    dtype and device given here, which the results have too.
+    Configurations `q` [rad], or [m] for prismatic joints, have any batch shape. They are converted to `dtype`
+    and `device`, and the results have these too.
 
-    Each step is T[j + 1] = T[parents[j]] @ (C + cos(q) A + sin(q) B) with constant A, B and C, so it takes
-    one small matrix product and two multiply-adds over the batch.
+    The frame of joint j is T[j + 1] = T[parents[j]] @ (C + cos(q) A + sin(q) B) with constant A, B and C. It
+    takes one small matrix product and two multiply-adds over the batch.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class ForwardKinematics:
 
 
 POINT_UNIT = 0.1
-"""Distances in L_point and L_collision are divided by this [m], so that they are of the size of L_joint."""
+"""Distances in L_point and L_collision are divided by this [m], to be about as large as L_joint."""
 MAX_DISTANCE = 1.0
 """Largest distance that is computed [m]; also the distance to an empty scene."""
 SAFE_DISTANCE = 0.05

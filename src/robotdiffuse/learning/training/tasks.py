@@ -1,4 +1,4 @@
-"""The trainings: of an auto-encoder of point clouds, of the diffusion model, and of baselines' networks."""
+"""Training of an auto-encoder of point clouds, of the diffusion model, and of baselines' networks."""
 
 import copy
 from abc import ABC, abstractmethod
@@ -73,8 +73,8 @@ RELATIVE_RIDGE = 1e-3
 def train_encoder(settings: EncoderTraining, out: str) -> dict[str, float]:
     """Train an auto-encoder; write encoder.safetensors and encoder.json into the folder `out`.
 
-    The same call continues a run that was interrupted. Returns errors on fresh clouds [m], those of the
-    reconstruction (see the encoder's `loss`) and of `linear_readout`, and `samples`. Raises the errors of
+    The same call continues a run that was interrupted. Returns errors on new clouds [m]: those of the
+    reconstruction, see the encoder's `loss`, and of `linear_readout`; and `samples`. Raises the errors of
     `loop.train`.
     """
     return train(_EncoderTask(settings, Processes(settings.device)), out)
@@ -149,7 +149,7 @@ def linear_readout(encoder: Encoder, scenes: PackedScenes, rng: Generator) -> di
         .clip(-MAX_READOUT_DISTANCE, MAX_READOUT_DISTANCE)
         .astype(np.float64)
     )
-    # both relative to their means over the scenes of the fit
+    # z and targets relative to their means over the scenes of the fit
     (z, z_test), (target_fit, target_test) = (
         np.split(values - values[:READOUT_SCENES].mean(0), [READOUT_SCENES]) for values in (z, targets)
     )
@@ -180,9 +180,8 @@ def planning_success(
     candidates: int,
     rng: Generator,
 ) -> float:
-    """Share of free trajectories among `candidates` samples for each of the first non-trivial problems.
-
-    nan if the data hold no such problem.
+    """Share of free trajectories among `candidates` samples for each of the first `problems` non-trivial
+    problems; nan if the data hold no such problem.
     """
     settings = SamplingSettings(samples=candidates, sampling_steps=min(SAMPLING_STEPS, model.schedule.steps))
     free = []
@@ -209,10 +208,10 @@ def _guided(guidance: CollisionGuidance, q: ndarray, _level: float) -> ndarray:
 
 def free_in_scene(checker: CollisionChecker, q: Trajectories) -> Mask:
     """Which motions are free in the checker's scene, at their waypoints and between them."""
-    share = np.linspace(0, 1, CHECKS_PER_SEGMENT, endpoint=False)[:, None]
-    dense = q[:, :-1, None] + share * np.diff(q, axis=1)[:, :, None]
-    every = np.concatenate([dense.reshape(len(q), -1, q.shape[-1]), q[:, -1:]], 1)
-    free = checker.free(every.reshape(-1, q.shape[-1])).reshape(len(q), -1)
+    fractions = np.linspace(0, 1, CHECKS_PER_SEGMENT, endpoint=False)[:, None]
+    dense = q[:, :-1, None] + fractions * np.diff(q, axis=1)[:, :, None]
+    dense = np.concatenate([dense.reshape(len(q), -1, q.shape[-1]), q[:, -1:]], 1)
+    free = checker.free(dense.reshape(-1, q.shape[-1])).reshape(len(q), -1)
     return free.min(axis=1)
 
 
@@ -255,7 +254,7 @@ class PlannerTask(MotionTask):
         )
         self.module = self.model = model.to(processes.device)
         self.identity = {"robot": robot.name} | self._encoder_fingerprint("encoder_fingerprint")
-        # batches are computed, and problems of validations sampled, on the CPU
+        # on the CPU, batches are computed and validation problems are sampled
         self._on_cpu = on_cpu(model)
         self.clearances = packed_clearances(robot, model.settings)
         self._loss = PlannerLoss(model, robot, settings, processes)
@@ -365,7 +364,7 @@ class PlannerLoss:
             for a in (batch.noisy, batch.signal, batch.noise_level, batch.clean, batch.base)
         )
         predicted = model.objective.clean(noisy, output, signal, noise_level)
-        # the ends are held, so predictions there do not count
+        # start and goal are given, so predictions of these two waypoints do not count
         predicted = torch.cat([clean[:, :1], predicted[:, 1:-1], clean[:, -1:]], 1)
         q = model.joints_at(predicted, base, waypoints)
         error = q.new_zeros(len(q))
