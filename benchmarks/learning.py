@@ -12,8 +12,9 @@ solved if it passed the validator.
   input: the code is that of another scene of the family; the whole condition (code, start and goal) is
   hidden; the clearances are computed without obstacles. Guidance knows the obstacles in every row. The
   controls apply guidance to smooth noise, from which the model starts too: with as many gradient steps as the
-  network, and with as many as fit in the network's CPU time. - controls: only the guided network and the
-  controls of `alone`; prints benchmarks/results/network_equal_time.txt.
+  network, and with as many as fit in the network's CPU time.
+- controls: only the guided network and the controls of `alone`; prints
+  benchmarks/results/network_equal_time.txt.
 """
 
 import argparse

@@ -17,7 +17,7 @@
   problems, waypoints are configurations, in the others poses of the hand. The arm stops at each waypoint, or
   passes it within the blend; the seed is equal, so that the segments are equal too.
 - payloads: held-out problems with masses 10 cm in front of the hand's frame; torques are computed at every
-row of the motion.
+  row of the motion.
 
 Time limits are of CPU time. Coal on the exact meshes and PyBullet check every returned motion: its path every
 0.01 rad, and each row of the timed motion. PyBullet loads robot and tool from a URDF; if the problem has a

@@ -15,18 +15,14 @@ sampling.
 Differences from the papers, with the papers' values:
 
 - One network for both. It has 48 waypoints, as all our data (MPD 64, EDMP 50). Inputs are joint positions, as
-in EDMP
-  (MPD adds velocities), scaled to the joint limits, as in both.
+  in EDMP (MPD adds velocities), scaled to the joint limits, as in both.
 - T = 255 levels of the cosine schedule, as EDMP. MPD trains with 25 levels of an exponential schedule; its
-sampler here
-  takes the 25 of our levels that are nearest to them in signal-to-noise ratio.
+  sampler here takes the 25 of our levels that are nearest to them in signal-to-noise ratio.
 - Width 32 at resolutions 1, 2, 4 (0.7 million parameters); MPD has width 32 at 1, 2, 4, 8 (about 4 million).
-Our
-  network trains at 1,200 samples/s on a CPU core. It has layer norms over channels, and the condition scales
-  and shifts the features; the papers have group norms and add a time embedding.
+  Our network trains at 1,200 samples/s on a CPU core. It has layer norms over channels, and the condition
+  scales and shifts the features; the papers have group norms and add a time embedding.
 - Trained on trajectories of all scenes, as EDMP; MPD trains a prior per environment. A tenth of each batch
-are motions
-  with a free straight line, and half of each batch is reversed in time, as for our own model.
+  are motions with a free straight line, and half of each batch is reversed in time, as for our own model.
 
 **MPD**, a diffusion prior guided by cost gradients. Planning draws from the posterior given the costs: in the
 last part of the denoising steps, the mean of each step is moved by some gradient steps on the cost

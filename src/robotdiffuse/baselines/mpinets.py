@@ -8,15 +8,12 @@ new point clouds and noise.
 Differences from the paper, in addition to those of the network:
 
 - The paper ends a roll-out within 1 cm and 15 degrees of the target pose. Here, a goal is a configuration
-that must be
-  reached exactly. Near the goal, the motion continues on the straight line to it if that line is free; else
-  the policy goes on. For a goal pose, the goals are configurations from inverse kinematics.
+  that must be reached exactly. Near the goal, the motion continues on the straight line to it if that line is
+  free; else the policy goes on. For a goal pose, the goals are configurations from inverse kinematics.
 - The paper has one roll-out. The repetitions cannot lower the success rate, and they use the time that all
-planners get.
-  They are distributed over the goals, the nearest first, and end where the arm collides.
+  planners get. They are distributed over the goals, the nearest first, and end where the arm collides.
 - Motions are not repaired or shortened, and a motion that the validator refuses is not a result. If there is
-no valid
-  motion, the best one is validated at the end, so that the result tells what is wrong with it.
+  no valid motion, the best one is validated at the end, so that the result tells what is wrong with it.
 """
 
 from dataclasses import dataclass

@@ -6,14 +6,13 @@ Learning-based and Classical Motion Planners", T-RO 2020. The networks are in `l
 has these parts, by the paper's names:
 
 - *Bidirectional neural planning* (`NeuralPlanning.between`): start and goal side grow towards each other,
-until the
-  straight line between their last states is free. Motions between earlier states are not checked.
-- *Lazy states contraction*: states that a free straight line can skip are removed. - *Replanning*: states in
-collision are removed, and neural planning runs again between neighboring states without a free
-  straight line, up to `replanning` times. The network's dropout makes each run different.
+  until the straight line between their last states is free. Motions between earlier states are not checked.
+- *Lazy states contraction*: states that a free straight line can skip are removed.
+- *Replanning*: states in collision are removed, and neural planning runs again between neighboring states
+  without a free straight line, up to `replanning` times. The network's dropout makes each run different.
 - *Hybrid replanning*, if `hybrid` is on: a classical planner replaces the parts that still collide, here
-RRT-Connect
-  (paper: RRT*). It is off by default, as in the paper's MPNetPath:NR, so that benchmarks measure the network.
+  RRT-Connect (paper: RRT*). It is off by default, as in the paper's MPNetPath:NR, so that benchmarks measure
+  the network.
 
 Differences from the paper: `attempts` paths are planned at once, in one batch of the network, until one of
 them is free; the paper plans one path. New attempts begin until time runs out. If the network does not

@@ -93,19 +93,19 @@ PLANNERS = Registry(
             "baselines.guided_prior:EDMP",
             "EDMPSettings",
             LEARNED,
-            "EDMP: such a prior, guided by an ensemble of costs",
+            "EDMP: the diffusion prior of MPD, guided by an ensemble of costs",
         ),
         "straight_line": _entry(
             "baselines.straight_line:StraightLine",
             "StraightLineSettings",
             SEARCH,
-            "no planner: the straight line in joint space, the control of every other row",
+            "no planner: the straight line in joint space, as a baseline for all others",
         ),
         "control": _entry(
             "baselines.controls:Control",
             "ControlSettings",
             SEARCH,
-            "no planner: fixed vias, nearest motions of a data set or smooth noise, with or without guidance",
+            "no planner: baselines by fixed vias, nearest motions of a data set or smooth noise",
         ),
         "a_star": _entry(
             "baselines.lattice:AStar", "AStarSettings", SEARCH, "A* on a lattice of joint values"
@@ -119,10 +119,10 @@ PLANNERS = Registry(
         "ompl_rrt": _ompl("RRT", "RRT, then its path simplifier"),
         "ompl_rrt_connect": _ompl("RRTConnect", "RRT-Connect, then its path simplifier"),
         "ompl_prm": _ompl("PRM", "PRM, then its path simplifier"),
-        "ompl_rrt_star": _ompl("RRTStar", "RRT*, to the end of the time"),
-        "ompl_informed_rrt_star": _ompl("InformedRRTStar", "Informed RRT*, to the end of the time"),
-        "ompl_bit_star": _ompl("BITStar", "BIT*, to the end of the time"),
-        "ompl_aorrtc": _ompl("AORRTC", "AORRTC, to the end of the time"),
+        "ompl_rrt_star": _ompl("RRTStar", "RRT*, until the time limit"),
+        "ompl_informed_rrt_star": _ompl("InformedRRTStar", "Informed RRT*, until the time limit"),
+        "ompl_bit_star": _ompl("BITStar", "BIT*, until the time limit"),
+        "ompl_aorrtc": _ompl("AORRTC", "AORRTC, until the time limit"),
     },
     group="robotdiffuse.planners",
 )

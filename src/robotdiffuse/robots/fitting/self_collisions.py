@@ -85,18 +85,17 @@ def find_allowed_collisions(
 
     Pairs are allowed for these reasons, the first four as in MoveIt's Setup Assistant:
 
-    - adjacent: a joint connects the links; links without geometry between them are skipped. - always: the
-    links collide in nearly all samples. - never: the links collide in no sample, and no descent finds a
-    collision. - default: the links collide in the default pose, with the joints between them at zero. If the
-    limits include this
-      pose, the manufacturer considers it safe, so the meshes are taken to be too coarse there. Both links
-      must belong to the arm, since the limits do not account for a tool on the last link or for another arm.
-      A link after one held joint also counts as part of the arm. The pair must then also collide at the
-      joint's held value, which planning does not change.
+    - adjacent: a joint connects the links; links without geometry between them are skipped.
+    - always: the links collide in nearly all samples.
+    - never: the links collide in no sample, and no descent finds a collision.
+    - default: the links collide in the default pose, with the joints between them at zero. If the limits
+      include this pose, the manufacturer considers it safe, so the meshes are taken to be too coarse there.
+      Both links must belong to the arm, since the limits do not account for a tool on the last link or for
+      another arm. A link after one held joint also counts as part of the arm. The pair must then also collide
+      at the joint's held value, which planning does not change.
     - limits: the links collide in at least a fifth of the samples. The value of one joint between them
-    determines when,
-      and they collide at a stop of this joint: joints often have their stops where the links on both sides
-      meet.
+      determines when, and they collide at a stop of this joint: joints often have their stops where the links
+      on both sides meet.
     - pose: the links overlap slightly in a named pose of the SRDF, such as a tucked one.
 
     Coal tests the meshes unless the covering spheres show that they are apart. For pairs without collisions
