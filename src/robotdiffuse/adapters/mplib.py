@@ -198,7 +198,7 @@ class Planner:
             current_qpos: The present joint values, in the order of `user_joint_names`.
             mask: Ignored.
             options: `time_step` [s] between rows (0.1), `planning_time` [s] (1), `wrt_world`; other options
-            of MPlib are ignored.
+                of MPlib are ignored.
 
         Returns:
             A dictionary with `status`: "Success", or the reason for the failure. If the plan succeeded, also

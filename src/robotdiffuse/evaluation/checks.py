@@ -174,8 +174,7 @@ def check_data(
 
     Raises:
         InputError: If there is no data set, for another robot than that of the data, and if PyBullet is
-        required but not
-            installed.
+        required but not installed.
     """
     began = time.perf_counter()
     manifest = read_manifest(folder)

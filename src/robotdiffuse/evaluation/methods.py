@@ -219,9 +219,10 @@ def from_network(
     """Draws samples of the network, without refinement, search or shortcuts.
 
     Args:
-        sampler: The planner with the network. encoded: Returns a problem for a run; the scene of this problem
-        is encoded in place of the scene of the run. clearances: Replaces the function that computes the
-        clearances, inputs of the denoiser.
+        sampler: The planner with the network.
+        encoded: Returns a problem for a run; the scene of this problem is encoded in place of the scene of
+            the run.
+        clearances: Replaces the function that computes the clearances, inputs of the denoiser.
     """
 
     def draw(run: Run, checker: CollisionChecker) -> ndarray:

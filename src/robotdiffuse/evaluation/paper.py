@@ -208,23 +208,19 @@ The order of the rows is as printed, except for RRT* and MPiNets, which have equ
 of the differences is unknown. These explanations were tried:
 
 - Rounding: four times each printed score has no more than two decimals (1.67, 0.76, 1.67, 2.58, 3.06), so
-normalized
-  values were probably first rounded to two decimals. Then MPD has 0.645 exactly, MPiNets 0.4150, and MPNet
-  0.1975, which is 0.19 if truncated. RRT* (0.4475) and RobotDiffuse (0.7750) differ from the printed scores
-  by one digit. So typing errors in RRT*, MPiNets and RobotDiffuse, and a truncated score of MPNet, would
-  explain all differences.
+  normalized values were probably first rounded to two decimals. Then MPD has 0.645 exactly, MPiNets 0.4150,
+  and MPNet 0.1975, which is 0.19 if truncated. RRT* (0.4475) and RobotDiffuse (0.7750) differ from the
+  printed scores by one digit. So typing errors in RRT*, MPiNets and RobotDiffuse, and a truncated score of
+  MPNet, would explain all differences.
 - Other normalizations of the columns (fractions of the maximum, logarithms, ranks; all combinations): the
-largest
-  difference is still 0.025 or more.
+  largest difference is still 0.025 or more.
 - Other weights: with the best weights that sum to 1, the largest difference is 0.011. With (0.2418, 0.1870,
-0.2929,
-  0.2196), which sum to 0.94, it is 0.002 (0.005 if the weights are rounded to two decimals). But four free
-  weights for five scores prove little, and the paper states equal weights.
+  0.2929, 0.2196), which sum to 0.94, it is 0.002 (0.005 if the weights are rounded to two decimals). But four
+  free weights for five scores prove little, and the paper states equal weights.
 - Other figures than the printed ones, perhaps from an earlier version of the table: with any change of a
-single cell, the
-  largest difference is at least 0.012. With 15.6 in place of 15.037 as the length of RRT*, and 88.0 in place
-  of 87.4 as the success of MPiNets, it is 0.004. RRT* is worst in success and time (0) and best in collision
-  (1), so with equal weights its printed score requires a normalized length of 0.67.
+  single cell, the largest difference is at least 0.012. With 15.6 in place of 15.037 as the length of RRT*,
+  and 88.0 in place of 87.4 as the success of MPiNets, it is 0.004. RRT* is worst in success and time (0) and
+  best in collision (1), so with equal weights its printed score requires a normalized length of 0.67.
 """
 
 

@@ -332,10 +332,12 @@ def run_all(
     """Make all runs in this process.
 
     Args:
-        cases: The cases. methods: Methods by name. seeds: Seeds of the runs. limit: Time limit of a run [s].
+        cases: The cases.
+        methods: Methods by name.
+        seeds: Seeds of the runs.
+        limit: Time limit of a run [s].
         folder: Folder that stores the records. The name of a method must then identify everything that its
-        records depend
-            on, since existing records are used again.
+            records depend on, since existing records are used again.
         title: Title of the progress bar.
         bar: Whether a progress bar is shown.
 

@@ -36,8 +36,7 @@ def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robo
 
     Args:
         name: Name, robot folder, or URDF. Only `robot add` reads xacro files, since compiling a file runs the
-        code
-            in it.
+            code in it.
         locked: Values at which joints are locked [rad] or [m] (see `Robot.with_locked`).
 
     Raises:

@@ -79,7 +79,7 @@ def inverse_kinematics(
             solution. Results are sorted by their distance from it. Joints that can turn more than once are
             turned by whole turns to be as close to it as possible.
         rest: Values for joints of another arm, which neither move the link nor are moved by it; None: random
-        values.
+            values.
 
     Returns:
         Configurations, one per row; no rows if the pose was not reached.

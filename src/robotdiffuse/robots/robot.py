@@ -302,8 +302,7 @@ class Robot(KinematicTree):
 
         Args:
             shape: The object, at its pose in the frame of `link`. A curved shape is replaced by a polyhedron
-            around
-                it, which is larger by at most 2 % of the radius.
+                around it, which is larger by at most 2 % of the radius.
             link: The link that holds the object.
             touch_links: Further links that the object may touch.
 
@@ -357,8 +356,7 @@ class Robot(KinematicTree):
 
         Raises:
             InputError: For unknown links, a link that no planned joint moves, a name that is already a
-            link's, and
-                shapes that cannot be attached.
+            link's, and shapes that cannot be attached.
         """
         field = TOOL if body.tool else "attached"
         self.check_moved(f"{field}.link", body.link)

@@ -197,8 +197,7 @@ class MovingObstacle(Value):
 
         Args:
             time: Time since the motion begins [s]. If the motion is unknown, the shape is returned at its
-            pose at time
-                0.
+                pose at time 0.
         """
         return self.shape.moved(self.pose(time) @ inverse(self.shape.T_base_shape))
 

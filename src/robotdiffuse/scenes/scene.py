@@ -84,15 +84,14 @@ class Scene(Value):
         """The obstacles of a MuJoCo model: all colliding geoms that are not part of the robot.
 
         Args:
-            model: A compiled model, such as `mujoco.MjModel.from_xml_path` returns. data: State of the model,
-            which gives the poses of free bodies; None: their poses in the model. base: The body that is the
-            base of the robot; the scene is in its frame. A robot that `load_robot` reads
-                from a model has the base "world".
+            model: A compiled model, such as `mujoco.MjModel.from_xml_path` returns.
+            data: State of the model, which gives the poses of free bodies; None: their poses in the model.
+            base: The body that is the base of the robot; the scene is in its frame. A robot that `load_robot`
+                reads from a model has the base "world".
 
         Returns:
             Scene: Planes become boxes of their size; an infinite plane becomes a box of 10 m. Meshes are
-            replaced by
-                their convex hulls, as MuJoCo does.
+            replaced by their convex hulls, as MuJoCo does.
 
         Raises:
             InputError: For an unknown body, and for height fields and signed distance fields.

@@ -313,11 +313,9 @@ class PointCloud(Shape):
 
         Args:
             file: A .ply, .pcd, .xyz, .csv, .npy or .npz file, or the occupied voxels of an octomap (.bt), in
-            the frame
-                of the base.
+                the frame of the base.
             point_radius: Radius of the sphere around each point [m]; None: 1 cm, or for an octomap the radius
-            of the
-                sphere around a voxel, both times `scale`.
+                of the sphere around a voxel, both times `scale`.
             scale: Meters for each unit of the file: 0.001 for millimeters.
             name: Name of the obstacle, for messages and allowed contacts.
 
@@ -472,8 +470,7 @@ class HeightMap(_Posed, Triangulated):
     collision.
 
     heights: heights along z [m], with rows along y and columns along x. Cells with a height that is not a
-    number are
-        holes.
+    number are holes.
     cell: distance between neighboring points of the grid [m]. xyz, wxyz: pose of the height map's frame in
     the frame of the robot's base. Its origin is the first point of the
         grid, at height 0.

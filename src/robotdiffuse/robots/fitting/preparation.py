@@ -565,15 +565,18 @@ def add_robot(
     """Read a URDF, prepare the robot (see `prepare`) and write the robot folder.
 
     Args:
-        urdf: URDF or xacro file, or MuJoCo model. Compiling xacro runs the code in its expressions. name:
-        Name of the robot; by default the URDF's. base: See `UrdfTree.robot`, also for `tip`, `locked` and
-        `group`. limits: Joint limits, a file in the form of MoveIt's joint_limits.yaml. out: Folder to write;
-        by default `user_robots() / name`. license: License of the geometry, kept in the folder. settings:
-        Settings of the preparation. seed: The same input and seed give the same robot. progress: Called at
-        each step. srdf: Source of groups, poses and passive joints; by default the SRDF found beside the
-        URDF. Only an SRDF that
-            is given here also allows pairs of links, which are then not checked. In both cases, the report
-            lists where sampling and the SRDF differ.
+        urdf: URDF or xacro file, or MuJoCo model. Compiling xacro runs the code in its expressions.
+        name: Name of the robot; by default the URDF's.
+        base: See `UrdfTree.robot`, also for `tip`, `locked` and `group`.
+        limits: Joint limits, a file in the form of MoveIt's joint_limits.yaml.
+        out: Folder to write; by default `user_robots() / name`.
+        license: License of the geometry, kept in the folder.
+        settings: Settings of the preparation.
+        seed: The same input and seed give the same robot.
+        progress: Called at each step.
+        srdf: Source of groups, poses and passive joints; by default the SRDF found beside the URDF. Only an
+            SRDF that is given here also allows pairs of links, which are then not checked. In both cases, the
+            report lists where sampling and the SRDF differ.
         allow: Further pairs of links that are not checked.
         packages: Folders of ROS packages by name.
 

@@ -192,15 +192,14 @@ class UrdfTree:
 
         Args:
             base: First link of the robot; by default the root. Links between the root and the base are left
-            out. The
-                pose of the base in the root's frame is kept, for scenes that are given in the root's frame.
+                out. The pose of the base in the root's frame is kept, for scenes that are given in the root's
+                frame.
             tip: Last link. By default the link where a gripper or a hand begins (see `robots.parsing.srdf`),
-            such as
-                panda_hand for a Panda with fingers; without a gripper, the deepest link.
-            locked: Values of locked joints by name [rad] or [m]. group: A group of the SRDF, the common
-            prefix of an arm's joint names, "both" for two arms, or "all" for
-                all arms. A group of several chains, such as two arms, is one robot with several tips. Without
-                group and tip, the robot must have exactly one arm.
+                such as panda_hand for a Panda with fingers; without a gripper, the deepest link.
+            locked: Values of locked joints by name [rad] or [m].
+            group: A group of the SRDF, the common prefix of an arm's joint names, "both" for two arms, or
+                "all" for all arms. A group of several chains, such as two arms, is one robot with several
+                tips. Without group and tip, the robot must have exactly one arm.
             srdf: Source of groups, named poses and passive joints.
 
         Raises:
