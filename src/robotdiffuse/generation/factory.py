@@ -147,8 +147,7 @@ MAX_PROBLEMS_PER_ROW = 50
 EXTRA_PROBLEMS = 1_000
 """A shard with n rows fails after MAX_PROBLEMS_PER_ROW n + EXTRA_PROBLEMS problems."""
 PROBLEMS_PER_SHARD = 2**32
-"""Number of problem numbers that are reserved for each shard, so that no two shards contain the same
-problem."""
+"""Problem numbers reserved for each shard, so that no two shards contain the same problem."""
 
 Arrays = dict[str, ndarray]
 Counts = dict[str, int]
@@ -331,7 +330,7 @@ def _make_on_node(settings: GenerationSettings, index: int, wanted: dict[str, st
         if actual != wanted[name]:
             raise InputError(
                 f"a node of the Ray cluster has {name} {actual}, this machine {wanted[name]}; their data may "
-                "differ: install the same on all"
+                "differ: install the same version on all nodes"
             )
     return make_shard(settings, index)
 

@@ -70,8 +70,8 @@ def reachable() -> Bool[ndarray, "56 56 32"]:
 
 
 REACH_SAMPLES = 256
-"""Number of random configurations by which an arm's reach is estimated; the result is within 1 cm of that of
-thousands of configurations."""
+"""Number of random configurations by which an arm's reach is estimated; thousands of configurations give a
+reach that differs by less than 1 cm."""
 
 
 @once_per_robot

@@ -34,7 +34,7 @@ class ScheduleSettings(Settings, name="schedule"):
     steps: Annotated[int, Bound(least=2.0, most=100_000.0)] = 200
     """T, the number of noise levels (paper: 200)."""
     offset: NotNegative = 0.008
-    """The equation's s: it keeps the noise of the first levels from being too small."""
+    """The equation's s, which makes the noise of the first levels large enough."""
     floor: Annotated[float, Bound(above=0.0, below=1.0)] = 1e-4
     """Smallest alpha_bar, which is the fraction of the variance that is still signal at the last level."""
     log_snr_shift: NotNegative = 0.0
@@ -69,7 +69,7 @@ class NoiseSchedule:
         """Weight of the loss on x_0 at level t: 1 + SNR, at most `limit`.
 
         With 1 + SNR the network's effective target has unit variance on every level (Karras et al. 2022,
-        table 1, for unit data variance); the limit is the one of min-SNR weighting (Hang et al. 2023).
+        table 1, for unit data variance); the limit is that of min-SNR weighting (Hang et al. 2023).
         """
         power = self.signal[t] ** 2 + self.noise[t] ** 2
         return power / np.maximum(self.noise[t] ** 2, power / limit)

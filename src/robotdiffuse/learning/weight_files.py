@@ -250,7 +250,7 @@ def check_weights(name: str, folder: str | FilePath | None) -> None:
 
 
 def weights_folder(name: str, folder: str | FilePath | None, robot: Robot) -> FilePath:
-    """The folder with weights of a network: the given one, or that of `weights_for`.
+    """The folder with weights of a network: the given folder, or the folder from `weights_for`.
 
     Raises InputError if it holds none, naming the command that trains them.
     """
@@ -266,7 +266,7 @@ def weights_folder(name: str, folder: str | FilePath | None, robot: Robot) -> Fi
 
 
 def completion_folder(folder: str | FilePath | None) -> FilePath:
-    """The folder with weights of the completion network: the given one, or that of the package.
+    """The folder with weights of the completion network: the given folder, or the package's.
 
     Raises InputError if it holds none, naming the command that trains them.
     """

@@ -56,8 +56,7 @@ class CameraCalibration:
     covariance: Float[ndarray, "6 6"]
     """Covariance of the camera's position [m] and rotation vector [rad], in the base frame."""
     agreement: float
-    """Fraction of the image cells that should show the arm in which the measured depth is that of the arm's
-    model."""
+    """Of the image cells that should show the arm, the fraction with the depth of the arm's model."""
 
     @property
     def pose_deviation(self) -> tuple[float, float]:

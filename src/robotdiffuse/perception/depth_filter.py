@@ -201,8 +201,8 @@ since the edges of objects are hardly ever so straight."""
 AT_RANGE = 0.8
 """Beyond this fraction of the range, returns may end because the surface leaves the range."""
 TOO_NEAR = 0.3
-"""A region without returns may be a surface too near to be measured. It counts as one if returns beside it
-are nearer than this [m] along at least NEAR_SHARE of its border."""
+"""A region without returns counts as a surface that is too near to be measured if returns beside it are
+nearer than this [m] along at least NEAR_SHARE of its border."""
 NEAR_SHARE = 0.05
 
 

@@ -65,8 +65,8 @@ class DepthView(Value):
     noise: "DepthNoise | None" = None
     """Noise of the sensor, as `measure_noise` returns it; None: estimated from the image."""
     pose_deviation: tuple[float, float] = (0.0, 0.0)
-    """Largest error of T_base_camera, with that of the arm if it carries the camera: position [m], angle
-    [rad]."""
+    """Largest error of T_base_camera: position [m] and angle [rad]. If the arm carries the camera, the arm's
+    own error is included."""
 
     def __post_init__(self) -> None:
         depth = numbers(self.depth)

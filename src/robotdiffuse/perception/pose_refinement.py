@@ -325,7 +325,8 @@ def _deviation(view: DepthView, T: Pose, covariance: Float[ndarray, "6 6"]) -> t
     """The `pose_deviation` of a refined pose: a position [m] and an angle [rad] that bound how far its error
     displaces points in the map; at most the stated deviation.
 
-    The position bounds displacements along rays and those of near points; the angle bounds the others.
+    The position bounds displacements along rays, and any displacement of points nearer than NEAR. The angle
+    bounds the other displacements, in proportion to the distance.
     """
     height, width = view.depth.shape
     fx, fy, cx, cy = view.intrinsics

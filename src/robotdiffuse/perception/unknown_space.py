@@ -350,9 +350,9 @@ MIN_RISK = 0.2
 def explored_confidence(risk: float) -> float:
     """The probability that a motion is free in the true scene, if an Explorer's views left little unknown.
 
-    The share of sampled worlds would be too low: these suit the large regions that a single view leaves
-    unknown. risk: the predicted probability of being occupied, summed over the voxels that the motion passes
-    through.
+    The share of sampled worlds would be too low here: sampled worlds suit the large regions that a single
+    view leaves unknown. risk: the predicted probability of being occupied, summed over the voxels that the
+    motion passes through.
     """
     odds, slope = EXPLORED
     return 1 / (1 + math.exp(-(odds + slope * math.log(max(risk, MIN_RISK)))))

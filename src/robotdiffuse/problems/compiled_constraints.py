@@ -1,5 +1,5 @@
-"""PathConstraints: the constraints of a problem as arrays. Evaluates the constraints, proves that motions
-satisfy them, and projects configurations onto them.
+"""PathConstraints: evaluates a problem's path constraints, proves that motions satisfy them, and projects
+configurations onto them.
 
 The compiled functions are in `constraint_kernel.py` and `projection_kernel.py`; this file builds the arrays
 that they need and interprets their results.
@@ -47,18 +47,18 @@ from robotdiffuse.robots.robot import Robot
 MIN_SEGMENT_FRACTION = 1e-7
 """A proof splits a segment into pieces no shorter than this fraction of the segment."""
 VIOLATION_STEP = 0.01
-"""Joint-space distance between the configurations at which the maximum of a violation is searched for
+"""The maximum of a violation is searched for at configurations that are this far apart in joint space
 [rad]."""
 VIOLATION_STEPS = 1000
-"""Number of these configurations."""
+"""Maximum number of these configurations."""
 PROJECTION_FRACTION = 0.5
 """Projection aims at this fraction of a tolerance, to end well within the tolerance."""
 POSE_TOLERANCE = 2e-6
 """Tolerance of the pose of a projected link [m], [rad]."""
 GOAL_MARGIN = 1e-3
-"""Projected configurations keep this fraction of a goal's tolerances as a reserve."""
+"""Fraction of a goal's tolerances that projected configurations do not use."""
 INNER_GOAL_FRACTION = 0.9
-"""Projection aims at this fraction of what is left of a goal's tolerances."""
+"""Projection aims at this fraction of a goal's tolerances, after GOAL_MARGIN is subtracted."""
 MIN_LINE_LENGTH = 1e-3
 """Along shorter lines, the orientation does not follow the position: the link turns in place [m]."""
 SAME_POSE_TOLERANCE = 1e-3
@@ -67,13 +67,13 @@ SAME_POSE_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class ConstraintViolation:
-    """The first place on a motion where a constraint is violated, or not proved."""
+    """A place where a constraint is violated, or not proved."""
 
     constraint: Constraint
     at: float
-    """Place on the motion: waypoint index plus the fraction of the segment after it."""
+    """Place on the motion: waypoint index plus fraction of the segment after it; 0 for a configuration."""
     value: float
-    """Maximum value until the constraint is satisfied again [m] or [rad]."""
+    """Maximum value from this place until the constraint is satisfied again [m] or [rad]."""
     limit: float
     """Largest allowed value [m] or [rad]."""
     angular: bool
@@ -125,18 +125,16 @@ class PathConstraints:
         Raises InputError if a Cartesian line has no unique end pose.
         """
         self.robot = problem.robot
-        each = [(constraint, row) for constraint in problem.constraints for row in _rows(problem, constraint)]
-        self.owners = [constraint for constraint, _ in each]
+        own = [(constraint, row) for constraint in problem.constraints for row in _rows(problem, constraint)]
+        self.owners = [constraint for constraint, _ in own]
         """The constraint of each row."""
-        at = [(pose.frame, row) for pose in poses for row in _pose_rows(pose, *exact)]
-        frames = [owner.frame for owner in self.owners] + [frame for frame, _ in at]
-        self.rows = _arrays(problem.robot, frames, [row for _, row in each + at])
+        goals = [(pose.frame, row) for pose in poses for row in _pose_rows(pose, *exact)]
+        frames = [owner.frame for owner in self.owners] + [frame for frame, _ in goals]
+        self.rows = _arrays(problem.robot, frames, [row for _, row in own + goals])
         self._speed_limited_rows = [
             (m, owner.speed)
             for m, owner in enumerate(self.owners)
-            if isinstance(owner, CartesianLine)
-            and owner.speed is not None
-            and each[m][1].row_kind == DISTANCE
+            if isinstance(owner, CartesianLine) and owner.speed is not None and own[m][1].row_kind == DISTANCE
         ]
 
     def values(self, q: Configurations) -> Float[ndarray, "n rows"]:
@@ -144,7 +142,7 @@ class PathConstraints:
         return kernel.values(self.rows, for_kernels(q))
 
     def limits(self, tolerance_fraction: float) -> Values:
-        """The largest allowed values with a fraction of the tolerances [m] or [rad]."""
+        """The largest allowed value of each row, if a fraction of its tolerance may be used [m] or [rad]."""
         return self.rows.limit - (1 - tolerance_fraction) * self.rows.tolerance
 
     def satisfied(self, q: Configurations, tolerance_fraction: float = 1.0) -> Bool[ndarray, "n"]:
@@ -152,20 +150,20 @@ class PathConstraints:
         return np.all(self.values(q) <= self.limits(tolerance_fraction), axis=1)
 
     def projected(self, q: Configurations, tolerance_fraction: float, most: int = -1) -> Configurations:
-        """The configurations projected onto a fraction of the tolerances, at most `most` of them unless
-        `most` is -1; failed projections are left out."""
+        """The configurations, projected so that they use at most a fraction of the tolerances. Failed
+        projections are left out. most: the largest number of configurations; -1: all."""
         rows, satisfied = self.project(q, tolerance_fraction, most)
         return rows[satisfied]
 
     def project(
         self, q: Configurations, tolerance_fraction: float, most: int = -1
     ) -> tuple[Configurations, Bool[ndarray, "n"]]:
-        """Like `projected`, but returns a row for each configuration, and which rows keep the tolerances."""
+        """`projected`, but with a row for each configuration; also returns which rows keep the tolerances."""
         rows = np.array(q, np.float64, order="C")
         return rows, project_each(self.rows, self.limits(tolerance_fraction), rows, most)
 
     def worst_violation(self, q: Configuration) -> ConstraintViolation | None:
-        """The largest violation of a configuration, relative to the tolerances; None if there is none."""
+        """The violation of a configuration that is largest relative to the tolerance; None without one."""
         [values] = self.values(q[None])
         over = (values - self.rows.limit) / self.rows.tolerance
         row = int(over.argmax())
@@ -174,17 +172,19 @@ class PathConstraints:
     def first_violation(
         self, q: Configurations, chord: float = 0.0, tolerance_fraction: float = 1.0
     ) -> ConstraintViolation | None:
-        """Where the straight segments through waypoints first violate a constraint, or are not proved to
-        satisfy it; None if all constraints are proved along all segments.
+        """The first place where the straight segments through waypoints violate a constraint, or are not
+        proved to satisfy it; None if all constraints are proved along all segments.
 
         chord: bound of the motion's deviation from the segments in each joint [rad] or [m]; limits are
-        tightened to cover it. tolerance_fraction: the fraction of the tolerances that must suffice.
+        tightened to cover it. tolerance_fraction: the fraction of the tolerances that the motion may use.
         """
         q = for_kernels(q)
         rows = self.rows
-        around = np.where(rows.row_kind == DISTANCE, rows.lever_bounds.sum(axis=1), rows.chain_length)
+        # how much a row's value can change if each joint deviates by `chord`; the reference of a TURN turns
+        # with the position along its segment
+        own_change = np.where(rows.row_kind == DISTANCE, rows.lever_bounds.sum(axis=1), rows.chain_length)
         turning = (rows.row_kind == TURN) * np.linalg.norm(rows.a, axis=1) * np.linalg.norm(rows.b, axis=1)
-        slack = chord * (around + turning * rows.lever_bounds.sum(axis=1))
+        slack = chord * (own_change + turning * rows.lever_bounds.sum(axis=1))
         limits = self.limits(tolerance_fraction) - slack
         segment, fraction, row = kernel.first_unproved(rows, limits, q, MIN_SEGMENT_FRACTION)
         if row < 0:
@@ -192,7 +192,8 @@ class PathConstraints:
         return self._violation(row, segment + fraction, self._maximum(q, segment, fraction, row))
 
     def speeds(self, q: Configurations, rates: JointRows) -> Float[ndarray, "n limited"]:
-        """Speeds of the frames with a speed limit [m/s], one column each, at joint velocities `rates`."""
+        """Speeds of the frames with a speed limit [m/s], one column each, at joint velocities `rates`
+        [rad/s]."""
         columns = [
             kernel.speeds(self.rows, m, for_kernels(q), for_kernels(rates))
             for m, _ in self._speed_limited_rows
@@ -204,8 +205,8 @@ class PathConstraints:
         motion.
 
         A partial derivative of a frame's position by several joints is at most as long as the lever of the
-        last of these joints in the chain. The sum of all products of joint rates whose last joint is m is the
-        product of the sums over the joints up to m, less the product of the sums up to m - 1.
+        last of these joints in the chain. The products of joint rates with m as their last joint sum up to
+        the product of the sums over the joints up to m, less the product of the sums up to m - 1.
 
         derivatives: bounds on the first three derivatives of the joint positions, for each piece.
         """
@@ -230,7 +231,7 @@ class PathConstraints:
         return [self.owners[m] for m, _ in self._speed_limited_rows]
 
     def _maximum(self, q: ndarray, segment: int, fraction: float, row: int) -> float:
-        """The maximum value of a row from a place on the motion until it is satisfied again."""
+        """The maximum value of a row from a place on the motion until the row is satisfied again."""
         following = min(segment + 1, len(q) - 1)
         at = q[segment] + fraction * (q[following] - q[segment])
         remaining = np.concatenate([at[None], q[following:]])
@@ -289,8 +290,8 @@ def _line_rows(problem: Problem, line: CartesianLine) -> list[_Row]:
     turn = rotation_vector(T_goal[:3, :3] @ T_start[:3, :3].T)
     total_angle = float(np.linalg.norm(turn))
     if length < MIN_LINE_LENGTH and total_angle > 0:
-        # The link turns in place: the axis of the turn keeps its direction, and a vector perpendicular to the
-        # axis stays within half the total angle of where it points in the middle of the turn.
+        # The link turns in place. Two cones express this: the axis of the turn keeps its direction, and a
+        # vector perpendicular to it stays within half the total angle of its direction in mid-turn.
         axis = turn / total_angle
         across = rotation_z_to(axis)[:, 0]
         middle = rotation_about(axis, total_angle / 2) @ across
@@ -298,21 +299,22 @@ def _line_rows(problem: Problem, line: CartesianLine) -> list[_Row]:
             limit = min(spread + line.angle, np.pi)
             rows.append(_Row(CONE, limit, line.angle, a=T_start[:3, :3].T @ link_axis, b=direction))
     else:
-        share = displacement / length**2 if length > 0 else displacement
-        rows.append(_Row(TURN, line.angle, line.angle, T_start, a=turn, b=share))
+        per_length = displacement / length**2 if length > 0 else displacement
+        rows.append(_Row(TURN, line.angle, line.angle, T_start, a=turn, b=per_length))
     return rows
 
 
 def line_end(problem: Problem, line: CartesianLine) -> Pose:
-    """T_base_frame of the link of a line at the goal. Raises InputError if the goal does not determine it."""
+    """The pose T_base_frame of a line's link at the goal. Raises InputError if the goal does not determine
+    this pose."""
     robot = problem.robot
     goal = problem.goal
     if isinstance(goal, JointGoal):
         poses = [link_pose(robot, q, line.frame) for q in goal.positions]
-        off = [inverse(poses[0]) @ T for T in poses[1:]]
+        differences = [inverse(poses[0]) @ T for T in poses[1:]]
         if all(
             np.linalg.norm(T[:3, 3]) < SAME_POSE_TOLERANCE and rotation_angle(T[:3, :3]) < SAME_POSE_TOLERANCE
-            for T in off
+            for T in differences
         ):
             return poses[0]
         why = f"the {len(poses)} goal configurations put {line.frame} at different poses"
@@ -333,7 +335,7 @@ def line_end(problem: Problem, line: CartesianLine) -> Pose:
 
 
 def rotation_vector(rotation: Rotation) -> Vector:
-    """Axis times angle; accurate also near half a turn."""
+    """The rotation's axis times its angle [rad]; accurate also near half a turn."""
     angle = rotation_angle(rotation)
     if angle < 1e-12:
         return np.zeros(3)
@@ -391,8 +393,8 @@ def _arrays(robot: Robot, frames: list[str], rows: list[_Row]) -> Rows:
 
 
 def _lever_bounds(robot: Robot, frame: str) -> JointValues:
-    """For each joint that moves a frame, in order, a bound of the distance from its axis to the frame's
-    origin [m]; 1 for prismatic joints, 0 after the last joint."""
+    """For each joint of a frame's chain, in order, a bound of the distance from its axis to the frame's
+    origin [m]; 1 for prismatic joints. Entries after the last joint of the chain are 0."""
     chain = list(robot.chain(frame))
     slides = np.array(robot.prismatic)[chain]
     travel = np.maximum(np.abs(robot.lower), np.abs(robot.upper))[chain] + 1e-3

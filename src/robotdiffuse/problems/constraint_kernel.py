@@ -1,7 +1,8 @@
 """Numba kernel of path constraints: evaluates them, and proves them along straight motions.
 
 `compiled_constraints.py` builds the arrays that this file reads (`Rows`) from the constraints of a problem. A
-row is a scalar function of the pose of a link, its frame, whose value must not exceed a limit:
+row is a scalar function of the pose of a link, which is called the row's frame. There are four kinds of rows;
+the value of each must not exceed a limit:
 
 - DISTANCE: from the frame's origin to a box [m], negative inside. Lines, planes and segments are boxes of
   zero or infinite size along some of their axes.
@@ -12,11 +13,14 @@ row is a scalar function of the pose of a link, its frame, whose value must not 
   frame's orientation relative to a reference exceeds its tolerance [rad].
 
 A piece of a motion is proved to satisfy a row from the poses at its two ends. Along the piece, the joints
-move by dq at constant rates, so the frame's origin p leaves the straight line between its end positions by at
-most an eighth of the maximum second derivative, which is at most sum_jk |dq_j dq_k| r_max(j,k), where r_k is
-the distance from the axis of joint k to p. Distance to a box is convex with slope 1, hence DISTANCE is at
-most this deviation plus the larger value at the two ends. The cosine of CONE is linear in the axis, whose
-second derivative is at most (sum_j |dq_j|)². TURN grows no faster than the frame and its reference rotate.
+move by dq at constant rates.
+
+- DISTANCE: the frame's origin p leaves the straight line between its positions at the two ends by at most an
+  eighth of its second derivative. This derivative is at most sum_jk |dq_j dq_k| r_max(j,k), where r_k, the
+  lever of joint k, is the distance from its axis to p. Distance to a box is convex with slope 1, so it is at
+  most this deviation plus the larger value at the two ends.
+- CONE: its cosine is linear in the axis, whose second derivative is at most (sum_j |dq_j|)².
+- TURN: it grows no faster than the frame and its reference rotate.
 """
 
 from typing import NamedTuple
@@ -46,7 +50,7 @@ class Rows(NamedTuple):
     lower: np.ndarray
     upper: np.ndarray
     row_kind: np.ndarray
-    """[m] DISTANCE, CONE, TURN or ROLL_PITCH_YAW."""
+    """[m] kind of each row: DISTANCE, CONE, TURN or ROLL_PITCH_YAW."""
     chain_length: np.ndarray
     """[m] number of joints that move the frame."""
     same_frame: np.ndarray
@@ -61,43 +65,52 @@ class Rows(NamedTuple):
     """[m, 3] DISTANCE, ROLL_PITCH_YAW: half edge lengths of the box, or tolerances, that projection aims
     for."""
     a: np.ndarray
-    """[m, 3] CONE: the axis in the frame; TURN: the rotation vector from start to goal."""
+    """[m, 3] CONE: the axis in the frame; TURN: the rotation vector from start to goal [rad]."""
     b: np.ndarray
-    """[m, 3] CONE: the direction; TURN: the segment divided by its squared length."""
+    """[m, 3] CONE: the direction; TURN: the vector from start to goal divided by its squared length, so that
+    b · (p - start) is the fraction of the segment at p."""
     limit: np.ndarray
-    """[m] largest allowed value [m] or [rad]."""
+    """[m] largest allowed value, in meters or radians."""
     inner_limit: np.ndarray
     """[m] value that projection aims for."""
     tolerance: np.ndarray
-    """[m] size of the allowed range of values, for fractions of it."""
+    """[m] size of the allowed range of values; settings such as `tolerance_fraction` refer to it."""
     lever_bounds: np.ndarray
-    """[m, dof] for each joint of the chain, a bound of the distance from its axis to the frame's origin; 1
-    for prismatic joints."""
+    """[m, dof] for each joint of the chain, an upper bound of its lever: the distance from its axis to the
+    frame's origin in meters; 1 for prismatic joints."""
 
 
 class Work(NamedTuple):
     """Preallocated arrays of one thread."""
 
     T: np.ndarray
-    """[3, 4] pose of the frame."""
+    """[3, 4] pose of the frame in the base frame."""
     q: np.ndarray
     """[dof] values of the joints of a chain."""
     axes: np.ndarray
+    """[dof, 3] axes of the joints of a chain in the base frame."""
     origins: np.ndarray
+    """[dof, 3] a point on each of these axes."""
     values: np.ndarray
     """[2, m] values of the rows at the two ends of a piece."""
     levers: np.ndarray
-    """[2, m, dof] distances from the joint axes to the frame's origin at the two ends."""
-    limits: np.ndarray
+    """[2, m, dof] levers of the joints at the two ends."""
     target: np.ndarray
+    """[3, 4] the interpolated pose of a TURN."""
     error: np.ndarray
+    """[6] the error of a row: a rotation vector, or roll, pitch and yaw."""
     J: np.ndarray
+    """[3 m, dof] Jacobian of the residuals e, for projection."""
     e: np.ndarray
     A: np.ndarray
+    """[3 m, 3 m] matrix of the linear system of a step."""
     y: np.ndarray
     step: np.ndarray
+    """[dof] the step of a projection."""
     held: np.ndarray
+    """[dof] joints that a step must not move."""
     trial: np.ndarray
+    """[dof] configuration at the end of a piece."""
 
 
 @kernel()
@@ -111,7 +124,6 @@ def make_work(rows):
         np.empty((dof, 3)),
         np.empty((2, m)),
         np.empty((2, m, dof)),
-        np.empty(m),
         np.empty((3, 4)),
         np.empty(6),
         np.zeros((row_count, dof)),
@@ -153,7 +165,8 @@ def in_box(rows, m, T, r):
 
 @inner_kernel()
 def _cone(rows, m, T, normal):
-    """The angle of a CONE; writes to normal[3] the rotation axis that reduces it, of length sin(angle)."""
+    """The angle of a CONE. Writes to `normal` the rotation axis [3] that reduces the angle, of length
+    sin(angle)."""
     a = rows.a[m]
     b = rows.b[m]
     x = T[0, 0] * a[0] + T[0, 1] * a[1] + T[0, 2] * a[2]
@@ -199,8 +212,9 @@ def _turn(rows, m, T, target, error):
 
 @inner_kernel()
 def _roll_pitch_yaw(rows, m, T, angles):
-    """The value of a ROLL_PITCH_YAW; writes to angles[3] roll, pitch and yaw, in that of their two
-    representations which exceeds the tolerances less."""
+    """The value of a ROLL_PITCH_YAW. Writes roll, pitch and yaw to `angles`; of the two equivalent sets of
+    angles, the set that exceeds the tolerances less."""
+    # entries of the rotation from the reference to the frame
     R = rows.reference_pose[m]
     r00 = r10 = r20 = r21 = r22 = 0.0
     for i in range(3):
@@ -233,7 +247,7 @@ def _roll_pitch_yaw(rows, m, T, angles):
 
 @inner_kernel()
 def row_value(rows, m, work):
-    """The value of row m at the pose in work.T."""
+    """The value of row m at the pose in work.T [m] or [rad]; writes its error to work.error."""
     if rows.row_kind[m] == CONE:
         return _cone(rows, m, work.T, work.error)
     if rows.row_kind[m] == TURN:
@@ -251,8 +265,8 @@ def row_value(rows, m, work):
 
 @kernel()
 def evaluate(rows, q, end, work):
-    """Writes the values at a configuration to work.values[end], and the distances from the joint axes to the
-    frame's origin to work.levers[end]."""
+    """Writes the values at a configuration to work.values[end], and the joints' levers to work.levers[end].
+    end: 0 or 1."""
     for m in range(len(rows.row_kind)):
         if not rows.same_frame[m]:
             pose_frame(rows, m, q, work)
@@ -292,7 +306,7 @@ def speeds(rows, m, q, rates):
 
 @inner_kernel()
 def add_velocity(rows, m, k, rate, work, total):
-    """Adds to `total` the velocity of the frame's origin of row m that joint k of its chain causes."""
+    """Adds to `total` the velocity of the origin of row m's frame that joint k of the chain causes [m/s]."""
     a = work.axes[k, 0]
     b = work.axes[k, 1]
     c = work.axes[k, 2]
@@ -316,12 +330,13 @@ def add_velocity(rows, m, k, rate, work, total):
 def _unproved(rows, limits, a, b, fraction, first, second, work):
     """The first row that is not proved along a piece of the motion from a to b; -1 if all are proved.
 
-    The piece is `fraction` of the motion, and its ends are evaluated as `first` and `second`.
+    fraction: length of the piece, relative to the motion. first, second: the rows of work.values and
+    work.levers that `evaluate` has written for the two ends of the piece.
     """
     for m in range(len(rows.row_kind)):
         u = work.values[first, m]
         v = work.values[second, m]
-        turn = 0.0
+        turn = 0.0  # bound of the frame's rotation along the piece [rad]
         for k in range(rows.chain_length[m]):
             if rows.joint_kinds[m, k] != PRISMATIC:
                 j = rows.chain[m, k]
@@ -330,10 +345,10 @@ def _unproved(rows, limits, a, b, fraction, first, second, work):
             if limits[m] < np.pi and min(np.cos(u), np.cos(v)) - turn * turn / 8 < np.cos(limits[m]):
                 return m
             continue
-        beyond = 0.0
-        before = 0.0
-        travel = 0.0
-        bend = 0.0
+        beyond = 0.0  # how far the joints after joint k can move the frame's origin [m]
+        before = 0.0  # summed motion of the joints before joint k
+        travel = 0.0  # bound of the length of the origin's path [m]
+        bend = 0.0  # bound of the origin's second derivative over the piece [m]
         for k in range(rows.chain_length[m]):
             j = rows.chain[m, k]
             beyond += rows.lever_bounds[m, k] * fraction * abs(b[j] - a[j])
@@ -343,6 +358,7 @@ def _unproved(rows, limits, a, b, fraction, first, second, work):
             beyond -= rows.lever_bounds[m, k] * d
             lever = max(work.levers[first, m, k], work.levers[second, m, k])
             if rows.joint_kinds[m, k] != PRISMATIC:
+                # between the ends, the later joints can lengthen the lever by half of what they move
                 lever += 0.5 * max(beyond, 0.0)
             travel += lever * d
             bend += lever * d * (d + 2 * before)
@@ -351,6 +367,7 @@ def _unproved(rows, limits, a, b, fraction, first, second, work):
             if max(u, v) + bend / 8 > limits[m]:
                 return m
             continue
+        # how much the interpolated orientation turns for each meter along the segment [rad/m]
         spin = np.sqrt(rows.a[m, 0] ** 2 + rows.a[m, 1] ** 2 + rows.a[m, 2] ** 2)
         spin *= np.sqrt(rows.b[m, 0] ** 2 + rows.b[m, 1] ** 2 + rows.b[m, 2] ** 2)
         if 0.5 * (u + v + turn + spin * travel) > limits[m]:
@@ -361,7 +378,7 @@ def _unproved(rows, limits, a, b, fraction, first, second, work):
 @inner_kernel()
 def proved(rows, limits, a, b, min_fraction, work):
     """The fraction of the straight motion from a to b up to which the limits are proved, and the row that is
-    not proved there; 1.0 and -1 if all are proved. Pieces are split down to the fraction `min_fraction`."""
+    not proved there; 1.0 and -1 if all are proved. min_fraction: shortest piece that is tried."""
     proved_fraction = 0.0
     fraction = 1.0
     end = 0
@@ -385,8 +402,10 @@ def proved(rows, limits, a, b, min_fraction, work):
 
 @kernel()
 def first_unproved(rows, limits, q, min_fraction):
-    """Where the limits are first not proved along the motion through q[n, dof]: the segment, the fraction of
-    it, and the row. The row is -1 if all are proved."""
+    """The first place where the limits are not proved along the motion through q[n, dof].
+
+    Returns the segment, the fraction of the segment, and the row that is not proved; -1 if all are proved.
+    """
     work = make_work(rows)
     evaluate(rows, q[0], 0, work)
     for m in range(len(rows.row_kind)):

@@ -26,7 +26,8 @@ class JointGoal(Value):
         positions = numbers(self.positions)
         if positions is None or positions.ndim not in (1, 2) or positions.size == 0:
             raise InputError(
-                f"goal is {shown(self.positions)}; it must be a configuration or a list of them of one length"
+                f"goal is {shown(self.positions)}; it must be a configuration, or a list of configurations "
+                "of one length"
             )
         object.__setattr__(self, "positions", np.atleast_2d(positions))
         super().__post_init__()

@@ -55,7 +55,7 @@ class Case:
     reference: float | None = None
     """Length of the shortest known path [rad]; None if no search ran, or none found a path."""
     problem_set: str = ""
-    """Name of the problem set: that of a family, or the stem of a file or folder."""
+    """Name of the problem set: the name of a family, or of a file or folder without its ending."""
 
     @property
     def key(self) -> tuple[str, str]:

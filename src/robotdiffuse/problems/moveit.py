@@ -168,8 +168,8 @@ class MoveItFrames(dict[str, ndarray]):
 def moveit_frames(data: object, robot: Robot | None = None) -> MoveItFrames:
     """The frames of a parsed planning scene; `robot` as in `read_moveit_scene`.
 
-    The scene's own frame is the one in which robot_state.multi_dof_joint_state gives the pose of the robot,
-    by default `world`. Raises InputError if it has more than one transform, that of the robot's root.
+    The scene's own frame is the frame in which robot_state.multi_dof_joint_state gives the pose of the
+    robot's root, by default `world`. Raises InputError if that field has more than one transform.
     """
     if mapping_of(SCENE, data, "robot_state").get("attached_collision_objects"):
         raise InputError("attached_collision_objects are for the start_state of a request")

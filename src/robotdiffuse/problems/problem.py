@@ -325,7 +325,7 @@ class Problem(Value):
     Scene, goal and views of a Problem are always in the base's frame; `in_world` accepts them in the
     world's."""
     waypoints: tuple[Goal, ...] = ()
-    """Goals to reach before `goal`, in this order; the motion stops at those without a `blend`."""
+    """Goals to reach before `goal`, in this order. The motion stops at waypoints whose `blend` is 0."""
     constraints: tuple[Constraint, ...] = ()
     """Path constraints, which hold along the whole motion."""
     moving: tuple[MovingObstacle, ...] = ()

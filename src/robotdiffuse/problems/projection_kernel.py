@@ -1,6 +1,6 @@
 """Numba kernel that projects configurations onto path constraints by damped Newton steps.
 
-The rows, their values and their working memory are those of `constraint_kernel.py`.
+`constraint_kernel.py` defines the rows, their values and the working memory.
 """
 
 import numpy as np
@@ -20,20 +20,21 @@ from robotdiffuse.problems.constraint_kernel import (
 from robotdiffuse.robots.ik_kernel import PRISMATIC, damped_step
 
 ANGLE_WEIGHT = 0.3
-"""Meters that correspond to one radian in projection."""
+"""An error of 1 rad counts as this many meters in projection [m/rad]."""
 MIN_COSINE = 0.05
-"""Smallest cosine of a pitch with which rates of roll and yaw are computed."""
-# For projection: damping (squared singular values well above it are inverted), longest step [rad], and
-# number of steps.
+"""The rates of roll and yaw diverge at a pitch of 90°: the cosine of the pitch is at least this in them."""
 DAMPING = 1e-5
+"""Damping of the steps; only squared singular values well above it are inverted."""
 MAX_STEP = 1.0
+"""Longest step of a projection [rad]."""
 MAX_ITERATIONS = 30
+"""Maximum number of steps of a projection."""
 
 
 @inner_kernel()
 def _angle_rate(reference, axis, angles, r):
-    """Rate of roll (r = 0), pitch (1) or yaw (2) relative to a reference orientation, at these angles, while
-    the frame turns about an axis at 1 rad/s."""
+    """Rate [rad/s] of roll (r = 0), pitch (1) or yaw (2) relative to a reference orientation, while the frame
+    turns about an axis (base frame) at 1 rad/s. angles: the present roll, pitch and yaw."""
     sine = np.sin(angles[2])
     cosine = np.cos(angles[2])
     x = y = z = 0.0
@@ -51,7 +52,8 @@ def _angle_rate(reference, axis, angles, r):
 def _residuals(rows, limits, q, work):
     """The number of residuals of the rows that exceed their limits.
 
-    Writes to work.e the residuals to the values that projection aims for, and to work.J their Jacobian.
+    Writes these residuals to work.e: the differences to the values that projection aims for, with angles
+    multiplied by ANGLE_WEIGHT. Writes their Jacobian to work.J.
     """
     count = 0
     dof = len(q)
@@ -61,16 +63,17 @@ def _residuals(rows, limits, q, work):
         value = row_value(rows, m, work)
         if value <= limits[m]:
             continue
-        lines = 1 if rows.row_kind[m] == CONE else 3
-        keep = 1.0 - rows.inner_limit[m] / value if value > 0 else 1.0
-        sine = np.sqrt(work.error[0] ** 2 + work.error[1] ** 2 + work.error[2] ** 2)
-        for r in range(lines):
+        residuals = 1 if rows.row_kind[m] == CONE else 3
+        # the part of the error to remove: it leaves an error of inner_limit
+        share = 1.0 - rows.inner_limit[m] / value if value > 0 else 1.0
+        sine = np.sqrt(work.error[0] ** 2 + work.error[1] ** 2 + work.error[2] ** 2)  # of a CONE's angle
+        for r in range(residuals):
             if rows.row_kind[m] == DISTANCE:
                 x = in_box(rows, m, work.T, r)
-                off = min(max(x, -rows.inner_half_size[m, r]), rows.inner_half_size[m, r]) - x
-                if off == 0.0:
+                offset = min(max(x, -rows.inner_half_size[m, r]), rows.inner_half_size[m, r]) - x
+                if offset == 0.0:
                     continue
-                work.e[count] = off * keep
+                work.e[count] = offset * share
             elif rows.row_kind[m] == CONE:
                 work.e[count] = ANGLE_WEIGHT * (value - rows.inner_limit[m])
             elif rows.row_kind[m] == ROLL_PITCH_YAW:
@@ -80,17 +83,18 @@ def _residuals(rows, limits, q, work):
                     continue
                 work.e[count] = ANGLE_WEIGHT * (min(max(angle, -half_size), half_size) - angle)
             else:
-                work.e[count] = ANGLE_WEIGHT * work.error[3 + r] * keep
+                work.e[count] = ANGLE_WEIGHT * work.error[3 + r] * share
+            # the derivatives by the joints of the chain
             for j in range(dof):
                 work.J[count, j] = 0.0
             for k in range(rows.chain_length[m]):
                 entry = 0.0
                 if rows.row_kind[m] == DISTANCE:
-                    moved = work.y
-                    moved[0] = moved[1] = moved[2] = 0.0
-                    add_velocity(rows, m, k, 1.0, work, moved)
+                    velocity = work.y
+                    velocity[0] = velocity[1] = velocity[2] = 0.0
+                    add_velocity(rows, m, k, 1.0, work, velocity)
                     for i in range(3):
-                        entry += rows.reference_pose[m, i, r] * moved[i]
+                        entry += rows.reference_pose[m, i, r] * velocity[i]
                 elif rows.joint_kinds[m, k] != PRISMATIC and rows.row_kind[m] == TURN:
                     entry = ANGLE_WEIGHT * work.axes[k, r]
                 elif rows.joint_kinds[m, k] != PRISMATIC and rows.row_kind[m] == ROLL_PITCH_YAW:
@@ -112,7 +116,7 @@ def step(rows, limits, q, most, work):
     """Moves q by one damped Newton step towards the limits, within the joint limits.
 
     most: longest step [rad]. Returns the number of residuals before the step: 0 if q satisfied all limits and
-    was not moved, -1 if no step helps.
+    was not moved; or -1 if the step is shorter than 1e-9, so that q cannot come nearer to the limits.
     """
     dof = len(q)
     count = _residuals(rows, limits, q, work)
@@ -120,6 +124,7 @@ def step(rows, limits, q, most, work):
         return 0
     work.held[:] = False
     damped_step(work.J, work.e, DAMPING, count, dof, work.held, work.A, work.y, work.step)
+    # if the step moves joints beyond their limits, solve again without these joints
     clamped_joint = False
     for k in range(dof):
         low = q[k] <= rows.lower[k]
@@ -154,8 +159,8 @@ def project(rows, limits, q, work):
 
 @kernel(nogil=True)
 def project_each(rows, limits, q, most):
-    """Projects configurations q[n, dof] in place, until `most` of them satisfy the limits; returns which of
-    them do [n]."""
+    """Projects configurations q[n, dof] in place, in order, until `most` of them satisfy the limits; -1: all.
+    Returns which of them satisfy the limits [n]."""
     work = make_work(rows)
     satisfied = np.zeros(len(q), np.bool_)
     count = 0

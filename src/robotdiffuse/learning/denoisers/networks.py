@@ -81,7 +81,7 @@ def attend(
     v: Float[Tensor, "batch heads others size"],
     causal: bool = False,
 ) -> Float[Tensor, "batch tokens width"]:
-    """Attention of tokens to others; causal: each token only to those up to itself.
+    """Attention of tokens to others; causal: each token attends only to itself and the tokens before it.
 
     On a CPU, bf16 and short sequences use plain matrix products, which are faster there than the fused
     kernel. Long sequences in fp32, and GPUs, use the fused kernel.
@@ -146,7 +146,7 @@ class Block(nn.Module):
         self, width: int, heads: int, hidden: int, layers: int, causal: bool = False, cross: bool = False
     ) -> None:
         """layers: number of blocks in a row; the more, the smaller the initial weights of each.
-        cross: whether the tokens also attend to those of an encoder (the decoder of Vaswani et al. 2017).
+        cross: whether the tokens also attend to an encoder's tokens (the decoder of Vaswani et al. 2017).
         """
         super().__init__()
         self.heads = heads
@@ -183,7 +183,7 @@ class Block(nn.Module):
 
 
 class TrajectoryTransformer(Denoiser):
-    """A transformer whose tokens are patches of waypoints; its settings tell the variants apart.
+    """A transformer whose tokens are patches of waypoints. The class of its settings selects the variant:
 
     - Encoder-only (the paper's motion predictor): a further token before those of the waypoints, z_tk,
       carries the condition and the noise level. z_tk may also be added to every other token.
@@ -308,9 +308,9 @@ class ResidualBlock(nn.Module):
 class UNet(Denoiser):
     """After Janner et al. 2022 and Carvalho et al. 2023 (MPD), with layer norms over the channels.
 
-    Two residual blocks per resolution on the way down, and two on the way up, whose input includes the
-    waypoints of the same resolution on the way down. Numbers of waypoints that cannot be halved often enough
-    are extended by repeating the last waypoint, and the result is cut.
+    Each resolution has two residual blocks on the way down and two on the way up; the input of the latter
+    includes the features of this resolution from the way down. If the number of waypoints cannot be halved
+    often enough, the last waypoint is repeated, and the result is cut.
     """
 
     def __init__(

@@ -53,7 +53,7 @@ class TrainingSettings(Settings):
     minutes: Positive | None = 40.0
     """Length of the run in wall time [min]; the learning rate reaches 0 at its end. None: by `samples`."""
     samples: Count | None = None
-    """Length of the run in training samples. Runs of this kind are reproducible, timed ones are not."""
+    """Length of the run in training samples. Such runs are reproducible; runs by `minutes` are not."""
     seed: Natural = 0
     batch: Count = 128
     """Number of samples in a training step."""
@@ -147,13 +147,13 @@ class PlannerTraining(MotionTraining, ModelParts):
     """Peak learning rate of AdamW (paper: 3e-4)."""
     weight_decay: NotNegative = 0.01
     weight_limit: Positive | None = 5.0
-    """Largest weight of a noise level in the loss, see NoiseSchedule.weight; None: all have the same
+    """Largest weight of a noise level in the loss, see NoiseSchedule.weight; None: all levels have equal
     weight."""
     losses: LossSettings = field(default_factory=LossSettings)
     """The paper's losses of joints, points and collision."""
     trivial_share: Share = 0.1
-    """Share of each batch whose straight line from start to goal is free, so that the network learns to keep
-    straight lines."""
+    """Share of trivial trajectories in each batch, with a free straight line from start to goal: from these
+    the network learns to keep straight lines."""
     smooth_noise: bool = True
     """Whether the noise has the covariance of the trajectories over the waypoints; otherwise it is white (the
     paper's)."""

@@ -44,8 +44,8 @@ Module = TypeVar("Module", bound=nn.Module)
 
 
 class Processes:
-    """The processes of a training, from the view of one process. All call the same methods in the same
-    order."""
+    """The processes of a training, as one of them sees them. All processes must call the same methods in the
+    same order."""
 
     def __init__(self, device: str | None) -> None:
         """device: cpu, or cuda with a device for every process; None: cuda if there is one.
@@ -61,7 +61,7 @@ class Processes:
         cpu = device == "cpu" or not cuda
         bf16 = fast_bf16() if cpu else torch.cuda.is_bf16_supported(including_emulation=False)
         device_type = "cpu" if cpu else "cuda"
-        # Accelerate keeps one state per interpreter, that of its first use
+        # Accelerate keeps one state per interpreter, from its first use
         begun = PartialState().device if PartialState._shared_state else None
         if begun is not None and begun.type != device_type:
             raise InputError(
@@ -77,7 +77,7 @@ class Processes:
 
     @property
     def first(self) -> bool:
-        """Whether this process is the one that validates, logs, prints and writes files."""
+        """Whether this process validates, logs, prints and writes files; only the first process does."""
         return self.index == 0
 
     def autocast(self) -> AbstractContextManager[None]:
@@ -114,7 +114,7 @@ class Processes:
         return gather_object([value])
 
     def share(self, value: Value | None) -> Value:
-        """The first process's value; the values of the others are ignored."""
+        """The value of the first process, in all processes; their own values are ignored."""
         return self.gather(value)[0]
 
     def first_goes_first(self) -> AbstractContextManager[None]:
@@ -174,7 +174,7 @@ class TrainingTask(ABC):
 
     @abstractmethod
     def validate(self, fraction: float) -> Validation:
-        """Figures on held-out data, which are the same data at every call."""
+        """Figures on held-out data; every call uses the same data."""
 
     def finish(self) -> dict[str, float]:
         """The figures of the trained network."""
@@ -206,7 +206,7 @@ class Position:
 class TrainingRun:
     """Trains a module's parameters; continues an earlier run in the same folder.
 
-    A resumed run gives the same result as an uninterrupted one: weights, their average, moments of the
+    A resumed run gives the same result as an uninterrupted run: weights, their average, moments of the
     optimizer and the random states come from the checkpoint.
 
     Several processes, started by torchrun, are one run: each draws its own batches of the size in the
@@ -534,7 +534,7 @@ class MotionTask(TrainingTask):
         self.settings = settings
         self.robot = robot
         self.processes = processes
-        # the first process caches the codes of the scenes for the others
+        # the first process caches the codes of the scenes for the other processes
         with processes.first_goes_first():
             self.data = load_data(
                 settings.data, robot, encoder, settings.waypoints, self._report, settings.turned_copies

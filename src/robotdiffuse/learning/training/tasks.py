@@ -135,7 +135,7 @@ class _EncoderTask(TrainingTask):
 
 
 def linear_readout(encoder: Encoder, scenes: PackedScenes, rng: Generator) -> dict[str, float]:
-    """Errors of a linear read-out of z, the same measure for all encoders.
+    """Errors of a linear read-out of z, a measure that all encoders can be compared by.
 
     A linear map from z to the signed distances of fixed positions around the arm to the obstacles is fitted
     to the first READOUT_SCENES and tested on the others. `readout`: mean error of this map [m];
@@ -227,7 +227,8 @@ def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
     trajectory_prior.
 
     The same call continues a run that was interrupted. Returns `validation`, the loss on held-out
-    trajectories, `success`, the share of free motions among those sampled for their problems, and `samples`.
+    trajectories; `success`, the share of collision-free motions among samples for held-out problems; and
+    `samples`.
     Raises the errors of `loop.train`, and InputError if the data or the encoder do not fit.
     """
     return train(PlannerTask(settings, Processes(settings.device)), out)
@@ -301,7 +302,7 @@ def model_settings(settings: PlannerTraining, encoder: Encoder | None) -> Motion
 
 
 class PlannerLoss:
-    """Computes the loss of a batch: that of the objective, L_point and L_collision (paper, eq. L)."""
+    """Computes the loss of a batch: the objective's loss plus L_point and L_collision (paper, eq. L)."""
 
     def __init__(
         self, model: MotionNetwork, robot: Robot, settings: PlannerTraining, processes: Processes

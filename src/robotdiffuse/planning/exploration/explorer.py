@@ -1,19 +1,23 @@
 """Explorer: takes an arm to goals through space that cameras see on the way.
 
-**Strict.** The arm enters no voxel that was not seen free: the validator accepts each motion among obstacles
-that cover all other space (`seen_free.py`). Exempt are the voxels with centers within 3 cm of the arm where a
-motion begins, and the space within 2 cm of it where it ends; seen points count there too. With `see_goal` the
-arm's surface at the goal must have been seen free as well (`seen_free.GoalSeen`). So the promise is as good
-as the map: in a scene that does not change, with a camera whose poses and errors are as stated, such a motion
-meets nothing. Where poses are inexact, what obstacles may reach within their error is free only to a view
-that sees it so by a margin of all of its own error, such as one from nearby.
+An Explorer returns steps. A *look* is a step that moves the arm to a viewpoint, where the caller takes an
+image. Motions follow one of two policies.
 
-**Probabilistic.** The arm goes if the motion's stated `confidence` is high enough, and otherwise looks first.
-The confidence follows from the predicted probability of all voxels that the map does not know and the motion
-sweeps, but for those that the arm fills where it begins and ends.
+**Strict.** The arm enters only voxels that were seen free: the validator accepts each motion among obstacles
+that cover all other space (`seen_free.py`). There are two exceptions: voxels with centers within 3 cm of the
+arm at the start of a motion, and the space within 2 cm of the arm at its end. Seen points are obstacles there
+as well. With `see_goal`, the arm's surface at the goal must also have been seen free (`seen_free.GoalSeen`).
+The promise is as good as the map: if the scene does not change, and the camera's poses and errors are as
+stated, such a motion does not collide. Space that an obstacle may reach because of a pose's error counts as
+free only if a view sees it free by a margin of all of its own error, such as a view from nearby.
 
-Looks are chosen by what a tentative motion, planned among what was seen alone, would sweep unseen. A look's
-own motion is subject to the same policy; under the probabilistic one, too, a strict motion comes first.
+**Probabilistic.** The arm executes a motion whose stated `confidence` is high enough, and otherwise looks
+first. The confidence follows from the predicted probability of all unknown voxels that the motion sweeps,
+without those that the arm fills at the start and at the end.
+
+To choose a look, the Explorer plans a tentative motion among the seen obstacles alone; looks should show the
+unseen space that it would sweep. The motion of a look is subject to the policy as well. Under the
+probabilistic policy, a strict motion to the viewpoint is tried first.
 """
 
 from collections.abc import Iterable, Sequence
@@ -76,17 +80,17 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.tolerances import VerifySettings, goal_error
 
 PROBABILITY_BELOW = np.float32(0.1)
-"""That a voxel below the volume that the network predicts is occupied, where the map does not know it: the
-share of unknown voxels within reach that are."""
+"""Probability that an unknown voxel below the volume of the network is occupied: the share of the unknown
+voxels within reach that are occupied."""
 NOTHING, DEFAULTS = Scene(()), ExplorerSettings()
 QUICK_FRACTION = 0.2
-"""Part of the time limit for a search that a look, or another search, may follow. Within space seen free it
-doubles with each look: the more was seen, the less likely a search fails for lack of it."""
+"""Fraction of the time limit for a search after which a look or another search may follow. For searches
+within space seen free, it doubles with each look: the more space was seen, the likelier is a motion."""
 TENTATIVE_MOTIONS = 2
-"""Number of tentative motions among seen obstacles; views are planned for the one that sweeps the least
+"""Number of tentative motions among seen obstacles; looks are planned for the motion that sweeps the least
 unseen space."""
 AT_GOAL = 1e-3
-"""Largest distance of any joint to a goal that the arm is at [rad], [m] for prismatic joints."""
+"""The arm is at a goal if every joint is within this of the goal [rad], [m] for prismatic joints."""
 ARRIVED = VerifySettings(goal_tolerance=AT_GOAL)
 
 
@@ -106,10 +110,11 @@ class Explorer:
         seed: int = 0,
     ) -> None:
         """
-        cameras: on the arm, which looks are made with; views of other cameras can be observed all the same.
-        scene: what is known without views, such as the floor.
-        free_zone: low and high corner of a box declared free unless a view finds something there, such as
-            the space around the arm's base [m].
+        cameras: the cameras on the arm, with which looks are made. Views of other cameras can be observed
+            as well.
+        scene: shapes that are known without views, such as the floor.
+        free_zone: low and high corner of a box [m] that counts as free unless a view finds something there,
+            such as the space around the arm's base.
         """
         check_type("settings", settings, ExplorerSettings, "ExplorerSettings")
         self.robot, self.cameras, self.scene, self.settings = robot, tuple(cameras), scene, settings
@@ -126,22 +131,22 @@ class Explorer:
         self._goal: Goal | None = None
         self._looks = 0
         self._looked_for = np.zeros(MAP.shape, np.bool_)
-        """The voxels that views were to show."""
+        """The voxels that looks since `set_goal` should have shown."""
         self._way_in: Configurations | None = None
         """Waypoints of the latest motion that was returned."""
         self._news: list[DepthView] = []
         """Views since the latest step."""
         self._beside: DepthView | None = None
-        """The latest one of a camera that is not on the arm, before the latest step."""
+        """The latest view, before the latest step, of a camera that is not on the arm."""
         self._free = self.map.free
-        """Voxels that were free then."""
+        """Voxels that were free at the latest step."""
 
     @locked
     def set_goal(self, goal: ArrayLike | Goal) -> None:
-        """Set the next goal. What was seen is kept.
+        """Set the next goal. The map and the views are kept.
 
         Args:
-            goal: Configurations, or poses as `rd.Problem` takes them.
+            goal: Configurations or poses, as `rd.Problem` accepts them.
 
         Raises:
             InputError: For a goal that does not fit the robot.
@@ -178,7 +183,7 @@ class Explorer:
             configuration: Where the arm is [dof].
 
         Raises:
-            InputError: Before `set_goal`, and for a configuration that is not one.
+            InputError: Before `set_goal`, and for values that are no configuration of the robot.
         """
         if self._goal is None:
             raise InputError("there is no goal; call set_goal first")
@@ -195,7 +200,7 @@ class Explorer:
         points, errors = self._views.points(self.map.free)
         self.map.doubt(points, errors.sum(axis=1))
         self._free = self.map.free
-        self._seed += TENTATIVE_MOTIONS  # what one step's searches did not find, those of the next one may
+        self._seed += TENTATIVE_MOTIONS  # so that the searches of each step differ
         policies = (
             (STRICT, PROBABILISTIC)
             if self.settings.policy == STRICT_THEN_PROBABILISTIC
@@ -203,7 +208,7 @@ class Explorer:
         )
         step = Step(STUCK, "")
         for policy in policies:
-            # under the strict policy, space that obstacles may reach is not seen free
+            # the strict policy need not enlarge points: the map does not call space within their error free
             enlarged = policy != STRICT
             shapes = point_shapes(points, self.robot, self.scene, q, goals, errors, enlarged)
             problem = Problem(
@@ -219,9 +224,10 @@ class Explorer:
 
     @locked
     def wanted(self, path: Path) -> Voxels:
-        """The voxels that views are to show.
+        """The voxels that looks should show.
 
-        They are the unknown ones that a tentative motion sweeps, and those of a goal that must be seen.
+        They are the unknown voxels that a tentative motion sweeps and, if the goal must be seen, the voxels
+        of the arm's surface there that were not seen.
 
         Args:
             path: The tentative motion.
@@ -230,7 +236,8 @@ class Explorer:
 
     @locked
     def stop(self, motion: Trajectory, time: float) -> Stop | None:
-        """How a motion under way ends early, if what was observed since `next` returned it is in its way.
+        """How a motion under way ends early, if views observed since `next` returned it show an obstacle in
+        its way.
 
         After the stop, ask `next` again.
 
@@ -244,7 +251,7 @@ class Explorer:
         return stop_before(self.robot, self.scene, self._news, self._free, motion, time)
 
     def _step(self, problem: Problem, policy: str) -> Step:
-        """The step under one policy."""
+        """The step under one policy: go, look or stuck."""
         if policy == STRICT and isinstance(problem.goal, JointGoal):
             goals = [q for q in problem.goal.positions if not reaches_outside(self.robot, q)]
             if not goals:
@@ -278,7 +285,7 @@ class Explorer:
         return motion.confidence is not None and motion.confidence >= self.settings.confidence
 
     def _may_go(self, motion: PlanResult, policy: str) -> bool:
-        """Whether a motion to the goal keeps to the policy, and the goal was seen if it must be."""
+        """Whether a motion to the goal keeps to the policy, and the goal was seen if that is required."""
         return self._good(motion, policy) and not self._goal_seen.missing(motion)
 
     def _go(self, motion: PlanResult, policy: str) -> Step:
@@ -295,8 +302,10 @@ class Explorer:
         predicted: Probabilities | None,
         motion: PlanResult,
     ) -> Step:
-        """A look at what a tentative motion sweeps unseen, or why there is none. `motion`: the one to the
-        goal that does not keep to the policy."""
+        """A look at the unseen space that a tentative motion sweeps; or a step that says why there is none.
+
+        motion: the motion to the goal that does not keep to the policy, or the failed result.
+        """
         why = self._goal_seen.missing(motion) or motion.reason
         if motion.solved and policy == PROBABILISTIC:
             why = "the motion has no confidence, since nothing was measured"
@@ -322,7 +331,7 @@ class Explorer:
         if safe_motion is not None and self._may_go(safe_motion, under):
             return self._go(safe_motion, under)
         predicted = self.predicted() if predicted is None else predicted
-        # a look has many ways: under either policy it takes one through space seen free if there is any
+        # the motion of a look is through space seen free if possible, under both policies
         policies = (STRICT, PROBABILISTIC) if self.settings.policy == PROBABILISTIC else (policy,)
         for under in policies:
             way = self._way_to_look(problem, under, to_view, predicted)
@@ -343,15 +352,16 @@ class Explorer:
         wanted: Voxels,
         predicted: Probabilities | None,
     ) -> PlanResult | None:
-        """A motion by a policy to where a camera sees most of the wanted voxels; None if none was found."""
+        """A motion under a policy to a viewpoint from which a camera sees most of the wanted voxels; None if
+        no motion was found."""
         allowed = self._seen_free(problem) if policy == STRICT else problem
         tree = ReachableTree(self.robot, allowed.scene, problem.start)
         way_in = self._way_in_to(problem.start)
         hemmed_in = way_in is None or bool(moved(self.robot, way_in[:1], [problem.start])[0] < CONFINED)
         taken = self._goal_seen.taken
         for camera in self.cameras:
-            of = wanted, predicted, self._rng, taken, hemmed_in, self._beside
-            ways = best_looks(self.map, tree, camera, *of)
+            arguments = wanted, predicted, self._rng, taken, hemmed_in, self._beside
+            ways = best_looks(self.map, tree, camera, *arguments)
             for waypoints in islice(ways, self.settings.look_attempts):
                 if policy == STRICT:
                     way = self._along(allowed, waypoints, "look")
@@ -366,16 +376,17 @@ class Explorer:
         q = view.configuration
         assert q is not None  # the map takes no other views
         return any(
-            is_on(self.robot, one.link, one.T_link_camera, view.T_base_camera, q) for one in self.cameras
+            is_on(self.robot, camera.link, camera.T_link_camera, view.T_base_camera, q)
+            for camera in self.cameras
         )
 
     def _way_in_to(self, q: Configuration) -> Configurations | None:
-        """The latest motion that was returned, if it ended here."""
+        """Waypoints of the latest motion that was returned, if it ended at this configuration."""
         way = self._way_in
         return way if way is not None and np.abs(way[-1] - q).max() <= AT_GOAL else None
 
     def _way_back(self, problem: Problem) -> PlanResult | None:
-        """A motion that leaves by the way in, as far as there is more room; None if there is none."""
+        """A motion back along the latest motion, on the shortest part that is accepted; None without one."""
         way = self._way_in_to(problem.start)
         if way is None:
             return None
@@ -390,7 +401,8 @@ class Explorer:
         return self._along(self._seen_free(problem, waypoints[-1]), waypoints, name)
 
     def _seen_free(self, problem: Problem, *goals: Configuration) -> Problem:
-        """The problem with obstacles that cover all space not seen free, but near the start and the goals."""
+        """The problem with obstacles that cover all space not seen free, except near the start and the
+        goals."""
         obstacles = not_seen_free(self.map, self.scene, problem.start, goals)
         return replace(problem, scene=problem.scene.with_shapes([*problem.scene.shapes, *obstacles]))
 
@@ -404,10 +416,10 @@ class Explorer:
         return PlanningContext(self._planner.name, problem, PlanRequest(limit, seed, FIRST))
 
     def _least_unseen(self, as_seen: Problem) -> tuple[PlanResult, Voxels]:
-        """A motion among seen obstacles, and the unseen space on it that views are to show.
+        """A motion among seen obstacles, and the unseen voxels on it that looks should show.
 
-        Of several motions, the one with the least unseen space; without any, a failed result. Motions avoid
-        occupied voxels, and those that views failed to show, if they can.
+        It is the motion with the least unseen space of several; or a failed result if none was found. If
+        possible, motions avoid occupied voxels, and voxels that earlier looks failed to show.
         """
         goals = as_seen.goal.positions if isinstance(as_seen.goal, JointGoal) else ()
         ends = near_ends(self.map, (as_seen.start, *goals))
@@ -419,15 +431,15 @@ class Explorer:
         results = list[tuple[PlanResult, Voxels]]()
         for seed in range(self._seed, self._seed + TENTATIVE_MOTIONS):
             result = self._planned(avoiding, self._quick_limit, seed)
-            if result.path is None and not any(one.solved for one, _ in results):
+            if result.path is None and not any(earlier.solved for earlier, _ in results):
                 avoiding = as_seen
                 result = self._planned(as_seen, self.settings.time_limit, seed)
             unseen = ends if result.path is None else self.wanted(result.path)
             results.append((result, unseen))
             if result.path is not None and not unseen.any():
                 break
-        solved = [(one, unseen) for one, unseen in results if one.path is not None]
-        return min(solved, key=lambda one: int(one[1].sum()), default=results[-1])
+        solved = [(result, unseen) for result, unseen in results if result.path is not None]
+        return min(solved, key=lambda pair: int(pair[1].sum()), default=results[-1])
 
     @property
     def _quick_limit(self) -> float:
@@ -441,8 +453,11 @@ class Explorer:
         limit: float,
         may_look: bool = False,
     ) -> PlanResult:
-        """A motion to the problem's goal by a policy, found within a time limit [s]. If the arm may look
-        first, a strict one is not searched for where there hardly is one."""
+        """A motion to the problem's goal under a policy, found within a time limit [s].
+
+        may_look: whether the arm may look first. A strict motion is then not searched for if too little of
+        the space at the goal was seen free.
+        """
         if policy == PROBABILISTIC:
             return self._probabilistic(problem, predicted, limit)
         goals = self._goals(problem)
@@ -461,9 +476,9 @@ class Explorer:
     def _probabilistic(
         self, problem: Problem, predicted: Probabilities | None, limit: float, to_goal: bool = True
     ) -> PlanResult:
-        """A motion among what was seen and predicted, with its confidence.
+        """A motion among seen and predicted obstacles, with its confidence.
 
-        to_goal: whether the problem's goal is the Explorer's, not where a look ends.
+        to_goal: whether the problem's goal is that of the Explorer; otherwise it is a viewpoint.
         """
         assumed_problem = replace(problem, unknown=PADDED if predicted is None else PREDICTED)
         goals = problem.goal.positions if to_goal and isinstance(problem.goal, JointGoal) else ()
@@ -476,9 +491,11 @@ class Explorer:
     def _with_confidence(
         self, motion: PlanResult, predicted: Probabilities | None, to_goal: bool = True
     ) -> PlanResult:
-        """The motion with the confidence that follows from the probability that it sweeps; None if the map
-        holds no measurement. The arm is taken to be free where a motion begins, and at the goal, but not
-        where a look ends."""
+        """The motion with the confidence that follows from the summed probability of the voxels that it
+        sweeps. The confidence is None if the map holds no measurement.
+
+        The arm counts as free of collision at the start of a motion and at the goal, but not at a viewpoint.
+        """
         if motion.path is None or predicted is None:
             return motion
         ends = motion.path.positions[[0, -1] if to_goal else [0]]
@@ -490,27 +507,31 @@ class Explorer:
         return replace(motion, swept_probability=swept, confidence=stated)
 
     def _unknown(self, ends: Iterable[Configuration], predicted: Probabilities | None) -> UnknownSpace:
-        """What the map does not know, without the voxels that the arm fills at these configurations."""
+        """The voxels that the map does not know, without those that the arm fills at these configurations."""
         lost = np.pad(refined(self._views.volume().lost), ((0, 0), (0, 0), (LAYERS_BELOW, 0)))
         return UnknownSpace(self.robot, ends, self.map.unknown, predicted, 0.0, MAP, lost)
 
     def _planned(self, problem: Problem, limit: float, seed: int | None = None) -> PlanResult:
-        """A first motion in the problem's scene as it is, found within a time limit [s]."""
-        compile_scene_for(self.robot, problem.scene)  # now, outside the time limit
+        """The first motion found in the problem's scene, within a time limit [s]."""
+        compile_scene_for(self.robot, problem.scene)  # compile now, outside the time limit
         return self._planner.plan(problem, limit, self._seed if seed is None else seed, FIRST)
 
     def _goals(self, problem: Problem) -> Configurations | PlanResult:
         """The goal configurations, or the result that says why there is none."""
         if isinstance(problem.goal, JointGoal):
             return problem.goal.positions
-        seed = 0 if self.settings.see_goal else self._seed  # views are planned for the same ones again
+        # with see_goal, a constant seed gives the same goals at each step, so that looks add up
+        seed = 0 if self.settings.see_goal else self._seed
         usable = usable_start_goal(self._context(problem, self.settings.time_limit, seed))
         return usable if isinstance(usable, PlanResult) else np.stack(usable.goals)
 
     @locked
     def predicted(self) -> Probabilities | None:
-        """The probability that each voxel is occupied, 0 where the map knows it to be free; None without the
-        network, where it does not cover the arm's reach, and before the first view."""
+        """The predicted probability that each voxel is occupied; 0 in voxels that the map knows to be free.
+
+        None if the settings exclude the network, if it does not cover the arm's reach, and before the first
+        view.
+        """
         if not (len(self._views) and self.settings.predict):
             return None
         from robotdiffuse.learning.completion import covers, predict

@@ -1,5 +1,6 @@
-"""Where to look: configurations that the arm can reach and from which its camera sees what a motion would
-sweep; and the next best view, the pose of a camera beside the arm that sees most of it.
+"""Viewpoints: configurations that the arm can reach and from which its camera sees the unseen space that a
+motion would sweep; and the next best view, the pose beside the arm from which a camera sees most of that
+space.
 """
 
 from collections.abc import Iterator, Sequence
@@ -36,16 +37,16 @@ from robotdiffuse.trajectories.simplification import simplify
 RESOLUTION = 0.02
 """No point of the arm moves further than this between two checks of a motion [m]."""
 CAPACITY = 2000
-"""Most configurations of a tree."""
+"""Maximum number of configurations in a tree."""
 PARTS = (0.25, 0.5, 1.0)
-"""Parts of a way that may be gone."""
+"""Fractions of a path's length that may be executed."""
 
 
 class ReachableTree:
-    """A tree of straight motions without collision from a configuration on.
+    """A tree of collision-free straight motions that begins at a configuration.
 
-    Searches between two configurations fail where only a narrow gap leads out of the first one. The tree
-    knows what is beyond such gaps before anything there is chosen as a goal.
+    A search between two configurations often fails if only a narrow gap leads away from the first one. The
+    tree finds what is reachable behind such gaps before one of its configurations is chosen as a goal.
     """
 
     def __init__(self, robot: Robot, scene: Scene, start: Configuration) -> None:
@@ -58,19 +59,19 @@ class ReachableTree:
 
     @property
     def configurations(self) -> Configurations:
-        """The start, and what is reached from it."""
+        """The configurations of the tree, the start first."""
         return self._trees.nodes[0, : len(self)].astype(np.float64)
 
     def grow(self, targets: Configurations, longest: Float[ndarray, "n"]) -> None:
-        """Extend the tree from its nearest configuration towards each target, where that motion is free.
+        """Extend the tree from its nearest configuration towards each target, if that motion is free.
 
-        longest: the longest extension towards each [rad, joint-space L2].
+        longest: the longest extension towards each target [rad, joint-space L2].
         """
         targets = np.clip(targets, self._space.lower, self._space.upper)
         extend(self._space, self._trees, targets.astype(np.float32), longest.astype(np.float32))
 
     def way(self, number: int) -> Configurations:
-        """Waypoints from the start to one of the configurations."""
+        """Waypoints from the start to the configuration with this index."""
         nodes = self._trees.nodes[0]
         parents = self._trees.parents[0]
         path = [number]
@@ -82,14 +83,14 @@ class ReachableTree:
 
 
 def moved(robot: Robot, to: Configurations, others: Sequence[Configuration]) -> Float[ndarray, "n"]:
-    """How far the arm is in each configuration from where it is in the nearest of others: the mean of its
-    covering spheres [m]."""
-    reached, away = (np.stack([placed_spheres(robot, q)[:, :3] for q in some]) for some in (to, others))
-    return np.min([np.linalg.norm(reached - one, axis=2).mean(axis=1) for one in away], axis=0)
+    """How far the arm moves from the nearest of other configurations to each configuration of `to`: the mean
+    over its covering spheres [m]."""
+    reached, away = (np.stack([placed_spheres(robot, q)[:, :3] for q in rows]) for rows in (to, others))
+    return np.min([np.linalg.norm(reached - other, axis=2).mean(axis=1) for other in away], axis=0)
 
 
 def first_parts(waypoints: Configurations) -> Iterator[Configurations]:
-    """The first parts of a way, the shortest first, and all of it."""
+    """The first parts of a path in order of their length, the whole path last."""
     at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1))])
     for part in PARTS:
         end = part * at[-1]
@@ -97,38 +98,37 @@ def first_parts(waypoints: Configurations) -> Iterator[Configurations]:
         yield np.concatenate([waypoints[at < end], last[None]])
 
 
-# Reachable configurations that a look is chosen from, at first; random ones that they are sought by in a
-# round; and the most rounds.
+# The tree grows by TARGETS random targets in a round, until it has CONFIGURATIONS or after ROUNDS rounds.
 CONFIGURATIONS = 900
 TARGETS = 1200
 ROUNDS = 5
 SPREADS = (0.3, 0.8, 2.0)
-"""Standard deviations of the distances of random ones from the arm's, in equal parts [rad]."""
+"""Standard deviations of the targets about the start, each for a third of the targets [rad]."""
 LONGEST_STEP = 1.0
-"""The longest step towards one [rad, joint-space L2]; most are much shorter, for gaps."""
+"""Longest extension towards a target [rad, joint-space L2]; most are much shorter, to pass gaps."""
 REFINEMENTS = (0.25, 0.1)
-"""Standard deviations of the configurations around the best ones, in rounds after the first [rad]."""
-# Number of the best ones, and of configurations around each of them.
+"""Standard deviations of the targets about the best configurations, in two further rounds [rad]."""
+# Number of these best configurations, and of targets about each of them.
 REFINED = 12
 NEIGHBORS = 15
 MAX_VOXELS = 1500
-"""Maximum number of swept voxels by which views are scored."""
+"""Maximum number of swept voxels by which viewpoints are scored."""
 FULL_COST_LENGTH = 8.0
-"""A look this far away counts half [rad, joint-space L2]."""
+"""The score of a viewpoint at this distance is halved [rad, joint-space L2]."""
 UNSEEN_WEIGHT = 0.05
-"""Weight of a swept voxel that is surely free, by the prediction; one that is surely occupied has 1 more."""
+"""Weight of a swept voxel, to which its predicted probability of being occupied is added."""
 MIN_SEEN = 0.02
-"""Looks that see a smaller part of the weight are of no use."""
+"""Viewpoints that see a smaller part of the total weight are not used."""
 CONFINED = 0.1
-"""An arm that gets no farther than this is hemmed in by what its own shadow hides from cameras beside it. It
-moves as far as it can first, so that the shadow moves too [m]."""
+"""An arm that can move no farther than this is confined by unseen space in its own shadow, which it hides
+from cameras beside it. It first moves as far as it can, so that its shadow moves [m]."""
 SIMILAR_LOOK = 0.2
-"""A look that is nearer than this to one that did not show what is wanted counts less [rad]."""
+"""A viewpoint nearer than this to an earlier one that did not show the wanted voxels counts less [rad]."""
 
 
 def swept_unseen(known: OccupancyMap, path: Path) -> Voxels:
-    """The voxels that the map does not know and whose covering balls a path touches, without those near its
-    ends, which count as free."""
+    """The unknown voxels whose covering balls a path touches, except near its start and end: voxels there
+    count as free."""
     swept = (
         MAP.swept(known.robot, path, COVER_RADIUS) & known.unknown & ~near_ends(known, [path.positions[0]])
     )
@@ -146,16 +146,20 @@ def best_looks(
     hemmed_in: bool = False,
     beside: DepthView | None = None,
 ) -> Iterator[Configurations]:
-    """Ways to configurations from which the camera sees wanted voxels, the best first: weighted by the
-    prediction if there is one, against the way to get there.
+    """Yields paths to viewpoints from which the camera sees wanted voxels, the best first.
 
-    tree: of configurations that the arm can reach, which grows here. A voxel counts by the chance that
-    nothing hides it: neither the arm, nor what is occupied or predicted.
-    taken: configurations of earlier images that did not show the wanted voxels; looks from nearby count
-    less, once for each of them.
-    beside: the latest image of a camera that does not move, which sees what the arm no longer hides.
-    hemmed_in: whether there is no way back. At last, and first for an arm that is CONFINED, there is a way to
-    where the arm is farthest from where images were taken.
+    The score of a viewpoint is the weight of the wanted voxels that it sees, reduced for a long path. A voxel
+    counts with the probability that nothing hides it: neither the arm, nor occupied or predicted voxels.
+
+    tree: configurations that the arm can reach; it grows here.
+    probability: the predicted probability that each voxel is occupied, which adds to its weight; None without
+    a prediction.
+    taken: configurations of earlier images that did not show the wanted voxels. Each of them lowers the score
+    of viewpoints nearby.
+    hemmed_in: whether the arm cannot go back. The last path is then to the configuration in which the arm is
+    farthest from where it was in all images; for a CONFINED arm it is also the first path.
+    beside: the latest image of a camera that does not move. It sees what the arm at a viewpoint no longer
+    hides.
     """
     robot = known.robot
     at = np.argwhere(wanted)
@@ -179,7 +183,8 @@ def best_looks(
         q: Configurations,
         poses: Float[ndarray, "n 4 4"],
     ) -> Float[ndarray, "n"]:
-        """The part of the weight that a camera sees at each pose, with the arm in each configuration."""
+        """The part of the total weight that a camera sees from each pose, with the arm at the configuration
+        of the same row."""
         sums = seen_weights(
             compile_robot(robot),
             q.astype(np.float32),
@@ -200,12 +205,12 @@ def best_looks(
         [seen_at_start] = seen_by(beside.intrinsics, beside.depth.shape, np.inf, start[None], pose)
 
     def scored(q: Configurations) -> Float[ndarray, "n"]:
-        """The scores of configurations; 0 for those that see too little."""
+        """The scores of configurations; 0 for configurations that see less than MIN_SEEN."""
         seen = seen_by(camera.intrinsics, (height, width), camera.range, q, camera.poses(robot, q))
         if beside is not None:
             poses = np.tile(beside.T_base_camera, (len(q), 1, 1))
-            others = seen_by(beside.intrinsics, beside.depth.shape, np.inf, q, poses)
-            seen = seen + np.maximum(others - seen_at_start, 0.0)
+            from_beside = seen_by(beside.intrinsics, beside.depth.shape, np.inf, q, poses)
+            seen = seen + np.maximum(from_beside - seen_at_start, 0.0)
         score = seen / (1 + np.linalg.norm(q - start, axis=1) / FULL_COST_LENGTH)
         for earlier in taken:
             score *= np.minimum(np.abs(q - earlier).max(axis=1) / SIMILAR_LOOK, 1.0)
@@ -247,7 +252,7 @@ MIN_PROBABILITY = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class NextView(Value):
-    """A camera pose, and how much of the crossed unknown space it sees."""
+    """A camera pose, and how much it sees of the unknown space that a motion sweeps."""
 
     T_base_camera: Pose
     seen: float
@@ -265,10 +270,10 @@ def poses_around() -> list[Pose]:
 def next_view(problem: Problem, result: PlanResult, poses: Sequence[Pose] | None = None) -> NextView:
     """The camera pose that shows most of what a motion may collide with.
 
-    It is the pose from which a camera like that of the first view sees most of the probability that the
-    motion sweeps. A voxel counts by the chance that nothing hides it: neither what was seen, nor what is
-    predicted, nor the arm at the start. With a policy other than "predicted", all swept unknown voxels count
-    the same.
+    From this pose, a camera with the intrinsics of the first view sees the largest part of the predicted
+    probability of the unknown voxels that the motion sweeps. A voxel counts with the probability that nothing
+    hides it: neither seen or predicted obstacles nor the arm at the start. With a policy other than
+    "predicted", all swept unknown voxels have equal weight.
 
     Args:
         problem: A problem with views.

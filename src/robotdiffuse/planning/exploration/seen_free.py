@@ -1,11 +1,11 @@
-"""Obstacles that keep an arm within space that was seen free.
+"""Obstacles that keep an arm within space that was seen free (`not_seen_free`); and whether the space that an
+arm fills at a goal was seen free (`GoalSeen`).
 
-What was seen of the space that an arm fills at a goal.
-
-Voxels of 2 cm are too coarse for that: those that the arm touches at a goal are rarely seen free as a whole.
-So small balls cover the arm's surface there, and each must be free: an image sees through it, or it lies in
-voxels that the map knows to be free, or within a covering sphere of the arm when an image was taken, or in
-what is taken on trust where the motion begins. What is inside of the surface needs no view: nothing floats.
+For the goal, voxels of 2 cm are too coarse: voxels that the arm touches there are rarely seen free as a
+whole. So small balls cover the arm's surface at the goal, and each ball must be free for one of four reasons:
+an image sees through it; it lies in voxels that the map knows to be free; a covering sphere of the arm
+contained it when an image was taken; or it is so near the arm at the start of the motion that it counts as
+free. The space inside the surface needs no view, since obstacles do not float.
 """
 
 from collections.abc import Iterable, Sequence
@@ -32,11 +32,11 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Shape
 
 PARTS = 4
-"""Parts of a voxel's edge where voxels are split."""
+"""Near goals, voxels are split into this many parts along each edge."""
 NOT_SEEN_FREE = "not seen free"
 MIN_FREE_SHARE = 0.8
-"""Searches fail where a smaller part of what the arm fills at the goal, and not at the start, was seen free:
-see benchmarks/results/exploring.txt."""
+"""Searches fail if less than this share of the space that the arm fills at the goal but not at the start was
+seen free: see benchmarks/results/exploring.txt."""
 WALL = 2.0
 """Thickness of the walls around the map [m]."""
 
@@ -44,13 +44,13 @@ WALL = 2.0
 def not_seen_free(
     known: OccupancyMap, known_scene: Scene, start: Configuration, goals: Sequence[Configuration] = ()
 ) -> tuple[Shape, ...]:
-    """Obstacles that cover all space that the map does not know to be free, apart from the known scene's.
+    """Obstacles that cover all space that the map does not know to be free, except the known scene.
 
-    Balls cover the voxels at the surface of that space, and walls stand around the map, so a motion that the
-    validator accepts among them enters no other voxel. Exempt are the voxels with centers near the start, of
-    which the arm could not get out otherwise, and the space within CARVING_MARGIN of the goals: voxels that
-    reach into it are split, and small balls cover the parts that do not. Seen points are obstacles of their
-    own.
+    Balls cover the voxels at the surface of this space, and walls surround the map. So a motion that the
+    validator accepts among them enters only voxels that are known to be free. There are two exceptions.
+    Voxels with centers near the arm at the start are not covered: the arm could not leave them otherwise.
+    The space within CARVING_MARGIN of the arm at the goals is not covered either: voxels that reach into this
+    space are split, and small balls cover only their parts outside. Seen points are separate obstacles.
     """
     unseen = ~(known.free | near_ends(known, (start,)))
     spheres = np.zeros((0, 4))
@@ -74,19 +74,21 @@ def not_seen_free(
 
 
 def near_ends(known: OccupancyMap, ends: Sequence[Configuration]) -> Voxels:
-    """The voxels around the arm at these configurations that count as free, at least in part."""
+    """The voxels around the arm at these configurations, which count as free, at least in part."""
     return MAP.filled(known.robot, ends, CARVING_MARGIN + MAP.edge / 2)
 
 
 def hardly_seen(known: OccupancyMap, start: Configuration, goal: Configuration) -> bool:
-    """Whether so little was seen free around a goal that searches within space seen free are in vain."""
+    """Whether so little of the space around a goal was seen free that a search within it would fail."""
     filled = near_ends(known, (goal,)) & ~near_ends(known, (start,))
     return bool(known.free[filled].sum() < MIN_FREE_SHARE * filled.sum())
 
 
 def cover(known: OccupancyMap, known_scene: Scene, points: Points, edge: float, name: str) -> AssumedPoints:
-    """Balls that cover the voxels with these centers and this edge [m], without those in the known scene and
-    out of reach."""
+    """Balls that cover voxels, without the voxels in the known scene and those out of the arm's reach.
+
+    points: centers of the voxels [m]. edge: their edge [m]. name: of the obstacle.
+    """
     radius = edge * 3**0.5 / 2
     center, reach = reach_ball(with_covering_spheres(known.robot))
     points = points[np.linalg.norm(points - center, axis=1) < reach + radius]
@@ -99,7 +101,7 @@ def least_unknown(known: OccupancyMap, goals: Configurations) -> Configuration:
 
 
 def reaches_outside(robot: Robot, q: Configuration) -> bool:
-    """Whether the arm reaches out of the map: centers of its covering spheres lie outside."""
+    """Whether the arm reaches out of the map: the centers of some of its covering spheres are outside."""
     low, high = _ends_of_map()
     centers = placed_spheres(robot, q)[:, :3]
     return bool(((centers < low) | (centers > high)).any())
@@ -125,19 +127,20 @@ def _walls() -> list[Box]:
 
 
 BORDER = np.float32(1.0)
-"""Pixels around a ball that count too in images that were filtered: the filter moves edges by about one."""
+"""Width of the margin around a ball that is checked as well in filtered images: the filter moves edges by
+about one pixel."""
 LITTLE_UNSEEN = 1e-3
-"""If a smaller part of the surface was not seen, messages say where it is."""
+"""If less than this part of the surface was not seen, messages say where it is."""
 KEY_DECIMALS = 5
-"""Digits of joint positions that tell configurations apart."""
+"""Configurations that are equal to this number of decimals count as the same."""
 
 
 class GoalSeen:
-    """Which balls of the arm's surface at goal configurations nothing has shown to be free."""
+    """The balls on the arm's surface at goal configurations that nothing has shown to be free."""
 
     def __init__(self, robot: Robot, known: OccupancyMap, views: ViewMemory, required: bool) -> None:
-        """views: kept ones, which count for new goals. required: False if goals need not be seen; nothing is
-        missing then."""
+        """views: the kept views, which count for new goals as well. required: whether goals must be seen; if
+        not, nothing is ever missing."""
         self._robot = robot
         self._known = known
         self._views = views
@@ -160,15 +163,15 @@ class GoalSeen:
             self._unseen = {q: self._not_shown(balls, [view]) for q, balls in self._unseen.items()}
 
     def best(self, start: Configuration, goals: Configurations) -> Configuration:
-        """The goal of whose surface least is unseen."""
+        """The goal at which the smallest part of the arm's surface is unseen."""
         best_goal = min(goals, key=lambda q: len(self.unseen(start, q)))
         goal_keys = set(map(_key, goals))
         self._unseen = {q: balls for q, balls in self._unseen.items() if q in goal_keys}
         return best_goal
 
     def unseen(self, start: Configuration, q: Configuration) -> Points:
-        """The centers of the balls at a configuration that nothing has shown to be free [m]. start: where the
-        arm is."""
+        """The centers of the balls at configuration `q` that nothing has shown to be free [m]. start: the
+        arm's present configuration."""
         key = _key(q)
         if key not in self._unseen:
             self._unseen[key] = self._not_shown(surface_balls(self._robot, q), self._views.views)
@@ -177,7 +180,7 @@ class GoalSeen:
         return balls[~(near | within_voxels(balls, BALL_RADIUS, self._known.free, MAP))]
 
     def wanted(self, path: Path) -> Voxels:
-        """The voxels that views are to show of the surface where a path ends."""
+        """The voxels with unseen parts of the arm's surface at the end of a path."""
         out = np.zeros(MAP.shape, np.bool_)
         if self._required:
             at = MAP.indices(self.unseen(path.positions[0], path.positions[-1]))
@@ -185,8 +188,8 @@ class GoalSeen:
         return out
 
     def missing(self, motion: PlanResult) -> str:
-        """Says how much was not seen of the arm's surface where a motion ends, and where if it is little; ""
-        if nothing is missing."""
+        """A message on how much of the arm's surface at the end of a motion was not seen and, if it is
+        little, where; "" if nothing is missing."""
         if not self._required or motion.path is None:
             return ""
         start, q = motion.path.positions[[0, -1]]
@@ -199,7 +202,8 @@ class GoalSeen:
         return f"{100 * share:.2g} % of the arm's surface at the goal was not seen{where}"
 
     def _not_shown(self, balls: Points, views: Iterable[DepthView]) -> Points:
-        """The balls that no view shows to be free: none sees through them, and the arm was elsewhere."""
+        """The balls that no view shows to be free: no image sees through them, and the arm did not contain
+        them when an image was taken."""
         for view in views:
             assert view.configuration is not None  # the map takes no other views
             depth, _, _ = usable_image(view, self._robot, view.configuration, 0.0)
@@ -223,5 +227,5 @@ class GoalSeen:
 
 
 def _key(q: Configuration) -> tuple[float, ...]:
-    """The same for a goal and for the end of a motion there."""
+    """A key that is the same for a goal and for the end of a motion to this goal."""
     return tuple(np.round(q, KEY_DECIMALS).tolist())

@@ -27,7 +27,7 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.validator import verify, verify_trajectory
 
 SAME_POSE = 1e-9
-"""Poses are the same if their entries differ by less than this."""
+"""Two poses count as equal if their entries differ by less than this."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,9 +35,9 @@ class RecordedView:
     """A view, and the occupancy map after it."""
 
     time: float
-    """Time since the first step, without pauses [s]."""
+    """Time since the first step, without pauses between motions [s]."""
     act: int
-    """Index of the step that was being executed; -1 before the first."""
+    """Index of the step that was being executed; -1 before the first step."""
     view: DepthView
     camera: int | None
     """Index of the arm's camera that took the view; None for a camera that is not on the arm."""
@@ -54,7 +54,7 @@ class RecordedAct:
     """A step, and the state of the arm when it began."""
 
     begins: float
-    """When the step begins, since the first step [s]."""
+    """When the step begins: time since the first step [s]."""
     step: Step
     configuration: Configuration
     """Configuration of the arm before the step."""
@@ -69,12 +69,12 @@ class RecordedAct:
 
     @property
     def waypoints(self) -> Configurations:
-        """Waypoints of the motion; without one, the configuration."""
+        """Waypoints of the motion; without a motion, the configuration."""
         return _waypoints(self.step, self.configuration)
 
     @property
     def duration(self) -> float:
-        """Duration of the motion [s]; 0 without one."""
+        """Duration of the motion [s]; 0 without a motion."""
         return 0.0 if self.trajectory is None else self.trajectory.duration
 
 
@@ -138,7 +138,7 @@ def _waypoints(step: Step, q: Configuration) -> Configurations:
 
 WRIST_OFFSET = (0.04, 0.0, 0.03)
 """Position of the simulated camera in the frame of the arm's tip [m]."""
-# Width and height of the images of that camera [pixels], and its horizontal and vertical field of view [rad].
+# Width and height of this camera's images [pixels], and its horizontal and vertical field of view [rad].
 SIZE = (320, 240)
 FIELD_OF_VIEW = (1.22, 0.96)
 LENS_RADIUS = 0.005
@@ -195,15 +195,15 @@ def seen_from_beside(problem: Problem) -> DepthView:
 
 
 def camera_beside(problem: Problem, noise: DepthNoise | None, seed: int) -> DepthView:
-    """The image of that camera, as a depth camera measures it."""
+    """The image of `seen_from_beside`, as a real depth camera would measure it."""
     return measured(seen_from_beside(problem), np.inf, noise, np.random.default_rng(seed))
 
 
 def simulated_explorer(
     problem: Problem, settings: ExplorerSettings, noise: DepthNoise | None, seed: int
 ) -> RecordedExplorer:
-    """An explorer with a camera at the arm's tip. It knows the floor, and has observed one image of the
-    camera beside the arm.
+    """An explorer with a camera at the arm's tip. It knows the floor, and has observed an image of the camera
+    beside the arm.
 
     Raises InputError for a problem with fields that exploring would ignore.
     """
@@ -225,7 +225,8 @@ def taken(
     noise: DepthNoise | None,
     rng: np.random.Generator,
 ) -> DepthView:
-    """The image of the problem's true scene that a camera on the arm takes."""
+    """The image of the problem's true scene that a camera on the arm takes with the arm at configuration
+    `q`."""
     T = camera.poses(problem.robot, q[None])[0]
     view = ray_cast(problem.scene, T, camera.intrinsics, camera.size, problem.robot, q)
     obstacles = compile_scene_for(problem.robot, problem.scene)
@@ -236,8 +237,8 @@ def taken(
 
 
 def measured(view: DepthView, reach: float, noise: DepthNoise | None, rng: np.random.Generator) -> DepthView:
-    """The image as a sensor measures it: 0 below MIN_DEPTH, infinite beyond `reach`, and with noise if
-    given."""
+    """The image as a sensor measures it: depths below MIN_DEPTH are 0, those beyond `reach` [m] infinite;
+    noise is added if it is given."""
     depth = np.where(view.depth > reach, np.inf, np.where(view.depth < MIN_DEPTH, 0.0, view.depth))
     view = replace(view, depth=depth, range=reach if np.isfinite(reach) else MAX_RANGE)
     return view if noise is None else noise.applied(view, rng)
@@ -250,13 +251,13 @@ def explore(
     seed: int = 0,
     beside: DepthView | None = None,
 ) -> Iterator[Event]:
-    """Explore the problem's scene from its start to its goal, and yield each step; ends with a step without a
+    """Explore the problem's scene from its start to its goal, and yield each step. Ends with a step without a
     motion, or after a collision.
 
     The cameras on the arm take images during each motion.
 
-    beside: an image of a fixed camera. It takes another one after each motion, because the arm no longer
-        hides the same part of the scene.
+    beside: an image of a fixed camera. This camera takes another image after each motion, because the arm
+        then hides another part of the scene.
     """
     rng = np.random.default_rng(seed)
     q = problem.start

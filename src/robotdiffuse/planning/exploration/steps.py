@@ -1,4 +1,4 @@
-"""Cameras and settings of an Explorer, and the steps that it asks for."""
+"""Cameras and settings of an Explorer, and the steps that it returns."""
 
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -19,11 +19,12 @@ from robotdiffuse.scenes.scene import Scene
 
 @dataclass(frozen=True, eq=False)
 class ArmCamera(Value):
-    """A depth camera on a link of the arm. Its body should be part of the robot, as a held object is."""
+    """A depth camera on a link of the arm. Attach the camera's body to the robot, so that it is checked for
+    collisions."""
 
     link: str
     T_link_camera: Pose
-    """x to the right in the image, y down, z ahead."""
+    """Pose of the optical frame: x to the right in the image, y down, z ahead."""
     intrinsics: tuple[float, float, float, float]
     """fx, fy, cx, cy [pixels]."""
     size: tuple[int, int]
@@ -65,8 +66,8 @@ POLICIES = (STRICT, PROBABILISTIC, STRICT_THEN_PROBABILISTIC)
 @dataclass(frozen=True)
 class ExplorerSettings(Settings, name="explorer"):
     policy: Annotated[str, OneOf(POLICIES)] = STRICT
-    """strict: only through space seen free; probabilistic: where the stated confidence is high enough;
-    strict_then_probabilistic: the latter where the former leads nowhere."""
+    """strict: motions only through space seen free; probabilistic: motions whose stated confidence is high
+    enough; strict_then_probabilistic: the probabilistic policy where the strict policy finds no step."""
     confidence: Annotated[float, Bound(least=0.0, most=1.0)] = 0.98
     """Minimum stated confidence of motions under the probabilistic policy."""
     time_limit: Positive = 1.0
@@ -74,15 +75,16 @@ class ExplorerSettings(Settings, name="explorer"):
     max_looks: Natural = 8
     """Maximum number of views on the way to a goal."""
     look_attempts: Count = 4
-    """Viewpoints to which a step searches a motion, the most useful first."""
+    """Maximum number of viewpoints of a camera to which a step searches a motion, the best first."""
     predict: bool = True
-    """Whether the occupancy completion network weighs views and gives confidences; it does so where it covers
-    the arm's reach."""
+    """Whether the occupancy completion network weighs viewpoints and gives confidences, if it covers the
+    arm's reach."""
     see_goal: bool = False
-    """Whether all of the arm's surface at the goal must have been seen free before it goes there; for policy
-    strict. It takes more views, and fails where something is nearer to the goal than about 1 cm."""
+    """Whether the arm's whole surface at the goal must have been seen free before the arm goes there; for
+    policy strict. This takes more views, and fails if an obstacle is nearer than about 1 cm to the arm at the
+    goal."""
     max_age: Positive | None = None
-    """What was seen longer ago than this is forgotten [s]; None: never."""
+    """Observations older than this are forgotten [s]; None: never."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -104,12 +106,12 @@ class Step:
     policy: str = ""
     """The policy that the motion keeps, "strict" or "probabilistic"."""
     motion: PlanResult | Any = None
-    """Solved. A strict motion is certified against all that was not seen free; `motion.problem` holds these
-    obstacles."""
+    """A solved result. A strict motion is certified against obstacles that cover all space not seen free;
+    `motion.problem` holds them."""
     confidence: float | None = None
     """Stated probability that a motion is free, under the probabilistic policy."""
     seen: Scene | None = None
-    """The known scene and the points that the kept views saw; None where nothing was planned."""
+    """The known scene and the points that the kept views saw; None if nothing was planned."""
     wanted: Voxels | None = None
-    """What a look is to show: voxels of the map that are unknown and that a tentative motion to the goal
-    sweeps. None for other steps."""
+    """The voxels that a look should show: unknown voxels of the map that a tentative motion to the goal
+    sweeps, and unseen ones at the goal. None for other steps."""

@@ -1,8 +1,8 @@
-"""Ends a motion under way before what appears in its way.
+"""Stops a motion under way before an obstacle that appears in its way.
 
-The arm leaves its motion in time, not in space: it follows the same path, slower and slower, until it rests.
-So the stop passes no configuration that the motion would not have passed, and stays within what was validated
-when the motion was planned; what was seen since then is validated anew.
+The stop follows the path of the motion, slower and slower until the arm rests. So it passes only
+configurations that were validated when the motion was planned; they are validated again among the obstacles
+that were seen since then.
 """
 
 from collections.abc import Sequence
@@ -28,15 +28,15 @@ from robotdiffuse.validation.validator import verifier
 ROW_TIME = 0.004
 """Time between the rows of a stop [s]."""
 BRAKING_DELAY = 0.02
-"""Between the times at which braking is tried to begin [s]."""
+"""Step between the times at which braking may begin [s]."""
 BRAKING_TIMES = 0.05 * 1.12 ** np.arange(35)
-"""How long braking may take, the shortest first [s]."""
+"""Durations of braking that are tried, the shortest first [s]."""
 RAMPS = (0.1, 0.25, 0.5)
-"""Shares of the braking time in which the deceleration rises, and falls again."""
+"""Fractions of the braking time that are tried for the rise of the deceleration, and for its fall."""
 LIMIT_TOLERANCE = 1e-3
-"""Rates may exceed their limits by this part of them."""
+"""Accelerations and jerks may exceed their limits by this fraction of the limit."""
 APPEARED_PADDING = 0.05
-"""Radius of points that appeared where space was free [m]."""
+"""Radius of points that appeared in space that was free before [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,14 +44,13 @@ class Stop:
     """How a motion ends early."""
 
     begins: float
-    """When the stop takes over, on the clock of the motion that it ends [s]."""
+    """When the stop replaces the motion, in time of the motion [s]."""
     motion: Trajectory
-    """From then on; ends at rest on the path of the motion that it ends."""
+    """The stop, from this time on; it ends at rest on the path of the motion."""
     reason: str
-    """What is in the way."""
+    """The violation that the motion would have: what is in the way."""
     certified: bool
-    """Whether the validator accepts the stop among what was seen; else the arm comes too near before it can
-    stop."""
+    """Whether the validator accepts the stop among all that was seen; if not, the arm cannot stop in time."""
 
 
 def stop_before(
@@ -62,13 +61,14 @@ def stop_before(
     motion: Trajectory,
     time: float,
 ) -> Stop | None:
-    """The earliest stop from a time of a motion on, if views show something in the way of its rest; None if
-    they do not.
+    """The earliest stop of a motion from a time on, if views show an obstacle in the way of what remains of
+    it; otherwise None.
 
-    Points where space was free before appeared: they are obstacles with a padding, since only the front of
-    what they belong to is seen. views: taken during the motion. free: voxels of `OccupancyMap.free` when the
-    motion was planned. time: when a new command takes effect, on the motion's clock [s]. Velocities,
-    accelerations and jerks are within the robot's limits. Raises InputError for a time outside of the motion.
+    The stop is within the robot's limits of velocity, acceleration and jerk. Points in space that was free
+    before have appeared: these are padded, since only the front of the object that they belong to is seen.
+
+    views: views taken during the motion. free: `OccupancyMap.free` when the motion was planned. time: when a
+    new command takes effect, in time of the motion [s]. Raises InputError for a time outside the motion.
     """
     if not 0 <= time <= motion.duration:
         raise InputError(f"time is {shown(time)}; it must be in [0, {motion.duration:.4g}] s of the motion")
@@ -78,8 +78,8 @@ def stop_before(
     points = np.concatenate([np.zeros((0, 3)), *(shape.points for shape in seen)])
     appeared = PointCloud(points[_within(points, free)], APPEARED_PADDING, name="appeared")
     validator = verifier(Problem(robot, known.with_shapes([*known.shapes, *seen, appeared]), current, end))
-    rest = np.concatenate([current[None], motion.positions[motion.times > time]])
-    violation = validator.path(Path(robot.joint_names, rest)).violation
+    remaining = np.concatenate([current[None], motion.positions[motion.times > time]])
+    violation = validator.path(Path(robot.joint_names, remaining)).violation
     if violation is None:
         return None
     stop = braked(robot, motion, time)
@@ -97,7 +97,7 @@ def _within(points: Points, free: Voxels) -> Bool[ndarray, "n"]:
 
 
 def braked(robot: Robot, motion: Trajectory, time: float) -> Trajectory:
-    """The motion from a time on that rests as early as possible, on the same path and within the limits."""
+    """The motion from a time on, slowed to rest as early as the limits allow, on the same path."""
     best = _rows(motion, time, motion.duration - time, 0.0, RAMPS[0])
     stop_time = motion.duration
     for delay in np.arange(0.0, motion.duration - time, BRAKING_DELAY):
@@ -113,17 +113,17 @@ def braked(robot: Robot, motion: Trajectory, time: float) -> Trajectory:
 
 
 def _rows(motion: Trajectory, time: float, delay: float, braking: float, ramp: float) -> Trajectory:
-    """The motion from `time` on, for a delay as it is, then slowed to rest.
+    """The motion from `time` on: unchanged for `delay` [s], then slowed to rest in `braking` [s].
 
-    Its own time runs on with a speed that falls from 1 to 0 in the braking time. The deceleration rises, is
-    constant and falls, like a trapezoid.
+    While braking, the motion's time passes with a speed that falls from 1 to 0. The deceleration of this
+    speed is a trapezoid: it rises for `ramp` of the braking time, is constant, and falls for `ramp`.
     """
     duration = delay + braking
     count = max(int(np.ceil(duration / ROW_TIME)), 1)
     times = duration * np.arange(count + 1) / count
-    passed = times
-    speed = np.ones(count + 1)
-    slowing = np.zeros(count + 1)
+    passed = times  # time of the motion that has passed [s]
+    speed = np.ones(count + 1)  # its first derivative
+    slowing = np.zeros(count + 1)  # its second derivative [1/s]
     if braking > 0:
         u = np.clip((times - delay) / braking, 0.0, 1.0)
         peak = 1 / (1 - ramp)

@@ -316,7 +316,7 @@ class Surface:
 
 
 def is_free(rectangle: Rectangle, taken: list[Rectangle]) -> bool:
-    """Whether a rectangle keeps MIN_GAP from all those that are taken."""
+    """Whether a rectangle has at least a distance of MIN_GAP, along x or y, from each taken rectangle."""
     x, y, a, b = rectangle
     return all(abs(x - u) >= a + c + MIN_GAP or abs(y - v) >= b + d + MIN_GAP for u, v, c, d in taken)
 
@@ -329,8 +329,8 @@ def loose_in_cells(
     rng: Generator,
     at_sides: bool = False,
 ) -> None:
-    """Adds random loose objects, at most one per cell (see `Cell`); leaves out those that take more than two
-    thirds of a cell's width.
+    """Adds random loose objects, at most one per cell (see `Cell`). Objects that would take more than two
+    thirds of a cell's width are left out.
 
     Each cell with an object is narrowed to the wider free part beside the object. depth: of the cells [m].
     at_sides: whether objects stand at the left or right side of a cell, instead of anywhere.
@@ -585,7 +585,7 @@ CLUTTER = Table(
     wall_share=0.0,
     pillar_share=0.2,
 )
-"""Many small objects close together; those in front hide most of those behind."""
+"""Many small objects close together; objects in front hide most of the objects behind them."""
 
 
 @dataclass(frozen=True)
