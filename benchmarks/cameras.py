@@ -169,7 +169,12 @@ def problems(family: str, count: int, known: set[int]) -> Iterator[tuple[int, Pr
         if family in FAMILIES
         else ((i, entry.load()) for i, entry in enumerate(load_problems(Path(family))) if not entry.error)
     )
-    hard = (one for one in numbered if one[0] in known or (one[0] > max(known, default=-1) and _hard(one[1])))
+    last_known = max(known, default=-1)
+    hard = (
+        (number, problem)
+        for number, problem in numbered
+        if number in known or (number > last_known and _hard(problem))
+    )
     yield from itertools.islice(hard, count)
 
 
@@ -246,14 +251,14 @@ def run(arguments: argparse.Namespace) -> None:
     """Make the records that are missing."""
     networks = {BY + Path(folder).name: exported_completion(folder) for folder in arguments.weights}
     methods = [*arguments.methods, *networks]
-    kept = JsonLines(Path(arguments.records))
+    records = JsonLines(Path(arguments.records))
     images = IMAGES[arguments.images]
     place = {name: vars(arguments)[name] for name in PLACE}
-    done = {(r["family"], r["number"], r["method"]) for r in kept.rows if place.items() <= r.items()}
+    done = {(r["family"], r["number"], r["method"]) for r in records.rows if place.items() <= r.items()}
     each = arguments.problems // len(arguments.families)
     warm = True
     for family in arguments.families:
-        known = {row["number"] for row in kept.rows if row["family"] == family}
+        known = {row["number"] for row in records.rows if row["family"] == family}
         for number, problem in progress(list(problems(family, each, known)), family):
             missing = [method for method in methods if (family, number, method) not in done]
             if not missing:
@@ -271,7 +276,7 @@ def run(arguments: argparse.Namespace) -> None:
                 warm = False
             for method in missing:
                 row = plan(problem, partial, method, networks.get(method))
-                kept.append({"family": family, "number": number, **place, "view_time": spent, **row})
+                records.append({"family": family, "number": number, **place, "view_time": spent, **row})
 
 
 def table(rows: list[Row], title: str) -> None:
@@ -281,24 +286,28 @@ def table(rows: list[Row], title: str) -> None:
     lines = []
     others = dict.fromkeys(row["method"] for row in rows if row["method"].startswith(BY))
     for method in [*METHODS, *others, TRUE]:
-        mine = [row for row in rows if row["method"] == method]
-        if not mine:
+        of_method = [row for row in rows if row["method"] == method]
+        if not of_method:
             continue
-        free = sum(row["free"] for row in mine)
-        solved = sum(row["solved"] for row in mine)
-        low, high = wilson_interval(free, len(mine))
-        first = [row for row in mine if row["assumption"] == FIRST_ASSUMPTIONS.get(method, FIRST_PREDICTED)]
-        shares = [np.mean([row["free"] for row in mine if row["family"] == family]) for family in families]
+        free = sum(row["free"] for row in of_method)
+        solved = sum(row["solved"] for row in of_method)
+        low, high = wilson_interval(free, len(of_method))
+        first = [
+            row for row in of_method if row["assumption"] == FIRST_ASSUMPTIONS.get(method, FIRST_PREDICTED)
+        ]
+        shares = [
+            np.mean([row["free"] for row in of_method if row["family"] == family]) for family in families
+        ]
         lines.append(
             (
                 method,
-                len(mine),
-                f"{100 * free / len(mine):.1f} ({100 * low:.0f} to {100 * high:.0f})",
-                f"{100 * solved / len(mine):.0f}",
+                len(of_method),
+                f"{100 * free / len(of_method):.1f} ({100 * low:.0f} to {100 * high:.0f})",
+                f"{100 * solved / len(of_method):.0f}",
                 f"{100 * free / max(solved, 1):.0f}",
-                f"{100 * len(first) / len(mine):.0f}" if first else "",
+                f"{100 * len(first) / len(of_method):.0f}" if first else "",
                 f"{100 * np.mean([row['free'] for row in first]):.0f}" if first else "",
-                f"{1e3 * np.median([row['time'] for row in mine]):.0f}",
+                f"{1e3 * np.median([row['time'] for row in of_method]):.0f}",
                 *(f"{100 * share:.0f}" for share in shares),
             )
         )
@@ -307,12 +316,14 @@ def table(rows: list[Row], title: str) -> None:
     print_table(title, columns, lines)
     base = {name: _free(rows, name) for name in [*METHODS, *others, TRUE]}
     pairs = [("padded", "as seen"), ("predicted", "as seen"), ("predicted", "padded"), (TRUE, "predicted")]
-    pairs += [(other, of) for other in others for of in ("as seen", "padded", "predicted")]
+    pairs += [(other, baseline) for other in others for baseline in ("as seen", "padded", "predicted")]
     for a, b in pairs:
-        both = base[a].keys() & base[b].keys()
-        if both:
-            pair = compare(*(np.array([1.0 if base[m][k] else np.nan for k in sorted(both)]) for m in (a, b)))
-            gain = 100 * (pair.a_only - pair.b_only) / len(both)
+        common = base[a].keys() & base[b].keys()
+        if common:
+            pair = compare(
+                *(np.array([1.0 if base[m][k] else np.nan for k in sorted(common)]) for m in (a, b))
+            )
+            gain = 100 * (pair.a_only - pair.b_only) / len(common)
             print(f"{a} over {b}: {gain:+.1f} points, p = {pair.p_success:.2g} (McNemar, exact)")
     print()
 
@@ -330,27 +341,27 @@ def calibration(rows: list[Row], of: str) -> None:
     """Print the stated confidence against the fraction of motions that are free, for each method. of: the
     source of the problems, for the title."""
     for method in METHODS:
-        mine = [row for row in rows if row["method"] == method and row["solved"]]
-        if not mine:
+        planned = [row for row in rows if row["method"] == method and row["solved"]]
+        if not planned:
             continue
-        stated = np.array([row["confidence"] for row in mine])
-        free = np.array([row["free"] for row in mine], float)
+        stated = np.array([row["confidence"] for row in planned])
+        free = np.array([row["free"] for row in planned], float)
         lines = [
             (f"{i / 5:.1f} to {(i + 1) / 5:.1f}", n, f"{said:.2f}", f"{was:.2f}")
             for i, n, said, was in fifths(stated, free)
         ]
         print_table(f"Confidence of {method}, {of}", ["stated", "motions", "mean", "free"], lines)
-        whole = f"{len(mine)} motions, {stated.mean():.2f} stated, {free.mean():.2f} free"
+        whole = f"{len(planned)} motions, {stated.mean():.2f} stated, {free.mean():.2f} free"
         print(f"{whole}, expected error {expected_error(stated, free):.3f}\n")
 
 
 def fifths(stated: Values, free: Values) -> list[tuple[int, int, float, float]]:
     """For each fifth of the range of confidences that has motions: its index, the number of its motions,
     their mean stated confidence, and the fraction of them that is free."""
-    at = np.minimum(5 * stated, 4).astype(int)
+    fifth = np.minimum(5 * stated, 4).astype(int)
     return [
-        (i, int((at == i).sum()), float(stated[at == i].mean()), float(free[at == i].mean()))
-        for i in np.unique(at).tolist()
+        (i, int((fifth == i).sum()), float(stated[fifth == i].mean()), float(free[fifth == i].mean()))
+        for i in np.unique(fifth).tolist()
     ]
 
 
@@ -363,14 +374,14 @@ def report(rows: list[Row]) -> None:
     """Print the tables for each combination of number of views, images, walls and cameras."""
     places = dict.fromkeys(tuple(row[name] for name in PLACE) for row in rows)
     for place in places:
-        some = [row for row in rows if tuple(row[name] for name in PLACE) == place]
+        of_place = [row for row in rows if tuple(row[name] for name in PLACE) == place]
         count, images, walls, cameras = place
         title = f"views: {count}, images: {images}, {'a room' if walls else 'no walls'}, cameras: {cameras}"
-        for own in (True, False):
-            mine = [row for row in some if (row["family"] in FAMILIES) == own]
-            if mine:
-                table(mine, f"{'Families' if own else 'Other problems'}, {title}")
-                calibration(mine, "families" if own else "other problems")
+        for own_families in (True, False):
+            chosen = [row for row in of_place if (row["family"] in FAMILIES) == own_families]
+            if chosen:
+                table(chosen, f"{'Families' if own_families else 'Other problems'}, {title}")
+                calibration(chosen, "families" if own_families else "other problems")
     spent = [row["view_time"] for row in rows]
     print(f"From views to the problem's scene: {1e3 * np.median(spent):.0f} ms of CPU time (median)")
 
@@ -405,15 +416,15 @@ def fit(rows: list[Row]) -> None:
 
 def run_next_view(records: str, families: list[str], count: int) -> None:
     """Make the missing records of second views."""
-    kept = JsonLines(Path(records))
-    done = {(row["family"], row["number"]) for row in kept.rows}
+    file = JsonLines(Path(records))
+    done = {(row["family"], row["number"]) for row in file.rows}
     for family in families:
         known = {number for of, number in done if of == family}
-        some = list(problems(family, count // len(families), known))
-        for number, problem in progress(some, family):
+        drawn = list(problems(family, count // len(families), known))
+        for number, problem in progress(drawn, family):
             if (family, number) not in done:
                 row = {"family": family, "number": number}
-                kept.append(row | plan_with_second_views(problem, family, number))
+                file.append(row | plan_with_second_views(problem, family, number))
 
 
 def plan_with_second_views(problem: Problem, family: str, number: int) -> Row:
@@ -448,19 +459,19 @@ def report_next_view(rows: list[Row]) -> None:
     motion from one view has a confidence below UNSURE."""
     rows = [row for row in rows if SECOND_VIEWS[0] in row]
     unsure = [row for row in rows if row["confidence"] < UNSURE]
-    for title, some in (("All", rows), (f"Stated confidence of one view below {UNSURE}", unsure)):
-        if not some:
+    for title, chosen in (("All", rows), (f"Stated confidence of one view below {UNSURE}", unsure)):
+        if not chosen:
             continue
 
-        def share(name: str, some: list[Row] = some) -> str:
-            return f"{100 * np.mean([row[name] for row in some]):.1f}"
+        def share(name: str, chosen: list[Row] = chosen) -> str:
+            return f"{100 * np.mean([row[name] for row in chosen]):.1f}"
 
-        lines = [("one view", len(some), share("one"), share("confidence"))]
-        lines += [(name, len(some), share(name), share(f"{name} confidence")) for name in SECOND_VIEWS]
+        lines = [("one view", len(chosen), share("one"), share("confidence"))]
+        lines += [(name, len(chosen), share(name), share(f"{name} confidence")) for name in SECOND_VIEWS]
         print_table(title, ["second view", "problems", "free in the true scene, %", "stated, %"], lines)
-        proposed = np.array([1.0 if row[SECOND_VIEWS[0]] else np.nan for row in some])
+        proposed = np.array([1.0 if row[SECOND_VIEWS[0]] else np.nan for row in chosen])
         for other in SECOND_VIEWS[1:]:
-            pair = compare(proposed, np.array([1.0 if row[other] else np.nan for row in some]))
+            pair = compare(proposed, np.array([1.0 if row[other] else np.nan for row in chosen]))
             print(
                 f"next_view alone free {pair.a_only}, {other} alone {pair.b_only}, p = {pair.p_success:.2g}"
             )
@@ -476,8 +487,10 @@ def main() -> None:
         default=list(FAMILIES),
         help="families, or folders of MotionBenchMaker (all families)",
     )
-    every = [*METHODS, TRUE]
-    parser.add_argument("--methods", nargs="+", default=every, choices=every, metavar="NAME", help="(all)")
+    method_names = [*METHODS, TRUE]
+    parser.add_argument(
+        "--methods", nargs="+", default=method_names, choices=method_names, metavar="NAME", help="(all)"
+    )
     parser.add_argument("--views", type=int, default=1, help="(1)")
     parser.add_argument("--images", default=IDEAL, choices=IMAGES, metavar="NAME", help="(ideal)")
     parser.add_argument("--walls", action="store_true", help="a room around the scene")

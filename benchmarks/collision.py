@@ -125,15 +125,15 @@ def kernel_speed(title: str, places: list[Place]) -> list[str]:
     """A row of the table of speeds, averaged over the scenes: along free edges, all edges, random
     configurations; and the time to prepare a scene."""
     rng = np.random.default_rng(SEED)
-    along = []
-    every = []
-    edge = []
-    share = []
-    build = []
+    along_ns = []
+    random_ns = []
+    edge_us = []
+    free_fractions = []
+    build_seconds = []
     for robot, scene in places[:SCENES]:
         start = time.process_time()
         checker = CollisionChecker(robot, scene)
-        build.append(time.process_time() - start)
+        build_seconds.append(time.process_time() - start)
         space = search_space(checker, RESOLUTION)
         starts, ends = random_edges(checker, rng)
         if len(starts) < EDGES:
@@ -141,15 +141,25 @@ def kernel_speed(title: str, places: list[Place]) -> list[str]:
         free = check_edges(space, starts, ends)
         count = checked_configurations(space, starts, ends)
         seconds = fastest(lambda a=starts[free], b=ends[free], s=space: check_edges(s, a, b))
-        along.append(1e9 * seconds / count[free].sum())
-        edge.append(1e6 * fastest(lambda a=starts, b=ends, s=space: check_edges(s, a, b)) / len(starts))
-        share.append(free.mean())
+        along_ns.append(1e9 * seconds / count[free].sum())
+        edge_us.append(1e6 * fastest(lambda a=starts, b=ends, s=space: check_edges(s, a, b)) / len(starts))
+        free_fractions.append(free.mean())
         q = rng.uniform(robot.lower, robot.upper, (4096, robot.dof)).astype(np.float32)
-        every.append(1e9 * fastest(lambda c=checker, q=q: c.free(q)) / len(q))
-    if not along:
+        random_ns.append(1e9 * fastest(lambda c=checker, q=q: c.free(q)) / len(q))
+    if not along_ns:
         return [title, *["-"] * 6]
-    figures = [np.mean(along), np.max(along), np.mean(edge), 100 * np.mean(share), np.mean(every)]
-    return [title, *(f"{x:.0f}" if x >= 20 else f"{x:.1f}" for x in figures), f"{1e3 * np.median(build):.1f}"]
+    figures = [
+        np.mean(along_ns),
+        np.max(along_ns),
+        np.mean(edge_us),
+        100 * np.mean(free_fractions),
+        np.mean(random_ns),
+    ]
+    return [
+        title,
+        *(f"{x:.0f}" if x >= 20 else f"{x:.1f}" for x in figures),
+        f"{1e3 * np.median(build_seconds):.1f}",
+    ]
 
 
 def without_pairs(robot: Robot) -> Robot:
@@ -172,10 +182,10 @@ def soundness(title: str, places: list[Place], configurations: int) -> tuple[nda
         bare = without_pairs(robot)
         meshes = [ExactCollision(bare, scene).collides(q), ExactCollision(robot, Scene()).collides(q)]
         spheres = [~CollisionChecker(bare, scene).free(q), ~CollisionChecker(robot, Scene()).free(q)]
-        both = ~CollisionChecker(robot, scene).free(q)
-        assert (both == (spheres[0] | spheres[1])).all()
+        collides = ~CollisionChecker(robot, scene).free(q)
+        assert (collides == (spheres[0] | spheres[1])).all()
         for k, (mesh, sphere) in enumerate(
-            zip([*meshes, meshes[0] | meshes[1]], [*spheres, both], strict=True)
+            zip([*meshes, meshes[0] | meshes[1]], [*spheres, collides], strict=True)
         ):
             counts[k] += [(~mesh).sum(), (~mesh & sphere).sum(), mesh.sum(), (mesh & ~sphere).sum()]
     return counts, [count_row(f"{title}, {what}", counts[k]) for k, what in enumerate(WHAT)]
@@ -272,7 +282,7 @@ def main() -> None:
     places = {
         "ROP, 2 obstacles + floor": rop_places(robot, False, count),
         "ROP dense, 3 to 12 + floor": rop_places(robot, True, count),
-        **{name: of[:count] for name, of in published.items()},
+        **{name: scenes[:count] for name, scenes in published.items()},
         f"ROP dense, cloud of {POINTS:,}": cloud_places(robot, min(5, count)),
     }
     columns = ["", "ns, free edges", "worst scene", "us per edge", "edges free %", "ns, random q", "build ms"]
@@ -280,15 +290,15 @@ def main() -> None:
         f"Kernel, self-collision included, one core; edges of 1 rad checked every {1e3 * RESOLUTION:.0f} mm "
         "(per configuration; per edge: free or not)",
         columns,
-        [kernel_speed(title, of) for title, of in places.items()],
+        [kernel_speed(title, scenes) for title, scenes in places.items()],
     )
     along_paths(robot, arguments.families, arguments.each)
 
     sampled = {"ROP": rop_places(robot, False, 500), "ROP dense": rop_places(robot, True, 500), **published}
     total = np.zeros((3, 4), int)
     rows = []
-    for title, of in sampled.items():
-        counts, family = soundness(title, of, -(-arguments.configurations // len(sampled)))
+    for title, scenes in sampled.items():
+        counts, family = soundness(title, scenes, -(-arguments.configurations // len(sampled)))
         total += counts
         rows += family
     rows += [count_row(f"all, {what}", total[k]) for k, what in enumerate(WHAT)]

@@ -138,9 +138,9 @@ def _ends(
             continue
         T_goal = _pose(rng)
         if kind == "line":
-            way = rng.normal(size=3)
+            direction = rng.normal(size=3)
             T_goal = T.copy()
-            T_goal[:3, 3] += rng.uniform(0.15, 0.4) * way / np.linalg.norm(way)
+            T_goal[:3, 3] += rng.uniform(0.15, 0.4) * direction / np.linalg.norm(direction)
             shares = np.linspace(0, 1, LINE_PLACES)[1:-1]
             between = [transform((1 - s) * T[:3, 3] + s * T_goal[:3, 3], T[:3, :3]) for s in shares]
             if not all(_reached(robot, P, 1, checker, rng) is not None for P in between):
@@ -159,8 +159,8 @@ def _pose(rng: np.random.Generator) -> ndarray:
 def _reached(
     robot: Robot, T: ndarray, count: int, checker: CollisionChecker, rng: np.random.Generator
 ) -> ndarray | None:
-    found = inverse_kinematics(robot, HAND, T, count, rng=rng, accept=checker.free)
-    return found if len(found) else None
+    configurations = inverse_kinematics(robot, HAND, T, count, rng=rng, accept=checker.free)
+    return configurations if len(configurations) else None
 
 
 def ours(planner: Planner, problem: Problem, seed: int) -> Answer:
@@ -227,8 +227,8 @@ def peer(problem: Problem, seed: int) -> Answer:
     if path is None:
         return Answer(spent, np.inf, None, np.inf, False)
     rows = np.stack(path)
-    made = Path(problem.robot.joint_names, rows)
-    return Answer(spent, spent, rows, made.length, verifier(problem).path(made).valid)
+    joint_path = Path(problem.robot.joint_names, rows)
+    return Answer(spent, spent, rows, joint_path.length, verifier(problem).path(joint_path).valid)
 
 
 def checked(problem: Problem, rows: ndarray) -> Checked:
@@ -258,12 +258,12 @@ def _excess(problem: Problem, frames: ndarray) -> float:
     assert isinstance(constraint, rd.CartesianLine)
     first = poses[0]
     last = poses[-1]
-    way = last[:3, 3] - first[:3, 3]
+    segment = last[:3, 3] - first[:3, 3]
     p = np.array([T[:3, 3] for T in poses])
-    shares = np.clip((p - first[:3, 3]) @ way / (way @ way), 0, 1)
-    off = np.linalg.norm(p - first[:3, 3] - shares[:, None] * way, axis=1).max()
+    shares = np.clip((p - first[:3, 3]) @ segment / (segment @ segment), 0, 1)
+    distance = np.linalg.norm(p - first[:3, 3] - shares[:, None] * segment, axis=1).max()
     turned = max(rotation_angle(first[:3, :3].T @ T[:3, :3]) for T in poses)
-    return float(max((off - ROUNDING) / OFF_LINE, (turned - ROUNDING) / TURNED) - 1)
+    return float(max((distance - ROUNDING) / OFF_LINE, (turned - ROUNDING) / TURNED) - 1)
 
 
 def compared(kind: str, number: int, with_peer: bool) -> None:
@@ -278,11 +278,11 @@ def compared(kind: str, number: int, with_peer: bool) -> None:
         peer(problems[0], 0)
         answers["sscbirrt"] = [peer(p, i) for i, p in enumerate(progress(problems, f"{kind}, sscbirrt"))]
     possible = sum(any(a[i].positions is not None for a in answers.values()) for i in range(number))
-    both = [i for i in range(number) if all(a[i].positions is not None for a in answers.values())]
+    solved_by_all = [i for i in range(number) if all(a[i].positions is not None for a in answers.values())]
     columns = []
-    for name, found in answers.items():
-        done = [(problems[i], a) for i, a in enumerate(found) if a.positions is not None]
-        seen = [
+    for name, planner_answers in answers.items():
+        done = [(problems[i], a) for i, a in enumerate(planner_answers) if a.positions is not None]
+        checks = [
             checked(p, a.positions)
             for p, a in progress(done, f"{kind}, checks of {name}")
             if a.positions is not None
@@ -297,11 +297,13 @@ def compared(kind: str, number: int, with_peer: bool) -> None:
                 f"{len(done)} of {possible}",
                 f"{np.median(firsts):.0f} / {np.percentile(firsts, 95):.0f} ms",
                 f"{np.median(times):.0f} / {np.percentile(times, 95):.0f} ms",
-                f"{np.median([found[i].length for i in both]):.2f} rad" if both else "-",
-                str(sum(s.coal > 0 for s in seen)),
-                str(sum(s.pybullet for s in seen)),
-                str(sum(s.excess > 0 for s in seen)),
-                f"{100 * (1 + max(s.excess for s in seen)):.1f} %",
+                f"{np.median([planner_answers[i].length for i in solved_by_all]):.2f} rad"
+                if solved_by_all
+                else "-",
+                str(sum(s.coal > 0 for s in checks)),
+                str(sum(s.pybullet for s in checks)),
+                str(sum(s.excess > 0 for s in checks)),
+                f"{100 * (1 + max(s.excess for s in checks)):.1f} %",
                 f"{sum(a.proved for _, a in done)} of {len(done)}",
             ]
         )
@@ -310,7 +312,7 @@ def compared(kind: str, number: int, with_peer: bool) -> None:
         f"solved in {LONG:.0f} s",
         "CPU time until the first path, median / p95",
         "CPU time until it answers, median / p95",
-        f"length, median of the {len(both)} that all solve",
+        f"length, median of the {len(solved_by_all)} that all solve",
         "motions in collision by Coal",
         "in collision by PyBullet",
         "beyond the tolerance at 1 mm steps",

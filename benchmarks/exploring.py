@@ -235,18 +235,20 @@ def usable(problem: Problem, clearance: float) -> bool:
 
 def run(arguments: argparse.Namespace) -> None:
     """Make the records that are missing."""
-    kept = JsonLines(Path(arguments.records))
+    records = JsonLines(Path(arguments.records))
     images = IMAGES[arguments.images]
     place = {"images": arguments.images, "walls": arguments.walls}
     done = {
-        (row["family"], row["number"], row["method"]) for row in kept.rows if place.items() <= row.items()
+        (row["family"], row["number"], row["method"]) for row in records.rows if place.items() <= row.items()
     }
     warm = False
     for family in arguments.families:
-        some = (one for one in problems(family, MAX_PROBLEMS, set()) if usable(one[1], arguments.clear))
+        usable_problems = (
+            one for one in problems(family, MAX_PROBLEMS, set()) if usable(one[1], arguments.clear)
+        )
         end = arguments.skip + arguments.problems // len(arguments.families)
-        some = list(islice(some, arguments.skip, end))
-        for number, problem in progress(some, family):
+        usable_problems = list(islice(usable_problems, arguments.skip, end))
+        for number, problem in progress(usable_problems, family):
             for method in arguments.methods:
                 if (family, number, method) in done:
                     continue
@@ -255,7 +257,7 @@ def run(arguments: argparse.Namespace) -> None:
                     play(problem, family, number, PROBABILISTIC, images)
                     warm = True
                 row = play(problem, family, number, method, images)
-                kept.append({"family": family, "number": number, "method": method, **place, **row})
+                records.append({"family": family, "number": number, "method": method, **place, **row})
 
 
 def report(rows: list[Row]) -> None:
@@ -264,19 +266,19 @@ def report(rows: list[Row]) -> None:
     places = dict.fromkeys((row["images"], row["walls"]) for row in rows)
     for own, (images, walls) in product((True, False), places):
         lines = []
-        some = [
+        of_place = [
             row
             for row in rows
             if (row["family"] in FAMILIES, row["images"], row["walls"]) == (own, images, walls)
         ]
         for method in (*ONCE, *METHODS):
-            mine = [row for row in some if row["method"] == method]
-            if mine:
-                lines.append(line(method, mine))
+            of_method = [row for row in of_place if row["method"] == method]
+            if of_method:
+                lines.append(line(method, of_method))
         if lines:
             columns = ["method", "problems", "reached, %", "collisions", "looks a leg, mean / p90"]
-            of = "Families" if own else "Other problems"
-            title = f"{of}, images: {images}, {'a room' if walls else 'no walls'}"
+            source = "Families" if own else "Other problems"
+            title = f"{source}, images: {images}, {'a room' if walls else 'no walls'}"
             print_table(title, [*columns, "CPU s a leg, median / p90"], lines)
     print("CPU time is the Explorer's (observe and next), without simulated images and the validation.")
 
@@ -298,12 +300,14 @@ def line(method: str, rows: list[Row]) -> tuple[str | int, ...]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="An arm explores simulated scenes.")
-    every = [*ONCE, *METHODS]
+    method_names = [*ONCE, *METHODS]
     parser.add_argument("--problems", type=int, default=28, help="of all families together (28)")
     parser.add_argument("--skip", type=int, default=0, help="the first of each family (0)")
     parser.add_argument("--clear", type=float, default=0.0, help="least clearance of start and goal [m] (0)")
     parser.add_argument("--families", nargs="+", default=list(FAMILIES), help="(all)")
-    parser.add_argument("--methods", nargs="+", default=every, choices=every, metavar="NAME", help="(all)")
+    parser.add_argument(
+        "--methods", nargs="+", default=method_names, choices=method_names, metavar="NAME", help="(all)"
+    )
     parser.add_argument("--images", default=IDEAL, choices=IMAGES, metavar="NAME", help="(ideal)")
     parser.add_argument("--walls", action="store_true", help="a room around the scene")
     parser.add_argument("--records", default="exploring.jsonl", help="(exploring.jsonl)")

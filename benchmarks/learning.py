@@ -132,19 +132,19 @@ def network_methods(planner: Diffusion, cases: list[Case]) -> dict[str, Draw]:
     unguided = Diffusion(replace(planner.settings, guidance_steps=0))
     model = planner.network(PANDA)
     blind = clearances_without_obstacles(model)
-    found: dict[str, Draw] = {}
-    for name, of in (("guided", planner), ("without guidance", unguided)):
-        found |= {
-            name: from_network(of),
-            f"{name}, code of another scene": from_network(of, other),
-            f"{name}, clearances hidden": from_network(of, clearances=blind),
-            f"{name}, both": from_network(of, other, blind),
+    methods: dict[str, Draw] = {}
+    for name, sampler in (("guided", planner), ("without guidance", unguided)):
+        methods |= {
+            name: from_network(sampler),
+            f"{name}, code of another scene": from_network(sampler, other),
+            f"{name}, clearances hidden": from_network(sampler, clearances=blind),
+            f"{name}, both": from_network(sampler, other, blind),
         }
         if model.settings.null_condition:
-            found[f"{name}, condition hidden"] = from_network(
-                Diffusion(replace(of.settings, guidance_scale=0.0))
+            methods[f"{name}, condition hidden"] = from_network(
+                Diffusion(replace(sampler.settings, guidance_scale=0.0))
             )
-    return found
+    return methods
 
 
 def controls(planner: Diffusion, cases: list[Case]) -> dict[str, Draw]:
@@ -181,17 +181,19 @@ def equal_time_steps(planner: Diffusion, cases: list[Case]) -> int:
     return max(round(few + (network - short) * (many - few) / (long - short)), 1)
 
 
-def print_worth_of_inputs(found: dict[str, list[Record]]) -> None:
+def print_worth_of_inputs(records: dict[str, list[Record]]) -> None:
     """Print how much single-sample success falls if an input of the network is changed, on all families
     together."""
     rows = []
     for name in ("guided", "without guidance"):
-        own = np.array([record.passed or 0.0 for record in found[name]])
-        for taken in ("code of another scene", "condition hidden", "clearances hidden"):
-            less = own - [record.passed or 0.0 for record in found[f"{name}, {taken}"]]
-            low, high = (100 * x for x in bootstrap_interval(less))
-            rows.append((name, taken, f"{100 * less.mean():+.1f} ({low:+.1f} to {high:+.1f})"))
-    print_table(f"{len(own)} problems: single samples, points", ["network", "less", "mean (95 %)"], rows)
+        unchanged = np.array([record.passed or 0.0 for record in records[name]])
+        for change in ("code of another scene", "condition hidden", "clearances hidden"):
+            losses = unchanged - [record.passed or 0.0 for record in records[f"{name}, {change}"]]
+            low, high = (100 * x for x in bootstrap_interval(losses))
+            rows.append((name, change, f"{100 * losses.mean():+.1f} ({low:+.1f} to {high:+.1f})"))
+    print_table(
+        f"{len(unchanged)} problems: single samples, points", ["network", "less", "mean (95 %)"], rows
+    )
 
 
 def report_alone(
@@ -202,9 +204,9 @@ def report_alone(
     planner = Diffusion(replace(NETWORK_ALONE, weights=weights))
     draws = (network_methods(planner, cases) if inputs else {}) | controls(planner, cases)
     methods = {name: sampled(draw) for name, draw in draws.items()}
-    found = run_all(cases, methods, seeds=(1,), title=family)
-    show(summary("Network alone, 16 samples", found, (SINGLE, BEST, LENGTH, CPU)), width=WIDTH)
-    return found
+    records = run_all(cases, methods, seeds=(1,), title=family)
+    show(summary("Network alone, 16 samples", records, (SINGLE, BEST, LENGTH, CPU)), width=WIDTH)
+    return records
 
 
 def main() -> None:

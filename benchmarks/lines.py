@@ -57,12 +57,12 @@ def drawn(kind: str) -> Iterator[tuple[rd.Problem, ndarray]]:
         if not len(starts):
             continue
         T = link_pose(robot, starts[0], HAND)
-        way, axis = rng.normal(size=(2, 3))
+        direction, axis = rng.normal(size=(2, 3))
         length, angle = (rng.uniform(0.15, 0.4), 0.0)
         if kind == "screw":
             length, angle = rng.uniform(0.05, 0.25), rng.uniform(0.3, 1.2)
         turn = rotation_about(axis / np.linalg.norm(axis), angle)
-        end = transform(T[:3, 3] + length * way / np.linalg.norm(way), turn @ T[:3, :3])
+        end = transform(T[:3, 3] + length * direction / np.linalg.norm(direction), turn @ T[:3, :3])
         line = rd.CartesianLine(HAND, TOLERANCE, ANGLE)
         yield rd.Problem(robot, held_out.scene, starts[0], rd.PoseGoal(HAND, end), constraints=[line]), end
 
@@ -70,22 +70,22 @@ def drawn(kind: str) -> Iterator[tuple[rd.Problem, ndarray]]:
 def followed(robot: Robot, start: ndarray, end: ndarray) -> ndarray | None:
     """Configurations along the line by a plain follower; None if the follower does not reach the end."""
     T = link_pose(robot, start, HAND)
-    way = end[:3, 3] - T[:3, 3]
+    translation = end[:3, 3] - T[:3, 3]
     turn = rotation_vector(end[:3, :3] @ T[:3, :3].T)
     angle = float(np.linalg.norm(turn))
     axis = turn / angle if angle > 1e-9 else np.eye(3)[2]
-    count = int(np.ceil(max(np.linalg.norm(way) / STEP, angle / TURN_STEP)))
+    count = int(np.ceil(max(np.linalg.norm(translation) / STEP, angle / TURN_STEP)))
     rows = [start]
     for share in np.linspace(0, 1, count + 1)[1:]:
-        target = transform(T[:3, 3] + share * way, rotation_about(axis, share * angle) @ T[:3, :3])
+        target = transform(T[:3, 3] + share * translation, rotation_about(axis, share * angle) @ T[:3, :3])
         q = rows[-1]
         for _ in range(MAX_ITERATIONS):
-            at = link_pose(robot, q, HAND)
-            off = np.append(target[:3, 3] - at[:3, 3], rotation_vector(target[:3, :3] @ at[:3, :3].T))
-            if np.abs(off).max() < 1e-6:
+            T_now = link_pose(robot, q, HAND)
+            error = np.append(target[:3, 3] - T_now[:3, 3], rotation_vector(target[:3, :3] @ T_now[:3, :3].T))
+            if np.abs(error).max() < 1e-6:
                 break
             J = link_jacobians(robot, q[None], HAND)[0]
-            q = q + J.T @ np.linalg.solve(J @ J.T + DAMPING**2 * np.eye(6), off)
+            q = q + J.T @ np.linalg.solve(J @ J.T + DAMPING**2 * np.eye(6), error)
         else:
             return None
         inside = (q >= robot.lower).all() and (q <= robot.upper).all()

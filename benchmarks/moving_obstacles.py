@@ -50,14 +50,14 @@ def scene(robot: Robot, count: int, seed: int) -> tuple[rd.MovingObstacle, ...]:
         radius = rng.uniform(0.35, 0.75)
         angle = rng.uniform(-1.3, 1.3)
         through = np.array([radius * np.cos(angle), radius * np.sin(angle), rng.uniform(0.2, 0.8)])
-        way = rng.normal(size=3) * [1, 1, 0.3]
-        way /= np.linalg.norm(way)
-        flat = way[:2] / np.linalg.norm(way[:2])
+        direction = rng.normal(size=3) * [1, 1, 0.3]
+        direction /= np.linalg.norm(direction)
+        flat = direction[:2] / np.linalg.norm(direction[:2])
         if np.linalg.norm(through[:2] - flat * (through[:2] @ flat)) < BASE_DISTANCE:
             continue
         speed = SPEED * rng.uniform(0.5, 1.0)
         before = rng.uniform(0.8, 3.5)
-        ends = [through - speed * before * way, through + speed * rng.uniform(2.0, 4.0) * way]
+        ends = [through - speed * before * direction, through + speed * rng.uniform(2.0, 4.0) * direction]
         legs = np.linalg.norm(ends[1] - ends[0]) / speed
         times = legs * np.arange(4)
         places = [ends[i % 2] for i in range(4)]
@@ -166,10 +166,10 @@ def repairs(robot: Robot, runs: int) -> Iterator[float]:
     """CPU times of repairs of D* Lite after one ball has moved for a period, at most LATTICE_LIMIT [ms]."""
     for seed in range(runs):
         [ball] = scene(robot, 1, seed)
-        way = np.arange(0.0, ball.track[0][1], PERIOD)
-        checkers = [CollisionChecker(robot, rd.Scene([FLOOR, ball.at(t)])) for t in way]
+        times = np.arange(0.0, ball.track[0][1], PERIOD)
+        checkers = [CollisionChecker(robot, rd.Scene([FLOOR, ball.at(t)])) for t in times]
         search = LatticeSearch(checkers[0], np.array(START), np.array([GOAL]), DStarLiteSettings())
-        for checker in checkers[:: max(len(way) // 20, 1)]:
+        for checker in checkers[:: max(len(times) // 20, 1)]:
             began = time.process_time()
             search.update(checker)
             search.run(partial(late, began + LATTICE_LIMIT))
@@ -214,15 +214,17 @@ def main() -> None:
     notes = []
     with PyBulletOracle(robot, rd.Scene()) as oracle:
         for count in arguments.balls:
-            every = [problem_of(robot, scene(robot, count, seed)) for seed in range(arguments.runs)]
-            plans = [planner.plan(problem, 5.0, until=FIRST) for problem in progress(every, f"{count} balls")]
+            problems = [problem_of(robot, scene(robot, count, seed)) for seed in range(arguments.runs)]
+            plans = [
+                planner.plan(problem, 5.0, until=FIRST) for problem in progress(problems, f"{count} balls")
+            ]
             solvable = [
-                (seed, problem) for seed, problem in enumerate(every) if plans[seed].trajectory is not None
+                (seed, problem) for seed, problem in enumerate(problems) if plans[seed].trajectory is not None
             ]
             took = [plan.trajectory.duration for plan in plans if plan.trajectory is not None]
             spent = [1e3 * plan.planning_time for plan in plans if plan.trajectory is not None]
             notes.append(
-                f"{count} balls: a motion is known in {len(solvable)} of {len(every)} runs; it takes "
+                f"{count} balls: a motion is known in {len(solvable)} of {len(problems)} runs; it takes "
                 f"{np.median(took):.2f} s (median), found in {np.median(spent):.0f} ms (median)"
             )
             for name, go in methods.items():

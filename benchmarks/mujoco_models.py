@@ -206,8 +206,12 @@ def main() -> None:
         folder = arguments.prepared or Path(scratch)
         for file in arguments.models or [EXAMPLE]:
             name = file.parent.name if file.stem in ("robot", "scene") else file.stem
-            kept = folder / name
-            robot = rd.load_robot(kept) if kept.exists() else add_robot(file, out=kept).robot
+            robot_folder = folder / name
+            robot = (
+                rd.load_robot(robot_folder)
+                if robot_folder.exists()
+                else add_robot(file, out=robot_folder).robot
+            )
             rng = np.random.default_rng(SEED)
             world = world_of(file, robot, rng)
             configurations = draw(robot, rng, arguments.configurations)

@@ -59,9 +59,9 @@ COLUMNS = ("paths", "apart", "classes", *SMOOTHNESS)
 
 def even(path: Float[ndarray, "n dof"]) -> Float[ndarray, "waypoints dof"]:
     """The path at WAYPOINTS places even in arc length."""
-    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-    places = np.linspace(0.0, at[-1], WAYPOINTS)
-    return np.stack([np.interp(places, at, column) for column in path.T], axis=1)
+    lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    places = np.linspace(0.0, lengths[-1], WAYPOINTS)
+    return np.stack([np.interp(places, lengths, column) for column in path.T], axis=1)
 
 
 def sides(problem: Problem, path: Float[ndarray, "waypoints dof"]) -> tuple[int, ...]:
@@ -119,20 +119,22 @@ def of_search(planner: AORRTC) -> Method:
     return call
 
 
-def report_diversity(every: dict[str, list[Case]]) -> None:
+def report_diversity(cases_of: dict[str, list[Case]]) -> None:
     """Print how motions of `diffusion` and of search differ among themselves, and how smooth they are."""
     network = Diffusion(DiffusionSettings(samples=MOTIONS))
     search = AORRTC()
     for planner in (network, search):
-        planner.warm_up(next(iter(every.values()))[0].problem)
+        planner.warm_up(next(iter(cases_of.values()))[0].problem)
     methods = {"diffusion": of_network(network), "aorrtc": of_search(search)}
     rows = []
-    for family, cases in every.items():
-        found = run_all(cases, methods, limit=PLANNER_LIMIT, title=f"{family}, diversity")
+    for family, cases in cases_of.items():
+        records_of = run_all(cases, methods, limit=PLANNER_LIMIT, title=f"{family}, diversity")
         # only problems on which both planners have several motions
-        both = [i for i in range(len(cases)) if all("apart" in of[i].measures for of in found.values())]
-        for name, records in found.items():
-            compared = [records[i] for i in both]
+        common = [
+            i for i in range(len(cases)) if all("apart" in of[i].measures for of in records_of.values())
+        ]
+        for name, records in records_of.items():
+            compared = [records[i] for i in common]
             rows.append((family, name, len(compared), *(_mean(compared, key) for key in COLUMNS)))
     print_table(
         f"Diversity of {MOTIONS} motions and smoothness of the returned one, means over problems",
@@ -158,8 +160,8 @@ def main() -> None:
     families = parts_of(arguments.families, FAMILIES)
     use_processor_time()
     print(header("numpy", "numba", "onnxruntime"))
-    every = {name: draw_hard_cases(name, arguments.problems, arguments.cases) for name in families}
-    report_diversity(every)
+    cases_of = {name: draw_hard_cases(name, arguments.problems, arguments.cases) for name in families}
+    report_diversity(cases_of)
 
 
 if __name__ == "__main__":

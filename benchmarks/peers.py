@@ -184,11 +184,11 @@ def of_peer(name: str, python: Path, robot: dict[str, Any], problems: list[dict]
             last = (done.stderr.strip().splitlines() or ["no message"])[-1]
             return [], f"{name} cannot be run: exit status {done.returncode}, {last}"
         data = json.loads(answers.read_text())
-    found = [
+    parsed = [
         Answer(a["cpu"], a["duration"], None if a["rows"] is None else np.array(a["rows"]), a["reason"])
         for a in data["answers"]
     ]
-    return found, ", ".join(f"{package} {number}" for package, number in data["versions"].items())
+    return parsed, ", ".join(f"{package} {number}" for package, number in data["versions"].items())
 
 
 def row(
@@ -257,20 +257,23 @@ def main() -> None:
                 if not python.exists():
                     note = f"{name} is not installed: {python} does not exist"
                 else:
-                    found, note = of_peer(name, python, robot, problems)
-                    if found:
-                        answers[name] = found
+                    planner_answers, note = of_peer(name, python, robot, problems)
+                    if planner_answers:
+                        answers[name] = planner_answers
                 notes += [note] if note not in notes else []
-            both = {
+            solved_by_all = {
                 i
                 for i in range(len(cases))
                 if all(a[i].rows is not None and a[i].cpu <= TIME_LIMIT for a in answers.values())
             }
-            rows += [row(name, goal, cases, found, both) for name, found in answers.items()]
-            for name, found in answers.items():
-                reasons = [a.reason for a in found if a.rows is None]
+            rows += [
+                row(name, goal, cases, planner_answers, solved_by_all)
+                for name, planner_answers in answers.items()
+            ]
+            for name, planner_answers in answers.items():
+                reasons = [a.reason for a in planner_answers if a.rows is None]
                 notes += [f"{goal}, {name}: {reason}" for reason in dict.fromkeys(reasons)]
-            notes.append(f"{goal}: durations are means over the {len(both)} problems that all solve")
+            notes.append(f"{goal}: durations are means over the {len(solved_by_all)} problems that all solve")
     columns = [
         "goal",
         "planner",
@@ -287,8 +290,8 @@ def main() -> None:
         "rd.verify along the lines between the rows; free: by Coal on the convex meshes every "
         f"{MESH_STEP:g} rad; 1 mm: no deeper contact by PyBullet."
     )
-    of = ", ".join(names if arguments.problems else ("shelf",))
-    print_table(f"{len(cases)} problems of {of}", columns, rows, (about, *notes))
+    sources = ", ".join(names if arguments.problems else ("shelf",))
+    print_table(f"{len(cases)} problems of {sources}", columns, rows, (about, *notes))
 
 
 if __name__ == "__main__":

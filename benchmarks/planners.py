@@ -113,13 +113,13 @@ def first(cases: Sequence[Case]) -> None:
     several calls."""
     method = {"aorrtc": planned(warm("aorrtc", cases), until=FIRST, clearance=0.0)}
     calls = [run_all(cases, method, limit=5.0, title="first")["aorrtc"] for _ in range(FIRST_CALLS)]
-    found = {of[0].name: min(of, key=lambda r: r.cpu or np.inf) for of in zip(*calls, strict=True)}
+    fastest = {group[0].name: min(group, key=lambda r: r.cpu or np.inf) for group in zip(*calls, strict=True)}
     rows = []
-    for family, of in by_family(cases):
-        records = [found[case.name] for case in of]
+    for family, group in by_family(cases):
+        records = [fastest[case.name] for case in group]
         paths = [1e3 * r.progress[0][0] for r in records if r.progress]
         cpu = np.percentile([1e3 * (r.cpu or np.nan) for r in records], (50, 95))
-        rows.append((family, sum(r.solved for r in records), len(of), np.median(paths), *cpu))
+        rows.append((family, sum(r.solved for r in records), len(group), np.median(paths), *cpu))
     columns = ["family", "solved", "of", "first path ms", "whole call ms", "p95"]
     print_table(
         "aorrtc until the first motion",
@@ -137,10 +137,10 @@ def lengths(cases: Sequence[Case], known: dict, limits: Sequence[float], seeds: 
             found[name, limit] = records
     best = best_known(cases, known, [record for records in found.values() for record in records])
     rows = []
-    for family, of in by_family(cases):
-        inside = {case.name for case in of}
+    for family, group in by_family(cases):
+        inside = {case.name for case in group}
         for name in PLANNERS:
-            row = [f"{family} ({len(of)})", name]
+            row = [f"{family} ({len(group)})", name]
             for limit in limits:
                 records = [r for r in found[name, limit] if r.name in inside]
                 ratios = [r.measures["joint_length"] / best[r.name] for r in records if r.solved]

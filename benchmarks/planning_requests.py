@@ -155,21 +155,21 @@ def together(number: int) -> Iterator[NamedProblem]:
     collision."""
     for i in range(number):
         rng = np.random.default_rng([SEED, 1, i])
-        given = held_out_problem(("shelf", "table")[i % 2], i // 2)
-        assert isinstance(given.goal, JointGoal)
+        held_out = held_out_problem(("shelf", "table")[i % 2], i // 2)
+        assert isinstance(held_out.goal, JointGoal)
         T_hand_tool = transform(np.array([0.0, 0.0, 0.12]))
-        robot = given.robot.with_tool("panda_hand", T_hand_tool, [rd.Cylinder([0, 0, 0.09], 0.01, 0.06)])
+        robot = held_out.robot.with_tool("panda_hand", T_hand_tool, [rd.Cylinder([0, 0, 0.09], 0.01, 0.06)])
         size = rng.uniform(0.03, 0.1, 3)
         robot = robot.attach(rd.Box([0, 0, size[2] / 2 + 0.001], size, name="parcel"), "tool")
         T_world_base = transform(rng.uniform(-1, 1, 3), rotation_from_rpy(*rng.uniform(-3, 3, 3).tolist()))
         goals: list[Goal] = [
             PoseGoal("parcel", T_world_base @ link_pose(robot, q, "parcel"), [0.02] * 3, [0.1, 0.1, np.pi])
-            for q in (given.goal.positions[0], given.start)
+            for q in (held_out.goal.positions[0], held_out.start)
         ]
-        world = given.scene.moved(T_world_base)
+        world = held_out.scene.moved(T_world_base)
         try:
             problem = Problem.in_world(
-                T_world_base, robot, world, given.start, goals[1], waypoints=[goals[0]]
+                T_world_base, robot, world, held_out.start, goals[1], waypoints=[goals[0]]
             )
         except InputError:
             continue
@@ -286,42 +286,42 @@ def sequences(number: int) -> Iterator[Problem]:
     """Problems with three waypoints each: configurations in half of the problems, poses in the others."""
     for i in range(number):
         rng = np.random.default_rng([SEED, 2, i])
-        given = held_out_problem(("shelf", "table")[i % 2], i // 2)
-        robot = given.robot
-        exact = ExactCollision(given.robot, given.scene)
-        way: list[Any] = []
-        while len(way) < 3:
-            q = given.start + rng.uniform(-1.0, 1.0, robot.dof)
+        held_out = held_out_problem(("shelf", "table")[i % 2], i // 2)
+        robot = held_out.robot
+        exact = ExactCollision(held_out.robot, held_out.scene)
+        waypoints: list[Any] = []
+        while len(waypoints) < 3:
+            q = held_out.start + rng.uniform(-1.0, 1.0, robot.dof)
             within = ((q > robot.lower) & (q < robot.upper)).all()
             if within and not exact.collides(q[None])[0]:
-                way.append(PoseGoal(HAND, link_pose(robot, q, HAND)) if i // 2 % 2 else JointGoal(q))
-        yield replace(given, waypoints=way)
+                waypoints.append(PoseGoal(HAND, link_pose(robot, q, HAND)) if i // 2 % 2 else JointGoal(q))
+        yield replace(held_out, waypoints=waypoints)
 
 
 def nearest(problem: Problem, motion: Trajectory) -> list[float]:
     """The least distance of a motion to each waypoint [rad] or [m]."""
     curve = CubicHermiteSpline(motion.times, motion.positions, motion.velocities)
     q: ndarray = curve(np.linspace(0, motion.duration, CURVE_SAMPLES))
-    found = []
+    distances = []
     for goal in problem.waypoints:
         if isinstance(goal, JointGoal):
             apart = q - goal.positions[0]
         else:
             assert isinstance(goal, PoseGoal)
             apart = link_origins(problem.robot, q, goal.frame) - goal.T_base_frame[:3, 3]
-        found.append(float(np.linalg.norm(apart, axis=1).min()))
-    return found
+        distances.append(float(np.linalg.norm(apart, axis=1).min()))
+    return distances
 
 
 def blended(number: int, name: str) -> None:
     """Plan with stops and with each blend, check the motions on meshes, and print a table."""
     planner = rd.load_planner(name)
-    every = list(sequences(number))
-    planner.warm_up(every[0], TIME_LIMIT)
+    problems = list(sequences(number))
+    planner.warm_up(problems[0], TIME_LIMIT)
     rows = []
     collisions = 0
-    for i, problem in enumerate(progress(every, "Blended")):
-        found: dict[str, Any] = {}
+    for i, problem in enumerate(progress(problems, "Blended")):
+        by_blend: dict[str, Any] = {}
         for blend in (0.0, *BLENDS):
             named = replace(problem, blend=blend)
             began = time.process_time()
@@ -334,9 +334,9 @@ def blended(number: int, name: str) -> None:
             collisions += int(contacts.coal > 0) + int(contacts.pybullet)
             speeds = np.linalg.norm(motion.velocities[1:-1], axis=1)
             beyond = [d / blend if blend else d for d in nearest(problem, motion)]
-            found[f"{blend:g}"] = motion.duration, spent, float(speeds.min()), max(beyond)
-        if len(found) == 1 + len(BLENDS):
-            rows.append(found)
+            by_blend[f"{blend:g}"] = motion.duration, spent, float(speeds.min()), max(beyond)
+        if len(by_blend) == 1 + len(BLENDS):
+            rows.append(by_blend)
     if not rows:
         print(f"Blended: none of {number} sequences is solved")
         return

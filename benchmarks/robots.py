@@ -119,15 +119,15 @@ def report(head: str, tallies: dict[str, Tally]) -> None:
     """Print the tables of the robots measured so far."""
     rows = []
     notes = []
-    for name, of in tallies.items():
-        if of.problems == 0:
+    for name, tally in tallies.items():
+        if tally.problems == 0:
             rows.append([name, "0", *["-"] * 7])
             continue
-        p50, p95 = np.percentile(of.times, (50, 95))
-        found = [f"{of.problems}", f"{of.short}", f"{of.long}", f"{p50:.1f}", f"{p95:.1f}"]
-        rows.append([name, *found, f"{of.configurations}", f"{of.by_coal}", f"{of.by_pybullet}"])
-        if of.hard:
-            notes.append(f"{name}, not within a second: {', '.join(of.hard)}")
+        p50, p95 = np.percentile(tally.times, (50, 95))
+        counts = [f"{tally.problems}", f"{tally.short}", f"{tally.long}", f"{p50:.1f}", f"{p95:.1f}"]
+        rows.append([name, *counts, f"{tally.configurations}", f"{tally.by_coal}", f"{tally.by_pybullet}"])
+        if tally.hard:
+            notes.append(f"{name}, not within a second: {', '.join(tally.hard)}")
     columns = (
         "robot",
         "problems",
@@ -154,7 +154,7 @@ def measure_inverse_kinematics(poses: int) -> None:
         ("position only, 10 distinct solutions", 10, InverseKinematicsSettings(position_only=True)),
     ):
         milliseconds = []
-        found = []
+        solution_counts = []
         position = 0.0
         rotation = 0.0
         gap = np.inf
@@ -162,14 +162,14 @@ def measure_inverse_kinematics(poses: int) -> None:
             start = time.perf_counter()
             solutions = inverse_kinematics(robot, FRAME, T, count, rng=rng, settings=settings)
             milliseconds.append(1e3 * (time.perf_counter() - start))
-            found.append(len(solutions))
+            solution_counts.append(len(solutions))
             assert ((solutions > robot.lower) & (solutions < robot.upper)).all()
             for i, q in enumerate(solutions):
                 reached = link_pose(robot, q, FRAME)
                 position = max(position, float(np.linalg.norm(reached[:3, 3] - T[:3, 3])))
                 rotation = max(rotation, rotation_angle(reached[:3, :3] @ T[:3, :3].T))
                 gap = min(gap, np.abs(solutions[:i] - q).max(-1).min(initial=np.inf))
-        counts = np.array(found)
+        counts = np.array(solution_counts)
         times = np.array(milliseconds)
         print(
             f"{what}: {(counts > 0).mean():.2%} of {poses} solved, all {count} found for"
@@ -180,10 +180,9 @@ def measure_inverse_kinematics(poses: int) -> None:
         )
     for what, xyz in (("far", (2.0, 0.0, 0.5)), ("just out of reach", (0.9, 0.0, 0.6))):
         start = time.perf_counter()
-        found = len(inverse_kinematics(robot, FRAME, transform(np.array(xyz)), rng=rng))
-        print(
-            f"unreachable ({what}): {found} found, given up in {1e3 * (time.perf_counter() - start):.1f} ms"
-        )
+        solutions = inverse_kinematics(robot, FRAME, transform(np.array(xyz)), rng=rng)
+        elapsed = 1e3 * (time.perf_counter() - start)
+        print(f"unreachable ({what}): {len(solutions)} found, given up in {elapsed:.1f} ms")
 
 
 def main() -> None:

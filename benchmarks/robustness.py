@@ -68,10 +68,10 @@ def wait_for_workers(group: int) -> float:
 
 def _runs_in(group: int, stat: Path) -> bool:
     try:
-        state, _, found = stat.read_text().rpartition(")")[2].split()[:3]
+        state, _, process_group = stat.read_text().rpartition(")")[2].split()[:3]
     except (OSError, ValueError):
         return False
-    return int(found) == group and state != "Z"
+    return int(process_group) == group and state != "Z"
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -158,7 +158,7 @@ def run_inputs(pipe: Connection, seed: int, kinds: tuple[str, ...]) -> None:
 
 def run_campaign(seconds: float, seed: int, kinds: tuple[str, ...]) -> Campaign:
     """Run as many inputs as there is time for, numbered from `seed` on."""
-    found = Campaign(Counter(), [], dict.fromkeys(kinds, 0.0))
+    campaign = Campaign(Counter(), [], dict.fromkeys(kinds, 0.0))
     context = multiprocessing.get_context("spawn")
     until = time.monotonic() + seconds
     number = seed
@@ -184,31 +184,31 @@ def run_campaign(seconds: float, seed: int, kinds: tuple[str, ...]) -> Campaign:
             if took > CPU_LIMIT and kind != "socket":
                 result = "fault"
                 said = f"{took:.1f} s"
-            found.counts[kind, result] += 1
-            found.slowest[kind] = max(found.slowest[kind], took)
+            campaign.counts[kind, result] += 1
+            campaign.slowest[kind] = max(campaign.slowest[kind], took)
             if result == "fault":
-                found.faults.append(f"{kind} {number}: {said}")
+                campaign.faults.append(f"{kind} {number}: {said}")
             number = number + 1
             first = False
         worker.kill()
         worker.join()
-    return found
+    return campaign
 
 
 def fuzz(arguments: argparse.Namespace) -> None:
     """Run damaged inputs and print their outcomes."""
     kinds = tuple(parts_of(arguments.only, KINDS))
-    found = run_campaign(arguments.seconds, arguments.seed, kinds)
+    campaign = run_campaign(arguments.seconds, arguments.seed, kinds)
     rows = []
     for kind in kinds:
-        counts = [found.counts[kind, what] for what in ("answer", "error", "fault")]
-        rows.append([kind, f"{sum(counts):,}", *(f"{n:,}" for n in counts), f"{found.slowest[kind]:.2f}"])
+        counts = [campaign.counts[kind, what] for what in ("answer", "error", "fault")]
+        rows.append([kind, f"{sum(counts):,}", *(f"{n:,}" for n in counts), f"{campaign.slowest[kind]:.2f}"])
     print(header("numpy", "trimesh", "coal"), "\n")
     columns = ["kind", "inputs", "answers", "one-line errors", "anything else", "slowest, s"]
-    print_table(f"{found.counts.total():,} damaged inputs, from seed {arguments.seed}", columns, rows)
-    for fault in found.faults[:200]:
+    print_table(f"{campaign.counts.total():,} damaged inputs, from seed {arguments.seed}", columns, rows)
+    for fault in campaign.faults[:200]:
         print(fault)
-    if found.faults:
+    if campaign.faults:
         sys.exit(1)
 
 

@@ -209,10 +209,10 @@ class Study:
         return case_file(self.out / "problems", FAMILY).held_out(FAMILY, count, validator, first_length)
 
     def training(self, row: str) -> PlannerTraining:
-        of = ROWS[row]
+        spec = ROWS[row]
         return PlannerTraining(
-            encoder=str(self.encoder) if of.encoder is None else of.encoder,
-            encoder_settings=of.settings,
+            encoder=str(self.encoder) if spec.encoder is None else spec.encoder,
+            encoder_settings=spec.settings,
             data=str(self.data),
             minutes=None,
             samples=self.samples,
@@ -220,8 +220,8 @@ class Study:
             condition_drop=0.1,
             losses=JOINT_POINT_COLLISION,
             turned_copies=15,
-            denoiser=of.denoiser,
-            denoiser_settings=of.denoiser_settings,
+            denoiser=spec.denoiser,
+            denoiser_settings=spec.denoiser_settings,
             checkpoint_seconds=300.0,
             device="cpu",
         )
@@ -286,8 +286,8 @@ class SceneTask(PlannerTask):
         folder = self.study.folder(self.row)
         notes = {"samples": samples, "motions": len(self.train_data)}
         write_tensors(folder / "averaged.safetensors", self.model.state_dict(), notes)
-        found = tried(self.row, self.model, self.cases, ("own", "hidden"), CURVE_SAMPLES)
-        shares = {name: float(passed.mean()) for name, passed in found.items()}
+        passed_by_code = tried(self.row, self.model, self.cases, ("own", "hidden"), CURVE_SAMPLES)
+        shares = {name: float(passed.mean()) for name, passed in passed_by_code.items()}
         JsonLines(folder / "curve.jsonl").append(notes | shares)
         return Validation(super().validate(fraction).loss, shares["own"])
 
@@ -315,12 +315,14 @@ def tried(
     scenes = PackedScenes.pack([case.problem.scene for case in cases], 2, floor=True)
     assert model.encoder is not None
     z = codes_of(row, model.encoder, scenes)
-    found = {}
+    passed_by_code = {}
     for name in codes:
         q = sampled_motions(model, cases, z[name], count, hidden=name == "hidden")
         pairs = zip(cases, q, strict=True)
-        found[name] = np.array([validated(case.problem, motions).passed for case, motions in pairs], float)
-    return found
+        passed_by_code[name] = np.array(
+            [validated(case.problem, motions).passed for case, motions in pairs], float
+        )
+    return passed_by_code
 
 
 def no_clearances(q: ndarray) -> ndarray:
@@ -359,14 +361,14 @@ def sampled_motions(
 def results(row: str, study: Study, cases: Sequence[Case], codes: Sequence[str]) -> Results:
     """The results of the newest checkpoint with each code. They are cached in the folder of the row."""
     model, samples = study.trained(row)
-    found = {}
+    passed_by_code = {}
     for name in codes:
         file = study.folder(row) / "tried" / f"{samples}_{len(cases)}_{CODES.index(name)}.npy"
         if not file.exists():
             file.parent.mkdir(exist_ok=True)
             np.save(file, tried(row, model, cases, [name], BEST_OF)[name])
-        found[name] = np.load(file)
-    return Results(samples, found)
+        passed_by_code[name] = np.load(file)
+    return Results(samples, passed_by_code)
 
 
 def errors(row: str, study: Study) -> list[tuple[str, ...]]:
@@ -380,14 +382,14 @@ def errors(row: str, study: Study) -> list[tuple[str, ...]]:
     rows = []
     for level in ERROR_LEVELS:
         noise = model.draw_noise(len(q), np.random.default_rng(1))
-        signal, deviation = (float(of[level]) for of in (model.schedule.signal, model.schedule.noise))
+        signal, deviation = (float(levels[level]) for levels in (model.schedule.signal, model.schedule.noise))
         noisy = (signal * clean + deviation * noise).astype(np.float32)
-        found = []
+        squared_errors = []
         for name, code in z.items():
             condition = model.condition(code, q[:, 0], q[:, -1])
             predict = model.predictor(reference, condition, no_clearances, 0.0 if name == "hidden" else 1.0)
-            found.append(f"{np.square(predict(noisy, level) - clean)[:, 1:-1].mean():.3f}")
-        rows.append((f"{ROWS[row].title}: level {level}", *found))
+            squared_errors.append(f"{np.square(predict(noisy, level) - clean)[:, 1:-1].mean():.3f}")
+        rows.append((f"{ROWS[row].title}: level {level}", *squared_errors))
     return rows
 
 
@@ -396,20 +398,20 @@ def validation_motions(data: Path) -> tuple[Float32[ndarray, "n waypoints dof"],
     motions = []
     scenes = []
     for rows in read_rows(data, PANDA, WAYPOINTS):
-        kept = (rows.split != SPLITS.index("train")) & ~rows.shard["line_free"]
-        motions.append(rows.q[kept])
-        scenes.append(rows.scenes[kept])
+        chosen = (rows.split != SPLITS.index("train")) & ~rows.shard["line_free"]
+        motions.append(rows.q[chosen])
+        scenes.append(rows.scenes[chosen])
     return np.concatenate(motions), PackedScenes.joined(scenes)
 
 
 def without_network(cases: Sequence[Case]) -> Float[ndarray, "n count"]:
     """Which samples of smooth noise about the straight line pass."""
     rng = np.random.default_rng(5)
-    found = []
+    passed = []
     for case in progress(cases, "smooth noise"):
         ends = case.problem.start, goal_of(case.problem)[None]
-        found.append(validated(case.problem, smooth_noise(*ends, BEST_OF, WAYPOINTS, PANDA, rng)).passed)
-    return np.array(found, float)
+        passed.append(validated(case.problem, smooth_noise(*ends, BEST_OF, WAYPOINTS, PANDA, rng)).passed)
+    return np.array(passed, float)
 
 
 def in_points(values: Float[ndarray, "n"], sign: str = "") -> str:
@@ -426,20 +428,23 @@ def report(study: Study, rows: Sequence[str], plot: Path) -> None:
     worth = []
     conclusion = ""
     for row in progress(rows, "networks"):
-        samples, found = results(row, study, cases, CODES)
-        for name, passed in found.items():
+        samples, passed_by_code = results(row, study, cases, CODES)
+        for name, passed in passed_by_code.items():
             single = passed.mean(1)
             best = passed.max(1)
             table.append((f"{ROWS[row].title}: {name}", f"{samples:,}", in_points(single), in_points(best)))
-        own = found["own"]
-        mean = found["mean"]
+        own_code = passed_by_code["own"]
+        mean_code = passed_by_code["mean"]
         for name in CODES[1:]:
-            less = own.mean(1) - found[name].mean(1), own.max(1) - found[name].max(1)
+            less = (
+                own_code.mean(1) - passed_by_code[name].mean(1),
+                own_code.max(1) - passed_by_code[name].max(1),
+            )
             worth.append((f"{ROWS[row].title}: over {name}", *(in_points(part, "+") for part in less)))
         if row == "oracle":
-            points = 100 * float(own.mean() - mean.mean())
+            points = 100 * float(own_code.mean() - mean_code.mean())
             verdict = "can matter" if points >= DECISIVE else "is the bottleneck so far, not its encoder"
-            over = in_points(own.mean(1) - mean.mean(1), "+")
+            over = in_points(own_code.mean(1) - mean_code.mean(1), "+")
             conclusion = (
                 f"After {samples:,} training samples the oracle's own code is worth {over} points of single "
                 f"samples over the mean code of the same network: a code of the whole scene {verdict}."
@@ -478,8 +483,8 @@ def report(study: Study, rows: Sequence[str], plot: Path) -> None:
 def curve(study: Study, row: str) -> list[dict[str, Any]]:
     """The learning curve of a row, by training samples. If an interruption led to two entries for one number
     of samples, the later one counts."""
-    found = {at["samples"]: at for at in JsonLines(study.folder(row) / "curve.jsonl").rows}
-    return [found[samples] for samples in sorted(found)]
+    by_samples = {at["samples"]: at for at in JsonLines(study.folder(row) / "curve.jsonl").rows}
+    return [by_samples[samples] for samples in sorted(by_samples)]
 
 
 COLORS = ("#14487f", "#d1495b", "#3f7fc4", "#8a94a3")
@@ -490,11 +495,11 @@ def draw(curves: dict[str, list[dict[str, Any]]], file: Path) -> None:
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.subplots()
     for color, (row, points) in zip(COLORS, curves.items(), strict=False):
-        at = [point["samples"] / 1e3 for point in points]
+        samples = [point["samples"] / 1e3 for point in points]
         for name, line in (("own", "o-"), ("hidden", "--")):
             values = [100 * point[name] for point in points]
             label = f"{ROWS[row].title}" if name == "own" else f"{ROWS[row].title}, hidden"
-            axes.plot(at, values, line, color=color, label=label, ms=3)
+            axes.plot(samples, values, line, color=color, label=label, ms=3)
     axes.set_xlabel("training samples [thousand]")
     axes.set_ylabel("single samples that pass [%]")
     axes.set_ylim(bottom=0)

@@ -167,8 +167,10 @@ def cpu_time(process: int) -> float:
 
 def workers_of(process: int) -> list[int]:
     """The process ids of the server's workers."""
-    found = subprocess.run(["pgrep", "-P", str(process), "-f", "spawn_main"], capture_output=True, text=True)
-    return [int(line) for line in found.stdout.split()]
+    listing = subprocess.run(
+        ["pgrep", "-P", str(process), "-f", "spawn_main"], capture_output=True, text=True
+    )
+    return [int(line) for line in listing.stdout.split()]
 
 
 def main() -> None:
@@ -190,9 +192,9 @@ def main() -> None:
         [sys.executable, "-m", "robotdiffuse", *command], stdout=subprocess.PIPE, text=True
     ) as server:
         assert server.stdout is not None
-        found = re.search(r"http://[^;]+", server.stdout.readline())
-        assert found is not None
-        url = found.group()
+        match = re.search(r"http://[^;]+", server.stdout.readline())
+        assert match is not None
+        url = match.group()
         while httpx.get(f"{url}/health").json()["workers_ready"] < arguments.workers:
             time.sleep(0.2)
         load(url, plan_requests, arguments.clients, min(20.0, arguments.seconds / 4), lambda _: None)
@@ -246,8 +248,8 @@ def main() -> None:
         f"What {arguments.clients} clients saw in {arguments.seconds:.0f} s",
         ("", "undisturbed", f"{len(kills)} workers killed"),
         [
-            ("answers", *(str(sum(of.answers.values())) for of in (counts, killed))),
-            ("by code", *(_codes(of) for of in (counts, killed))),
+            ("answers", *(str(sum(seen.answers.values())) for seen in (counts, killed))),
+            ("by code", *(_codes(seen) for seen in (counts, killed))),
             ("lost, without an answer", str(counts.lost), str(killed.lost)),
             ("not the planner's path", str(counts.wrong), str(killed.wrong)),
             (

@@ -166,17 +166,17 @@ def outcome(urdf: Path, found: Urdf | None, samples: int, problems: int) -> Outc
             seconds = time.process_time()
             mebibytes = _peak_mebibytes()
             return Outcome(seconds, mebibytes, str(error).replace(f"{urdf.parent}/", ""))
-        of = Outcome(time.process_time(), _peak_mebibytes(), "", tuple(report.warnings), report.robot.dof)
-        of.parts = sum(link.parts for link in report.links)
-        of.spheres = report.sphere_count
-        of.free = report.false_collisions.free
-        of.refused_by_parts = report.false_collisions.by_parts
-        of.refused_by_spheres = report.false_collisions.by_spheres
-        of.points_outside = points_outside(urdf, report)
-        of.free_on_table, of.refused_on_table = on_table(report.robot, samples)
-        of.empty, of.past_box = planned(report.robot)
-        of.furniture = in_furniture(report.robot, problems)
-    return of
+        result = Outcome(time.process_time(), _peak_mebibytes(), "", tuple(report.warnings), report.robot.dof)
+        result.parts = sum(link.parts for link in report.links)
+        result.spheres = report.sphere_count
+        result.free = report.false_collisions.free
+        result.refused_by_parts = report.false_collisions.by_parts
+        result.refused_by_spheres = report.false_collisions.by_spheres
+        result.points_outside = points_outside(urdf, report)
+        result.free_on_table, result.refused_on_table = on_table(report.robot, samples)
+        result.empty, result.past_box = planned(report.robot)
+        result.furniture = in_furniture(report.robot, problems)
+    return result
 
 
 def _peak_mebibytes() -> float:
@@ -229,11 +229,11 @@ def past_a_box(robot: Robot, q: np.ndarray) -> Problem | None:
     """A problem between two free configurations, with a box around the place of the tip halfway along the
     straight line; None if no pair of configurations gives such a problem."""
     for start, goal in pairwise(q):
-        way = np.linspace(start, goal, 33)
-        tips = link_origins(robot, way, robot.tip)
+        line = np.linspace(start, goal, 33)
+        tips = link_origins(robot, line, robot.tip)
         size = 0.15 * np.linalg.norm(np.ptp(tips, axis=0))
         scene = Scene([Box(tips[16], (size, size, size))])
-        free = CollisionChecker(robot, scene).free(way)
+        free = CollisionChecker(robot, scene).free(line)
         if free[0] and free[-1] and not free.all():
             return Problem(robot, scene, start, goal)
     return None
@@ -256,8 +256,8 @@ def in_furniture(robot: Robot, problems: int) -> tuple[int, int, int] | None:
     counts = [0, 0]
     planner.plan(drawn[0].problem(robot), time_limit=10.0)  # compiles
     for k, limit in enumerate((1.0, 10.0)):
-        for one in drawn:
-            counts[k] += planner.plan(one.problem(robot), time_limit=limit).solved
+        for sampled in drawn:
+            counts[k] += planner.plan(sampled.problem(robot), time_limit=limit).solved
     return len(drawn), counts[0], counts[1]
 
 
@@ -284,29 +284,35 @@ def find(case: str, sites: list[str], folder: Path) -> Path | None:
 
 def report(outcomes: dict[str, Outcome]) -> None:
     """Print the tables."""
-    prepared = {name: one for name, one in outcomes.items() if not one.refusal}
+    prepared = {name: result for name, result in outcomes.items() if not result.refusal}
     rows = []
     notes = []
     plans = []
-    for name, one in prepared.items():
-        figures = (one.free, one.refused_by_parts, one.refused_by_spheres)
-        shares = [f"{share:.1%}" for share in (*figures, one.free_on_table, one.refused_on_table)]
-        counts = [f"{one.dof}", f"{one.parts}", f"{one.spheres}"]
-        rows.append([name, f"{one.seconds:.0f}", f"{one.mebibytes:.0f}", *counts, *shares])
-        rows[-1].append(f"{one.points_outside}")
-        notes += [f"{name}: {warning}" for warning in one.warnings]
-        plans.append([name, one.empty, one.past_box, *map(str, one.furniture or ("-", "-", "-"))])
+    for name, result in prepared.items():
+        figures = (result.free, result.refused_by_parts, result.refused_by_spheres)
+        shares = [f"{share:.1%}" for share in (*figures, result.free_on_table, result.refused_on_table)]
+        counts = [f"{result.dof}", f"{result.parts}", f"{result.spheres}"]
+        rows.append([name, f"{result.seconds:.0f}", f"{result.mebibytes:.0f}", *counts, *shares])
+        rows[-1].append(f"{result.points_outside}")
+        notes += [f"{name}: {warning}" for warning in result.warnings]
+        plans.append([name, result.empty, result.past_box, *map(str, result.furniture or ("-", "-", "-"))])
     columns = ("URDF", "CPU s", "MiB", "joints", "parts", "spheres", "free", "by parts", "by spheres")
     columns += ("on table", "refused", "points outside")
     print_table(f"Prepared from the URDF alone: {len(prepared)}", columns, rows, notes)
     columns = ("URDF", "empty scene", "past a box", "furniture problems", "solved in 1 s", "in 10 s")
     print_table("Plans", columns, plans)
-    refused = {name: one for name, one in outcomes.items() if one.refusal}
+    refused = {name: result for name, result in outcomes.items() if result.refusal}
     print(f"Refused by one line: {len(refused)}")
-    for name, one in refused.items():
-        print(f"{name} ({one.seconds:.0f} s, {one.mebibytes:.0f} MiB)\n    {one.refusal}")
-    over = [n for n, one in outcomes.items() if one.seconds > MAX_SECONDS or one.mebibytes > MAX_MEBIBYTES]
-    wrong = [n for n, one in refused.items() if "\n" in one.refusal or one.refusal.startswith("DEFECT")]
+    for name, result in refused.items():
+        print(f"{name} ({result.seconds:.0f} s, {result.mebibytes:.0f} MiB)\n    {result.refusal}")
+    over = [
+        n
+        for n, result in outcomes.items()
+        if result.seconds > MAX_SECONDS or result.mebibytes > MAX_MEBIBYTES
+    ]
+    wrong = [
+        n for n, result in refused.items() if "\n" in result.refusal or result.refusal.startswith("DEFECT")
+    ]
     print(f"More than {MAX_SECONDS} s or {MAX_MEBIBYTES} MiB: {', '.join(over) or 'none'}")
     print(f"No single line, or a defect: {', '.join(wrong) or 'none'}")
     if wrong:
@@ -324,8 +330,8 @@ def main() -> None:
     arguments = parse(parser, cases=[next(iter(WORKS)), next(iter(REFUSED))], samples=100, problems=3)
     if arguments.one:
         name, urdf = arguments.one
-        one = outcome(Path(urdf), FOUND.get(name), arguments.samples, arguments.problems)
-        print(json.dumps(asdict(one)))
+        result = outcome(Path(urdf), FOUND.get(name), arguments.samples, arguments.problems)
+        print(json.dumps(asdict(result)))
         return
     print(header("numpy", "numba", "coal", "example-robot-data"))
     outcomes: dict[str, Outcome] = {}

@@ -125,12 +125,12 @@ def record(problem: Problem, family: str, number: int, depth: str) -> Row:
         p = predicted[crossed.voxels]
         swept = COARSE.swept(problem.robot, result.path, GROWN) & elsewhere
         near = swept & volume.unknown
-        of = (volume.unknown, volume.occupied, volume.lost, volume.out_of_view, volume.shadow)
+        parts = (volume.unknown, volume.occupied, volume.lost, volume.out_of_view, volume.shadow)
         length = result.path.length
         features = [
             *(len(p), p.sum(), p.max(initial=0), _log_free(p), crossed.unseen_share, crossed.lost_share),
             *np.histogram(p, BINS)[0],
-            *(swept.sum(), *((swept & part).sum() / max(swept.sum(), 1) for part in of)),
+            *(swept.sum(), *((swept & part).sum() / max(swept.sum(), 1) for part in parts)),
             *(means[near].sum(), highest[near].max(initial=0), _log_free(means[near])),
             *np.histogram(highest[near], BINS)[0],
             *(crossed.free_share, free_share(predicted, refined(near)), length, result.trajectory.duration),
@@ -176,14 +176,14 @@ def _log_free(p: ndarray) -> float:
 
 def run(arguments: argparse.Namespace) -> None:
     """Make the records that are missing, family after family in each round."""
-    kept = JsonLines(Path(arguments.records))
-    done = {(row["family"], row["number"]) for row in kept.rows}
+    records = JsonLines(Path(arguments.records))
+    done = {(row["family"], row["number"]) for row in records.rows}
     sources = {name: problems(name, arguments.rounds, set()) for name in arguments.families}
     for i in range(arguments.rounds):
         for family, source in sources.items():
             number, problem = next(source, (0, None))
             if problem is not None and (Path(family).name, number) not in done:
-                kept.append(record(problem, Path(family).name, number, ORDER[i % len(ORDER)]))
+                records.append(record(problem, Path(family).name, number, ORDER[i % len(ORDER)]))
 
 
 def called(row: Row) -> list[Row]:
@@ -225,16 +225,16 @@ def scores(rows: list[Row], hidden: int, columns: int | None) -> Scores:
     """
     x = [np.array([inputs(row, m)[:columns] for m in row["motions"]], np.float32) for row in rows]
     y = [np.array([m["free"] for m in row["motions"]], np.float32) for row in rows]
-    own = [i for i, row in enumerate(rows) if row["family"] in FAMILIES]
-    parts = [[i for i in own if rows[i]["number"] % FOLDS == fold] for fold in range(FOLDS)]
-    parts.append([i for i in range(len(rows)) if i not in own])
+    of_families = [i for i, row in enumerate(rows) if row["family"] in FAMILIES]
+    parts = [[i for i in of_families if rows[i]["number"] % FOLDS == fold] for fold in range(FOLDS)]
+    parts.append([i for i in range(len(rows)) if i not in of_families])
     out = Scores()
     for part in parts:
-        learned = [i for i in own if i not in part]
+        learned = [i for i in of_families if i not in part]
         if part and learned:
             weights = np.concatenate([np.full(len(y[i]), 1 / len(y[i])) for i in learned])
-            every = np.concatenate([x[i] for i in learned]), np.concatenate([y[i] for i in learned])
-            model = trained(*every, weights, hidden)
+            training = np.concatenate([x[i] for i in learned]), np.concatenate([y[i] for i in learned])
+            model = trained(*training, weights, hidden)
             out |= {i: model(x[i]) for i in part}
     return out
 
@@ -339,9 +339,9 @@ def report(rows: list[Row]) -> None:
         "ideal depth": [row for row in solved if row["depth"] == IDEAL],
         "noise": [row for row in solved if row["depth"] != IDEAL],
     }
-    for name, some in groups.items():
-        if some:
-            compared(name, some, [*models])
+    for name, group in groups.items():
+        if group:
+            compared(name, group, [*models])
 
 
 def compared(title: str, rows: list[Row], models: list[str]) -> None:
@@ -362,13 +362,15 @@ def compared(title: str, rows: list[Row], models: list[str]) -> None:
             f"{1e3 * np.mean(spent):.0f}",
         )
         lines.append((name, share, pair.a_only, pair.b_only, f"{pair.p_success:.2g}", *figures))
-    some = np.mean([any(motion["free"] for motion in row["motions"]) for row in rows])
+    any_free = np.mean([any(motion["free"] for motion in row["motions"]) for row in rows])
     random = [np.mean([motion["free"] for motion in _of(row, FIRST)]) for row in rows]
     more = 100 * (base - random)
     low, high = bootstrap_interval(more)
     gain = f"a call over a random first motion: {more.mean():+.1f} points ({low:.1f} to {high:.1f})"
     columns = ["choice", "free, %", "gained", "lost", "p", "stated", "error", "ms"]
-    print_table(f"{title}: {len(rows)} problems; some motion is free in {100 * some:.1f} %", columns, lines)
+    print_table(
+        f"{title}: {len(rows)} problems; some motion is free in {100 * any_free:.1f} %", columns, lines
+    )
     print(f"{gain}\n")
 
 
@@ -379,8 +381,8 @@ def _chosen_free(row: Row) -> bool:
 def cpu_time(row: Row, motions: list[Row]) -> float:
     """CPU time of making and comparing these motions of a record [s]."""
     kinds = {motion["kind"] for motion in motions} | {FIRST}
-    own = sum(motion["time"] + motion["stating"] for motion in motions)
-    return row["spent"]["view"] + sum(row["spent"][kind] for kind in kinds) + own
+    motion_time = sum(motion["time"] + motion["stating"] for motion in motions)
+    return row["spent"]["view"] + sum(row["spent"][kind] for kind in kinds) + motion_time
 
 
 def main() -> None:

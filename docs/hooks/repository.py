@@ -56,7 +56,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     """Rewrites links to files of the repository."""
     sources = {site_path(file): file for file in outside_files()}
     here = page.file.src_uri
-    own = sources.get(here, f"docs/{here}")
+    source = sources.get(here, f"docs/{here}")
     if here.startswith(REPORTS):
         page.meta["hide"] = ["toc"]  # reports have wide tables
 
@@ -64,7 +64,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         target, anchor = match.groups()
         if ":" in target:
             return match.group(0)
-        file = posixpath.normpath(posixpath.join(posixpath.dirname(own), target))
+        file = posixpath.normpath(posixpath.join(posixpath.dirname(source), target))
         return f"]({posixpath.relpath(site_path(file), posixpath.dirname(here) or '.')}{anchor})"
 
     return LINK.sub(rewritten, markdown)
