@@ -107,11 +107,13 @@ def print_preparation(report: "AddReport") -> None:
         for pair in falsely.pairs[:MAX_PAIRS]
     ]
     parts = sum(link.parts for link in report.links)
-    by_method = f"{falsely.by_parts:.1%}, {falsely.by_spheres:.1%}"
     summary = [
         ("convex parts, spheres", f"{parts}, {report.sphere_count}"),
         ("configurations free of self-collision", f"{falsely.free:.1%}"),
-        ("of these false collisions by convex parts, by spheres", by_method),
+        (
+            "of these false collisions by convex parts, by spheres",
+            f"{falsely.by_parts:.1%}, {falsely.by_spheres:.1%}",
+        ),
         ("processor time, memory", f"{report.seconds:.0f} s, {report.memory / 2**20:.0f} MiB"),
     ]
     show(

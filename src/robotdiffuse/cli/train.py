@@ -190,8 +190,9 @@ def train_for_robot(
     _check_disk(work, data.trajectories)
     defaults: dict[str, Any] = {"samples": SAMPLES} if options.get("minutes") is None else {}
     defaults |= {"encoder": str(work / "encoder")}
-    fixed = {"data": str(work / "data"), "robot": source}
-    settings: PlannerTraining = make_settings(defaults | options | fixed)
+    settings: PlannerTraining = make_settings(
+        defaults | options | {"data": str(work / "data"), "robot": source}
+    )
     print(
         f"{robot.name}: {data.trajectories:,} motions, then training; all in {work}",
         file=sys.stderr,

@@ -186,8 +186,9 @@ def problem_of_motion(motion: RecordedMotion, robot: Robot, scene: Scene) -> Pro
     not planned are locked at their values in the first row."""
     movable = {j.name for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None}
     movable -= set(robot.joint_names)
-    first = dict(zip(motion.joint_names, motion.positions[0].tolist(), strict=True))
-    robot = robot.with_locked({name: value for name, value in first.items() if name in movable})
+    first = motion.positions[0]
+    locked = {name: float(first[j]) for j, name in enumerate(motion.joint_names) if name in movable}
+    robot = robot.with_locked(locked)
     motion = replace(motion, notes=())
     q = motion_of_robot(motion, robot).motion.positions
     return Problem(robot, scene, q[0], JointGoal(q[-1:]))

@@ -460,8 +460,9 @@ def write_bag(problem: Problem, trajectory: Trajectory, file: Path) -> None:
         "/display_planned_path": (DISPLAY_TRAJECTORY, display_trajectory(problem, trajectory, record)),
     }
     try:
-        prefix = f".{file.name}."
-        with TemporaryDirectory(prefix=prefix, dir=file.parent, ignore_cleanup_errors=True) as folder:
+        with TemporaryDirectory(
+            prefix=f".{file.name}.", dir=file.parent, ignore_cleanup_errors=True
+        ) as folder:
             new = Path(folder, file.name)
             old = Path(folder, "old")
             with BagWriter(new, version=VERSION) as writer:  # it names the database after the folder
