@@ -35,7 +35,7 @@ EMPTY = np.float32(-1e-6)
 """Depth of a pixel without a return where nothing seems to be in range, in a view that states no range. The
 pixel shows nothing, but the voxels behind it are HIDDEN, not LOST."""
 MAX_DEPTH = np.float32(1e6)
-"""Depth of a pixel without an obstacle in range, and of unknown pixels [m]."""
+"""Depth of a pixel without an obstacle in range [m]; in minima, pixels without a return have it too."""
 POOLED_FOCAL_LENGTH = 250.0
 """Images are downsampled by min-pooling while their focal length stays above this [pixels]: a voxel of 4 cm
 at a distance of 2 m is then 5 pixels wide."""
@@ -73,6 +73,7 @@ def usable_depth(depth, focal):
         for u in range(1, w - 1):
             d = out[v, u]
             step = max(FLYING_PIXEL_STEP, FLYING_PIXEL_WIDTHS * d / focal)
+            # the left, right, upper and lower neighbor
             a = out[v, u - 1]
             b = out[v, u + 1]
             c = out[v - 1, u]
@@ -349,6 +350,7 @@ def _state_of_block(first, intrinsics, T, low, voxel, errors, size, factor, tabl
     py = low[1] + (np.float32(first[1]) + middle) * voxel - T[1, 3]
     pz = low[2] + (np.float32(first[2]) + middle) * voxel - T[2, 3]
     x, y, z = in_camera(T, px, py, pz)
+    # half the extent of a voxel in depth, and the range of depths of the block [m]
     ez = _HALF * voxel * (abs(T[0, 2]) + abs(T[1, 2]) + abs(T[2, 2]))
     near = z - np.float32(BLOCK) * ez
     far = z + np.float32(BLOCK) * ez
@@ -398,7 +400,7 @@ def _carve_block(
     h, w = table.shape[1:]
     share = _ONE / np.float32(factor)
     half = _HALF * voxel
-    ez = half * (abs(T[0, 2]) + abs(T[1, 2]) + abs(T[2, 2]))
+    ez = half * (abs(T[0, 2]) + abs(T[1, 2]) + abs(T[2, 2]))  # half the extent of a voxel in depth [m]
     for i in range(first[0], end[0]):
         px = low[0] + (np.float32(i) + _HALF) * voxel - T[0, 3]
         for j in range(first[1], end[1]):
@@ -421,9 +423,11 @@ def _carve_block(
                 if counts[i, j, k] > 0:
                     pixels = fx * fy * (voxel / z) ** 2
                     counts[i, j, k] = max(0, counts[i, j, k] - int(MIN_POINT_FRACTION * pixels))
-                front = raw[row, column]
-                nothing = front
+                # the depth at the voxel's center; `front` becomes the nearest depth if there is no return
+                center_depth = raw[row, column]
+                front = center_depth
                 if front > z + ez or front <= _ZERO:
+                    # The voxel is free if all pixels that it may cover are deeper than `beyond`.
                     # A rotation of the camera moves a point perpendicular to its ray, so it changes the
                     # point's depth only beside the optical axis.
                     aside = errors[1] * z * np.sqrt(x * x + y * y)
@@ -459,12 +463,12 @@ def _carve_block(
                 state[i, j, k] = HIDDEN
                 if arm[row, column]:
                     state[i, j, k] = SHADOW
-                elif nothing <= -_NEAREST:
+                elif center_depth <= -_NEAREST:
                     state[i, j, k] = LOST
                 elif front < z:
                     state[i, j, k] = BEHIND
                     behind[i, j, k] = z - front
-                elif nothing == NO_RETURN:
+                elif center_depth == NO_RETURN:
                     state[i, j, k] = LOST
 
 

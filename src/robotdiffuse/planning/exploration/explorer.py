@@ -85,7 +85,7 @@ voxels within reach that are occupied."""
 NOTHING, DEFAULTS = Scene(()), ExplorerSettings()
 QUICK_FRACTION = 0.2
 """Fraction of the time limit for a search after which a look or another search may follow. For searches
-within space seen free, it doubles with each look: the more space was seen, the likelier is a motion."""
+within space seen free, it doubles with each look, since a motion is more likely the more space was seen."""
 TENTATIVE_MOTIONS = 2
 """Number of tentative motions among seen obstacles; looks are planned for the motion that sweeps the least
 unseen space."""
@@ -177,10 +177,10 @@ class Explorer:
 
     @locked
     def next(self, configuration: ArrayLike) -> Step:
-        """What the arm, at rest, shall do next.
+        """The next step of the arm, which must be at rest.
 
         Args:
-            configuration: Where the arm is [dof].
+            configuration: The arm's present configuration [dof].
 
         Raises:
             InputError: Before `set_goal`, and for values that are no configuration of the robot.
@@ -188,8 +188,8 @@ class Explorer:
         if self._goal is None:
             raise InputError("there is no goal; call set_goal first")
         q = vector("explorer", "configuration", configuration, self.robot.dof)
-        standing = [view for view in self._news if not self._is_on_arm(view)]
-        self._beside = standing[-1] if standing else None
+        beside = [view for view in self._news if not self._is_on_arm(view)]
+        self._beside = beside[-1] if beside else None
         self._news = []
         if goal_error(self.robot, self._goal, q, ARRIVED) is None:
             return Step(DONE, "the arm is at the goal")
@@ -239,11 +239,11 @@ class Explorer:
         """How a motion under way ends early, if views observed since `next` returned it show an obstacle in
         its way.
 
-        After the stop, ask `next` again.
+        After the stop, call `next` again.
 
         Args:
             motion: The motion under way.
-            time: When a new command takes effect, on the motion's clock [s].
+            time: When a new command takes effect: time since the start of the motion [s].
 
         Returns:
             The earliest stop on the same path; None if nothing is in the way.
@@ -334,12 +334,12 @@ class Explorer:
         # the motion of a look is through space seen free if possible, under both policies
         policies = (STRICT, PROBABILISTIC) if self.settings.policy == PROBABILISTIC else (policy,)
         for under in policies:
-            way = self._way_to_look(problem, under, to_view, predicted)
-            if way is not None:
-                stated = way.confidence if under == PROBABILISTIC else None
+            look = self._way_to_look(problem, under, to_view, predicted)
+            if look is not None:
+                stated = look.confidence if under == PROBABILISTIC else None
                 self._looked_for |= to_view
                 why += "; look at unseen space on the way"
-                return Step(LOOK, why, under, way, stated, wanted=to_view)
+                return Step(LOOK, why, under, look, stated, wanted=to_view)
         back = self._way_back(problem) if STRICT in policies else None
         if back is not None:
             return Step(LOOK, f"{why}; go back on the way in and look from there", STRICT, back)
@@ -352,24 +352,25 @@ class Explorer:
         wanted: Voxels,
         predicted: Probabilities | None,
     ) -> PlanResult | None:
-        """A motion under a policy to a viewpoint from which a camera sees most of the wanted voxels; None if
-        no motion was found."""
+        """A motion under a policy to a viewpoint, one of those from which a camera sees most wanted voxels;
+        None if no motion was found."""
         allowed = self._seen_free(problem) if policy == STRICT else problem
         tree = ReachableTree(self.robot, allowed.scene, problem.start)
         way_in = self._way_in_to(problem.start)
+        # the arm cannot go back to a different place: no motion brought it here, or only a short one
         hemmed_in = way_in is None or bool(moved(self.robot, way_in[:1], [problem.start])[0] < CONFINED)
         taken = self._goal_seen.taken
         for camera in self.cameras:
             arguments = wanted, predicted, self._rng, taken, hemmed_in, self._beside
-            ways = best_looks(self.map, tree, camera, *arguments)
-            for waypoints in islice(ways, self.settings.look_attempts):
+            paths = best_looks(self.map, tree, camera, *arguments)
+            for waypoints in islice(paths, self.settings.look_attempts):
                 if policy == STRICT:
-                    way = self._along(allowed, waypoints, "look")
+                    motion = self._along(allowed, waypoints, "look")
                 else:
                     look = replace(problem, goal=JointGoal(waypoints[-1:]))
-                    way = self._probabilistic(look, predicted, self.settings.time_limit, to_goal=False)
-                if way is not None and self._good(way, policy):
-                    return way
+                    motion = self._probabilistic(look, predicted, self.settings.time_limit, to_goal=False)
+                if motion is not None and self._good(motion, policy):
+                    return motion
         return None
 
     def _is_on_arm(self, view: DepthView) -> bool:
@@ -382,15 +383,15 @@ class Explorer:
 
     def _way_in_to(self, q: Configuration) -> Configurations | None:
         """Waypoints of the latest motion that was returned, if it ended at this configuration."""
-        way = self._way_in
-        return way if way is not None and np.abs(way[-1] - q).max() <= AT_GOAL else None
+        path = self._way_in
+        return path if path is not None and np.abs(path[-1] - q).max() <= AT_GOAL else None
 
     def _way_back(self, problem: Problem) -> PlanResult | None:
         """A motion back along the latest motion, on the shortest part that is accepted; None without one."""
-        way = self._way_in_to(problem.start)
-        if way is None:
+        way_in = self._way_in_to(problem.start)
+        if way_in is None:
             return None
-        for waypoints in first_parts(way[::-1]):
+        for waypoints in first_parts(way_in[::-1]):
             motion = self._within_seen_free(problem, waypoints, "back on the way in")
             if motion is not None:
                 return motion
@@ -423,8 +424,8 @@ class Explorer:
         """
         goals = as_seen.goal.positions if isinstance(as_seen.goal, JointGoal) else ()
         ends = near_ends(self.map, (as_seen.start, *goals))
-        in_vain = self._looked_for & self.map.unknown
-        blocked = surface((self.map.occupied | in_vain) & ~ends)
+        not_shown = self._looked_for & self.map.unknown
+        blocked = surface((self.map.occupied | not_shown) & ~ends)
         name = "occupied, or looked for in vain"
         avoided = cover(self.map, self.scene, MAP.centers(blocked), MAP.edge, name)
         avoiding = replace(as_seen, scene=as_seen.scene.with_shapes([*as_seen.scene.shapes, avoided]))

@@ -77,9 +77,9 @@ class ReachableTree:
         path = [number]
         while parents[path[-1]] >= 0:
             path.append(parents[path[-1]])
-        way = simplify(self._space, nodes[path[::-1]], 1).astype(np.float64)
-        way[0] = self._start
-        return way
+        waypoints = simplify(self._space, nodes[path[::-1]], 1).astype(np.float64)
+        waypoints[0] = self._start
+        return waypoints
 
 
 def moved(robot: Robot, to: Configurations, others: Sequence[Configuration]) -> Float[ndarray, "n"]:
@@ -226,6 +226,7 @@ def best_looks(
         best = tree.configurations[np.argsort(-score, kind="stable")[:REFINED]].repeat(NEIGHBORS, axis=0)
         tree.grow(best + spread * rng.standard_normal(best.shape), np.full(len(best), np.inf))
         score = np.concatenate([score, scored(tree.configurations[len(score) :])])
+    # the configuration in which the arm is farthest from where it was in all images
     distances = moved(robot, tree.configurations, [start, *taken])
     farthest = int(distances.argmax())
     if hemmed_in and distances[farthest] < CONFINED:
