@@ -362,8 +362,9 @@ class _States:
         """Add a message, if it has positions of all joints of the arm."""
         positions = dict(zip(state["name"], state["position"], strict=False))  # may have velocities alone
         if all(name in positions for name in self._robot.joint_names):
-            q = np.array([positions[name] for name in self._robot.joint_names])
-            insert_by_time(self._states, (stamp, q))
+            insert_by_time(
+                self._states, (stamp, np.array([positions[name] for name in self._robot.joint_names]))
+            )
 
     def at(self, stamp: float, where: str) -> Configuration:
         """The configuration at a time, interpolated. Raises InputError, naming `where`, if there is no joint

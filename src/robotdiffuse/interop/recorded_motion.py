@@ -186,8 +186,9 @@ def problem_of_motion(motion: RecordedMotion, robot: Robot, scene: Scene) -> Pro
     not planned are locked at their values in the first row."""
     movable = {j.name for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None}
     movable -= set(robot.joint_names)
-    first = motion.positions[0]
-    locked = {name: float(first[j]) for j, name in enumerate(motion.joint_names) if name in movable}
+    locked = {
+        name: float(motion.positions[0, j]) for j, name in enumerate(motion.joint_names) if name in movable
+    }
     robot = robot.with_locked(locked)
     motion = replace(motion, notes=())
     q = motion_of_robot(motion, robot).motion.positions
