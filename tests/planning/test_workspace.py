@@ -274,7 +274,7 @@ def test_motions_are_joined_with_and_without_a_stop() -> None:
     space.remove("can")
     elsewhere = space.plan("ready", end, time_limit=10.0)
     for motions, blend, message in (
-        ([there, line], 0.05, "constraints of their own, which a corner would leave"),
+        ([there, line], 0.05, "constraints that others lack"),
         ([there, there], 0.0, r"results\[1\] begins .* rad from the end of results\[0\] in"),
         ([there], 0.0, "it takes two to join"),
         ([there, elsewhere], 0.0, r"results\[1\] is for another robot or scene"),

@@ -10,18 +10,18 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError, shown
 
 MAX_COORDINATE = 1e4
-"""Largest absolute coordinate, size or joint value [m] or [rad]: ten kilometers. At this distance float32
-resolves about a millimeter, and compiled code adds a margin for it."""
+"""Largest absolute coordinate, size or joint value [m] or [rad]. At 10 km, adjacent float32 numbers are about
+1 mm apart; compiled code adds a margin for this error."""
 MIN_SIZE = 1e-9
-"""Smallest size [m]; float32 cannot resolve smaller ones beside coordinates."""
-# Smallest limit of a joint's velocity or acceleration, and largest rate, in their own units.
+"""Smallest size [m]; float32 loses a smaller size when it is added to a coordinate."""
+# Smallest limit of a joint's velocity, acceleration or jerk, and largest value of these rates, in SI units.
 MIN_RATE = 1e-6
 MAX_RATE = 1e6
 MAX_DURATION = 1e6
 """Longest motion in files and requests [s]."""
 RIGID_SLACK = 1e-4
-"""Largest allowed error of any entry of a pose: of R R^T from the identity, and of the last row from 0 0 0
-1."""
+"""Largest allowed error of a pose matrix: of each entry of R R^T against the identity, and of each entry of
+the last row against 0 0 0 1."""
 IDENTITY = np.eye(4)
 IDENTITY.setflags(write=False)
 
@@ -31,21 +31,21 @@ T = TypeVar("T")
 class Value:
     """Base of the dataclasses that are values: the arrays in their fields are read-only.
 
-    Caches use the object's identity as the key, so its arrays must not change. An array that can be written
-    to is copied, so that the caller's array stays writable. Subclasses with a `__post_init__` of their own
-    call this one at its end.
+    Caches use the object's identity as the key, so its arrays must not change. A writable array is copied, so
+    that the caller's array stays writable. A subclass that defines `__post_init__` calls this class's
+    `__post_init__` at its end.
     """
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        if "__repr__" not in cls.__dict__:  # else dataclass writes one with whole arrays
+        if "__repr__" not in cls.__dict__:  # else @dataclass adds a __repr__ that prints whole arrays
             cls.__repr__ = Value.__repr__
 
     def __repr__(self) -> str:
         return one_line(self)
 
     def __dir__(self) -> list[str]:
-        """The attributes without what modules cache in the value's `__dict__` under their names."""
+        """The attributes, without the caches that modules keep in `__dict__` under their dotted names."""
         return [name for name in super().__dir__() if "." not in name]
 
     def __post_init__(self) -> None:
@@ -56,13 +56,13 @@ class Value:
                 object.__setattr__(self, name, frozen)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        # arrays can be written to when they come out of a pickle or a deep copy
+        # arrays from a pickle or a deep copy are writable
         self.__dict__.update({name: read_only(value) for name, value in state.items()})
 
 
 def read_only(value: T) -> T:
-    """Returns the value if its arrays are read-only, else a read-only copy; looks into tuples and
-    dictionaries."""
+    """Returns the value unchanged if all its arrays are read-only, else a copy in which they are. Arrays are
+    looked for in tuples and dictionaries too."""
     if isinstance(value, ndarray):
         if not _writable(value):
             return value
@@ -81,14 +81,15 @@ def read_only(value: T) -> T:
 
 
 def for_kernels(array: ndarray, dtype: type = np.float64) -> ndarray:
-    """The array as compiled code takes it, contiguous and not read-only: for Numba a read-only array has
-    another type, for which it would compile everything once more."""
+    """The array as compiled code takes it: contiguous and writable. A read-only array has another type in
+    Numba, so Numba would compile all functions again for it."""
     array = np.ascontiguousarray(array, dtype)
     return array if array.flags.writeable else array.copy()
 
 
 def _writable(array: ndarray) -> bool:
-    """Whether anyone can write to it, by the array that it is a view of too."""
+    """Whether the array's memory can be written to: through the array, through an array that it is a view of,
+    or, for memory that NumPy does not own, possibly through the owner (anything but bytes)."""
     owner: Any = array
     while isinstance(owner, ndarray):
         if owner.flags.writeable:
@@ -107,7 +108,7 @@ def numbers(value: object) -> ndarray | None:
 
 
 def _holds_boolean(value: object) -> bool:
-    """Whether nested lists hold a boolean; NumPy makes 0 or 1 of it beside numbers."""
+    """Whether nested lists hold a boolean, which NumPy would turn into 0 or 1 in a list with numbers."""
     if isinstance(value, list | tuple):
         return any(map(_holds_boolean, value))
     return isinstance(value, bool) or getattr(value, "dtype", None) == np.bool_
@@ -136,10 +137,10 @@ def rows(
     most: float = MAX_COORDINATE,
     meaning: str = "",
 ) -> ndarray:
-    """The value as `count` rows, None for one or more, of `columns` numbers within ±most.
+    """The value as an array of `count` rows (None: at least one row) of `columns` numbers within ±most.
 
-    Raises InputError, naming the field or its first wrong row, for anything else; `meaning` ends the sentence
-    about the right shape, e.g. ", a column for each joint".
+    Raises InputError, naming the field `name` or its first wrong row, for anything else. The message states
+    the right shape and then `meaning`, e.g. ", a column for each joint".
     """
     array = numbers(value)
     requirement = f"it must be {count or 'n'} x {columns} finite numbers{meaning}"
@@ -172,7 +173,7 @@ def points(owner: str, name: str, value: object) -> ndarray:
         more = "" if len(bad) == 1 else f" and {len(bad) - 1} more"
         rule = f"finite numbers within ±{MAX_COORDINATE:g} m"
         raise InputError(f"{owner}.{name}[{bad[0]}]{more} is {shown(row)}; it must be {rule}")
-    array.setflags(write=False)  # so that large ones are not copied once more
+    array.setflags(write=False)  # so that `Value` does not copy a large array
     return array
 
 
@@ -190,7 +191,10 @@ def positive(owner: str, name: str, value: object, most: float = MAX_COORDINATE)
 
 
 def unit_quaternion(owner: str, value: object, name: str = "wxyz") -> ndarray:
-    """The quaternion scaled to length 1; one of length 1 is returned unchanged, bit for bit."""
+    """The quaternion scaled to length 1. If its length is 1 already, its numbers are not changed at all.
+
+    Raises InputError, naming owner.name, unless it is four finite numbers that are not all zero.
+    """
     wxyz = vector(owner, name, value, 4)
     norm = np.linalg.norm(wxyz)
     if norm < 1e-6:
@@ -199,7 +203,11 @@ def unit_quaternion(owner: str, value: object, name: str = "wxyz") -> ndarray:
 
 
 def rigid_transform(what: str, value: object, slack: float = RIGID_SLACK) -> ndarray:
-    """The value as a 4 x 4 pose. Raises InputError, naming `what`, for anything else."""
+    """The value as a 4 x 4 pose, with the last row set to exactly 0 0 0 1.
+
+    Raises InputError, naming `what`, for other shapes, and if an entry of R R^T or of the last row is off by
+    more than `slack`.
+    """
     T = numbers(value)
     if T is None or T.shape != (4, 4) or not within(T):
         raise InputError(
@@ -219,9 +227,9 @@ def form(array: ndarray | None) -> str:
 
 
 MAX_NUMBERS = 8
-"""Arrays of more numbers than this are shown by their shape."""
+"""`short` shows an array of more numbers than this by its shape."""
 MAX_ENTRIES = 3
-"""Tuples and tables of more entries than this are shown by their number."""
+"""`short` shows a tuple or list of more entries than this by the number of its entries."""
 MAX_TEXT = 200
 """Longest text of a value [characters]."""
 
@@ -237,7 +245,7 @@ def one_line(value: Any) -> str:
 
 
 def short(value: Any) -> str:
-    """A short text of a value: of small arrays their numbers, of large ones their shape."""
+    """A short text of a value: the numbers of a small array, the shape of a large one."""
     if isinstance(value, ndarray):
         if value.size <= MAX_NUMBERS:
             return _numbers(value.tolist())

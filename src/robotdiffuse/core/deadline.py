@@ -6,10 +6,11 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 
 LONG = 0.2
-"""Steps shorter than this begin as long as any time is left [s]."""
+"""A step that takes less than this [s] begins if any time is left, even if less than the step takes. Timing
+may exceed the time limit by it."""
 _remaining: ContextVar[Callable[[], float] | None] = ContextVar("remaining", default=None)
 _cancel_check: ContextVar[Callable[[], None] | None] = ContextVar("cancel_check", default=None)
-# Ends of the message "the time limit is too short ...".
+# Work for which too little time is left; the words end the message "the time limit is too short ...".
 PREPARING = "to prepare the scene"
 TIMING = "for timing"
 
@@ -20,7 +21,7 @@ class OutOfTimeError(Exception):
     def __init__(self, step: str, what: str = PREPARING) -> None:
         super().__init__(step)
         self.what = what
-        """what: PREPARING or TIMING, the work that the step is part of."""
+        """PREPARING or TIMING: the work that the step is part of."""
 
 
 @contextmanager
@@ -57,8 +58,8 @@ def check_cancelled() -> None:
 def check_timing(step: str, seconds: float = 0.0) -> None:
     """`check_time` for a step of timing, which may run up to LONG past the time limit.
 
-    Planners reserve as much time as timing took in earlier calls, so it rarely exceeds the limit. If it does,
-    the overrun lets a path that was found late be returned.
+    Planners reserve time for timing (`PlanningContext.search_until`), so timing rarely exceeds the limit. The
+    overrun allows a planner to return a path that was found late.
     """
     _check(step, seconds, TIMING, LONG)
 

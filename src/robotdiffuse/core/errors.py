@@ -20,8 +20,8 @@ MAX_NAMES = 100
 class InputError(ValueError):
     """Bad input. The message is one line that names the field, its value and what would be right.
 
-    Each entry of `listed` is a further line below it. The command line prints the message and exits with
-    status 2.
+    Each entry of `listed` is a further, indented line of the message. The command line prints the message and
+    exits with status 2.
     """
 
     def __init__(self, message: str = "", listed: Iterable[str] = ()) -> None:
@@ -41,8 +41,8 @@ class OutputError(InputError):
 
 @contextmanager
 def located(where: object) -> Iterator[None]:
-    """Within the block, the message of an InputError gets the place `where` in front, unless it begins with
-    it."""
+    """Within the block, `where: ` is put before the message of an InputError, unless the message begins with
+    `where`."""
     try:
         yield
     except InputError as error:
@@ -53,8 +53,8 @@ def located(where: object) -> Iterator[None]:
 
 @contextmanager
 def reading(file: object) -> Iterator[None]:
-    """As `located`, for reading a file. An error of another kind becomes an InputError that says that the
-    file is damaged."""
+    """As `located`, for reading a file. Any exception other than InputError becomes an InputError that says
+    that the file is damaged."""
     try:
         with located(file):
             yield
@@ -66,7 +66,8 @@ def reading(file: object) -> Iterator[None]:
 
 @contextmanager
 def needs(package: str, extra: str) -> Iterator[None]:
-    """Within the block, an ImportError becomes an InputError that names the extra to install."""
+    """Within the block, an ImportError becomes an InputError that names the package and the optional
+    dependencies (`robotdiffuse[extra]`) to install."""
     try:
         yield
     except ImportError:
@@ -75,8 +76,8 @@ def needs(package: str, extra: str) -> Iterator[None]:
 
 
 def check_type(what: str, value: object, kind: type | tuple[type, ...], wanted: str) -> None:
-    """Raises InputError unless the value is of one of these types; `wanted` says in the message what the
-    value must be."""
+    """Raises InputError unless the value is an instance of `kind`. The message says that it must be
+    `wanted`."""
     if not isinstance(value, kind):
         raise InputError(f"{what} is {shown(value)}; it must be {wanted}")
 
@@ -84,16 +85,16 @@ def check_type(what: str, value: object, kind: type | tuple[type, ...], wanted: 
 def check_list(
     what: str, value: Any, kinds: type | tuple[type, ...] | UnionType, wanted: str, least: int = 0
 ) -> None:
-    """Raises InputError unless the value is a list of at least `least` instances of these types; `wanted`
-    names them."""
+    """Raises InputError unless the value is a list or tuple of at least `least` instances of `kinds`. The
+    message says that it must be a list of `wanted`."""
     of_kind = isinstance(value, list | tuple) and all(isinstance(entry, kinds) for entry in value)
     if not of_kind or len(value) < least:
         raise InputError(f"{what} is {shown(value)}; it must be a list of {wanted}")
 
 
 def distinct(*values: float | int, digits: int = 6) -> list[str]:
-    """The numbers as texts, for messages that compare them. Different numbers get different texts, with more
-    digits than `digits` if necessary."""
+    """The numbers as texts of `digits` digits, for messages that compare numbers. Where different numbers
+    would have equal texts, all texts have more digits."""
     texts = [f"{value:.{digits}g}" for value in values]
     if len({*texts}) < len({*values}) and digits < 17:
         return distinct(*values, digits=digits + 1)
@@ -108,13 +109,13 @@ def shown(value: object) -> str:
         value = value[: MAX_QUOTE + 1]
     try:
         text = repr(value)
-    except (ValueError, RecursionError):  # an integer of too many digits, lists within lists
+    except (ValueError, RecursionError):  # an integer of too many digits; lists nested too deeply
         text = f"a very long {type(value).__name__}"
     return shortened(text)
 
 
 def shortened(text: str) -> str:
-    """Foreign text as one short printable line."""
+    """Text from a file or a user as one printable line of at most MAX_QUOTE characters."""
     text = " ".join(_printable(text).split())
     return text if len(text) <= MAX_QUOTE else text[: MAX_QUOTE - 3] + "..."
 
@@ -139,7 +140,8 @@ def unknown_name(what: str, name: object, known: Iterable[object]) -> InputError
 
 
 def suggestion(name: object, known: Iterable[str]) -> str:
-    """The end of a message about an unknown name: the known name that is most like it, or nothing."""
+    """The end of a message about an unknown name: "; did you mean ...?" with the most similar known name;
+    empty if none is similar."""
     similar = get_close_matches(str(name)[:MAX_WORD], list(known)[:MAX_NAMES], n=1)
     return f"; did you mean {similar[0]}?" if similar else ""
 

@@ -43,7 +43,8 @@ _closed: ContextVar[bool] = ContextVar("closed", default=False)
 
 @contextmanager
 def no_files() -> Iterator[None]:
-    """Within the block, no file is read and none is said to exist: for requests from the network."""
+    """Within the block, `is_file` returns False and `input_file` raises InputError: for requests from the
+    network, which must not read files."""
     before = _closed.set(True)
     try:
         yield
@@ -52,16 +53,17 @@ def no_files() -> Iterator[None]:
 
 
 def file_name(file: object, what: str = "file") -> Path:
-    """The path that a name stands for; InputError for what is neither text nor a path or is too long."""
+    """The name as a path. Raises InputError, naming `what`, for a value that is neither text nor a path, and
+    for a name that is too long."""
     if not isinstance(file, str | os.PathLike):
         raise InputError(f"{what} is {shown(file)}; it must be the name of a file, a text or a pathlib.Path")
     path = Path(file)
     try:
         os.lstat(path)
     except OSError as error:
-        if error.errno == errno.ENAMETOOLONG:  # pathlib would raise it where it looks for the file
+        if error.errno == errno.ENAMETOOLONG:  # pathlib would raise this OSError later, at the first access
             raise InputError(f"{what} {path}: {error.strerror}") from None
-    except ValueError:  # such a name is refused where the file is read
+    except ValueError:  # a NUL in the name; `input_file` raises InputError for it
         pass
     return path
 
@@ -123,7 +125,7 @@ def read_text(file: str | Path, what: str = "", largest: int = MAX_FILE_SIZE) ->
 
 
 def read_arrays(file: str | Path) -> dict[str, ndarray]:
-    """The arrays of an .npz file by name; that of an .npy file under the name "".
+    """The arrays of an .npz file by name. The array of an .npy file has the name "".
 
     Raises InputError as `input_file` does, for damaged files, and for archives that unpack to more than
     MAX_FILE_SIZE.
@@ -233,12 +235,12 @@ class _Composer:
         self.where = where
         self.count = 0
         self.anchors: dict[str, tuple[Any, int]] = {}
-        """Value of each anchor, and the number of values within it."""
+        """Value of each anchor, and the number of values that it contains, itself included."""
 
     def document(self) -> Any:
         loader = self.loader
         value = None
-        loader.get_event()  # of the stream
+        loader.get_event()  # the start of the stream
         if not loader.check_event(yaml.StreamEndEvent):
             loader.get_event()
             value = self._node(0)

@@ -1,5 +1,5 @@
-"""Loading time: compiling code, reading compiled code from the cache, importing modules, and building what is
-built once per robot. It is not counted in the time of a planning call."""
+"""Loading time: the time spent on compiling code, reading compiled code from the cache, importing modules,
+and building the arrays of a robot. The planning time of a call excludes loading time."""
 
 import threading
 import time
@@ -12,18 +12,18 @@ class _Clock(threading.local):
 
     loading = compiling = began = 0.0
     depth = 0
-    """Number of blocks of `loading` that the thread is in."""
+    """Number of nested blocks of `loading` that the thread is in."""
     compiles = False
-    """Whether code was compiled in the outermost of these blocks."""
+    """Whether code was compiled since the outermost block of `loading` began."""
     noted = 0.0
     """The value of `compiling` at the last `compile_note` [s]."""
 
 
 _clock = _Clock()
 compiled: list[str] = []
-"""Names of the functions that this process has compiled, or has begun to; for progress."""
+"""Names of the functions that this process has compiled or is compiling; for reports of progress."""
 on_first_compilation: Callable[[], None] | None = None
-"""Called once, when a function is compiled."""
+"""Called when this process begins to compile its first function; then set to None."""
 
 
 @contextmanager
@@ -65,8 +65,7 @@ def compiles(name: str) -> None:
 
 
 def loading_seconds() -> float:
-    """Time that this thread has spent on loading so far [s], including the time in a block that has not ended
-    yet."""
+    """Time that this thread has spent on loading so far [s], including the current block of `loading`."""
     return _clock.loading + (time.perf_counter() - _clock.began if _clock.depth else 0.0)
 
 
@@ -76,7 +75,7 @@ def compile_seconds() -> float:
 
 
 def compile_note() -> str:
-    """A note on the compile time of this thread; empty if none has passed since the last note."""
+    """A note for users on this thread's compile time; empty if nothing was compiled since the last note."""
     if _clock.compiling == _clock.noted:
         return ""
     _clock.noted = _clock.compiling

@@ -9,7 +9,7 @@ from weakref import WeakKeyDictionary
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 _locks: "WeakKeyDictionary[object, Any]" = WeakKeyDictionary()
-# One for each object, not in the object: objects can be copied and pickled, locks cannot.
+# The locks are kept outside of their objects, since objects are copied and pickled and locks cannot be.
 _table = Lock()
 
 

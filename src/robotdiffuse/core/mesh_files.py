@@ -41,11 +41,11 @@ NO_GEOMETRY = frozenset(
 """Elements of Collada that contain no geometry. They are removed before reading, since trimesh also drops
 geometry if one of them is damaged."""
 BYTES_PER_USE = 30_000
-"""Memory that each use of a part of a geometry in a Collada scene is assumed to take, in addition to its
-indices [bytes]."""
+"""Estimated memory of each use of a geometry's part in a Collada scene, without the part's indices
+[bytes]."""
 MAX_ACCESSED = 20_000_000
-"""Maximum number of elements of all accessors of a glTF file: those without a buffer take no bytes in the
-file."""
+"""Maximum number of elements of all accessors of a glTF file. The file's size does not bound this number,
+since an accessor without a buffer takes no bytes."""
 
 # trimesh logs a traceback of each error that it raises; without a handler, logging prints it on standard
 # error
@@ -57,16 +57,16 @@ def read_triangles(
 ) -> tuple[ndarray, ndarray]:
     """Vertices [v, 3] and faces [f, 3] of a mesh file, with z up.
 
-    Collada is read in meters by its <unit>, other formats in the units of the file. Collada with another
-    <up_axis>, and glTF, which has y up, are turned.
+    Collada is converted to meters by its <unit>; vertices of other formats keep the units of the file. glTF,
+    which has y up, and Collada files with another <up_axis> than z are rotated so that z is up.
 
     Args:
-        file: Of a format in MESH_FORMATS. Materials and images are not read.
-        merge: Whether vertices at the same place are joined.
+        file: A file with an ending in MESH_FORMATS. Materials and images are not read.
+        merge: Whether vertices with equal coordinates are merged.
         notes: Receives a note if the file is turned or scaled.
 
     Raises:
-        InputError: As `input_file` does, for other formats, and for empty or damaged files.
+        InputError: For files that `input_file` refuses, other formats, and empty or damaged files.
     """
     import trimesh
 
@@ -152,9 +152,15 @@ def _weight(
     known: dict[str, int | None],
     depth: int,
 ) -> int:
-    """Length of the indices of the geometries that a Collada node and those below it use, in characters.
+    """Estimated memory [bytes] of the geometries that a Collada node and its descendants use: the sum of
+    `weights`, with each use of a geometry counted.
 
-    known: results by node; None while one is being computed.
+    Args:
+        node: The node.
+        nodes: All nodes of the file by URL, such as "#arm".
+        weights: Memory of one use of each geometry, by URL [bytes].
+        known: Results by URL of a node; None while the result is being computed.
+        depth: Nesting of the node below the scene.
     """
     if depth > MAX_DEPTH:
         raise InputError(f"its nodes are nested more than {MAX_DEPTH} levels deep")
@@ -194,7 +200,7 @@ def _buffer_resolver(mesh: Path) -> Any:
         size = 0
 
         def get(self, name: str) -> Any:
-            for place in (name.strip(), name.strip().lstrip("/"), Path(name).name):  # which trimesh tries
+            for place in (name.strip(), name.strip().lstrip("/"), Path(name).name):  # as trimesh tries them
                 file = Path(self.parent, place)
                 if os.path.lexists(file):
                     input_file(file)

@@ -13,7 +13,8 @@ from typing import Any, BinaryIO
 from robotdiffuse.core.errors import InputError, OutputError, shown
 from robotdiffuse.core.input_files import file_name
 
-# errors of the disk (full, over a quota, file too large, input/output error) rather than of the file's name
+# Errors of the disk (full, over a quota, file too large, input/output error), which another file name would
+# not avoid.
 DISK_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
@@ -26,12 +27,13 @@ def write_error(file: Path, error: OSError) -> InputError:
 def write_atomically(
     file: Path, content: str | bytes | Callable[[BinaryIO], object], make_folder: bool = False
 ) -> None:
-    """Write a temporary file and rename it over `file`, so that no reader sees it half written.
+    """Write a temporary file and rename it to `file`, so that no reader sees `file` half written.
 
     content: text, bytes, or a function that writes to a stream.
+    make_folder: whether to make the folder of `file` if it does not exist.
 
-    If writing fails or is interrupted, the old file stays as it is. Raises InputError if the file cannot be
-    written, and its subclass OutputError if the disk is full.
+    If writing fails or is interrupted, an existing `file` keeps its content. Raises InputError if the file
+    cannot be written, and its subclass OutputError for an error of the disk, such as a full one.
     """
     temporary = file.with_name(f".{file.name}.{secrets.token_hex(8)}.tmp")
     try:
@@ -70,13 +72,13 @@ def check_output(file: str | Path, endings: tuple[str, ...]) -> Path:
 
 
 class JsonLines:
-    """A file of JSON objects, one per line. `append` returns once the row is on disk. Without a file, rows
+    """A file of JSON objects, one per line. `append` returns once the row is on disk. If `file` is None, rows
     are kept in memory only."""
 
     def __init__(self, file: Path | None) -> None:
-        """Read the existing rows; a last line that was cut off is dropped.
+        """Read the existing rows. A last line without a line break, as a killed process leaves, is ignored.
 
-        Raises InputError, naming file and line, for any other line that is not a JSON object.
+        Raises InputError, naming file and line, for a complete line that is not a JSON object.
         """
         self.rows: list[dict[str, Any]] = []
         self._file = file
@@ -100,14 +102,14 @@ class JsonLines:
             write_atomically(self._file, "".join(json.dumps(row) + "\n" for row in rows), make_folder=True)
 
     def append(self, row: dict[str, Any]) -> None:
-        """Add a row and flush it to the disk. If that fails, neither the file nor `rows` has it."""
+        """Add a row and flush it to the disk. If writing fails, the row is in neither the file nor `rows`."""
         if self._file is not None:
             self._write(self._file, json.dumps(row) + "\n")
         self.rows.append(row)
 
     def _write(self, file: Path, line: str) -> None:
         if self._without_cut_line is not None:
-            # removed only now: when the file was read, another process may still have been writing this line
+            # The cut line is removed here and not on reading, when another process could still be writing it.
             write_atomically(file, self._without_cut_line)
             self._without_cut_line = None
         file.parent.mkdir(parents=True, exist_ok=True)

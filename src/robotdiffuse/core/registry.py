@@ -29,16 +29,17 @@ class Entry:
     kind: str = ""
     """Category within its registry, e.g. search or learned for planners."""
     supports: frozenset[str] = frozenset()
-    """Features that not every entry of the registry supports, e.g. path constraints for planners."""
+    """The optional features that the entry supports, e.g. path constraints for a planner."""
 
 
 class AddedEntries(NamedTuple):
     """What a program has added to the package's tables."""
 
     tables: dict[str, dict[str, Entry]]
-    """Entries by the kind of their registry, then by name."""
+    """Added entries by registry (`Registry.what`), then by name."""
     modules: tuple[str, ...]
-    """Modules of `import_modules`, which may add to other tables too, such as that of metrics."""
+    """Modules that `import_modules` imported; they may also add to tables that are no Registry, such as the
+    table of metrics."""
 
 
 _tables: dict[str, "Registry"] = {}
@@ -56,7 +57,8 @@ def added_entries() -> AddedEntries:
 
 
 def adopt_entries(added: AddedEntries) -> None:
-    """Import the parent process's modules, and add its entries to all registries, those created later too."""
+    """Import the modules of the parent process and add its entries to the registries of this process,
+    including registries that are created later."""
     import_modules(added.modules)
     _adopted.update(added.tables)
     for registry in _tables.keys() & added.tables.keys():
@@ -64,18 +66,19 @@ def adopt_entries(added: AddedEntries) -> None:
 
 
 class Registry(dict[str, Entry]):
-    """Entries by name, in the order of listing. A program may add its own:
+    """Entries by name, in the order of listing. A program may add an entry:
 
     PLANNERS["mine"] = Entry("my_package.planner:MyPlanner", "what it does", "MySettings")
 
-    Worker processes get them too.
+    Worker processes get added entries too.
     """
 
     def __init__(self, what: str, entries: dict[str, Entry], group: str = "") -> None:
         """
         what: the kind of entry in error messages, e.g. "planner".
-        group: the group of entry points by which installed packages add an Entry each, e.g.
-            "robotdiffuse.planners"; empty for none.
+        entries: the package's own entries.
+        group: the group of entry points, e.g. "robotdiffuse.planners", in which an installed package may name
+            an Entry; empty if packages cannot add entries.
         """
         super().__init__(entries | _adopted.get(what, {}))
         self.what = what
@@ -85,14 +88,15 @@ class Registry(dict[str, Entry]):
 
     @cached_property
     def _installed(self) -> dict[str, EntryPoint]:
-        """Entry points of installed packages by name. Looking for them takes 20 ms, so it is done late."""
+        """Entry points of installed packages by name. The search takes 20 ms, so it runs on first use."""
         return {point.name: point for point in entry_points(group=self.group)} if self.group else {}
 
     def __contains__(self, name: object) -> bool:
         return super().__contains__(name) or name in self._installed
 
     def __missing__(self, name: str) -> Entry:
-        """The entry that an installed package gives. Raises InputError if it cannot be loaded."""
+        """The entry that the entry point of an installed package names. Raises InputError if the entry point
+        cannot be loaded."""
         point = self._installed[name]
         try:
             entry = point.load()
@@ -156,9 +160,9 @@ class Registry(dict[str, Entry]):
 
 
 def import_modules(names: Iterable[str]) -> None:
-    """Import modules, from the current folder too, that add entries to the registries.
+    """Import modules that add entries to the registries; modules in the current folder are found too.
 
-    Raises InputError for one that cannot be imported.
+    Raises InputError for a module that cannot be imported.
     """
     for name in names:
         if os.getcwd() not in sys.path:

@@ -24,7 +24,7 @@ from robotdiffuse.core.types import (
 )
 
 PROBLEM_ENDINGS = (".yaml", ".yml", ".jsonl")
-"""Endings of problem files that no result has."""
+"""Endings that problem files may have and result files never have."""
 NO_PROBLEM = "without its problem"
 """Beginning of the note with the reason why a result was saved without its problem."""
 REQUIRED = ("status", "reason", "planner", "robot", "joint_names", "planning_time", "verified", "seed")
@@ -32,21 +32,22 @@ REQUIRED = ("status", "reason", "planner", "robot", "joint_names", "planning_tim
 
 @dataclass(frozen=True, eq=False)
 class PlanResult:
-    """The answer of a planner. `path` is set if and only if `status` is SOLVED, and then it passed
+    """The answer of a planner. `path` is set if and only if `status` is SOLVED; every such path has passed
     `verify`.
 
-    What a result without a motion lacks is None; to type checkers it may be anything, so that code for
-    solved results needs no assertions.
+    Fields that describe a motion are None if there is none. They are annotated with Any, so that type
+    checkers ask for no assertions in code for solved results.
     """
 
     status: Status
     reason: str
-    """A sentence that says why there is no motion and what to do; for SOLVED, which part of the planner found
-    it."""
+    """A sentence. SOLVED: which part of the planner found the path; otherwise why there is no motion and what
+    to do."""
     planner: str
     robot: str
     planning_time: float
-    """Wall time of plan() [s], including verification, without time parameterization."""
+    """Wall time of plan() until the returned path is validated [s], without loading time; the path's final
+    time parameterization follows and does not count."""
     seed: int
     stage: str = ""
     """The part of the planner that produced the path, e.g. 'aorrtc', 'straight_line', 'network'."""
@@ -62,34 +63,34 @@ class PlanResult:
     notes: tuple[str, ...] = field(default=())
     """Input that was changed or ignored, e.g. a start clamped to a limit."""
     goal_index: int | None = None
-    """Which goal of an `AnyGoal`, or which row of several goal configurations, the motion ends at, from 0 on;
-    0 for a single goal, None without a motion."""
+    """Index from 0 of the goal where the motion ends, among the goals of an `AnyGoal` or the rows of several
+    goal configurations; 0 for a single goal, None without a motion."""
     progress: tuple[tuple[float, float], ...] = ()
-    """Time [s since the call] and joint-space length [rad] of each shorter path; the last pair is the
-    returned path."""
+    """Time [s since the call] and joint-space length [rad] of each path that was shorter than all before; the
+    last pair is the returned path."""
     refused: str = ""
     """`Violation.kind` of the last path that the validator rejected; "" if it rejected none."""
     assumption: str = ""
-    """Problems with views: the assumption about unknown space that the motion was planned under, e.g. "points
-    padded by 9 cm"; "as seen" assumes no obstacles there. "" without views."""
+    """Problems with camera views: the assumption about unknown space under which the motion was planned, e.g.
+    "points padded by 9 cm". "as seen" assumes that unknown space has no obstacles. "" without views."""
     confidence: float | None = None
-    """Problems with views: probability that the motion is free of obstacles in unknown space. `verified`
-    covers observed obstacles only."""
+    """Problems with camera views: probability that the motion hits no obstacle in unknown space. `verify`
+    checks observed obstacles only."""
     swept_probability: float | None = None
     """Sum of the predicted occupancy probabilities of all unknown voxels that the motion sweeps; None without
     the predicted policy for unknown space."""
     unknown_region: tuple[tuple[float, ...], tuple[float, ...]] | None = None
-    """Lower and upper corner, in the base frame [m], of a box around the crossed unknown space that is most
-    likely occupied; None if the motion crosses none."""
+    """Lower and upper corner, in the base frame [m], of a box around the most probably occupied part of the
+    unknown space that the motion crosses; None if it crosses no unknown space."""
     fraction: float | None = None
-    """Problems with a Cartesian line: what fraction of the line can be followed from the start, 1 if there is
-    a motion; `reason` says what stops it there."""
+    """Problems with a Cartesian line: the fraction of the line that the arm can follow from the start, 1 if
+    there is a motion. If it is below 1, `reason` says what stops the arm."""
     corner_deviations: tuple[float, ...] | None = field(default=None, repr=False)
-    """How far the motion may leave each waypoint of the path [rad, joint-space L2]; None: the default of
-    timing. Files do not hold it."""
+    """How far the motion may pass each waypoint of the path, where it rounds the corner [rad, joint-space
+    L2]; None: `TimingSettings.corner_deviation`. Result files omit this field."""
     trees: tuple[Tree, ...] = field(default=(), repr=False)
-    """Search trees from the start and from the goals, when the shortest path was found or time ran out. Only
-    if the planner's setting `keep_trees` is true; files do not hold them."""
+    """Search trees from the start and from the goals, when the shortest path was found or time ran out. Empty
+    unless the planner's setting `keep_trees` is true; result files omit them."""
     problem: Any = field(default=None, repr=False)
     """The `Problem`, which `save` and `rd.show` use; None in results read from files."""
 
@@ -122,10 +123,9 @@ class PlanResult:
         """Write the result.
 
         Args:
-            file: A .json file for everything, with the problem as in a problem file, or a .csv file for the
-                trajectory alone.
-            problem: The content of a problem file; None: the problem of the result. A robot that is neither
-                bundled nor read from a file has no name; then the file holds no problem, and a note says so.
+            file: A .json file for the result and its problem, or a .csv file for the trajectory alone.
+            problem: The content of a problem file; None: the result's own problem. If its robot is neither
+                bundled nor read from a file, the file holds no problem, and a note says so.
 
         Raises:
             InputError: For another ending, a file that cannot be written, or .csv without a trajectory.
@@ -238,7 +238,8 @@ READERS: dict[str, Callable[[str, Any], Any]] = {
     "unknown_region": lambda name, value: _rows(name, value, 2, 3),
     "fraction": _number,
 }
-"""Fields that files hold as they are, in this order, and what reads them."""
+"""Fields that result files hold under the same name, in this order, with the function that checks and
+converts each value."""
 NONE_ALLOWED = {"progress"} | {f.name for f in fields(PlanResult) if f.default is None}
 
 

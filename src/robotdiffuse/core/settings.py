@@ -42,7 +42,7 @@ class Bound:
     infinite: bool = False
 
     def problem(self, value: Any) -> str | None:
-        """The rule that the value breaks; None if it is within the bounds."""
+        """What the value must be but is not, such as "at least 1"; None if it is within the bounds."""
         within = (
             (self.above is None or value > self.above)
             and (self.least is None or value >= self.least)
@@ -92,9 +92,10 @@ class Filled:
 
 @dataclass(frozen=True)
 class SettingsOf:
-    """Settings of the registry entry that another field names, such as `denoiser_settings` for `denoiser`.
+    """Marks a field with the settings of the registry entry that another field names: `denoiser_settings` has
+    the settings of the entry `denoiser`.
 
-    The value is None if the other field does not hold a name of the registry but, for example, a folder.
+    The value is None if the other field holds no name of the registry but, for example, a folder.
     """
 
     field: str
@@ -122,7 +123,8 @@ class Setting(NamedTuple):
 
     @property
     def value(self) -> str:
-        """The default in the form that `Settings.changed` takes; "..." if that is long."""
+        """The default in the form that `Settings.changed` takes; "..." if it has more than LONG
+        characters."""
         plain = self.default is None or isinstance(self.default, bool)
         text = str(self.default).lower() if plain else str(self.default)
         return text if len(text) <= LONG else "..."
@@ -145,7 +147,7 @@ class Settings:
             cls.settings_name = name
 
     def __post_init__(self) -> None:
-        """Turns lists into tuples, and NumPy's numbers into Python's.
+        """Converts lists to tuples, and numbers of NumPy to Python's int and float.
 
         Raises InputError for the first field of the wrong type or out of bounds.
         """
@@ -159,10 +161,10 @@ class Settings:
 
     @classmethod
     def from_json(cls: type[Given], values: object, where: str) -> Given:
-        """The settings of `to_json`.
+        """The settings from the values that `to_json` returned.
 
-        Raises InputError, with `where` before the field, for one that is unknown, missing, of the wrong type
-        or out of bounds.
+        Raises InputError, naming `where` and the field, for a field that is unknown, missing, of the wrong
+        type or out of bounds.
         """
         if not isinstance(values, dict):
             raise InputError(f"{where} is {shown(values)}; it must be a table of settings")
@@ -177,7 +179,8 @@ class Settings:
         for name, field in fields.items():
             if name in values:
                 at = f"{where}.{name}"
-                # no settings are given, so the name in the other field need not be in a registry
+                # without settings, the name in the other field may be no entry of the registry, so it is not
+                # looked up
                 kind = None if values[name] is None else _settings_class(hints[name], values, fields)
                 if kind is not None:
                     converted[name] = kind.from_json(values[name], at)
@@ -213,7 +216,8 @@ class Settings:
         return self.replaced(values)
 
     def replaced(self: Given, values: Mapping[str, Any]) -> Given:
-        """A copy with some settings replaced: {"step": 0.5, "guidance.margin": 0.02}, or nested tables.
+        """A copy with some settings replaced: {"step": 0.5, "guidance.margin": 0.02}, or with nested settings
+        as a table, {"guidance": {"margin": 0.02}}.
 
         Raises InputError as `changed` does.
         """
@@ -272,7 +276,7 @@ def _split(hint: Any) -> tuple[Any, tuple[Any, ...]]:
 
 
 def _fits(hint: Any, value: Any) -> bool:
-    """Whether a value is of a type; entries of tuples are not looked at."""
+    """Whether a value is of a type; the entries of a tuple are not checked."""
     for option in _options(_split(hint)[0]):
         bare = _split(option)[0]
         kind = get_origin(bare) or bare
@@ -289,10 +293,10 @@ def _fits(hint: Any, value: Any) -> bool:
 
 
 def _converted(where: str, hint: Any, value: Any, owner: object = None) -> Any:
-    """The value as its field keeps it: lists as tuples, other kinds of numbers, such as NumPy's, as Python's.
+    """The value as its field stores it: a list as a tuple, a number of NumPy as Python's int or float.
 
-    owner: the settings that hold the field, once all their fields are set. Raises InputError for a value of
-    the wrong type or out of bounds.
+    owner: the settings object, for marks that compare the field with another; None before it exists. Raises
+    InputError for a value of the wrong type or out of bounds.
     """
     if not _fits(hint, value):
         raise InputError(f"{where} is {shown(value)}; it takes {_rule(hint)}")

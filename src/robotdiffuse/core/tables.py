@@ -26,11 +26,11 @@ class Column:
     format: str = ""
     """Format of numbers, such as `.2f`; empty: all digits."""
     better: Literal["more", "less", ""] = ""
-    """Which values are best and so marked."""
+    """Whether the largest or the smallest value is the best, which is marked; "": no value is marked."""
     left: bool = False
-    """Whether texts are aligned left, as in the first column."""
+    """Whether texts are aligned left; those of the first column always are."""
     scale: float = 1.0
-    """Shown units per unit of the values."""
+    """Factor from a cell's number to the shown number, such as 1000 from s to ms."""
 
     @property
     def title(self) -> str:
@@ -38,7 +38,7 @@ class Column:
 
 
 class Figure(NamedTuple):
-    """A text and the number behind it, by which the best figure is found."""
+    """A text to show, and the number by which it is compared with other figures of its column."""
 
     text: str
     value: float
@@ -87,8 +87,8 @@ class Table:
 
     @property
     def best(self) -> set[tuple[int, int]]:
-        """Row and column of the best figures of each column, compared as shown; none if more than half of the
-        rows have it."""
+        """Row and column of each best figure. Figures that are shown alike are equally good. A column has no
+        best figure if more than half of the rows share it."""
         places: set[tuple[int, int]] = set()
         for j, column in enumerate(self.columns):
             values = {i: _value(row[j]) for i, row in enumerate(self.rows)}
@@ -96,8 +96,8 @@ class Table:
             if column.better and finite:
                 best = (max if column.better == "more" else min)(finite.values())
                 texts = {_text(self.rows[i][j], column) for i, value in finite.items() if value == best}
-                level = [i for i in finite if _text(self.rows[i][j], column) in texts]
-                places |= {(i, j) for i in level if 2 * len(level) <= len(self.rows)}
+                winners = [i for i in finite if _text(self.rows[i][j], column) in texts]
+                places |= {(i, j) for i in winners if 2 * len(winners) <= len(self.rows)}
         return places
 
     def at_left(self, j: int) -> bool:
@@ -148,7 +148,7 @@ def terminal(table: Table) -> "RichTable":
 
 def show(*tables: Table, width: int | None = None) -> None:
     """Print tables as wide as the terminal, or as WIDTH without one."""
-    # pairs are printed without rich, whose import takes longer than a plan
+    # Tables of pairs are printed without rich: importing it takes longer than planning a motion.
     if all(len(table.columns) == 2 and not table.headed for table in tables):
         columns = width or (shutil.get_terminal_size().columns if sys.stdout.isatty() else WIDTH)
         print("\n\n".join("\n".join(pair_lines(table, columns)) for table in tables))
@@ -202,6 +202,5 @@ def markdown(table: Table) -> list[str]:
 
 
 def plain(text: str) -> str:
-    """Escape a text for Markdown: characters of formatting and columns; an underscore within a word is
-    neither."""
+    """The text with Markdown's special characters escaped, except underscores within a word."""
     return re.sub(r"[\\|*<`]|(?<!\w)_|_(?!\w)", r"\\\g<0>", text)

@@ -17,7 +17,7 @@ IDENTITY = np.eye(4)
 
 def rotation_from_quaternion(wxyz: Float[ndarray, "*b 4"]) -> Float[ndarray, "*b 3 3"]:
     """Rotation matrix of a quaternion, normalized first."""
-    if wxyz.ndim == 1:  # plain floats: NumPy takes several times as long for four numbers
+    if wxyz.ndim == 1:  # Python floats: for four numbers, NumPy takes several times as long
         w, x, y, z = wxyz.tolist()
         norm = math.sqrt(w * w + x * x + y * y + z * z)
         return np.array(_rotation(w / norm, x / norm, y / norm, z / norm))
@@ -27,7 +27,7 @@ def rotation_from_quaternion(wxyz: Float[ndarray, "*b 4"]) -> Float[ndarray, "*b
 
 
 def _rotation(w: Any, x: Any, y: Any, z: Any) -> list[list[Any]]:
-    """The rows of the matrix of a unit quaternion, or of arrays of them."""
+    """The rotation matrix of a unit quaternion as rows of entries; its components may be arrays."""
     return [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -105,10 +105,11 @@ def pose(xyz: ArrayLike, *, wxyz: ArrayLike | None = None, rpy: ArrayLike | None
     Args:
         xyz: Position [m].
         wxyz: Rotation as a quaternion, scalar first, of any length.
-        rpy: Rotation as roll, pitch and yaw in the order of URDFs [rad]; without both there is none.
+        rpy: Rotation as roll, pitch and yaw in the order of URDFs [rad]. Without wxyz and rpy, the rotation
+            is the identity.
 
     Raises:
-        InputError: For both rotations, and for anything but finite numbers.
+        InputError: If wxyz and rpy are given, and for anything but finite numbers.
     """
     if wxyz is not None and rpy is not None:
         raise InputError("pose has wxyz and rpy; give one of them")
@@ -131,17 +132,17 @@ def inverse(T: Pose) -> Pose:
 
 
 def placed(T: Pose, points: Points) -> Points:
-    """Points of a frame in the frame in which its pose is T."""
+    """Points p_b of a frame b in frame a: T_a_b @ p_b, where T is the pose T_a_b."""
     return points @ T[:3, :3].T + T[:3, 3]
 
 
 def moved_spheres(T: Pose, spheres: Spheres) -> Spheres:
-    """Spheres x y z radius of a frame in the frame in which its pose is T."""
+    """Spheres (x y z radius) of a frame b in frame a, where T is the pose T_a_b."""
     return np.column_stack([placed(T, spheres[:, :3]), spheres[:, 3]])
 
 
 def ball_around(points: Points) -> tuple[Vector, float]:
-    """Center and radius of a ball around points: about the middle of their box."""
+    """Center and radius [m] of a ball that contains the points; its center is that of their bounding box."""
     center = (points.min(axis=0) + points.max(axis=0)) / 2
     return center, float(np.linalg.norm(points - center, axis=1).max())
 

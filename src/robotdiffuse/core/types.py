@@ -21,15 +21,16 @@ from robotdiffuse.core.output_files import check_output, write_atomically
 Configuration = Float[ndarray, "dof"]
 """Joint positions [rad], [m] for prismatic joints."""
 AnyConfiguration = ArrayLike | Mapping[str, float]
-"""A configuration as numbers, as values by joint, or as the name of a pose."""
+"""A configuration as numbers in the order of the joints, as a table of values by joint name, or as the name
+of one of the robot's poses."""
 Configurations = Float[ndarray, "_ dof"]
-"""Configurations in rows, such as waypoints, samples and goals."""
+"""Configurations as rows, such as waypoints, samples and goals."""
 JointValues = Float[ndarray, "dof"]
 """A number for each joint, such as its limit, velocity or effort."""
 JointRows = Float[ndarray, "_ dof"]
-"""Numbers for each joint in rows, such as velocities along a motion."""
+"""Rows with a number for each joint, such as velocities along a motion."""
 Values = Float[ndarray, "_"]
-"""A number for each of many things, such as times, places and distances."""
+"""A list of numbers, such as times, arc lengths and distances."""
 Points = Float[ndarray, "_ 3"]
 """[m]"""
 Vector = Float[ndarray, "3"]
@@ -40,9 +41,9 @@ Pose = Float[ndarray, "4 4"]
 """A rigid transform."""
 Poses = Float[ndarray, "_ 4 4"]
 Spheres = Float[ndarray, "_ 4"]
-"""Centers and radii in rows [m]."""
+"""Rows of center x y z and radius [m]."""
 Mask = Bool[ndarray, "_"]
-if TYPE_CHECKING:  # fields of values, whose constructors take all that NumPy reads as arrays
+if TYPE_CHECKING:  # types of fields that hold arrays and can be set from anything that NumPy converts to one
 
     class _Given:
         def __get__(self, owner: Any, kind: Any = None) -> ndarray: ...
@@ -68,19 +69,19 @@ else:
     PoseOrNone = Pose | None
     ArrayOrNone = ndarray | None
 ROWS = ("positions", "velocities", "accelerations")
-"""Arrays of a trajectory with a row for each time."""
+"""Names of a trajectory's arrays that have a row for each time and a column for each joint."""
 REST = 1e-3
 """The arm counts as resting if its speed is at most this fraction of the greatest speed of the motion."""
 MAX_SAMPLE_RATE = 1e5
 """Largest rate at which trajectories are resampled [Hz]."""
 ACCELERATION_GAIN = 1.005
-"""Factor by which resampling may raise the greatest acceleration of a joint."""
+"""Largest ratio of a joint's greatest acceleration after resampling to that before, without averaging."""
 ACCELERATION_SHARE = 0.25
-"""The accelerations of resampled rows may differ from those of the cubics between them by this fraction of
-the joint's greatest acceleration."""
+"""Largest difference between a resampled row's acceleration and that of the cubic that begins or ends there,
+without averaging, as a fraction of the joint's greatest acceleration."""
 TIME_TOLERANCE = 1e-9
-"""Times outside of a trajectory by at most this count as its ends; resampled rows are at least this far apart
-[s]."""
+"""A time at most this long before the start or after the end of a trajectory counts as that end; resampled
+rows are at least this far apart [s]."""
 
 
 class Status(Enum):
@@ -92,16 +93,17 @@ class Status(Enum):
     NO_PATH = "no_path"
     """The search ended before the time limit without a path."""
     INVALID_START = "invalid_start"
-    """The start is out of limits, in collision or too close to it."""
+    """The start is outside of the joint limits, in collision or nearly in collision."""
     INVALID_GOAL = "invalid_goal"
-    """Every goal is out of limits, in collision or too close to it."""
+    """Every goal is outside of the joint limits, in collision or nearly in collision."""
     UNREACHABLE_GOAL = "unreachable_goal"
     """Inverse kinematics found no configuration for the goal pose."""
     ERROR = "error"
     """`plan_many` only: planning this problem raised an error, or killed its process."""
 
 
-# When planning ends: at the first verified motion, when more time hardly helps, or at the time limit.
+# When planning ends: at the first verified motion, when more time hardly improves the motion, or at the time
+# limit.
 FIRST = "first"
 CONVERGED = "converged"
 TIME_LIMIT = "time_limit"
@@ -122,7 +124,7 @@ class Path(Value):
     """[rad], [m] for prismatic joints."""
 
     def __repr__(self) -> str:
-        if getattr(self.positions, "ndim", 0) != 2:  # a motion is checked when it is used
+        if getattr(self.positions, "ndim", 0) != 2:  # a Path is validated on use, not when it is made
             return one_line(self)
         rows, joints = self.positions.shape
         return f"Path({joints} joints, {rows} waypoints, {self.length:.3f} rad)"
@@ -142,11 +144,11 @@ class Tree(NamedTuple):
     nodes: Float[ndarray, "n dof"]
     """[rad], [m] for prismatic joints; roots first."""
     parents: Int[ndarray, "n"]
-    """Row of each node's parent, which precedes its own; -1 for roots."""
+    """Row of each node's parent, which is above the node's own row; -1 for roots."""
 
 
 class State(NamedTuple):
-    """Where a trajectory is at one time [dof] or at several [n, dof]."""
+    """The state of a trajectory at one time, as arrays [dof], or at n times, as arrays [n, dof]."""
 
     positions: Float[ndarray, "*n dof"]
     velocities: Float[ndarray, "*n dof"]
@@ -170,8 +172,8 @@ def check_sample_rate(rate: object) -> None:
 class Trajectory(Value):
     """Positions, velocities and accelerations over time.
 
-    Between rows, positions lie on the cubics through the rows' positions and velocities, as they do for the
-    validator and for certificates.
+    Between two rows, the motion is the cubic with the positions and velocities of both rows. The validator
+    and certificates check this motion.
     """
 
     joint_names: tuple[str, ...]
@@ -193,9 +195,9 @@ class Trajectory(Value):
 
     @property
     def stops(self) -> Float[ndarray, "k"]:
-        """Times [s] at which the whole arm rests between start and end; a wait counts once, at its middle.
+        """Times [s] at which the whole arm rests between start and end. A wait is one stop, at its middle.
 
-        Only the rows are checked, so call this before `resample`, whose rows may miss a stop.
+        Only rows are checked, and the rows after `resample` may miss a stop: read `stops` before.
         """
         speed = np.linalg.norm(self.velocities, axis=1)
         edges = np.diff((speed <= REST * speed.max()).astype(int), prepend=0, append=0)
@@ -206,18 +208,18 @@ class Trajectory(Value):
 
     @property
     def peak_jerks(self) -> Float[ndarray, "dof"]:
-        """The largest jerk of each joint [rad/s³] or [m/s³], with accelerations linear between the rows;
-        infinite for a joint whose acceleration is not 0 at the start or the end, where it jumps."""
+        """The largest jerk of each joint [rad/s³] or [m/s³], with accelerations linear between the rows. A
+        joint with an acceleration at the start or the end has infinite jerk, since it jumps from or to 0."""
         steps = np.diff(self.times)[:, None]
         between = np.abs(np.diff(self.accelerations, axis=0) / steps).max(axis=0, initial=0.0)
         return np.where((self.accelerations[[0, -1]] == 0).all(axis=0), between, np.inf)
 
     def at(self, time: float | int | Float[ndarray, "n"]) -> State:
-        """The state at a time or at several.
+        """The state at one time or at several times.
 
-        Positions are on the cubics through the rows, and velocities are their derivatives. Accelerations are
-        linear between rows, and jerks are their slopes; at a row, the jerk is that of the step after it. A
-        trajectory of one row rests there.
+        Positions and velocities are those of the cubics between rows. Accelerations are linear between rows,
+        and jerks are their slopes; at a row, the jerk is that of the step after the row. A trajectory of one
+        row is returned as that row with zero jerk.
 
         Args:
             time: Time, or times [n], from 0 to the duration [s].
@@ -253,20 +255,21 @@ class Trajectory(Value):
 
     @property
     def cubic_accelerations(self) -> tuple[Float[ndarray, "m dof"], Float[ndarray, "m dof"]]:
-        """Accelerations of the cubic from each row to the next, at its start and at its end; in between they
-        are linear in time."""
+        """Accelerations at the start and at the end of the cubic from each row to the next. Within a cubic,
+        the acceleration is linear in time."""
         steps = np.diff(self.times)[:, None]
         v = self.velocities
         mean = np.diff(self.positions, axis=0) / steps
         return (6 * mean - 4 * v[:-1] - 2 * v[1:]) / steps, (2 * v[:-1] + 4 * v[1:] - 6 * mean) / steps
 
     def resample(self, rate: float | int) -> "Trajectory":
-        """The motion with a row at each multiple of a sample time, and the last row.
+        """The motion with rows 1 / rate apart, and a last row at its end.
 
         With fewer rows, the cubics between them may need larger accelerations where the acceleration changes
-        quickly. A motion from rest to rest is then averaged: its rows lie on the uniform cubic B-spline of
-        the new rows. Such a motion leaves the path by up to a sixth of the acceleration divided by rate², and
-        lasts up to three steps longer. Validate the new motion: between its rows it may differ from this one.
+        quickly. A motion from rest to rest is then averaged: its rows lie on the uniform cubic B-spline that
+        has the resampled positions as control points. An averaged motion leaves the path by up to a sixth of
+        the acceleration divided by rate², and lasts up to three steps longer. Validate the returned motion:
+        between its rows it may differ from this one.
 
         Args:
             rate: Rows in a second [Hz], above 0 and at most 100,000.
@@ -321,7 +324,7 @@ class Trajectory(Value):
         stream = io.StringIO()
         writer = csv.writer(stream, lineterminator="\n")
         kinds = ("position", "velocity", "acceleration")
-        # a spreadsheet would read names that begin with these as formulas
+        # a spreadsheet would read a name that begins with one of these characters as a formula
         names = [f"'{name}" if name[0] in "=+-@" else name for name in self.joint_names]
         writer.writerow(["time", *(f"{name}_{kind}" for kind in kinds for name in names)])
         columns = (self.times[:, None], *(getattr(self, rows) for rows in ROWS))
@@ -336,8 +339,8 @@ Rows = tuple[Float[ndarray, "n"], Float[ndarray, "n dof"], Float[ndarray, "n dof
 def interpolated(
     at: Float[ndarray, "*at"] | float, times: Values, rows: JointRows
 ) -> Float[ndarray, "*at dof"]:
-    """Rows at times between the given ones, by linear interpolation; before the first time the first row,
-    after the last time the last one."""
+    """The rows at the times `at`, interpolated linearly between the rows at `times`; the first row before the
+    first time, the last row after the last time."""
     return np.stack([np.interp(at, times, column) for column in rows.T], axis=-1)
 
 
@@ -347,12 +350,14 @@ def spline_rows(
     window: int = 1,
     velocity: Float[ndarray, "dof"] | float = 0.0,
 ) -> Rows:
-    """The uniform cubic B-spline whose control points are moving averages of the configurations of a motion
-    that ends at rest, `step` [s] apart, over `window` of them. Before these the arm moved with `velocity`.
+    """The rows of a uniform cubic B-spline that smooths a motion that ends at rest.
 
-    Velocities and accelerations are weighted means of the motion's, and so within the same limits at every
-    time; jerks are constant between rows. The spline leaves the motion's path by no more than about a sixth
-    of the acceleration times `step` squared, and stays on straight lines.
+    Its control points are moving averages over `window` configurations in `controls`, which are `step` [s]
+    apart. Before the first configuration, the arm moved with the constant `velocity`.
+
+    Velocities and accelerations are weighted means of the motion's, so they obey the same limits at every
+    time; jerks are constant between rows. With a window of 1, the spline leaves the motion's path by at most
+    about a sixth of the acceleration times `step` squared; straight lines stay straight.
     """
     before = np.arange(-window - 2, 0)[:, None] * step * np.broadcast_to(velocity, controls.shape[1])
     moved = np.concatenate(
@@ -383,12 +388,17 @@ RATES = ("velocities", "accelerations")
 def check_motion_arrays(
     joint_names: object, arrays: Mapping[str, object], where: str = ""
 ) -> tuple[tuple[str, ...], dict[str, ndarray]]:
-    """The joint names and the arrays of a motion, as a tuple and as float64 arrays of equal length.
+    """The joint names of a motion as a tuple, and its arrays as float64 arrays of equal length.
 
-    `arrays` has the positions first, under any name, and may have `times`, `velocities` and `accelerations`.
-    `where` precedes the names of fields in messages, e.g. "trajectory.". Raises InputError, naming the field,
-    for missing or repeated joint names, no rows, wrong shapes, and numbers that are not finite or too large.
-    Times may begin anywhere and need not increase; see `check_increasing`.
+    Args:
+        joint_names: The joint names.
+        arrays: The positions first, under any name; then optionally `times`, `velocities`, `accelerations`.
+        where: Text before field names in messages, e.g. "trajectory.".
+
+    Raises:
+        InputError: Naming the field, for missing or repeated joint names, no rows, wrong shapes, and numbers
+            that are not finite or too large. Times may begin anywhere and need not increase; see
+            `check_increasing`.
     """
     names = joint_names
     if not isinstance(names, list | tuple) or not names or not all(isinstance(n, str) and n for n in names):
@@ -409,7 +419,7 @@ def check_motion_arrays(
 
 
 def check_increasing(times: ndarray) -> None:
-    """Raise InputError if finite times do not strictly increase."""
+    """Raise InputError unless the times, which are finite, strictly increase."""
     backwards = np.flatnonzero(np.diff(times) <= 0)
     if len(backwards):
         i = int(backwards[0])

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from robotdiffuse.problems.problem import Problem
 
 
-# Kinds of planners: without a network; only a network's motions, with or without guidance.
+# Kinds of planners: SEARCH planners use no network; LEARNED planners return motions that a network proposes.
 SEARCH = "search"
 LEARNED = "learned"
 # Features that not every planner supports.
@@ -38,7 +38,7 @@ PLANNERS = Registry(
             "planning.search.rrt:RobotDiffuse",
             "AORRTCSettings",
             SEARCH,
-            "aorrtc under the package's name (the default)",
+            "the default: AORRTC, same as aorrtc",
             PATH_CONSTRAINTS,
             CLEARANCE,
         ),
@@ -75,13 +75,13 @@ PLANNERS = Registry(
             "baselines.mpnet:MPNet",
             "MPNetPlannerSettings",
             LEARNED,
-            "MPNet: a network with dropout proposes waypoints from both ends",
+            "MPNet: a network with dropout proposes waypoints from the start and from the goal",
         ),
         "mpinets": _entry(
             "baselines.mpinets:MPiNets",
             "MPiNetsSettings",
             LEARNED,
-            "MPiNets: a policy on points of scene, arm and target is rolled out",
+            "MPiNets: rolls out a policy that sees points of the scene, the arm and the target",
         ),
         "mpd": _entry(
             "baselines.guided_prior:MPD",
@@ -105,7 +105,7 @@ PLANNERS = Registry(
             "baselines.controls:Control",
             "ControlSettings",
             SEARCH,
-            "no planner: baselines by fixed vias, nearest motions of a data set or smooth noise",
+            "no planner: baselines by fixed waypoints, nearest motions of a data set or smooth noise",
         ),
         "a_star": _entry(
             "baselines.lattice:AStar", "AStarSettings", SEARCH, "A* on a lattice of joint values"
@@ -138,19 +138,19 @@ def load_planner(name: str, settings: object | None = None, weights: str | None 
         name: A name that `robotdiffuse planner list` shows.
         settings: The settings that differ from the defaults, such as {"range": 0.5}, or the planner's own
             dataclass.
-        weights: Folder with weights for a learned planner, in place of the bundled ones. If you give
-            settings, name the folder in them instead.
+        weights: Folder with weights for a learned planner, in place of the bundled weights. If you also give
+            settings, set their field `weights` instead.
 
     Raises:
-        InputError: For an unknown name, settings of another planner, both settings and weights, weights that
-            cannot be read, and weights for a planner that takes none.
+        InputError: For an unknown name, settings of another planner, settings together with weights, weights
+            that cannot be read, and weights for a planner without a network.
     """
     if weights is not None:
         if settings is not None:
             raise InputError(f"planner {name} got settings and weights; name the weights in the settings")
         if PLANNERS.entry(name).kind == SEARCH:
-            learned = ", ".join(candidate for candidate, its in PLANNERS.items() if its.kind != SEARCH)
-            raise InputError(f"planner {name} has no weights; those that have: {learned}")
+            learned = ", ".join(candidate for candidate, entry in PLANNERS.items() if entry.kind != SEARCH)
+            raise InputError(f"planner {name} has no weights; planners with weights: {learned}")
         settings = {"weights": str(file_name(weights, "weights"))}
     if isinstance(settings, Mapping):
         settings = _default_settings(name).replaced(settings)
@@ -198,21 +198,23 @@ def plan(
 
     Args:
         problem: The problem; `rd.load_problem` reads one from a file.
-        time_limit: Wall time of the call, without what is loaded once (code, weights, a robot's arrays) [s].
+        time_limit: Wall time of the call [s]. Loading code, weights and a robot's arrays, which happens once,
+            does not count.
         seed: Seed of all random numbers, at least 0. The same seed gives the same path, unless time runs out.
-        until: "first" returns the first verified motion, "converged" searches on until more time hardly
-            improves it, "time_limit" until time runs out. Planners that cannot improve a path return their
-            first.
+        until: "first": return the first verified motion. "converged": improve the motion until more time
+            hardly improves it. "time_limit": improve it until time runs out. Planners that cannot improve a
+            path always return their first motion.
         clearance: Distance to obstacles that aorrtc, rrt_connect and robotdiffuse keep wherever start, goal
             and passages allow it, at most 0.5 [m]. Elsewhere the distance is smaller, and a note says so.
-            None: the problem's, or 1 cm. Other planners refuse a clearance.
+            None: the problem's clearance, or 1 cm if it has none. Other planners refuse a clearance.
         velocity_scaling: Fraction of the velocity limits that the motion uses, from 0.001 to 1.
         acceleration_scaling: Fraction of the acceleration limits that the motion uses, from 0.001 to 1.
-        jerk: Largest jerk of any joint [rad/s³], at least 0.01. None: the robot's jerk limits, or 10 / s
-            times the acceleration limit of joints without one; infinite: no limit.
+        jerk: Largest jerk of any joint [rad/s³], at least 0.01; infinite: no limit. None: each joint's own
+            jerk limit; for a joint without one, 10 / s times its acceleration limit.
         objective: What aorrtc, rrt_connect and robotdiffuse minimize: "time", the motion's duration, or
             "length" of the path in joint space.
-        planner: A name that `robotdiffuse planner list` shows. A planner is loaded once for its settings.
+        planner: A name that `robotdiffuse planner list` shows. A planner stays loaded for later calls with
+            the same settings.
         settings: Settings of the planner that differ from the defaults, such as {"range": 0.5}, or its
             dataclass.
 
@@ -220,8 +222,8 @@ def plan(
         A result with a verified motion, or with a status and a reason why there is none.
 
     Raises:
-        InputError: One line, for arguments of the wrong type or out of bounds, unknown planners and settings,
-            and problems that the planner does not support.
+        InputError: For arguments of the wrong type or out of bounds, unknown planners and settings, and
+            problems that the planner does not support.
 
     Examples:
         >>> ball = rd.Sphere([0.5, 0.0, 0.7], 0.2)
@@ -234,12 +236,12 @@ def plan(
         raise InputError(
             f"settings is {shown(settings)}; it must be a table of settings, such as {{'range': 0.5}}"
         )
-    PLANNERS.entry(planner)  # unknown names first
+    PLANNERS.entry(planner)  # an unknown planner is reported before unknown settings
     if isinstance(settings, Mapping):
         settings = _default_settings(planner).replaced(settings)
     loaded = _planners.get(key := (planner, repr(settings)))
     if loaded is None:
-        while len(_planners) >= MAX_LOADED:  # the oldest goes
+        while len(_planners) >= MAX_LOADED:  # drop the planner that was loaded first
             _planners.pop(next(iter(tuple(_planners))), None)
         loaded = _planners[key] = load_planner(planner, settings)
     limits = velocity_scaling, acceleration_scaling, jerk

@@ -1,4 +1,4 @@
-"""What a call of a planner asks for, and the call itself: its clock, its random numbers and its results."""
+"""The request and the context of a planning call: its arguments, clock, random numbers and results."""
 
 import time
 from collections.abc import Callable
@@ -42,28 +42,29 @@ from robotdiffuse.validation.report import Report, Violation
 from robotdiffuse.validation.validator import Verifier, verifier
 
 DEFAULT_CLEARANCE = 0.01
-"""Clearance where neither the request nor the problem sets one [m]."""
+"""Clearance if neither the request nor the problem sets one [m]."""
 CONSTRAINED_SAMPLE_TIME = 0.002
-"""Time between the rows of motions under path constraints [s]: their paths have many corners, close
-together."""
+"""Time between the rows of motions under path constraints [s]. It is short, because the corners of such paths
+are close together."""
 EARLY_VALIDATION_FACTOR = 5.0
-"""The first path is validated at once if at least this many validations still fit in the time left."""
+"""A path is validated during the search if the time left for searching is more than this multiple of the time
+reserved for validating and timing a path."""
 TOLERANCE_FRACTION = 0.95
-"""Planners use only this fraction of each tolerance of path constraints; the rest is a reserve."""
+"""Fraction of each tolerance of path constraints that planners use; the remainder is a safety margin."""
 MAX_RESERVED_FRACTION = 0.5
-"""Largest fraction of the time limit that is reserved for validation and timing."""
+"""Largest fraction of the time limit that is reserved for the first validation and timing."""
 RESERVED_FACTOR = 3.0
-"""Time that is reserved for validating and timing a path, as a multiple of the longest time that the call has
-taken for one path."""
+"""Time that is reserved for validating and timing a path, as a multiple of the longest time that this call
+has spent on one path."""
 EXPECTED_VALIDATION_TIME = 0.003
-"""Time that is reserved for validating and timing a path before the call has done so once [s]."""
+"""Time that is reserved for validating and timing the first path of a call [s]."""
 MIN_TIME_LIMIT = 1e-3
-"""Time limit for the remaining work once time has run out [s]."""
+"""Smallest time limit that `time_left` returns, even if the call's time has run out [s]."""
 
 
 @dataclass(frozen=True)
 class PlanRequest(Settings):
-    """What a call of a planner asks for besides its problem; `rd.plan` documents the fields."""
+    """The arguments of a planning call besides its problem; `rd.plan` documents the fields."""
 
     time_limit: Annotated[float, Bound(above=0.0, most=1e9)] = 1.0
     seed: Natural = 0
@@ -76,18 +77,20 @@ class PlanRequest(Settings):
 
 
 def clock() -> float:
-    """The time of a clock that stands still while this thread loads code [s]."""
+    """The time of a clock that stops while this thread loads code, see `core/loading.py` [s]."""
     return time.perf_counter() - loading_seconds()
 
 
 def time_left(time_limit: float, began: float) -> float:
-    """The time left of the time limit of a call that began at the time `began` of `clock`; at least
-    MIN_TIME_LIMIT, or the limit itself if that is less [s]."""
+    """Time that is left [s] of a call's time limit; `began` is the `clock` at the call's beginning.
+
+    At least MIN_TIME_LIMIT, or the time limit itself if it is less.
+    """
     return min(time_limit, max(time_limit - (clock() - began), MIN_TIME_LIMIT))
 
 
 def requested_clearance(problem: Problem, clearance: float | None) -> float:
-    """The clearance of a call; if it gives none, the problem's, or the default one [m]."""
+    """The clearance of a call [m]: `clearance`, else the problem's, else DEFAULT_CLEARANCE."""
     choices = (clearance, problem.clearance, DEFAULT_CLEARANCE)
     return next(value for value in choices if value is not None)
 
@@ -118,7 +121,8 @@ class PlanningContext:
     ) -> None:
         """Starts the clock.
 
-        segments: number of paths that the motion joins; timing takes as many times the usual intervals.
+        segments: number of planned paths that the motion joins; timing uses this many times as many intervals
+            as for a single path.
 
         Raises InputError if `problem` is not a Problem.
         """
@@ -128,20 +132,22 @@ class PlanningContext:
         self.problem = problem
         self.request = request
         self.clearance = requested_clearance(problem, request.clearance)
-        """Distance to obstacles that paths keep where they can [m]."""
+        """Distance to obstacles that paths keep where possible [m]."""
         scalings = request.velocity_scaling, request.acceleration_scaling
         self.timing = _timing(*scalings, request.jerk, bool(problem.constraints), segments)
         self._reserved = min(EXPECTED_VALIDATION_TIME, MAX_RESERVED_FRACTION * request.time_limit)
         self.validator = verifier(problem)
         self.notes = (*unit_notes(problem), *contact_notes(problem.scene), *problem.notes)
-        """Notes of the result, on what was changed or ignored."""
+        """Notes of the result: what was changed or ignored."""
         self._prepared = 0.0
-        """When the search began [s since the call]."""
+        """When the search began [s since the call]; 0 before."""
         self._progress: list[tuple[float, float]] = []
         self._refused = ""
         self.refused_at = 0.0, ""
-        """The part of the last refused motion up to its violation, and the violation's message."""
+        """The first violation of the last refused motion: the fraction of the motion before it, and its
+        message."""
         self._ended: tuple[Status, str] | None = None
+        """Status and reason of the result once no path can be finished any more; None before."""
 
     @cached_property
     def rng(self) -> np.random.Generator:
@@ -149,7 +155,7 @@ class PlanningContext:
         return np.random.default_rng(self.request.seed)
 
     def begin_search(self) -> None:
-        """Note that start and goal states are known and the search begins."""
+        """Record that the search begins now, after start and goal states were found."""
         self._prepared = self.elapsed
 
     def note(self, text: str) -> None:
@@ -157,8 +163,8 @@ class PlanningContext:
         self.notes = (*self.notes, text)
 
     def keeps_constraints(self, q: Configurations) -> bool:
-        """Whether the polyline through configurations, such as a rounded corner, keeps the path constraints
-        within TOLERANCE_FRACTION of their tolerances."""
+        """Whether the polyline through configurations, such as a rounded corner, deviates from the path
+        constraints by at most TOLERANCE_FRACTION of their tolerances."""
         constraints = self.validator.constraints
         rows = q if len(q) > 1 else np.repeat(q, 2, axis=0)
         return constraints is None or not constraints.first_violation(
@@ -171,8 +177,7 @@ class PlanningContext:
         return self._progress[0][0] if self._progress else np.inf
 
     def improved(self, length: float) -> None:
-        """Note the joint-space length [rad] of a path that was just found; ignored unless it is the
-        shortest."""
+        """Record the joint-space length [rad] of a path that was just found, if it is the shortest so far."""
         if not self._progress or length < self._progress[-1][1]:
             self._progress.append((self.elapsed, length))
 
@@ -184,20 +189,19 @@ class PlanningContext:
 
     @property
     def search_until(self) -> float:
-        """When searching must end to leave time for `finish` [s since the call]."""
+        """When the search must end, so that time is left for `finish` [s since the call]."""
         return self.request.time_limit - self._reserved
 
     @property
     def validates_early(self) -> bool:
-        """Whether there is time to validate paths while the search goes on."""
-        if self.problem.constraints:  # the search finds few paths, and each is timed
+        """Whether enough time is left to validate a path during the search."""
+        if self.problem.constraints:  # a search under constraints finds few paths and times each of them
             return self.remaining > self._reserved
         return self.remaining > EARLY_VALIDATION_FACTOR * self._reserved
 
     @property
     def remaining(self) -> float:
-        """Wall time left for searching [s]; negative once it has run out, or once no path can be finished any
-        more."""
+        """Wall time left for searching [s]; at most 0 once it has run out, and -1 after `ended`."""
         return -1.0 if self._ended else self.search_until - self.elapsed
 
     def fail(self, status: Status, reason: str) -> PlanResult:
@@ -214,8 +218,8 @@ class PlanningContext:
         )
 
     def unsolved(self, reason: str = "") -> PlanResult:
-        """The result of a search without a path: TIMEOUT if time has run out, NO_PATH if the search ended by
-        itself."""
+        """The result of a search that found no path: status TIMEOUT if time has run out, NO_PATH if the
+        search ended before."""
         if self._ended:
             return self.fail(*self._ended)
         if self.remaining <= 0:
@@ -244,7 +248,7 @@ class PlanningContext:
 
     @property
     def ended(self) -> bool:
-        """Whether too little time is left to finish a path; `unsolved` gives the reason."""
+        """Whether no path can be finished any more, usually for lack of time; `unsolved` gives the reason."""
         return self._ended is not None
 
     def finish(
@@ -257,12 +261,19 @@ class PlanningContext:
         deviations: Float[ndarray, "n"] | None = None,
         trajectory: Trajectory | None = None,
     ) -> PlanResult | None:
-        """Validate the path through the waypoints and time it; None if the path or its motion is refused.
+        """Validate the path through the waypoints, time it, and validate the motion.
 
-        stage: the part of the planner that found the waypoints.
-        notes: notes on this path, added to those of the call.
-        keeps, deviations: as in `time_parameterize`.
-        trajectory: the motion along a path that is timed already.
+        Args:
+            waypoints: The path.
+            stage: The part of the planner that found the path.
+            reason: The result's reason; empty: "solved by" and the stage.
+            notes: Notes on this path, added to those of the call.
+            keeps: As in `time_parameterize`.
+            deviations: As in `time_parameterize`.
+            trajectory: The motion along the path, if it is timed already.
+
+        Returns:
+            The solved result; None if the validator refuses the path or the motion, or if time runs out.
         """
         began = self.elapsed
         try:
@@ -287,7 +298,8 @@ class PlanningContext:
         problem = self.problem
         waypoints = np.asarray(waypoints, dtype=np.float64)
         turns = np.flatnonzero(problem.robot.wraps(waypoints).any(axis=1))
-        # a step of nearly a whole turn could be a small step of a wrapped angle; two steps cannot
+        # A controller that wraps angles could take a step of nearly a whole turn for a small step back, so
+        # such a step gets a waypoint at its middle.
         if len(turns):
             middles = 0.5 * (waypoints[turns] + waypoints[turns + 1])
             waypoints = np.insert(waypoints, turns + 1, middles, axis=0)
@@ -312,7 +324,7 @@ class PlanningContext:
         )
         timed = motion.report(trajectory)
         if timed.violation is not None:
-            if timed.violation.kind == "time":  # too long to validate, like any other motion of this problem
+            if timed.violation.kind == "time":  # every motion of this problem would take too long to validate
                 self._ended = Status.NO_PATH, timed.violation.message
             return self._refuse(timed.violation, trajectory.duration)
         stops = ", ".join(f"{at:.3g} s" for at in trajectory.stops)
@@ -320,7 +332,8 @@ class PlanningContext:
             notes = (*notes, f"the motion stops on its way, at {stops}: corners there could not be rounded")
         scene = _least(report.scene_clearance, timed.scene_clearance)
         itself = _least(report.self_clearance, timed.self_clearance)
-        # the time at which the search noted this length; the shorter paths that it noted were refused
+        # Progress ends with the returned path, at the time when the search recorded its length. Shorter
+        # recorded paths are left out, since they were refused.
         final_length = path.length
         tolerance = final_length * 1e-3
         longer = [(at, length) for at, length in self._progress if length > final_length + tolerance]
@@ -346,8 +359,8 @@ class PlanningContext:
 
     @property
     def beside(self) -> ExtraLimits:
-        """Limits on timing besides the joint limits: speeds that constraints bound, torques with a
-        payload."""
+        """Limits on timing in addition to the joint limits: speed limits of constraints, and torque limits
+        with a payload."""
         constraints = self.validator.constraints
         pace = None
         if constraints is not None and len(constraints.speed_limited):
@@ -366,7 +379,8 @@ def _least(*clearances: float | None) -> float:
 
 
 class _TimedMotion:
-    """Validates trajectories and caches the last report: the final trajectory was usually just validated."""
+    """Validates trajectories. The last report is cached, because timing usually has just validated the
+    trajectory that it returns."""
 
     def __init__(self, validator: Verifier) -> None:
         self.validator = validator

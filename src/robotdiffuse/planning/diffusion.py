@@ -1,19 +1,18 @@
-"""The diffusion model alone: encoder, sampling, guidance, without search.
+"""Planner `diffusion`: samples motions from the diffusion model under collision guidance, without a search.
 
-The scene's point cloud is encoded; trajectories from start to goal are sampled by the diffusion model, under
-collision guidance; every sample goes to the validator, and the shortest valid one is returned. If none is
-valid, the next batch is drawn from new noise, until time runs out. There is no straight line, no search, no
-refinement, and nothing is shortened: what this planner solves, the network and its guidance solve. With the
-settings samples=1, repeat=false and weights of config `paper`, which do not take clearances as inputs, it
-does only what the paper says; with guidance_steps=0 too, it is the row JPC of the paper's Table 2, which has
-no guidance.
+An encoder embeds the scene's point cloud. Given this embedding, the diffusion model samples paths from start
+to goal under collision guidance. The validator checks every sample, and the shortest valid path is returned.
+If no sample is valid, the next batch is drawn from new noise, until time runs out. Paths are not simplified
+and the straight line is not tried, so every solution comes from the network and its guidance.
 
-Path constraints are one more cost of guidance. Before validation, the inner waypoints of each sample are
-projected onto the constraints; the validator proves that the constraints hold between the waypoints too. The
-network was trained without constraints.
+The paper's method is samples=1, repeat=false and weights of config `paper`, which do not take clearances as
+inputs. If guidance_steps is 0 as well, it is the row JPC of the paper's Table 2, which has no guidance.
 
-The sampler and the number of its steps are those stored with the weights, unless the settings give others.
-With guidance_steps=0 the network runs without guidance.
+Path constraints add a cost to guidance. Before validation, the inner waypoints of each sample are projected
+onto the constraints; the validator proves that the constraints hold between waypoints as well. The network
+was trained without constraints.
+
+The sampler and the number of its steps are stored with the weights; settings may replace them.
 """
 
 from dataclasses import dataclass, field, replace
@@ -43,37 +42,39 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class DiffusionSettings(SamplingSettings, LearnedSettings, name="diffusion"):
     guidance_steps: Natural = 8
-    """Number of gradient steps at each guided denoising step."""
+    """Number of gradient steps at each guided denoising step; 0: no guidance."""
     points: Count = 320
-    """Number of points in the encoder's input cloud (paper: 1,400); ignored if the encoder needs a fixed
-    number."""
+    """Number of points in the encoder's input cloud (paper: 1,400); ignored by encoders for clouds of a fixed
+    size."""
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
     optimize_time: NotNegative = 0.0
-    """Time for more batches after the first one with a valid sample [s]; the shortest of all is returned."""
+    """Time for further batches after the first batch with a valid sample [s]; the shortest valid path of all
+    batches is returned."""
     repeat: bool = True
-    """Whether more batches are drawn if the validator accepts no sample of the first one (the paper: no)."""
+    """Whether more batches are drawn if the validator accepts no sample of the first batch (the paper:
+    no)."""
 
 
 def encode(
     model: "MotionModel", checker: CollisionChecker, points: int, rng: np.random.Generator
 ) -> Float[ndarray, "code"]:
-    """The embedding z of a scene: a cloud of `points` points on its surfaces, or as many as the encoder
-    needs, encoded by the frozen encoder."""
-    of_encoder = model.settings.encoder_settings
-    assert of_encoder is not None  # unconditional priors are not used by these planners
-    count = points if of_encoder.any_size else of_encoder.cloud
-    return model.encode(sample_surface(checker.scene, count, rng, of_encoder.region), rng)
+    """The embedding z of a scene, by the frozen encoder, of a cloud of `points` random points on its
+    surfaces; an encoder for clouds of a fixed size gets that number of points."""
+    encoder_settings = model.settings.encoder_settings
+    assert encoder_settings is not None  # only unconditional priors have none
+    count = points if encoder_settings.any_size else encoder_settings.cloud
+    return model.encode(sample_surface(checker.scene, count, rng, encoder_settings.region), rng)
 
 
 def _projected(constraints: PathConstraints, path: Configurations) -> Configurations:
-    """The path with its inner waypoints projected onto the constraints. If the projection of a waypoint
-    fails, the path itself, which the validator will refuse."""
+    """The path with its inner waypoints projected onto the constraints. If a projection fails, the path is
+    returned unchanged, and the validator refuses it."""
     between = constraints.projected(path[1:-1], TOLERANCE_FRACTION)
     return np.concatenate([path[:1], between, path[-1:]]) if len(between) == len(path) - 2 else path
 
 
 class Diffusion(ExportedPlanner[DiffusionSettings]):
-    """The diffusion model and its guidance as a planner; see the head of this file."""
+    """The diffusion model and its guidance as a planner; see the docstring of the module."""
 
     name = "diffusion"
     network_name = "model"
@@ -93,9 +94,9 @@ class Diffusion(ExportedPlanner[DiffusionSettings]):
     ) -> Trajectories:
         """A batch of samples under guidance, divided among the nearest goals.
 
-        code: the scene embedding of `encode`.
-        clearances: the model's clearance inputs; None: the true ones of the checker's scene.
-        constraints: of the path, one more cost of the guidance.
+        code: the scene embedding from `encode`.
+        clearances: the function that computes the model's clearance inputs; None: from the checker's scene.
+        constraints: path constraints, which add a cost to guidance.
         """
         from robotdiffuse.learning.motion_model import link_clearances
 
@@ -130,10 +131,10 @@ class Diffusion(ExportedPlanner[DiffusionSettings]):
         code = encode(model, start_goal.checker, self.settings.points, rng)
         names = context.problem.robot.joint_names
         constraints = context.validator.constraints
-        every = list[Path]()
+        samples = list[Path]()
         valid = list[Path]()
         until = context.request.time_limit
-        while not every or (context.elapsed < until and (valid or self.settings.repeat)):
+        while not samples or (context.elapsed < until and (valid or self.settings.repeat)):
             batch = self.draw(model, start_goal.checker, code, start, goals, rng, constraints=constraints)
             if constraints is not None:
                 batch = [_projected(constraints, q) for q in batch]
@@ -143,12 +144,11 @@ class Diffusion(ExportedPlanner[DiffusionSettings]):
                 context.improved(path.length)
             if passed and not valid:
                 until = min(context.elapsed + self.settings.optimize_time, context.request.time_limit)
-            every = every + paths
+            samples = samples + paths
             valid = valid + passed
-        reason = f"{len(valid)} of {len(every)} samples of the network are valid"
-        # where none is, the validator is asked about one once more, so that the result says what is wrong
-        # with it
-        for path in sorted(valid or every[-1:], key=lambda path: path.length):
+        reason = f"{len(valid)} of {len(samples)} samples of the network are valid"
+        # If no sample is valid, the last one is validated again, so that the result names its violation.
+        for path in sorted(valid or samples[-1:], key=lambda path: path.length):
             solved_reason = f"solved by network: {reason}"
             result = context.finish(path.positions, "network", solved_reason, keeps=context.keeps_constraints)
             if result is not None:

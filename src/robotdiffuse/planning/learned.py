@@ -17,14 +17,15 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.surface_points import VisibleRegion, sample_surface
 
 SAMPLES_PER_GOAL = 4
-"""Smallest number of samples for each goal of a batch."""
+"""Smallest number of samples per goal, when a batch of samples is divided among several goals."""
 
 
 @dataclass(frozen=True)
 class LearnedSettings(Settings):
     weights: str | None = None
-    """Folder of trained weights, or panda_points, the bundled weights without clearances as inputs. None: the
-    weights trained on this machine for the robot, or else the bundled ones."""
+    """Folder of trained weights, or "panda_points": bundled weights of a network without clearances as
+    inputs.
+    None: weights that were trained on this machine for the robot, or else its bundled weights."""
 
 
 LearnedPlannerSettings = TypeVar("LearnedPlannerSettings", bound=LearnedSettings)
@@ -42,10 +43,10 @@ class LearnedPlanner(Planner[LearnedPlannerSettings]):
         check_weights(self.network_name, self.settings.weights)
 
     def network(self, robot: Robot) -> Any:
-        """The trained network for a robot, here as a PyTorch module.
+        """The trained network for a robot, as a PyTorch module.
 
-        Raises InputError if there is none, naming the command that trains one, or if PyTorch is not
-        installed.
+        Raises InputError if there are no weights for the robot (the message names the command that trains
+        them), or if PyTorch is not installed.
         """
         need_packages(f"the planner {self.name}", "torch")
         from robotdiffuse.learning.checkpoint import load_network
@@ -58,17 +59,18 @@ class LearnedPlanner(Planner[LearnedPlannerSettings]):
 
 
 class ExportedPlanner(LearnedPlanner[LearnedPlannerSettings]):
-    """A planner with a diffusion model, which needs no PyTorch."""
+    """A planner with a diffusion model that ONNX Runtime runs, without PyTorch."""
 
     def network(self, robot: Robot) -> Any:
-        """See `LearnedPlanner`; a `MotionModel`."""
+        """The trained network for a robot, as a `MotionModel`. Raises InputError if there is none."""
         from robotdiffuse.learning.exported_model import exported_model  # imports ONNX Runtime
 
         return exported_model(self.network_name, self.settings.weights, robot)
 
 
 def nearest_goals(start: Configuration, goals: Configurations, samples: int) -> Configurations:
-    """The goals among which a batch of `samples` samples is divided: those nearest to the start, in order."""
+    """The goals among which a batch of `samples` samples is divided: as many of those nearest to the start as
+    get SAMPLES_PER_GOAL each, nearest first; at least one."""
     order = np.argsort(np.linalg.norm(goals - start, axis=1))
     return goals[order[: max(samples // SAMPLES_PER_GOAL, 1)]]
 
@@ -76,7 +78,8 @@ def nearest_goals(start: Configuration, goals: Configurations, samples: int) -> 
 def scene_clouds(
     checker: CollisionChecker, region: VisibleRegion, points: int, count: int, rng: np.random.Generator
 ) -> Float32[ndarray, "count points 3"]:
-    """Clouds of random points on the obstacles' surfaces in the region [m]; zeros if there are none."""
+    """`count` clouds of `points` random points on the surfaces of obstacles within the region [m]; zeros
+    where there are no surfaces."""
     clouds = np.zeros((count, points, 3), np.float32)
     for cloud in clouds:
         surface_points = sample_surface(checker.scene, points, rng, region)

@@ -1,8 +1,8 @@
 """Straight lines of the tool, followed from the start by inverse kinematics from pose to pose.
 
-This takes milliseconds and gives smooth motions. If it cannot follow the line to its end, the search under
-the constraint (`search/constrained.py`) continues, and the result says how far the line was followed, and
-what stopped it.
+Following takes milliseconds and gives smooth motions. If the line cannot be followed to its end, the search
+under path constraints (`search/constrained.py`) takes over. If that fails too, the result says how far the
+line can be followed and what stops the arm there.
 """
 
 from collections.abc import Callable
@@ -37,7 +37,8 @@ from robotdiffuse.trajectories.speed_limits import scaled_limits, symmetric_boun
 from robotdiffuse.trajectories.timing_kernel import fastest_speeds
 
 STAGE = "line"
-# Distance [m] and angle [rad] between poses of the line, and their number.
+# Largest distance [m] and angle [rad] between neighboring poses of the line; smallest and largest number of
+# steps between poses (a long line has MAX_STEPS longer steps).
 STEP = 0.008
 TURN_STEP = 0.04
 MIN_STEPS = 6
@@ -46,33 +47,37 @@ MAX_JOINT_STEP = 0.25
 """If a joint would move by more than this from one pose to the next, the line cannot be followed [rad] or
 [m]."""
 LIMIT_MARGIN = 1e-3
-"""Distance that joints keep from their limits, because the curve between poses may leave them [rad] or
-[m]."""
+"""Distance that joints keep from their limits at the poses, since the curve between poses may come closer
+[rad] or [m]."""
 NEAR_LIMIT = 1e-2
-"""A joint this close to its limit is named as the reason for the end of a line [rad] or [m]."""
+"""A joint closer than this to its limit is named as the reason why the line cannot be followed [rad] or
+[m]."""
 OTHER_ENDS = 4
-"""Number of configurations of the end pose to which motions are steered if following from the start ends
-early."""
+"""Number of configurations of the end pose that are tried as goals if following without a goal configuration
+stops early."""
 END_STEPS = np.array([0.1, 0.3, 0.7])
-"""Steps of the joints, without a motion of the link, to other configurations of the end [rad, L2]."""
+"""Null-space steps from one configuration of the end pose to seeds of others [rad, L2]."""
 LONGER = 1.08
-"""The path in joint space to another configuration of the end may be longer by this factor than the path that
-following gives."""
+"""Largest ratio of the joint-space length of a path to another configuration of the end pose, to that of the
+path followed first."""
 HERE = 1e-5
-"""The link counts as being at the end of the line if its pose differs from it by less than this [m], and in
-entries of R."""
+"""The link is at the end of the line if each entry of its pose (translation [m] and rotation matrix) differs
+from the end pose by less than this."""
 SAME = 1e-5
-"""Largest difference of any joint from the configuration to which a line is followed [rad] or [m]."""
+"""A followed line reaches a goal configuration if each joint ends closer than this to it [rad] or [m]."""
 TOLERANCES = 1e-9, 1e-9
-"""Tolerances of the poses of a curve [m], [rad]; small, since the second derivative of the curve divides them
-by the square of the steps."""
+"""Tolerances of inverse kinematics at the poses [m], [rad]. They are small, because the second derivative of
+the curve divides errors by the square of the step."""
 ROUND = InverseKinematicsSettings(max_rounds=1)
 
 
 def follow_line(context: PlanningContext) -> PlanResult | None:
-    """The fastest of several motions that follow the line from the start and pass the validator. If there is
-    none, a result whose `fraction` and `reason` say how far the line can be followed. None if there are
-    several goals, or if the link is at the end of the line already but the goal is another configuration."""
+    """The fastest of several motions that follow the line from the start and pass the validator.
+
+    If there is no such motion, a failed result: its `fraction` and `reason` say how far the line can be
+    followed and what stops the arm. None for an `AnyGoal` or `PosesGoal`, and if the link is at the end of
+    the line already but the validator refuses to stay there, e.g. since the goal is another configuration.
+    """
     problem = context.problem
     robot = context.problem.robot
     if not isinstance(problem.goal, PoseGoal | JointGoal):
@@ -92,7 +97,8 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
     limits = scaled_limits(robot, context.timing)
 
     def cost(rows: Float[ndarray, "n dof"]) -> float:
-        """Least duration of a motion through rows within limits of velocity and acceleration, roughly [s]."""
+        """Approximate minimum duration [s] of a motion through configurations within the limits of velocity
+        and acceleration."""
         first = np.gradient(rows, axis=0)
         second = np.diff(rows, 2, axis=0)
         second = np.concatenate([second[:1], second, second[-1:]])
@@ -101,7 +107,8 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
         return float((2 / (speeds[1:] + speeds[:-1])).sum())
 
     def tried(end: Float[ndarray, "dof"] | None) -> bool:
-        """Whether the line can be followed to an end."""
+        """Whether the line can be followed to its last pose, while joints are steered to the configuration
+        `end` if it is given. The motion becomes a candidate if it ends there."""
         nonlocal fraction, why
         rows = _followed(problem, line, targets, *chain, end)
         fraction_followed = (len(rows) - 1) / len(targets)
@@ -151,16 +158,16 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
 
 
 def _poses(T_start: Float[ndarray, "4 4"], T_end: Float[ndarray, "4 4"]) -> Float[ndarray, "n 4 4"]:
-    """Poses along the line, evenly spaced, without the first."""
+    """Poses T_base_link along the line, evenly spaced, without the start and with the end."""
     displacement = T_end[:3, 3] - T_start[:3, 3]
     turn = rotation_vector(T_end[:3, :3] @ T_start[:3, :3].T)
     angle = float(np.linalg.norm(turn))
     count = max(np.linalg.norm(displacement) / STEP, angle / TURN_STEP, MIN_STEPS)
-    shares = np.linspace(0, 1, min(int(np.ceil(count)), MAX_STEPS) + 1)[1:, None]
+    fractions = np.linspace(0, 1, min(int(np.ceil(count)), MAX_STEPS) + 1)[1:, None]
     axis = turn / angle if angle > 0 else np.eye(3)[2]
-    poses = np.tile(T_end, (len(shares), 1, 1))
-    poses[:-1, :3, 3] = T_start[:3, 3] + shares[:-1] * displacement
-    poses[:-1, :3, :3] = rotation_about(axis, angle * shares[:-1, None]) @ T_start[:3, :3]
+    poses = np.tile(T_end, (len(fractions), 1, 1))
+    poses[:-1, :3, 3] = T_start[:3, 3] + fractions[:-1] * displacement
+    poses[:-1, :3, :3] = rotation_about(axis, angle * fractions[:-1, None]) @ T_start[:3, :3]
     return poses
 
 
@@ -174,8 +181,11 @@ def faster_ends(
     rows: Float[ndarray, "k dof"],
     cost: Callable[[Float[ndarray, "k dof"]], float],
 ) -> list[tuple[float, Float[ndarray, "k dof"]]]:
-    """Costs and motions along the line that end in other configurations than these rows do. Each has a lower
-    cost than those before it and is not much longer than these rows."""
+    """Costs and motions along the line that end in other configurations of the end pose than `rows`.
+
+    Each returned motion has a lower cost than `best_cost` and than the motions before it, and is at most
+    LONGER times as long as `rows`.
+    """
     end = rows[-1]
     max_length = LONGER * path_length(rows)
     constrained = 3 if line.angle is None else 6
@@ -183,7 +193,8 @@ def faster_ends(
     jacobian = link_jacobians(problem.robot, end[None], line.frame)[0][:constrained, arm]
     faster = list[tuple[float, Float[ndarray, "k dof"]]]()
     redundant = np.linalg.svd(jacobian)[2][constrained:]
-    # first the same end once more, but steered to
+    # the zero offset follows the line to the same end again, with the other joints steered there from the
+    # start
     offsets = [
         0 * redundant[:1],
         *(np.outer(steps, direction) for direction in redundant for steps in (END_STEPS, -END_STEPS)),
@@ -211,8 +222,11 @@ def _followed(
     joints: IKChain,
     end: Float[ndarray, "dof"] | None,
 ) -> Float[ndarray, "k dof"]:
-    """Configurations at the start and at these poses, as far as joints can follow. Joints that do not move
-    the link move straight to their values at the end, or stay."""
+    """Configurations at the start and at the poses in `targets`, up to the last pose that joints can follow.
+
+    end: the goal configuration to which the joints `arm` are steered; None: no steering. Joints that do not
+    move the link move linearly to their values in `end`, or stay.
+    """
     start = problem.start
     steer = end is not None
     goal = start if end is None else end
@@ -229,8 +243,8 @@ def _followed(
 
 def _obstruction(robot: Robot, q: Float[ndarray, "dof"]) -> str:
     """Why a line cannot be followed beyond this configuration."""
-    room = np.where(robot.continuous, np.inf, np.minimum(q - robot.lower, robot.upper - q))
-    j = int(room.argmin())
-    if room[j] < NEAR_LIMIT:
+    limit_distance = np.where(robot.continuous, np.inf, np.minimum(q - robot.lower, robot.upper - q))
+    j = int(limit_distance.argmin())
+    if limit_distance[j] < NEAR_LIMIT:
         return f"{robot.joint_names[j]} is at its limit there, {q[j]:.3f} rad"
     return "the arm is at the edge of its reach there, or a joint would have to jump"

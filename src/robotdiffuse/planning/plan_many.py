@@ -45,29 +45,31 @@ def plan_many(
 ) -> Iterator[PlanResult]:
     """Plan many problems in parallel.
 
-    A problem that raises an error, or kills its process, has a result with status ERROR; the others continue.
-    On a cluster, a problem that kills its process ends the call. Each process loads its compiled code before
-    its first problem, outside the time limit. Processes import the main script: without the line `if __name__
-    == "__main__":` above its statements, all results have status ERROR.
+    A problem that raises an error, or kills its process, gets a result with status ERROR; planning of the
+    other problems continues. On a cluster, a problem that kills its process ends the call. Each process loads
+    its compiled code before its first problem, outside the time limit. Processes import the main script, so
+    its statements must be below `if __name__ == "__main__":`; otherwise all results have status ERROR.
 
     Args:
         problems: The problems.
-        planner: As of `load_planner`.
-        settings: As of `load_planner`.
-        weights: As of `load_planner`.
+        planner: Name of the planner, as in `load_planner`.
+        settings: Settings of the planner, as in `load_planner`.
+        weights: Folder of weights, as in `load_planner`.
         workers: Number of processes; None: one for each core.
-        cluster: "ray": the Ray cluster that RAY_ADDRESS names, or one started here, in place of processes.
-            Problems of a lost node are planned again on another.
-        progress: Called after each problem, in the order in which problems end, with the number of finished
-            problems and the number of all.
+        cluster: None: processes on this machine. "ray": the Ray cluster at the address RAY_ADDRESS, or a Ray
+            instance that is started on this machine. Problems of a lost node are planned again on another
+            node.
+        progress: Called after each finished problem, in the order in which problems finish, with the number
+            of finished problems and the number of all problems.
         request: Arguments of `rd.plan`, the same for all problems: time_limit, seed, until, ...
 
-    Returns: An iterator over the results in the order of the problems. Each is returned as soon as it and all
-        results before it are finished.
+    Returns: An iterator over the results in the order of the problems. It yields a result as soon as this and
+        all earlier results are finished.
 
     Raises:
-        InputError: At once, for an unknown planner, settings or weights that do not fit it, unknown arguments
-            or arguments out of bounds, a number of workers below 1, and an unknown cluster.
+        InputError: Before any planning, for an unknown planner, settings or weights that do not fit the
+            planner, unknown arguments or arguments out of bounds, a number of workers below 1, and an unknown
+            cluster.
     """
     check_not_importing()
     if isinstance(problems, str) or not isinstance(problems, Iterable):
@@ -105,7 +107,8 @@ def _reported(results: Results, total: int, progress: Callable[[int, int], objec
 def _planned(
     problems: list[Problem], loaded: PlannerArguments, workers: int, request: PlanRequest
 ) -> Results:
-    # each robot is sent to a process once, without its compiled arrays; the process keeps those it compiles
+    # Each process gets each robot once, without cached arrays; the process computes and caches its own
+    # arrays.
     robots = list(dict.fromkeys(problem.robot for problem in problems))
     number = {robot: i for i, robot in enumerate(robots)}
     bare = [replace(robot) for robot in robots]

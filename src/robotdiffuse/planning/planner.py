@@ -23,7 +23,8 @@ from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape, Sphere
 from robotdiffuse.validation.tolerances import goal_index
 
 PlannerSettings = TypeVar("PlannerSettings", bound=Settings)
-# Time limits of the calls of `warm_up` [s]: for easy problems, and for the problem whose search need not end.
+# Time limits of the planning calls in `warm_up` [s]: for easy problems, and for the last one, which need not
+# be solved.
 EASY_TIME_LIMIT = 1.0
 SHORT_TIME_LIMIT = 0.02
 WARM_UP_RADIUS = 0.08
@@ -36,11 +37,11 @@ class Planner(ABC, Generic[PlannerSettings]):
     name: ClassVar[str]
     settings_class: type[PlannerSettings]
     supports: ClassVar[frozenset[str]] = frozenset()
-    """PATH_CONSTRAINTS, CLEARANCE, both or none; a request for a feature that the planner does not support is
-    refused. `plan` handles everything else that a problem or a request may contain, for every planner."""
+    """Which of the features PATH_CONSTRAINTS and CLEARANCE the planner supports; `plan` refuses requests for
+    the others. `plan` handles everything else that a problem or a request may contain, for every planner."""
 
     follows_lines: ClassVar[bool] = False
-    """Whether problems with a Cartesian line are first solved by `line_following.py`, without a search."""
+    """Whether `line_following.py` tries to solve a problem with a Cartesian line before `solve` is called."""
 
     def __init__(self, settings: PlannerSettings | None = None) -> None:
         self.settings = self.settings_class() if settings is None else settings
@@ -50,11 +51,12 @@ class Planner(ABC, Generic[PlannerSettings]):
         order; `rd.plan` documents them.
 
         The same seed gives the same path, as long as time does not run out. A result with status SOLVED holds
-        a path and a trajectory that passed `verify`; any other status comes with a reason.
+        a path and a trajectory that passed `verify`; with any other status, `reason` says why there is none.
 
-        Problems may also have, for every planner:
+        Every planner accepts problems with:
 
-        - waypoints: the motion stops at each or passes within its blend (`planning/pipeline/waypoints.py`);
+        - waypoints: the motion stops at each waypoint, or passes it within its blend distance
+          (`planning/pipeline/waypoints.py`);
         - moving obstacles: the motion waits, slows down or retreats on its path
           (`planning/pipeline/moving_obstacles.py`);
         - a start velocity: the arm is moving when the motion begins (`planning/pipeline/waypoints.py`);
@@ -65,7 +67,7 @@ class Planner(ABC, Generic[PlannerSettings]):
         and diffusion.
 
         Raises InputError for arguments out of bounds, for a clearance or constraints that the planner does
-        not support, and if `prepare` raises it.
+        not support, and for missing weights (see `prepare`).
         """
         check_problem(problem)
         result = self._plan(problem, PlanRequest(*values, **request))
@@ -85,13 +87,13 @@ class Planner(ABC, Generic[PlannerSettings]):
         return pipeline_for(problem)(self, problem, request)
 
     def warm_up(self, problem: Problem, until: str = CONVERGED) -> list[PlanResult]:
-        """Load or compile the code of later calls now, for programs that cannot wait in a first call.
+        """Load or compile the code that planning calls need, so that the first call does not wait for it.
 
-        Without it, the first call loads what it needs: the call takes longer, but its planning time excludes
-        the loading. until: the value that later calls will have.
+        Without `warm_up`, the first call loads this code itself, outside of its planning time. Pass the
+        `until` of later calls.
 
-        Returns the results of the calls that it makes: without obstacles, with balls on the straight line,
-        and a very short one with one small obstacle of each kind in the problem's scene.
+        Returns the results of the planning calls that `warm_up` makes: one without obstacles; two with a ball
+        on the straight line; and a short one with one small obstacle of each kind in the problem's scene.
         """
         from robotdiffuse.collision.exact_meshes import warm_up as load_coal
 
@@ -103,7 +105,7 @@ class Planner(ABC, Generic[PlannerSettings]):
         goal = problem.goal
         load_coal(robot)
         results = [call(Problem(robot, Scene(), start, goal), EASY_TIME_LIMIT)]
-        # a ball on the line leads to a path with corners, whose timing is separate compiled code
+        # a ball on the straight line forces a path with corners; separate compiled code times such paths
         ends = [] if results[0].path is None else [results[0].path.positions[-1]]
         on_line = [start + share * (end - start) for end in ends for share in (0.5, 0.35)]
         for q in on_line:
@@ -125,8 +127,9 @@ class Planner(ABC, Generic[PlannerSettings]):
 
 
 def pipeline_for(problem: Problem) -> Callable[[Solver, Problem, PlanRequest], PlanResult]:
-    """The function that plans for a problem: the first part of the pipeline that applies, else `attempt`.
-    Each part is imported only when it is needed."""
+    """The function that plans for a problem: the module of `planning/pipeline` that handles its moving
+    obstacles, waypoints, start velocity or views, in this order of precedence; `attempt` if it has none. A
+    module is imported only when it is needed."""
     if problem.moving:
         from robotdiffuse.planning.pipeline.moving_obstacles import plan_among_moving_obstacles
 
@@ -147,8 +150,8 @@ def pipeline_for(problem: Problem) -> Callable[[Solver, Problem, PlanRequest], P
 
 
 def ever_finer(context: PlanningContext, settings: PlannerSettings) -> Iterator[tuple[PlannerSettings, int]]:
-    """Yields settings and attempt number until time runs out, each time with a finer resolution: for searches
-    whose path the validator refused."""
+    """Yields settings and the number of the attempt, from 0, until time runs out. Each attempt has a finer
+    resolution of collision checks, for searches whose last path the validator refused."""
     attempt = 0
     while attempt == 0 or context.remaining > 0:
         yield settings, attempt
@@ -157,7 +160,7 @@ def ever_finer(context: PlanningContext, settings: PlannerSettings) -> Iterator[
 
 
 def one_of_each(scene: Scene) -> Scene:
-    """A scene with the first shape of each kind, where meshes have one triangle and point clouds one
+    """A scene with the first shape of each kind; meshes are reduced to one triangle and point clouds to one
     point."""
     shapes: dict[str, Shape] = {}
     for shape in scene.shapes:

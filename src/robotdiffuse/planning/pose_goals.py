@@ -1,4 +1,4 @@
-"""Goal configurations for poses of one link, or of several links at once: those nearest to the start."""
+"""Goal configurations for poses of one link or of several links, sorted by their distance from the start."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -22,27 +22,29 @@ from robotdiffuse.robots.inverse_kinematics import (
 GOAL_COUNT = 10
 """Number of configurations to find for a pose (the paper's k)."""
 SEEDS = 64
-"""Number of seeds of a round."""
+"""Number of seed configurations of inverse kinematics in a round."""
 ROUND = InverseKinematicsSettings(seeds_per_round=SEEDS, max_rounds=1)
 """Settings of one round of inverse kinematics for a pose without tolerances."""
-# Largest number of rounds; largest number of rounds in a row without a new configuration, once there is one;
-# and number of rounds after which a pose is given up if no configuration reached it.
+# Number of rounds: at most MAX_ROUNDS; once a configuration is found, rounds end after PATIENCE rounds in a
+# row without a new one; if no configuration reached the pose after REACH_ROUNDS, the pose is given up.
 MAX_ROUNDS = 64
 PATIENCE = 2
 REACH_ROUNDS = 16
 TOLERANCE_FRACTION = 0.9
-"""Fraction of the tolerances of path constraints that goals keep."""
+"""Fraction of the tolerances of goal poses and path constraints that goal configurations use."""
 MIN_DIFFERENCE = 0.1
 """Two configurations count as different if at least one joint differs by more than this [rad] or [m]."""
-# To bring a configuration nearer to the start, it is moved by a fraction PULL of the way there and projected
-# onto the goal again, at most MAX_PULLS times, as long as its distance falls by the fraction MIN_PULL_GAIN.
+# A configuration is brought nearer to the start by steps: it is moved by the fraction PULL of the way to the
+# start and projected onto the goal again. There are at most MAX_PULLS steps; they end when the distance to
+# the start falls by less than the fraction MIN_PULL_GAIN.
 PULL = 0.5
 MAX_PULLS = 12
 MIN_PULL_GAIN = 0.01
 EXACT = POSE_TOLERANCE, POSE_TOLERANCE
-"""Tolerances of poses that give none [m], [rad]."""
+"""Tolerances [m], [rad] of poses without tolerances of their own."""
 
 Accept = Callable[[Configurations], ndarray]
+"""Which of several configurations are acceptable, such as those free of collision: a boolean for each."""
 
 
 def pose_configurations(
@@ -54,15 +56,21 @@ def pose_configurations(
     rounds: int = MAX_ROUNDS,
     exact: tuple[float, float] = EXACT,
 ) -> Configurations:
-    """At most `count` configurations that bring links to their poses, or to poses within their tolerances,
-    and keep the problem's path constraints; those nearest to the problem's start first.
+    """At most `count` configurations that reach the goal within its tolerances and keep the problem's path
+    constraints; those nearest to the problem's start first.
 
-    The first seed is the start. Poses without tolerances are reached by inverse kinematics; tolerances, path
-    constraints and several poses by damped Newton steps for all of them together. Configurations are then
-    drawn towards the start, as far as the goal allows. Other arms of the robot stay at the start.
+    The first seed is the start. A pose without tolerances is reached by inverse kinematics. Tolerances, path
+    constraints and several poses are satisfied together, by damped Newton steps. Configurations are then
+    moved towards the start, as far as the goal allows. Other arms of the robot stay at the start.
 
-    accept: which configurations are acceptable, such as those free of collision. rounds: largest number of
-    rounds of seeds. exact: tolerances of poses that give none [m], [rad].
+    Args:
+        problem: The problem.
+        goal: The goal.
+        rng: Random generator of the seeds.
+        accept: Which configurations are acceptable; None: all.
+        count: Largest number of configurations.
+        rounds: Largest number of rounds of seeds.
+        exact: Tolerances [m], [rad] of poses without tolerances of their own.
     """
     robot = problem.robot
     start = problem.start
@@ -75,12 +83,12 @@ def pose_configurations(
     for k in range(rounds):
         check_time("configurations of the goal pose")
         seed_count = count if k == 0 else SEEDS
-        # projection ends at the edges of the tolerances, so every other round uses only a part of the
-        # tolerances
+        # Projection ends at the boundary of the tolerances; to find configurations inside, every other round
+        # uses only a fraction of the tolerances.
         aims = poses
         if k % 2:
-            part = rng.uniform()
-            aims = [_within(pose, part) for pose in poses]
+            fraction = rng.uniform()
+            aims = [_within(pose, fraction) for pose in poses]
         new = [at_pose(problem, aim, seed_count, rng, exact) for aim in aims]
         solutions = [np.concatenate([before, more]) for before, more in zip(solutions, new, strict=True)]
         seeds = new[0] if len(poses) == 1 else _combined(problem, poses, solutions, rng)
@@ -106,8 +114,8 @@ def pose_configurations(
 def at_pose(
     problem: Problem, pose: PoseGoal, count: int, rng: np.random.Generator, exact: tuple[float, float]
 ) -> Configurations:
-    """At most `count` configurations for one pose from a round of seeds, of which the first is the start;
-    without path constraints."""
+    """At most `count` configurations for one pose, from one round of seeds. The first seed is the start; path
+    constraints are ignored."""
     robot = problem.robot
     start = problem.start
     if not pose.tolerant and exact == EXACT:
@@ -124,8 +132,8 @@ def at_pose(
 def at_poses(
     problem: Problem, poses: Sequence[PoseGoal], count: int, rng: np.random.Generator
 ) -> Iterator[Configurations]:
-    """At most `count` configurations for each of many poses of a link without tolerances, from the same
-    seeds, of which the first is the start."""
+    """At most `count` configurations for each of many poses, which are poses of one link without tolerances.
+    All poses use the same seeds, of which the first is the start."""
     robot = problem.robot
     start = problem.start
     seeds = random_seeds(robot, robot.lower, robot.upper, SEEDS, rng, start)
@@ -135,22 +143,23 @@ def at_poses(
         yield robot.nearest_turns(configurations, start)
 
 
-def _within(pose: PoseGoal, part: float) -> PoseGoal:
-    """The pose with its tolerances multiplied by `part`; angles that are free stay free."""
+def _within(pose: PoseGoal, fraction: float) -> PoseGoal:
+    """The pose with its tolerances multiplied by `fraction`; an unconstrained angle stays unconstrained."""
     xyz = pose.xyz_tolerance
     rpy = pose.rpy_tolerance
     return replace(
         pose,
-        xyz_tolerance=None if xyz is None else part * xyz,
-        rpy_tolerance=None if rpy is None else np.where(rpy < np.pi, part * rpy, rpy),
+        xyz_tolerance=None if xyz is None else fraction * xyz,
+        rpy_tolerance=None if rpy is None else np.where(rpy < np.pi, fraction * rpy, rpy),
     )
 
 
 def _combined(
     problem: Problem, poses: Sequence[PoseGoal], solutions: Sequence[ndarray], rng: np.random.Generator
 ) -> Configurations:
-    """Random combinations of configurations for each pose alone; joints that several poses move take the
-    values of one of them."""
+    """Seeds for several poses: random combinations of the configurations in `solutions` that each pose alone
+    has. A joint that moves several links takes its value from one pose's configuration, chosen at random. No
+    rows if a pose has no configuration."""
     seeds = np.tile(problem.start, (SEEDS if all(len(alone) for alone in solutions) else 0, 1))
     for k in rng.permutation(len(poses)):
         moving = ~on_other_arm(problem.robot, poses[k].frame)
@@ -160,7 +169,7 @@ def _combined(
 
 
 def _pulled(constraints: PathConstraints, q: Configurations, start: Configuration) -> Configurations:
-    """The configurations drawn towards the start, as far as the goal allows."""
+    """The configurations moved towards the start, as far as the goal and the constraints allow."""
     robot = constraints.robot
     nearest = q
     for _ in range(MAX_PULLS):
@@ -179,7 +188,7 @@ def _accepted(q: Configurations, accept: Accept | None) -> Configurations:
 
 
 def _distinct(q: Configurations) -> Configurations:
-    """The configurations without those that are close to an earlier one."""
+    """The configurations without those that differ from an earlier one by at most MIN_DIFFERENCE."""
     unique = q[:0]
     for row in q:
         if (np.abs(unique - row).max(axis=1, initial=0.0) > MIN_DIFFERENCE).all():

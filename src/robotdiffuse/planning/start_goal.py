@@ -1,4 +1,4 @@
-"""Start and goal states: usable configurations for a search, or the reason why there are none."""
+"""Start and goal configurations for a search, or the reason why there are none."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -27,37 +27,41 @@ if TYPE_CHECKING:
     from robotdiffuse.problems.compiled_constraints import PathConstraints
 
 GOAL_TIME_FRACTION = 0.5
-"""If there are several goals: after this fraction of the time limit no more goals are tried, if one is free
-or if none was free at the first try."""
+"""Of several goals, no more goals are tried after this fraction of the time limit: in the first pass over the
+goals if one was free, in the second pass in any case."""
 NEAR_POSE_FRACTIONS = (0.1, 0.3, 0.9)
-"""If a pose cannot be reached exactly, it is to be reached within these fractions of the validator's
-tolerances, tried in turn."""
-# Rounds of seeds for that, and number of configurations for each of several poses.
+"""If a pose cannot be reached exactly, inverse kinematics tries these fractions of the validator's goal
+tolerances, in this order."""
 NEAR_POSE_ROUNDS = 2
+"""Number of rounds of seeds for each of NEAR_POSE_FRACTIONS."""
 FIRST_TRY_COUNT = 3
+"""Number of configurations to find for each of several poses in the first pass."""
 MANY_GOALS = 8
-"""If there are at least this many poses of a link, the first try uses the same seeds for all of them."""
-# Number of configurations of a pose whose exact meshes are checked where the covering spheres collide, and
-# number of those that become goals.
+"""If there are at least this many poses of a link, the first pass uses the same seeds for all of them."""
+# A configuration of a pose may be free although its covering spheres collide. At most MAX_EXACT_GOALS such
+# configurations are checked with exact meshes, and at most MAX_GRAZING_GOALS of them become goals.
 MAX_EXACT_GOALS = 20
 MAX_GRAZING_GOALS = 3
 END_MARGIN = 0.0005
-"""Near a start or goal with less than the requested clearance, paths keep the clearance of this
-configuration, minus this margin [m]."""
+"""Near a start or goal that is closer to obstacles than the requested clearance, paths keep the distance of
+this start or goal minus this margin [m]."""
 CLEARANCE_STEPS = 5
 """Number of steps of `falling_clearances`."""
 RETREAT_STEP = 0.01
-"""Step length out of contact of the covering spheres [rad]."""
+"""Length of the steps by which `retreat` moves the covering spheres out of contact [rad, joint-space L2]."""
 RETREAT_STEPS = 100
+"""Largest number of these steps."""
 MAX_OVERTURN = np.pi / 2
 """How far a continuous joint may turn beyond the start and the goals in a search [rad]."""
 
 
 class StartGoal:
-    """The start and the goals of a search, and configurations nearby where the covering spheres are free.
+    """The start and the goals of a search, each with a lead: a nearby configuration whose covering spheres
+    are free, from which or to which the search plans. The lead of a free configuration is the configuration
+    itself.
 
-    The start of a continuous joint is within half a turn here; `complete` adds its whole turns back. Each
-    goal is replaced by its images, see `images`.
+    Whole turns are removed from continuous joints of the start; `complete` adds them to the path. Each goal
+    is replaced by its images, see `images`; images without a lead are dropped.
     """
 
     def __init__(
@@ -72,23 +76,23 @@ class StartGoal:
         self._turns = robot.whole_turns(start)
         self.start = start - self._turns
         goal_images = [image for goal in goals for image in images(robot, self.start, goal)]
-        every = [self.start, *goal_images]
-        free = checker.free(np.stack(every))  # in one batch: most are free
+        states = [self.start, *goal_images]
+        free = checker.free(np.stack(states))  # one batch, since most are free
         self.start_lead, *leads = (
-            q.copy() if at_once and constraints is None else retreat(checker, q, constraints)
-            for q, at_once in zip(every, free, strict=True)
+            q.copy() if is_free and constraints is None else retreat(checker, q, constraints)
+            for q, is_free in zip(states, free, strict=True)
         )
         self.goals = [goal for goal, lead in zip(goal_images, leads, strict=True) if lead is not None]
         self.goal_leads = [lead for lead in leads if lead is not None]
 
     def rows(self) -> tuple[Configuration, Configurations]:
-        """The start and the goals of a search, in float32."""
+        """The leads of the start [dof] and of the goals [n, dof], in float32."""
         assert self.start_lead is not None
         return self.start_lead.astype(np.float32), np.array(self.goal_leads, np.float32)
 
     def kept_clearance(self, wanted: float) -> float:
-        """The clearance that a path can keep: the wanted one, or half that of the start or a goal if less
-        [m]."""
+        """A clearance that a path can keep [m]: half of the smallest among `wanted` and the clearances of the
+        start and the goals."""
         start, goals = self.rows()
         leads = np.concatenate([start[None], goals])
         return min(wanted, 0.5 * float(self.checker.link_clearances(leads).min(initial=wanted)))
@@ -96,8 +100,8 @@ class StartGoal:
     def space(self, resolution: float, clearance: float) -> Space:
         """The space in which searches check motions, at a resolution [m] and a clearance [m].
 
-        Near a start or goal with less clearance, the clearance is reduced to its own, and grows with the
-        distance from it (`collision.kernels.motions.padding_near`).
+        A start or goal may be closer to obstacles than the clearance. Its own clearance then applies there,
+        and the clearance grows with the distance from it (`collision.kernels.motions.padding_near`).
         """
         start, goals = self.rows()
         states = np.concatenate([start[None], goals])
@@ -105,14 +109,17 @@ class StartGoal:
 
     def _within(self, space: Space, states: Configurations) -> Space:
         """The space with continuous joints limited to MAX_OVERTURN beyond the range of start and goals."""
-        turning = self._robot.continuous
-        lower = np.where(turning, np.maximum(space.lower, states.min(axis=0) - MAX_OVERTURN), space.lower)
-        upper = np.where(turning, np.minimum(space.upper, states.max(axis=0) + MAX_OVERTURN), space.upper)
+        continuous = self._robot.continuous
+        lower = np.where(continuous, np.maximum(space.lower, states.min(axis=0) - MAX_OVERTURN), space.lower)
+        upper = np.where(continuous, np.minimum(space.upper, states.max(axis=0) + MAX_OVERTURN), space.upper)
         return space._replace(lower=lower.astype(np.float32), upper=upper.astype(np.float32))
 
     def complete(self, path: Configurations, direct: bool = False) -> Configurations:
-        """The path of a search in float64, with the exact start and goal in place of its ends, or added
-        before and after them. `direct`: always in place of them."""
+        """The path of a search from the exact start to the exact goal, in float64.
+
+        Where the path ends at a lead that differs from the start or goal, the start or goal is added;
+        otherwise it replaces the path's end. direct: always replace the ends.
+        """
         assert self.start_lead is not None
         path = path.astype(np.float64)
         errors = [np.abs(path[-1] - lead).max() for lead in self.goal_leads]
@@ -128,30 +135,34 @@ class StartGoal:
 def padded_space(
     checker: CollisionChecker, states: Configurations, resolution: float, clearance: float
 ) -> Space:
-    """The space for motions that keep a clearance [m], except near a start or goal that is closer."""
+    """The space for motions that keep a clearance [m], except near start and goal states that are closer to
+    obstacles."""
     if clearance <= 0:
         return search_space(checker, resolution)
-    has = checker.link_clearances(states).min(axis=1, initial=1.0)
-    close = has < clearance + END_MARGIN
-    near = np.column_stack([states[close], np.maximum(has[close] - END_MARGIN, 0.0)])
+    own_clearances = checker.link_clearances(states).min(axis=1, initial=1.0)
+    close = own_clearances < clearance + END_MARGIN
+    near = np.column_stack([states[close], np.maximum(own_clearances[close] - END_MARGIN, 0.0)])
     return search_space(checker, resolution, clearance, near)
 
 
 def falling_clearances(most: float, checker: CollisionChecker, states: Configurations) -> list[float]:
-    """Clearances for a search to try, falling to zero in CLEARANCE_STEPS steps [m]. Two more are the
-    clearance of the start, states[0], and that of the goal that is farthest from obstacles."""
-    has = checker.link_clearances(states).min(axis=1, initial=1.0)
-    at_ends = {max(float(end) - END_MARGIN, 0.0) for end in (has[0], has[1:].max()) if end < most}
+    """Clearances for a search to try, from `most` to zero [m].
+
+    These are CLEARANCE_STEPS equal steps, and, if below `most`, the clearance of the start, states[0], and of
+    the goal that is farthest from obstacles, each minus END_MARGIN.
+    """
+    own = checker.link_clearances(states).min(axis=1, initial=1.0)
+    at_ends = {max(float(end) - END_MARGIN, 0.0) for end in (own[0], own[1:].max()) if end < most}
     return sorted(
         {most * step / CLEARANCE_STEPS for step in range(CLEARANCE_STEPS + 1)} | at_ends, reverse=True
     )
 
 
 def images(robot: Robot, start: Configuration, goal: Configuration) -> list[Configuration]:
-    """The goal with whole turns added to continuous joints: a search does not wrap them.
+    """Copies of the goal with whole turns added to continuous joints, since a search does not wrap angles.
 
-    First the image nearest to the start, then those with one continuous joint turned the other way: an
-    obstacle may block the short way.
+    First the copy nearest to the start. Then, for each continuous joint, a copy in which this joint turns the
+    other way, because an obstacle may block the shorter way.
     """
     nearest = goal - robot.whole_turns(goal - start)
     images = [nearest]
@@ -163,11 +174,11 @@ def images(robot: Robot, start: Configuration, goal: Configuration) -> list[Conf
 
 
 def usable_start_goal(context: PlanningContext) -> StartGoal | PlanResult:
-    """The start and the goals for a search of this call, or the failed result if there are none.
+    """The start and the goals for the search of a call; a failed result if there are none.
 
-    For poses, up to `pose_goals.GOAL_COUNT` configurations by inverse kinematics. Goals whose covering
-    spheres are free are preferred; if there are none, those whose exact meshes are free are used. Of several
-    goals, each is tried once; only if none is free, each is tried again for longer.
+    A pose gives up to `pose_goals.GOAL_COUNT` configurations by inverse kinematics. Configurations whose
+    covering spheres are free are preferred over those of which only the exact meshes are free. Several goals
+    are tried with little work each; only if none is free, they are tried again with more.
     """
     checker = CollisionChecker(context.problem.robot, context.problem.scene)
     goals = _usable_goals(context, checker)
@@ -187,11 +198,11 @@ def usable_start_goal(context: PlanningContext) -> StartGoal | PlanResult:
 def retreat(
     checker: CollisionChecker, q: Configuration, constraints: "PathConstraints | None" = None
 ) -> Configuration | None:
-    """A configuration nearby whose covering spheres are free, found down the gradient of the collision cost.
+    """A configuration near q whose covering spheres are free, found by descending the collision cost.
 
-    For a start or goal whose exact meshes are free while the spheres around them are not. None if no free
-    configuration was found within 1 rad, or it does not keep the constraints. The motion to it is left to the
-    validator.
+    Used for a start or goal whose exact meshes are free although the covering spheres collide. None if no
+    free configuration is found within 1 rad, or if the configuration violates the constraints. The motion
+    between q and the configuration is not checked here, but by the validator.
     """
     robot = checker.robot
     at = q.copy()
@@ -207,8 +218,8 @@ def retreat(
 
 
 def closeness(checker: CollisionChecker, q: Configuration) -> str:
-    """A message that says where the covering spheres penetrate deepest, for a configuration whose meshes are
-    free."""
+    """A message that says where the covering spheres of a configuration with free meshes penetrate
+    deepest."""
     clearances = np.concatenate([checker.link_clearances(q[None])[0], checker.pair_clearances(q[None])[0]])
     deepest = int(clearances.argmin())
     link, partner = [*((link, None) for link in checker.links), *checker.pairs][deepest]
@@ -254,7 +265,7 @@ def _usable_goals(context: PlanningContext, checker: CollisionChecker) -> Config
 
 
 def _too_heavy(context: PlanningContext, q: Configuration) -> str | None:
-    """A message that names the joint that cannot hold the problem's payload there; None if all can."""
+    """A message that names a joint that cannot hold the problem's payload at q; None if every joint can."""
     return None if context.validator.dynamics is None else context.validator.dynamics.overload_message(q)
 
 
@@ -271,7 +282,8 @@ def _goals(context: PlanningContext, goal: Goal, checker: CollisionChecker) -> C
 def _any_goals(
     context: PlanningContext, goals: Sequence[OneGoal], checker: CollisionChecker
 ) -> Configurations | PlanResult:
-    """The free configurations of several goals, by one try for each; if none is free, by more for each."""
+    """The free configurations of several goals. The first pass does little work for each goal; if no goal is
+    free, the second pass does more."""
     until = GOAL_TIME_FRACTION * context.request.time_limit
     free = list[ndarray]()
     exact = [goal for goal in goals if isinstance(goal, PoseGoal) and not goal.tolerant]
@@ -284,9 +296,9 @@ def _any_goals(
             batches.append(configurations)
             if context.elapsed > until and checker.free(np.concatenate(batches)).any():
                 break
-        every = np.concatenate(batches)
-        every = every[checker.free(every)]
-        free = [_with_turns(context, every)] if len(every) else []
+        candidates = np.concatenate(batches)
+        candidates = candidates[checker.free(candidates)]
+        free = [_with_turns(context, candidates)] if len(candidates) else []
     else:
         for goal in goals:
             if free and context.elapsed > until:
@@ -312,7 +324,7 @@ def _any_goals(
 
 
 def _first_try(context: PlanningContext, goal: OneGoal, checker: CollisionChecker) -> Configurations:
-    """Free configurations of one of several goals, by little work."""
+    """Free configurations of one of several goals, from one round of seeds; no rows if none was found."""
     if isinstance(goal, JointGoal):
         constraints = context.validator.constraints
         free = checker.free(goal.positions)
@@ -384,7 +396,8 @@ def _pose_goals(
                     f"{1e3 * near[0]:g} mm and {np.degrees(near[1]):.2g} degrees of it"
                 )
                 break
-    # meshes may be free where the covering spheres are not
+    # Exact meshes may be free where the covering spheres collide. Distinct rejected configurations are
+    # checked, nearest to the start first, if they are nearer to it than the best free one.
     rejected = rejected[np.unique(np.round(rejected, 1), axis=0, return_index=True)[1]]
     rejected = rejected[np.argsort(distances(rejected), kind="stable")][:MAX_EXACT_GOALS]
     if len(configurations):
@@ -422,7 +435,7 @@ def _pose_goals(
 
 
 def _pose_goals_module() -> ModuleType:
-    """The module `pose_goals`, imported here because it imports compiled code, rarely needed."""
+    """The module `pose_goals`, imported on first use because it imports compiled code."""
     with loading():
         from robotdiffuse.planning import pose_goals
 
@@ -430,8 +443,7 @@ def _pose_goals_module() -> ModuleType:
 
 
 def _with_turns(context: PlanningContext, goals: Iterable[ndarray]) -> Configurations:
-    """The goals and their copies with whole turns: a pose does not say how often a continuous joint has
-    turned."""
+    """The goals and their copies with whole turns added to continuous joints, which reach the same pose."""
     robot = context.problem.robot
     start = context.problem.start
     return np.concatenate([robot.equivalent_configurations(q, start) for q in goals])
@@ -446,9 +458,9 @@ def _free_meshes(robot: Robot, scene: Scene, q: Configurations) -> Configuration
 
 
 def _explained(robot: Robot, scene: Scene, q: Configuration) -> str | None:
-    """The message of `explain_collision`, imported here because it imports Coal."""
+    """A message that says what collides at q, by `explain_collision`; None if the meshes are free."""
     with loading():
-        from robotdiffuse.collision.exact_meshes import explain_collision
+        from robotdiffuse.collision.exact_meshes import explain_collision  # imports Coal, rarely needed
 
     message = explain_collision(robot, scene, q)
     if message and any(isinstance(shape, SeenPoints) and shape.name in message for shape in scene.shapes):

@@ -27,10 +27,10 @@ Contacts = Mapping[str, Sequence[str] | str]
 TIP = "tip"
 WORLD = "world"
 LINE_TIME_LIMIT = 0.3
-"""Time limit for planning one straight line [s], if an earlier `MoveTo` step could be planned again to end in
-another configuration."""
+"""Time limit for planning a straight line [s] after a `MoveTo` step: if the line fails, the `MoveTo` step is
+planned again to another end."""
 SAME_END = 0.1
-"""Two end configurations of a step count as the same if no joint differs by more than this [rad] or [m]."""
+"""Two end configurations of a step are different if a joint differs by more than this [rad] or [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,14 +38,15 @@ class MoveTo:
     """A step of `Workspace.plan_steps`: move around the obstacles to a goal."""
 
     goal: Any
-    """A pose [4, 4] in the frame of the world, or several [n, 4, 4], any of which may be reached; or any
-    other goal that `Workspace.plan` takes."""
+    """A pose T_world_link [4, 4]; several poses [n, 4, 4], any of which may be reached; or any other goal
+    that `Workspace.plan` takes."""
     link: str | None = None
-    """The link or held object that poses are of; None: the tip of the workspace."""
+    """The link or held object that moves to the pose; None: the tip of the workspace."""
     constraints: Sequence[Constraint] = ()
     """Path constraints of this step, in the frame of the base."""
     contacts: Contacts = field(default_factory=dict)
-    """Contacts that are allowed during this step: obstacles, each with names of links, or "all"."""
+    """Contacts that are allowed during this step: for each obstacle, the links that may touch it, or
+    "all"."""
     name: str = "move to"
     """Name of the step, for messages."""
 
@@ -55,9 +56,9 @@ class MoveRelative:
     """A step of `Workspace.plan_steps`: move the tip along a straight line and keep its orientation."""
 
     xyz: ArrayLike
-    """How far to move [3] [m]."""
+    """Displacement [3], in the axes of `frame` [m]."""
     frame: str = TIP
-    """The frame in whose axes `xyz` is given: "tip" or "world"."""
+    """Axes of `xyz`: those of the tip at the start of the step ("tip"), or of the world ("world")."""
     tolerance: float = 0.001
     """Largest distance of the tip from the line [m]."""
     contacts: Contacts = field(default_factory=dict)
@@ -109,11 +110,11 @@ class StepsResult:
     """The verified motion of each step, None for `Attach` and `Detach`. If a step failed, its result is the
     last one."""
     workspace: Any
-    """The `Workspace` after these steps: where obstacles are then, and what the robot holds."""
+    """The `Workspace` after these steps, with the obstacles and held objects as they are then."""
     reason: str
-    """What happened, in a sentence; if a step failed, it begins with this step and says why."""
+    """A sentence: "solved in ... steps", or which step failed and why."""
     planning_time: float
-    """Wall time of the call, without the time for loading code [s]."""
+    """Wall time of the call, without loading code [s]."""
 
     def __repr__(self) -> str:
         outcome = "solved" if self.solved else "failed"
@@ -132,15 +133,15 @@ class StepsResult:
 
     @property
     def trajectory(self) -> Trajectory | Any:
-        """The motions of all steps one after the other, at rest in between; None if a step failed, or if
-        none moves. Each motion was verified with the contacts and held objects of its step."""
+        """The motions of all steps one after the other, at rest in between; None if a step failed, or if no
+        step moves the arm. Each motion was verified with the contacts and held objects of its step."""
         motions = [result.trajectory for result in self.results if result is not None]
         return one_after_another(motions) if motions and self.solved else None
 
     @property
     def begins(self) -> Float[ndarray, "steps"]:
-        """When each step begins in `trajectory` [s]; for `Attach` and `Detach`, this is when the gripper
-        acts."""
+        """Time at which each step begins in `trajectory` [s]; the gripper acts when `Attach` and `Detach`
+        begin."""
         durations = [
             result.duration if result is not None and result.solved else 0.0 for result in self.results
         ]
@@ -164,8 +165,8 @@ class StepsResult:
 def plan_steps(
     space: Any, steps: Sequence[Step], start: AnyConfiguration, time_limit: float, **request: Any
 ) -> StepsResult:
-    """See `Workspace.plan_steps`. If a step fails, the last step before it that can end at another goal or in
-    another configuration is planned again."""
+    """See `Workspace.plan_steps`. The search is depth-first: if a step fails, the last `MoveTo` step before
+    it that has another end is planned again to that end."""
     began = clock()
     check_type("steps", steps, (list, tuple), "a list of steps")
     for i, step in enumerate(steps):
@@ -174,7 +175,7 @@ def plan_steps(
     retried_ends = 0
 
     def motions(k: int, space: Any, q: Configuration) -> Iterator[PlanResult]:
-        """Motions of a step, each with another end; the last may be a failure."""
+        """Motions of step k from q, each to another goal or goal configuration; the last may be a failure."""
         step = steps[k]
         assert isinstance(step, MoveTo | MoveRelative)
         space = copy(space)
@@ -209,8 +210,8 @@ def plan_steps(
     def planned(
         k: int, space: Any, q: Configuration, results: tuple[PlanResult | None, ...]
     ) -> StepsResult | None:
-        """A result for all steps, of which the first k are planned already; None if one of the others
-        fails."""
+        """A result for all steps. The first k steps are planned already, with these `results`, and end at q.
+        None if a later step fails; `furthest` then tells about the failure after the most steps."""
         nonlocal furthest, retried_ends
         if k == len(steps):
             return StepsResult(tuple(steps), results, space, f"solved in {k} steps", clock() - began)
@@ -251,8 +252,8 @@ def plan_steps(
 
 
 def _other_ends(problem: Problem) -> list[tuple[int, Configuration]]:
-    """Configurations at the goals of a problem, each with the index of its goal; none for poses with
-    tolerances."""
+    """Configurations at the goals of a problem, each with its goal index (see `PlanResult.goal_index`); none
+    for poses with tolerances and for poses of several links."""
     goals = problem.goal.goals if isinstance(problem.goal, AnyGoal) else (problem.goal,)
     ends = list[tuple[int, Configuration]]()
     for i, goal in enumerate(goals):
@@ -260,6 +261,6 @@ def _other_ends(problem: Problem) -> list[tuple[int, Configuration]]:
             rows = problem.robot.ik(goal.T_base_frame, goal.frame, near=problem.start)
             ends += [(i, row) for row in rows]
         elif isinstance(goal, JointGoal):
-            several = len(goals) == 1
-            ends += [(j if several else i, row) for j, row in enumerate(goal.positions)]
+            single_goal = len(goals) == 1
+            ends += [(j if single_goal else i, row) for j, row in enumerate(goal.positions)]
     return ends

@@ -1,4 +1,4 @@
-"""What a program keeps between calls: a robot, its named obstacles and what it holds."""
+"""Workspace: a robot, its named obstacles and its held objects, which a program keeps between calls."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -29,12 +29,12 @@ from robotdiffuse.scenes.shapes import Shape
 class Workspace:
     """A robot among named obstacles, for programs that plan again and again.
 
-    All poses are in the frame of the world. Each call plans for the obstacles as they are then; what is
-    computed for a robot and its held objects is kept. A workspace belongs to one thread.
+    Poses given as matrices are in the frame of the world. Each call plans for the current obstacles; arrays
+    computed for a robot with its held objects are reused. A workspace must be used by one thread only.
 
     Args:
         robot: The robot.
-        tip: The link that poses are of; None: the tip of the robot.
+        tip: The link that is moved to poses; None: the tip of the robot.
         T_world_base: Pose of the robot's base [4, 4]; None: the base is the origin of the world.
 
     Raises:
@@ -52,12 +52,12 @@ class Workspace:
 
     def __init__(self, robot: Robot, tip: str | None = None, T_world_base: ArrayLike | None = None) -> None:
         self.robot = robot
-        """The robot, with what it holds."""
+        """The robot with its held objects."""
         self.tip = robot.tip if tip is None else tip
         robot.link_frame(self.tip)
         base = np.eye(4) if T_world_base is None else rigid_transform("T_world_base", T_world_base)
         self.T_world_base: ndarray = base
-        """Pose of the base."""
+        """Pose of the base in the world."""
         self._T_base_world = inverse(base)
         self.scene = Scene()
         """The obstacles, in the frame of the base."""
@@ -68,13 +68,13 @@ class Workspace:
         return tuple(shape.name for shape in self.scene.shapes)
 
     def add(self, *shapes: Shape) -> None:
-        """Add obstacles. One with the name of an obstacle that is there replaces it.
+        """Add obstacles. A shape with the name of an existing obstacle replaces it.
 
         Args:
-            shapes: Shapes, meshes or point clouds, each with a name of its own.
+            shapes: Shapes, meshes or point clouds with different names, in the frame of the world.
 
         Raises:
-            InputError: For anything but shapes, and for two of one name.
+            InputError: For anything but shapes, and for two shapes with equal names.
         """
         new = Scene(shapes).moved(self._T_base_world).shapes
         names = [shape.name for shape in new]
@@ -90,7 +90,7 @@ class Workspace:
 
         Args:
             name: Name of the obstacle.
-            T_world_shape: Pose of its frame [4, 4].
+            T_world_shape: New pose of the obstacle's own frame [4, 4].
 
         Raises:
             InputError: For an unknown name, a pose that is not rigid, and a point cloud, which has no frame.
@@ -106,7 +106,7 @@ class Workspace:
         """Remove obstacles.
 
         Args:
-            names: Names of the obstacles; none: all.
+            names: Names of the obstacles; without names, all are removed.
 
         Raises:
             InputError: For an unknown name.
@@ -117,11 +117,11 @@ class Workspace:
         )
 
     def allow(self, obstacle: str, links: Sequence[str] | str) -> None:
-        """Allow links to touch an obstacle, as fingers what they grasp.
+        """Set which links may touch an obstacle, such as the fingers that grasp it.
 
         Args:
             obstacle: Name of the obstacle.
-            links: Names of links and held objects; "all"; or none, to allow no contact again.
+            links: Names of links and held objects; "all"; or an empty list to allow no contact.
 
         Raises:
             InputError: For an unknown obstacle.
@@ -134,13 +134,13 @@ class Workspace:
     def attach(
         self, name: str, q: AnyConfiguration, link: str | None = None, touch_links: Iterable[str] = ()
     ) -> None:
-        """The robot takes an obstacle; from then on it is a link of the robot.
+        """Attach an obstacle to the robot: it becomes a held object, which moves with a link.
 
         Args:
             name: Name of the obstacle.
-            q: Configuration at which it is grasped [dof], or the name of a pose.
+            q: Configuration at which it is grasped [dof], values by joint, or the name of a pose.
             link: The link that holds it; None: the tip of the workspace.
-            touch_links: Further links that it may touch.
+            touch_links: Further links that it may touch while it is held.
 
         Raises:
             InputError: For an unknown obstacle or link, and for a point cloud.
@@ -152,11 +152,11 @@ class Workspace:
         )
 
     def detach(self, name: str, q: AnyConfiguration) -> None:
-        """The robot puts a held object down, which is an obstacle from then on.
+        """Detach a held object from the robot: it becomes an obstacle at its current place.
 
         Args:
             name: Name of the object.
-            q: Configuration at which it is released [dof], or the name of a pose.
+            q: Configuration at which it is released [dof], values by joint, or the name of a pose.
 
         Raises:
             InputError: For an unknown name.
@@ -176,7 +176,7 @@ class Workspace:
         return self.T_world_base @ self.robot.fk(self._configuration(q), link or self.tip)
 
     def ik(self, pose: ArrayLike, near: ArrayLike | None = None, count: int = 10) -> ndarray:
-        """Configurations that bring the tip to a pose; they may collide.
+        """Configurations that bring the tip to a pose. Collisions are not checked.
 
         Args:
             pose: T_world_tip [4, 4].
@@ -184,7 +184,7 @@ class Workspace:
             count: Largest number of configurations.
 
         Returns:
-            Distinct configurations [k, dof]; no rows if the pose is out of reach.
+            Distinct configurations [k, dof]; no rows if none was found.
         """
         T = self._T_base_world @ rigid_transform("pose", pose)
         return self.robot.ik(T, self.tip, near=near, count=count)
@@ -223,7 +223,7 @@ class Workspace:
                 be reached; or a goal that `rd.Problem` takes, in the frame of the base.
             start: Start configuration [dof], values by joint, or the name of a pose.
             constraints: Path constraints, in the frame of the base.
-            time_limit: Wall time of the call, with what it takes to read many goals [s].
+            time_limit: Wall time of the call, including the conversion of many goals [s].
             request: Further arguments of `rd.plan`: seed, until, ...
 
         Returns:
@@ -236,10 +236,10 @@ class Workspace:
     def plan_steps(
         self, steps: Sequence[Step], start: AnyConfiguration, time_limit: float = 10.0, **request: Any
     ) -> StepsResult:
-        """Plan steps such as approach, grasp, lift, carry and place; the workspace stays as it is.
+        """Plan steps such as approach, grasp, lift, carry and place. The workspace is not changed.
 
-        Where a step fails, the last step before it that can end at another goal, or in another configuration,
-        is planned again.
+        If a step fails, an earlier `MoveTo` step is planned again to another goal or goal configuration: the
+        last such step for which one is left.
 
         Args:
             steps: `rd.MoveTo`, `rd.MoveRelative`, `rd.Attach` and `rd.Detach`, in their order.
@@ -248,10 +248,10 @@ class Workspace:
             request: Further arguments of `rd.plan`: seed, until, ...
 
         Returns:
-            A result with a verified motion for each step, or with the step that failed, and why.
+            A result with a verified motion for each step, or with the step that failed and the reason.
 
         Raises:
-            InputError: Where a step alone would; the message names the step.
+            InputError: For a step with wrong input; the message names the step.
 
         Examples:
             >>> space = rd.Workspace(rd.load_robot("panda"))
@@ -273,30 +273,30 @@ class Workspace:
         waypoints: Sequence[ArrayLike] = (),
         **request: Any,
     ) -> PlanResult:
-        """Move the tip along a straight line, turning evenly.
+        """Plan a motion of the tip along a straight line, with an evenly turning orientation.
 
         Args:
-            pose: T_world_tip at the end [4, 4]; or in the frame of the base a `rd.PoseGoal`, of which the
-                pose within its tolerances nearest to the present one is taken, or a `rd.AnyGoal`, of which
-                the nearest to the tip that a line leads to is taken.
+            pose: End of the line: T_world_tip [4, 4], or a goal in the frame of the base. For a `rd.PoseGoal`
+                with tolerances, the line ends at a pose within them that is near to the pose at the start.
+                For a `rd.AnyGoal`, lines to the goals are tried until one is found, nearest goal first.
             start: Start configuration [dof], values by joint, or the name of a pose.
             tolerance: Largest distance of the tip from the line [m].
-            angle: Largest deviation of its orientation [rad]; None: any on the way.
-            speed: Largest speed of the tip [m/s]; None: what the joints allow.
-            time_limit: Wall time of the call [s]; of several goals, each has an equal share of what is left.
-            waypoints: Poses of the tip [4, 4] at which the motion stops on its way: a line leads to each.
+            angle: Largest deviation of its orientation [rad]; None: any orientation on the way.
+            speed: Largest speed of the tip [m/s]; None: only the joint limits apply.
+            time_limit: Wall time of the call [s]; the remaining time is divided equally among untried goals.
+            waypoints: Poses T_world_tip [4, 4] on the way. A line leads to each, and the motion stops there.
             request: Further arguments of `rd.plan`: seed, until, ...
 
         Returns:
-            A result; with waypoints the lines are each verified, and joined as by `rd.join`. `fraction`
-            says how much of the line can be followed, and `reason` why no more. Of
-            several goals, `goal_index` is the one that is reached, or the result is that of the goal that a
-            line gets nearest to.
+            A result. `fraction` says how much of the line can be followed; if it is below 1, `reason` says
+            why. With waypoints, each line is verified, and the lines are joined as by `rd.join`. For an
+            `rd.AnyGoal`, `goal_index` is the goal that is reached; if none is, the result is that of the goal
+            with the largest `fraction`.
         """
         from robotdiffuse.problems.compiled_constraints import line_end  # compiled code
 
         line = CartesianLine(self.tip, tolerance, angle, speed)
-        PlanRequest(time_limit)  # a wrong limit is refused before it is divided
+        PlanRequest(time_limit)  # raises InputError for a wrong limit, before the limit is divided
         began = clock()
         if len(waypoints):
             lines = list[PlanResult]()
@@ -316,8 +316,8 @@ class Workspace:
         matrices = numbers(pose)
         if matrices is not None and matrices.ndim == 3:
             raise InputError(
-                f"pose is {len(pose)} poses; a line has one end: give those before the last as waypoints, or "
-                "a rd.AnyGoal to reach any of them"
+                f"pose is {len(pose)} poses; a line has one end: give all poses but the last as waypoints, "
+                "or give a rd.AnyGoal to reach any one pose"
             )
         goals = pose.goals if several else [pose]
         if not isinstance(pose, AnyGoal | PoseGoal):
@@ -326,9 +326,9 @@ class Workspace:
         goals = [self._exact(goal, q) if isinstance(goal, PoseGoal) else goal for goal in goals]
         problems = [Problem(self.robot, self.scene, start, goal, constraints=[line]) for goal in goals]
         T_start = self._T_base_world @ self.pose(start)
-        off = [np.linalg.norm((line_end(problem, line) - T_start)[:3, 3]) for problem in problems]
+        distances = [np.linalg.norm((line_end(problem, line) - T_start)[:3, 3]) for problem in problems]
         best = None
-        for attempt, i in enumerate(np.argsort(off, kind="stable")):
+        for attempt, i in enumerate(np.argsort(distances, kind="stable")):
             if best is not None and clock() - began >= time_limit:
                 break
             seconds_left = time_left(time_limit, began) / (len(goals) - attempt)
@@ -343,7 +343,8 @@ class Workspace:
         return best
 
     def _exact(self, goal: PoseGoal, q: ndarray) -> PoseGoal:
-        """A pose within the tolerances of a goal, near to that of its link at a configuration."""
+        """A goal without tolerances: the pose within the tolerances of `goal` that is near to the pose of its
+        link at q. Each coordinate of the link's pose is clipped to its tolerance."""
         T = inverse(goal.T_base_frame) @ self.robot.fk(q, goal.frame)
         xyz_tolerance = np.zeros(3) if goal.xyz_tolerance is None else goal.xyz_tolerance
         rpy_tolerance = np.zeros(3) if goal.rpy_tolerance is None else goal.rpy_tolerance
@@ -363,7 +364,7 @@ class Workspace:
         return self._problem(Scene(), q).start
 
     def _problem(self, scene: Scene, start: AnyConfiguration | None = None) -> Problem:
-        """A problem of which only scene and start matter."""
+        """A problem that is used for its scene and its start only; its goal is a placeholder."""
         middle = 0.5 * (self.robot.lower + self.robot.upper)
         return Problem(self.robot, scene, middle if start is None else start, middle)
 

@@ -1,9 +1,9 @@
-"""Compiled code for the speeds of a motion along a path, from the arm's present place and speed: as fast as
-possible towards the end for a given time, then braking to rest.
+"""Compiled speeds of a motion along a path that is as fast as possible for a given time and then brakes to
+rest. It begins at the arm's current place on the path, with its current speed.
 
-The path has the parameter s, its speed is ṡ, and s̈ is constant in each grid interval. The limits are applied
-at both ends of the interval, even if the motion covers only a part of it, so an acceleration that is allowed
-at the beginning of an interval is allowed all through it.
+The path is q(s), with the derivatives q' and q'' by s; s̈ is constant in each interval of a grid over s.
+Limits are applied at both ends of an interval, even if the motion covers only a part of it. So an s̈ that is
+allowed at the beginning of an interval is allowed in all of it.
 """
 
 import numpy as np
@@ -12,17 +12,18 @@ from robotdiffuse.core.kernels import kernel
 from robotdiffuse.trajectories.timing_kernel import NEGLIGIBLE_DERIVATIVE
 
 MIN_INTERVAL = 1e-10
-"""Shorter parts of grid intervals are skipped."""
+"""A motion that begins closer than this to the next grid point begins there [unit of s]."""
 STILL_SPEED_SQUARED = 1e-12
-"""A squared speed below this counts as rest."""
+"""ṡ² below this counts as rest."""
 
 
 @kernel()
 def _acceleration_bounds(first_derivative, second_derivative, grid, i, s, x, greatest, acceleration):
-    """Lower and upper bound of s̈ in interval i, for a motion that is at s with ṡ² = x, so that ṡ² is at most
-    `greatest` at the end of the interval."""
+    """Lower and upper bound of s̈ in grid interval i, for a motion that is at s with ṡ² = x. `greatest` is
+    the greatest allowed ṡ² at the end of the interval."""
     low = -np.inf
     high = (greatest - x) / (2 * (grid[i + 1] - s))
+    # At grid point k, ṡ² is x + 2 s̈ (grid[k] - s), so q̈ = q' s̈ + q'' ṡ² is a s̈ + q'' x.
     for k in range(i, i + 2):
         for j in range(first_derivative.shape[1]):
             a = first_derivative[k, j] + 2 * (grid[k] - s) * second_derivative[k, j]
@@ -37,12 +38,12 @@ def _acceleration_bounds(first_derivative, second_derivative, grid, i, s, x, gre
 
 @kernel()
 def advance_then_brake(first_derivative, second_derivative, grid, greatest, s, speed, time, acceleration):
-    """Values of s and of ṡ, [n] each, of a motion that is as fast as possible for some time [s] and then
-    brakes to rest.
+    """Values of s and of ṡ there, [n] each, of a motion that is as fast as possible for `time` [s] and then
+    brakes to rest. Between two values, s̈ is constant.
 
-    first_derivative[k, dof], second_derivative[k, dof]: of the path, at the values grid[k] of s. greatest[k]:
-    the greatest ṡ² at which the end can still be reached within the limits. s, speed: s and ṡ at the
-    beginning. acceleration[dof]: the limit of each joint.
+    first_derivative, second_derivative: q' and q'' at the grid points [m, dof]. grid: values of s [m].
+    greatest: the greatest ṡ² at each grid point from which the end can be reached within the limits [m]. s,
+    speed: s and ṡ at the beginning. acceleration: the limit of each joint [dof].
     """
     n = len(grid)
     out = np.empty((2, n + 2))
@@ -63,6 +64,7 @@ def advance_then_brake(first_derivative, second_derivative, grid, greatest, s, s
         next_speed_squared = max(x + 2 * path_acceleration * width, 0.0)
         speed_sum = np.sqrt(x) + np.sqrt(next_speed_squared)
         duration = 2 * width / speed_sum if speed_sum > 0 else np.inf
+        # The interval is left early when the time for acceleration runs out or when the motion comes to rest.
         if 0 < time_left < duration:
             travel = (np.sqrt(x) + 0.5 * path_acceleration * time_left) * time_left
             s = min(s + travel, grid[i + 1] - MIN_INTERVAL)
@@ -82,8 +84,8 @@ def advance_then_brake(first_derivative, second_derivative, grid, greatest, s, s
 
 @kernel()
 def state_after(path_values, speeds, time):
-    """The path parameter s and its speed at a time [s] after the beginning; after the motion, those at its
-    end."""
+    """s and ṡ at a time [s] after the beginning of a motion from `advance_then_brake`; at its end and later,
+    the last s and 0."""
     time_left = time
     for i in range(len(path_values) - 1):
         width = path_values[i + 1] - path_values[i]

@@ -1,7 +1,8 @@
-"""The cubics of a trajectory, which controllers execute between its rows, and their extremes in closed form.
+"""The cubics by which controllers interpolate between rows of a trajectory, and their extremes in closed
+form.
 
-Along a step of h seconds with the mean velocity m, from the velocity v to the velocity w, the acceleration is
-linear in time, from (6 m - 4 v - 2 w) / h to (2 v + 4 w - 6 m) / h.
+A step leads from one row to the next. In a step of h seconds from the velocity v to the velocity w, with the
+mean velocity m, the acceleration is linear in time: from (6 m - 4 v - 2 w) / h to (2 v + 4 w - 6 m) / h.
 """
 
 from typing import NamedTuple
@@ -31,6 +32,7 @@ class Extremes(NamedTuple):
     start: JointRows
     """Acceleration at the start of each step."""
     end: JointRows
+    """Acceleration at the end of each step."""
     velocity: JointRows
     """The largest absolute velocity in each step."""
     acceleration: JointRows
@@ -73,8 +75,9 @@ class Cubics:
         )
 
     def turns(self) -> tuple[Values, Configurations]:
-        """Times within steps at which some joint reverses its direction, so that its position is extreme, and
-        positions of all joints at these times."""
+        """Times [s] within steps at which a joint reverses its direction, so that its position is extreme,
+        and the positions of all joints at these times."""
+        # roots u in (0, 1) of the velocity v + h (start u + curve u² / 2), in a form without cancellation
         start = self.extremes.start
         v = self.trajectory.velocities[:-1] / self.steps
         curve = self.extremes.end - start
@@ -92,24 +95,27 @@ class Cubics:
         return times, self.states(steps, shares).positions
 
     def sampled(self, chord: float) -> tuple[Values, Configurations, JointValues]:
-        """Times and positions of the rows and of rows added between them, so that straight lines through all
-        of them are within `chord` of the cubics; and a bound on how far they are, for each joint [rad] or
-        [m]."""
+        """Times and positions of samples of the cubics, between which straight lines differ from the cubics
+        by at most `chord` in each joint [rad] or [m]; and a bound of this difference for each joint.
+
+        The samples are all rows and, where they are needed, equally spaced ones between them.
+        """
         times = self.trajectory.times
         q = self.trajectory.positions
-        bends = self.extremes.chord
-        off = self.extremes.chords
-        if bends.max(initial=0.0) <= chord:
-            return times, q, off
-        counts = np.ceil(np.sqrt(bends / chord)).astype(int)
+        chords = self.extremes.chord
+        joint_bounds = self.extremes.chords
+        if chords.max(initial=0.0) <= chord:
+            return times, q, joint_bounds
+        # a chord's error falls with the square of the number of parts
+        counts = np.ceil(np.sqrt(chords / chord)).astype(int)
         counts = np.maximum(counts, 1)
         step = np.repeat(np.arange(len(counts)), counts)
         share = np.concatenate([np.arange(n) / n for n in counts])
         between = self.states(step, share).positions
-        pull = self.extremes.acceleration
-        off = (pull * (self.steps / counts[:, None]) ** 2 / 8).max(axis=0)
+        acceleration = self.extremes.acceleration
+        joint_bounds = (acceleration * (self.steps / counts[:, None]) ** 2 / 8).max(axis=0)
         at = times[step] + share * self.steps[step, 0]
-        return np.append(at, times[-1]), np.concatenate([between, q[-1:]]), off
+        return np.append(at, times[-1]), np.concatenate([between, q[-1:]]), joint_bounds
 
 
 @kernel(error_model="numpy")
@@ -136,18 +142,19 @@ def _extremes(times, q, v):
             a = (6 * m - 4 * speed - 2 * v[i + 1, j]) * per
             b = (2 * speed + 4 * v[i + 1, j] - 6 * m) * per
             peak_speed = max(abs(speed), abs(v[i + 1, j]))
-            if a * b < 0:
+            if a * b < 0:  # the speed is also extreme where the acceleration is 0
                 peak_speed = max(peak_speed, abs(speed + h * a * a / (2 * (a - b))))
             mean[i, j] = m
             start[i, j] = a
             end[i, j] = b
             velocity[i, j], acceleration[i, j] = peak_speed, max(abs(a), abs(b))
             jerk[j] = max(jerk[j], abs(b - a) * per)
-            off = acceleration[i, j] * h * h / 8
-            chord[i], chords[j] = max(chord[i], off), max(chords[j], off)
+            bend = acceleration[i, j] * h * h / 8  # bound of the distance to the straight line
+            chord[i], chords[j] = max(chord[i], bend), max(chords[j], bend)
             low = min(q[i, j], q[i + 1, j])
             high = max(q[i, j], q[i + 1, j])
-            if low - off < lower[j] or high + off > upper[j]:
+            # the exact range is needed only if it may extend the range so far
+            if low - bend < lower[j] or high + bend > upper[j]:
                 low, high = _range(q[i, j], speed, a, b, h, low, high)
                 lower[j], upper[j] = min(lower[j], low), max(upper[j], high)
     return mean, start, end, velocity, acceleration, jerk, chord, chords, lower, upper
@@ -155,9 +162,12 @@ def _extremes(times, q, v):
 
 @inner_kernel()
 def _range(q, v, a, b, h, low, high):
-    """The least and the greatest position of a cubic. `low` and `high` are the smaller and the larger
-    position of its two ends. Inside, extremes are where the velocity v + h (a u + (b - a) u² / 2) is 0, with
-    u from 0 to 1."""
+    """The least and the greatest position of a cubic of h seconds with the position q and velocity v at its
+    start, and accelerations a at its start and b at its end.
+
+    low, high: the smaller and the larger position of its two ends. Inside, extremes are where the velocity
+    v + h (a u + (b - a) u² / 2) is 0, with u from 0 to 1.
+    """
     square = a * a - 2 * (b - a) * v / h
     if square < 0:
         return low, high

@@ -1,8 +1,8 @@
 """The fastest motions along smooth curves, such as the curves in joint space on which the tool follows a
 straight line.
 
-Where `timing.py` rounds the corners of polylines, the motion here stays on the curve: its place on the curve
-is averaged over time to keep the jerk limits, not its configurations.
+To keep the jerk limits, the motion is averaged over time. `timing.py` averages configurations, which cuts
+corners; here the place s on the curve is averaged, so that the motion stays on the curve.
 """
 
 import numpy as np
@@ -26,19 +26,21 @@ from robotdiffuse.trajectories.speed_limits import (
 from robotdiffuse.trajectories.timing_kernel import ROUNDING_MARGIN, fastest_speeds
 
 GRID_INTERVALS = 128
+"""Number of equal intervals of s in which s̈ is constant."""
 ACCELERATION_SHARES = (1.0, 0.7, 0.5, 0.35)
-"""Fractions of the acceleration limits that are tried in turn, until lower ones make the motion longer."""
+"""Fractions of the acceleration limits that are tried in turn, until a lower fraction makes the motion
+longer. With lower accelerations, the jerk limits need a shorter averaging window."""
 
 
 class SmoothCurve:
-    """The cubic spline through configurations, over the arc length of their polyline."""
+    """The cubic spline through configurations; its parameter s is the arc length of their polyline."""
 
     def __init__(self, waypoints: Float[ndarray, "n dof"]) -> None:
         self.knots = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1)))
         self._spline = CubicSpline(self.knots, waypoints)
 
     def __call__(self, s: Float[ndarray, "m"], order: int) -> Float[ndarray, "m dof"]:
-        """The curve (order 0) or a derivative with respect to s."""
+        """The curve (order 0) or its derivative of this order by s, at each s."""
         return self._spline(s, order)
 
 
@@ -48,8 +50,8 @@ def time_curve(
     settings: TimingSettings,
     extra: ExtraLimits = NO_EXTRA_LIMITS,
 ) -> Trajectory:
-    """The fastest motion from rest to rest along the smooth curve through at least four configurations, no
-    two neighbors equal.
+    """The fastest motion from rest to rest along the smooth curve through configurations. There must be at
+    least four, and neighbors must differ.
 
     Velocity, acceleration and jerk limits hold at every time. Raises OutOfTimeError if the deadline leaves no
     time.
@@ -69,10 +71,11 @@ def time_curve(
         step = ends[-1] / count
         times = step * np.arange(count + 1)
         interval = np.clip(np.searchsorted(ends, times, side="right") - 1, 0, GRID_INTERVALS - 1)
-        pulls = np.diff(speeds**2) / (2 * widths)
-        ago = times - ends[interval]
-        s = grid[interval] + (speeds[interval] + 0.5 * pulls[interval] * ago) * ago
+        s_acceleration = np.diff(speeds**2) / (2 * widths)
+        dt = times - ends[interval]
+        s = grid[interval] + (speeds[interval] + 0.5 * s_acceleration[interval] * dt) * dt
         s[-1] = grid[-1]
+        # average s over each window; the longer the window, the lower the jerk, and the later the end
         shortest = np.inf
         for window in jerk_windows(step, share * acceleration, jerk):
             total = np.cumsum(np.concatenate([np.zeros(window), s, np.full(window, s[-1])]))
@@ -80,6 +83,7 @@ def time_curve(
             controls[0] = waypoints[0]
             controls[-1] = waypoints[-1]
             clock, q, v, a = spline_rows(controls, step)
+            # factor on the time with which all limits hold
             slower = ROUNDING_MARGIN * max(
                 float((np.abs(v) / velocity).max()),
                 float(np.sqrt((np.abs(a) / acceleration).max())),

@@ -14,26 +14,26 @@ from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
 
 _ONE, _HALF = np.float32(1.0), np.float32(0.5)
 MAX_SUBDIVISIONS = 5
-"""Number of subdivisions in a round of corner smoothing; then waypoints that can be skipped are removed
-again."""
+"""Largest number of subdivisions in a round of corner smoothing."""
 MIN_MOVE = np.float32(0.005)
-"""Smoothing leaves a corner alone that it would move by less than this, and tightening makes no segment
-shorter than this [rad]."""
+"""Smallest move of a corner by smoothing, and smallest length of a segment after a move by tightening [rad,
+joint-space L2]."""
 MIN_GAIN = np.float32(1e-3)
 """Simplification ends after a round that shortens the path by less than this fraction of its length."""
 REMOVE_SHARE, PULL_SHARE = np.float32(0.1), np.float32(0.35)
-"""Tightening removes a waypoint in REMOVE_SHARE of its attempts, and between REMOVE_SHARE and PULL_SHARE
-pulls one straight towards its neighbors' chord. All others pull and also move it at random."""
+"""Tightening draws a number from 0 to 1 for each attempt. Below REMOVE_SHARE, it removes a waypoint; below
+PULL_SHARE, it moves the waypoint towards the chord of its neighbors; otherwise it adds a random move."""
 MAX_RANDOM_MOVE, RANDOM_MOVE_LOG_RANGE = np.float32(0.3), np.float32(5.0)
-"""Longest random move of a waypoint, in each joint [rad], and the natural logarithm of the ratio of the
-longest to the shortest."""
+"""Largest scale of random moves of a waypoint, in each joint [rad], and the natural logarithm of the ratio of
+the largest to the smallest scale."""
 
 
 @kernel(nogil=True)
 def simplify(space, path, rounds):
-    """A path [n, dof] with the same start and goal that is free and no longer.
+    """A free path [n, dof] with the start and goal of `path`, a free path, that is not longer.
 
-    Waypoints that a straight line can skip are removed; each round then smooths corners and removes again.
+    Waypoints that a straight line can skip are removed. Each of at most `rounds` rounds then smooths corners
+    and removes such waypoints again.
     """
     work, block, a, _ = _make_scratch(space, path)
     points = _skipped(space, path, block, work)
@@ -43,7 +43,8 @@ def simplify(space, path, rounds):
             return points
         smooth = _skipped(space, _smoothed(space, points, a, block, work), block, work)
         shorter = path_length(smooth)
-        # Smoothing did not check the halves of segments, whose checks fall on other configurations.
+        # Smoothing splits segments without a check. The halves are sampled at other configurations than the
+        # whole segment was, so the path is checked again.
         if shorter >= length or not _free(space, smooth, block, work):
             break
         points = smooth
@@ -55,10 +56,11 @@ def simplify(space, path, rounds):
 
 @kernel(nogil=True)
 def shortcut(space, path, tries, state):
-    """A path [n, dof] with the same start and goal that is free and no longer.
+    """A free path [n, dof] with the start and goal of `path`, a free path, that is not longer.
 
-    Waypoints that a straight line can skip are removed. `tries` attempts follow, which alternate between a
-    random shortcut between two segments and a move of a waypoint towards the chord of its neighbors.
+    Waypoints that a straight line can skip are removed. Then `tries` attempts alternate between a random
+    shortcut from one segment to another and a move of a waypoint towards the chord of its neighbors. state:
+    of the random generator.
     """
     work, block, a, b = _make_scratch(space, path)
     points = _skipped(space, path, block, work)
@@ -69,11 +71,11 @@ def shortcut(space, path, tries, state):
 
 @kernel(nogil=True)
 def tighten(space, path, tries, state):
-    """A path [n, dof] with the same start and goal that is free and no longer, near a given free one.
+    """A free path [n, dof] with the start and goal of `path`, a free path, that is not longer and near it.
 
-    Each of `tries` attempts removes or moves a random waypoint. Shortcuts and smoothing end a little above
-    the shortest path of the same homotopy class; tightening comes closer without new corners, each of which
-    would slow the motion down.
+    Each of `tries` attempts removes or moves a random waypoint. Shortcuts and smoothing end with paths a
+    little longer than the shortest path of the homotopy class. Tightening comes closer without new corners,
+    which would slow the motion down. state: of the random generator.
     """
     work, block, a, _ = _make_scratch(space, path)
     points = path.copy()
@@ -111,7 +113,8 @@ def _free(space, path, block, work):
 
 @inner_kernel()
 def _skipped(space, path, block, work):
-    """The path without the waypoints that straight lines can skip; the farthest reachable one comes next."""
+    """The path without waypoints that straight lines can skip. After each waypoint comes the farthest one
+    that a free straight line reaches."""
     out = np.empty(path.shape, np.float32)
     n = 0
     i = 0
@@ -179,7 +182,8 @@ def _shortcuts(space, path, tries, a, b, block, work, state):
             s, t = t, s
         i = _place_at(points, n, s, a)
         k = _place_at(points, n, t, b)
-        # The rests of both cut segments are checked again: their checks fall on other configurations.
+        # The remaining parts of both cut segments are checked again, since a check of a part samples other
+        # configurations than the check of its segment did.
         if (
             i == k
             or not motion_free(space, a, b, block, work)
@@ -205,7 +209,8 @@ def _shortcuts(space, path, tries, a, b, block, work, state):
 
 @allocation_free()
 def _place_at(points, n, length, out):
-    """Writes the configuration at a length along the path to `out`; returns the index of its segment."""
+    """Writes the configuration at a distance `length` along the first n points to `out` [dof]; returns the
+    index of its segment."""
     for i in range(n - 1):
         d = distance(points[i], points[i + 1])
         if length <= d or i == n - 2:
@@ -219,7 +224,8 @@ def _place_at(points, n, length, out):
 
 @inner_kernel()
 def _pull_in(space, points, n, trial, block, work, state):
-    """Moves a random inner waypoint towards the chord of its neighbors, by less after each failed check."""
+    """Moves a random inner waypoint towards the chord of its neighbors. Each failed check reduces the move to
+    40 %; after four failed checks, the waypoint stays."""
     i = 1 + int(random(state) * np.float32(n - 2))
     i = min(i, n - 2)
     before = points[i - 1]
@@ -240,8 +246,8 @@ def _pull_in(space, points, n, trial, block, work, state):
 
 @inner_kernel(inline="always")
 def _move(space, points, i, anywhere, trial, block, work, state):
-    """Moves waypoint i towards the chord of its neighbors, and at random with `anywhere`, if that is free
-    and shorter."""
+    """Moves waypoint i towards the chord of its neighbors if the path stays free and becomes shorter.
+    anywhere: whether a random move is added."""
     before = points[i - 1]
     at = points[i]
     after = points[i + 1]

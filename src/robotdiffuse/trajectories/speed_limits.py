@@ -1,5 +1,4 @@
-"""The fastest speeds along a polyline with rounded corners: the grid, the limits and the rows of the
-motion."""
+"""Timing of one polyline with rounded corners: its limits, its fastest speeds, and the rows of the motion."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,43 +17,44 @@ from robotdiffuse.trajectories.corner_rounding import BlendedPolyline
 from robotdiffuse.trajectories.timing_kernel import fastest_speeds, sample_positions, slowdown
 
 MAX_ROWS = 200_000
-"""Largest number of rows of a motion between two stops, before a jerk limit makes the motion longer; longer
-motions have larger steps."""
+"""Largest number of rows of a motion between two stops before it is averaged to keep jerk limits, which adds
+rows. Longer motions have larger time steps."""
 SECONDS_PER_ROW = 5e-6
-"""Time for sampling and validating a row [s]."""
+"""Estimated time to sample and validate a row [s]."""
 MIN_STEPS = 4
-"""Smallest number of steps of a motion between two stops: with fewer, its rows would miss that it speeds up
-and brakes."""
+"""Smallest number of time steps of a motion between two stops; fewer steps could not show that the motion
+speeds up and brakes."""
 ACCELERATION_FACTOR = 0.7
-"""Factor of the accelerations that are tried next for a motion that its jerk limits slow down."""
+"""Factor by which accelerations are lowered between attempts to make a motion with jerk limits shorter."""
 WINDOW_FRACTIONS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
-"""Averaging windows tried in turn, as fractions of the one that keeps the jerk limits of any motion: twice
-the largest ratio of a joint's acceleration limit to its jerk limit [s]."""
+"""Averaging windows tried in turn, as fractions of the full window. The full window keeps the jerk limits of
+any motion: it is twice the largest ratio of a joint's acceleration limit to its jerk limit [s]."""
 DEFAULT_JERK_RATIO = 10.0
-"""Jerk limit over acceleration limit of joints that state no jerk limit: full acceleration after 0.1 s
-[1/s]."""
+"""Jerk limit divided by acceleration limit, for joints without a jerk limit of their own [1/s]: the
+acceleration limit is reached after 0.1 s."""
 MIN_SCALING = 1e-3
-"""Smallest velocity and acceleration scale: a motion with less would be over a thousand times slower."""
+"""Smallest velocity and acceleration scale."""
 MIN_JERK = 0.01
-"""Smallest jerk limit [rad/s³] or [m/s³], with which a joint takes 15 s to turn by 1 rad."""
+"""Smallest jerk limit [rad/s³] or [m/s³]; a joint then takes about 15 s to turn by 1 rad from rest to
+rest."""
 Scaling = Annotated[float, Bound(least=MIN_SCALING, most=1.0)]
 Jerk = Annotated[float, Bound(least=MIN_JERK, infinite=True)]
 CHECKS_PER_INTERVAL = 8
-"""Number of parts of a grid interval at whose ends frame speeds and torques are checked."""
+"""Number of equal parts of a grid interval at the ends of which frame speeds and torques are checked."""
 MIN_TORQUE_SHARE = 2e-3
-"""Fraction of a torque limit that remains for motion where gravity takes all of the limit."""
+"""Smallest fraction of a torque limit that is available to motion, where gravity needs nearly all of it."""
 LIMIT_TOLERANCE = 1e-6
 """Fraction by which a motion with a start speed may exceed the limits."""
 START_SHARES = tuple(ACCELERATION_FACTOR**k for k in range(16))
-"""Fractions of the acceleration limits that are tried for a motion with a start speed."""
+"""Fractions of the acceleration limits that are tried in turn for a motion with a start speed."""
 MAX_SHARES = 12
-"""How often the limits of a motion with a start speed are lowered, until they hold between grid points
-too."""
+"""Largest number of times that the limits at grid points are lowered for a motion with a start speed, until
+the real limits hold between grid points."""
 BRAKING_FRACTION = 0.9
-"""Fraction of the acceleration with which `stopping_distance` brakes; the rest lets corners be rounded."""
-MIN_STOPPING_DISTANCE = 0.01
-"""Shortest straight line on which a motion stops from a start velocity [rad]: a corner at its end can be
+"""Fraction of the possible deceleration that `stopping_distance` assumes; the remainder allows corners to be
 rounded."""
+MIN_STOPPING_DISTANCE = 0.01
+"""Smallest result of `stopping_distance` [rad], so that a corner at the end of the line can be rounded."""
 
 
 class TooFastError(RuntimeError):
@@ -66,21 +66,22 @@ class TimingSettings(Settings, name="timing"):
     """Settings of the timing of paths."""
 
     sample_time: Annotated[float, Bound(least=1e-4, most=1.0)] = 0.004
-    """Largest time between the rows of a trajectory [s], unless it would have more than MAX_ROWS rows. Each
-    motion from stop to stop takes two of these steps longer than the fastest motion without a jerk limit."""
+    """Largest time between the rows of a trajectory [s], unless it would have more than MAX_ROWS rows.
+    Without a jerk limit, each motion from stop to stop takes two of these steps longer than the fastest
+    one."""
     velocity_scale: Scaling = 1.0
-    """Scale of the robot's velocity limits, in (0, 1]."""
+    """Scale of the robot's velocity limits, at most 1."""
     acceleration_scale: Scaling = 1.0
-    """Scale of the robot's acceleration limits, in (0, 1]."""
+    """Scale of the robot's acceleration limits, at most 1."""
     jerk: Jerk | None = None
     """Jerk limit of every joint [rad/s³] or [m/s³]; None: the robot's own limits, see `jerk_limits`;
-    infinite: none."""
+    infinite: no limit."""
     corner_deviation: NotNegative = 0.3
-    """How far a rounded corner may leave the path where it stays valid [rad, joint-space L2]. The jerk limit
-    cuts corners by up to 0.03 more (the Panda's limits)."""
+    """How far a rounded corner may leave the path, as long as the motion is valid [rad, joint-space L2].
+    Averaging for jerk limits cuts corners by up to 0.03 more (with the Panda's limits)."""
     corner_intervals: Count = 8
-    """Smallest number of grid intervals in a rounded corner; a wide corner has as many as a straight part of
-    its length."""
+    """Smallest number of grid intervals in a rounded corner; a long corner has as many as a straight part of
+    the same length."""
     line_intervals: Count = 64
     """Number of grid intervals of the whole motion, distributed by length."""
 
@@ -92,10 +93,10 @@ class FrameSpeedLimits(NamedTuple):
     """Limits on the speeds of frames."""
 
     speeds: Callable[[ndarray, ndarray], ndarray]
-    """Speeds [n, k] at configurations [n, dof] with joint velocities [n, dof]; linear in the velocities
-    [m/s]."""
+    """Speeds of k frames [n, k] at configurations [n, dof] with joint velocities [n, dof]; scaling the
+    velocities scales the speeds [m/s]."""
     limits: Values
-    """[m/s]"""
+    """Largest speed of each frame [k] [m/s]."""
 
 
 class ExtraLimits(NamedTuple):
@@ -103,14 +104,15 @@ class ExtraLimits(NamedTuple):
 
     frame_speeds: FrameSpeedLimits | None = None
     dynamics: Dynamics | None = None
-    """Joint torques are kept within its limits."""
+    """Dynamics with torque limits that the motion must keep."""
 
 
 NO_EXTRA_LIMITS = ExtraLimits()
 
 
 def timing_grid(line: BlendedPolyline, settings: TimingSettings) -> Values:
-    """Values of s at which the limits of a motion along a line are applied; see the kernel."""
+    """Values of s at which the limits of a motion along a line are applied; see
+    `timing_kernel.timing_grid`."""
     counts = settings.corner_intervals, settings.line_intervals
     return timing_kernel.timing_grid(line.knots, line.half_widths, *counts)
 
@@ -124,9 +126,9 @@ def time_line(
 ) -> Rows:
     """The fastest motion along a line that begins with ṡ = `start_speed` and ends at rest.
 
-    The jerk is constant between rows and within the limits, and accelerations are 0 at both ends. Raises
-    OutOfTimeError if the deadline leaves no time for it, and TooFastError if it cannot stop from its start
-    speed.
+    The fastest motion without jerk limits is averaged over time, so that the jerk is constant between rows
+    and within its limits; accelerations are 0 at both ends. Raises OutOfTimeError if the deadline leaves no
+    time, and TooFastError if the motion cannot stop from its start speed.
     """
     if start_speed > 0:
         return _moving_start(robot, line, settings, start_speed)
@@ -158,22 +160,23 @@ def time_line(
         if window == 1:
             break
     times, q, v, a = best
-    # The mean of motions within the extra limits may exceed them slightly.
+    # Averaging a motion within the extra limits may exceed these limits slightly.
     slower = 1.0 if extra is NO_EXTRA_LIMITS else extra_slowdown(extra, q, v, a)
     return times * slower, q, v / slower, a / slower**2
 
 
 def jerk_limits(robot: Robot, settings: TimingSettings = DEFAULT) -> JointValues:
-    """The jerk limit of each joint: that of the settings, else the robot's, else DEFAULT_JERK_RATIO times the
-    acceleration limit [rad/s³] or [m/s³]."""
+    """The jerk limit of each joint [rad/s³] or [m/s³]: the limit of the settings, else the joint's own limit,
+    else DEFAULT_JERK_RATIO times its acceleration limit."""
     if settings.jerk is not None:
         return np.full(robot.dof, settings.jerk)
     return np.where(robot.jerk > 0, robot.jerk, DEFAULT_JERK_RATIO * robot.acceleration)
 
 
 def _moving_start(robot: Robot, line: BlendedPolyline, settings: TimingSettings, start_speed: float) -> Rows:
-    """See `time_line`. The motion keeps its start speed for a while before it is averaged, so that the mean
-    begins at the start with that velocity and without acceleration."""
+    """`time_line` for a motion with a start speed. Before the averaging, the motion gets a lead: a part of
+    the first straight line at constant speed. The averaged motion then begins at the start with this speed
+    and without acceleration."""
     velocity, acceleration = scaled_limits(robot, settings)
     jerk = jerk_limits(robot, settings)
     step = settings.sample_time
@@ -213,7 +216,8 @@ def _moving_start(robot: Robot, line: BlendedPolyline, settings: TimingSettings,
 
 
 def stopping_distance(robot: Robot, settings: TimingSettings, velocity: JointValues) -> float:
-    """Length of a straight line on which a motion with a start velocity can stop [rad, joint-space L2]."""
+    """Length of a straight line in the direction of `velocity` on which a motion that begins with this
+    velocity can stop [rad, joint-space L2]."""
     acceleration = scaled_limits(robot, settings)[1]
     speed = float(np.linalg.norm(velocity))
     moving = velocity != 0
@@ -226,8 +230,8 @@ def stopping_distance(robot: Robot, settings: TimingSettings, velocity: JointVal
 
 
 def jerk_windows(step: float, acceleration: JointValues, jerk: JointValues) -> list[int]:
-    """Numbers of configurations over which `spline_rows` may average, in the order in which they are tried.
-    With the last number, the jerk limits are kept in any case."""
+    """Windows for `spline_rows` to try, in increasing order [configurations, which are `step` s apart]. The
+    last window keeps the jerk limits of any motion within the acceleration limits."""
     jerk_window = max(int(np.ceil(2 * (acceleration / jerk).max() / step)), 1)
     return sorted({1, *(int(np.ceil(fraction * jerk_window)) for fraction in WINDOW_FRACTIONS), jerk_window})
 
@@ -238,7 +242,7 @@ def _keeps_jerk(rows: Rows, step: float, jerk: JointValues) -> bool:
 
 
 def row_count(duration: float, settings: TimingSettings) -> int:
-    """The number of equal parts into which the rows of a motion divide its duration.
+    """The number of time steps of a motion of this duration [s].
 
     Raises OutOfTimeError if the deadline leaves no time for that many rows.
     """
@@ -266,12 +270,14 @@ def _fastest_speeds(
     start_speed: float = 0.0,
     extra: ExtraLimits = NO_EXTRA_LIMITS,
 ) -> Values:
-    """ṡ at each value of s in the grid, such that limits hold between grid points too."""
+    """ṡ at each grid point of the fastest motion that keeps the limits between grid points as well. A motion
+    from rest is slowed down as a whole; with a start speed, the limits at the grid points are lowered by
+    `share` until it does."""
     share = 1.0
     at_start = start_speed * np.abs(line(grid[:1], 1)[0])
     for _ in range(MAX_SHARES):
         check_timing("the fastest speeds")
-        # the velocity at the start is given, so the limit there cannot be lower
+        # the start velocity is fixed, so velocity limits below it could not be met
         limits = np.minimum(velocity, np.maximum(share * velocity, at_start)), share**2 * acceleration
         speeds = fastest_speeds(*derivatives_and_limits(line, grid, *limits, extra), start_speed)
         if start_speed and np.isnan(speeds).any():
@@ -292,11 +298,13 @@ def derivatives_and_limits(
     acceleration: JointValues,
     extra: ExtraLimits,
 ) -> tuple[ndarray, ndarray, ndarray, ndarray, ndarray, ndarray]:
-    """q' and q'' along the path, the grid, velocity limits, and lowest and highest accelerations.
+    """The arguments of `fastest_speeds`: q' and q'' at the grid points, the grid, velocity limits, and lowest
+    and highest accelerations.
 
-    Further columns stand for frame speeds, which have no acceleration limits, and for torques as shares of
-    their limits, which have no velocity limits: s̈ acts on them through q' and ṡ² through q'', and gravity's
-    share is taken from their limits.
+    Extra limits are further columns of the same form, as if they were joints. A frame speed is a multiple of
+    ṡ, which is its q'; it has no acceleration limits. A torque is a s̈ + b ṡ² + gravity; divided by its
+    limit, a is its q', b is its q'', and its acceleration limits are ±1 minus gravity. It has no velocity
+    limit.
     """
     first = line(grid, 1)
     second = line(grid, 2)
@@ -306,8 +314,8 @@ def derivatives_and_limits(
     columns = [(first, second, velocity, lowest, highest)]
     if extra.frame_speeds is not None:
         speeds = extra.frame_speeds.speeds(line(grid, 0), first)
-        endless = np.full_like(speeds, np.inf)
-        columns.append((speeds, np.zeros_like(speeds), extra.frame_speeds.limits, -endless, endless))
+        no_limit = np.full_like(speeds, np.inf)
+        columns.append((speeds, np.zeros_like(speeds), extra.frame_speeds.limits, -no_limit, no_limit))
     if extra.dynamics is not None:
         torques = extra.dynamics.torques
         limits = extra.dynamics.limits
@@ -318,10 +326,10 @@ def derivatives_and_limits(
         high = limits - gravity
         low = np.minimum(low, -MIN_TORQUE_SHARE * limits)
         high = np.maximum(high, MIN_TORQUE_SHARE * limits)
-        pull = torques(q, still, first) - gravity
-        bend = torques(q, first, second) - gravity
-        endless = np.full(len(limits), np.inf)
-        columns.append((pull / limits, bend / limits, endless, low / limits, high / limits))
+        a = torques(q, still, first) - gravity
+        b = torques(q, first, second) - gravity
+        no_limit = np.full(len(limits), np.inf)
+        columns.append((a / limits, b / limits, no_limit, low / limits, high / limits))
     first, second, velocity, lowest, highest = (
         np.concatenate(rows, axis=-1) for rows in zip(*columns, strict=True)
     )
@@ -329,7 +337,8 @@ def derivatives_and_limits(
 
 
 def _slow_to_extra_limits(line: BlendedPolyline, grid: Values, speeds: Values, extra: ExtraLimits) -> Values:
-    """The speeds, slowed down so that frame speeds and torques keep their limits between grid points too."""
+    """The speeds, slowed down so that frame speeds and torques keep their limits between grid points as
+    well."""
     if extra is NO_EXTRA_LIMITS:
         return speeds
     intervals = np.repeat(np.arange(len(grid) - 1), CHECKS_PER_INTERVAL + 1)
@@ -339,27 +348,28 @@ def _slow_to_extra_limits(line: BlendedPolyline, grid: Values, speeds: Values, e
     q = line(s, 0)
     first = line(s, 1)
     rates = first * np.sqrt(squared)[:, None]
-    pull = (np.diff(speeds**2) / (2 * np.diff(grid)))[intervals]
-    accelerations = first * pull[:, None] + line(s, 2) * squared[:, None]
+    s_acceleration = (np.diff(speeds**2) / (2 * np.diff(grid)))[intervals]
+    accelerations = first * s_acceleration[:, None] + line(s, 2) * squared[:, None]
     return speeds / extra_slowdown(extra, q, rates, accelerations)
 
 
 def extra_slowdown(extra: ExtraLimits, q: Configurations, v: JointRows, a: JointRows) -> float:
-    """How many times slower a motion must be, at least 1, to keep the extra limits."""
+    """The factor, at least 1, by which a motion's duration must grow to keep the extra limits at these
+    rows."""
     slower = 1.0
     if extra.frame_speeds is not None:
         speeds = extra.frame_speeds.speeds(q, v)
         slower = max(slower, float((speeds / extra.frame_speeds.limits).max(initial=0.0)))
     if extra.dynamics is not None:
-        # all torque but gravity's grows with the square of the speed
+        # torques of the motion, without gravity, grow with the square of the speed
         gravity = extra.dynamics.holding_torques(q)
         limits = extra.dynamics.limits
         motion_torques = extra.dynamics.torques(q, v, a) - gravity
-        room = np.maximum(limits - np.sign(motion_torques) * gravity, MIN_TORQUE_SHARE * limits)
-        slower = max(slower, float(np.sqrt((np.abs(motion_torques) / room).max(initial=1.0))))
+        available = np.maximum(limits - np.sign(motion_torques) * gravity, MIN_TORQUE_SHARE * limits)
+        slower = max(slower, float(np.sqrt((np.abs(motion_torques) / available).max(initial=1.0))))
     return slower
 
 
 def scaled_limits(robot: Robot, settings: TimingSettings) -> tuple[ndarray, ndarray]:
-    """Velocity and acceleration limits [dof] with the scales of the settings."""
+    """Velocity and acceleration limits [dof] of a robot, multiplied by the scales of the settings."""
     return settings.velocity_scale * robot.velocity, settings.acceleration_scale * robot.acceleration

@@ -1,5 +1,5 @@
-"""Time-optimal timing of a path within velocity, acceleration and jerk limits. Also stops along a path and
-the timed motions between them, forwards and back, for motions that wait or retreat."""
+"""Time-optimal timing of a path within velocity, acceleration and jerk limits. For motions that wait or
+retreat, `StopGraph` has stops along a path and timed motions between them in both directions."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -32,14 +32,15 @@ SHRINK_FACTOR = 0.5
 MIN_DEVIATION = 2e-4
 """A corner that cannot be rounded with this deviation is a stop [rad, joint-space L2]."""
 MAX_TIMINGS = 8
-"""How often a motion is timed and validated; after that it stops at every corner."""
+"""Largest number of times that a motion with rounded corners is timed and validated; if the last is refused,
+the motion stops at every corner."""
 MAX_SLOWER_TIMINGS = 4
-"""How many of these timings may lower the accelerations, if each corner is free by itself but the motion as a
-whole is refused."""
+"""In this many first timings, accelerations are lowered if each corner is free but the motion is refused; in
+later timings, all corners are rounded less."""
 CORNER_SAMPLES = 17
-"""Number of configurations of a rounded corner that are checked."""
+"""Number of configurations that are checked along a rounded corner."""
 CORNER_PLACES = np.linspace(-1, 1, CORNER_SAMPLES)
-"""The places of these configurations, in half widths of the corner from its middle."""
+"""Places of the checked configurations: offset from the corner's middle in half widths."""
 SAME_WAYPOINT_DISTANCE = 1e-6
 """Consecutive waypoints closer than this are merged [rad]."""
 
@@ -57,27 +58,37 @@ def time_parameterize(
 ) -> Trajectory:
     """The fastest motion along the path, from rest to rest, within the robot's limits at every row.
 
-    Corners of the path are rounded so that the motion need not stop there. If `valid` rejects the whole
-    motion, `free` checks the corners one by one, and each that fails is rounded half as far until it is free.
-    A corner becomes a stop if it is not free with a deviation of MIN_DEVIATION, or if the motion as a whole
-    is still refused after MAX_TIMINGS timings. With stops at all corners the rows lie on the path itself, so
-    a free path always has a trajectory; that one is returned without validation.
+    Corners of the path are rounded so that the motion need not stop there. If `valid` refuses the motion,
+    `free` checks the corners one by one, and a corner that is not free is rounded half as far until it is. A
+    corner becomes a stop if it is not free with a deviation of MIN_DEVIATION. All corners become stops if the
+    motion is still refused after MAX_TIMINGS timings. With stops at all corners, the rows lie on the path
+    itself, so a free path always has a trajectory; this trajectory is returned without validation.
 
-    `valid`: validates the whole motion. `free`: whether a path is free of collision. `keeps`: whether
-    configurations [n, dof] along a rounded corner keep what the path keeps, such as a clearance; corners that
-    do not are rounded less from the start, but at least by MIN_DEVIATION. `start_speed` [rad/s, joint-space
-    L2]: the speed at the beginning, along the first straight line, which must be long enough to stop on.
-    `extra`: further limits (speeds of frames, torques), which are applied only if the motion begins at rest.
-    `deviations`: how far the motion may leave each waypoint [rad], instead of `settings.corner_deviation`.
+    The jerk of motions from rest is constant between rows and within `jerk_limits`. A low jerk limit costs
+    time at both ends of the motion and at each stop, and cuts corners slightly more.
 
-    Motions from rest have constant jerk between rows, within the limits of `jerk_limits`. A low jerk limit
-    costs time at both ends of the motion and at each stop, and cuts corners slightly more.
+    Args:
+        robot: The robot.
+        path: The path.
+        valid: Validates a motion.
+        free: Whether a path is free of collision.
+        settings: Settings of timing.
+        keeps: Whether the configurations [n, dof] along a rounded corner meet a requirement that the path
+            meets, such as a clearance. Other corners are rounded less from the beginning, but by at least
+            MIN_DEVIATION.
+        start_speed: Speed at the beginning [rad/s, joint-space L2], along the first straight line, which must
+            be long enough to stop on.
+        extra: Limits on frame speeds and torques, applied only if the motion begins at rest.
+        deviations: How far the motion may pass each waypoint [n] [rad, joint-space L2]; None:
+            `settings.corner_deviation`.
 
-    Times start at 0 and strictly increase; the first and last rows are the first and last waypoint exactly.
-    A path of length zero becomes two equal rows at rest.
+    Returns:
+        The motion. Times start at 0 and strictly increase; the first and the last row are exactly the first
+        and the last waypoint. A path of length zero becomes two equal rows at rest.
 
-    Raises InputError if a velocity or acceleration limit of a joint is below MIN_RATE, and OutOfTimeError if
-    the deadline leaves no time.
+    Raises:
+        InputError: If a velocity or acceleration limit of a joint is below MIN_RATE.
+        OutOfTimeError: If the deadline leaves no time.
     """
     rounding = valid, free, settings, keeps, extra, deviations
     return rounded_corners(robot, path, *rounding, start_speed=start_speed)[2]
@@ -95,8 +106,8 @@ def rounded_corners(
     stops: Sequence[int] = (),
     start_speed: float = 0.0,
 ) -> tuple[Configurations, Values, Trajectory]:
-    """The distinct waypoints of a path, by how much each corner is rounded [rad], and the resulting motion;
-    see `time_parameterize`. Corners at the path's rows `stops` are not rounded."""
+    """The distinct waypoints of a path [m, dof], the deviation of each rounded corner [m - 2] (0: a stop),
+    and the motion; see `time_parameterize`. Corners at the path's rows `stops` are not rounded."""
     _check_limits(robot)
     rows = _distinct(path.positions)
     waypoints = path.positions[rows]
@@ -110,7 +121,7 @@ def rounded_corners(
     deviations = _shrunk(waypoints, allowed[1:-1], keeps, MIN_DEVIATION)
     while start_speed and deviations[:1].any():
         stop = np.append(np.flatnonzero(deviations == 0), len(deviations))[0]
-        try:  # whether a motion with this start speed can pass the corners up to its first stop
+        try:  # whether the motion can pass the corners up to its first stop at its start speed
             _time_segments(robot, path, waypoints[: stop + 2], deviations[:stop], settings, start_speed)
             break
         except TooFastError:
@@ -124,11 +135,12 @@ def rounded_corners(
         if (less < deviations).any():
             deviations = less
         elif attempt < MAX_SLOWER_TIMINGS and not start_speed:
-            # Averaging for the jerk limits cuts corners; with half the accelerations it cuts them an eighth
-            # as much.
+            # Averaging over time, which keeps the jerk limits, cuts corners. Half the accelerations cut
+            # corners an eighth as far: the deviation grows with the acceleration and the square of the
+            # window, and the window with the acceleration.
             scale = max(SHRINK_FACTOR * slower.acceleration_scale, MIN_SCALING)
             slower = replace(slower, acceleration_scale=scale)
-        else:  # the motion as a whole is refused: every corner is in doubt
+        else:  # the refusal may come from any corner: round all of them less
             deviations = _smaller(deviations)
             slower = settings
     deviations = np.zeros(len(waypoints) - 2)
@@ -137,7 +149,7 @@ def rounded_corners(
 
 
 def _smaller(deviations: Values) -> Values:
-    """The next deviations to try: 0, a stop, below MIN_DEVIATION."""
+    """Smaller deviations to try next; a deviation below MIN_DEVIATION becomes 0, a stop."""
     less = SHRINK_FACTOR * deviations
     return np.where(less < MIN_DEVIATION, 0.0, less)
 
@@ -148,26 +160,26 @@ def _shrunk(
     accepts: Callable[[ndarray], bool],
     least: float = 0.0,
 ) -> Values:
-    """The deviations, each shrunk until the configurations of its rounded corner are accepted, but not below
-    `least`."""
-    deviations, accepted = deviations.copy(), np.zeros(len(deviations))
+    """The deviations, each shrunk until `accepts` is true for the configurations [CORNER_SAMPLES, dof] of its
+    rounded corner, but not below `least`."""
+    deviations, accepted_widths = deviations.copy(), np.zeros(len(deviations))
     while True:
         # Two corners share a segment: if one shrinks, the other becomes wider and must be checked again.
         line = rounded_line(waypoints, deviations)
         widths = line[3]
-        doubtful = np.flatnonzero((deviations > 0) & (widths > accepted * (1 + 1e-9)))
-        if not len(doubtful):
+        unchecked = np.flatnonzero((deviations > 0) & (widths > accepted_widths * (1 + 1e-9)))
+        if not len(unchecked):
             return deviations
-        along = line[1][1 + doubtful, None] + widths[doubtful, None] * CORNER_PLACES
-        corners = evaluate(line, along.ravel(), 0).reshape(len(doubtful), CORNER_SAMPLES, -1)
+        s = line[1][1 + unchecked, None] + widths[unchecked, None] * CORNER_PLACES
+        corners = evaluate(line, s.ravel(), 0).reshape(len(unchecked), CORNER_SAMPLES, -1)
         smaller = np.maximum(_smaller(deviations), np.minimum(deviations, least))
-        for i, corner in zip(doubtful.tolist(), corners, strict=True):
+        for i, corner in zip(unchecked.tolist(), corners, strict=True):
             if accepts(corner):
-                accepted[i] = widths[i]
+                accepted_widths[i] = widths[i]
             elif smaller[i] < deviations[i]:
                 deviations[i] = smaller[i]
-            else:
-                accepted[i] = np.inf
+            else:  # at its smallest deviation, the corner is not checked again
+                accepted_widths[i] = np.inf
 
 
 def _check_limits(robot: Robot) -> None:
@@ -180,7 +192,8 @@ def _check_limits(robot: Robot) -> None:
 
 
 def _distinct(positions: Configurations) -> Int[ndarray, "m"]:
-    """Indices of rows that differ from the previous one; the first and the last row are always kept."""
+    """Indices of the first row, of every row that differs from the last returned one, and of the last row.
+    Only one index if all rows are equal."""
     if (np.linalg.norm(positions[1:] - positions[:-1], axis=1) > SAME_WAYPOINT_DISTANCE).all():
         return np.arange(len(positions))
     distinct = [0]
@@ -213,7 +226,7 @@ def _time_segments(
 
 
 def _joined(pieces: Sequence[tuple[ndarray, ...]]) -> tuple[ndarray, ...]:
-    """Joins motions, each of which begins with the last row of the one before."""
+    """Joins motions (times, then columns). Each motion begins with the last row of the motion before it."""
     start = 0.0
     parts = []
     for times, *more in pieces:
@@ -224,10 +237,10 @@ def _joined(pieces: Sequence[tuple[ndarray, ...]]) -> tuple[ndarray, ...]:
 
 
 PATH_PARTS = 8
-"""Number of parts of about equal length into which stops divide a path; more parts take longer and gain
-little."""
+"""Number of parts of about equal length into which `StopGraph` divides a path. With more parts, planning
+takes longer and gains little."""
 SPEED_FACTORS = (1.0, 0.5)
-"""The graph has each motion at these fractions of its highest speed."""
+"""Fractions of the highest speed at which `StopGraph` has each motion."""
 MIN_DISTANCE = 1e-3
 """Stops closer to each other than this are merged [rad]."""
 
@@ -236,11 +249,13 @@ class Motion(NamedTuple):
     """A timed motion from rest at one stop to rest at another."""
 
     source: int
-    """Index of the stop where it begins."""
+    """Index of the stop where the motion begins."""
     target: int
+    """Index of the stop where the motion ends."""
     ticks: int
-    """Its duration in time steps."""
+    """Duration in time steps."""
     rows: Rows
+    """Times, positions, velocities and accelerations."""
 
 
 class StopGraph:
@@ -262,8 +277,7 @@ class StopGraph:
         """Every motion lasts a whole number of time steps `step` [s].
 
         Corners are rounded as in `time_parameterize`, with its arguments `valid`, `free`, `keeps`, `extra`
-        and `deviations`. The path's rows `required_stops` are always stops: motions begin or end there, and
-        none passes through them.
+        and `deviations`. The path's rows `required_stops` are stops that no motion passes without stopping.
         """
         self.joint_names = path.joint_names
         self.step = step
@@ -277,11 +291,12 @@ class StopGraph:
         sharp = self.line.knots[1:-1][rounded == 0]
         self.motions: list[Motion] = []
         for (i, low), (j, high) in combinations(enumerate(self.stops), 2):
-            if not ((low < sharp) & (sharp < high)).any():  # else it would pass a stop
+            if not ((low < sharp) & (sharp < high)).any():  # a motion cannot pass a sharp corner
                 self.motions += self._between(robot, settings, i, j)
 
     def _find_stops(self, deviations: Values) -> Values:
-        """Values of s of all stops: none within a rounded corner, and every corner that is not rounded."""
+        """Values of s of all stops, in order: both ends, every sharp corner, and PATH_PARTS - 1 places
+        between the ends, moved out of rounded corners and dropped if near another stop."""
         line = self.line
         length = self.line.length
         corners = line.knots[1:-1]
@@ -316,8 +331,8 @@ class StopGraph:
         return motions
 
     def sample(self, radii: JointValues, travel: float) -> tuple[Values, Configurations]:
-        """Values of s, and the configurations there, between which no point of the arm moves further than
-        `travel` [m]. All stops are among them. `radii` as of `motion_radii`."""
+        """Values of s, including all stops, and the configurations there [n, dof]. From one to the next, no
+        point of the arm moves further than `travel` [m]. radii: from `motion_radii`."""
         parts = []
         for low, high in zip(self.stops[:-1], self.stops[1:], strict=True):
             samples = self.line(np.linspace(low, high, 33), 0)
@@ -327,14 +342,16 @@ class StopGraph:
         return s, self.line(s, 0)
 
     def nearest_samples(self, motion: Motion, configurations: Configurations) -> Int[ndarray, "ticks"]:
-        """Index of the nearest of some configurations at each tick of a motion, from its start to its end."""
+        """For each tick of a motion, from its start to its end, the index of the nearest configuration among
+        `configurations`."""
         times, q = motion.rows[:2]
         ticks = self.step * np.arange(motion.ticks + 1)
         at = interpolated(ticks, times, q)
         return ((configurations**2).sum(axis=1) - 2 * at @ configurations.T).argmin(axis=1)
 
     def trajectory(self, motions: list[Motion | int]) -> Trajectory:
-        """Motions one after the other; an integer in `way` is a wait of one time step."""
+        """The trajectory of motions one after the other; an integer in `motions` is a wait of one time
+        step."""
         q = self.line(self.stops[:1], 0)
         a = motions[0].rows[3][:1] if motions and not isinstance(motions[0], int) else 0 * q
         segments = [(np.zeros(1), q, 0 * q, a)]

@@ -1,11 +1,14 @@
 """Compiled timing: evaluates rounded polylines, finds the fastest speeds along them, and samples
 trajectories.
 
-The speeds are those of time-optimal path parameterization by reachability analysis (H. Pham and Q.-C. Pham,
-"A new approach to time-optimal path parameterization based on reachability analysis", T-RO 2018). With x = ṡ²
-and u = s̈ constant in each grid interval, a backward pass finds the greatest x from which the end can be
-reached within all limits; a forward pass then takes the greatest u in each interval. Limits hold at both ends
-of an interval.
+The path is q(s), with the derivatives q' and q'' by s, where s is the arc length of the polyline in joint
+space. A joint moves with q' ṡ and accelerates with q' s̈ + q'' ṡ².
+
+Speeds are found by time-optimal path parameterization by reachability analysis (TOPP-RA; H. Pham and Q.-C.
+Pham, "A new approach to time-optimal path parameterization based on reachability analysis", T-RO 2018). Its
+symbols are x = ṡ² and u = s̈; u is constant in each interval of a grid over s. A backward pass finds the
+greatest x at each grid point from which the end can be reached within all limits. A forward pass then takes
+the greatest u in each interval. Limits are applied at both ends of each interval.
 """
 
 import numpy as np
@@ -13,31 +16,35 @@ import numpy as np
 from robotdiffuse.core.kernels import inner_kernel, kernel
 
 SLOWDOWN_CHECKS_PER_INTERVAL = 16
-"""Number of parts of a grid interval at whose ends `slowdown` checks limits; with 4, a reversal was 1.8 % too
-fast."""
-# Factors on rates before they are compared with limits: on curves, where rates between the checked places
-# were up to 0.025 % greater, and on straight lines.
+"""Number of equal parts of a grid interval at the ends of which `slowdown` checks limits. With 4 parts, one
+joint exceeded its limit by 1.8 % where it reversed its direction."""
+# Factors on velocities and accelerations before `slowdown` compares them with limits. CURVE_MARGIN is for
+# rounded corners, where rates between the checked values of s were up to 0.025 % greater; ROUNDING_MARGIN is
+# for straight lines.
 CURVE_MARGIN = 1.0002
 ROUNDING_MARGIN = 1 + 1e-9
 NEGLIGIBLE_DERIVATIVE = 1e-7
-"""Smaller components of the first derivative by s, whose norm is one on straight lines, count as zero."""
+"""Components of q' below this count as zero; the norm of q' is 1 on straight lines."""
 NEGLIGIBLE_SHARE = 1e-8
-"""If the next speed contributes less than this fraction of an acceleration limit, its contribution is
-ignored."""
+"""The next ṡ² is ignored in a limit if it contributes less than this fraction of an acceleration limit."""
 BLEND_DEVIATION = 3.0 / 16.0
-"""b(0) of `BlendedPolyline`: the distance from corner to blend, divided by the half width times the change of
-direction."""
-# The grid of `estimated_time`.
+"""b(0) of `BlendedPolyline`: the distance from the corner to the middle of its blend, divided by the half
+width times the norm of the change of direction."""
+# Numbers of grid intervals of `estimated_time`; see `TimingSettings`.
 CORNER_INTERVALS = 8
 LINE_INTERVALS = 32
 MIN_SPEED_RATIO = 0.01
-"""Each ṡ² is at least this fraction of the previous one and of the greatest possible one. Where a joint's q'
-changes sign, the limits would otherwise allow a speed that only a stop can follow."""
+"""At each grid point, ṡ² is at least this fraction of the previous ṡ² or of the greatest ṡ² there. Where a
+joint's q' changes sign, the limits would otherwise allow a speed after which the motion must stop."""
 
 
 @inner_kernel()
 def evaluate_at(waypoints, knots, directions, half_widths, s, order, out):
-    """Writes the path (order 0) or its first or second derivative at s to out[dof]; see `BlendedPolyline`."""
+    """Writes q (order 0), q' (1) or q'' (2) at s to out[dof].
+
+    The arguments and symbols are those of `BlendedPolyline`.
+    """
+    # the segment that contains s, by bisection
     segments = len(directions)
     low = 0
     high = segments
@@ -49,6 +56,7 @@ def evaluate_at(waypoints, knots, directions, half_widths, s, order, out):
             high = middle
     segment = low
     dof = waypoints.shape[1]
+    # the rounded corner that contains s; -1: s is on a straight part
     corner = -1
     if segment > 0 and s - knots[segment] < half_widths[segment - 1]:
         corner = segment - 1
@@ -57,7 +65,7 @@ def evaluate_at(waypoints, knots, directions, half_widths, s, order, out):
     if corner >= 0:
         d = half_widths[corner]
         u = (s - knots[corner + 1]) / d
-        if order == 0:
+        if order == 0:  # b(u) or its derivative by u
             b = 3 / 16 + u / 2 + 3 / 8 * u**2 - u**4 / 16
         elif order == 1:
             b = 1 / 2 + 3 / 4 * u - u**3 / 4
@@ -84,7 +92,8 @@ def evaluate_at(waypoints, knots, directions, half_widths, s, order, out):
 
 @kernel()
 def evaluate(line, s, order):
-    """`evaluate_at` for every value of s, [m, dof]; `line` is (waypoints, knots, directions, half_widths)."""
+    """q, q' or q'' (order 0, 1, 2) at values of s [m], as an array [m, dof]. `line` is the tuple (waypoints,
+    knots, directions, half_widths)."""
     waypoints, knots, directions, half_widths = line
     out = np.empty((len(s), waypoints.shape[1]))
     for i in range(len(s)):
@@ -94,8 +103,8 @@ def evaluate(line, s, order):
 
 @kernel()
 def rounded_line(waypoints, deviations):
-    """The polyline through waypoints [n, dof] with the widest blends that leave it by at most the deviations
-    [n - 2] and do not overlap, as the arguments of `evaluate`."""
+    """The `line` of `evaluate` for a polyline through waypoints [n, dof]. Its corners have the widest blends
+    that do not overlap and leave the polyline by at most the deviations [n - 2]."""
     n, dof = waypoints.shape
     lengths = np.empty(n - 1)
     knots = np.zeros(n)
@@ -110,8 +119,8 @@ def rounded_line(waypoints, deviations):
     for i in range(n - 2):
         turn = np.sqrt(((directions[i + 1] - directions[i]) ** 2).sum())
         blend_widths[i] = deviations[i] / max(BLEND_DEVIATION * turn, 1e-12)
-    # Two corners share the segment between them: each gets half of it, or more if the other needs less. A
-    # segment at an end belongs to its only corner.
+    # Two corners share the segment between them. Each corner gets half of the segment, or what the other
+    # corner does not need if that is more. The first and the last segment belong to one corner each.
     for i in range(n - 2):
         before = lengths[i]
         after = lengths[i + 1]
@@ -125,10 +134,11 @@ def rounded_line(waypoints, deviations):
 
 @kernel()
 def timing_grid(knots, half_widths, corner_intervals, line_intervals):
-    """Values of s: equal parts of every rounded corner, and parts of the straight lines by their lengths.
+    """Grid of increasing values of s, with equal intervals in every straight part and every rounded corner.
 
-    Along a straight line s̈ is piecewise constant, which any grid represents exactly except at the switching
-    points. Rounded corners need points of their own because the limits on ṡ change along them.
+    A part has its share, by length, of `line_intervals` intervals; but a straight part has at least 2, and a
+    corner at least `corner_intervals`. Corners need more because the limits on ṡ change along them. On a
+    straight part, s̈ is piecewise constant, which any grid represents exactly except at the switching points.
     """
     length = knots[-1]
     corners = len(half_widths)
@@ -153,7 +163,7 @@ def timing_grid(knots, half_widths, corner_intervals, line_intervals):
 
 @kernel()
 def least_time(line, velocity, acceleration, corner_intervals, line_intervals):
-    """Duration of the fastest motion along a line from rest to rest, without limits of jerk [s]."""
+    """Duration of the fastest motion along a line from rest to rest, without jerk limits [s]."""
     grid = timing_grid(line[1], line[3], corner_intervals, line_intervals)
     first = evaluate(line, grid, 1)
     second = evaluate(line, grid, 2)
@@ -168,17 +178,18 @@ def least_time(line, velocity, acceleration, corner_intervals, line_intervals):
 
 @kernel()
 def estimated_time(line, velocity, acceleration):
-    """About the least duration of a motion along a line from rest to rest, without limits of jerk [s]: on
-    random lines 0.7 % more, with a standard deviation of 0.5 %.
+    """Estimate of `least_time` by a tenth of its work [s]. On random lines, the estimate is 0.7 % too long on
+    average, with a standard deviation of 0.5 %.
 
-    In each interval the greatest s̈ is that at its slower end, in one backward and one forward pass. Where
-    that exceeds a limit at the other end, the interval takes longer. That is a tenth of the work of
-    `fastest_speeds`.
+    A backward pass and a forward pass limit s̈ in each interval by the acceleration limits at one end only,
+    the end from which the pass comes. If the limits at either end are exceeded then, the interval's duration
+    is scaled up.
     """
     grid = timing_grid(line[1], line[3], CORNER_INTERVALS, LINE_INTERVALS)
     first = evaluate(line, grid, 1)
     second = evaluate(line, grid, 2)
     n, dof = first.shape
+    # greatest x at each grid point by the velocity limits, and by the acceleration limits with s̈ = 0
     x = np.empty(n)
     for i in range(n):
         limit = np.inf
@@ -189,64 +200,68 @@ def estimated_time(line, velocity, acceleration):
                 limit = min(limit, acceleration[j] / abs(second[i, j]))
         x[i] = limit
     x[0] = x[n - 1] = 0.0
+    # x grows by 2 width s̈ in an interval: braking limits (backward), then speeding up (forward)
     for i in range(n - 1, 0, -1):
-        limit = x[i] + 2 * (grid[i] - grid[i - 1]) * _greatest_pull(
-            first, second, i, x[i], -1.0, acceleration
-        )
+        limit = x[i] + 2 * (grid[i] - grid[i - 1]) * _greatest_u(first, second, i, x[i], -1.0, acceleration)
         x[i - 1] = min(x[i - 1], limit)
     for i in range(n - 1):
-        limit = x[i] + 2 * (grid[i + 1] - grid[i]) * _greatest_pull(first, second, i, x[i], 1.0, acceleration)
+        limit = x[i] + 2 * (grid[i + 1] - grid[i]) * _greatest_u(first, second, i, x[i], 1.0, acceleration)
         x[i + 1] = min(x[i + 1], limit)
     duration = 0.0
     for i in range(n - 1):
         width = grid[i + 1] - grid[i]
-        pull = (x[i + 1] - x[i]) / (2 * width)
-        worst_excess = 1.0
+        u = (x[i + 1] - x[i]) / (2 * width)
+        worst_excess = 1.0  # largest ratio of a joint's acceleration to its limit
         for j in range(dof):
             for k in range(2):
-                rate = abs(first[i + k, j] * pull + second[i + k, j] * x[i + k])
-                worst_excess = max(worst_excess, rate / acceleration[j])
+                joint_acceleration = abs(first[i + k, j] * u + second[i + k, j] * x[i + k])
+                worst_excess = max(worst_excess, joint_acceleration / acceleration[j])
         duration += 2 * width / (np.sqrt(x[i]) + np.sqrt(x[i + 1])) * np.sqrt(worst_excess)
     return duration
 
 
 @inner_kernel()
-def _greatest_pull(first, second, i, x, sign, acceleration):
-    """The greatest |s̈| of a sign with which accelerations are within their limits at grid point i."""
-    max_pull = np.inf
+def _greatest_u(first, second, i, x, sign, acceleration):
+    """The greatest |s̈|, for s̈ of this sign, with which all joints keep their acceleration limits at grid
+    point i, where ṡ² is x."""
+    max_u = np.inf
     for j in range(first.shape[1]):
         if first[i, j] != 0:
-            pull = sign * first[i, j]
-            curve = second[i, j] * x
-            max_pull = min(max_pull, (acceleration[j] - (curve if pull > 0 else -curve)) / abs(pull))
-    return max_pull
+            by_u = sign * first[i, j]  # the joint's acceleration is by_u |s̈| + by_x
+            by_x = second[i, j] * x
+            max_u = min(max_u, (acceleration[j] - (by_x if by_u > 0 else -by_x)) / abs(by_u))
+    return max_u
 
 
 @inner_kernel()
-def _bounds_of_next(first, second, i, width, x, most, weakest, strongest):
-    """Bounds of the next x after x in interval i, as linear functions of x; `most` is the greatest next x.
+def _bounds_of_next(first, second, i, width, x, max_next, lowest, highest):
+    """Bounds of y, the ṡ² at the end of grid interval i, if ṡ² is x at its beginning.
 
-    Returns the value at 0 and the slope of the lower bound, then of the upper bound (at x itself the two
-    parts may cancel), and the greatest x that those limits allow which do not depend on the next x. With u =
-    (y - x) / (2 width), the acceleration of a joint is alpha x + beta y at both ends of the interval.
+    The acceleration of a joint at either end of the interval is alpha x + beta y, since u = (y - x) / (2
+    width). So each limit bounds y by a linear function of x; the tightest lower and upper bound at x count.
+
+    first, second, lowest, highest: as of `controllable`. width: of the interval. max_next: greatest y.
+
+    Returns intercept and slope of the lower bound, intercept and slope of the upper bound (not their values
+    at x, where both parts may cancel), and the greatest x that limits without influence of y allow.
     """
-    high = most
+    high = max_next
     high_slope = 0.0
-    low, low_slope = (0.0, MIN_SPEED_RATIO) if x < most else (MIN_SPEED_RATIO * most, 0.0)
-    greatest = np.inf
+    low, low_slope = (0.0, MIN_SPEED_RATIO) if x < max_next else (MIN_SPEED_RATIO * max_next, 0.0)
+    max_x = np.inf
     for j in range(first.shape[1]):
-        for k in range(2):
-            pull = first[i + k, j] / (2 * width)
+        for k in range(2):  # the beginning and the end of the interval
+            by_u = first[i + k, j] / (2 * width)
             curve = second[i + k, j]
-            alpha, beta = (-pull, pull + curve) if k else (curve - pull, pull)
-            weak = weakest[i + k, j]
-            strong = strongest[i + k, j]
-            if abs(beta) * most <= NEGLIGIBLE_SHARE * min(strong, -weak):
+            alpha, beta = (-by_u, by_u + curve) if k else (curve - by_u, by_u)
+            low_limit = lowest[i + k, j]
+            high_limit = highest[i + k, j]
+            if abs(beta) * max_next <= NEGLIGIBLE_SHARE * min(high_limit, -low_limit):
                 if alpha != 0:
-                    greatest = min(greatest, (strong if alpha > 0 else weak) / alpha)
+                    max_x = min(max_x, (high_limit if alpha > 0 else low_limit) / alpha)
                 continue
-            up = strong / beta
-            down = weak / beta
+            up = high_limit / beta
+            down = low_limit / beta
             slope = -alpha / beta
             if beta < 0:
                 up, down = down, up
@@ -256,15 +271,17 @@ def _bounds_of_next(first, second, i, width, x, most, weakest, strongest):
             if down + slope * x > low + low_slope * x:
                 low = down
                 low_slope = slope
-    return low, low_slope, high, high_slope, greatest
+    return low, low_slope, high, high_slope, max_x
 
 
 @kernel()
-def controllable(first, second, grid, velocity, weakest, strongest):
-    """The greatest ṡ² at each grid point from which the end can be reached at rest without a stop before it.
+def controllable(first, second, grid, velocity, lowest, highest):
+    """TOPP-RA's backward pass: the greatest ṡ² at each grid point from which the motion can reach the end, at
+    rest there and without a stop before.
 
-    first, second: q' and q'' at the grid points, [m, dof]; grid: values of s, [m]; velocity: limits [dof];
-    weakest, strongest: lowest and highest accelerations [m, dof]. The result is positive except at the end.
+    first, second: q' and q'' at the m grid points [m, dof]. grid: values of s [m]. velocity: limits [dof].
+    lowest, highest: limits of accelerations at the grid points [m, dof]. The result [m] is positive except at
+    the end.
     """
     n, dof = first.shape
     x = np.empty(n)
@@ -277,12 +294,14 @@ def controllable(first, second, grid, velocity, weakest, strongest):
     x[n - 1] = 0.0
     for i in range(n - 2, -1, -1):
         width = grid[i + 1] - grid[i]
+        # Lower x[i] until the lower bound of the next x is not above the upper bound: to the x where the two
+        # tightest bounds at x[i] meet, as in Newton's method.
         for _ in range(64):
-            low, low_slope, high, high_slope, greatest = _bounds_of_next(
-                first, second, i, width, x[i], x[i + 1], weakest, strongest
+            low, low_slope, high, high_slope, max_x = _bounds_of_next(
+                first, second, i, width, x[i], x[i + 1], lowest, highest
             )
-            if x[i] > greatest:
-                x[i] = greatest
+            if x[i] > max_x:
+                x[i] = max_x
                 continue
             if low + low_slope * x[i] <= high + high_slope * x[i] or low_slope <= high_slope:
                 break
@@ -291,30 +310,32 @@ def controllable(first, second, grid, velocity, weakest, strongest):
 
 
 @kernel()
-def fastest_speeds(first, second, grid, velocity, weakest, strongest, start_speed=0.0):
-    """ṡ at each grid point: `start_speed` at the first, 0 at the last, positive between; arguments as of
-    `controllable`. All NaN if the end cannot be reached from the start speed."""
+def fastest_speeds(first, second, grid, velocity, lowest, highest, start_speed=0.0):
+    """TOPP-RA: ṡ at each grid point of the fastest motion; `start_speed` at the first, 0 at the last,
+    positive between. All NaN if the end cannot be reached from the start speed. The other arguments are those
+    of `controllable`."""
     n = len(grid)
-    x = controllable(first, second, grid, velocity, weakest, strongest)
+    max_x = controllable(first, second, grid, velocity, lowest, highest)
     speeds = np.zeros(n)
-    now = start_speed * start_speed
-    if now > x[0] * (1 + NEGLIGIBLE_DERIVATIVE):
+    x = start_speed * start_speed
+    if x > max_x[0] * (1 + NEGLIGIBLE_DERIVATIVE):
         speeds[:] = np.nan
         return speeds
     for i in range(n - 1):
-        speeds[i] = np.sqrt(now)
+        speeds[i] = np.sqrt(x)
         width = grid[i + 1] - grid[i]
-        high, slope = _bounds_of_next(first, second, i, width, now, x[i + 1], weakest, strongest)[2:4]
-        # from x[i] at least this speed is possible, and proportionally less from a smaller x
-        floor_speed = MIN_SPEED_RATIO * now * min(1.0, x[i + 1] / x[i])
-        now = min(max(high + slope * now, floor_speed), x[i + 1])
+        high, slope = _bounds_of_next(first, second, i, width, x, max_x[i + 1], lowest, highest)[2:4]
+        # Rounding errors must not stop the motion: at least this next x is possible, because the backward
+        # pass ensured it from max_x[i], and in proportion from a smaller x.
+        min_next = MIN_SPEED_RATIO * x * min(1.0, max_x[i + 1] / max_x[i])
+        x = min(max(high + slope * x, min_next), max_x[i + 1])
     return speeds
 
 
 @kernel()
 def slowdown(line, grid, speeds, velocity, acceleration):
-    """The factor, at least 1, by which the motion must be slowed to keep the limits between grid points
-    too."""
+    """The factor, at least 1, by which the motion's duration must grow so that velocity and acceleration
+    limits [dof] hold between grid points as well. `speeds`: ṡ at the grid points."""
     waypoints, knots, directions, half_widths = line
     dof = waypoints.shape[1]
     factor = 1.0
@@ -322,45 +343,46 @@ def slowdown(line, grid, speeds, velocity, acceleration):
     second = np.empty(dof)
     for i in range(len(grid) - 1):
         width = grid[i + 1] - grid[i]
-        pull = (speeds[i + 1] ** 2 - speeds[i] ** 2) / (2 * width)
-        # on a straight part, rates are greatest at its ends
+        u = (speeds[i + 1] ** 2 - speeds[i] ** 2) / (2 * width)
+        # on a straight part, velocities and accelerations are greatest at the interval's ends
         evaluate_at(waypoints, knots, directions, half_widths, grid[i] + 0.5 * width, 2, second)
         curved = np.abs(second).max() > 0
-        spare = CURVE_MARGIN if curved else ROUNDING_MARGIN
-        for part in range(0, SLOWDOWN_CHECKS_PER_INTERVAL + 1, 1 if curved else SLOWDOWN_CHECKS_PER_INTERVAL):
-            at = part / SLOWDOWN_CHECKS_PER_INTERVAL * width
-            evaluate_at(waypoints, knots, directions, half_widths, grid[i] + at, 1, first)
-            evaluate_at(waypoints, knots, directions, half_widths, grid[i] + at, 2, second)
-            squared = max(speeds[i] ** 2 + 2 * pull * at, 0.0)
-            speed = np.sqrt(squared)
+        margin = CURVE_MARGIN if curved else ROUNDING_MARGIN
+        for k in range(0, SLOWDOWN_CHECKS_PER_INTERVAL + 1, 1 if curved else SLOWDOWN_CHECKS_PER_INTERVAL):
+            ds = k / SLOWDOWN_CHECKS_PER_INTERVAL * width
+            evaluate_at(waypoints, knots, directions, half_widths, grid[i] + ds, 1, first)
+            evaluate_at(waypoints, knots, directions, half_widths, grid[i] + ds, 2, second)
+            x = max(speeds[i] ** 2 + 2 * u * ds, 0.0)
+            speed = np.sqrt(x)
             for j in range(dof):
-                factor = max(factor, spare * abs(first[j]) * speed / velocity[j])
-                rate = abs(first[j] * pull + second[j] * squared)
-                factor = max(factor, spare * np.sqrt(rate / acceleration[j]))
+                factor = max(factor, margin * abs(first[j]) * speed / velocity[j])
+                joint_acceleration = abs(first[j] * u + second[j] * x)
+                factor = max(factor, margin * np.sqrt(joint_acceleration / acceleration[j]))
     return factor
 
 
 @kernel()
 def sample_positions(line, grid, speeds, times):
-    """Positions [n, dof] at increasing times of the motion with these speeds, which rests after its end.
+    """Positions [n, dof] of a motion at increasing times [n], from 0 on [s]; after its end, the last
+    waypoint.
 
-    grid, speeds: values of s [m] and ṡ at each, between which s̈ is constant; times [n]: from 0 on [s].
+    grid, speeds: m values of s and ṡ there [m]; s̈ is constant between them.
     """
     waypoints, knots, directions, half_widths = line
-    ends = np.zeros(len(grid))
+    ends = np.zeros(len(grid))  # time at each grid point [s]
     for i in range(len(grid) - 1):
-        both = speeds[i] + speeds[i + 1]
-        ends[i + 1] = ends[i] + (2 * (grid[i + 1] - grid[i]) / both if both > 0 else 0.0)
+        speed_sum = speeds[i] + speeds[i + 1]
+        ends[i + 1] = ends[i] + (2 * (grid[i + 1] - grid[i]) / speed_sum if speed_sum > 0 else 0.0)
     q = np.empty((len(times), waypoints.shape[1]))
     i = 0
     for k in range(len(times)):
         time = min(times[k], ends[-1])
         while i < len(grid) - 2 and ends[i + 1] <= time:
             i += 1
-        lasts = ends[i + 1] - ends[i]
-        ago = time - ends[i]
-        pull = (speeds[i + 1] - speeds[i]) / lasts if lasts > 0 else 0.0
-        s = min(grid[i] + (speeds[i] + 0.5 * pull * ago) * ago, grid[i + 1])
+        duration = ends[i + 1] - ends[i]
+        dt = time - ends[i]
+        u = (speeds[i + 1] - speeds[i]) / duration if duration > 0 else 0.0
+        s = min(grid[i] + (speeds[i] + 0.5 * u * dt) * dt, grid[i + 1])
         if times[k] >= ends[-1]:
             s = grid[-1]
         evaluate_at(waypoints, knots, directions, half_widths, s, 0, q[k])

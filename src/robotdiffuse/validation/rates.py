@@ -1,19 +1,19 @@
-"""Rates of a trajectory: those that follow from its positions and times, and whether its own rates agree.
+"""Rates of a trajectory: whether its velocities and accelerations are within the limits, and whether they
+agree with its positions and times.
 
-Limits hold all along the cubics through the rows' positions and velocities, which controllers execute (see
-trajectories/cubics.py), whatever accelerations are written. A motion that is within the limits between its
-rows, but whose cubics are not, needs closer rows. The arm is taken to stand still before the first and after
-the last row.
+Limits must hold all along the cubics through the rows' positions and velocities, which controllers execute
+(see trajectories/cubics.py). The rows' own accelerations must keep the limits too, but do not affect the
+cubics. A trajectory whose cubics exceed the limits needs rows at shorter intervals. The arm is assumed to
+rest before the first row (or to move at the problem's start velocity) and after the last row.
 
-Rates agree if they are those of some motion within the limits. With velocities v0 and v1 at both ends of a
-step of h seconds, and accelerations up to A, the length of the step is within
-h (v0 + v1) / 2 ± (A h² - (v1 - v0)² / A) / 4; the extremes are full acceleration followed by full braking and
-vice versa. The test of agreement takes for A twice the greatest acceleration in the motion, computed or
-written, if that is less. Written accelerations must be near those of the cubics beside their row.
+Rates agree with the positions if some motion within the limits has them. If a joint's velocity changes from
+v0 to v1 in a step of h seconds with accelerations up to A, it moves by h (v0 + v1) / 2 ± (A h² - (v1 - v0)² /
+A) / 4. The extremes are full acceleration followed by full braking, and the reverse. A is twice the greatest
+acceleration in the motion, by rows or by positions, but at most the limit. The acceleration of a row must be
+near those of the cubics before and after the row.
 
-Positions are known only to a resolution, which over a step of nanoseconds hides any velocity. Where rows are
-closer than a millisecond, the tests are therefore repeated from each row to later ones, with the resolution
-of these two rows alone.
+Positions have a limited resolution, which hides any velocity over a step of nanoseconds. If rows are closer
+than a millisecond, the tests are therefore repeated between rows that are further apart.
 """
 
 from collections.abc import Callable, Iterator
@@ -30,10 +30,10 @@ from robotdiffuse.validation.report import Violation
 from robotdiffuse.validation.tolerances import DEFAULT, VerifySettings
 
 AVERAGING_WINDOWS = (1e-3, 4e-3, 16e-3)
-"""Where rows are closer than the first of these [s], mean accelerations are tested over windows of at least
-each length; over shorter ones, the resolution of positions would hide them."""
+"""Lengths of time over which mean accelerations are tested if any rows are closer than the first length [s].
+The resolution of positions hides mean accelerations over shorter times."""
 MIN_TIME = 1e-12
-"""Shorter times are taken as this [s], so that rates over them are finite."""
+"""Smallest time by which a change is divided [s], so that rates are finite."""
 
 
 def rate_violations(
@@ -43,11 +43,12 @@ def rate_violations(
     start_velocity: JointValues | None = None,
     cubics: Cubics | None = None,
 ) -> list[Violation]:
-    """The first violation of each kind in the rates of a trajectory, whose rows are finite and times
-    increase; `cubics` are its cubics, if they are known.
+    """The first violation of each kind in the rates of a trajectory. Its rows must be finite and its times
+    must increase.
 
-    The motion must begin at `start_velocity` [dof], by default at rest, and end at rest. A limit of 0 means
-    that the robot gives none: then the rates must only agree with each other.
+    The motion must begin with `start_velocity` [dof] (None: at rest) and end at rest. A limit of 0 means that
+    the robot states none; the rates must then only agree with the positions. cubics: those of the trajectory,
+    if they are known.
     """
     first_violations: dict[str, Violation] = {}
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -79,14 +80,15 @@ class _Check(NamedTuple):
     """The rate in words."""
     rates: JointRows
     off: JointRows
-    """Deviation of the rates."""
+    """Deviation of the rates from the expected value (0 for limits)."""
     allowed: Float[ndarray, "#n dof"]
     """Allowed deviation."""
     right: Callable[[int, int], str]
-    """The expected value in words, by row and joint."""
+    """The end of a message: the expected value, by row and joint."""
 
 
 def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: JointValues) -> Iterator[_Check]:
+    """All tests of the rates; `begins` is the velocity before the motion."""
     trajectory = cubics.trajectory
     q = trajectory.positions
     v = trajectory.velocities
@@ -95,9 +97,11 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
     mean = cubics.extremes.mean
     change = np.diff(v, axis=0) / cubics.steps
     blur = 2 * settings.limit_slack / step
-    """Uncertainty of the mean velocities, from the resolution of positions."""
+    """Uncertainty of the mean velocity of each step, from the resolution of positions."""
     share = 1 + settings.rate_slack
+    """Factor on limits, for the tolerance."""
     nothing = settings.rate_slack * np.where(robot.velocity > 0, robot.velocity, _peak(v, mean))
+    """Velocity that counts as zero, for each joint."""
 
     def limited(kind: str, what: str, rates: ndarray, limit: ndarray, allowed: ndarray) -> _Check:
         allowed_rates = allowed if (limit > 0).all() else np.where(limit > 0, allowed, np.inf)
@@ -115,11 +119,14 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
     limits = robot.velocity
     onwards = "mean velocity from here to the next row"
     yield limited("jump", onwards, mean, limits, settings.jump * limits + blur)
-    # Velocities of cubics contain up to 3/2 of the mean velocity, accelerations 6 of it over the step.
+    # An error of a step's mean velocity m changes the cubic's velocities by up to 3/2 of it, and its
+    # accelerations by 6 times it divided by the step's duration (see trajectories/cubics.py).
     onwards = "velocity by its positions from here to the next row"
     yield limited("velocity", onwards, cubics.extremes.velocity, limits, share * limits + 1.5 * blur)
     yield limited("velocity", "velocity", v, limits, share * limits)
 
+    # Second differences of positions. Mirrored steps before the first and after the last row let the mean
+    # velocity over both steps be the velocity at the end: `begins`, and 0.
     around = _padded(2 * begins - mean[:1], mean, -mean[-1:])
     length = _padded(step[:1], step, step[-1:])
     unsure = _padded(blur[:1], blur, blur[-1:])
@@ -136,7 +143,7 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
     yield limited("acceleration", "mean acceleration by its velocities", change, limits, share * limits)
     yield limited("acceleration", "acceleration", a, limits, share * limits)
 
-    # Rows may miss the peaks of the acceleration, but not by half.
+    # The greatest acceleration between rows is assumed to be at most twice the greatest measured one.
     measured = np.maximum(_peak(a, second, change), settings.rate_slack * robot.acceleration)
     strongest = np.where(limits > 0, np.minimum(share * limits, 2 * measured), 2 * measured)
     spent = np.divide(change**2, strongest, out=np.zeros_like(change), where=strongest > 0)
@@ -152,7 +159,7 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
         allowed,
         lambda i, j: f"but the velocities of these rows are {v[i, j]:.6g} and {v[i + 1, j]:.6g}",
     )
-    if len(a) > 1 and (off <= allowed).all():  # else the cubics are not those of the positions
+    if len(a) > 1 and (off <= allowed).all():  # otherwise velocities, and so the cubics, are wrong
         start = cubics.extremes.start
         end = cubics.extremes.end
         before = _padded(start[:1], end)
@@ -161,7 +168,7 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
         high = np.maximum(before, after)
         outside = np.maximum(low - a, a - high)
         if begins.any():
-            outside[0] = 0.0  # the motion before is unknown and may have ended in any acceleration
+            outside[0] = 0.0  # the unknown motion before the start may have had any acceleration
         near = settings.rate_agreement * np.where(limits > 0, np.minimum(limits, measured), measured)
         yield _Check(
             "rates",
@@ -174,6 +181,7 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
 
     if step.min(initial=np.inf) >= AVERAGING_WINDOWS[0]:
         return
+    # The tests between rows that are further apart: from an earlier row, at which the excess is largest.
     times = trajectory.times
     resolution = settings.limit_slack
     onwards = "mean velocity from an earlier row to here"
@@ -204,17 +212,17 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
 
 
 def _cumulative(steps: JointRows) -> JointRows:
-    """Sums of all steps before each row."""
+    """For each row, the sum of all steps before it; 0 for the first row."""
     return _padded(np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0))
 
 
 def _worst_earlier_row(
     times: Values, way: JointRows, allowed: JointRows
 ) -> tuple[Int[ndarray, "n dof"], JointRows]:
-    """For each row and joint the earlier row with the largest excess, and the time since then [s].
+    """For each row and joint, the earlier row with the largest excess, and the time since that row [s].
 
-    The excess is the change of `way` since that row, in either direction, minus the growth of `allowed`. The
-    first row refers to itself.
+    The excess is the absolute change of `way` since the earlier row, minus the growth of `allowed`. For the
+    first row, the row itself is returned.
     """
     rows = np.arange(len(way))[:, None]
     beyond = np.full(way.shape, -np.inf)
@@ -232,6 +240,7 @@ def _worst_earlier_row(
 
 
 def _change_since(rows: JointRows, first: Int[ndarray, "n dof"]) -> JointRows:
+    """The change of each joint's value since its earlier row `first`."""
     return rows - np.take_along_axis(rows, first, axis=0)
 
 
@@ -242,9 +251,9 @@ def _second_differences(
     resolution: float,
     nothing: JointValues,
 ) -> tuple[JointRows, JointRows]:
-    """Mean accelerations about each row, from positions at the nearest rows at least `window` [s] away, and
-    their uncertainty. Before the motion the arm moves at its start velocity, and afterwards it stands
-    still."""
+    """Mean accelerations about each row and their uncertainty, from the positions at the row and at the
+    nearest rows at least `window` [s] before and after it. Before the motion, the arm moves with the velocity
+    `begins`; after it, the arm rests."""
     times = trajectory.times
     q = trajectory.positions
     clock = _padded(times[:1] - window, times, times[-1:] + window)

@@ -1,4 +1,4 @@
-"""What a validation returns."""
+"""Report, the result of a validation, and the violations in it."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,21 +12,21 @@ class Violation:
     """not_finite, start, limits, scene_collision, self_collision, constraint, torque, twitch, jump,
     waypoint or goal; for trajectories also time, rest, velocity, acceleration, rates and speed."""
     time: float
-    """Where the violation is: for a path, waypoint index plus fraction of the segment; for a trajectory, time
-    [s]."""
+    """Place of the violation. For a trajectory, the time [s]; for a path, the index of a waypoint plus the
+    traveled fraction of the segment after it."""
     message: str
-    """One line."""
+    """What is violated, in one line."""
     subject: str | None = None
     """The link that collides or is constrained, or the joint that is out of limits."""
     other: str | None = None
     """The obstacle, the other link or the kind of constraint."""
     excess: float | None = None
-    """Amount of the violation: the greatest depth until the contact ends [m], the greatest value of a
-    constraint until it is kept again, or the excess over a limit or error at the goal in its unit."""
+    """Amount of the violation. For a contact, its greatest depth [m]; for a constraint, its greatest value
+    until it is met again; otherwise the excess over a limit or the error at the goal, in its own unit."""
 
     @property
     def line(self) -> str:
-        """The message with the place, which some messages name."""
+        """The message, with the place of the violation added if the message does not name it."""
         named = f" at {self.time:.3f} s" in self.message or " at waypoint " in self.message
         return self.message if named else f"{self.message} (at {self.time:.3f})"
 
@@ -44,15 +44,16 @@ class Report:
     self_clearance: float | None
     """Lower bound on the distance between links that are checked against each other [m]."""
     jerk_share: float | None = None
-    """The largest jerk of a valid trajectory as a share of the joint's limit (`jerk_limits`); infinite if
-    accelerations jump at the ends. Not a requirement: above 1 the motion is valid, but some controllers
-    refuse it."""
+    """The largest jerk of a valid trajectory, divided by the joint's limit (`jerk_limits`); infinite if the
+    acceleration is not 0 at the start or the end. Jerk limits are no requirement: a motion with a share above
+    1 is valid, but some controllers refuse it."""
     found: tuple[Violation, ...] = ()
-    """All violations that were found, the first of each kind; `violations` also finds every contact."""
+    """All violations that were found, the first of each kind; the function `violations` finds every
+    contact."""
 
     @property
     def min_clearance(self) -> float | None:
-        """The smaller of both clearances [m]."""
+        """The smaller of `scene_clearance` and `self_clearance` [m]; None for an invalid motion."""
         if self.scene_clearance is None or self.self_clearance is None:
             return None
         return min(self.scene_clearance, self.self_clearance)

@@ -35,40 +35,40 @@ class VerifySettings(Settings, name="verify"):
     goal_slack: NotNegative = 1e-5
     """The tolerances in a pose goal may be exceeded by this [m] or [rad]."""
     rest: NotNegative = 1e-6
-    """The arm is at rest where no joint is faster than this [rad/s] or [m/s]."""
+    """At a waypoint where the motion must stop, no joint may be faster than this [rad/s] or [m/s]."""
     rate_slack: NotNegative = 0.01
-    """Share by which a trajectory may exceed velocity, acceleration, effort and speed limits. Also the share
-    of a velocity limit by which its velocities may disagree with its positions, and below which it starts and
-    ends at rest."""
+    """Fraction by which a trajectory may exceed velocity, acceleration, effort and speed limits. A velocity
+    may also differ by this fraction of its limit from that of the positions, and from zero at the start and
+    the end."""
     rate_agreement: NotNegative = 0.5
-    """Share of a joint's greatest acceleration by which a row's acceleration may leave the range of the
-    accelerations of the cubics before and after the row."""
+    """How far the acceleration of a row may be outside of the range of accelerations of the cubics before and
+    after the row, as a fraction of the joint's greatest acceleration."""
     jump: Positive = 1.5
-    """A step of a trajectory is a jump if its mean velocity exceeds this times the velocity limit."""
+    """A step between rows is a jump if a joint's mean velocity exceeds its velocity limit by this factor."""
     chord: Positive = 1e-3
-    """Collision between rows is validated on straight lines. Where the cubic through the rows' positions and
-    velocities, which controllers follow, leaves them by more than this [rad] or [m], rows on the cubic are
-    added; more where the clearance is so small that the rest matters."""
+    """Controllers follow cubics between rows, but collision is validated on straight lines. Rows on a cubic
+    are added until it leaves the lines by at most this [rad] or [m]; more are added if the clearance is
+    small."""
     constraint_chord: Positive = 1e-6
-    """Like `chord`, for motions with path constraints. This distance is subtracted from the tolerances of the
-    constraints."""
+    """`chord` for validating path constraints. The tolerances of constraints are reduced by what a cubic may
+    differ from the lines."""
     reversal_angle: NotNegative = float(np.radians(150))
     """A change of direction in joint space by more than this [rad] is a sharp reversal."""
     reversal_step: NotNegative = 0.05
-    """Only reversals between straight moves of at least this length count [rad, joint-space L2]."""
+    """Reversals are counted between rows that are at least this far apart [rad, joint-space L2]."""
     reversals: Natural = 3
-    """A motion with more sharp reversals than this twitches."""
+    """Largest allowed number of sharp reversals; a motion with more of them twitches."""
     tightness: Annotated[float, Bound(above=0.0, below=1.0)] = 0.5
-    """The certified clearances of a `Report` are at least this fraction of the smallest clearance that was
-    measured, in (0, 1)."""
+    """The certified clearances of a `Report` are at least this fraction of the smallest measured
+    clearance."""
 
 
 DEFAULT = VerifySettings()
 EXACT = VerifySettings(goal_distance=1e-4, goal_angle=1e-4)
-"""Tight tolerances, with which goals close to each other can be distinguished."""
+"""Tight tolerances, by which `goal_index` distinguishes goals that are close to each other."""
 BLEND_SAMPLE_SHARE = 0.25
-"""A blend is tested at configurations that are apart by at most this fraction of its radius [joint-space
-L2]."""
+"""Largest distance between the configurations at which `first_place_within` tests a path, as a fraction of
+the blend radius [joint-space L2]."""
 
 
 class GoalError(NamedTuple):
@@ -89,12 +89,17 @@ def goal_error(
     blend: float = 0.0,
     poses: dict[str, Pose] | None = None,
 ) -> GoalError | None:
-    """The error of a configuration with respect to a goal; None at the goal. Of several goals, the smallest
-    error.
+    """The error of a configuration with respect to a goal; None if it is at the goal. For an `AnyGoal`, the
+    smallest error.
 
-    `blend`: radius within which the goal counts as reached: around a configuration in joint space [rad, L2],
-    around the position of a pose, or the box of its tolerances [m]. `poses`: those of links at the
-    configuration, as far as they are known.
+    Args:
+        robot: The robot.
+        goal: The goal.
+        q: The configuration.
+        settings: Tolerances.
+        blend: Distance at which the goal counts as reached: to a goal configuration [rad, joint-space L2]; to
+            the position of a pose, or to the box of its tolerances [m].
+        poses: Cache of the poses T_base_link at q by link, which this function fills.
     """
     poses = {} if poses is None else poses
     if isinstance(goal, AnyGoal):
@@ -140,8 +145,8 @@ def goal_error(
 
 
 def goal_index(robot: Robot, goal: Goal, q: Configuration) -> int | None:
-    """Which of several goals, or of several goal configurations, a configuration is at; 0 at a single goal,
-    and None at none. Where several goals are close to each other, one that is reached exactly comes first."""
+    """Index of the goal at which a configuration is, among the goals of an `AnyGoal` or the rows of several
+    goal configurations; None if it is at no goal. Goals that are reached exactly come before others."""
     goals: Sequence[Goal] = goal.goals if isinstance(goal, AnyGoal) else (goal,)
     if isinstance(goal, JointGoal):
         goals = [JointGoal(row) for row in goal.positions]
@@ -161,10 +166,10 @@ def first_place_within(
     settings: VerifySettings = DEFAULT,
     after: float = 0.0,
 ) -> float | None:
-    """The first place after `after` where a path through configurations comes within `blend` of a goal.
+    """The first place from `after` on where a path through configurations is within `blend` of a goal.
 
-    A place is a row plus the share of the way to the next. None if no sample of the path comes so near;
-    samples are BLEND_SAMPLE_SHARE of the blend apart.
+    A place is the index of a row plus the traveled fraction of the segment after it. None if no sample of the
+    path is that near; samples are at most BLEND_SAMPLE_SHARE of the blend apart.
     """
     places, way = sample_path(q, BLEND_SAMPLE_SHARE * blend, after)
     for i in np.flatnonzero(_near(robot, goal, way, blend, settings)):
@@ -174,11 +179,8 @@ def first_place_within(
 
 
 def sample_path(q: Configurations, step: float, after: float = 0.0) -> tuple[Values, JointRows]:
-    """Places after `after` at most a step apart [rad, joint-space L2] on a path, and the configurations
-    there.
-
-    A place is a row plus the share of the way to the next.
-    """
+    """Places on a path from `after` on, at most `step` apart [rad, joint-space L2], and the configurations
+    there. A place is the index of a row plus the traveled fraction of the segment after it."""
     steps = np.linalg.norm(np.diff(q, axis=0), axis=1)
     counts = np.maximum(np.ceil(steps / step), 1).astype(int)
     shares = [np.arange(count) / count for count in counts]
@@ -191,7 +193,7 @@ def sample_path(q: Configurations, step: float, after: float = 0.0) -> tuple[Val
 def _near(
     robot: Robot, goal: Goal, q: Configurations, blend: float, settings: VerifySettings
 ) -> Bool[ndarray, "n"]:
-    """Marks configurations that may be within `blend` of a goal, by position alone."""
+    """Whether each configuration may be within `blend` of a goal; orientations of poses are not checked."""
     if isinstance(goal, AnyGoal):
         return np.any([_near(robot, part, q, blend, settings) for part in goal.goals], axis=0)
     if isinstance(goal, PosesGoal):
@@ -208,7 +210,8 @@ def _near(
 
 
 def _turned(rotation: ndarray, tolerance: ndarray, slack: float) -> bool:
-    """Whether roll, pitch and yaw are within the tolerance, in either of their two representations."""
+    """Whether roll, pitch and yaw of a rotation are within the tolerances [3]. Each rotation has two triples
+    of these angles; one within the tolerances is enough."""
     roll, pitch, yaw = rpy_from_rotation(rotation)
     alternative = np.array([roll + np.pi, np.pi - pitch, yaw + np.pi])
     representations = np.array([roll, pitch, yaw]), (alternative + np.pi) % (2 * np.pi) - np.pi

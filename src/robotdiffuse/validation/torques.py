@@ -1,8 +1,9 @@
-"""Torques and speeds along motions: finds the first one beyond its limit, or proves that there is none.
+"""Joint torques and frame speeds along motions: finds the first value that exceeds its limit, or proves that
+no value does.
 
-A motion consists of pieces with cubic or straight positions and smooth torques. Torques, or speeds of frames,
-are computed at both ends of a piece. Where the bound on their second derivative (see robots/dynamics.py)
-allows one beyond its limit in between, the piece is halved.
+A motion consists of pieces, on which positions are straight or cubic and torques are smooth. Values are
+computed at both ends of a piece. Bounds on their second derivatives (see robots/dynamics.py) bound the values
+in between. If such a bound exceeds the limit, the piece is halved.
 """
 
 from collections.abc import Callable
@@ -17,13 +18,13 @@ from robotdiffuse.robots.dynamics import Dynamics, Stretches
 from robotdiffuse.trajectories.cubics import Cubics
 
 RESOLUTION = 1e-3
-"""A piece is not halved further once its values are known to this fraction of their limits; a value that may
-still exceed its limit counts as beyond it."""
+"""A piece is not halved further once its values are known to this fraction of their limits. If a value may
+still exceed its limit then, it counts as exceeding it."""
 MAX_OPEN_PIECES = 100_000
-"""Maximum number of open pieces; if there are more, as in motions with very many turns, they count as beyond
-the limit."""
+"""Maximum number of pieces that are halved at once. If there are more, as in motions with very many turns,
+their values count as exceeding the limits."""
 PLACE_RESOLUTION = 1 / 64
-"""The place where a value first exceeds its limit is located to this fraction of a piece."""
+"""Resolution of the place where a value first exceeds its limit, as a fraction of a step from row to row."""
 States = tuple[JointRows, JointRows, JointRows]
 """Positions, velocities and accelerations."""
 
@@ -32,26 +33,26 @@ class Pieces(NamedTuple):
     """The pieces of a motion, from each row to the next."""
 
     states: Callable[[Int[ndarray, "n"], Values], States]
-    """States by piece and share of the piece."""
+    """States at places, given by the index of the piece and the fraction of it that has passed, its share."""
     along: Stretches
-    """Bounds along each piece, with derivatives by the share."""
+    """Bounds on positions and derivatives along each piece; derivatives are by the share."""
 
 
 class Excess(NamedTuple):
-    """The first value that exceeds its limit, or is not proved to be within it."""
+    """The first value that exceeds its limit, or is not proved to be within its limit."""
 
     place: float
-    """Row plus the share of the way to the next."""
+    """Row, plus the share of the piece after it that has passed."""
     joint: int
     """Index of the joint, or of the frame."""
     torque: float
-    """[N m] or [N]; of a frame its speed [m/s]."""
+    """The torque of the joint [N m] or [N], or the speed of the frame [m/s]."""
     excess: float
-    """Largest excess along the motion, in the same unit."""
+    """Largest excess along the motion, in the unit of `torque`."""
 
 
 def trajectory_pieces(trajectory: Trajectory) -> Pieces:
-    """Pieces of a trajectory, whose times increase: the cubics through its positions and velocities."""
+    """Pieces of a trajectory with increasing times: the cubics through its positions and velocities."""
     if len(trajectory.positions) == 1:
         return static_pieces(trajectory.positions)
     cubics = Cubics(trajectory)
@@ -66,7 +67,7 @@ def trajectory_pieces(trajectory: Trajectory) -> Pieces:
 
 
 def static_pieces(q: Configurations) -> Pieces:
-    """Pieces of a path on straight lines, at rest everywhere."""
+    """Pieces of a path, on straight lines between waypoints, with zero velocity everywhere."""
     q = np.repeat(q, 2, axis=0) if len(q) == 1 else q
     step = np.diff(q, axis=0)
     still = np.zeros((3, *step.shape))
@@ -81,12 +82,13 @@ def static_pieces(q: Configurations) -> Pieces:
 
 
 def _farthest(q: Configurations) -> JointRows:
+    """Largest absolute position of each joint at the ends of each piece."""
     return np.maximum(np.abs(q[:-1]), np.abs(q[1:]))
 
 
 def first_excess(dynamics: Dynamics, pieces: Pieces, slack: float) -> Excess | None:
-    """The first torque that exceeds its limit by more than a share `slack`; None if it is proved that none
-    does."""
+    """The first torque that exceeds its limit by more than the fraction `slack`; None if it is proved that no
+    torque does."""
     bends = dynamics.second_derivatives(pieces.along)
     return first_beyond(dynamics.limits, dynamics.torques, bends, pieces.states, slack)
 
@@ -98,10 +100,15 @@ def first_beyond(
     states: Callable[[ndarray, ndarray], States],
     slack: float,
 ) -> Excess | None:
-    """The first of k `values` of states, such as torques, that exceeds its limit by more than a share
-    `slack`; None if it is proved that none does.
+    """The first value along a motion, such as a torque, that exceeds its limit by more than the fraction
+    `slack`; None if it is proved that no value does.
 
-    bends: bounds on the second derivatives of the values along each piece, by the share.
+    Args:
+        limits: Limits of k values [k].
+        values: Computes the k values [n, k] from n positions, velocities and accelerations.
+        bends: Bounds on the second derivatives of the values along each of m pieces, by the share.
+        states: `Pieces.states`.
+        slack: Allowed excess, as a fraction of a limit.
     """
     allowed = limits * (1 + slack)
     count = len(bends)
@@ -117,20 +124,22 @@ def first_beyond(
     places: list[ndarray] = [np.zeros(0)]
     beyond: list[ndarray] = [np.zeros((0, len(allowed)))]
     while len(piece):
+        # between the ends of [low, high], a value is at most the larger end value plus `bulge`
         bulge = bends[piece] * (high - low)[:, None] ** 2 / 8
         bound = np.maximum(at_low, at_high)
-        open_ = bound + bulge > allowed
-        begun = (at_low > allowed).any(axis=1)
-        goes_on = (at_high > allowed).any(axis=1)
+        undecided = bound + bulge > allowed
+        low_exceeds = (at_low > allowed).any(axis=1)
+        high_exceeds = (at_high > allowed).any(axis=1)
         unsure = np.minimum(bulge, RESOLUTION * limits)
-        last = bulge <= unsure if len(piece) <= MAX_OPEN_PIECES else np.ones_like(open_)
-        over = begun | goes_on
-        lost = (open_ & last).any(axis=1)
-        wrong = np.flatnonzero(over | lost)
-        places.append(piece[wrong] + np.where(over & ~begun, high, low)[wrong])
+        resolved = bulge <= unsure if len(piece) <= MAX_OPEN_PIECES else np.ones_like(undecided)
+        exceeds = low_exceeds | high_exceeds
+        unproved = (undecided & resolved).any(axis=1)
+        wrong = np.flatnonzero(exceeds | unproved)
+        places.append(piece[wrong] + np.where(exceeds & ~low_exceeds, high, low)[wrong])
         beyond.append((np.where(bound > allowed, bound, bound + unsure) - allowed)[wrong])
-        unresolved = over & (begun != goes_on) & (high - low > PLACE_RESOLUTION)
-        halved = open_.any(axis=1) & (unresolved | ~(over | lost))
+        # halve what is undecided, and what exceeds at one end only, to locate the place
+        unlocated = exceeds & (low_exceeds != high_exceeds) & (high - low > PLACE_RESOLUTION)
+        halved = undecided.any(axis=1) & (unlocated | ~(exceeds | unproved))
         piece = piece[halved]
         low = low[halved]
         high = high[halved]

@@ -1,7 +1,7 @@
 """The validator: whether a motion is free of collision, within limits, and leads from the start to the goal.
 
-Freedom from collision between waypoints is certified, not sampled: see collision/motions.py. Between its rows
-a trajectory is validated along the cubics that controllers execute: see trajectories/cubics.py and rates.py.
+Freedom from collision between waypoints is certified, not sampled: see collision/motions.py. A trajectory is
+validated along the cubics that controllers execute between its rows: see trajectories/cubics.py and rates.py.
 The validator does not depend on planners.
 """
 
@@ -33,17 +33,17 @@ from robotdiffuse.validation.torques import (
     trajectory_pieces,
 )
 
-if TYPE_CHECKING:  # what most problems do not need is imported where one does
+if TYPE_CHECKING:  # modules for features that few problems have are imported when they are needed
     from robotdiffuse.collision.moving_obstacles import MovingCollision, TimedContact
     from robotdiffuse.problems.compiled_constraints import PathConstraints
 
 MAX_DURATION = 1e5
 """Longest motion that is validated, about a day [s]."""
 CHORD_SHARE = 0.1
-"""The certified clearances of a trajectory are reduced by at most this fraction because its cubics leave the
-straight lines."""
+"""Collision is checked on straight lines, and certified clearances are reduced by how far the cubics leave
+them. Rows are added until the reduction is at most this fraction of the clearance."""
 CHORD_MARGIN = 0.9
-"""Factor on the chords tried next, so that one trial suffices."""
+"""Safety factor on the `chord` that is computed for the next try, so that a single retry suffices."""
 
 
 RATE_KINDS = ("rest", "rates", "velocity", "acceleration", "jump")
@@ -55,8 +55,8 @@ def verify(problem: Problem, motion: Path | Trajectory, settings: VerifySettings
 
     Args:
         problem: The problem that the motion is to solve.
-        motion: A trajectory, which is checked as it will be executed, with its times and rates; or a path,
-            which is checked for everything but moving obstacles, since it has no times.
+        motion: A trajectory, which is checked as it will be executed, with its times and rates; or a path. A
+            path has no times, so rates and moving obstacles are not checked.
         settings: Tolerances of the validator.
 
     Returns:
@@ -82,16 +82,17 @@ def verify(problem: Problem, motion: Path | Trajectory, settings: VerifySettings
 def verify_trajectory(problem: Problem, trajectory: Trajectory, settings: VerifySettings = DEFAULT) -> Report:
     """Validate a trajectory for a problem, with its rates and times, and among moving obstacles.
 
-    All limits hold along the cubics through the positions and velocities of its rows. Its velocities and
-    accelerations must agree with its positions. It must begin at rest, or at the problem's start velocity,
-    and end at rest. Raises InputError if its joints are not those of the robot, or its shapes are wrong.
+    All limits must hold along the cubics through the positions and velocities of the rows. Velocities and
+    accelerations must agree with the positions. The motion must begin at rest, or with the problem's start
+    velocity, and end at rest. Raises InputError if the joints are not those of the robot, or for wrong
+    shapes.
     """
     check_motion("trajectory", trajectory, (Trajectory,))
     return verify(problem, trajectory, settings)
 
 
 def check_motion(what: str, motion: object, kinds: tuple[type, ...]) -> None:
-    """Raise InputError unless `motion` is a motion of one of these kinds, with arrays of numbers."""
+    """Raise InputError, naming `what`, unless `motion` is an instance of `kinds` with arrays of numbers."""
     descriptions = {Path: "a Path, e.g. result.path", Trajectory: "a Trajectory, e.g. result.trajectory"}
     check_type(what, motion, kinds, ", or ".join(descriptions[kind] for kind in kinds))
     check_type(f"{what}.joint_names", motion.joint_names, (tuple, list), "a tuple of names")  # type: ignore
@@ -169,10 +170,13 @@ class Verifier:
         at_rest: ndarray | None,
         along: tuple[ndarray, ndarray] | None,
     ) -> Report:
-        """The report on straight lines between places on the cubics, whose clearances are reduced by how far
-        any point of the arm leaves these lines.
+        """The report on straight lines between samples of the cubics.
 
-        Places are added until that is little beside the clearances.
+        The clearances are reduced by a bound on the distance of any point of the arm from its place on the
+        lines. Samples are added until the bound is small compared with the clearances, see CHORD_SHARE.
+
+        found: violations that are known. at_rest: for each row, whether the motion rests there. along: as in
+        `_report`.
         """
         settings = self.settings
         chord = self.settings.chord
@@ -192,8 +196,8 @@ class Verifier:
             chord = CHORD_MARGIN * float(off.max()) * allowed / lost
 
     def collision_free(self, path: Path) -> bool:
-        """Whether a path is certified free of collision and keeps the path constraints. Start, goal and
-        limits are not checked."""
+        """Whether a path is certified free of collision and proved to keep the path constraints. Start, goal
+        and limits are not checked."""
         self._check_shape("path", path)
         if self.constraints is not None and self.constraints.first_violation(path.positions) is not None:
             return False
@@ -224,11 +228,11 @@ class Verifier:
         at_rest: ndarray | None = None,
         along: tuple[ndarray, ndarray] | None = None,
     ) -> Report:
-        """The report on waypoints, with the earliest violation; `found` are violations that are already
-        known.
+        """The report on the straight lines between configurations, with the earliest violation.
 
-        `times`: None for a path. `at_rest`: marks the rows at which a trajectory through waypoints is at
-        rest. `along`: times and positions at which path constraints are tested, by default the waypoints.
+        q: configurations [n, dof]. times: their times; None for a path. found: violations that are already
+        known. at_rest: whether the motion rests at each row; None: it may stop at any row. along: times and
+        configurations between which path constraints are proved; None: `times` and `q`.
         """
         bad = np.flatnonzero(~(np.abs(q) <= MAX_COORDINATE).all(axis=1))
         if len(bad):
@@ -279,7 +283,8 @@ class Verifier:
         return Violation("start", 0.0, message, name, None, excess)
 
     def _wrapped(self, q: ndarray, clock: ndarray) -> Violation | None:
-        """The first step of a continuous joint that is nearly a whole turn."""
+        """A violation if a continuous joint turns by nearly a whole turn in one step, where wrapped angles
+        are probable."""
         turns = self.robot.wraps(q)
         wrapped = np.flatnonzero(turns.any(axis=1))
         if not len(wrapped):
@@ -310,7 +315,7 @@ class Verifier:
     def _constrained(
         self, q: ndarray, clock: ndarray, along: tuple[ndarray, ndarray] | None
     ) -> Violation | None:
-        """The first place where the motion is not proved to keep the path constraints."""
+        """A violation at the first place where the motion is not proved to keep the path constraints."""
         if self.constraints is None:
             return None
         chord = 0.0 if along is None else self.settings.constraint_chord
@@ -323,7 +328,8 @@ class Verifier:
         return Violation("constraint", at, wrong.message, constraint.frame, constraint.kind, wrong.excess)
 
     def _limits_between(self, cubics: Cubics) -> list[Violation]:
-        """The first place between rows where a cubic leaves the joint limits."""
+        """A violation at the first place between rows where a cubic leaves the joint limits; no entries if
+        there is none."""
         robot = self.robot
         extremes = cubics.extremes
         beyond = np.maximum(robot.lower - extremes.lower, extremes.upper - robot.upper)
@@ -337,7 +343,8 @@ class Verifier:
         return [] if violation is None else [violation]
 
     def _too_fast(self, cubics: Cubics) -> list[Violation]:
-        """The first place where a frame is not proved to be as slow as its constraint requires."""
+        """A violation at the first place where a frame is not proved to keep its speed limit; no entries if
+        there is none."""
         assert self.constraints is not None
         limits = self.constraints.speed_limits
         trajectory = cubics.trajectory
@@ -359,8 +366,8 @@ class Verifier:
         return [Violation("speed", at, message, constraint.frame, constraint.kind, beyond.excess)]
 
     def _torques(self, clock: ndarray, pieces: Pieces, what: str) -> list[Violation]:
-        """The first place where a joint's torque with the payload is not proved to be within its effort
-        limit."""
+        """A violation at the first place where a joint's torque with the payload is not proved to be within
+        its effort limit; no entries if there is none. what: the end of the message."""
         assert self.dynamics is not None
         beyond = first_excess(self.dynamics, pieces, self.settings.rate_slack)
         if beyond is None:
@@ -371,8 +378,8 @@ class Verifier:
         return [Violation("torque", at, message, name, None, beyond.excess)]
 
     def _twitch(self, q: ndarray, clock: ndarray) -> Violation | None:
-        """A violation if the motion has too many sharp reversals, counted on waypoints `reversal_step`
-        apart."""
+        """A violation if the motion has more than `reversals` sharp reversals, counted on rows that are at
+        least `reversal_step` apart."""
         settings = self.settings
         if not len(q) > settings.reversals + 2:
             return None
@@ -396,8 +403,8 @@ class Verifier:
         return Violation("goal", time, f"the motion ends {off.message}", off.subject, None, off.excess)
 
     def _waypoints(self, q: ndarray, clock: ndarray, at_rest: ndarray | None) -> Violation | None:
-        """The first of the problem's waypoints at which the motion does not stop, or that it does not pass
-        within its blend, after the waypoints before it."""
+        """A violation for the first of the problem's waypoints that the motion misses: it must stop there, or
+        pass within the waypoint's blend, after it has reached the waypoints before."""
         problem = self.problem
         after = 0.0
         for k, (goal, blend) in enumerate(zip(problem.waypoints, problem.blend, strict=True)):
@@ -445,8 +452,8 @@ class Verifier:
 
 @kernel()
 def _spaced_rows(q, step):
-    """Indices of rows of q[n, dof] such that each is at least `step` from the one before, beginning with row
-    0."""
+    """Indices of rows of q [n, dof]: row 0, then each row that is at least `step` from the last returned
+    row."""
     row_indices = np.zeros(len(q), np.int64)
     count = 1
     for i in range(1, len(q)):
@@ -461,8 +468,8 @@ def _spaced_rows(q, step):
 
 @lru_cache(maxsize=8)
 def verifier(problem: Problem, settings: VerifySettings = DEFAULT) -> Verifier:
-    """The Verifier of a problem. The last few are cached, so that many paths of one problem are validated
-    fast."""
+    """The Verifier of a problem. The last eight are cached, so that data of the robot and the scene is
+    prepared once for many paths of a problem."""
     return Verifier(problem, settings)
 
 
@@ -485,20 +492,21 @@ def collision_violation(contact: Contact, time: float) -> Violation:
 def violations(
     problem: Problem, motion: Path | Trajectory, settings: VerifySettings = DEFAULT
 ) -> tuple[Violation, ...]:
-    """All violations of a motion in order; empty if it is valid.
+    """All violations of a motion in the order of their places; empty if it is valid.
 
-    They include every contact, at the place where it begins, joint limits once for each joint, and the first
-    of every other kind.
+    They include every contact, at the place where it begins; joint limits once for each joint; and the first
+    violation of every other kind.
     """
-    from robotdiffuse.collision.contacts import contacts  # which only this needs
+    from robotdiffuse.collision.contacts import contacts  # imported here, since nothing else needs it
 
     timed = isinstance(motion, Trajectory)
     report = verify(problem, motion, settings)
     if report.valid or (report.violation is not None and report.violation.kind in ("not_finite", "time")):
         return () if report.violation is None else (report.violation,)
-    still = {*(shape.name for shape in problem.scene.shapes), *problem.robot.link_names}
+    # contacts with static obstacles and links, and joint limits, are found again below, all of them
+    static = {*(shape.name for shape in problem.scene.shapes), *problem.robot.link_names}
     all_violations = [
-        w for w in report.found if w.kind != "limits" and not (w.kind in CONTACT_KINDS and w.other in still)
+        w for w in report.found if w.kind != "limits" and not (w.kind in CONTACT_KINDS and w.other in static)
     ]
     q = motion.positions
     clock = np.arange(len(motion.positions), dtype=float)

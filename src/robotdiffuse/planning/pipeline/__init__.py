@@ -1,6 +1,8 @@
-"""What surrounds any planner: moving obstacles, waypoints, a start velocity, unknown space. Each part takes
-the planner as an argument, and calls it once or several times for problems that the planner can solve by
-itself."""
+"""Planning with moving obstacles, waypoints, a start velocity and unknown space, for any planner.
+
+The modules handle one of these features each. A module calls the planner, once or several times, for problems
+without the feature.
+"""
 
 from dataclasses import replace
 from typing import ClassVar, Protocol, runtime_checkable
@@ -27,8 +29,8 @@ class Solver(Protocol):
 
 
 def attempt(solver: Solver, problem: Problem, request: PlanRequest) -> PlanResult:
-    """Plan from the problem's start to its goal, without its waypoints, moving obstacles, start velocity and
-    unknown space, which the pipeline handles."""
+    """Plan from the problem's start to its goal by one call of the planner. The problem's waypoints, moving
+    obstacles, start velocity and unknown space are ignored: other modules of the pipeline handle them."""
     context = PlanningContext(solver.name, problem, request)
     followed = None
     lines = any(isinstance(constraint, CartesianLine) for constraint in problem.constraints)

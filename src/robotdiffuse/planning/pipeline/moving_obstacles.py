@@ -1,16 +1,16 @@
-"""Motions among obstacles that move: any planner's path among what stands still, timed so that the moving
-obstacles pass.
+"""Motions among moving obstacles: a planner finds a path in the static scene, which is then timed so that the
+arm does not meet the moving obstacles.
 
-Along the path there are places where the arm may stop. Motions between any two of them, forwards and
-backwards, at full speed or slower, are timed within the limits as always. A grid of times is gone through
-once to find which motions, after which waits, reach the end first: a place is reached at a time if the arm
-waited there before, or if a collision-free motion ends there (safe intervals, M. Phillips and M. Likhachev,
-"SIPP: Safe interval path planning for dynamic environments", ICRA 2011, on a grid). The grid only proposes:
-the validator checks the motion as a whole in time. If that fails, other paths are tried: other seeds, and
-paths around the obstacles where they are at some time.
+The path has places where the arm may stop. Motions between any two places, forwards and backwards, at full or
+half speed, are timed within the robot's limits. A search over a grid of times finds the sequence of motions
+and waits that reaches the end first. A place is reached at a time if the arm was there one step before and
+can wait, or if a collision-free motion ends there. This is SIPP on a grid (M. Phillips and M. Likhachev,
+"SIPP: Safe interval path planning for dynamic environments", ICRA 2011). The validator then checks the whole
+motion in continuous time. If it refuses the motion, other paths are tried: with other seeds, and around the
+obstacles at their places at a random time.
 
-The motion stops at each waypoint of a path through waypoints, in their order. It waits there if it must, and
-may go back to an earlier waypoint.
+With waypoints, the motion stops at each waypoint in their order. It may wait there or go back to an earlier
+waypoint.
 """
 
 from dataclasses import replace
@@ -33,10 +33,11 @@ from robotdiffuse.trajectories.timing import MIN_DISTANCE, SPEED_FACTORS, StopGr
 from robotdiffuse.validation.tolerances import goal_error
 from robotdiffuse.validation.validator import verifier
 
+# Values of `came` (see `_reached`) for a place that is not reached, or is reached by waiting.
 UNREACHED = -2
 WAITED = -1
 CELLS_PER_CLOCK_CHECK = 10_000_000
-"""Number of cells of motions that are visited between two readings of the clock."""
+"""Number of cells (configurations of motions at ticks) that are visited between two readings of the clock."""
 
 
 def earliest(
@@ -47,15 +48,16 @@ def earliest(
     first: Int[ndarray, "n"],
     cells: Int[ndarray, "k"],
 ) -> tuple[list[int], bool]:
-    """The earliest schedule from rest at the first place, at tick 0, to the last place.
+    """The schedule that takes the arm from rest at the first place, at tick 0, to the last place first.
 
-    clear: which configurations are free at which tick.
-    cell: the configuration of each place.
-    source, target: the places that each motion connects.
-    first, cells: motion m passes the configurations cells[first[m] : first[m + 1]], one per tick.
+    clear: whether each configuration is free at each tick.
+    cell: index of the configuration at each place.
+    source, target: indices of the places where each motion begins and ends.
+    first, cells: motion m passes the configurations with the indices cells[first[m] : first[m + 1]], one per
+        tick.
 
-    Returns the numbers of the motions in order, with -1 for each tick of waiting, and whether the last place
-    can be reached. Raises OutOfTimeError if a deadline leaves no time.
+    Returns the indices of the motions in order, with -1 for each tick of waiting, and whether the last place
+    can be reached. Raises OutOfTimeError if the deadline leaves no time.
     """
     came = np.full((clear.shape[1], len(cell)), UNREACHED)
     came[0, 0] = WAITED
@@ -70,9 +72,9 @@ def earliest(
 
 @kernel(nogil=True)
 def _reached(came, clear, cell, source, target, first, cells, begin, count):
-    """Go through `count` ticks from `begin`, and write to came[ticks, places] by which motion a place is
-    reached at a tick, or WAITED. Returns the tick at which the last place is first reached; -1 if it is none
-    of these."""
+    """Visit `count` ticks from `begin` on. For each tick and place, write to came [ticks, places] the index
+    of the motion by which the place is reached then, or WAITED. Returns the tick at which the last place is
+    first reached; -1 if it is not reached in these ticks."""
     places = len(cell)
     ticks = clear.shape[1]
     for now in range(begin, min(begin + count, ticks - 1)):
@@ -100,7 +102,7 @@ def _reached(came, clear, cell, source, target, first, cells, begin, count):
 
 @kernel()
 def _way_to(end, came, source, first):
-    """The numbers of the motions that reach the last place at tick `end`, in order; -1 for each tick of
+    """The indices of the motions that reach the last place at tick `end`, in order; -1 for each tick of
     waiting."""
     motion_numbers = [0 for _ in range(0)]
     place = came.shape[1] - 1
@@ -118,14 +120,14 @@ def _way_to(end, came, source, first):
 GRID_STEP = 0.02
 """Step of the grid of times [s]."""
 CELL_SECONDS = 1e-8
-"""Least computing time per cell of the grid (a configuration at a time) [s]."""
+"""Smallest computing time per cell of the grid (a configuration at a time) [s]."""
 GRID_TRAVEL = 0.02
-"""No point of the arm moves further than this between two configurations of the grid [m]."""
-# The grid ends at this factor of the duration without moving obstacles, plus this time [s].
+"""Largest travel of any point of the arm between two neighboring configurations of the grid [m]."""
+# The grid of times ends at DURATION_FACTOR times the duration without moving obstacles, plus EXTRA_TIME [s].
 EXTRA_TIME = 5.0
 DURATION_FACTOR = 3.0
 PATH_TIME_FRACTION = 0.5
-"""Fraction of the remaining time that planning each path gets."""
+"""Time limit for planning a path, as a fraction of the remaining time."""
 
 
 def plan_among_moving_obstacles(solver: Solver, problem: Problem, request: PlanRequest) -> PlanResult:
@@ -149,7 +151,7 @@ def plan_among_moving_obstacles(solver: Solver, problem: Problem, request: PlanR
     reason = ""
     while attempts == 0 or context.remaining > 0:
         scene = problem.scene
-        if attempts % 2:  # paths around the obstacles where they are at some time
+        if attempts % 2:  # every other path avoids the moving obstacles at their places at a random time
             time = float(rng.uniform(0.0, horizon))
             standing = (obstacle.at(time) for obstacle in problem.moving if obstacle.known)
             scene = scene.with_shapes([*scene.shapes, *standing])
@@ -170,7 +172,7 @@ def plan_among_moving_obstacles(solver: Solver, problem: Problem, request: PlanR
             except OutOfTimeError as error:
                 if attempted_paths == 1:
                     return context.out_of_time(error)
-                attempted_paths -= 1  # the last path was not tried in time
+                attempted_paths -= 1  # timing the last path was not completed
                 break
             if timed is None:
                 continue
@@ -206,7 +208,8 @@ def _solved(
 
 
 def _stops(problem: Problem, path: Path) -> list[int]:
-    """The rows of a path at its waypoints: for each the first one after the waypoint before."""
+    """The row of a path at each waypoint: the first one that reaches it, from the row of the waypoint before
+    on."""
     rows = range(len(path.positions))
     stops = [0]
     for goal in problem.waypoints:
@@ -224,8 +227,8 @@ def _timed(
     found: PlanResult,
     clearance: float,
 ) -> Trajectory | None:
-    """The earliest collision-free motion along the path found, with its corners rounded as there, on the grid
-    of times; None if there is none."""
+    """The motion along the path of `found` that reaches the end first, by the grid of times; None if there is
+    none. Corners are rounded as in `found`. clearance: to moving obstacles [m]."""
     path = found.path
     assert path is not None
     robot = problem.robot

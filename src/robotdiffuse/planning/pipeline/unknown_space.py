@@ -1,18 +1,19 @@
-"""Planning in a scene of which cameras saw a part: assumptions about unknown space, for any planner.
+"""Planning in a scene of which cameras saw only a part: assumptions about unknown space, for any planner.
 
-An assumption adds obstacles to the scene as seen. Each policy has a list of assumptions, the most careful one
-first. They are tried in this order, and the first one that leaves a motion gives the result. So every motion
-avoids what was seen, and as many assumed obstacles as possible:
+An assumption adds obstacles to the observed scene. "As seen" is the assumption without additional obstacles.
+Each policy for unknown space has a list of assumptions, the most cautious first. They are tried in this
+order, and the first under which a motion is found gives the result. So every motion avoids the observed
+obstacles, and as many assumed obstacles as possible. The policies are:
 
-- padded: observed points, inflated by 9 cm, by 6, by 4; then as seen.
+- padded: observed points, inflated by 9 cm, then by 6 cm, then by 4 cm; then as seen.
 - predicted: voxels that the occupancy completion network predicts occupied with a probability above 0.1, 0.2,
-  0.35, 0.5; then as seen. Among several motions under an assumption, one is chosen that sweeps little
+  0.35, 0.5; then as seen. Among several motions under an assumption, one is chosen that sweeps voxels of low
   probability.
-- occupied: every voxel that no view saw; no other assumption is tried.
+- occupied: every voxel that no view saw. If no motion is found, planning fails.
 - optimistic: as seen.
 
-By default, the policy is predicted where the network covers the arm's reach, else padded. A motion under any
-assumption but the first has a note that names those that failed.
+The default policy is predicted if the network covers the arm's reach, otherwise padded. If a motion is found
+under a later assumption than the first, a note names the assumptions that failed.
 
 Start and goal are assumed to be free: the space around them is removed from the assumed obstacles, but not
 from observed ones.
@@ -47,29 +48,28 @@ from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.problem import OCCUPIED, OPTIMISTIC, PADDED, PREDICTED, JointGoal, Problem
 from robotdiffuse.robots.kinematics import placed_spheres
 
-# Under an assumption, the motion with the least probability is chosen from several: largest and smallest
-# number.
+# Under an assumption, at most MAX_FIRST_MOTIONS motions are planned, of which one is chosen. The risk of a
+# motion is the sum of the predicted probabilities of all unknown voxels that it sweeps. Planning ends early
+# if a motion's risk is at most NEGLIGIBLE_RISK, or, after MIN_FIRST_MOTIONS motions, at most ACCEPTABLE_RISK.
 MAX_FIRST_MOTIONS = 8
 MIN_FIRST_MOTIONS = 4
-# With the smallest number of motions, the search for more ends if one sweeps a summed probability of at most
-# ACCEPTABLE_RISK; it ends at once if one sweeps at most NEGLIGIBLE_RISK.
 ACCEPTABLE_RISK = 2.0
 NEGLIGIBLE_RISK = 0.1
 CONFIDENCE_TOLERANCE = 0.01
-"""A shorter motion is preferred if its confidence is lower by no more than this."""
+"""The shortest motion is chosen among those with a confidence at most this much below the highest."""
 AS_SEEN_TIME_FRACTION = 0.3
 """Fraction of the time limit that is reserved for the assumption "as seen", unless the policy excludes it."""
 ASSUMPTION_TIME_FRACTION = 0.25
-"""Fraction of the remaining other time that an assumption gets if others follow."""
+"""Time for each other assumption, as a fraction of the remaining time that is not reserved."""
 MIN_TIME_FRACTION = 0.1
 """Smallest fraction of the time limit for an attempt of the planner."""
 PICTURE_THRESHOLD = 0.2
-"""Pictures show voxels with a probability above this."""
+"""`predicted_obstacles` has the voxels with a probability above this."""
 FREE_UNKNOWN_SPACE = "unknown space taken as free"
 MIN_MEASURED_SHARE = 0.01
-"""Nothing is planned if every view measures something at fewer pixels than this fraction."""
+"""Planning fails if each view has depth at less than this fraction of its pixels."""
 NOTED_SHARE = 0.8
-"""A note names each view that measures something at fewer pixels than this fraction."""
+"""A note names each view that has depth at less than this fraction of its pixels."""
 AS_SEEN = "as seen"
 """Name of the assumption without additional obstacles."""
 
@@ -81,16 +81,15 @@ def plan_with_unknown_space(
     predicted: Probabilities | None = None,
     unknown: UnknownSpace | None = None,
 ) -> PlanResult:
-    """A motion under the problem's policy for unknown space, within the time limit; see the head of this
-    file.
+    """A motion under the problem's policy for unknown space; see the docstring of the module.
 
     predicted: the probability that each fine voxel of the observed volume is occupied; None: the occupancy
-    completion network predicts it if the policy needs it. unknown: the space that no view saw, for a problem
-    whose scene contains the observed points already, under the policy padded or predicted; None: computed
-    from the problem's views.
+    completion network predicts it if the policy needs it.
+    unknown: the space that no view saw; None: computed from the problem's views. It may be given under the
+    policies padded and predicted, if the problem's scene already contains the observed points.
 
-    The result says which assumption it comes from, its confidence (how likely the motion is free in the true
-    scene), and which unknown space it crosses.
+    The result states the assumption, the confidence (the probability that the motion is free in the true
+    scene), and the unknown space that the motion crosses.
     """
     policy, policy_note = policy_for(problem)
     if policy == PREDICTED and predicted is None:
@@ -134,7 +133,8 @@ def plan_with_unknown_space(
             if not occupied_only and search_time < MIN_TIME_FRACTION * limit:
                 break
             assumed = with_assumption(problem, assumption, goals)
-            compile_scene_for(problem.robot, assumed.scene)  # now, outside the assumption's time
+            # prepared here, so that it does not count as the assumption's time
+            compile_scene_for(problem.robot, assumed.scene)
             search_time = (1 - AS_SEEN_TIME_FRACTION) * limit - context.elapsed
             share = max(ASSUMPTION_TIME_FRACTION * search_time, MIN_TIME_FRACTION * limit)
             until = limit if occupied_only else context.elapsed + share
@@ -156,7 +156,8 @@ def plan_with_unknown_space(
 
 
 def policy_for(problem: Problem) -> tuple[str, str]:
-    """The problem's policy for unknown space or the default one, and a note where that is not prediction."""
+    """The problem's policy for unknown space, or the default policy; and a note if the default is not
+    prediction, otherwise ""."""
     if problem.unknown is not None:
         return problem.unknown, ""
     from robotdiffuse.learning.completion import REACH, covers
@@ -168,14 +169,14 @@ def policy_for(problem: Problem) -> tuple[str, str]:
 
 
 def _lesser(failed: list[str], used: str) -> str:
-    """A note on the assumptions that left no motion; "" if none failed."""
+    """A note on the assumptions under which no motion was found; "" if there are none."""
     if not failed:
         return ""
     return f"no motion was found in the time given to {', '.join(failed)}: planned with {used}"
 
 
 def _with_notes(context: PlanningContext, result: PlanResult, *notes: str) -> PlanResult:
-    """The result with the notes of the call, which results of attempts lack, and with further notes."""
+    """The result with the notes of the call and with further notes; each note once."""
     every = (*context.notes, *result.notes, *(note for note in notes if note))
     return replace(result, notes=tuple(dict.fromkeys(every)))
 
@@ -183,7 +184,7 @@ def _with_notes(context: PlanningContext, result: PlanResult, *notes: str) -> Pl
 def assumptions_of(
     problem: Problem, volume: ObservedVolume | None, predicted: Probabilities | None
 ) -> Iterator[Assumption]:
-    """The assumptions of the problem's policy, the most careful first.
+    """The assumptions of the problem's policy, the most cautious first, without "as seen".
 
     predicted: the probability that each fine voxel is occupied, for the policy "predicted".
     """
@@ -204,7 +205,8 @@ def assumptions_of(
 def unknown_space_of(
     problem: Problem, volume: ObservedVolume, predicted: Probabilities | None
 ) -> UnknownSpace:
-    """The space that no view of the problem saw, with its start and given goal configurations free."""
+    """The space that no view of the problem saw; the arm's space at the start and at goal configurations
+    counts as free."""
     goals = problem.goal.positions if isinstance(problem.goal, JointGoal) else ()
     lost = refined(volume.lost)
     ends = (problem.start, *goals)
@@ -212,7 +214,7 @@ def unknown_space_of(
 
 
 def predicted_obstacles(problem: Problem) -> AssumedPoints:
-    """The obstacles that the occupancy completion network predicts for the problem's views: for pictures."""
+    """The obstacles that the occupancy completion network predicts for the problem's views, for drawing."""
     from robotdiffuse.learning.completion import predict
 
     volume = observe(problem.views, problem.robot, problem.start)
@@ -222,8 +224,8 @@ def predicted_obstacles(problem: Problem) -> AssumedPoints:
 
 
 def _goals(context: PlanningContext, as_seen: Problem) -> Configurations | PlanResult:
-    """The goal configurations, for a pose those that are free of observed obstacles; or the failed result if
-    there are none."""
+    """The goal configurations: those of a JointGoal, or for poses those that are free of observed obstacles.
+    A failed result if there are none."""
     if isinstance(as_seen.goal, JointGoal):
         return as_seen.goal.positions
     start_goal = usable_start_goal(PlanningContext(context.planner_name, as_seen, context.request))
@@ -231,8 +233,8 @@ def _goals(context: PlanningContext, as_seen: Problem) -> Configurations | PlanR
 
 
 def with_assumption(problem: Problem, assumption: Assumption, goals: Configurations) -> Problem:
-    """The problem in the scene as seen with the obstacles of an assumption, and with those goals that require
-    the fewest obstacles to be removed."""
+    """The problem with an assumption's obstacles added to the observed scene, except those at the start or at
+    the goals. Only the goals at which the fewest obstacles have to be removed are kept."""
     start, *at_goals = (placed_spheres(problem.robot, q).astype(np.float32) for q in (problem.start, *goals))
     needed = np.array([assumption.touched(spheres) for spheres in at_goals] if len(at_goals) > 1 else [0])
     easiest = np.flatnonzero(needed == needed.min())
@@ -242,7 +244,7 @@ def with_assumption(problem: Problem, assumption: Assumption, goals: Configurati
 
 
 class _Attempts:
-    """The attempts of a planner under the assumptions of one call."""
+    """Calls a planner for problems under assumptions, within one planning call."""
 
     def __init__(self, solver: Solver, context: PlanningContext, unknown: UnknownSpace) -> None:
         self.solver = solver
@@ -250,10 +252,10 @@ class _Attempts:
         self.unknown = unknown
 
     def best(self, problem: Problem, assumption: str, until: float) -> PlanResult:
-        """A motion found by `until` [s since the call], or the result that says why there is none.
+        """A motion found before `until` [s since the call], or the result that says why there is none.
 
-        With a prediction, several first motions and one with the rest of the time are compared: of those with
-        about the highest confidence, the shortest is returned.
+        With predicted probabilities, several first motions are planned, and then one that is improved for the
+        remaining time. Among those with about the highest confidence, the shortest is returned.
         """
         request = self.context.request
         if self.unknown.probability is None:

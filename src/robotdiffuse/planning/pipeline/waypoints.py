@@ -1,17 +1,18 @@
-"""Motions through waypoints, one segment from each waypoint to the next, validated as one motion; and motions
-from a start velocity.
+"""Motions through waypoints and motions from a start velocity.
 
-Each segment begins where the one before it ended. For a goal with many configurations the planner picks one,
-and the next goal may be out of reach from there. So when a later segment has no path, all segments are
-planned again with another seed, as long as there is time.
+A motion through waypoints has a segment from each waypoint to the next; the segments are joined and validated
+as one motion. Each segment begins where the segment before it ended. If a waypoint has many goal
+configurations, the planner chooses one, from which the next waypoint may be out of reach. So if a later
+segment has no path, all segments are planned again with another seed, as long as there is time.
 
-A blended waypoint is a corner between two segments. It is rounded like the corners of paths: as widely as its
-blend allows, less where that is not free. The motion stops there after all where no rounding is free, or
-where rounding takes longer than stopping, as it may where the path turns back.
+A waypoint with a blend is a corner between two segments. It is rounded like the corners of paths, as widely
+as its blend allows and as the corner is free. The motion stops at the waypoint if no rounding is free, or if
+stopping is faster, as it may be where the path turns back.
 
-With a start velocity, the arm is moving when the motion begins, without acceleration. It first goes straight
-on, as far as it needs to stop. The planner plans from there. The path is then timed from the start velocity
-on, and its corner at the stopping place is rounded where that is free, so that the arm need not stop there.
+A motion from a start velocity begins while the arm is moving, without acceleration. It starts with a straight
+line that is long enough to stop on, in the direction of the velocity. The planner plans from the end of this
+line. The path with the line is then timed from the start velocity. The corner at the end of the line is
+rounded if it is free, so that the arm need not stop there.
 """
 
 from collections.abc import Sequence
@@ -37,21 +38,21 @@ from robotdiffuse.validation.tolerances import DEFAULT, goal_error
 from robotdiffuse.validation.validator import verifier
 
 BLEND_FRACTION = 0.9
-"""Fraction of a blend that is used; the rest covers the motion between the places that are validated."""
+"""Fraction of a blend that is used; the remainder covers the motion between the validator's samples."""
 MAX_DEVIATION_PER_BLEND = 10.0
-"""First corner deviation that is tried, per meter of blend [rad/m]: some joints move the frame only a
-little."""
-# Each corner deviation that is tried is this factor of the last, up to this many times.
+"""First corner deviation that is tried, per meter of blend [rad/m]. It is large, because some joints move the
+frame only a little."""
+# Deviations are tried in turn, at most MAX_DEVIATIONS; each is DEVIATION_FACTOR times the one before.
 DEVIATION_FACTOR = 0.9
 MAX_DEVIATIONS = 80
 
 
 def plan_through_waypoints(solver: Solver, problem: Problem, request: PlanRequest) -> PlanResult:
-    """A motion that visits the problem's waypoints in order and ends at its goal; it stops at each waypoint,
-    or passes within its blend.
+    """A motion that visits the problem's waypoints in order and ends at its goal. It stops at each waypoint,
+    or passes it within its blend.
 
-    Each segment gets an equal part of the time that is left. `planning_time` of the result counts all
-    segments and the last validation; `progress` has one entry, the whole path.
+    The remaining time is divided equally among the remaining segments. `planning_time` of the result counts
+    all segments and the final validation; `progress` has one entry, for the whole path.
     """
     context = PlanningContext(solver.name, problem, request)
     goals = (*problem.waypoints, problem.goal)
@@ -75,14 +76,15 @@ def plan_through_waypoints(solver: Solver, problem: Problem, request: PlanReques
         if not any(several[: len(segments) - 1]) or context.remaining <= 0:
             failed = segments[-1]
             reason = f"segment {len(segments)} of {len(goals)}: {failed.reason}"
-            # a later segment begins where the one before ended: the problem's start is not at fault
+            # INVALID_START would blame the problem's start, but a later segment begins at a planned
+            # configuration
             later = len(segments) > 1 and failed.status is Status.INVALID_START
             return context.fail(Status.NO_PATH if later else failed.status, reason)
 
 
 def _motions(context: PlanningContext, segments: Sequence[PlanResult]) -> list[Trajectory]:
-    """The motions from stop to stop: of single segments, or of several with blended waypoints between
-    them."""
+    """The motions from stop to stop. Segments between two stops are blended to one motion if it is valid and
+    faster than stopping at the waypoints between them."""
     blend = context.problem.blend
     motions = list[Trajectory]()
     first = 0
@@ -98,8 +100,8 @@ def _motions(context: PlanningContext, segments: Sequence[PlanResult]) -> list[T
 
 
 def _without_stops(context: PlanningContext, segments: Sequence[PlanResult], first: int) -> Trajectory | None:
-    """The segments, of which `first` is the number of the first, as one motion without stops; None if the
-    validator refuses it."""
+    """One motion along several segments without stops; None if the validator refuses it. first: index of the
+    first segment."""
     problem = context.problem
     last = first + len(segments) - 1
     goals = (*problem.waypoints, problem.goal)
@@ -134,8 +136,8 @@ def _without_stops(context: PlanningContext, segments: Sequence[PlanResult], fir
 def _corners(
     segments: Sequence[PlanResult], default: float
 ) -> tuple[Int[ndarray, "waypoints"], Float[ndarray, "n"]]:
-    """The rows of the segments' path at the waypoints, and how far the motion may leave each row [rad]; 0 at
-    the waypoints."""
+    """For the joined path of segments: the rows at which the waypoints are, and how far the motion may pass
+    each row [rad, joint-space L2], which is 0 at the waypoints."""
     lengths = [len(segment.path.positions) - 1 for segment in segments if segment.path is not None]
     ends = np.cumsum(lengths)
     deviations = np.full(ends[-1] + 1, default)
@@ -147,7 +149,8 @@ def _corners(
 
 
 def _deviation(problem: Problem, path: Path, row: int, goal: Goal, blend: float) -> float:
-    """How far the motion may leave the path's corner at a row and still pass a goal within its blend."""
+    """How far the motion may pass the path's corner at a row and still come within the blend of a goal [rad,
+    joint-space L2]; 0 if no tried deviation is small enough."""
     q = path.positions
     deviation = MAX_DEVIATION_PER_BLEND * blend
     for _ in range(MAX_DEVIATIONS):
@@ -159,7 +162,7 @@ def _deviation(problem: Problem, path: Path, row: int, goal: Goal, blend: float)
 
 
 def _path(segments: Sequence[PlanResult]) -> Path:
-    """The paths of the segments as one path; a row that ends one and begins the next is kept once."""
+    """The paths of the segments as one path; the row that two paths share appears once."""
     paths = [segment.path for segment in segments if segment.path is not None]
     rows = np.concatenate([paths[0].positions, *(path.positions[1:] for path in paths[1:])])
     return Path(paths[0].joint_names, rows)
@@ -168,7 +171,7 @@ def _path(segments: Sequence[PlanResult]) -> Path:
 def _joined(
     context: PlanningContext, segments: Sequence[PlanResult], motions: Sequence[Trajectory]
 ) -> PlanResult:
-    """The result for the segments as one motion, validated as one."""
+    """The result for all segments, with their motions joined and validated as one motion."""
     path = _path(segments)
     trajectory = one_after_another(motions)
     reports = context.validator.path(path), context.validator.trajectory(trajectory)
@@ -201,7 +204,7 @@ def _joined(
 
 
 def one_after_another(motions: Sequence[Trajectory]) -> Trajectory:
-    """Motions from rest to rest as one; a row that ends one and begins the next is kept once."""
+    """Motions from rest to rest as one trajectory; the row that two motions share appears once."""
     times = [motions[0].times]
     parts = [motions[0]]
     for motion in motions[1:]:
@@ -218,21 +221,24 @@ def one_after_another(motions: Sequence[Trajectory]) -> Trajectory:
 def join(
     results: Sequence[PlanResult], blend: float = 0.0, time_limit: float = 10.0, **request: Any
 ) -> PlanResult:
-    """One motion of several, each of which begins where the one before ends, verified as one.
+    """Join several motions into one, which is verified as a whole. Each must begin where the one before it
+    ends.
 
     Args:
-        results: Results of `rd.plan` for one robot and one scene, without waypoints.
-        blend: How far from each end between them the motion may pass without a stop: [m] for a pose, [rad]
-            for a configuration; 0: it stops there. Constraints that only some of the motions keep need 0.
+        results: Results of `rd.plan` for the same robot and the same scene, without waypoints.
+        blend: The joined motion passes within this distance of each place where two motions meet, without a
+            stop: [m] for a pose, [rad] for a configuration; 0: it stops there. It must be 0 if the motions
+            have different path constraints.
         time_limit: Wall time of the call [s].
-        request: Further arguments of `rd.plan`, for corners: clearance, velocity_scaling, ...
+        request: Further arguments of `rd.plan` for rounding corners: clearance, velocity_scaling, ...
 
     Returns:
-        A result whose problem has the goals between as waypoints; or a reason why the motions are none
-        together.
+        A result whose problem has the goals of all motions but the last as waypoints; or a result that says
+        why the joined motion is not valid.
 
     Raises:
-        InputError: For results without a motion, of other robots or scenes, and motions that do not meet.
+        InputError: For results without a motion, for different robots or scenes, and for motions that do not
+            meet.
 
     Examples:
         >>> space = rd.Workspace(rd.load_robot("panda"))
@@ -274,12 +280,12 @@ def join(
             name = first.robot.joint_names[int(gap.argmax())]
             raise InputError(
                 f"results[{i}] begins {gap.max():.3g} rad from the end of results[{i - 1}] in {name}: plan "
-                "it from path.positions[-1] of that"
+                f"it from results[{i - 1}].path.positions[-1]"
             )
     if blend and any(len(problem.constraints) > len(shared) for problem in problems):
         raise InputError(
-            f"blend is {blend:g}, and some motions have constraints of their own, which a corner would "
-            "leave; join them with blend 0"
+            f"blend is {blend:g}, but some motions have constraints that others lack, which a rounded corner "
+            "could violate; join them with blend 0"
         )
     goals = [problem.goal for problem in problems]
     problem = replace(first, waypoints=goals[:-1], blend=blend, goal=goals[-1], constraints=shared, notes=())

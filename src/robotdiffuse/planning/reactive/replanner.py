@@ -1,16 +1,16 @@
 """Replanning at 50 Hz among obstacles of which only the current position and a maximum speed are known.
 
-**Guarantee.** Every motion that `Replanner.step` returns ends at rest, and is certified until then: no point
-of the arm comes near any place that an obstacle can reach from where it was last seen at its maximum speed
-(`collision/moving_obstacles.py`). The path passed the validator against the static scene and the arm itself.
-If no new motion can be certified, the arm continues the last one, which was. An obstacle may still run into
-an arm at rest, as obstacles can corner any arm; the loop evades where it predicts that.
+**Guarantee.** Every motion that `Replanner.step` returns ends at rest and is certified until then. No point
+of the arm comes near any place that an obstacle can reach, at its maximum speed, from where it was last seen
+(`collision/moving_obstacles.py`). The validator has certified the path against the static scene and the arm
+itself. If no new motion can be certified, the arm continues its last motion, which is certified. An obstacle
+may still hit an arm at rest. The replanner evades if it predicts this, but obstacles can corner any arm.
 
-**Limits.** Velocity, acceleration and jerk are within the robot's limits at every time, stops included
-(`timed_path.JerkFilter`). Joints that state no jerk limit have none here.
+**Limits.** Velocity, acceleration and jerk are within the robot's limits at every time, also while the arm
+stops (`timed_path.JerkFilter`). Joints without a jerk limit of their own have no jerk limit here.
 
-**Prediction.** Which way to go is chosen by where the obstacles will be if they keep the velocity last seen.
-The guarantee does not depend on the prediction.
+**Prediction.** The replanner chooses its way by a prediction: each obstacle keeps the velocity that was last
+observed. The guarantee does not depend on the prediction.
 """
 
 from collections.abc import Mapping
@@ -48,7 +48,7 @@ from robotdiffuse.trajectories.speed_limits import Jerk
 from robotdiffuse.validation.validator import verifier
 
 OBSERVATION_ERROR = 1e-3
-"""Tolerance for an obstacle that seems to move faster than its maximum speed, for inexact observations
+"""An obstacle may seem to move this much further than its maximum speed allows, for inexact observations
 [m]."""
 
 
@@ -57,14 +57,18 @@ class ObservedObstacle:
     """An obstacle as it was last seen."""
 
     obstacle: MovingObstacle
-    """As in the problem, or static where it was last seen."""
+    """The problem's obstacle before the first observation; then the obstacle at its last observed pose."""
     time: float = np.nan
-    """When it was last seen [s]; NaN: never."""
+    """Time of the last observation [s]; NaN: never observed."""
     velocity: Float[ndarray, "3"] | None = None
-    """[m/s]; None: unknown."""
+    """Velocity of its origin by the last two observations [m/s]; None: unknown."""
 
     def again(self, value: ArrayLike, now: float) -> "ObservedObstacle":
-        """The obstacle after a new observation."""
+        """The obstacle after a new observation at the time `now` [s]. value: T_base_obstacle [4, 4], or the
+        origin of its frame [3].
+
+        Raises InputError for an invalid pose, and if the obstacle was faster than its maximum speed.
+        """
         name = self.obstacle.name
         T_before = self.obstacle.shape.T_base_shape
         xyz = numbers(value)
@@ -89,18 +93,19 @@ class ObservedObstacle:
         return ObservedObstacle(MovingObstacle(shape, max_speed=max_speed), now, velocity)
 
     def anywhere(self) -> MovingObstacle:
-        """The obstacle moving in any way from when it was last seen."""
+        """The obstacle as one that moves in any way, up to its maximum speed, since it was last seen."""
         return MovingObstacle(self.obstacle.shape, max_speed=self.obstacle.top_speed)
 
     def straight_on(self, now: float) -> MovingObstacle:
-        """The obstacle keeping the velocity last seen, from now on."""
+        """The obstacle as one that keeps its last observed velocity, from the time `now` [s] on."""
         velocity = np.zeros(3) if self.velocity is None else self.velocity
         passed = transform((now - self.time) * velocity)
         return MovingObstacle(self.obstacle.shape.moved(passed), velocity=velocity)
 
 
 class PredictedObstacles:
-    """Moving obstacles from a time on, grown or predicted, for checks of motions in time."""
+    """Moving obstacles from the time `since` [s] on, for checks of motions in time. They are predicted
+    (`straight_on`), or grown: each is everywhere where it can be (`anywhere`)."""
 
     def __init__(self, robot: Robot, moving: list[MovingObstacle], since: float) -> None:
         self._moving = moving
@@ -109,7 +114,7 @@ class PredictedObstacles:
         self.margin = np.zeros(len(moving))
 
     def wider(self, margin: Float[ndarray, "obstacles"]) -> "PredictedObstacles":
-        """The same obstacles, each inflated by a margin [m]."""
+        """These obstacles, each inflated by its margin [m]."""
         inflated = copy(self)
         inflated.margin = self.margin + margin
         inflated._collision = self._collision.inflated(margin)
@@ -120,20 +125,22 @@ class PredictedObstacles:
         return [obstacle.at(time - self._since) for obstacle in self._moving]
 
     def near(self, motion: Trajectory, begins: float, clearance: float) -> float | None:
-        """When an obstacle first comes nearer to the motion than the clearance [s]; None if none does."""
+        """Time at which an obstacle first comes closer to the arm than the clearance [m], during a motion
+        that begins at `begins` [s]; None if no obstacle does."""
         times = motion.times + (begins - self._since)
         first = self._collision.first_unproved_time(times, motion.positions, clearance)
         return None if first is None else first + self._since
 
     def comes_to(self, q: Configurations, times: Float[ndarray, "n"], rest_time: float) -> float | None:
-        """When an obstacle first touches the arm on its way, or while it then rests for `rest_time` [s]; None
-        if none."""
+        """Time at which an obstacle first touches the arm [s], while it moves through the configurations q at
+        `times` [s] and then rests for `rest_time` [s]; None if no obstacle does."""
         times = np.append(times, times[-1] + rest_time) - self._since
         first = self._collision.first_unproved_time(times, np.concatenate([q, q[-1:]]), 0.0)
         return None if first is None else first + self._since
 
     def comes(self, q: Configuration, time: float, rest_time: float) -> float | None:
-        """When an obstacle first touches the arm at rest [s]; None if none does."""
+        """Time at which an obstacle first touches the arm [s], if it rests at q from `time` on for
+        `rest_time` [s]; None if no obstacle does."""
         return self.comes_to(q[None], np.array([time]), rest_time)
 
     def free(
@@ -142,8 +149,9 @@ class PredictedObstacles:
         q: Configurations,
         begins: float,
     ) -> bool:
-        """Whether no obstacle touches the arm on its way for HORIZON, or until it has rested at the end for
-        REST_TIME."""
+        """Whether no obstacle touches the arm during a motion: within HORIZON, or until it has rested at the
+        end for REST_TIME if the motion is shorter. times: from the beginning of the motion, which is at
+        `begins` [s]."""
         soon = max(int(np.searchsorted(times, HORIZON)), 1)
         rest_time = REST_TIME if soon == len(times) else 0.0
         return self.comes_to(q[:soon], times[:soon] + begins, rest_time + 1e-3) is None
@@ -151,30 +159,31 @@ class PredictedObstacles:
 
 SEARCH_TIME_LIMIT = 10.0
 """Time limit for the first path [s]."""
-# For predictions: resolution of motion checks [m], and time between two rows of a motion [s].
+# Checks that use predictions: resolution of motion checks [m], and time between two rows of a motion [s].
 COARSE_RESOLUTION = 0.05
 COARSE_SAMPLE_TIME = 0.04
 MARGIN_FRACTIONS = 1.0, 0.6, 0.3
-"""Fractions of the safety margin that are tried."""
+"""Fractions of SAFETY_MARGIN that are tried in turn."""
 DRIVING_PERIODS = 1, 6
-"""Periods for which the arm drives on before it brakes, in the order tried; the longer one gets it away from
-near obstacles."""
+"""Numbers of periods for which the arm accelerates before it brakes, tried in turn. The larger number lets it
+leave the neighborhood of an obstacle."""
 PREDICTION_DELAYS = 0.3, 0.0, 0.8
-"""A search takes the obstacles where they are predicted this long after the arm rests, in turn [s]."""
+"""Successive searches for a path use the obstacles as predicted this long after the arm rests, in turn
+[s]."""
 EVASION_OVERHEAD = 0.2
-"""Time that an evasion takes beyond its length at full speed [s]."""
+"""Time that an evasion takes in addition to its duration at full speed [s]."""
 HORIZON = 2.5
 """How far ahead the obstacles are predicted [s]."""
 REST_TIME = 1.0
-"""Where the arm stops, no obstacle is predicted to come for this long [s]."""
+"""Time for which no obstacle may be predicted to hit the arm where it stops [s]."""
 SAFETY_MARGIN = 0.2
-"""Predictions keep the distance to obstacles that these can go at their maximum speed in this time [s], where
-possible: nearer to one, hardly any motion can be certified to stop in time."""
+"""Predicted obstacles are inflated by what they can travel in this time at their maximum speed [s], if
+possible. Closer to an obstacle, hardly any motion can be certified to stop in time."""
 ITERATIONS = 600
 """Largest number of iterations of a search for a path; there is at most one search per step."""
 EVASIONS = 24
-"""Number of random directions that are tried for an evasion, if the arm rests where an obstacle is
-predicted."""
+"""Number of random directions that are tried for an evasion: a short move away, if an obstacle is predicted
+to hit the arm at rest."""
 EVASION_RADIUS = 0.8
 """Length of evasions [rad, joint-space L2]."""
 AT_REST = SpeedProfile(np.zeros(2), np.zeros(2))
@@ -187,12 +196,12 @@ class ReplannerSettings(Settings, name="replanner"):
     clearance: NotNegative = 0.005
     """Distance of the covering spheres to every place that the obstacles can reach [m]."""
     sample_time: Annotated[float, Bound(least=1e-3, most=0.1)] = 0.005
-    """Time between the rows of the motion that a step returns [s]. Filtering for the jerk limits delays
-    motions by at least four of these."""
+    """Time between the rows of the motion that a step returns [s]. The filter for jerk limits delays motions
+    by at least four of these times."""
     jerk: Jerk | None = None
-    """Jerk limit of every joint [rad/s³] or [m/s³]; None: the limits that the robot states, and none for
-    joints without one: unlike in plans, the default of 10 / s times the acceleration limit does not hold,
-    with which stops take 1.7 times as long."""
+    """Jerk limit of every joint [rad/s³] or [m/s³]; None: each joint's own limit, and no limit for a joint
+    without one. The default of `rd.plan` for such joints, 10 / s times the acceleration limit, would make
+    stops 1.7 times as long."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,9 +211,9 @@ class Command:
     begins: float
     """When the motion begins [s], on the clock of `now`: one period after the step."""
     motion: Trajectory
-    """Certified until it ends at rest. Its times count from `begins`."""
+    """A motion that ends at rest and is certified until then. Its times count from `begins`."""
     renewed: bool
-    """Whether the motion is new; False: it is the rest of the last one."""
+    """True: the motion was planned in this step; False: it is the remainder of the last motion."""
     arrived: bool
     """Whether the arm rests at a goal."""
 
@@ -212,9 +221,10 @@ class Command:
 class Replanner:
     """Takes an arm to a goal among obstacles that move freely up to a maximum speed.
 
-    `problem.moving` are the obstacles, each with its `max_speed` or the largest speed of its known motion.
-    The scene is static, and the arm is at rest at the start. Threads may share a Replanner: one call waits
-    for another.
+    The obstacles are `problem.moving`; the maximum speed of each is its `max_speed`, or the largest speed of
+    its known motion. The rest of the scene is static, and the arm is at rest at the start. Threads may share
+    a
+    Replanner: calls wait for each other.
     """
 
     def __init__(
@@ -248,11 +258,11 @@ class Replanner:
         jerk = stated if settings.jerk is None else np.full(problem.robot.dof, settings.jerk)
         self._filter = JerkFilter(problem.robot, jerk, settings.sample_time, problem.start)
         self._path, self._goals, self._space = self._first_path()
-        # The motion under way: along the path, from this time on, before it is filtered.
+        # The current motion along the path, before the filter, and the time when it begins [s].
         self._since = -np.inf
         self._motion = AT_REST
         self._left = False
-        """Whether the arm leaves the path at the end of its motion, for a new goal."""
+        """Whether the path must be left where the current motion ends, because the goal has changed."""
         self._rehearse()
 
     def _rehearse(self) -> None:
@@ -265,15 +275,14 @@ class Replanner:
 
     @locked
     def set_goal(self, goal: ArrayLike | Goal) -> None:
-        """Take the arm to another goal, from where its present motion ends.
-
-        The next steps search for the way.
+        """Take the arm to another goal, from where its current motion ends. The next steps search for the
+        path.
 
         Args:
-            goal: As of `rd.Problem`.
+            goal: A goal as in `rd.Problem`.
 
         Raises:
-            InputError: For a goal that is not usable in the static scene; the old one stays then.
+            InputError: For a goal that is not usable in the static scene; the goal is then unchanged.
         """
         rest = self._path.at(float(self._motion.s[-1]))
         problem = replace(self.problem, goal=goal)  # type: ignore[arg-type]
@@ -289,11 +298,12 @@ class Replanner:
 
     @locked
     def step(self, observation: Mapping[str, ArrayLike], now: float) -> Command:
-        """The motion from one period after now, given the obstacles as observed now.
+        """The motion that begins one period after `now`, given the obstacles as observed at `now`.
 
         Args:
-            observation: T_base_obstacle [4, 4], or only the origin of the obstacle's frame [3], by name. An
-                obstacle that is missing may be anywhere that it can have reached since it was last seen.
+            observation: For each observed obstacle, by name, T_base_obstacle [4, 4] or only the origin of its
+                frame [3]. An obstacle that is missing may be anywhere that it can have reached since it was
+                last seen.
             now: Time of the observation [s]; it must grow from step to step.
 
         Raises:
@@ -367,10 +377,12 @@ class Replanner:
         self._now = now
         for name, observed in self._seen.items():
             if not np.isfinite(observed.time):
-                self._seen[name] = replace(observed, time=now)  # not seen yet: where the problem says
+                # never observed: it is now where the problem says
+                self._seen[name] = replace(observed, time=now)
 
     def _predict(self) -> PredictedObstacles:
-        """The predicted obstacles, with the largest safety margin that the arm keeps now."""
+        """The predicted obstacles, inflated by the largest fraction of the safety margin that the arm keeps
+        at its current place."""
         moving = [observed.straight_on(self._now) for observed in self._seen.values()]
         speeds = np.array([observed.obstacle.top_speed for observed in self._seen.values()])
         position = self._path.at(float(self._motion.s[0]))
@@ -382,8 +394,8 @@ class Replanner:
         return predicted
 
     def _choose_path(self, predicted: PredictedObstacles) -> bool:
-        """Search for another path if an obstacle is predicted on the present one; returns whether none is
-        predicted on the path that the arm is on."""
+        """Search for another path if the chosen one is predicted to be blocked or does not lead to the goal.
+        Returns whether the path that was chosen before is predicted to be free."""
         rest_time = self._rest_time
         rest = self._path.at(float(self._motion.s[-1]))
         next_path = self._path if self._next is None else self._next
@@ -400,15 +412,16 @@ class Replanner:
         return clear
 
     def _path_clear(self, predicted: PredictedObstacles, path: TimedPath, under_way: bool) -> bool:
-        """Whether the arm can go on to the end of a path, by the prediction."""
+        """Whether the arm is predicted to meet no obstacle on a path. under_way: it is on the path already;
+        False: it begins the path when it rests."""
         s, speed = (float(self._motion.s[0]), float(self._motion.speeds[0])) if under_way else (0.0, 0.0)
         begins = self._since if under_way else self._rest_time
         motion = path.coarse(path.onwards(s, speed), COARSE_SAMPLE_TIME)
         return predicted.free(*motion, begins)
 
     def _search(self, predicted: PredictedObstacles, start: Configuration, time: float) -> TimedPath | None:
-        """A path from where the arm can rest to a goal, around the obstacles predicted for some time after
-        that; or back to the present path, where that is free."""
+        """A path from `start`, where the arm rests at `time`, to a goal, around the predicted obstacles; it
+        may lead back to the current path where this is free to its end. None if none was found."""
         self._searches += 1
         later = time + PREDICTION_DELAYS[self._searches % len(PREDICTION_DELAYS)]
         still = self._still.scene
@@ -439,7 +452,8 @@ class Replanner:
         return self._certified(np.concatenate([path, after[end]]), True)
 
     def _evasion(self, predicted: PredictedObstacles, rest: Configuration, time: float) -> TimedPath | None:
-        """A straight path to where the next obstacle is predicted latest; None if that is here."""
+        """A straight path from `rest` to the tried place where an obstacle is predicted to come last; None if
+        the arm should stay."""
         robot = self._robot
         directions = self._rng.normal(size=(EVASIONS, robot.dof))
         directions *= EVASION_RADIUS / np.linalg.norm(directions, axis=1, keepdims=True)
@@ -467,7 +481,7 @@ class Replanner:
         return TimedPath.certified(self._robot, self._validator, waypoints, to_goal, *limits)
 
     def _change_path(self) -> None:
-        """At rest, change to the next path, or to what follows the present one."""
+        """If the arm rests, change to the next path, or to the path that follows the current one."""
         if not self._rests:
             return
         if self._next is not None:
@@ -480,7 +494,8 @@ class Replanner:
             self._motion = AT_REST
 
     def _extend(self, predicted: PredictedObstacles, grown: PredictedObstacles, clear: bool) -> bool:
-        """Extend the motion if the extension is certified and useful; returns whether it was extended."""
+        """Extend the motion along the path if the extension is certified. It must also end where no obstacle
+        is predicted, unless the path is clear or an evasion. Returns whether the motion was extended."""
         settings = self.settings
         path = self._path
         s = float(self._motion.s[0])

@@ -1,11 +1,11 @@
-"""Paths that are certified in the static scene, speed profiles along them, and jerk limits for motions that
-are replanned while the arm moves.
+"""For motions that are replanned while the arm moves: paths that are certified in the static scene, speed
+profiles along them, and a filter for jerk limits.
 
-For jerk limits, a motion within velocity and acceleration limits is sampled on a grid of times, averaged over
-a window, and used as the control points of a uniform cubic B-spline. Each value of the spline depends only on
-samples up to its own time, so a motion that begins then does not change earlier values. Velocities and
-accelerations are weighted means of the motion's, and the jerk is at most twice the acceleration divided by
-the duration of the window.
+The filter takes a motion within velocity and acceleration limits. It samples the motion on a grid of times,
+averages the samples over a window, and uses the means as control points of a uniform cubic B-spline. The
+spline at any time depends only on samples up to that time, so replanning does not change the spline before.
+Its velocities and accelerations are weighted means of the motion's. Its jerk is at most twice the
+acceleration limit divided by the duration of the window.
 """
 
 from dataclasses import dataclass, replace
@@ -28,13 +28,14 @@ from robotdiffuse.trajectories.timing_kernel import controllable, sample_positio
 from robotdiffuse.validation.tolerances import DEFAULT
 from robotdiffuse.validation.validator import Verifier, verifier
 
-# Fractions of the limits that are used at the grid points; the margin is for the motion between them.
+# Fractions of the velocity and acceleration limits that are used; the remainder is a margin for the motion
+# between grid points.
 VELOCITY_FRACTION = 0.99
 ACCELERATION_FRACTION = 0.96
 CORNER_SAMPLES = 65
 """Number of configurations of a rounded corner at which distances are checked."""
 MIN_LENGTH = 1e-4
-"""Paths are longer than this [rad]."""
+"""Smallest length of a path [rad, joint-space L2]."""
 LINE_INTERVAL = 0.03
 """Approximate length of the grid intervals on straight pieces [rad, joint-space L2]."""
 CORNER_INTERVALS = 16
@@ -42,17 +43,17 @@ CORNER_INTERVALS = 16
 
 
 class SpeedProfile(NamedTuple):
-    """A motion along a path: values of the path parameter s, and the speed at each."""
+    """A motion along a path: values of the path parameter s, and ṡ at each; s̈ is constant between them."""
 
     s: Float[ndarray, "m"]
     speeds: Float[ndarray, "m"]
 
     def after(self, time: float) -> tuple[float, float]:
-        """s and speed at a time after the beginning [s]."""
+        """s and ṡ at a time [s] after the beginning of the motion."""
         return braking_kernel.state_after(self.s, self.speeds, time)
 
     def rest(self, time: float) -> "SpeedProfile":
-        """The rest of the motion from a time after the beginning on [s]."""
+        """The remaining motion from a time [s] after its beginning on."""
         s, speed = self.after(time)
         later = self.s > s + 1e-12
         return SpeedProfile(np.append(s, self.s[later]), np.append(speed, self.speeds[later]))
@@ -66,16 +67,16 @@ class SpeedProfile(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TimedPath:
-    """A polyline with rounded corners that passed the validator; the arm need not stop along it."""
+    """A polyline with rounded corners that passed the validator; the arm need not stop before its end."""
 
     robot: Robot
     acceleration: Configuration
-    """Acceleration limits of motions along it."""
+    """Acceleration limits of motions along the path [dof]."""
     line: BlendedPolyline
     to_goal: bool
-    """Whether it, or the path that follows, ends at the goal."""
+    """Whether this path, or the last path that follows it, ends at the goal."""
     then: "TimedPath | None" = None
-    """The path that follows after a stop at the end; None if this is the last."""
+    """The path that follows after a stop at this path's end; None if this is the last path."""
 
     @staticmethod
     def certified(
@@ -86,10 +87,10 @@ class TimedPath:
         acceleration: Configuration,
         displacement: float,
     ) -> "TimedPath | None":
-        """The path through waypoints; None if the validator refuses it, or all waypoints are the same.
+        """The path through waypoints; None if the validator refuses it, or if its length is below MIN_LENGTH.
 
-        Rounded corners are free even if the arm is up to `displacement` [m] off the path. The arm stops at a
-        corner that cannot be rounded so.
+        A corner is rounded only if the arm is free at it with a clearance of `displacement` [m], since the
+        filter moves the arm off the path by up to this distance. At other corners, the arm stops.
         """
         path = Path(robot.joint_names, waypoints)
         if path.length < MIN_LENGTH or not validator.collision_free(path):
@@ -136,18 +137,19 @@ class TimedPath:
         )
 
     def on_then_rest(self, s: float, speed: float, time: float) -> SpeedProfile:
-        """The motion that drives as fast as possible towards the end for a time [s], then brakes to rest."""
+        """The motion from s, with the speed ṡ, that is as fast as possible for `time` [s], then brakes to
+        rest."""
         return SpeedProfile(
             *braking_kernel.advance_then_brake(*self._grid, s, speed, time, self.acceleration)
         )
 
     def onwards(self, s: float, speed: float) -> SpeedProfile:
-        """The fastest motion to the end."""
+        """The fastest motion from s, with the speed ṡ, to the end."""
         return self.on_then_rest(s, speed, np.inf)
 
     @property
     def end(self) -> float:
-        """A value of s just before the last."""
+        """A motion that reaches this s counts as being at the end of the path."""
         return self.line.length - 1e-9
 
     def at(self, s: float) -> Configuration:
@@ -155,36 +157,36 @@ class TimedPath:
         return self.line(np.array([s]), 0)[0]
 
     def remaining(self, s: float) -> Configurations:
-        """Waypoints from s to the end, of the paths that follow too."""
+        """The configuration at s and the waypoints after it, including those of the paths that follow."""
         waypoints = self.line.waypoints[self.line.knots > s + MIN_LENGTH]
         after = self.then.remaining(0.0)[1:] if self.then is not None else waypoints[:0]
         return np.concatenate([self.at(s)[None], waypoints, after])
 
     def positions(self, motion: SpeedProfile, times: Float[ndarray, "n"]) -> Configurations:
-        """Configurations at times after the beginning of a motion, which rests after its end [s]."""
+        """Configurations [n, dof] at times [s] after the beginning of a motion; at its end, the arm rests."""
         s = np.append(motion.s, motion.s[-1])
         speeds = np.append(motion.speeds, 0.0)
         return sample_positions(self.line.arrays, s, speeds, times)
 
     def coarse(self, motion: SpeedProfile, step: float) -> tuple[Float[ndarray, "n"], Configurations]:
-        """Times, `step` [s] apart, and configurations of a motion until it rests."""
+        """Times [s], `step` apart, and configurations of a motion from its beginning until it rests."""
         times = step * np.arange(int(np.ceil(motion.duration / step)) + 2)
         return times, self.positions(motion, times)
 
 
 MAX_DISPLACEMENT = 0.005
-"""Largest distance by which averaging moves a point of the arm off its path, where the path bends [m]."""
+"""Largest distance by which the filter may move a point of the arm off the path, where the path bends [m]."""
 SHARE_FACTOR = 0.9
-"""The accelerations are reduced by this factor until MAX_DISPLACEMENT is kept."""
+"""Factor by which accelerations are reduced, repeatedly, until MAX_DISPLACEMENT is kept."""
 GRID_TOLERANCE = 1e-4
-"""A motion that begins before a time of the grid by at most this fraction of a step counts as beginning
-there."""
+"""A time that is before a time of the grid by at most this fraction of a step counts as that time."""
 STILL = 1e-9
-"""Samples that differ by less are equal [rad]."""
+"""The arm rests if its last samples differ by less than this in each joint [rad]."""
 
 
 class JerkFilter:
-    """The jerk-limited motion that follows an acceleration-limited one."""
+    """The filter for jerk limits: turns a motion within velocity and acceleration limits, which may be
+    replanned on the way, into one within jerk limits; see the docstring of the module."""
 
     def __init__(self, robot: Robot, jerk: Configuration, step: float, q: Configuration) -> None:
         """A filter that is at rest at q. step: time between two times of the grid [s]."""
@@ -200,29 +202,32 @@ class JerkFilter:
                 break
             share *= SHARE_FACTOR
         self.acceleration = share * robot.acceleration
-        """Acceleration limits that the given motions must keep [dof]."""
+        """Acceleration limits that motions to be filtered must keep [dof]."""
         self.displacement = displacement
-        """Upper bound on how far any point of the arm is from its place on the given path [m]; 0 on straight
-        lines."""
+        """Upper bound on how far the filter moves any point of the arm off the path [m]; on straight lines,
+        it does not leave the path."""
         self._window = window
         self._samples = np.repeat(q[None], window + 3, axis=0)
-        """Configurations at the last times of the grid, up to the one with index `_index`."""
+        """Configurations at the last times of the grid, up to the time with index `_index`."""
         self._origin = -np.inf
+        """Time of the grid with index 0 [s]."""
         self._index = 0
         self._ago = 0.0
+        """Time since the last time of the grid [s]."""
 
     @property
     def lag(self) -> float:
-        """Time by which the filtered motion comes to rest after the given one, at most [s]."""
+        """Largest delay with which the filtered motion comes to rest after the motion that is filtered
+        [s]."""
         return (self._window + 3) * self.step
 
     @property
     def at_rest(self) -> bool:
-        """Whether the filtered motion rests, if the given one goes on resting."""
+        """Whether the filtered motion rests, provided that the motion that is filtered continues to rest."""
         return bool(np.ptp(self._samples, axis=0).max() < STILL)
 
     def advance(self, path: TimedPath, motion: SpeedProfile, since: float, now: float) -> None:
-        """Take samples of the given motion, which began at `since`, up to the time `now` [s]."""
+        """Sample a motion that began at the time `since` [s], up to the time `now` [s]."""
         if not np.isfinite(self._origin):
             self._origin = now
             return
@@ -234,8 +239,8 @@ class JerkFilter:
         self._ago = max(now - self._origin - index * self.step, 0.0)
 
     def follow(self, path: TimedPath, motion: SpeedProfile) -> Trajectory:
-        """The filtered motion from now on until it rests, if the given motion begins now; two rows if it
-        rests."""
+        """The filtered motion from now until it rests, if `motion` begins now; two rows if the arm rests
+        already."""
         step = self.step
         window = self._window
         u = self._ago / self.step
@@ -243,12 +248,14 @@ class JerkFilter:
         count = 1 if resting else int(np.ceil((motion.duration + self._ago) / step)) + window + 2
         times = step * np.arange(1, count + 1) - self._ago
         raw = np.concatenate([self._samples, path.positions(motion, times)])
-        # differences from the end, so that the motion ends exactly there
+        # moving averages of the differences from the end, so that the motion ends exactly at its end
         total = np.cumsum(np.concatenate([0 * raw[:1], raw - raw[-1]]), axis=0)
         points = (total[window:] - total[:-window]) / window
         before = points[1:-3]
         at = points[2:-2]
         after = points[3:-1]
+        # The first row is between two times of the grid: basis of the spline, its first and second derivative
+        # at the fraction u of a step.
         first = np.array(
             [
                 [(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, 1 + 3 * u + 3 * u**2 - 3 * u**3, u**3],

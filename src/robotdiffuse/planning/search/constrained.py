@@ -1,12 +1,13 @@
 """Search under path constraints: RRT-Connect with projected nodes, and simplification, in the anytime loop.
 
 D. Berenson, S. Srinivasa and J. Kuffner, "Task Space Regions: A framework for pose-constrained
-manipulation planning", IJRR 2011 (CBiRRT2), for trees with projected steps. Edges are proved, not sampled: a
-straight piece is accepted where the constraints are proved along it; else its middle is projected, and both
-halves are treated alike.
+manipulation planning", IJRR 2011 (CBiRRT2), for trees with projected steps. Edges are proved, not sampled. A
+straight piece is accepted if the constraints are proved to hold along it. Otherwise its middle is projected
+onto the constraints, and both halves are handled in the same way.
 
-The planners aorrtc, rrt_connect and robotdiffuse use it for problems with constraints. The search keeps a
-little more than the tolerances, which rounding of corners and numbers needs; the validator proves the result.
+The planners aorrtc, rrt_connect and robotdiffuse use this search for problems with path constraints. Its
+tolerances are slightly smaller than the problem's, since rounded corners and rounded numbers deviate a
+little. The validator proves the result for the problem's tolerances.
 """
 
 from typing import NamedTuple
@@ -22,45 +23,48 @@ from robotdiffuse.problems.constraint_kernel import evaluate, make_work, proved
 from robotdiffuse.problems.projection_kernel import project
 
 MAX_DEPTH = 9
-"""A motion is halved at most this many times."""
+"""Largest number of times that an edge is halved."""
 MIN_PIECE = 0.004
-"""Shortest piece [rad]."""
+"""Pieces shorter than this are not halved [rad]."""
 MAX_PIECES = 512
+"""Largest number of straight pieces of an edge."""
 MAX_GROWTH = 0.2
 """Along a straight piece, the value of a constraint row may exceed its values at both ends by this fraction
 of the row's tolerance."""
 MIN_PROOF_PIECE = 1 / 16
-"""A proof splits a piece into parts no shorter than this fraction of its length."""
+"""Shortest part of a piece in a proof, as a fraction of the piece's length."""
 MAX_DRIFT = 0.85
-"""A projected middle is no further from either end than this fraction of the piece's length."""
+"""Largest distance of a projected middle from either end, as a fraction of the piece's length."""
 MIN_APPROACH = 0.95
-"""After a step, the distance to its target must be at most this fraction of the distance before."""
+"""Largest distance to the target after an extension, as a fraction of the distance before."""
 MAX_STEP_FACTOR = 2.0
-"""A step is at most this many times as long as the straight line that it replaces."""
-# A shortcut counts if it leaves at most this part of the length; after this many in a row that do not, no
-# more are tried.
+"""Largest ratio of the length of an edge to the length of the straight line that it replaces."""
 SHORTCUT_GAIN = 0.99
+"""A shortcut is accepted if its length is at most this fraction of the length that it replaces."""
 MAX_FAILED_SHORTCUTS = 20
+"""Shortcuts end when more than this many in a row were not accepted."""
 MIN_CORNER_MOVE = 0.005
-"""Smoothing leaves corners that it would move by less than this [rad]."""
+"""Smallest move of a corner by smoothing [rad, joint-space L2]."""
 MAX_INITIAL_PIECE = 0.15
 """Pieces of a path are split down to this length before simplification [rad]."""
 
 
 class Limits(NamedTuple):
-    """What every edge of the search keeps, and working memory."""
+    """The path constraints that every edge of the search keeps, and working memory."""
 
     rows: tuple
     """`problems.constraint_kernel.Rows`"""
     kept: np.ndarray
-    """[m] limits of the rows, a little within those of the validator."""
+    """[m] limits of the values of the m rows, slightly smaller than the validator's limits."""
     work: tuple
     growing: np.ndarray
-    """[m] limits along one piece."""
+    """[m] limits along the piece that is being proved."""
     stack: np.ndarray
+    """[MAX_DEPTH, dof] ends of the pieces that `between` has yet to reach."""
     out: np.ndarray
-    """[MAX_PIECES, dof] the motion that `between` found."""
+    """[MAX_PIECES, dof] ends of the pieces of the motion that `between` found."""
     here: np.ndarray
+    """[dof] the configuration that `between` has reached."""
 
 
 @kernel()
@@ -111,7 +115,7 @@ def _extended(space, limits, trees, tree, near, q, longest, scratch):
 @inner_kernel()
 def _straight(limits, a, b):
     """Whether the straight piece between two configurations is proved to keep the constraints, with values
-    little above those at its ends."""
+    that exceed those at its ends by at most MAX_GROWTH of the tolerance."""
     rows = limits.rows
     work = limits.work
     evaluate(rows, a, 0, work)
@@ -129,10 +133,10 @@ def _usable(space, limits, a, b, scratch):
 
 @inner_kernel()
 def between(space, limits, a, b, most, scratch):
-    """Find a motion from a to b, which keep the constraints, as straight pieces; write their ends to
-    limits.out.
+    """Find a free motion in straight pieces between two configurations a and b that keep the constraints;
+    write the ends of the pieces to limits.out.
 
-    Returns their number; 0 if none was found, or it is longer than `most` [rad].
+    Returns the number of pieces; 0 if no motion was found or if it is longer than `most` [rad].
     """
     stack = limits.stack
     current = limits.here
@@ -169,7 +173,7 @@ def between(space, limits, a, b, most, scratch):
 
 @kernel(nogil=True)
 def line(space, limits, a, b):
-    """The waypoints [n, dof] of `between`, with a; n = 0 if there is none."""
+    """The waypoints [n, dof] of a motion from a to b by `between`; n = 0 if none was found."""
     trees = rrt_kernel.make_trees(a, b.reshape(1, -1), MAX_PIECES + 1)
     scratch = rrt_kernel.make_scratch(space, trees.nodes)
     end = rrt_kernel.extended(space, limits, trees, 0, 0, b, 2.0 * distance(a, b), scratch)
@@ -178,14 +182,15 @@ def line(space, limits, a, b):
 
 @kernel(nogil=True)
 def simplify(space, limits, path, rounds, tries, state):
-    """A path with the same ends that is no longer: try shortcuts between random places, `tries` of them; then
-    in each of `rounds` rounds smooth the corners and leave out waypoints that a straight piece can skip."""
+    """A path with the start and goal of `path` that is not longer. First `tries` shortcuts between random
+    waypoints are tried, and waypoints that a straight piece can skip are removed. Then each of `rounds`
+    rounds smooths the corners, and such waypoints are removed again."""
     scratch = rrt_kernel.make_scratch(space, path)
     points = _finer(path)
-    lost = 0
+    failed = 0
     for _ in range(tries):
         n = len(points)
-        if n < 3 or lost > MAX_FAILED_SHORTCUTS:
+        if n < 3 or failed > MAX_FAILED_SHORTCUTS:
             break
         i = min(int(random(state) * (n - 2)), n - 3)
         k = min(i + 2 + int(random(state) * (n - i - 2)), n - 1)
@@ -193,11 +198,11 @@ def simplify(space, limits, path, rounds, tries, state):
         if before <= distance(points[i], points[k]) * 1.0001:
             continue
         count = between(space, limits, points[i], points[k], SHORTCUT_GAIN * before, scratch)
-        lost += 1
+        failed += 1
         if count > 0:
             shortcut = np.concatenate((points[i : i + 1], limits.out[:count]))
             points = np.concatenate((points[:i], _finer(shortcut), points[k + 1 :]))
-            lost = 0
+            failed = 0
     points = _skipped(space, limits, points, scratch)
     for _ in range(rounds):
         points = _smoothed(space, limits, points, scratch)
@@ -206,7 +211,7 @@ def simplify(space, limits, path, rounds, tries, state):
 
 @inner_kernel()
 def _finer(path):
-    """The path with its pieces split until they are no longer than MAX_INITIAL_PIECE."""
+    """The path with each piece split into equal parts that are at most MAX_INITIAL_PIECE long."""
     total = 1
     for i in range(len(path) - 1):
         total += max(1, int(np.ceil(distance(path[i], path[i + 1]) / MAX_INITIAL_PIECE)))
@@ -223,7 +228,8 @@ def _finer(path):
 
 @inner_kernel()
 def _skipped(space, limits, path, scratch):
-    """The path without waypoints that straight pieces can skip, in growing steps."""
+    """The path without waypoints that straight pieces can skip. From each waypoint, pieces to waypoints ever
+    further ahead are tried until one fails."""
     out = np.empty(path.shape)
     n = 0
     i = 0

@@ -1,15 +1,15 @@
-"""The planners RRT-Connect and AORRTC, and their anytime search: rounds of two trees find a first path and
-shorter ones; paths are validated on the way.
+"""The planners RRT-Connect and AORRTC, and their anytime search.
 
-If rounds find no path, the next ones require a smaller clearance. In a round of AORRTC, new trees keep only
-nodes through which a path of at most BOUND_FACTOR times the best known length can still run; the path that
-the round finds is simplified and tightened, and bounds the next round if it is the shortest. The rounds of
-RRT-Connect are restarts without a bound.
+The search runs in rounds. In each round, two new trees grow until they find a path. Paths are simplified,
+tightened (`trajectories/simplification.py`), and validated during the search. If no path is found, the
+required clearance is lowered.
 
-With the objective "length" a call returns the shortest path found. With "time", every path found is also
-the start of a local search for a faster motion, and the call returns the motion that takes the least time.
-Under path constraints there is no such local search: each path that is estimated to be the fastest so far is
-timed, and the call returns the fastest of these motions.
+Rounds of AORRTC have a bound: the trees keep only nodes through which a path of at most BOUND_FACTOR times
+the best length is possible. Rounds of RRT-Connect are restarts without a bound.
+
+With the objective "length", a call returns the shortest path found. With "time", a local search makes motions
+along the paths faster, and the call returns the fastest motion. Under path constraints, there is no local
+search: each path with the lowest estimated time so far is timed, and the call returns the fastest motion.
 """
 
 from collections.abc import Callable, Sequence
@@ -43,58 +43,57 @@ from robotdiffuse.trajectories.simplification import simplify, tighten
 from robotdiffuse.trajectories.speed_limits import scaled_limits
 
 MIN_CLEARANCE = 0.002
-"""Clearance that is tried before 0, even if none is requested [m]: with it, collision checks need not tell
-contact from near contact, which is costly, and paths become hardly longer."""
+"""Clearance that is tried before 0, even if none is requested [m]. Without a clearance, collision checks are
+expensive near contact; with this one, paths are hardly longer."""
 FALLING_FRACTIONS = (1.0, 0.5, 0.25)
-"""Fractions of the requested clearance that are tried in turn. If it is above the default clearance, its
-fractions above the default come first, then those of the default."""
+"""Fractions of the requested clearance that are tried in turn; see `usual_clearances`."""
 ITERATIONS_PER_CLEARANCE = 400
 """Number of iterations at a clearance before the next lower one is tried."""
 BOUND_FACTOR = 1.15
-"""The length bound of a round is this factor times the best length. Paths of trees are longer before they are
-simplified: if the best path is a long detour, a bound of just its length could exclude another way that is
-shorter once it is simplified."""
+"""Length bound of a round, as a multiple of the best length. The bound is above the best length, because
+paths become shorter when they are simplified."""
 TIGHTENING_FACTOR = 1.05
-"""A path longer than this factor times the best length is not tightened: tightening would not make it shorter
-than the best one."""
+"""Paths longer than this multiple of the best length are not tightened, since tightening would not make them
+shorter than the best path."""
 OPTIMALITY_TOLERANCE = 1e-4
-"""A path whose length exceeds that of the straight line by no more than this fraction is optimal."""
+"""A path counts as optimal if it is longer than the straight line by at most this fraction."""
 NEAR_FACTOR = 1.3
-"""Paths of at most this factor times the best length may become the fastest motion."""
+"""Paths up to this multiple of the best length become candidates for the fastest motion."""
 LONG_ROUND_FACTOR = 5
-"""If the first round finds no path, rounds have this many times as many iterations until there is one: larger
-trees find a narrow passage sooner than new ones."""
+"""If the first round finds no path, later rounds have this many times as many iterations until a path is
+found: large trees find narrow passages sooner than new trees do."""
 VALIDATION_INTERVAL = 4_000
-"""Number of iterations between two validations of shorter paths. Validating only at the end could lose
-everything found since the last valid path."""
+"""Number of iterations between two validations during the search. If the search validated only at the end, a
+refused path would cost all improvements."""
 ATTEMPTS_PER_ITERATION = 0.2
-"""Number of attempts to make a motion faster, per iteration of the search; attempts and iterations then take
-about the same time."""
+"""Number of attempts to make a motion faster, per iteration of the search. With this ratio, attempts and
+iterations take about the same time."""
 ATTEMPTS_AFTER_SEARCH = 200
-"""Number of attempts between two checks whether to go on, once the search has ended."""
-# With until="converged", attempts end once doubling their number has reduced the motion's time by less than
-# the fraction TIME_GAIN, but not before TIME_PATIENCE attempts.
+"""Number of attempts to make a motion faster between two checks of the stopping rule, after the search."""
+# With until="converged", attempts to make a motion faster end when the last doubling of their number reduced
+# its time by less than the fraction TIME_GAIN, but not before TIME_PATIENCE attempts.
 TIME_GAIN = 0.0025
 TIME_PATIENCE = 1_600
 MIN_TIME_GAIN = 0.01
 """While the search goes on, a motion is validated only if its estimated time is below that of the best
 validated motion by at least this fraction."""
 MAX_DETOUR = 1.05
-"""If a goal is a pose: once there is a motion no longer than this factor times the straight line to the
-nearest goal configuration, only such motions are kept."""
+"""For pose goals: once there is a path up to this multiple of the straight line to the nearest goal
+configuration, longer paths are dropped as candidates for the fastest motion."""
 FINAL_CANDIDATES = 2
-"""Number of valid motions of which the fastest is returned, if there is time to validate as many."""
+"""Number of fastest candidates that are validated at the end, if there is time; the fastest valid motion is
+returned."""
 END_MARGIN = 1e-6
-"""Under path constraints, tolerances are widened to the values at the start and the goals, plus this
-margin."""
+"""Under path constraints, the search widens its tolerances to the values of the constraints at the start and
+the goals, plus this margin."""
 PATHS_TO_FIND = 2
-"""Number of paths that RRT-Connect, or any search under path constraints, finds with until="converged"; the
-best is returned."""
+"""With until="converged", RRT-Connect and searches under path constraints end after this many paths; the best
+path is returned."""
 STRAIGHT_EXCESS = 0.02
-"""Under path constraints, a path counts as the shortest if its length exceeds that of the straight line by no
-more than this fraction."""
+"""Under path constraints, a path counts as optimal if it is longer than the straight line by at most this
+fraction."""
 SHORTCUTS = 60
-"""Under path constraints, number of shortcuts that are tried on each path found."""
+"""Number of shortcuts that are tried on each path under path constraints."""
 
 
 @dataclass(frozen=True)
@@ -102,34 +101,34 @@ class SearchSettings(Settings):
     """The settings that RRT-Connect and AORRTC share."""
 
     range: Positive = 0.7
-    """Longest extension of a tree [rad, joint-space L2]: longer ones collide more often."""
+    """Longest extension of a tree [rad, joint-space L2]; longer extensions collide more often."""
     resolution: Positive = 0.05
-    """No point of the arm moves further than this between two checks of a motion [m]; the validator's
-    certificate covers the rest. The search halves it after a path that the validator refuses."""
+    """Largest travel of any point of the arm between two collision checks of a motion [m]. The search halves
+    it each time that the validator, which certifies the whole motion, refuses a path."""
     smoothings: Natural = 1
     """Number of rounds of smoothing for each path found."""
     tightenings: Natural = 200
     """Number of attempts to shorten a path by small moves of its waypoints. The first path is shortened only
     once there is time to improve it."""
     iterations: Count = 20_000
-    """Largest number of iterations of a round, and of nodes in its trees. If the first round finds no path,
-    the next ones have five times as many."""
+    """Largest number of iterations in a round, and of nodes in each tree. If the first round finds no path,
+    later rounds have five times as many."""
     keep_trees: bool = False
-    """Whether results hold the trees of the search, for drawing."""
+    """Whether results hold the search trees, for drawing."""
 
 
 class AnytimeSearch:
-    """Rounds of RRT-Connect between a start and goals, and the best path so far.
+    """Rounds of RRT-Connect or AORRTC between a start and goals, and the best path so far.
 
-    The same seed gives the same rounds; `stop` only ends them.
+    The same seed gives the same rounds; `stop` decides only when they end.
     """
 
     clock_interval = 100
     """Number of iterations between two calls of `stop`."""
     spare_nodes = 0
-    """How many nodes beyond one an iteration may add to a tree."""
+    """Number of nodes, in addition to one, that an iteration may add to a tree."""
     limits: tuple | None = None
-    """Path constraints that the edges of trees keep."""
+    """`constrained.Limits`: path constraints that the edges of trees keep; None: no constraints."""
 
     def __init__(
         self,
@@ -143,10 +142,16 @@ class AnytimeSearch:
         stop: Callable[[], bool] = lambda: False,
         improved: Callable[[float], None] = lambda length: None,
     ) -> None:
-        """name: what results give as the `stage` of paths that this search finds. clearances: clearances to
-        try, falling [m]. bounded: whether rounds search below a bound on length (AORRTC); False: they are
-        restarts. tries: iterations without a path before the next clearance is tried. improved: called with
-        the length [rad] of each path that is the best so far.
+        """
+        start_goal: start and goals.
+        settings: settings of the search.
+        name: the `stage` of results with a path of this search.
+        seed: seed of the random numbers.
+        clearances: clearances to try in turn, falling [m].
+        bounded: whether rounds have a bound on length (AORRTC); False: they are restarts (RRT-Connect).
+        tries: number of iterations without a path before the next clearance is tried.
+        stop: whether the search must end now.
+        improved: called with the length [rad] of each path that is the best so far.
         """
         self.start_goal = start_goal
         self.settings = settings
@@ -161,24 +166,24 @@ class AnytimeSearch:
         self.work = 0
         """Number of iterations so far."""
         self.found = 0
-        """Number of paths that the search found."""
+        """Number of paths found so far."""
         self.history = list[tuple[ndarray, str]]()
-        """Each path that was the shortest when it was found, and its stage."""
+        """Each path that was the best when it was found, and its stage."""
         self.motions: TimeOptimization | None = None
-        """The fastest motions near the paths found, if the objective is time."""
+        """Candidates for the fastest motion, if the objective is time."""
         self._lengths = list[tuple[int, float]]()
+        """Number of iterations and length, each time that the best length fell."""
         self._untightened = False
-        """Whether the best path still has to be tightened. The first path is tightened later, when there is
-        time to improve it."""
+        """Whether the best path is the first one and not tightened; `improve` tightens it."""
         self._shortens = True
         """Whether paths are simplified, and straight lines tried."""
         self._state = random_state(seed)
         self._trees: rrt_kernel.Trees | None = None
+        """The trees of the current round; None between rounds."""
         self._round_end = 0
-        """The number of iterations (`work`) after which the present trees are dropped."""
+        """The number of iterations (`work`) at which the current round ends."""
         self._grown: rrt_kernel.Trees | None = None
-        """The trees that found the shortest path so far; before there is a path, the trees that are
-        growing."""
+        """The trees that found the best path; before there is a path, those of the current round."""
         self._clearances = clearances
         self._tries = tries
         self._stop = stop
@@ -194,7 +199,7 @@ class AnytimeSearch:
         name: str,
         bounded: bool = True,
     ) -> "AnytimeSearch":
-        """The search of a call of a planner, which ends with the call's time."""
+        """The search of a planning call; it ends when the call's time for searching has run out."""
         return cls(
             start_goal,
             settings,
@@ -213,12 +218,12 @@ class AnytimeSearch:
 
     @property
     def shortest(self) -> bool:
-        """Whether no path to any goal can be shorter."""
+        """Whether the best path is about as short as the straight line to the nearest goal."""
         return self._near_straight(OPTIMALITY_TOLERANCE)
 
     def _near_straight(self, fraction: float) -> bool:
-        """Whether the length of the best path exceeds that of the straight line by no more than a
-        fraction of it."""
+        """Whether the best path is longer than the straight line to the nearest goal by at most
+        `fraction`."""
         straight = np.linalg.norm(self.goals - self.start, axis=1).min()
         return bool(self.length <= straight * (1 + fraction))
 
@@ -241,7 +246,7 @@ class AnytimeSearch:
             self._iterate()
             lowest = self._level == len(self._clearances) - 1
             if self.best is None and self._tried >= self._tries and not lowest:
-                self._set_level(self._level + 1)  # the trees stay valid
+                self._set_level(self._level + 1)  # the trees keep a larger clearance, so they stay valid
                 self._try_straight_lines()
         return self.best is not None
 
@@ -255,13 +260,13 @@ class AnytimeSearch:
             self._iterate()
 
     def improves(self, gain: float, patience: int) -> bool:
-        """Whether to go on searching: the last doubling of the number of iterations shortened the path by at
-        least the fraction `gain`, or there were fewer than `patience` iterations."""
+        """`still_improves` for the length of the best path and the number of iterations."""
         return still_improves(self._lengths, self.work, float(self.length), gain, patience)
 
     def offer(self, path: Configurations, stage: str) -> bool:
-        """Simplify a path from the start to a goal, free in `space`, and keep it if it is the shortest so
-        far; returns whether it was."""
+        """Simplify a path from the start to a goal that is free in `space`, and make it the best path if it
+        is shorter; returns whether it is. If the objective is time, it may also become a candidate for the
+        fastest motion."""
         path = for_kernels(path, np.float32)
         settings = self.settings
         if self._shortens:
@@ -277,7 +282,7 @@ class AnytimeSearch:
         return bool(length < self.length) and self._take(path, float(length), stage)
 
     def _take(self, path: Configurations, length: float, stage: str) -> bool:
-        """Make a path the best one."""
+        """Make a path the best one and end the round; returns True."""
         self.best, self.length, self.stage = path, np.float32(length), stage
         self.history.append((path, stage))
         self._lengths.append((self.work, length))
@@ -291,9 +296,9 @@ class AnytimeSearch:
         return bool(motions_free(self.space, rows).all())
 
     def refuse(self, accepted: Configurations | None) -> None:
-        """Halve the resolution after the validator refused the best path, and go back to the last accepted
-        one. Once the finest resolution is reached, further paths are not shortened, because shortening could
-        turn each of them into the refused path again."""
+        """Go back to `accepted`, the last valid path (None: no path), after the validator refused the best
+        path, and halve the resolution. At the finest resolution, paths are not shortened any more, because
+        shortening could lead to the refused path again."""
         finer = finer_resolution(self.settings.resolution)
         self._shortens = finer < self.settings.resolution
         self.settings = replace(self.settings, resolution=finer)
@@ -317,12 +322,13 @@ class AnytimeSearch:
                 return
 
     def _line(self, goal: Configuration) -> Configurations:
-        """The edge from the start to a goal; without rows if there is none."""
+        """The path with one edge from the start to a goal; no rows if the edge is not free."""
         path = np.stack([self.start, goal])
         return path if motions_free(self.space, path).all() else path[:0]
 
     def _iterate(self) -> None:
-        """Run some iterations of a round, and offer the path that they find."""
+        """Run `clock_interval` iterations, in a new round if the last has ended, and offer the path that they
+        find."""
         iterations = self.settings.iterations
         if self.best is None and self.work >= iterations:
             iterations *= LONG_ROUND_FACTOR
@@ -348,15 +354,15 @@ class AnytimeSearch:
 
 
 class ConstrainedSearch(AnytimeSearch):
-    """Restarts of RRT-Connect under constraints."""
+    """Restarts of RRT-Connect under path constraints; the best path is the one of the lowest cost."""
 
     clock_interval = 20
 
     def __init__(self, context: PlanningContext, start_goal: StartGoal, settings: SearchSettings) -> None:
         constraints = context.validator.constraints
         start = start_goal.start_lead
-        assert constraints is not None and start is not None  # problems without are planned otherwise
-        with loading():  # its code is compiled apart, and rarely needed
+        assert constraints is not None and start is not None
+        with loading():  # compiled code that only problems with constraints need
             from robotdiffuse.planning.search import constrained
 
         self._code = constrained
@@ -367,7 +373,7 @@ class ConstrainedSearch(AnytimeSearch):
         self.context = context
         self.limits = constrained.make_limits(constraints.rows, tolerances)
         self.cost = np.inf
-        """Cost of the best path: its estimated duration [s], or its length [rad] if that is the objective."""
+        """Cost of the best path: estimated duration [s], or length [rad] if the objective is length."""
         self._speed_limits = scaled_limits(context.problem.robot, context.timing)
         super().__init__(
             start_goal,
@@ -383,8 +389,7 @@ class ConstrainedSearch(AnytimeSearch):
 
     @property
     def shortest(self) -> bool:
-        """Whether no path can be shorter by more than a small fraction, because the constraints hardly bend
-        the straight line."""
+        """Whether the best path is hardly longer than the straight line to the nearest goal."""
         return self._near_straight(STRAIGHT_EXCESS)
 
     def keeps_clearance(self, q: Configurations) -> bool:
@@ -392,7 +397,8 @@ class ConstrainedSearch(AnytimeSearch):
         return self.context.keeps_constraints(q) and super().keeps_clearance(q)
 
     def offer(self, path: Configurations, stage: str) -> bool:
-        """See `AnytimeSearch`; the path also keeps the constraints, and the one of the least cost is kept."""
+        """Simplify a path that is free and keeps the constraints, and make it the best path if its cost is
+        lower; returns whether it is."""
         if self._shortens:
             path = self._code.simplify(
                 self.space, self.limits, path, self.settings.smoothings, SHORTCUTS, self._state
@@ -418,17 +424,20 @@ class ConstrainedSearch(AnytimeSearch):
 
 
 def usual_clearances(wanted: float) -> list[float]:
-    """The clearances that a search tries in turn, falling [m]: the wanted one and its fractions; if it is
-    above the default clearance, then also the default and its fractions; last MIN_CLEARANCE and 0."""
-    falling = [share * wanted for share in FALLING_FRACTIONS]
+    """The clearances that a search tries in turn, falling [m].
+
+    These are FALLING_FRACTIONS of the wanted clearance. If it is above the default clearance, its fractions
+    above the default come first, then FALLING_FRACTIONS of the default. MIN_CLEARANCE and 0 come last.
+    """
+    falling = [fraction * wanted for fraction in FALLING_FRACTIONS]
     if wanted > DEFAULT_CLEARANCE:
-        usual = [share * DEFAULT_CLEARANCE for share in FALLING_FRACTIONS]
+        usual = [fraction * DEFAULT_CLEARANCE for fraction in FALLING_FRACTIONS]
         falling = [*(clearance for clearance in falling if clearance > DEFAULT_CLEARANCE), *usual]
     return [*(clearance for clearance in falling if clearance > MIN_CLEARANCE), MIN_CLEARANCE, 0.0]
 
 
 class _Validation:
-    """The best validated result of a search, and which of its paths was validated when."""
+    """Validates paths of a search and keeps the best valid result."""
 
     def __init__(self, context: PlanningContext, search: AnytimeSearch) -> None:
         self.context = context
@@ -437,7 +446,7 @@ class _Validation:
         self._by_time = context.request.objective == TIME
         self._path: ndarray | None = None
         self._shortest: PlanResult | None = None
-        """Result of the last valid path of the search, which is `_path`."""
+        """Result of `_path`, the last best path of the search that was valid."""
         self._timed = list[ndarray]()
         """The paths of the search that were validated."""
         self._validated_at = 0
@@ -446,7 +455,7 @@ class _Validation:
 
     @property
     def due(self) -> bool:
-        """Whether to validate now: the first path at once, better ones every VALIDATION_INTERVAL iterations,
+        """Whether to validate now: the first path at once; improvements every VALIDATION_INTERVAL iterations,
         or at once under path constraints."""
         interval = 0 if self.context.problem.constraints else VALIDATION_INTERVAL
         interval_passed = self.search.work >= self._validated_at + interval
@@ -459,9 +468,10 @@ class _Validation:
         return motions.best.time < (1 - MIN_TIME_GAIN) * _duration(self.best)
 
     def run(self) -> bool:
-        """Validate the best path of the search; if it is refused, the search goes back to the last valid one.
+        """Validate the best path of the search; if it is refused, the search goes back to its last valid
+        path.
 
-        Returns whether there is a valid path to answer with.
+        Returns whether there is a valid path to return.
         """
         search = self.search
         motions = self.search.motions
@@ -475,16 +485,16 @@ class _Validation:
         if search.best is self._path or self._accepts(search.best, search.stage):
             return True
         if self.context.remaining <= 0 and self.best is None:
-            # no time to search on: try the path before it
+            # no time is left to search: try the best path before the refused one
             return any(self._accepts(*before) for before in search.history[-2:-1])
         search.refuse(self._path)
         return False
 
     def run_last(self) -> None:
-        """Choose the final result: the fastest among the best motions found and the motion along the shortest
-        path.
+        """Choose the final result: the fastest of the best candidates' motions and the motion along the
+        shortest path.
 
-        Results validated before count only if time ran out: when they were validated depends on the clock,
+        Earlier results count only if time ran out. Which paths were validated earlier depends on the clock,
         and the same seed must give the same result.
         """
         search = self.search
@@ -515,8 +525,8 @@ class _Validation:
         self._timed.append(path)
         paths = [self.search.start_goal.complete(path, direct) for direct in (True, False)]
         result = None
-        # If covering spheres collide at the start or goal, the search began beside it; the exact meshes may
-        # be free on the direct way.
+        # If covering spheres collide at the start or goal, the search begins or ends at a lead (`StartGoal`).
+        # The meshes may be free on the direct way without the lead, which is tried first.
         if len(paths[0]) < len(paths[1]):
             result = self._finished(paths[0], stage, None)
         if result is None:
@@ -530,17 +540,17 @@ class _Validation:
         start_goal = self.search.start_goal
         max_deviation = self.context.timing.corner_deviation
         path = start_goal.complete(candidate.path)
-        # `complete` may have added the exact start before the search's first waypoint, or the goal after its
-        # last
+        # `complete` may have added the start before the search's first waypoint, or the goal after its last
         deviations = np.full(len(path), max_deviation)
-        begins = start_goal.start_lead
-        assert begins is not None  # else there would be no path
-        first = 1 if np.array_equal(begins, start_goal.start) else 2
+        lead = start_goal.start_lead
+        assert lead is not None  # otherwise there would be no path
+        first = 1 if np.array_equal(lead, start_goal.start) else 2
         deviations[first : first + len(candidate.deviations)] = candidate.deviations
         return self._finished(path, candidate.stage, deviations) is not None
 
     def _finished(self, path: ndarray, stage: str, deviations: ndarray | None) -> PlanResult | None:
-        """Validate and time a path, and keep its result."""
+        """Validate and time a path, and make its result the best one if it is better; None if it is
+        refused."""
         search = self.search
         target_clearance = self.context.clearance
         keeps = search.keeps_clearance
@@ -557,7 +567,7 @@ class _Validation:
         return result
 
     def _keep(self, result: PlanResult | None) -> None:
-        """Make a result the best one, unless its motion takes longer and the objective is time."""
+        """Make a result the best one; if the objective is time, only if its motion is faster."""
         if result is not None and (not self._by_time or _duration(result) < _duration(self.best)):
             self.best = result
 
@@ -572,10 +582,10 @@ def anytime(
     improves: Callable[[], bool],
     improve: Callable[[], None],
 ) -> PlanResult:
-    """Search for a path, and for better ones for as long as the call's `until` says.
+    """Search for a path, and then for better paths as long as the call's `until` requires.
 
-    improves: whether more time is still likely to shorten the path.
-    improve: spends some time on shorter paths.
+    improves: whether more search is likely to shorten the path.
+    improve: searches for shorter paths for a short time.
     """
     request = context.request
     problem = context.problem
@@ -626,16 +636,16 @@ def anytime(
 
 
 IMPROVEMENT_STEP = 1_000
-"""Number of iterations of AORRTC between two checks whether to go on searching."""
+"""Number of iterations of AORRTC between two checks of the stopping rule."""
 
 
 @dataclass(frozen=True)
 class AORRTCSettings(SearchSettings, name="aorrtc"):
     gain: Annotated[float, Bound(least=0.0, below=1.0)] = 0.0025
-    """With until="converged", the search ends once doubling the number of iterations has shortened the path
-    by less than this fraction, ..."""
+    """With until="converged", the search ends when the last doubling of the number of iterations shortened
+    the path by less than this fraction, but not before `patience` iterations."""
     patience: Natural = 16_000
-    """... but not before this many iterations."""
+    """Smallest number of iterations with until="converged"; see `gain`."""
 
 
 @dataclass(frozen=True)
@@ -667,14 +677,14 @@ class AORRTC(Planner[AORRTCSettings]):
 
 
 class RobotDiffuse(AORRTC):
-    """The default planner: AORRTC under the package's name, which loads no network."""
+    """The default planner, which is AORRTC under the package's name."""
 
     name = "robotdiffuse"
 
 
 class RRTConnect(Planner[RRTConnectSettings]):
-    """RRT-Connect (Kuffner and LaValle, 2000): two trees grow towards each other. Each path found is
-    simplified. Then the search restarts, for as long as `until` says."""
+    """RRT-Connect (Kuffner and LaValle, 2000): two trees grow towards each other until they meet, and the
+    path is simplified. The search then restarts, as long as `until` requires."""
 
     name = "rrt_connect"
     settings_class = RRTConnectSettings

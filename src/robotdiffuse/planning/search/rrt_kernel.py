@@ -1,4 +1,5 @@
-"""Compiled trees of sampling planners, and RRT-Connect and AORRTC, which grow two of them.
+"""Compiled search trees, and the planners RRT-Connect and AORRTC, which grow one from the start and one from
+the goals.
 
 J. Kuffner and S. LaValle, "RRT-Connect: An efficient approach to single-query path planning", ICRA 2000;
 balanced trees as in J. Kuffner and S. LaValle, "An efficient approach to path planning using balanced
@@ -6,8 +7,8 @@ bidirectional RRT search", 2005. T. S. Wilson, W. Thomason, Z. Kingston and J. D
 Almost-surely asymptotically optimal planning with RRT-Connect", RA-L 2025; samples as in J. D. Gammell, S. S.
 Srinivasa and T. D. Barfoot, "Informed RRT*", IROS 2014.
 
-Edges are straight motions where `limits` is None. Under path constraints it is `constrained.Limits`,
-for which that module defines `keep` and `extended`.
+Without path constraints, `limits` is None and edges are straight lines. With path constraints, `limits` is a
+`constrained.Limits`, and the module `constrained` defines `keep` and `extended`.
 """
 
 from typing import NamedTuple
@@ -24,27 +25,29 @@ _ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 _TAU = np.float32(6.283185307179586)
 INFINITE = np.float32(np.inf)
 _NOWHERE = np.float32(1e15)
-"""A coordinate far from all nodes, with a finite square [rad]."""
+"""Coordinate of unused node places, far from all nodes; its square is finite [rad]."""
 _FAR = np.float32(1e29)
-"""Less than the square of a distance to _NOWHERE, and more than any other."""
+"""A squared distance between those of nodes (smaller) and those of unused places (larger) [rad²]."""
 LINE_SHARE = np.float32(0.5)
-"""While there is no path, fraction of the samples that are drawn about the straight line; the others are
-uniform."""
+"""While there is no path: fraction of the samples that are drawn around the straight line from start to goal;
+the other samples are uniform."""
 LINE_SPREAD = np.float32(0.3)
-"""Standard deviation of the samples about the straight line, as a fraction of a joint's range."""
+"""Standard deviation of the samples around the straight line, as a fraction of a joint's range."""
 
 
 class Trees(NamedTuple):
-    """A tree from the start and one from the goals, if there are any; filled in place, so that a search can
-    be continued."""
+    """Tree 0 from the start and tree 1 from the goals, which may be empty. The arrays are filled in place, so
+    that a search can be continued. A lane is a group of W nodes, which the nearest-node search handles at
+    once."""
 
     nodes: np.ndarray
     """[2, capacity, dof]"""
     columns: np.ndarray
-    """[2 * dof, capacity in full lanes] the nodes by joint, for the nearest-node search; _NOWHERE beyond the
-    last."""
+    """[2 * dof, capacity rounded up to full lanes] the nodes by joint, for the nearest-node search; _NOWHERE
+    at unused places."""
     costs: np.ndarray
-    """[2, capacity in full lanes] path lengths from the roots [rad]; roots come first and have 0."""
+    """[2, capacity rounded up to full lanes] path length from a root to each node [rad]. Roots are the first
+    nodes and have the cost 0."""
     parents: np.ndarray
     """[2, capacity] -1 for roots."""
     children: np.ndarray
@@ -52,7 +55,7 @@ class Trees(NamedTuple):
     siblings: np.ndarray
     """[2, capacity] next child of the same parent, -1 for the last."""
     sizes: np.ndarray
-    """[2]"""
+    """[2] numbers of nodes."""
 
 
 class Scratch(NamedTuple):
@@ -66,7 +69,7 @@ class Scratch(NamedTuple):
 
 @kernel()
 def make_trees(start, goals, capacity):
-    """Trees with the start and the goals as their roots, of the start's type of numbers."""
+    """Trees with the start and the goals as their roots; nodes have the start's data type."""
     dof = len(start)
     lanes = (capacity + W - 1) // W * W
     trees = Trees(
@@ -95,19 +98,21 @@ def make_scratch(space, q):
 
 
 def keep(limits, q):
-    """Move q to where it keeps the path constraints; returns whether it does. Compiled code only."""
+    """Project q onto the path constraints, in place; returns whether it keeps them then. Only compiled code
+    can call this function."""
 
 
 def extended(space, limits, trees, tree, near, q, longest, scratch) -> int:  # type: ignore[return]
-    """`extended_straight` with edges that keep the path constraints. Compiled code only."""
+    """`extended_straight` with edges that keep the path constraints. Only compiled code can call this
+    function."""
 
 
 @allocation_free()
 def extended_straight(space, trees, tree, near, q, longest, bound, scratch):
     """Extend a tree from a node towards q by at most `longest` [rad].
 
-    Returns the last node added; -1 if the motion is not free, if no path through its end can be shorter than
-    `bound` [rad], and if the tree is full.
+    Returns the added node. Returns -1, and adds no node, if the motion is not free, if every path through its
+    end is at least as long as `bound` [rad], or if the tree is full.
     """
     origin = trees.nodes[tree, near]
     end = scratch.end
@@ -129,13 +134,14 @@ def extended_straight(space, trees, tree, near, q, longest, bound, scratch):
 def search(space, limits, trees, bound, longest, iterations, state):
     """Grow both trees for a number of iterations, or until they hold a path shorter than `bound` [rad].
 
-    RRT_CONNECT_PLANNER of Kuffner and LaValle, with balanced trees in place of SWAP. With a
-    bound, which is c_max of AORRTC, the trees grow in the space of configurations and costs: T_a is `tree`,
-    T_b is `other_tree`.
+    This is RRT_CONNECT_PLANNER of Kuffner and LaValle, but the smaller tree grows instead of SWAP. With a
+    finite bound, which is c_max of AORRTC, the trees grow in the space of configurations and costs. T_a is
+    `tree`, T_b is `other_tree`.
 
-    limits: None for straight edges, else those of path constraints.
-    bound: infinite for RRT-Connect, and under path constraints.
-    longest: largest extension [rad].
+    limits: None without path constraints, see the docstring of the module.
+    bound: infinite for RRT-Connect, and with path constraints.
+    longest: length of the longest extension [rad, joint-space L2].
+    state: of the random generator.
 
     Returns the waypoints [n, dof] from the start to a goal; n = 0 if none was found yet.
     """
@@ -161,7 +167,7 @@ def search(space, limits, trees, bound, longest, iterations, state):
             while g < len(goals) - 1 and u > shares[g]:
                 g += 1
             sample_within(space, start, goals[g], bound, sample, state)
-            # c_rand is uniform from the least cost-to-come to what the least cost-to-go leaves of c_max
+            # c_rand is uniform from g_hat, the least cost-to-come, to c_max - h_hat, the least cost-to-go
             g_hat = _to_roots(trees, tree, sample)
             h_hat = _to_roots(trees, other_tree, sample)
             c_rand = g_hat + random(state) * (bound - h_hat - g_hat)
@@ -186,11 +192,11 @@ def search(space, limits, trees, bound, longest, iterations, state):
         c_new = costs[tree, x_new]
         for j in range(len(sample)):
             sample[j] = nodes[tree, x_new, j]
-        # CONNECT(T_b, x_new): T_b may reach x_new at a cost of up to c_max - c_new
+        # CONNECT(T_b, x_new): T_b must reach x_new at a cost of at most c_max - c_new
         x_near = nearest(trees, other_tree, sample, bound - c_new)
         while True:
             gap = distance(nodes[other_tree, x_near], sample)
-            # no path through this edge is shorter than c_max
+            # a path through this edge would not be shorter than c_max
             if costs[other_tree, x_near] + gap + c_new >= bound:
                 break
             if limits is None:
@@ -212,7 +218,7 @@ def search(space, limits, trees, bound, longest, iterations, state):
 @kernel(nogil=True)
 def extend(space, trees, targets, longest):
     """Extend the start's tree from its nearest node towards each of the targets [n, dof], by at most
-    longest[n] [rad], where that motion is free."""
+    `longest` [n] [rad]. Targets to which the motion is not free are skipped."""
     scratch = make_scratch(space, trees.nodes)
     for n in range(len(targets)):
         near = nearest(trees, 0, targets[n], INFINITE)
@@ -221,7 +227,7 @@ def extend(space, trees, targets, longest):
 
 @allocation_free(inline="always")
 def add(trees, tree, q, cost, parent):
-    """Add a node to a tree, which must not be full; returns the node."""
+    """Add a node to a tree, which must not be full; returns the index of the node."""
     node = trees.sizes[tree]
     dof = len(q)
     for j in range(dof):
@@ -241,7 +247,7 @@ def add(trees, tree, q, cost, parent):
 
 @allocation_free()
 def rewire(trees, tree, node, parent, cost):
-    """Move a node, with its subtree, to another parent."""
+    """Move a node, with its subtree, to another parent, from which its cost is `cost`."""
     parents = trees.parents[tree]
     costs = trees.costs[tree]
     children = trees.children[tree]
@@ -283,7 +289,7 @@ def _root_count(trees, tree):
 
 @allocation_free(fastmath=True)
 def _to_roots(trees, tree, q):
-    """g_hat of the tree: distance to the nearest root, a lower bound of the cost of q [rad]."""
+    """g_hat of AORRTC: the distance of q to the nearest root of the tree, a lower bound of its cost [rad]."""
     g_hat = np.float32(1e9)
     for r in range(_root_count(trees, tree)):
         g_hat = min(g_hat, distance(trees.nodes[tree, r], q))
@@ -292,19 +298,19 @@ def _to_roots(trees, tree, q):
 
 @allocation_free()
 def nearest(trees, tree, q, c_rand):
-    """The node nearest to (q, c_rand), by position and cost, of those that reach q at a cost of at most
-    c_rand.
+    """The node nearest to (q, c_rand), by position and cost, among nodes from which a straight edge reaches q
+    at a cost of at most c_rand; the nearest root if there are none.
 
-    Without a bound, the nearest node by position; if no node reaches q, the nearest root.
+    If c_rand is infinite, the node nearest to q.
     """
     bounded = c_rand < INFINITE
     best = INFINITE
     x_near = -1
-    # the nodes by lanes of W
+    # one lane of W nodes at a time; `nearer` has a bit for each node
     for part in range((trees.sizes[tree] + W - 1) // W):
         square = _squared(trees, tree, part, q)
         if bounded:
-            # the cost that is left for the edge must be at least its length
+            # slack, the cost that remains for the edge, must be at least the edge's length
             slack = c_rand - load(trees.costs, tree, part)
             total = square + slack * slack
             nearer = (total < best) & ~(slack < _ZERO) & ~(slack * slack < square)
@@ -330,8 +336,8 @@ def nearest(trees, tree, q, c_rand):
 
 @allocation_free(inner=False)
 def nearest_few(trees, tree, q, index, squares):
-    """Write the nodes nearest to q to `index`, the nearest first, and their squared distances to `squares`;
-    returns their number, fewer than len(index) only in a smaller tree."""
+    """Write the len(index) nodes nearest to q to `index`, the nearest first, and their squared distances to
+    `squares`. Returns their number, which is less than len(index) only if the tree has fewer nodes."""
     count = 0
     cutoff = _FAR
     for part in range((trees.sizes[tree] + W - 1) // W):
@@ -358,7 +364,7 @@ def nearest_few(trees, tree, q, index, squares):
 
 @allocation_free(inline="always")
 def _squared(trees, tree, part, q):
-    """Squared distances of sixteen nodes from q."""
+    """Squared distances from q of the W nodes in a lane."""
     dof = len(q)
     aside = load(trees.columns, tree * dof, part) - np.float32(q[0])
     total = aside * aside
@@ -370,7 +376,7 @@ def _squared(trees, tree, part, q):
 
 @allocation_free()
 def _lower_cost(space, trees, tree, leaf, scratch, state):
-    """Give a leaf a parent through which its cost is lower: AORRTC's resampling of c_rand, which ends when
+    """Give a leaf a parent through which its cost is lower, by AORRTC's resampling of c_rand. It ends when
     the parent stays the same, the cost does not fall or an edge collides."""
     x_new = trees.nodes[tree, leaf]
     parent = trees.parents[tree, leaf]
@@ -398,8 +404,8 @@ def sample_box(space, q, state):
 
 @allocation_free(inner=False)
 def sample_about_line(space, start, goals, q, state):
-    """Sample q about the straight line from the start to one of the goals: normally distributed, clamped to
-    the limits."""
+    """Sample q around the straight line from the start to a random goal: normally distributed around a
+    uniform point of the line, clamped to the joint limits."""
     g = min(int(random(state) * len(goals)), len(goals) - 1)
     share = random(state)
     for j in range(len(q)):
@@ -410,7 +416,8 @@ def sample_about_line(space, start, goals, q, state):
 
 @kernel()
 def goal_shares(start, goals, bound):
-    """Cumulative shares of the samples for each goal, by the volumes of their hyperspheroids."""
+    """Cumulative fractions of the samples for each goal [goals], proportional to the volumes of the
+    hyperspheroids of paths shorter than `bound`."""
     shares = np.empty(len(goals), np.float32)
     total = _ZERO
     for g in range(len(goals)):
@@ -477,8 +484,8 @@ def branch(trees, tree, node):
 
 @inner_kernel()
 def _joined(trees, tree, x_new, x_connect):
-    """The path from the start to a goal through two nodes at the same place, x_new in `tree` and x_connect in
-    the other."""
+    """The path from the start to a goal where the trees meet: x_new in `tree` and x_connect in the other tree
+    are nodes at the same configuration."""
     first, second = (x_new, x_connect) if tree == 0 else (x_connect, x_new)
     forth = branch(trees, 0, first)
     back = branch(trees, 1, trees.parents[1, second])

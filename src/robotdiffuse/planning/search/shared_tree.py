@@ -1,25 +1,26 @@
 """Shared-Tree Informed RRT*, the paper's planner for data: one tree, many goals, a safety distance.
 
-The parts of the paper's section on data sets, and where they are here:
+The parts of the paper's section on data sets, their implementation here, and how the authors' code differs:
 
-- *Shared spanning tree*: one tree from the start is searched towards all goal configurations of a target
-  pose at once; every goal keeps its own best cost, the cheapest one is returned. Goals are drawn
-  by promise (`draw_goal`); the authors' code takes them in turn.
+- *Shared spanning tree*: one tree from the start grows towards all goal configurations of a target pose at
+  once. Every goal has its own best cost; the cheapest path is returned. Goals are drawn at random, weighted
+  by how much they are expected to improve the path (`draw_goal`). The authors take goals in turn.
 - *Informed*: samples come from the prolate hyperspheroid of the drawn goal (`rrt_kernel.sample_within`;
   J. Gammell et al., IROS 2014). The authors reject uniform samples instead.
-- *RRT\\**: choose-parent and rewiring among the k nearest nodes, k = e (1 + 1/d) ln n, which asymptotic
-  optimality needs (S. Karaman and E. Frazzoli, IJRR 2011; `add_node`). The authors rewire within a
-  fixed radius of 1.2 and have choose-parent commented out.
-- *Node security defense*: nodes and edges keep a safety distance to obstacles; near a start or goal that is
-  itself closer it is relaxed in steps (`collision.kernels.motions.padding_near`), and if no path is
-  found, the whole distance is lowered in steps. The authors enlarge the obstacles by 5 cm. The distance kept
-  is recorded.
-- *Cost*: joint-space length. The authors' is that of the end effector plus a little for orientation, which
-  makes detours of the joints cheap.
+- *RRT\\**: choose-parent and rewiring consider the k nearest nodes, with k = e (1 + 1/d) ln n as asymptotic
+  optimality requires (S. Karaman and E. Frazzoli, IJRR 2011; `add_node`). The authors rewire within a fixed
+  radius of 1.2 and have choose-parent commented out.
+- *Node security defense*: nodes and edges keep a safety distance to obstacles. The distance is smaller near a
+  start or goal that is closer to obstacles itself (`collision.kernels.motions.padding_near`). If no path is
+  found, the distance is lowered in steps; results state the final distance. The authors enlarge obstacles by
+  5 cm.
+- *Cost*: joint-space length. The authors' cost is the length of the end effector's path plus a small term for
+  its orientation, so detours of the joints cost little.
 
-Beyond the paper, to lower the cost within milliseconds: each round also asks RRT-Connect for one path,
-shortens it, and adds it to the tree if it is the shortest to its goal; and it shortens the best path. So the
-hyperspheroids shrink early. Both only add branches, so the tree remains one of RRT*.
+In addition to the paper's method, two steps lower the cost within milliseconds, so that the hyperspheroids
+shrink early. In each round, RRT-Connect searches for one path, which is shortened and added to the tree if it
+is the shortest to its goal; and the best path is shortened. Both steps only add branches, so the tree remains
+a tree of RRT*.
 """
 
 from collections.abc import Callable
@@ -46,18 +47,18 @@ from robotdiffuse.trajectories.simplification import shortcut
 
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 CAPACITY = 500_000
-"""Largest number of nodes of the tree; the system allocates their memory as it is used."""
+"""Largest number of nodes of the tree. The operating system allocates their memory only when it is used."""
 GOAL_BIAS = np.float32(0.1)
-"""Fraction of the samples that are at a goal, while it is not reached."""
+"""While the drawn goal is not reached: fraction of samples that are the goal itself."""
 GAIN = np.float32(1e-4)
 """A cost must fall by more than this fraction to count as lower; smaller differences are rounding errors."""
 NEIGHBORS = 64
 """Largest number of near neighbors; e (1 + 1 / dof) ln n is below it up to 10^8 nodes of 7 joints."""
 REMAINING_EXCESS = np.float32(0.5)
-"""Fraction of the excess of a goal's present cost over the straight line that is expected to remain."""
+"""Expected final excess of a goal's cost over the straight line, as a fraction of the current excess."""
 MIN_PROMISE = np.float32(0.03)
-"""Smallest promise (see `draw_goal`) of a goal that may still have the shortest path, so that no goal is left
-out forever."""
+"""Smallest weight in `draw_goal` of a goal that may still have the shortest path, so that every such goal is
+drawn at times."""
 SHORTCUTS = 20
 """Number of attempts to shorten a path."""
 
@@ -66,13 +67,13 @@ class Goals(NamedTuple):
     """The goals of the tree."""
 
     at: np.ndarray
-    """[k, dof]"""
+    """[k, dof] goal configurations."""
     node: np.ndarray
-    """[k] the goal's node, -1 until it is reached."""
+    """[k] node of the tree at each goal; -1 until the goal is reached."""
     bound: np.ndarray
-    """[k] the straight distance from the start: no path to the goal is shorter [rad]."""
+    """[k] straight distance from the start, a lower bound of the path length [rad]."""
     failures: np.ndarray
-    """[k] number of failed searches for this goal alone."""
+    """[k] number of failed searches of RRT-Connect for each goal alone."""
 
 
 def make_goals(start: Configuration, goals: Configurations) -> Goals:
@@ -105,11 +106,11 @@ def _is_open(trees, goals, g, best):
 
 @allocation_free(inner=False)
 def draw_goal(trees, goals, state):
-    """Draw a goal by its promise; -1 if no path can be shortened.
+    """Draw a goal with a probability proportional to its promise; -1 if no path can be shortened.
 
-    Promise: how much shorter the best path would get if the goal's own path lost the expected part of its
-    excess over the straight line; while no goal is reached, its nearness. Failed searches for the goal alone
-    lower it.
+    The promise of a goal is the expected reduction of the best cost: how far the goal's path would be below
+    the best cost if only REMAINING_EXCESS of its excess over the straight line remained. While no goal is
+    reached, nearer goals have more promise. Failed searches for a goal alone lower its promise.
     """
     best = _best_cost(trees, goals)
     total = _ZERO
@@ -134,7 +135,8 @@ def draw_goal(trees, goals, state):
 
 @allocation_free()
 def _draw(space, trees, goals, g, state, out):
-    """A sample for the goal: until it is reached sometimes the goal itself, else from its hyperspheroid."""
+    """Write a sample for goal g to `out`: the goal itself with the probability GOAL_BIAS until it is reached;
+    otherwise from its hyperspheroid, or from the joint range while there is no path."""
     best = min(_goal_cost(trees, goals, g), _best_cost(trees, goals))
     if goals.node[g] < 0 and random(state) < GOAL_BIAS:
         for j in range(len(out)):
@@ -157,11 +159,10 @@ def _remaining(trees, goals, q, best):
 
 @allocation_free()
 def add_node(space, trees, goals, q, scratch, index, gaps):
-    """RRT*'s extension to q: q becomes a child of the near node that gives it the lowest cost; then q becomes
-    the parent of near nodes whose cost it lowers. Returns the node; -1 if q cannot improve any path, or
-    cannot be reached.
+    """Extend of RRT* (Karaman and Frazzoli, IJRR 2011, algorithm 6) with q as x_new.
 
-    Extend of RRT* (Karaman and Frazzoli, IJRR 2011, algorithm 6) with q as x_new.
+    q becomes a child of the near node through which its cost is lowest, and then the parent of near nodes
+    with a lower cost through q. Returns the node of q; -1 if q cannot improve any path or cannot be reached.
 
     index, gaps: memory for the near nodes X_near and their distances.
     """
@@ -174,8 +175,8 @@ def add_node(space, trees, goals, q, scratch, index, gaps):
     remaining = _remaining(trees, goals, q, best)
     for i in range(count):
         gaps[i] = np.sqrt(gaps[i])
-    # x_min, the parent of least cost. Parents are tried in the order of cost: mostly the first is free; a
-    # negative distance marks those in collision
+    # x_min, the parent of least cost. Parents are tried in the order of cost, since usually the edge from the
+    # first is free. A negative distance marks a node whose edge collides.
     while True:
         chosen = -1
         cost = INFINITE
@@ -183,7 +184,7 @@ def add_node(space, trees, goals, q, scratch, index, gaps):
             if gaps[i] >= _ZERO and costs[index[i]] + gaps[i] < cost:
                 chosen = i
                 cost = costs[index[i]] + gaps[i]
-        # of no use, or a copy of a node
+        # q cannot improve a path, or is a copy of a node
         if chosen < 0 or cost + remaining >= best or gaps[chosen] <= np.float32(1e-6):
             return -1
         parent = index[chosen]
@@ -204,7 +205,8 @@ def add_node(space, trees, goals, q, scratch, index, gaps):
 
 @allocation_free()
 def _reach(trees, goals, g, node, cost):
-    """Make a node the last one before a goal."""
+    """Make a node the parent of the goal's node, with `cost` as the goal's cost; add this node if the goal is
+    not reached yet."""
     if goals.node[g] < 0:
         goals.node[g] = add(trees, 0, goals.at[g], cost, node)
     else:
@@ -213,11 +215,12 @@ def _reach(trees, goals, g, node, cost):
 
 @allocation_free()
 def _try_goals(space, trees, goals, node, drawn, longest, scratch):
-    """Join the goals that the node reaches more cheaply: the drawn one, and those nearby."""
+    """Connect the node to the drawn goal and to goals up to `longest` away, where this lowers the goal's
+    cost."""
     for g in range(len(goals.at)):
         gap = distance(trees.nodes[0, node], goals.at[g])
         cost = trees.costs[0, node] + gap
-        # a goal that cannot beat the best one still gets its own first path
+        # a goal gets its own first path even if another goal's path is shorter
         if (g != drawn and gap > longest) or cost >= _goal_cost(trees, goals, g) * (_ONE - GAIN):
             continue
         if motion_free(space, trees.nodes[0, node], goals.at[g], scratch.block, scratch.work):
@@ -274,7 +277,8 @@ def graft(trees, goals, path, g):
 @dataclass(frozen=True)
 class SharedTreeSettings(Settings, name="shared_tree_rrt_star"):
     safety_distance: NotNegative = 0.05
-    """Distance to obstacles that nodes and edges keep [m]; the default is what the authors' scenes imply."""
+    """Distance to obstacles that nodes and edges keep [m]; the default is that of the authors' enlarged
+    obstacles."""
     step_rounds: Count = 4
     """Number of rounds without a path before the safety distance is lowered."""
     range: Positive = 1.0
@@ -288,13 +292,14 @@ class SharedTreeSettings(Settings, name="shared_tree_rrt_star"):
     rounds: Count = 100_000
     """Largest number of rounds."""
     improvement: NotNegative = 0.005
-    """The search ends when the best cost fell by less than this fraction in `patience` rounds; 0: never."""
+    """The search ends when the best cost fell by less than this fraction in the last `patience` rounds; 0:
+    this rule is off."""
     patience: Count = 20
-    """See `improvement`."""
+    """Number of rounds for `improvement`."""
 
 
 class SharedTreeSearch:
-    """One search: start, goals, the tree, and the costs so far. The same state gives the same search."""
+    """A search with its start, goals, tree, and costs so far. The same random state gives the same search."""
 
     def __init__(
         self,
@@ -304,7 +309,7 @@ class SharedTreeSearch:
         settings: SharedTreeSettings,
         state: ndarray,
     ) -> None:
-        """Start and goals must be free of collision. `state` is that of `random_state`."""
+        """Start and goals must be free of collision. state: of the random generator, from `random_state`."""
         self.checker = checker
         self.settings = settings
         self.start = start.astype(np.float32)
@@ -343,8 +348,8 @@ class SharedTreeSearch:
 
     @property
     def finished(self) -> bool:
-        """Whether the search has reached what the settings ask for: no path can be shorter, or paths hardly
-        improve any more."""
+        """Whether the search should end: the best path is a straight line, paths hardly improve any more, no
+        path was found at any safety distance, or the largest number of rounds is reached."""
         settings = self.settings
         costs = self.costs
         if self.cost < np.inf:
@@ -383,9 +388,9 @@ class SharedTreeSearch:
             self._enter_step()
 
     def _enter_step(self) -> None:
-        """Set the safety distance of the step; the tree stays valid, as distances only fall."""
+        """Set the safety distance of the step. The tree stays valid, since safety distances only fall."""
         self.safety_distance = self._distances[self._step]
-        """Distance to obstacles that paths keep, except near a start or goal that is closer [m]."""
+        """Distance to obstacles that paths keep, except near a start or goal that is closer to them [m]."""
         self._rounds_at_step = 0
         self._space = padded_space(self.checker, self._ends, self.settings.resolution, self.safety_distance)
         for g, goal in enumerate(self.goals):
@@ -408,7 +413,7 @@ class SharedTreeSearch:
 
 
 class SharedTreeRRTStar(Planner[SharedTreeSettings]):
-    """Shared-Tree Informed RRT* as an anytime planner: it ends when it hardly improves or time runs out."""
+    """Shared-Tree Informed RRT* as a planner: it ends when the path hardly improves or time runs out."""
 
     name = "shared_tree_rrt_star"
     settings_class = SharedTreeSettings

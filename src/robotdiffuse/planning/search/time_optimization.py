@@ -1,7 +1,8 @@
-"""The fastest motion near the paths of a search: a compiled local search on each of the most promising ones,
-by random changes of its waypoints and corners.
+"""The fastest motion near the paths of a search. Candidates are the most promising paths; a compiled local
+search makes them faster by random changes of waypoints and corners.
 
-The time of a candidate is that of the fastest motion along its rounded polyline, without limits of jerk.
+The time of a candidate is that of the fastest motion along its polyline with rounded corners, without jerk
+limits.
 """
 
 from collections.abc import Sequence
@@ -22,22 +23,24 @@ from robotdiffuse.trajectories.speed_limits import TimingSettings, scaled_limits
 from robotdiffuse.trajectories.straight_line import straight_line_time
 from robotdiffuse.trajectories.timing_kernel import estimated_time, evaluate_at, least_time, rounded_line
 
-# Of all attempts, the part up to REMOVE_SHARE removes a waypoint unless it is the only one, that up to
-# ADD_SHARE adds one in the middle of a segment and moves it, and that up to WIDEN_SHARE changes a corner's
-# deviation. All others move a waypoint, and half of them change its deviation too.
+# An attempt draws a number from 0 to 1. Below REMOVE_SHARE, it removes a waypoint, unless it is the only
+# inner one; below ADD_SHARE, it adds a waypoint in the middle of a segment and moves it; below WIDEN_SHARE,
+# it changes a corner's deviation; otherwise it moves a waypoint, and in half of the cases also changes its
+# deviation.
 REMOVE_SHARE = 0.02
 ADD_SHARE = 0.05
 WIDEN_SHARE = 0.12
-# Factor by which the deviation of a corner changes, and the most it may reach [rad, joint-space L2].
+# Factor by which the deviation of a corner changes, and the largest deviation [rad, joint-space L2].
 WIDENING = 1.5
 MAX_DEVIATION = 1.0
-# Longest move of a waypoint in each joint [rad], and the natural logarithm of its ratio to the shortest.
+# Largest scale of moves of a waypoint in each joint [rad], and the natural logarithm of the ratio of the
+# largest to the smallest scale.
 MAX_MOVE = 0.4
 MOVE_LOG_RANGE = 5.0
 REPEAT_FACTOR = 2.0
-"""Length of the move that follows a successful one, in its direction."""
+"""After a successful move, the waypoint is moved again by this multiple of the move."""
 MIN_DEVIATION = 0.002
-"""Corners are rounded with at least this deviation [rad]; the timing may round them less."""
+"""Smallest deviation of a corner here [rad]; later timing may round corners less."""
 MIN_SEGMENT = 0.005
 """Shortest segment [rad]."""
 # A rounded corner is checked along chords of this length [rad], of which there are at most MAX_CHORDS.
@@ -49,9 +52,11 @@ MAX_CHORDS = 16
 def reduce_time(space, path, deviations, time, velocity, acceleration, longest, tries, state):
     """A faster rounded polyline: its waypoints [m, dof], its deviations [m - 2] and its estimated time [s].
 
-    path: waypoints [n, dof], n >= 3, whose polyline is free, as are its rounded corners; time: its estimated
-    time; longest: bound on its length [rad, joint-space L2]. After a move that made it faster, the same
-    waypoint moves on in the same direction.
+    path: waypoints [n, dof], n >= 3; the polyline and its rounded corners must be free. deviations: of its
+    corners [n - 2]. time: its estimated time [s]. velocity, acceleration: limits [dof]. longest: bound on the
+    length of the result [rad, joint-space L2]. tries: number of attempts. state: of the random generator.
+
+    If a move makes the path faster, the next attempt moves this waypoint further in the same direction.
     """
     dof = path.shape[1]
     work = make_workspace(space.robot, space.scene)
@@ -82,8 +87,9 @@ def reduce_time(space, path, deviations, time, velocity, acceleration, longest, 
 
 @inner_kernel(inline="always")
 def _candidate(space, path, deviations, step, again, state):
-    """A change of the path or of its corners, and the first and the last segment that it touches; no
-    waypoints if one of these is too short. Waypoint `again`, unless it is 0, moves on by `step`."""
+    """A changed path, its deviations, and the indices of the first and the last changed segment. The path has
+    no waypoints if a changed segment is too short. again: index of a waypoint that moves again in the
+    direction `step`; 0: a random change."""
     n, dof = path.shape
     kind = np.float32(1.0) if again else random(state)
     i = again if again else 1 + min(int(random(state) * (n - 2)), n - 3)
@@ -129,8 +135,8 @@ def _candidate(space, path, deviations, step, again, state):
 
 @inner_kernel(inline="always")
 def _is_free(space, line, first, last, a, b, block, work):
-    """Whether segments `first` to `last` of the polyline are free, and the rounded corners at their ends and
-    next to them."""
+    """Whether these parts of the polyline are free: segments `first` to `last`, the rounded corners at their
+    ends, and one more corner on each side, whose width may have changed."""
     waypoints = line[0]
     widths = line[3]
     for i in range(first, last + 1):
@@ -160,8 +166,8 @@ def _corner_is_free(space, line, corner, a, b, block, work):
 
 @kernel(nogil=True)
 def free_deviations(space, path, deviation):
-    """For each corner of a free polyline [n, dof], the largest of `deviation` and its halves for which the
-    rounded corner is free [n - 2], and at least MIN_DEVIATION."""
+    """For each corner of a free polyline [n, dof], `deviation`, halved until the rounded corner is free or
+    the deviation is at most MIN_DEVIATION [n - 2]."""
     dof = path.shape[1]
     work = make_workspace(space.robot, space.scene)
     block = np.empty((dof, W), np.float32)
@@ -178,24 +184,28 @@ def free_deviations(space, path, deviation):
 
 
 MAX_CANDIDATES = 6
-"""Largest number of candidates that are kept."""
-# Attempts to make a candidate faster when it is offered, and later in turn.
+"""Largest number of candidates."""
+# Attempts to make a candidate faster: when its path is offered, and each time that it is improved later.
 FIRST_ATTEMPTS = 32
 ATTEMPTS = 16
 BEST_TURNS = 3
-"""The fastest candidate has this many turns before another one has its own."""
+"""Number of times that the fastest candidate is improved for each time that another candidate is."""
 OPTIMALITY_TOLERANCE = 2e-3
-"""A motion is optimal if it takes longer than its slowest joint would alone by no more than this fraction."""
+"""A motion counts as optimal if its time exceeds the time that its slowest joint would need alone by at most
+this fraction."""
 ESTIMATE_ERROR = 1.02
-"""Estimated times are at most about this factor times the exact ones."""
+"""Largest ratio of an estimated time to the exact time, approximately."""
 
 
 def still_improves(
     history: Sequence[tuple[int, float]], work: int, now: float, gain: float, patience: int
 ) -> bool:
-    """Whether the last doubling of the work reduced a cost to `now` by at least the fraction `gain`, or there
-    was less work than `patience`. history: for each time that the cost fell, the work until then and the
-    cost."""
+    """Whether more work is likely to reduce a cost further: the last doubling of the work reduced it by at
+    least the fraction `gain`, or less work than `patience` was done.
+
+    history: the work done and the cost, each time that the cost fell. work: the work done so far. now: the
+    cost.
+    """
     half = [cost for after, cost in history if after <= work / 2]
     if work < patience or not half:
         return True
@@ -203,14 +213,14 @@ def still_improves(
 
 
 def estimated_duration(path: Configurations, deviation: float, limits: tuple[Configuration, ...]) -> float:
-    """The estimated time of a motion along a path whose corners it leaves by at most `deviation`, with these
-    limits of velocity and acceleration [s]."""
+    """The estimated time of a motion along a path [s]. The motion leaves the path's corners by at most
+    `deviation`; limits are the velocity and acceleration limits [dof]."""
     path = with_corner(path)
     return float(estimated_time(rounded_line(path, np.full(len(path) - 2, deviation)), *limits))
 
 
 def with_corner(path: Configurations) -> Configurations:
-    """The path in float64; of a single segment with its middle as a waypoint."""
+    """The path in float64; a path of one segment gets the segment's middle as a waypoint."""
     path = path.astype(np.float64)
     return np.insert(path, 1, path.mean(axis=0), axis=0) if len(path) == 2 else path
 
@@ -245,10 +255,10 @@ class TimeOptimization:
         seed: int,
         longest: float = np.inf,
     ) -> None:
-        """longest: once there is a candidate that is no longer than this, only such candidates are kept
-        [rad]."""
+        """longest: length [rad, joint-space L2]. Once there is a candidate up to this length, longer
+        candidates are dropped."""
         self._limits = scaled_limits(robot, settings)
-        # no motion is faster than its slowest joint alone
+        # no motion is faster than its slowest joint would be alone
         alone = [
             straight_line_time(start[[j]], goals[:, [j]], *(limits[[j]] for limits in self._limits))
             for j in range(len(start))
@@ -264,7 +274,7 @@ class TimeOptimization:
         self.attempts = 0
         """Number of attempts so far."""
         self.times = list[tuple[int, float]]()
-        """The attempts after which the least time fell, and the least time [s]."""
+        """Number of attempts and least time [s], each time that the least time fell."""
 
     @property
     def best(self) -> Candidate | None:
@@ -297,17 +307,16 @@ class TimeOptimization:
         self._sort()
 
     def improve(self, space: Space) -> None:
-        """Spend ATTEMPTS on one of the candidates."""
+        """Make ATTEMPTS attempts on one candidate: the best one, or every fourth time another in turn."""
         self._turn += 1
         runners_up = len(self.candidates) - 1
-        turn, rest = divmod(self._turn, BEST_TURNS + 1)
-        chosen = self.candidates[1 + turn % runners_up if runners_up and rest == 0 else 0]
+        cycle, turn = divmod(self._turn, BEST_TURNS + 1)
+        chosen = self.candidates[1 + cycle % runners_up if runners_up and turn == 0 else 0]
         self._improve(space, chosen, ATTEMPTS)
         self._sort()
 
     def improves(self, gain: float, patience: int) -> bool:
-        """Whether to go on: the last doubling of the number of attempts reduced the least time by at least
-        the fraction `gain`, or there were fewer than `patience` attempts."""
+        """`still_improves` for the least time and the number of attempts."""
         return still_improves(self.times, self.attempts, self.times[-1][1], gain, patience)
 
     def _least_time(self, candidate: Candidate) -> float:
