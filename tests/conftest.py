@@ -32,10 +32,9 @@ def checked_modules() -> list[str]:
 
 
 def parse_in_one_thread_at_a_time() -> None:
-    """CPython 3.11 counts the depth of the syntax trees of all threads together (gh-106905): parsing in two
-    ends in "SystemError: AST constructor recursion depth mismatch", and a live page has no plan. The hook
-    parses each module when it is imported, and NumPy and beartype parse later too: it is not enough to lock
-    the hook, or to import all modules first."""
+    """CPython 3.11 counts the depth of the syntax trees of all threads together (gh-106905): parsing in two ends in
+    "SystemError: AST constructor recursion depth mismatch", and a live page has no plan. The hook parses each module when it is
+    imported, and NumPy and beartype parse later too: it is not enough to lock the hook, or to import all modules first."""
     parse = ast.parse
     parsing = threading.RLock()
 
@@ -81,8 +80,7 @@ def apart_from_the_users_robots(tmp_path_factory: pytest.TempPathFactory) -> Ite
 
 @pytest.fixture(autouse=True)
 def cpu_clock(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Planners' limits are CPU time, so that a loaded machine changes no answer; pages play motions in real
-    time."""
+    """Planners' limits are CPU time, so that a loaded machine changes no answer; pages play motions in real time."""
     if request.path.parent.name != "live":
         monkeypatch.setattr(time, "perf_counter", time.process_time)
 

@@ -26,8 +26,6 @@ COUNTS = {
     "weights": 50,
     "npz": 40,
 }
-
-
 SLOW = {"settings", "socket"}
 """These load PyTorch, or start a server."""
 

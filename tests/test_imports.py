@@ -11,7 +11,6 @@ from pathlib import Path
 
 SOURCE = Path(__file__).parents[1] / "src" / "robotdiffuse"
 MODULES = sorted(SOURCE.rglob("*.py"))
-
 ORDER = (
     *("core", "processes", "robots", "scenes", "collision", "perception"),
     *("drawables", "problems", "trajectories"),
@@ -36,7 +35,6 @@ APART = {
     | {"evaluation", "visualization"},
 }
 """Packages before it that a package does without, so that it can be used, and understood, without them."""
-
 EXTRAS = {
     "simulation": {"pybullet", "pybullet_data"},
     "baselines": {"ompl"},
@@ -54,8 +52,6 @@ EXTRAS = {
 }
 """Distributions that the core install lacks, by the packages that may import them."""
 LACKING = frozenset().union(*EXTRAS.values())
-
-
 ENTRANCES = {"__init__", "__main__"}
 """These may import everything."""
 

@@ -7,6 +7,7 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.example_robots import planar_arm
+from helpers.refusals import refuses
 from robotdiffuse.baselines import controls, straight_line
 from robotdiffuse.baselines.straight_line import StraightLine, StraightLineSettings
 from robotdiffuse.collision import CollisionChecker
@@ -37,8 +38,7 @@ def test_vias_are_free_and_on_the_candidates() -> None:
     q = control.candidates(START, GOAL[None], checker, np.random.default_rng(0))
     assert (q[:, 0] == START).all() and (q[:, -1] == GOAL).all()
     np.testing.assert_array_equal(q[:, q.shape[1] // 2], vias[:3])
-    with pytest.raises(rd.InputError, match="only the panda"):
-        controls.fixed_vias(planar_arm(0.5, 0.4))
+    refuses("only the panda", controls.fixed_vias, planar_arm(0.5, 0.4))
 
 
 def test_the_nearest_motions_are_bent_to_start_and_goal(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -56,10 +56,8 @@ def test_the_nearest_motions_are_bent_to_start_and_goal(monkeypatch: pytest.Monk
 
 
 def test_data_are_for_the_nearest_motions_alone(tmp_path: Path) -> None:
-    with pytest.raises(rd.InputError, match="needs data"):
-        controls.ControlSettings(source=controls.NEAREST)
-    with pytest.raises(rd.InputError, match="needs data"):
-        controls.ControlSettings(data=str(tmp_path))
+    refuses("needs data", controls.ControlSettings, source=controls.NEAREST)
+    refuses("needs data", controls.ControlSettings, data=str(tmp_path))
 
 
 MIDDLE = 0.5 * (PANDA.lower + PANDA.upper)

@@ -9,8 +9,9 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 from torch import Tensor
 
+from helpers.refusals import refuses
 from helpers.short_training import trained
-from robotdiffuse import InputError, JointGoal, Problem, Scene, Sphere, Status, load_robot
+from robotdiffuse import JointGoal, Problem, Scene, Sphere, Status, load_robot
 from robotdiffuse.baselines import guided_prior
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.learning.denoisers import UNetSettings
@@ -156,8 +157,7 @@ def test_spaced_levels(spaced, steps: int) -> None:
     schedule = NoiseSchedule(ScheduleSettings(steps=255))
     levels = spaced(schedule, steps)
     assert len(levels) == steps and levels[0] == 255 and levels[-1] >= 1 and np.all(np.diff(levels) < 0)
-    with pytest.raises(InputError, match="between 1 and 255"):
-        spaced(schedule, 256)
+    refuses("between 1 and 255", spaced, schedule, 256)
 
 
 def test_the_precision_is_that_of_the_process() -> None:
@@ -220,7 +220,7 @@ def test_guidance_lowers_the_collision_cost() -> None:
         assert np.all(after < before) and np.array_equal(moved[:, [0, -1]], q[:, [0, -1]])
 
 
-def test_each_guide_moves_only_its_rows() -> None:
+def test_each_guide_moves_only_its_rows_and_goals_take_turns() -> None:
     edmp = guided_prior.EDMP(guided_prior.EDMPSettings(samples=30))
     shares = edmp.settings.shares()
     assert np.array_equal(np.concatenate([np.arange(30)[share] for share in shares]), np.arange(30))
@@ -236,9 +236,6 @@ def test_each_guide_moves_only_its_rows() -> None:
         guided_prior.EDMPSettings(guides=tuple(replace(guide, guided_share=0.4) for guide in guided_prior.ENSEMBLE))
     )
     assert np.array_equal(late.guided(CHECKER, same[:24], 12), same[:24])
-
-
-def test_goals_take_turns() -> None:
     goals = np.stack([RIGHT, LEFT + 0.1, LEFT + 0.2])
     starts, shared = guided_prior.shared_out(LEFT, goals, 8)
     assert np.all(starts == LEFT) and np.array_equal(shared, np.stack([goals[1], goals[2]] * 4))
@@ -267,11 +264,6 @@ def test_failure_says_what_was_wrong(planner, monkeypatch):
     assert result.refused == "scene_collision" and "samples" in result.reason
 
 
-def test_missing_weights(tmp_path) -> None:
-    with pytest.raises(InputError, match="train planner --config trajectory_prior"):
-        guided_prior.EDMP(guided_prior.EDMPSettings(weights=str(tmp_path))).plan(PROBLEM, time_limit=1.0)
-
-
 @pytest.mark.parametrize(
     "make, message",
     [
@@ -282,5 +274,4 @@ def test_missing_weights(tmp_path) -> None:
     ],
 )
 def test_bad_settings(make, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        make()
+    refuses(message, make)

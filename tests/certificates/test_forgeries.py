@@ -29,8 +29,7 @@ Record = dict[str, Any]
 
 @pytest.fixture(scope="module")
 def true(tmp_path_factory: pytest.TempPathFactory) -> tuple[FilePath, rd.Problem]:
-    """A motion with a stop at a waypoint, above a near table, beside a moving ball, with a load, a cone and a
-    speed limit."""
+    """A motion with a stop at a waypoint, above a near table, beside a moving ball, with a load, a cone and a speed limit."""
     robot = rd.load_robot("panda")
     table = rd.Box([0.5, 0.0, 0.194], [0.6, 1.6, 0.1], name="table")
     ball = rd.MovingObstacle(rd.Sphere([0.5, 1.4, 0.5], 0.1, "ball"), velocity=[0.0, -0.05, 0.0])

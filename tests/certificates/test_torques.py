@@ -48,8 +48,7 @@ def test_dynamics_are_pinocchios(name: str) -> None:
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("step", [0.2, 0.02])
 def test_bounds_are_bounds(name: str, step: float) -> None:
-    """Against torques of motions with a row at each of many samples, by which nothing of the motion
-    changes."""
+    """Against torques of motions with a row at each of many samples, by which nothing of the motion changes."""
     problem = loaded(name)
     rng = np.random.default_rng(1)
     for _ in range(5):

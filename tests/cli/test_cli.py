@@ -23,36 +23,27 @@ from robotdiffuse.problems.fields import problem_schema
 from robotdiffuse.robots import load_robot
 
 TRAIN = ["train", "planner", "--data", "d", "--encoder", "dgcnn", "--out", "o"]
-
-
 BAD_CALL = {
     "no command": ([], "COMMAND"),
-    "unknown command": (["plann"], "plann"),
+    "unknown command": (["plna"], "did you mean plan?"),
     "missing file": (["plan", "missing.yaml"], "missing.yaml"),
     "weights of a planner without": (
-        ["plan", "problem.json", "--planner", "rrt_connect", "--weights", "w"],
-        "planner rrt_connect has no weights",
+        ["plan", "problem.json", "--planner", "rrt_connect", "--weights", "w"], "planner rrt_connect has no weights"
     ),
     "weights of a name that no file has": (
-        ["plan", "problem.json", "--planner", "diffusion", "--weights", "w" * 5000],
-        "wwww... File name too long",
+        ["plan", "problem.json", "--planner", "diffusion", "--weights", "w" * 5000], "wwww... File name too long"
     ),
-    "weights that are none": (
-        ["plan", "problem.json", "--planner", "diffusion", "--weights", "."],
-        "holds no model",
-    ),
+    "weights that are none": (["plan", "problem.json", "--planner", "diffusion", "--weights", "."], "holds no model"),
     "unknown planner": (["plan", "problem.json", "--planner", "rrt"], "known: a_star, aorrtc, control"),
     "no time": (["plan", "problem.json", "--time-limit", "0"], "'0' is not a positive number"),
     "negative clearance": (["plan", "problem.json", "--clearance", "-1"], "'-1' is not a number of at le"),
     "unknown ending": (["plan", "problem.json", "--out", "r.xml"], "unknown ending '.xml'; known: .json"),
     "missing folder": (["plan", "problem.json", "--out", "no/r.json"], "the folder no does not exist"),
-    "unknown option": (["plan", "problem.json", "--fast"], "--fast"),
+    "unknown option": (["plan", "problem.json", "--tme-limit=3"], "did you mean --time-limit?"),
     "unknown robot": (["robot", "info", "pandaa"], "pandaa"),
     "no workers": (["data", "generate", "--out", "d", "--workers", "0"], "'0' is not an integer"),
     "train without out": (["train", "encoder"], "--out"),
-    "train twice as long": (
-        ["train", "encoder", "--out", "e", "--minutes", "1", "--samples", "9"], "not allowed with"
-    ),
+    "train twice as long": (["train", "encoder", "--out", "e", "--minutes", "1", "--samples", "9"], "not allowed with"),
     "no data": (["data", "info", "."], "no data set"),
     "no data file": (["data", "import", "x.npz", "--out", "y"], "x.npz does not exist"),
     "ending of a replay": (["explore", "problem.json", "--out", "seen.gif"], ".html, .png"),
@@ -82,6 +73,10 @@ def test_bad_call_is_status_2_in_one_line(case: str, tmp_path: Path, said: Said)
 def test_help_and_version(said: Said) -> None:
     assert "--time-limit" in said(0, "plan", "--help")
     assert said(0, "--version").startswith("robotdiffuse 0.")
+    printed = said(0, "--help")
+    topics = [line for line in printed.splitlines() if line.endswith(":") and not line.startswith(" ")]
+    assert topics[1:] == [f"{topic}:" for topic in COMMANDS], "every command is below a topic"
+    assert "\n  plan         plan a motion" in printed
 
 
 @pytest.mark.parametrize(
@@ -115,30 +110,15 @@ sys.exit(main())
     assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "robotdiffuse: stopped\n")
 
 
-def test_planner_list_shows_them_all_without_loading_them() -> None:
+def test_planners_are_listed_without_loading_them_and_so_are_their_settings(said: Said) -> None:
     code = "from robotdiffuse.cli import *; main(['planner', 'list']); sys.exit('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert all(name in done.stdout for name in PLANNERS)
-
-
-def test_settings_of_a_planner_are_listed(said: Said) -> None:
     printed = said(0, "planner", "info", "rrt_connect")
     assert "range" in printed and "0.7" in printed and "Longest extension of a tree" in printed
     assert "unknown planner 'teleport'" in said(2, "planner", "info", "teleport")
     assert said(2, "planner", "info", "aorrt").endswith("did you mean aorrtc?\n")
-
-
-@pytest.mark.parametrize(("words", "meant"), [(("plna",), "plan"), (("plan", "x.yaml", "--tme-limit=3"), "--time-limit")])
-def test_misspelled_words_get_a_suggestion(words: tuple[str, ...], meant: str, said: Said) -> None:
-    assert f"did you mean {meant}?" in said(2, *words)
-
-
-def test_help_lists_every_command_below_a_topic(said: Said) -> None:
-    printed = said(0, "--help")
-    topics = [line for line in printed.splitlines() if line.endswith(":") and not line.startswith(" ")]
-    assert topics[1:] == [f"{topic}:" for topic in COMMANDS]
-    assert "\n  plan         plan a motion" in printed
 
 
 def test_a_module_of_the_current_folder_adds_planners(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: Said) -> None:
@@ -207,7 +187,7 @@ def test_progress_without_a_terminal_is_a_line_at_once(capsys: pytest.CaptureFix
 ROOT = Path(__file__).parents[2]
 
 
-def test_the_schema_accepts_the_problems_of_the_documentation() -> None:
+def test_the_schema_accepts_the_problems_of_the_documentation(said: Said) -> None:
     jsonschema = pytest.importorskip("jsonschema")
     validator = jsonschema.Draft202012Validator(problem_schema())
     blocks = [block for page in PAGES for block in code_blocks(page) if block.language == "yaml"]
@@ -217,6 +197,7 @@ def test_the_schema_accepts_the_problems_of_the_documentation() -> None:
     assert len(problems) > 5 and len(files) > 2
     for problem in problems + files:
         assert [error.message for error in validator.iter_errors(problem)] == []
+    assert json.loads(said(0, "schema")) == problem_schema()
 
 
 @pytest.mark.parametrize(
@@ -233,10 +214,6 @@ def test_the_schema_accepts_the_problems_of_the_documentation() -> None:
 def test_the_schema_refuses_what_files_may_not_hold(changes: dict[str, object]) -> None:
     jsonschema = pytest.importorskip("jsonschema")
     assert not jsonschema.Draft202012Validator(problem_schema()).is_valid(PROBLEM | changes)
-
-
-def test_the_schema_is_printed(said: Said) -> None:
-    assert json.loads(said(0, "schema")) == problem_schema()
 
 
 def completed(script: str, *words: str) -> list[str]:
@@ -269,7 +246,6 @@ def test_robot_add_with_srdf_and_robot_list(
     pairs = ("base", "j4_link", "User"), ("base", "j3_link", "Never"), ("base", "j1_link", "Adjacent")
     rows = (f'<disable_collisions link1="{a}" link2="{b}" reason="{why}"/>' for a, b, why in pairs)
     (tmp_path / "made.srdf").write_text(f"<robot name='made'>{''.join(rows)}</robot>")
-
     with coarse_grids():
         assert run("robot", "add", str(file), "--allow", "j1_link", "j4_link") == 0
     told = capsys.readouterr()
@@ -278,18 +254,13 @@ def test_robot_add_with_srdf_and_robot_list(
     allowed = load_robot("made").allowed_collisions
     assert frozenset(("j1_link", "j4_link")) in allowed
     assert frozenset(("base", "j4_link")) not in allowed  # found beside: compared, not taken
-
     given = ("--srdf", str(tmp_path / "made.srdf"), "--name", "by_srdf")
     with coarse_grids():
         assert run("robot", "add", str(file), *given) == 0
     assert frozenset(("base", "j4_link")) in load_robot("by_srdf").allowed_collisions
     assert "unknown link in allow 'moon'" in said(2, "robot", "add", str(file), "--allow", "base", "moon")
-
     out = said(0, "robot", "list")
     assert all(name in out for name in ("panda", "made", "by_srdf"))
     assert len(str(load_robot("panda")).splitlines()) <= 10
-
-
-def test_robot_info(said: Said) -> None:
     printed = said(0, "robot", "info", "panda")
     assert "panda_joint7" in printed and "2.8973" in printed and "spheres on" in printed

@@ -19,8 +19,6 @@ from robotdiffuse.visualization.exploration import write_exploration_picture
 from robotdiffuse.visualization.picture import PictureSettings
 
 ROOT = Path(__file__).parents[2]
-
-
 EXAMPLES = sorted(ROOT.glob("examples/*.yaml")) + sorted(ROOT.glob("src/robotdiffuse/examples/*.yaml"))
 
 
@@ -50,22 +48,15 @@ def test_files_are_written_though_nobody_reads_what_is_printed(tmp_path: Path, m
     assert rd.load_result("r.json").result.solved
 
 
+def melon(y: float) -> dict[str, object]:
+    return {"scene": [{"sphere": {"center": [0.3, y, 0.5], "radius": 0.2, "name": "melon"}}]}
+
+
+FAR = {"frame": "panda_hand", "xyz": [2.0, 0.0, 0.5], "wxyz": [1, 0, 0, 0]}
 NO_PLAN = {
-    "start in collision": (
-        {"scene": [{"sphere": {"center": [0.3, -0.45, 0.5], "radius": 0.2, "name": "melon"}}]},
-        "invalid_start",
-        "melon",
-    ),
-    "goal in collision": (
-        {"scene": [{"sphere": {"center": [0.3, 0.45, 0.5], "radius": 0.2, "name": "melon"}}]},
-        "invalid_goal",
-        "melon",
-    ),
-    "pose out of reach": (
-        {"goal": {"pose": {"frame": "panda_hand", "xyz": [2.0, 0.0, 0.5], "wxyz": [1, 0, 0, 0]}}},
-        "unreachable_goal",
-        "panda_hand",
-    ),
+    "start in collision": (melon(-0.45), "invalid_start", "melon"),
+    "goal in collision": (melon(0.45), "invalid_goal", "melon"),
+    "pose out of reach": ({"goal": {"pose": FAR}}, "unreachable_goal", "panda_hand"),
 }
 
 
@@ -81,7 +72,7 @@ def test_no_plan_is_status_1_with_the_reason(case: str, tmp_path: Path, said: Sa
 
 def test_what_has_no_motion_is_drawn(tmp_path: Path, said: Said) -> None:
     """`view problem.yaml` was refused, and `plan --out bad.html` wrote nothing and said so neither."""
-    problem = write_problem(tmp_path, **NO_PLAN["goal in collision"][0])
+    problem = write_problem(tmp_path, **melon(0.45))
     outs = ("--out", "bad.html", "--out", "bad.json", "--out", "bad.csv")
     assert "not written: bad.csv: there is no motion" in said(1, "plan", problem, "--planner", "rrt_connect", *outs)
     assert not (tmp_path / "bad.csv").exists()
@@ -104,7 +95,7 @@ def test_a_result_saved_from_python_holds_its_problem(tmp_path: Path, said: Said
 
 def test_problem_of_a_jsonl_file(tmp_path: Path, said: Said) -> None:
     file = tmp_path / "problems.jsonl"
-    blocked = PROBLEM | {"scene": NO_PLAN["start in collision"][0]["scene"]}
+    blocked = PROBLEM | melon(-0.45)
     file.write_text(f"{json.dumps(PROBLEM)}\n{json.dumps(blocked)}\n")
     assert run("plan", file, "--planner", "rrt_connect", "--time-limit", 5) == 0
     assert "invalid_start" in said(1, "plan", file, "--planner", "rrt_connect", "--index", 1)

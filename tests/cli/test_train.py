@@ -25,11 +25,14 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[PlannerTraining]:
     return trained
 
 
-def test_unknown_config_lists_them_with_what_they_are(said: Said) -> None:
+def test_unknown_configs_and_those_without_their_encoder_are_refused(said: Said) -> None:
     error = said(2, *TRAIN, "--config", "papre")
     assert error.startswith("robotdiffuse: error: unknown config 'papre'; known:\n")
     for name, config in CONFIGS.items():
         assert f"  {name}: {config.description}\n" in error
+    command = ("train", "planner", "--config", "paper", "--out", "o")
+    for rest in (("--data", "d"), ("--robot", "panda")):
+        assert "--config paper needs --encoder" in said(2, *command, *rest)
 
 
 def test_parts_replace_those_of_the_config(trained: list[PlannerTraining]) -> None:
@@ -76,9 +79,3 @@ def test_the_encoder_of_the_config_is_that_of_an_arm_too(
     monkeypatch.setattr("robotdiffuse.cli.train.generate", lambda *_, **__: None)
     assert run("train", "planner", "--robot", "panda", "--out", "o", "--config", config) == 0
     assert trained[0].encoder == encoder and not Path("o", "encoder").exists()
-
-
-def test_config_paper_needs_its_encoder(said: Said) -> None:
-    command = ("train", "planner", "--config", "paper", "--out", "o")
-    for rest in (("--data", "d"), ("--robot", "panda")):
-        assert "--config paper needs --encoder" in said(2, *command, *rest)

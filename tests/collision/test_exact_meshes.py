@@ -16,8 +16,6 @@ from robotdiffuse.collision.exact_meshes import ExactCollision, explain_collisio
 from robotdiffuse.robots.kinematics import link_pose
 
 Q0 = np.zeros(3)
-
-
 coordinate = st.floats(-1.5, 1.5)
 
 
@@ -80,11 +78,14 @@ def test_degenerate_point_clouds(points: np.ndarray) -> None:
     assert exact.link_distances(Q0)[0].distance == pytest.approx(right, abs=1e-6)
 
 
-def test_a_link_deep_in_a_point_cloud() -> None:
+def test_a_link_deep_in_a_point_cloud_and_an_empty_cloud() -> None:
     """Depth at the deepest point: the middle of the box, less far from the side than from the top."""
     points = np.stack([np.full(21, 0.25), np.linspace(-0.02, 0.02, 21), np.zeros(21)], axis=1)
     exact = ExactCollision(box_arm(), rd.Scene([rd.PointCloud(points, 0.01)]))
     assert exact.link_distances(Q0)[0].distance == pytest.approx(-HALF_WIDTH - 0.01, abs=1e-5)
+    exact = ExactCollision(box_arm(), rd.Scene([rd.PointCloud(np.zeros((0, 3)))]))
+    assert exact.link_distances(Q0)[0] == ("l1", None, np.inf)
+    assert not exact.collides(np.zeros((2, 3))).any()
 
 
 def test_equal_points_are_one() -> None:
@@ -94,12 +95,6 @@ def test_equal_points_are_one() -> None:
     assert np.array_equal(cloud.distinct_points, two)
     once, often = (ExactCollision(box_arm(), rd.Scene([one])) for one in (rd.PointCloud(two, 0.01), cloud))
     assert once.link_distances(Q0) == often.link_distances(Q0)
-
-
-def test_an_empty_point_cloud_is_an_empty_scene() -> None:
-    exact = ExactCollision(box_arm(), rd.Scene([rd.PointCloud(np.zeros((0, 3)))]))
-    assert exact.link_distances(Q0)[0] == ("l1", None, np.inf)
-    assert not exact.collides(np.zeros((2, 3))).any()
 
 
 def test_a_mesh_is_its_surface() -> None:

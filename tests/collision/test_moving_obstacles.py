@@ -1,5 +1,4 @@
-"""The motion certificate among moving obstacles against Coal at many times; and what moving obstacles
-reject."""
+"""The motion certificate among moving obstacles against Coal at many times; and what moving obstacles reject."""
 
 from pathlib import Path
 
@@ -7,6 +6,7 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.refusals import refuses
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.moving_obstacles import CONTACT_TIME_TOLERANCE, MovingCollision
 from robotdiffuse.core.transforms import rotation_about, transform
@@ -131,10 +131,8 @@ AWAY = transform(BALL.center + 2)
     ],
 )
 def test_motions_that_are_none(motion: dict, message: str) -> None:
-    with pytest.raises(rd.InputError, match=message):
-        rd.MovingObstacle(BALL, **motion)
-    with pytest.raises(rd.InputError, match="point_cloud"):
-        rd.MovingObstacle(rd.PointCloud([[0.5, 0, 0.5]]), velocity=[0, 1, 0])
+    refuses(message, rd.MovingObstacle, BALL, **motion)
+    refuses("point_cloud", rd.MovingObstacle, rd.PointCloud([[0.5, 0, 0.5]]), velocity=[0, 1, 0])
 
 
 @pytest.mark.parametrize("base", [None, transform(np.array([0, 0, 0.7]), rotation_about(AXIS, 0.5))])
@@ -170,8 +168,7 @@ SPHERE = {"sphere": {"center": [0, 0, 1], "radius": 0.1}}
 )
 def test_files_name_the_field(entry: object, message: str) -> None:
     record = problem_record(rd.Problem(PANDA, rd.Scene(), START, END))
-    with pytest.raises(rd.InputError, match=message):
-        problem_from_record(record | {"moving": entry})
+    refuses(message, problem_from_record, record | {"moving": entry})
 
 
 def test_moving_obstacles_stand_beside_neither_blends_nor_start_velocities() -> None:

@@ -28,10 +28,12 @@ def test_the_supported_version_of_numba_is_installed() -> None:
     assert numba.__version__.startswith("0.68."), "port core/kernels.py and collision/kernels/simd.py first"
 
 
-def test_compiled_code_has_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compiled_code_has_a_writable_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert kernels.cache_folder() == tmp_path / "robotdiffuse"
+    assert kernels.is_writable(tmp_path / "new" / "folder")
+    assert not kernels.is_writable(Path("/proc/nowhere"))
 
 
 def test_a_temporary_folder_is_used_if_nothing_else_is_writable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -54,11 +56,6 @@ def test_a_user_without_a_home_has_no_writable_cache(tmp_path: Path, monkeypatch
     with pytest.warns(UserWarning, match="is not writable"):
         kernels.cache_folder()
     assert [path.name for path in tmp_path.iterdir()] == ["temporary"]
-
-
-def test_a_folder_is_writable_if_a_file_can_be_written(tmp_path: Path) -> None:
-    assert kernels.is_writable(tmp_path / "new" / "folder")
-    assert not kernels.is_writable(Path("/proc/nowhere"))
 
 
 def test_importing_the_package_touches_no_file(tmp_path: Path) -> None:

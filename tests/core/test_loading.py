@@ -116,8 +116,7 @@ def test_compile_time_is_all_of_the_block_that_compiles(monkeypatch: pytest.Monk
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_first_calls_load_outside_their_time() -> None:
-    """`rd.plan` in a fresh process timed out while it loaded: each load here takes far longer than the
-    limit."""
+    """`rd.plan` in a fresh process timed out while it loaded: each load here takes far longer than the limit."""
     done = subprocess.run([sys.executable, "-c", FIRST_CALLS], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert [line.split()[0] for line in done.stdout.splitlines()] == ["solved"] * 7, done.stdout

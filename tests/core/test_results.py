@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import threading
 from dataclasses import fields, replace
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.refusals import refuses
 from robotdiffuse.core.errors import OutputError
 from robotdiffuse.core.output_files import JsonLines, write_atomically
 
@@ -43,11 +45,6 @@ def solved(trajectory: rd.Trajectory) -> rd.PlanResult:
         progress=((0.002, 3.5), (0.008, 3.0)),
         refused="scene_collision",
     )
-
-
-@pytest.fixture
-def failed() -> rd.PlanResult:
-    return rd.PlanResult(rd.Status.TIMEOUT, "no path in 1 s", "rrt_connect", "panda", 1.0, 0)
 
 
 def test_solved_result_round_trip(solved: rd.PlanResult, tmp_path: Path) -> None:
@@ -89,22 +86,23 @@ def test_results_of_earlier_versions_lack_fields(solved: rd.PlanResult, tmp_path
     assert (read.progress, read.refused, read.goal_index) == ((), "", None)
 
 
-def test_failed_result_round_trip(failed: rd.PlanResult, tmp_path: Path) -> None:
+def test_failed_result_round_trip(tmp_path: Path) -> None:
+    failed = rd.PlanResult(rd.Status.TIMEOUT, "no path in 1 s", "rrt_connect", "panda", 1.0, 0)
     file = tmp_path / "result.json"
     failed.save(str(file))
     read = rd.load_result(file).result
     assert read.status is rd.Status.TIMEOUT and read.path is None and read.trajectory is None
     assert json.loads(file.read_text())["verified"] is False
-    with pytest.raises(rd.InputError, match=r"no trajectory to write \(timeout\)"):
-        failed.save(str(tmp_path / "result.csv"))
+    refuses(r"no trajectory to write \(timeout\)", failed.save, str(tmp_path / "result.csv"))
 
 
-def test_unwritable(solved: rd.PlanResult, tmp_path: Path) -> None:
-    with pytest.raises(rd.InputError, match="nowhere does not exist"):
-        solved.save(tmp_path / "nowhere" / "r.json")
+def test_what_cannot_be_written_is_refused(solved: rd.PlanResult, tmp_path: Path) -> None:
+    refuses("nowhere does not exist", solved.save, tmp_path / "nowhere" / "r.json")
     (tmp_path / "folder.json").mkdir()
-    with pytest.raises(rd.InputError, match="is a folder"):
-        solved.save(tmp_path / "folder.json")
+    refuses("is a folder", solved.save, tmp_path / "folder.json")
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        replace(solved, min_clearance=float("nan")).save(tmp_path / "r.json")
+    assert [path.name for path in tmp_path.iterdir()] == ["folder.json"]
 
 
 def test_a_failed_write_keeps_the_old_file(solved: rd.PlanResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,12 +116,6 @@ def test_a_failed_write_keeps_the_old_file(solved: rd.PlanResult, tmp_path: Path
     with pytest.raises(OutputError, match="No space left on device"):
         solved.save(file)
     assert file.read_text() == "old" and list(tmp_path.iterdir()) == [file]
-
-
-def test_not_finite_is_never_written(solved: rd.PlanResult, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        replace(solved, min_clearance=float("nan")).save(tmp_path / "r.json")
-    assert not list(tmp_path.iterdir())
 
 
 DAMAGE = [
@@ -151,9 +143,7 @@ def test_damaged_result_is_refused(change: dict, message: str, solved: rd.PlanRe
     file = tmp_path / "r.json"
     solved.save(file)
     file.write_text(json.dumps(json.loads(file.read_text()) | change))
-    with pytest.raises(rd.InputError, match=message) as caught:
-        rd.load_result(file)
-    assert str(caught.value).startswith(str(file)) and "\n" not in str(caught.value)
+    refuses(f"^{re.escape(str(file))}.*{message}", rd.load_result, file)
 
 
 @pytest.mark.parametrize(
@@ -162,8 +152,7 @@ def test_damaged_result_is_refused(change: dict, message: str, solved: rd.PlanRe
 def test_not_a_result_file(text: str, message: str, tmp_path: Path) -> None:
     file = tmp_path / "r.json"
     file.write_text(text)
-    with pytest.raises(rd.InputError, match=message):
-        rd.load_result(file)
+    refuses(message, rd.load_result, file)
 
 
 def test_threads_that_write_one_file_leave_one_of_their_texts(tmp_path: Path) -> None:

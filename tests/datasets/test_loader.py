@@ -9,8 +9,8 @@ import torch
 from torch.utils.data import DataLoader
 
 from helpers.box_arm import box_arm
+from helpers.refusals import refuses
 from helpers.stores import manifest_of, random_arrays, write_store
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.datasets.loader import RopBatch, RopDataset
 from robotdiffuse.datasets.rows import resample
 from robotdiffuse.datasets.shards import SPLITS, read_shard, shard_path, split_of, write_manifest, write_shard
@@ -133,11 +133,9 @@ def test_bad_input(store, tmp_path):
         ({"points": 0}, "points is 0; it must be at least 1"),
         ({"robot": replace(ARM, spheres={})}, "use the robot of the data"),
     ]:
-        with pytest.raises(InputError, match=message):
-            RopDataset(store, **arguments)
+        refuses(message, RopDataset, store, **arguments)
     assert len(RopDataset(store, robot=ARM)) > 0
-    with pytest.raises(InputError, match="batch_size is 0"):
-        RopDataset(store).batches(0)
+    refuses("batch_size is 0", RopDataset(store).batches, 0)
 
     def shard(waypoints):
         write_shard(tmp_path, 0, random_arrays(ARM, 5, np.random.default_rng(0), waypoints), {})
@@ -154,5 +152,4 @@ def test_bad_input(store, tmp_path):
         (damaged, r"shard_00000\.zarr, array trajectories is damaged"),
     ]:
         change()
-        with pytest.raises(InputError, match=message):
-            RopDataset(tmp_path)
+        refuses(message, RopDataset, tmp_path)

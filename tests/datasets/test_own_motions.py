@@ -3,10 +3,10 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 import robotdiffuse as rd
 from helpers.commands import run
+from helpers.refusals import refuses
 from robotdiffuse.datasets.rows import problem_of
 from robotdiffuse.datasets.shards import check_shard, read_manifest
 
@@ -32,8 +32,7 @@ def test_own_motions_are_a_data_set_like_any_other(tmp_path, capsys):
     assert batch.trajectories.shape[1:] == (48, 7)
     assert run("data", "check", tmp_path / "own", "--workers", 1, "--no-pybullet") == 0
     assert "24" in capsys.readouterr().out
-    with pytest.raises(rd.InputError, match="holds data already"):
-        rd.write_dataset(MOTIONS, SCENES, tmp_path / "own", PANDA)
+    refuses("holds data already", rd.write_dataset, MOTIONS, SCENES, tmp_path / "own", PANDA)
 
 
 def test_what_is_wrong_is_named(tmp_path: Path) -> None:
@@ -45,6 +44,5 @@ def test_what_is_wrong_is_named(tmp_path: Path) -> None:
         (MOTIONS, SCENES[:3], "scenes are 3; they must be one rd.Scene, or one for each of 24 paths"),
         (MOTIONS[:1], rd.Scene([rd.Cylinder([1, 1, 1], 0.1, 0.1)]), "only spheres and boxes can be packed"),
     ):
-        with pytest.raises(rd.InputError, match=message):
-            rd.write_dataset(paths, around, tmp_path / "own")  # type: ignore[arg-type]
+        refuses(message, rd.write_dataset, paths, around, tmp_path / "own")
     assert not (tmp_path / "own" / "manifest.json").exists()

@@ -14,6 +14,7 @@ import pytest
 import zarr
 
 from helpers.box_arm import box_arm
+from helpers.refusals import refuses
 from helpers.stores import manifest_of, random_arrays, write_store
 from robotdiffuse.core.errors import InputError, OutputError
 from robotdiffuse.datasets import shards
@@ -79,8 +80,7 @@ def test_same_arrays_same_bytes_or_none_where_arrays_do_not_fit(tmp_path, arrays
     shards.write_shard(tmp_path / "b", 0, dict(reversed(arrays.items())), dict(reversed(counts.items())))
     shards.write_shard(tmp_path / "b", 0, arrays, counts)  # once more in its place
     for wrong, message in (({"costs": arrays["cost"]}, "'costs'"), ({"cost": arrays["cost"][:3]}, "unequal rows")):
-        with pytest.raises(InputError, match=message):
-            shards.write_shard(tmp_path / "b", 1, arrays | wrong, {})
+        refuses(message, shards.write_shard, tmp_path / "b", 1, arrays | wrong, {})
     assert files(tmp_path / "a") == files(tmp_path / "b")
     assert [p.name for p in (tmp_path / "b").iterdir()] == ["shard_00000.zarr"]
 
@@ -180,8 +180,7 @@ def test_damage_gives_one_line(store, message, damage):
 
 
 def test_manifest(tmp_path):
-    with pytest.raises(InputError, match=r"there is no .*manifest\.json; make one with: robotdiffuse data"):
-        shards.read_manifest(tmp_path / "nothing")
+    refuses(r"there is no .*manifest\.json; make one with: robotdiffuse data", shards.read_manifest, tmp_path / "nothing")
     manifest = manifest_of(ARM)
     shards.write_manifest(tmp_path, manifest)
     assert shards.read_manifest(tmp_path) == manifest
@@ -195,8 +194,7 @@ def test_manifest(tmp_path):
         ({"floors": {"rop": {"size": [2.0, 2.0, 0.1]}}}, r"manifest\.json is damaged: .*center"),
     ]:
         (tmp_path / "manifest.json").write_text(json.dumps(data | change))
-        with pytest.raises(InputError, match=message):
-            shards.read_manifest(tmp_path)
+        refuses(message, shards.read_manifest, tmp_path)
 
 
 @pytest.mark.parametrize("value", [None, [], {}, [[]], {"a": 1}, "", -1, 10**30])
@@ -209,9 +207,7 @@ def test_values_of_the_wrong_type_in_a_manifest_are_damage(tmp_path, value):
     fits |= {name for name in data if type(value) is type(data[name]) and value in (10**30, "", {"a": 1}, {})}
     for name in data.keys() - fits:
         file.write_text(json.dumps(data | {name: value}))
-        with pytest.raises(InputError, match=r"manifest\.json( is damaged)?: ") as caught:
-            shards.read_manifest(tmp_path)
-        assert "\n" not in str(caught.value)
+        refuses(r"manifest\.json( is damaged)?: ", shards.read_manifest, tmp_path)
 
 
 def test_the_robot_must_be_that_of_the_data_by_its_fingerprint():
@@ -225,8 +221,7 @@ def test_the_robot_must_be_that_of_the_data_by_its_fingerprint():
     assert [robot_fingerprint(other) == mine for other in others] == [False, False, True]
     manifest = manifest_of(panda)
     manifest.check_robot(replace(panda, name="renamed"))
-    with pytest.raises(InputError, match=r"the data are of the robot .* use the robot of the data"):
-        manifest.check_robot(others[0])
+    refuses(r"the data are of the robot .* use the robot of the data", manifest.check_robot, others[0])
 
 
 def test_splits_keep_scenes_together():
@@ -244,8 +239,7 @@ def test_splits_keep_scenes_together():
 def test_without_zarr(tmp_path, arrays, monkeypatch):
     monkeypatch.setitem(sys.modules, "zarr", None)
     for call in (lambda: shards.write_shard(tmp_path, 0, arrays, {}), lambda: shards.read_shard(tmp_path, 0)):
-        with pytest.raises(InputError, match=r'pip install "robotdiffuse\[data\]"'):
-            call()
+        refuses(r'pip install "robotdiffuse\[data\]"', call)
 
 
 @pytest.mark.parametrize("name", ["manifest.json", "shard_00000.zarr/seed/zarr.json", "robot.npz"])
@@ -258,5 +252,4 @@ def test_a_pipe_in_a_data_set_is_not_waited_for(tmp_path, arrays, name):
         "manifest.json": lambda: shards.read_manifest(tmp_path),
         "robot.npz": lambda: import_npz(tmp_path / name, tmp_path / "set"),
     }
-    with pytest.raises(InputError, match=f"{name} cannot be read: it is a device or a pipe"):
-        read.get(name, lambda: shards.read_shard(tmp_path, 0))()
+    refuses(f"{name} cannot be read: it is a device or a pipe", read.get(name, lambda: shards.read_shard(tmp_path, 0)))

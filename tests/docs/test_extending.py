@@ -49,24 +49,22 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
                 sys.modules.pop(file.stem, None)
 
 
-def test_a_planner_solves_and_is_validated(names: dict[str, Any]) -> None:
+def test_planners_solve_and_are_validated(names: dict[str, Any]) -> None:
     bent = names["bent"]
     assert bent.solved and bent.planner == "one_bend" and len(bent.path.positions) == 3
     assert rd.verify(names["problem"], bent.path).valid
     assert rd.load_planner("one_bend").plan(names["problem"], seed=1).solved
-
-
-def test_a_learned_planner_solves_by_its_network(names: dict[str, Any]) -> None:
     sampled = names["sampled"]
     assert sampled.solved and sampled.stage == "network" and sampled.planner == "shortened_sample"
     assert rd.verify(names["problem"], sampled.path).valid
 
 
-def test_parts_of_the_learned_stack_are_used_by_name(names: dict[str, Any]) -> None:
+def test_parts_of_the_learned_stack_are_used_by_name_and_a_metric_is_measured(names: dict[str, Any]) -> None:
     assert names["training"].denoiser == "by_waypoint" and names["motions"].shape == (2, 48, 7)
     assert names["code"].shape == (5, names["encoder"].settings.code)
     at_once = names["at_once"]
     assert at_once.planner == "diffusion" and "samples of the network" in at_once.reason
+    assert names["values"]["steps"] == 2
 
 
 def test_a_family_draws_problems(names: dict[str, Any]) -> None:
@@ -75,10 +73,6 @@ def test_a_family_draws_problems(names: dict[str, Any]) -> None:
     assert len(names["drawn"].scene.shapes) <= 1 + family.max_obstacles
     first, again = (family.draw(names["problem"].robot, np.random.default_rng(3)) for _ in range(2))
     assert np.array_equal(first.start, again.start)
-
-
-def test_a_metric_is_measured(names: dict[str, Any]) -> None:
-    assert names["values"]["steps"] == 2
 
 
 def test_a_shape_is_everywhere(names: dict[str, Any], tmp_path: Path) -> None:

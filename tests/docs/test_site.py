@@ -12,8 +12,6 @@ from helpers.browsers import CHROMIUM
 
 ROOT = Path(__file__).parents[2]
 LOADED = re.compile(r'<(?:script|img|iframe|source)[^>]*\ssrc="(?:https?:)?//|<link[^>]*stylesheet[^>]*//')
-
-
 pytestmark = pytest.mark.slow
 
 
@@ -48,10 +46,11 @@ def test_the_search_works_without_a_server(site: Path) -> None:
         browser.close()
 
 
-def test_the_command_reference_has_every_option(site: Path) -> None:
+def test_the_command_reference_has_every_option_and_the_readme_is_short(site: Path) -> None:
     page = (site / "reference" / "commands.html").read_text(encoding="utf-8")
     options = ("data generate", "--safety-distance", "robotdiffuse bench report", "--no-replays")
     assert all(option in page for option in options)
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 130
 
 
 def test_the_python_reference_has_every_public_name(site: Path) -> None:
@@ -60,7 +59,3 @@ def test_the_python_reference_has_every_public_name(site: Path) -> None:
     page = (site / "reference" / "python.html").read_text(encoding="utf-8")
     for name in dir(rd):
         assert f'.{name}"' in page, name
-
-
-def test_the_readme_is_short() -> None:
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 130

@@ -15,6 +15,7 @@ import pytest
 
 import robotdiffuse as rd
 from helpers import faulty_planner, waiting
+from helpers.refusals import refuses
 from robotdiffuse.cli import main
 from robotdiffuse.core import registry
 from robotdiffuse.core.registry import Entry
@@ -220,8 +221,7 @@ def test_a_planner_with_settings_or_weights_of_the_package() -> None:
     calls = bench.PlannerSpec.parse("aorrtc:until=time_limit:gain=0.01:clearance=0")
     assert calls.request()["until"] == "time_limit" and calls.request()["clearance"] == 0
     assert calls.load().settings == AORRTCSettings(gain=0.01)
-    with pytest.raises(rd.InputError, match="until 'soon'; known: converged"):
-        bench.PlannerSpec.parse("aorrtc:until=soon")
+    refuses("until 'soon'; known: converged", bench.PlannerSpec.parse, "aorrtc:until=soon")
     nested = bench.PlannerSpec.parse("diffusion:guidance.margin=0.02:samples=4").load()
     assert isinstance(nested, Diffusion)
     assert (nested.settings.guidance.margin, nested.settings.samples) == (0.02, 4)
@@ -246,8 +246,7 @@ def test_line_that_was_cut_off_is_made_again(tmp_path: Path, cut: int) -> None:
     appended.append(replace(RECORD, seed=2))
     assert RecordFile(file).records == [RECORD, replace(RECORD, seed=2)]
     file.write_text(file.read_text() + '{"planner": 1}\n' + json.dumps(RECORD.row()) + "\n")
-    with pytest.raises(rd.InputError, match="line 3 is no record"):
-        RecordFile(file)
+    refuses("line 3 is no record", RecordFile, file)
 
 
 def test_nontrivial_problems_are_not_solved_by_the_line(tmp_path: Path) -> None:
@@ -272,8 +271,7 @@ def test_problems_of_files_and_folders(tmp_path: Path) -> None:
     assert [(case.problem_set, case.family) for case in cases] == [("mine", family) for family in "aba"]
     assert len(gather_cases([str(folder)], 2, tmp_path / "out", quiet)) == 2
     (tmp_path / "empty").mkdir()
-    with pytest.raises(rd.InputError, match="holds no usable problem"):
-        gather_cases([str(tmp_path / "empty")], None, tmp_path / "out", quiet)
+    refuses("holds no usable problem", gather_cases, [str(tmp_path / "empty")], None, tmp_path / "out", quiet)
 
 
 def test_other_problems_of_the_same_name_are_refused(tmp_path: Path) -> None:
@@ -289,8 +287,7 @@ def test_other_problems_of_the_same_name_are_refused(tmp_path: Path) -> None:
     with pytest.raises(rd.InputError, match=r"problems called mine that were read from .*; those in .* others"):
         gather_cases([other], None, tmp_path / "out", quiet)
     (tmp_path / "rop.jsonl").write_text(lines[0])
-    with pytest.raises(rd.InputError, match="have the name of the family rop"):
-        gather_cases([str(tmp_path / "rop.jsonl")], None, tmp_path / "out", quiet)
+    refuses("have the name of the family rop", gather_cases, [str(tmp_path / "rop.jsonl")], None, tmp_path / "out", quiet)
 
 
 def test_other_weights_of_the_same_name_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -303,8 +300,7 @@ def test_other_weights_of_the_same_name_are_refused(tmp_path: Path, monkeypatch:
     first, other = (settings(tmp_path / "out", f"mpnet@{tmp_path / at}/best", count=1) for at in "ab")
     for _ in range(2):
         bench.run_bench(first, quiet, quiet)
-    with pytest.raises(rd.InputError, match="has records of mpnet@best with other weights than those in"):
-        bench.run_bench(other, quiet, quiet)
+    refuses("has records of mpnet@best with other weights than those in", bench.run_bench, other, quiet, quiet)
 
 
 @pytest.mark.parametrize(
@@ -323,8 +319,7 @@ def test_other_weights_of_the_same_name_are_refused(tmp_path: Path, monkeypatch:
     ],
 )
 def test_bad_settings_are_told_before_anything_is_made(tmp_path: Path, change: dict, match: str) -> None:
-    with pytest.raises(rd.InputError, match=match):
-        bench.run_bench(replace(settings(tmp_path / "out"), **change), quiet, quiet)
+    refuses(match, bench.run_bench, replace(settings(tmp_path / "out"), **change), quiet, quiet)
     assert not (tmp_path / "out" / "records").exists()
 
 
@@ -350,8 +345,7 @@ def test_the_command_runs_every_stage_of_a_preset(tmp_path: Path, monkeypatch: p
 
 
 def test_a_preset_in_place_of_planners_and_limits(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(rd.InputError, match="unknown preset 'table2'; known: anytime"):
-        bench.preset_settings("table2", tmp_path)
+    refuses("unknown preset 'table2'; known: anytime", bench.preset_settings, "table2", tmp_path)
     asked = ["bench", "run", "--out", str(tmp_path)]
     assert main([*asked, "--planners", "rrt_connect"]) == 2
     assert "name --planners and --problems, or a --preset" in capfd.readouterr().err

@@ -10,6 +10,7 @@ import pytest
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.motion_stores import line, random_motions, record, write_motions
+from helpers.refusals import refuses
 from robotdiffuse.datasets.rows import motion_of, problem_of
 from robotdiffuse.datasets.shards import pick_rows, read_shard, shard_path, write_shard
 from robotdiffuse.evaluation.checks import check_data
@@ -127,8 +128,7 @@ def test_no_data_and_another_robot_are_refused(tmp_path):
     ):
         if rows is not None:
             write_motions(tmp_path, ARM, rows)
-        with pytest.raises(rd.InputError, match=message):
-            check_data(tmp_path, robot, pybullet=False)
+        refuses(message, check_data, tmp_path, robot, pybullet=False)
 
 
 def test_random_motions_are_the_same_for_the_same_seed_and_all_are_in_more_processes(tmp_path):
@@ -146,8 +146,7 @@ def test_missing_pybullet_is_one_line(tmp_path, monkeypatch):
     for name in [name for name in sys.modules if name.startswith("robotdiffuse.simulation")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "pybullet", None)
-    with pytest.raises(rd.InputError, match=r'pip install "robotdiffuse\[sim\]"'):
-        check_data(tmp_path, ARM)
+    refuses(r'pip install "robotdiffuse\[sim\]"', check_data, tmp_path, ARM)
     assert not check_data(tmp_path, ARM, pybullet=False).findings
 
 
@@ -162,14 +161,12 @@ def test_rows_are_problems_and_motions_again(tmp_path):
     assert isinstance(problem.goal, rd.JointGoal) and np.allclose(problem.goal.positions, near["goals"][:2])
     motion = motion_of(ARM, shard, 0)
     assert isinstance(motion, rd.Path) and np.array_equal(motion.positions, near["trajectories"])
-
     floor = {"center": [0.0, 0.0, -0.2], "size": [3.0, 2.0, 0.4]}
     floored = replace(manifest, floors={"rop": floor, "rop_dense": None})
     first, *others = problem_of(floored, ARM, shard, 0).scene.shapes
     assert isinstance(first, rd.Box) and first.size.tolist() == floor["size"] and first.name == "floor"
     assert len(others) == 2
-    with pytest.raises(rd.InputError, match="family is 0; the manifest has 0"):
-        problem_of(replace(manifest, families={}, floors={}), ARM, shard, 0)
+    refuses("family is 0; the manifest has 0", problem_of, replace(manifest, families={}, floors={}), ARM, shard, 0)
     times = np.linspace(0, 2, len(near["trajectories"]))
     write_shard(tmp_path, 0, {k: v[None] for k, v in (near | {"times": times}).items()}, {})
     motion = motion_of(ARM, read_shard(tmp_path, 0), 0)

@@ -87,15 +87,6 @@ def test_jerk_of_jumps_of_the_acceleration_by_hand() -> None:
     assert metrics.log_dimensionless_jerk(motion) == pytest.approx(np.log(2**5 / a**2 * integral), abs=1e-9)
 
 
-def test_spectral_arc_length_of_minimum_jerk_does_not_depend_on_the_duration() -> None:
-    """Side lobes of its spectrum stay below the threshold."""
-    for duration in (0.8, 1.0, 3.0, 7.3):
-        motion = minimum_jerk(duration, np.zeros(2), np.array([0.6, 0.3]))
-        found = metrics.measured(ARM, path_of(motion), motion)
-        # The last frequency is a multiple of 1 / (16 to 32 durations).
-        assert found["sparc_joint"] == pytest.approx(-1.41, abs=0.015)
-
-
 @pytest.mark.parametrize("width", [0.1, 0.35, 1.0])
 def test_spectral_arc_length_of_a_gaussian(width: float) -> None:
     """Its amplitude is exp(-(2 pi f width)^2 / 2), 0.05 at x = 1 with x = f / last."""

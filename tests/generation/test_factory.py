@@ -20,6 +20,7 @@ from numpy import ndarray
 
 import robotdiffuse as rd
 from helpers import factory_runs
+from helpers.refusals import refuses
 from helpers.sphere_oracles import least_clearance
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import OutputError
@@ -56,7 +57,8 @@ def test_a_folder_called_like_a_robot_does_not_hide_it_from_nodes(tmp_path, monk
     assert not names_a_file("panda") and names_a_file("./panda") and rd.load_robot("panda") is PANDA
 
 
-def rows_of(folder: Path) -> dict[str, ndarray]:
+@pytest.fixture(scope="module")
+def rows(folder: Path) -> dict[str, ndarray]:
     parts = [read_shard(folder, index) for index in range(SETTINGS.shards)]
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0].arrays}
 
@@ -112,8 +114,8 @@ def checked_problem(row: dict[str, Any]) -> tuple[rd.Problem, CollisionChecker]:
 
 
 @pytest.mark.parametrize("i", range(12))
-def test_every_trajectory_is_what_it_claims_to_be(i: int, folder: Path) -> None:
-    row: dict[str, Any] = {name: values[i] for name, values in rows_of(folder).items()}
+def test_every_trajectory_is_what_it_claims_to_be(i: int, rows: dict[str, ndarray]) -> None:
+    row: dict[str, Any] = {name: values[i] for name, values in rows.items()}
     problem, checker = checked_problem(row)
     q = np.array(row["trajectories"])
     goal = row["goals"][row["goal_index"]]
@@ -123,7 +125,6 @@ def test_every_trajectory_is_what_it_claims_to_be(i: int, folder: Path) -> None:
     assert rd.verify(problem, rd.Path(PANDA.joint_names, q.astype(float))).valid
     fine = np.concatenate([a + np.linspace(0, 1, 20)[:, None] * (b - a) for a, b in pairwise(q)])
     assert least_clearance(checker, fine.astype(float)).min() > -1e-3
-
     # costs: of the best goal, not shorter than the line, and hardly longer than the waypoints
     assert row["cost"] == row["goal_costs"][row["goal_index"]] == np.nanmin(row["goal_costs"])
     straight = np.linalg.norm(q[-1] - q[0])
@@ -134,7 +135,6 @@ def test_every_trajectory_is_what_it_claims_to_be(i: int, folder: Path) -> None:
     # even, but for waypoints that cut a corner
     assert length.max() <= row["cost"] / 31 * (1 + 1e-4)
     np.testing.assert_allclose(row["detour"], row["cost"] / straight, rtol=1e-5)
-
     # difficulty: by other means than the search's
     line = q[0] + np.linspace(0, 1, 400)[:, None] * (q[-1] - q[0])
     deepest = least_clearance(checker, line.astype(float)).min()
@@ -148,10 +148,8 @@ def test_every_trajectory_is_what_it_claims_to_be(i: int, folder: Path) -> None:
 
 
 @pytest.mark.parametrize("target", ["position", "pose"])
-def test_the_target_holds_for_all_goals(target: str, folder: Path) -> None:
-    if target == "position":
-        rows = rows_of(folder)
-    else:
+def test_the_target_holds_for_all_goals(target: str, rows: dict[str, ndarray]) -> None:
+    if target == "pose":
         rows, _ = make_shard(replace(SETTINGS, trajectories=3, target="pose"), 0)
     several = 0
     for goals, wanted in zip(rows["goals"], rows["target_pose"], strict=True):
@@ -203,8 +201,7 @@ def test_frames_in_time_keep_the_velocity_limits() -> None:
     ],
 )
 def test_bad_settings_are_refused(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(rd.InputError, match=message):
-        replace(SETTINGS, **change)
+    refuses(message, replace, SETTINGS, **change)
     assert GenerationSettings.from_json(AORRTC.to_json(), "settings") == AORRTC
 
 
@@ -218,8 +215,7 @@ def test_other_settings_are_refused_by_name(folder: Path) -> None:
         (replace(SETTINGS, search=search), r"search\.safety_distance 0\.05, not 0\.02"),
     ):
         before = factory_runs.contents(folder)
-        with pytest.raises(rd.InputError, match=message):
-            generate(changed, folder)
+        refuses(message, generate, changed, folder)
         assert factory_runs.contents(folder) == before
 
 
@@ -236,30 +232,23 @@ def test_data_of_other_versions_and_robots_are_refused(change, message, folder, 
     data = json.loads((folder / "manifest.json").read_text())
     change(data)
     (tmp_path / "manifest.json").write_text(json.dumps(data))
-    with pytest.raises(rd.InputError, match=message):
-        generate(SETTINGS, tmp_path)
+    refuses(message, generate, SETTINGS, tmp_path)
 
 
 def test_unusable_folders_workers_and_clusters_are_refused(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(rd.InputError, match="workers is 0"):
-        generate(SETTINGS, tmp_path / "data", 0)
-    with pytest.raises(rd.InputError, match=r"cluster.*slurm.*ray"):
-        generate(SETTINGS, tmp_path / "data", cluster="slurm")
+    refuses("workers is 0", generate, SETTINGS, tmp_path / "data", 0)
+    refuses(r"cluster.*slurm.*ray", generate, SETTINGS, tmp_path / "data", cluster="slurm")
     with lock_folder(tmp_path), pytest.raises(rd.InputError, match="another process is filling"):
         generate(SETTINGS, tmp_path)
     assert not list(tmp_path.iterdir())
     (tmp_path / "file").write_text("")
-    with pytest.raises(rd.InputError, match=r"cannot use the folder .*file"):
-        generate(SETTINGS, tmp_path / "file")
-    with pytest.raises(rd.InputError, match=r"below.* cannot be written: Not a directory"):
-        generate(SETTINGS, tmp_path / "file" / "below")
+    refuses(r"cannot use the folder .*file", generate, SETTINGS, tmp_path / "file")
+    refuses(r"below.* cannot be written: Not a directory", generate, SETTINGS, tmp_path / "file" / "below")
     shutil.copytree(folder / "shard_00000.zarr", tmp_path / "shard_00000.zarr")
-    with pytest.raises(rd.InputError, match="holds shards but no manifest"):
-        generate(SETTINGS, tmp_path)
+    refuses("holds shards but no manifest", generate, SETTINGS, tmp_path)
     for damaged in ("{", "[" * 100_000):
         (tmp_path / "manifest.json").write_text(damaged)
-        with pytest.raises(rd.InputError, match=r"manifest\.json is damaged"):
-            generate(SETTINGS, tmp_path)
+        refuses(r"manifest\.json is damaged", generate, SETTINGS, tmp_path)
 
 
 def test_furniture_among_the_families(tmp_path: Path) -> None:
@@ -403,8 +392,7 @@ def test_a_worker_killed_from_outside_is_one_line_and_the_next_call_goes_on(
             worker = multiprocessing.active_children()[0]
             os.kill(worker.pid or 0, signal.SIGKILL)
 
-    with pytest.raises(rd.InputError, match=r"worker process was killed.*run the same command again$"):
-        generate(MANY, tmp_path, workers=2, progress=kill)
+    refuses(r"worker process was killed.*run the same command again$", generate, MANY, tmp_path, workers=2, progress=kill)
     assert 0 < factory_runs.shards(tmp_path) < SHARDS
     monkeypatch.setattr(factory, "on_this_machine", factory_runs.in_this_process)
     generate(MANY, tmp_path)

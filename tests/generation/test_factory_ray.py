@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from helpers.factory_runs import contents, in_this_process
-from robotdiffuse.core.errors import InputError
+from helpers.refusals import refuses
 from robotdiffuse.evaluation.bench import BenchSettings, run_bench
 from robotdiffuse.evaluation.runs import read_records
 from robotdiffuse.generation import GenerationSettings, factory, generate
@@ -23,9 +23,7 @@ os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
 os.environ["RAY_DEDUP_LOGS_SKIP_REGEX"] = "Raylet is terminated"
 ray: Any = pytest.importorskip("ray", reason="the extra `cluster` (ray) is not installed")
 cluster_utils: Any = pytest.importorskip("ray.cluster_utils")
-
 pytestmark = pytest.mark.cluster
-
 SETTINGS = GenerationSettings(trajectories=24, shard=2, waypoints=16)
 STORE = 80 * 2**20
 """Smallest object store of a node, about [bytes]."""
@@ -73,14 +71,11 @@ def test_a_node_killed_midway_changes_nothing(cluster, tmp_path, monkeypatch):
         killer.join()
     assert seen == list(range(0, 25, 2)) and not ray.is_initialized()
     assert len(cluster.list_all_nodes()) == 1
-
     # nodes that make other data are refused, by what differs
     older = factory.versions() | {"numba": "0.1"}
     monkeypatch.setattr(factory, "versions", lambda: older)
-    with pytest.raises(InputError, match=r"node of the Ray cluster has numba .*, this machine 0\.1"):
-        generate(SETTINGS, tmp_path / "other", cluster="ray")
+    refuses(r"node of the Ray cluster has numba .*, this machine 0\.1", generate, SETTINGS, tmp_path / "other", cluster="ray")
     monkeypatch.undo()
-
     monkeypatch.setattr(factory, "on_this_machine", in_this_process)
     generate(SETTINGS, tmp_path / "here")
     assert contents(tmp_path / "ray") == contents(tmp_path / "here")
@@ -92,8 +87,7 @@ def test_clusters_that_nobody_listens_at_are_refused(tmp_path: Path, monkeypatch
         closed = f"127.0.0.1:{taken.getsockname()[1]}"
         for address in (closed, "nonsense", "127.0.0.1:70000"):
             monkeypatch.setenv("RAY_ADDRESS", address)
-            with pytest.raises(InputError, match=f"no Ray cluster.*{address}"):
-                generate(SETTINGS, tmp_path, cluster="ray")
+            refuses(f"no Ray cluster.*{address}", generate, SETTINGS, tmp_path, cluster="ray")
 
 
 @pytest.mark.slow

@@ -61,7 +61,6 @@ def fine() -> trimesh.Trimesh:
 VISUAL = '<visual><geometry><box size="0.05 0.05 0.05"/></geometry></visual>'
 CAPSULE = '<collision><geometry><capsule radius="0.03" length="0.05"/></geometry></collision>'
 XACRO = '<robot name="made" xmlns:xacro="http://www.ros.org/wiki/xacro">{}</robot>'
-
 WORKS: dict[str, tuple[Callable[[Path], Path], int]] = {
     "three joints": (arm(chain("base", row("j", 3))), 3),
     "a gantry": (
@@ -93,7 +92,6 @@ WORKS: dict[str, tuple[Callable[[Path], Path], int]] = {
     "xacro": (text(XACRO.format(robot(ARM).split(">", 1)[1][: -len("</robot>")]), "made.urdf.xacro"), 4),
 }
 """What is made, and how many joints are planned."""
-
 NOTHING = "<robot name='bare'><link name='base'/></robot>"
 REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
     "a missing mesh": (

@@ -26,7 +26,6 @@ DESCRIPTIONS = {
     "xarm7": "xarm_description/urdf/xarm7.urdf",
     "ur5": "ur_description/urdf/ur5_joint_limited_robot.urdf",
 }
-
 AWKWARD = """<robot name="awkward">
   <link name="floor"/> <link name="base"/> <link name="rail"/> <link name="turret"/> <link name="arm"/>
   <link name="bracket"/> <link name="wrist"/> <link name="flange"/> <link name="tool"/> <link name="lid"/>

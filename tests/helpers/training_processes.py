@@ -1,12 +1,7 @@
-"""Trainings in processes of their own, for tests that kill them or start several by torchrun.
-
-python training_processes.py slow SETTINGS.json OUT        a training whose steps take a while
-torchrun ... training_processes.py two SETTINGS.json OUT   trainings that two processes share
-"""
+"""Trainings that two processes share: torchrun ... training_processes.py SETTINGS.json OUT."""
 
 import json
 import sys
-import time
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -19,19 +14,7 @@ from robotdiffuse.learning.training import tasks as training
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
 from robotdiffuse.learning.training.loop import Processes, TrainingRun
 
-STEP_SECONDS = 0.3
 STOP_AFTER = 3
-
-
-def slow(settings: PlannerTraining, out: Path) -> None:
-    original = TrainingRun.step
-
-    def step(self):
-        time.sleep(STEP_SECONDS)
-        original(self)
-
-    TrainingRun.step = step
-    training.train_planner(settings, str(out))
 
 
 def two(settings: PlannerTraining, out: Path) -> None:
@@ -75,13 +58,13 @@ def bad_step_in_one(out: str) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    kind, values, folder = sys.argv[1:]
+    values, folder = sys.argv[1:]
     arm = box_arm()
     training.load_robot = lambda name: arm
     given = PlannerTraining.from_json(json.loads(Path(values).read_text()), "settings")
 
     def run() -> int:
-        {"slow": slow, "two": two}[kind](given, Path(folder))
+        two(given, Path(folder))
         return 0
 
     exit_fast(run)

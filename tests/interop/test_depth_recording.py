@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import robotdiffuse as rd
 from helpers.explorations import FLOOR, HOME, WALL
+from helpers.refusals import refuses
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.interop import depth_recording, ros2
 from robotdiffuse.interop.ros2 import JOINT_STATE, McapWriter, to_message, typestore
@@ -141,8 +142,7 @@ def test_bags_hold_what_mcap_files_do(name: str, tmp_path: Path) -> None:
     assert view.configuration is not None and twin.configuration is not None
     np.testing.assert_array_equal(view.configuration, twin.configuration)
     if name == "folder":
-        with pytest.raises(rd.InputError, match="part of a ROS 2 bag: give the folder"):
-            list(rd.read_depth_views(next((tmp_path / name).glob("*.db3")), PANDA))
+        refuses("part of a ROS 2 bag: give the folder", list, rd.read_depth_views(next((tmp_path / name).glob("*.db3")), PANDA))
 
 
 def realsense(file: Path, compression: Writer1.CompressionFormat | None = None, zeros: int = 0) -> Path:
@@ -168,8 +168,7 @@ def test_bags_of_librealsense(compression: Writer1.CompressionFormat | None, tmp
     assert stamp == 3.0 and view.configuration is None and view.intrinsics == (300.0, 310.0, 0.5, 0.4)
     np.testing.assert_allclose(view.depth, [[0.5, 0.0], [1.5, 2.0]], rtol=1e-6)
     np.testing.assert_array_equal(view.T_base_camera, T)
-    with pytest.raises(rd.InputError, match="no transforms lead from panda_link0 to 0"):
-        list(rd.read_depth_views(file, PANDA))
+    refuses("no transforms lead from panda_link0 to 0", list, rd.read_depth_views(file, PANDA))
 
 
 @pytest.mark.parametrize("compression", Writer1.CompressionFormat)
@@ -179,16 +178,14 @@ def test_small_bags_that_unpack_to_much_are_refused(
     monkeypatch.setattr("robotdiffuse.interop.ros2.MAX_UNPACKED", 10**6)
     file = realsense(tmp_path / "r.bag", compression, zeros=2 * 10**6)
     assert file.stat().st_size < 10**5
-    with pytest.raises(rd.InputError, match="a chunk of more than 1,000,000 bytes"):
-        list(rd.read_depth_views(file, PANDA, T_base_camera=np.eye(4)))
+    refuses("a chunk of more than 1,000,000 bytes", list, rd.read_depth_views(file, PANDA, T_base_camera=np.eye(4)))
 
 
 @pytest.mark.parametrize("size", (0, 40, 5000))
 def test_damaged_bags_are_refused(size: int, tmp_path: Path) -> None:
     file = realsense(tmp_path / "r.bag")
     file.write_bytes(file.read_bytes()[:size])
-    with pytest.raises(rd.InputError, match=r"r\.bag is damaged"):
-        list(rd.read_depth_views(file, PANDA, T_base_camera=np.eye(4)))
+    refuses(r"r\.bag is damaged", list, rd.read_depth_views(file, PANDA, T_base_camera=np.eye(4)))
 
 
 def with_velocities_alone(messages: dict[str, Any]) -> None:
@@ -252,15 +249,12 @@ def test_an_image_without_a_joint_state_leaves_the_rest(tmp_path: Path) -> None:
     ],
 )
 def test_what_is_missing_is_said(change: Callable[[dict[str, Any]], object], message: str, tmp_path: Path) -> None:
-    with pytest.raises(rd.InputError, match=message) as error:
-        list(rd.read_depth_views(recording(tmp_path / "r.mcap", change), PANDA))
-    assert "\n" not in str(error.value)
+    refuses(message, list, rd.read_depth_views(recording(tmp_path / "r.mcap", change), PANDA))
 
 
 def test_other_files_and_topics_are_refused(tmp_path: Path) -> None:
     (tmp_path / "text.mcap").write_text("no recording")
-    with pytest.raises(rd.InputError, match="damaged"):
-        list(rd.read_depth_views(tmp_path / "text.mcap", PANDA))
+    refuses("damaged", list, rd.read_depth_views(tmp_path / "text.mcap", PANDA))
     with pytest.raises(rd.InputError, match="'/other' holds no images; topics of images: /camera/image_rect"):
         list(rd.read_depth_views(recording(tmp_path / "r.mcap"), PANDA, ["/other"]))
     view = rd.DepthView(np.ones((2, 2)), (300, 300, 0.5, 0.5), np.eye(4))
@@ -285,15 +279,12 @@ def test_chains_are_followed_and_interpolated_and_at_the_ends_the_nearest_counts
 
 
 def test_missing_transforms_are_said() -> None:
-    with pytest.raises(rd.InputError, match=r"no transform of link within 0\.1 s of the image"):
-        history().at("base", "camera", 6.0, 0.1, "the image")
+    refuses(r"no transform of link within 0\.1 s of the image", history().at, "base", "camera", 6.0, 0.1, "the image")
     with pytest.raises(rd.InputError, match=r"no transforms lead from world to camera.*lead to link, base"):
         history().at("world", "camera", 5.0, 0.1, "the image")
     circle = history()
     circle.add(pose("camera", "base", 5.0), static=True)
-    with pytest.raises(rd.InputError, match="no transforms lead from world"):
-        circle.at("world", "camera", 5.0, 0.1, "the image")
+    refuses("no transforms lead from world", circle.at, "world", "camera", 5.0, 0.1, "the image")
     bad = pose("base", "link", 5.0)
     bad["transform"]["rotation"] = dict.fromkeys("xyzw", 0.0)
-    with pytest.raises(rd.InputError, match="the transform of link has the rotation"):
-        circle.add(bad, static=False)
+    refuses("the transform of link has the rotation", circle.add, bad, static=False)

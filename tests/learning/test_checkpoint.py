@@ -9,8 +9,8 @@ import torch
 
 from helpers.box_arm import box_arm
 from helpers.example_robots import planar_arm
+from helpers.refusals import refuses
 from helpers.small_model import cloud, save_small_model, small_model
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning import checkpoint
 
 pytestmark = pytest.mark.usefixtures("no_export")
@@ -30,8 +30,7 @@ def test_checkpoint_round_trip(tmp_path):
     np.testing.assert_allclose(z[1], z[0], atol=5e-3)
     assert checkpoint.fingerprint(checkpoint.load_model(tmp_path)) == checkpoint.fingerprint(loaded)
     assert checkpoint.fingerprint(loaded) != checkpoint.fingerprint(small_model(1))
-    with pytest.raises(InputError, match=r"no trained model: encoder\.json"):
-        checkpoint.load_encoder(tmp_path / "nothing")
+    refuses(r"no trained model: encoder\.json", checkpoint.load_encoder, tmp_path / "nothing")
 
 
 def test_wrong_robot_is_refused(tmp_path):
@@ -44,8 +43,7 @@ def test_wrong_robot_is_refused(tmp_path):
         (planar_arm(0.5, 0.4), r"model\.json was trained for .* with joints"),
         (bare, "has spheres on the links l1, l2, not l1, l2, l3"),
     ):
-        with pytest.raises(InputError, match=message):
-            checkpoint.load_model(tmp_path, robot)
+        refuses(message, checkpoint.load_model, tmp_path, robot)
 
 
 def weights(change):
@@ -90,6 +88,4 @@ def setting(**values):
 def test_damaged_weights_give_one_line(tmp_path, damage, file):
     save_small_model(tmp_path)
     damage(tmp_path)
-    with pytest.raises(InputError, match=file) as caught:
-        checkpoint.load_model(tmp_path)
-    assert "\n" not in str(caught.value)
+    refuses(file, checkpoint.load_model, tmp_path)

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers.box_arm import box_arm
+from helpers.refusals import refuses
 from helpers.stores import manifest_of, random_arrays
 from robotdiffuse.cli import main
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.datasets.shards import write_manifest, write_shard
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning import encoders
@@ -149,8 +149,7 @@ def test_settings_are_read_by_name(name):
     z = MotionNetwork(RobotIdentity.of(box_arm()), settings).encode(cloud(3000)[0].numpy().astype(np.float64))
     assert z.shape == (SMALL[name].code,)
     other = next(other for other in SMALL.values() if other is not SMALL[name])
-    with pytest.raises(InputError, match=f"encoder is {name}, but its settings are {type(other).__name__}"):
-        replace(settings, encoder_settings=other)
+    refuses(f"encoder is {name}, but its settings are {type(other).__name__}", replace, settings, encoder_settings=other)
 
 
 def test_arranged_clouds():
@@ -322,5 +321,4 @@ def test_batches_with_clouds_instead_of_codes(data):
     ],
 )
 def test_parts_that_do_not_fit_are_refused(kind, parts, message):
-    with pytest.raises(InputError, match=message):
-        kind(**({"data": "data"} if kind is PlannerTraining else {}), **parts)
+    refuses(message, kind, **({"data": "data"} if kind is PlannerTraining else {}), **parts)

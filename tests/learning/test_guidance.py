@@ -170,8 +170,7 @@ def waves(seed: int = 0) -> np.ndarray:
 
 
 def constraint_cost(constraints: PathConstraints, share: float, q: np.ndarray) -> np.ndarray:
-    """The cost of trajectories [count, waypoints, dof], [count]: the sum of h² / 2 over rows and
-    waypoints."""
+    """The cost of trajectories [count, waypoints, dof], [count]: the sum of h² / 2 over rows and waypoints."""
     unit = np.where(constraints.rows.row_kind == DISTANCE, 1.0, ANGLE_WEIGHT)
     beyond = constraints.values(q.reshape(-1, q.shape[2])) - constraints.limits(share)
     return 0.5 * ((unit * np.maximum(beyond, 0.0)) ** 2).sum(axis=1).reshape(q.shape[:2]).sum(axis=1)

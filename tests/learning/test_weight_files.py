@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robotdiffuse.core.errors import InputError
+from helpers.refusals import refuses
 from robotdiffuse.learning.exported_model import OnnxNetwork
 from robotdiffuse.learning.weight_files import checked_bytes, read_description
 
@@ -20,14 +20,12 @@ def test_a_pipe_and_a_link_to_a_device_are_not_read(name: str, tmp_path: Path) -
         else:
             (tmp_path / file).symlink_to("/dev/zero")
     for read in (lambda: read_description(tmp_path, "model"), lambda: checked_bytes(tmp_path / "model.onnx", "", "model.json")):
-        with pytest.raises(InputError, match="it is a device or a pipe"):
-            read()
+        refuses("it is a device or a pipe", read)
 
 
 def test_a_nested_description_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "model.json").write_text("[" * 100_000)
-    with pytest.raises(InputError, match="nested more than 64 levels deep"):
-        read_description(tmp_path, "model")
+    refuses("nested more than 64 levels deep", read_description, tmp_path, "model")
 
 
 def test_a_network_reads_no_other_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -43,5 +41,4 @@ def test_a_network_reads_no_other_file(tmp_path: Path, monkeypatch: pytest.Monke
     model.graph.initializer[0].ClearField("raw_data")
     (tmp_path / "w.bin").write_bytes(np.ones(4, np.float32).tobytes())
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match=r"outside\.onnx keeps weights in another file"):
-        OnnxNetwork(model.SerializeToString(), "outside.onnx")
+    refuses(r"outside\.onnx keeps weights in another file", OnnxNetwork, model.SerializeToString(), "outside.onnx")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.refusals import refuses
 from helpers.sphere_oracles import depth_of_balls
 from robotdiffuse.perception.observed_volume import ObservedVolume, observe
 from robotdiffuse.perception.voxel_grid import LOW, SHAPE, VOXEL
@@ -149,7 +150,5 @@ def test_missing_returns_and_flying_pixels_change_little() -> None:
 
 
 def test_no_views_and_another_robots_configuration_are_refused() -> None:
-    with pytest.raises(rd.InputError, match="views is empty"):
-        observe([], PANDA, HOME)
-    with pytest.raises(rd.InputError, match="has 3 numbers; panda plans 7"):
-        observe([view(flat(1.0), q=np.zeros(3))], PANDA, HOME)
+    refuses("views is empty", observe, [], PANDA, HOME)
+    refuses("has 3 numbers; panda plans 7", observe, [view(flat(1.0), q=np.zeros(3))], PANDA, HOME)

@@ -57,8 +57,7 @@ def test_near_voxels_are_occupied_together() -> None:
 
 @pytest.mark.parametrize("more", [0, 9])
 def test_nothing_that_may_be_occupied_is_free_in_every_world(more: int) -> None:
-    """Also in a grid larger than the observed volume, as the map of an exploration is: an index was out of
-    bounds."""
+    """Also in a grid larger than the observed volume, as the map of an exploration is: an index was out of bounds."""
     shape = tuple(size + more for size in FINE_SHAPE)
     assert free_share(np.zeros(shape, np.float32), np.ones(shape, np.bool_)) == 1
     assert free_share(np.ones(shape, np.float32), np.ones(shape, np.bool_)) == 0

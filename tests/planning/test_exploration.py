@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 
 import robotdiffuse as rd
 from helpers.explorations import FLOOR, HOME, WALL, ZONE, recorded
+from helpers.refusals import refuses
 from robotdiffuse.perception.occupancy_map import OccupancyMap, ViewMemory
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.perception.unknown_space import CARVING_MARGIN
@@ -144,8 +145,7 @@ def test_looks_see_what_is_wanted() -> None:
 
 def test_what_keeps_the_arm_from_going_is_said() -> None:
     blind = explorer(seen=False)
-    with pytest.raises(rd.InputError, match="call set_goal first"):
-        blind.next(HOME)
+    refuses("call set_goal first", blind.next, HOME)
     blind.set_goal(HOME)
     assert blind.next(HOME).kind == "done"
     blind.set_goal(HOME + 0.3)
@@ -340,8 +340,7 @@ def test_a_motion_that_nothing_is_in_the_way_of_goes_on(motion: rd.Trajectory) -
     explorer = explorer_with_view(apart, motion.at(0.2).positions)
     assert explorer.stop(motion, 0.3) is None
     for time in (-0.1, motion.duration + 0.1, np.nan):
-        with pytest.raises(rd.InputError, match="time is"):
-            explorer.stop(motion, time)
+        refuses("time is", explorer.stop, motion, time)
 
 
 def test_certified_stops_before_a_ball_that_appears_are_free_in_the_true_scene(motion: rd.Trajectory) -> None:

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robotdiffuse import Box, InputError, PlanResult, Problem, Scene, load_planner, load_robot, next_view
+from helpers.refusals import refuses
+from robotdiffuse import Box, PlanResult, Problem, Scene, load_planner, load_robot, next_view
 from robotdiffuse.cli import main
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
@@ -92,13 +93,9 @@ def test_it_looks_from_where_nothing_is_in_the_way(problem: Problem, result: Pla
 
 
 def test_misuse_is_refused(problem: Problem, result: PlanResult, capsys: pytest.CaptureFixture) -> None:
-    with pytest.raises(InputError, match="has no views"):
-        next_view(Problem(PANDA, Scene(), START, GOAL), result)
-    with pytest.raises(InputError, match="poses is empty"):
-        next_view(problem, result, [])
-    with pytest.raises(InputError, match="no motion"):
-        next_view(problem, replace(result, path=None, trajectory=None))
-    with pytest.raises(InputError, match="T_base_camera"):
-        next_view(problem, result, [2 * np.eye(4)])
+    refuses("has no views", next_view, Problem(PANDA, Scene(), START, GOAL), result)
+    refuses("poses is empty", next_view, problem, result, [])
+    refuses("no motion", next_view, problem, replace(result, path=None, trajectory=None))
+    refuses("T_base_camera", next_view, problem, result, [2 * np.eye(4)])
     assert main(["plan", "examples/two_spheres.yaml", "--next-view"]) == 2
     assert "--next-view needs a problem with views" in capsys.readouterr().err

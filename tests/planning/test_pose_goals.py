@@ -14,6 +14,7 @@ from numpy import ndarray
 
 import robotdiffuse as rd
 from helpers.made_arms import chain, read_urdf, row, written
+from helpers.refusals import refuses
 from robotdiffuse.certificates.checker import check
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.transforms import rotation_angle, rotation_from_rpy, transform
@@ -112,6 +113,10 @@ def test_a_pose_out_of_reach_is_named_alone() -> None:
     result = rd.plan(rd.Problem(baxter(), rd.Scene(), start, goal), time_limit=60.0)
     assert result.status is rd.Status.UNREACHABLE_GOAL
     assert result.reason.endswith("brings left_gripper to the pose at (3.000, 0.000, 0.000) m")
+    robot = rd.load_robot("panda")
+    goal = rd.PoseGoal(robot.tip, transform(np.array([0.0, 0.0, 1.5])))
+    result = rd.plan(rd.Problem(robot, FREE, apart(robot, 1)[0], goal))
+    assert result.status is rd.Status.UNREACHABLE_GOAL
 
 
 def test_files_keep_them(tmp_path: Path) -> None:
@@ -146,9 +151,7 @@ def asked(*links: str) -> rd.Problem:
     ],
 )
 def test_what_makes_no_sense_is_one_line(make: Any, message: str) -> None:
-    with pytest.raises(rd.InputError, match=message) as refused:
-        make()
-    assert "\n" not in str(refused.value)
+    refuses(message, make)
 
 
 ARMS = ("iiwa14", "gen3", "panda", "ur5e")
@@ -189,7 +192,7 @@ def followed(robot: rd.Robot, start: ndarray, shift: ndarray) -> ndarray | None:
 def test_a_pose_where_the_hand_is_costs_no_motion(arm: str) -> None:
     """An iiwa14 moved by 3.2 rad."""
     robot = rd.load_robot(arm)
-    for k, start in enumerate(apart(robot, 4)):
+    for k, start in enumerate(apart(robot, 2)):
         start = start + 2 * np.pi * np.where(robot.continuous, k, 0)
         here = rd.PoseGoal(robot.tip, link_pose(robot, start, robot.tip))
         for goal in (here, rd.PoseGoal(robot.tip, here.T_base_frame, [0.01] * 3, [0.1, 0.1, np.pi])):
@@ -202,14 +205,12 @@ def test_a_pose_nearby_is_reached_by_the_nearest_configuration(arm: str) -> None
     """Alone, after a waypoint, as one of several goals, and along a straight line."""
     robot = rd.load_robot(arm)
     rng = np.random.default_rng(2)
-    tested = 0
     for start in apart(robot, 12):
         shift = rng.normal(size=3)
         shift *= 0.05 / np.linalg.norm(shift)
         there = followed(robot, start, shift)
         if there is None:
             continue
-        tested += 1
         T = link_pose(robot, start, robot.tip)
         here = rd.PoseGoal(robot.tip, T)
         goal = rd.PoseGoal(robot.tip, transform(T[:3, 3] + shift, T[:3, :3]))
@@ -225,8 +226,7 @@ def test_a_pose_nearby_is_reached_by_the_nearest_configuration(arm: str) -> None
             assert result.solved, result.reason
             assert result.path.length <= longest
             assert result.goal_index == (1 if isinstance(problem.goal, rd.AnyGoal) else 0)
-        if tested == 2:
-            return
+        return
     raise AssertionError("no starts")
 
 
@@ -246,7 +246,7 @@ def test_arms_of_few_joints_reach_poses_with_tolerances(arm: str, kind: str, tmp
     rng = np.random.default_rng(1)
     rpy = {"any orientation": [np.pi] * 3, "±0.5 rad": [0.5] * 3, "1 mm off": None}[kind]
     solved = 0
-    for there in apart(robot, 15):
+    for there in apart(robot, 8):
         T = link_pose(robot, there, robot.tip)
         if rpy is None:
             direction = rng.normal(size=3)
@@ -260,14 +260,7 @@ def test_arms_of_few_joints_reach_poses_with_tolerances(arm: str, kind: str, tmp
             off = np.linalg.norm(link_pose(robot, result.path.positions[-1], robot.tip)[:3, 3] - T[:3, 3])
             assert off < 4e-3, "near the pose, not at the edge of what the validator accepts"
             assert any("no configuration reaches the goal pose exactly" in note for note in result.notes)
-    assert solved >= 14
-
-
-def test_a_pose_out_of_reach_by_more_than_the_validator_accepts_stays_so() -> None:
-    robot = rd.load_robot("panda")
-    goal = rd.PoseGoal(robot.tip, transform(np.array([0.0, 0.0, 1.5])))
-    result = rd.plan(rd.Problem(robot, FREE, apart(robot, 1)[0], goal))
-    assert result.status is rd.Status.UNREACHABLE_GOAL
+    assert solved >= 7
 
 
 def many_grasps() -> tuple[rd.Problem, ndarray]:

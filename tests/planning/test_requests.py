@@ -60,8 +60,6 @@ ASKED: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "views and a cone": ({"seen": True, "constraints": [CONE]}, {}),
 }
 """What the problem has, and what the call asks for."""
-
-
 planner_named = cache(rd.load_planner)
 
 

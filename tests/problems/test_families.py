@@ -5,6 +5,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
+from helpers.refusals import refuses
 from robotdiffuse import Box, InputError, Scene, Sphere, load_robot
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.generation.factory import TARGETS
@@ -130,8 +131,7 @@ def test_obstacles_stay_clear_of_the_base() -> None:
             gaps = np.linalg.norm(points[:, None] - keep_out[:, :3], axis=2) - keep_out[:, 3]
             assert gaps.min() > 0
             assert isinstance(shape, Sphere | Box) and np.linalg.norm(shape.center - keep_out[0, :3]) > 0.15
-    with pytest.raises(InputError, match="widen"):
-        replace(ROP, x=(0.0, 0.0), y=(0.0, 0.0), z=(0.1, 0.1)).scene(rng, keep_out)
+    refuses("widen", replace(ROP, x=(0.0, 0.0), y=(0.0, 0.0), z=(0.1, 0.1)).scene, rng, keep_out)
 
 
 @pytest.mark.parametrize(
@@ -143,5 +143,4 @@ def test_obstacles_stay_clear_of_the_base() -> None:
     ],
 )
 def test_wrong_settings(change: dict[str, object], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        replace(ROP, **change)  # type: ignore[arg-type]
+    refuses(message, replace, ROP, **change)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.refusals import refuses
 from robotdiffuse.problems.held_out import Case, CaseFile, held_out_problem, line_length
 
 
@@ -79,11 +80,9 @@ def test_damaged_lines_are_named(tmp_path: Path) -> None:
     file = tmp_path / "rop.jsonl"
     for line, message in (("[1, 2]", "line 1 is not a JSON object"), ('{"drawn": 3}', "line 1 has drawn")):
         file.write_text(line + "\n")
-        with pytest.raises(rd.InputError, match=message):
-            CaseFile(file)
+        refuses(message, CaseFile, file)
 
 
 def test_two_of_one_name_are_refused() -> None:
     case = Case("a", "mine", held_out_problem("rop", 0), False)
-    with pytest.raises(rd.InputError, match="two problems are called a"):
-        CaseFile(None).fill([case, case])
+    refuses("two problems are called a", CaseFile(None).fill, [case, case])

@@ -9,6 +9,7 @@ from numpy import ndarray
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm, box_mesh
+from helpers.refusals import refuses
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.robots.bodies import ConvexMesh
@@ -151,6 +152,4 @@ def test_a_tool_is_the_tip_and_its_shapes_are_in_the_frame_of_its_link() -> None
     ],
 )
 def test_what_cannot_be_held_is_refused_in_one_line(wrong, message: str) -> None:
-    with pytest.raises(rd.InputError, match=message) as raised:
-        wrong(box_arm())
-    assert "\n" not in str(raised.value)
+    refuses(message, wrong, box_arm())

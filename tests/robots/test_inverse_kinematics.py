@@ -46,8 +46,7 @@ def test_solutions_are_exact_distinct_and_within_limits(name: str) -> None:
 
 
 def test_ur5_has_at_most_eight_solutions() -> None:
-    """A 6R arm with a nearly spherical wrist and joints of one turn has the eight solutions of the
-    textbook."""
+    """A 6R arm with a nearly spherical wrist and joints of one turn has the eight solutions of the textbook."""
     robot = example_robot("ur5")
     rng = np.random.default_rng(5)
     counts = []

@@ -81,8 +81,7 @@ def test_files_keep_all_tips(tmp_path: Path) -> None:
 
 
 def test_spheres_parts_and_the_arms_of_one_robot_agree() -> None:
-    """Configurations that are free by spheres are free by parts; Baxter's left arm has the same poses as
-    alone."""
+    """Configurations that are free by spheres are free by parts; Baxter's left arm has the same poses as alone."""
     robot = two_arms()
     rng = np.random.default_rng(0)
     q = rng.uniform(robot.lower, robot.upper, (2000, robot.dof))

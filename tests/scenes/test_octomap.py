@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.refusals import refuses
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.scenes.point_cloud import TREE_DEPTH, occupied_voxels, read_octomap
@@ -70,8 +71,7 @@ def test_an_octomap_is_a_cloud_of_a_problem_file(tmp_path: Path) -> None:
 )
 def test_damaged_octomaps(content: bytes, message: str, tmp_path: Path) -> None:
     (tmp_path / "map.bt").write_bytes(content)
-    with pytest.raises(rd.InputError, match=message):
-        read_octomap(tmp_path / "map.bt")
+    refuses(message, read_octomap, tmp_path / "map.bt")
 
 
 def test_a_height_map_is_an_obstacle_with_holes(tmp_path: Path) -> None:
@@ -97,10 +97,8 @@ def test_wrong_height_maps() -> None:
         ([[0.0, 1e9], [0, 0]], "not within"),
         ([[np.nan, 1], [0, 0]], "no cell of four heights"),
     ):
-        with pytest.raises(rd.InputError, match=message):
-            rd.HeightMap(heights, 0.1)
-    with pytest.raises(rd.InputError, match="'height_map' is a height_map; it must be one of sphere"):
-        rd.HeightMap(np.zeros((2, 2)), 0.1).solid()
+        refuses(message, rd.HeightMap, heights, 0.1)
+    refuses("'height_map' is a height_map; it must be one of sphere", rd.HeightMap(np.zeros((2, 2)), 0.1).solid)
 
 
 @pytest.mark.parametrize("edge", [1, 2, 4, 8])

@@ -9,6 +9,7 @@ import trimesh
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
+from helpers.refusals import refuses
 from robotdiffuse.collision.checker import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.types import Path as JointPath
@@ -53,7 +54,6 @@ def test_an_allowed_contact_is_allowed_everywhere(kind: str) -> None:
         assert nearest is None or nearest.distance > 0
     assert not rd.certify(problem, result.trajectory).check(problem).differences
     assert problem.clearance_at(HOME) > 0
-
     other = replace(problem, scene=rd.Scene(problem.scene.shapes))
     report = rd.verify(other, result.trajectory)
     assert report.violation is not None and "mug" in report.violation.message
@@ -103,13 +103,11 @@ def test_held_objects_are_links() -> None:
 
 
 def test_unknown_names_are_errors_with_the_known_ones() -> None:
-    with pytest.raises(rd.InputError, match=r"unknown obstacle in allowed_contacts: 'cup'; known: ball, wall"):
-        rd.Scene([BALL, WALL], {"cup": "all"})
+    refuses(r"unknown obstacle in allowed_contacts: 'cup'; known: ball, wall", rd.Scene, [BALL, WALL], {"cup": "all"})
     with pytest.raises(rd.InputError, match=r"unknown link in allowed_contacts of ball: 'l9'; known: .*l1, l2"):
         rd.Problem(box_arm(), rd.Scene([BALL], {"ball": ["l9"]}), [0, 0, 1.0], [0, 0, -1.0])
     for wrong in ([["ball"]], "ball", 3, {"ball": "l3"}, {"ball": 3}, {"ball": [3]}, {3: "all"}):
-        with pytest.raises(rd.InputError, match="allowed_contacts"):
-            rd.Scene([BALL], wrong)  # type: ignore[arg-type]
+        refuses("allowed_contacts", rd.Scene, [BALL], wrong)
 
 
 def test_a_name_given_twice_stands_for_both() -> None:
@@ -139,5 +137,4 @@ def test_allowed_contacts_come_back_from_files(tmp_path: Path) -> None:
     assert "ball: all" in text
     assert rd.load_problem(tmp_path / "grasp.yaml").scene.allowed_contacts == problem.scene.allowed_contacts
     (tmp_path / "grasp.yaml").write_text(text.replace("ball: all", "bell: all"))
-    with pytest.raises(rd.InputError, match=r"grasp.yaml: unknown obstacle in allowed_contacts: 'bell'"):
-        rd.load_problem(tmp_path / "grasp.yaml")
+    refuses(r"grasp.yaml: unknown obstacle in allowed_contacts: 'bell'", rd.load_problem, tmp_path / "grasp.yaml")

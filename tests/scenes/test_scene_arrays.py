@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from helpers.refusals import refuses
 from helpers.sphere_oracles import distance
-from robotdiffuse import Box, Capsule, Cylinder, InputError, Scene
+from robotdiffuse import Box, Capsule, Cylinder, Scene
 from robotdiffuse.problems.families.rop import ROP_DENSE
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 
@@ -79,10 +80,7 @@ def test_turned_scenes_have_turned_distances() -> None:
 
 def test_what_cannot_be_packed() -> None:
     (scene,) = some_scenes(1)
-    with pytest.raises(InputError, match="2 slots"):
-        PackedScenes.pack([scene], 2)
-    with pytest.raises(InputError, match="cylinder"):
-        PackedScenes.pack([Scene([Cylinder([0, 0, 0], 1, 1)])], 2)
+    refuses("2 slots", PackedScenes.pack, [scene], 2)
+    refuses("cylinder", PackedScenes.pack, [Scene([Cylinder([0, 0, 0], 1, 1)])], 2)
     for floor in (Capsule([0, 0, 0], 1, 1), Box([0, 0, 0], [1, 1, 1], [1, 1, 0, 0])):
-        with pytest.raises(InputError, match=f"is a {floor.kind}; it must be a box without rotation"):
-            PackedScenes.pack([Scene([floor])], 2, floor=True)
+        refuses(f"is a {floor.kind}; it must be a box without rotation", PackedScenes.pack, [Scene([floor])], 2, floor=True)

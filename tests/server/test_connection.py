@@ -164,9 +164,8 @@ def test_bytes_after_the_last_request_do_not_cut_its_answer_off(head: bytes) -> 
 
 
 def test_a_cancelled_call_is_left_before_it_begins_and_when_it_checks_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A call cancelled while its worker was still reading it went on planning, and the worker was killed. A
-    signal handler raised the exception anywhere in the call; inside a callback of compiled code it killed the
-    worker."""
+    """A call cancelled while its worker was still reading it went on planning, and the worker was killed. A signal handler
+    raised the exception anywhere in the call; inside a callback of compiled code it killed the worker."""
     worker.accept({}, ServeSettings())
     answers = iter([True])
     monkeypatch.setattr(worker, "cancelled", lambda: next(answers))

@@ -21,6 +21,7 @@ import robotdiffuse as rd
 from helpers import waiting
 from helpers.commands import run
 from helpers.faulty_planner import DIES, EATS, EXITS, HANGS, KEEPS, RAISES, SEARCHES
+from helpers.refusals import refuses
 from helpers.serving import serving
 from robotdiffuse.cli.serve import served_robots
 from robotdiffuse.core.types import UNTIL
@@ -370,7 +371,5 @@ def test_robots_named_at_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     shutil.copytree(DATA / "panda", tmp_path / "mine")
     assert set(served_robots(["mine"])) == {*ROBOTS, "mine"}
     for name in ("panda", str(tmp_path / "mine")):  # the robot in the folder is also called panda
-        with pytest.raises(rd.InputError, match="has the name panda of another robot"):
-            served_robots([name])
-    with pytest.raises(rd.InputError, match="unknown robot 'yours'"):
-        served_robots(["yours"])
+        refuses("has the name panda of another robot", served_robots, [name])
+    refuses("unknown robot 'yours'", served_robots, ["yours"])

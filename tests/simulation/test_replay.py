@@ -22,8 +22,6 @@ from robotdiffuse.simulation.world import mass_and_center
 from robotdiffuse.trajectories.timing import time_parameterize
 
 pytestmark = pytest.mark.sim
-
-
 PANDA_START = np.array([-0.6, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 
 

@@ -12,6 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 import robotdiffuse as rd
+from helpers.refusals import refuses
 from robotdiffuse.planning.reactive.timed_path import TimedPath
 from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.trajectories import speed_limits, timing_kernel
@@ -351,12 +352,10 @@ def test_every_path_has_a_timing(seed: int, dof: int, count: int, scale: float, 
     for end in (slice(0, -1), slice(1, None)):
         rates = first[end] * pull + second[end] * found[end, None] ** 2
         assert (np.abs(rates) <= acceleration * (1 + 1e-4)).all()
-
     theirs = toppra_speeds(line, grid, velocity, acceleration)
     if theirs is not None and np.isfinite(theirs).all() and (theirs[1:-1] > 0.01 * theirs.max()).all():
         ours, least = ((2 * np.diff(grid) / (speeds[1:] + speeds[:-1])).sum() for speeds in (found, theirs))
         assert ours == pytest.approx(least, rel=1e-3)
-
     t = timed(q, robot=arm(tuple(velocity), tuple(acceleration)))
     assert (np.abs(t.velocities) <= 1.01 * velocity).all()
     assert (np.abs(t.accelerations) <= 1.01 * acceleration).all()
@@ -366,15 +365,13 @@ def test_every_path_has_a_timing(seed: int, dof: int, count: int, scale: float, 
 @pytest.mark.parametrize("field", ["velocity_scale", "acceleration_scale", "jerk"])
 def test_settings_that_make_a_motion_endless_are_refused(field: str, value: float) -> None:
     right = "at least 0.01" if field == "jerk" else "between 0.001 and 1"
-    with pytest.raises(rd.InputError, match=rf"timing\.{field} is {value}; it must be {right}"):
-        TimingSettings(**{field: value})  # type: ignore[arg-type]
+    refuses(rf"timing\.{field} is {value}; it must be {right}", TimingSettings, **{field: value})
 
 
 @pytest.mark.parametrize("limit", [0.0, 1e-300, 1e-7, float("nan")])
 def test_limits_that_make_a_motion_endless_are_refused(limit: float) -> None:
     for robot in (arm((1.0, limit), (1.0, 1.0)), arm((1.0, 1.0), (1.0, limit))):
-        with pytest.raises(rd.InputError, match=rf"limit of j1 is {limit}; it must be at least 1e-06"):
-            timed([[0.0, 0.0], [1.0, 1.0]], robot=robot)
+        refuses(rf"limit of j1 is {limit}; it must be at least 1e-06", timed, [[0.0, 0.0], [1.0, 1.0]], robot=robot)
 
 
 @pytest.mark.parametrize("jerk", [None, 10.0])

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
+from helpers.refusals import refuses
 from helpers.sphere_oracles import random_shape
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.scenes.shapes import Shape
@@ -209,11 +210,9 @@ def test_the_earliest_of_different_violations_is_reported() -> None:
 
 def test_paths_of_another_shape_or_other_joints_raise() -> None:
     for rows in (np.zeros((0, 3)), np.zeros((2, 4))):
-        with pytest.raises(rd.InputError, match=r"path.positions has shape .* it must be n x 3 with n >= 1"):
-            rd.verify(*problem_and_path(rows))
+        refuses(r"path.positions has shape .* it must be n x 3 with n >= 1", rd.verify, *problem_and_path(rows))
     problem, path = problem_and_path(SWING)
-    with pytest.raises(rd.InputError, match=r"path.joint_names is j2, j1, j0; .* are j0, j1, j2"):
-        rd.verify(problem, rd.Path(path.joint_names[::-1], SWING))
+    refuses(r"path.joint_names is j2, j1, j0; .* are j0, j1, j2", rd.verify, problem, rd.Path(path.joint_names[::-1], SWING))
 
 
 @pytest.mark.parametrize("spacing", [0.3, 0.02])
@@ -296,8 +295,7 @@ def test_trajectories_that_jump_or_run_backwards() -> None:
 def test_wrong_shapes_of_a_trajectory_raise(name: str, cut: Callable[[np.ndarray], np.ndarray]) -> None:
     good = trajectory(2.0)
     object.__setattr__(good, name, np.asarray(cut(getattr(good, name))))
-    with pytest.raises(rd.InputError, match=rf"trajectory\.{name} has shape .*; it must be"):
-        verify_trajectory(problem_and_path(SWING)[0], good)
+    refuses(rf"trajectory\.{name} has shape .*; it must be", verify_trajectory, problem_and_path(SWING)[0], good)
 
 
 @pytest.mark.parametrize(("factor", "jumps"), [(1.0, False), (1.02, False), (1.49, False), (1.6, True)])

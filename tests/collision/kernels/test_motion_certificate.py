@@ -65,8 +65,6 @@ def curve(rng: np.random.Generator, robot: rd.Robot, width: float) -> ndarray:
 
 
 seeds = st.integers(0, 2**31)
-
-
 robots = st.sampled_from(list(LINKS))
 
 

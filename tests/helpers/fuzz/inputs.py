@@ -1,8 +1,7 @@
 """Damaged inputs of seventeen kinds: each must give an answer or a one-line error, in bounded time.
 
-An input is a kind and a seed; `outcome_of(kind, seed, folder)` makes the same one again. Texts are changed
-value by value, line by line or byte by byte, all others by bytes. `benchmarks/robustness.py` runs as many as
-there is time for.
+An input is a kind and a seed; `outcome_of(kind, seed, folder)` makes the same one again. Texts are changed value by value, line
+by line or byte by byte, all others by bytes. `benchmarks/robustness.py` runs as many as there is time for.
 """
 
 import copy
@@ -41,11 +40,8 @@ from robotdiffuse.validation.validator import Verifier
 
 MAX_MESSAGE_LENGTH = 1000
 """Characters of an error message; names of files and lists of known names make some long."""
-
 Make = Callable[[np.random.Generator, FilePath], Callable[[], object]]
 """Writes the files of an input to a folder and returns the call that reads them."""
-
-
 NASTY: tuple[Any, ...] = (
     *(None, True, False, 0, -1, 1, 2**31, 2**63, 10**25, -0.0, 0.5, 1e-300, 1e-9, 1e4, 1e5, 1e20, 1e39),
     *(1e308, float("inf"), float("nan"), "", "x", "x" * 5000, "\0", "\ud800", "../..", "/dev/zero", "panda"),

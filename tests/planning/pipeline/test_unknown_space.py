@@ -1,5 +1,4 @@
-"""Policies for unknown space: assumptions only add obstacles, with start and goal carved free; what results
-say."""
+"""Policies for unknown space: assumptions only add obstacles, with start and goal carved free; what results say."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.refusals import refuses
 from robotdiffuse.collision.moving_obstacles import MovingCollision
 from robotdiffuse.planning.reactive.timed_path import JerkFilter, SpeedProfile, TimedPath
 from robotdiffuse.robots.motion_bounds import motion_radii
@@ -159,8 +160,7 @@ def test_the_arm_waits_for_an_obstacle_at_the_goal() -> None:
 def test_invalid_steps_are_refused(observation: object, now: float, message: str) -> None:
     replanner = loop(np.array([[0.5, 1.6, 0.5]]))
     replanner.step({"sphere": [0.5, 1.6, 0.5]}, 0.0)
-    with pytest.raises(rd.InputError, match=message):
-        replanner.step(observation, now)  # type: ignore[arg-type]
+    refuses(message, replanner.step, observation, now)
 
 
 @pytest.mark.parametrize(
@@ -176,8 +176,7 @@ def test_invalid_steps_are_refused(observation: object, now: float, message: str
 def test_replanners_that_cannot_begin(fields: dict[str, Any], message: str) -> None:
     moving = [rd.MovingObstacle(rd.Sphere([3, 0, 0], 0.1), max_speed=0.1)]
     problem = rd.Problem(PANDA, rd.Scene([FLOOR]), START, END, moving=moving)
-    with pytest.raises(rd.InputError, match=message):
-        rd.Replanner(replace(problem, **fields))
+    refuses(message, rd.Replanner, replace(problem, **fields))
 
 
 @pytest.mark.parametrize("goal", ["start", "pose", "here"])
@@ -201,12 +200,11 @@ def test_a_new_goal_is_reached_from_where_the_motion_ends(goal: str) -> None:
 
 def test_a_goal_in_collision_leaves_the_old_one() -> None:
     replanner = loop(np.array([[0.0, -3.0, 0.5]]))
-    with pytest.raises(rd.InputError, match="cannot take this goal: the goal is in collision"):
-        replanner.set_goal([0, 1.5, 0, -0.5, 0, 2.1, 0.8])
+    refuses("cannot take this goal: the goal is in collision", replanner.set_goal, [0, 1.5, 0, -0.5, 0, 2.1, 0.8])
     assert np.allclose(replanner.problem.goal.positions, END)  # type: ignore[union-attr]
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_limits_hold_at_every_time_however_often_the_arm_brakes(seed: int) -> None:
     """Random paths, jerk limits, steps and periods; each motion goes on exactly as the last one."""
     rng = np.random.default_rng(seed)

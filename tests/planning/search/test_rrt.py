@@ -145,9 +145,7 @@ def test_arguments_are_checked(arguments: dict, message: str) -> None:
 
 
 def test_one_slow_validation_does_not_use_up_later_calls(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Regression: a first call, which loaded kernels, validated for a second; shorter calls then ended at
-    once."""
-
+    """Regression: a first call, which loaded kernels, validated for a second; shorter calls then ended at once."""
     late = [0.0]
 
     def slow(*arguments: Any, **others: Any) -> rd.Trajectory:

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import robotdiffuse as rd
+from helpers.refusals import refuses
 from robotdiffuse.core.transforms import rotation_about, rotation_from_rpy, transform
 from robotdiffuse.problems.files import load_problems, problem_from_record, problem_record, save_problem
 from robotdiffuse.robots.kinematic_tree import Joint
@@ -60,8 +61,7 @@ def test_a_hair_over_a_limit_is_clamped_and_said() -> None:
     )
     for beyond in (1e-5, float(np.float32(2 + 1e-5)) - 2, 9e-4):
         assert problem([2 + beyond, 0, 0]).start[0] == 2.0
-    with pytest.raises(rd.InputError, match=r"start: swing is 2.0011 rad; its limits are -1 to 2"):
-        problem([2.0011, 0, 0])
+    refuses(r"start: swing is 2.0011 rad; its limits are -1 to 2", problem, [2.0011, 0, 0])
 
 
 @given(st.floats(-100, 100))
@@ -89,9 +89,7 @@ MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
     ],
 )
 def test_wrong_problems(make: Callable[[], object], message: str) -> None:
-    with pytest.raises(rd.InputError, match=message) as raised:
-        make()
-    assert "\n" not in str(raised.value)
+    refuses(message, make)
 
 
 GOOD: dict[str, Any] = {
@@ -124,8 +122,7 @@ def test_problem_file(ending: str, tmp_path: Path) -> None:
     assert rd.Problem.load(tmp_path / f"problem.{ending}").start.tolist() == READY
     [entry] = load_problems(tmp_path / f"problem.{ending}")
     assert entry.load().start.tolist() == READY
-    with pytest.raises(rd.InputError, match=r"index is 2; .* holds (one|1) problem"):
-        rd.load_problem(tmp_path / f"problem.{ending}", 2)
+    refuses(r"index is 2; .* holds (one|1) problem", rd.load_problem, tmp_path / f"problem.{ending}", 2)
 
 
 def without(name: str) -> dict[str, Any]:
@@ -165,10 +162,7 @@ WRONG: dict[str, tuple[object, str]] = {
 def test_wrong_problem_files(case: str, tmp_path: Path) -> None:
     data, message = WRONG[case]
     file = written(tmp_path, data)
-    with pytest.raises(rd.InputError, match=message) as raised:
-        rd.load_problem(file)
-    assert str(raised.value).startswith(str(file)), "the file is named first"
-    assert "\n" not in str(raised.value)
+    refuses(f"^{re.escape(str(file))}.*{message}", rd.load_problem, file)
 
 
 def test_lines_of_problems(tmp_path: Path) -> None:
@@ -180,14 +174,11 @@ def test_lines_of_problems(tmp_path: Path) -> None:
     assert [entry.load().start[0] for entry in entries] == [0, 0.1, 0.2]
     assert entries[0].load().robot is entries[2].load().robot
     assert rd.load_problem(file, 1).start[0] == 0.1
-    with pytest.raises(rd.InputError, match=r"index is 3; .* holds 3 problems"):
-        rd.load_problem(file, 3)
+    refuses(r"index is 3; .* holds 3 problems", rd.load_problem, file, 3)
     file.write_text(lines[0] + '\n{"robot": 3')
-    with pytest.raises(rd.InputError, match=r"many\.jsonl, line 2 is not valid JSON"):
-        load_problems(file)
+    refuses(r"many\.jsonl, line 2 is not valid JSON", load_problems, file)
     file.write_text(lines[0] + "\n" + json.dumps(GOOD | {"start": []}) + "\n")
-    with pytest.raises(rd.InputError, match=r"many\.jsonl, line 2: start has 0 values"):
-        load_problems(file)
+    refuses(r"many\.jsonl, line 2: start has 0 values", load_problems, file)
 
 
 def full_problem(goal: Any) -> rd.Problem:
@@ -237,12 +228,9 @@ def test_places_that_cannot_be_written_to(tmp_path: Path) -> None:
     made = full_problem(None)
     (tmp_path / "folder.json").mkdir()
     for file in (tmp_path / "none" / "a.yaml", tmp_path / "none" / "a.jsonl", tmp_path / "folder.json"):
-        with pytest.raises(rd.InputError, match="cannot be written"):
-            save_problem(made, file)
-    with pytest.raises(rd.InputError, match="problem file format"):
-        save_problem(made, tmp_path / "a.txt")
-    with pytest.raises(rd.InputError, match="'crane' is neither bundled nor read from a file"):
-        problem_record(problem())
+        refuses("cannot be written", save_problem, made, file)
+    refuses("problem file format", save_problem, made, tmp_path / "a.txt")
+    refuses("'crane' is neither bundled nor read from a file", problem_record, problem())
     assert problem_record(problem(), robot="crane.urdf")["robot"] == "crane.urdf"
 
 
@@ -264,8 +252,7 @@ def test_moveit_files_in_a_problem(tmp_path: Path) -> None:
     scene, request = (str(DATA / "motion_bench_maker" / f"{name}0001.yaml") for name in ("scene", "request"))
     loaded = rd.load_problem(written(tmp_path, GOOD | {"scene": scene}))
     assert [shape.name for shape in loaded.scene.shapes] == ["can", "board"]
-    with pytest.raises(rd.InputError, match=r"(start|goal) cannot be combined with request"):
-        rd.load_problem(written(tmp_path, GOOD | {"request": request}))
+    refuses(r"(start|goal) cannot be combined with request", rd.load_problem, written(tmp_path, GOOD | {"request": request}))
 
 
 CAMERA = {"xyz": [0] * 3, "wxyz": [1, 0, 0, 0]}
@@ -286,17 +273,14 @@ CAMERA = {"xyz": [0] * 3, "wxyz": [1, 0, 0, 0]}
 def test_records_of_others_name_no_files_that_are_read(changed: dict[str, Any]) -> None:
     record = {"robot": "panda", "scene": [], "start": READY, "goal": {"joints": READY}} | changed
     robots = {"panda": rd.load_robot("panda")}
-    with pytest.raises(rd.InputError, match="is a file, and files are not read here"):
-        problem_from_record(record, robots)
-    with pytest.raises(rd.InputError, match="files are not read here"):
-        problem_from_record({"robot": "panda", "scene": [], "request": "/etc/passwd"}, robots)
+    refuses("is a file, and files are not read here", problem_from_record, record, robots)
+    refuses("files are not read here", problem_from_record, {"robot": "panda", "scene": [], "request": "/etc/passwd"}, robots)
 
 
 @pytest.mark.parametrize("robot", ["ur5", "panda/robot.json", "../panda", "/etc/passwd", "a.urdf", 1, None])
 def test_records_of_others_have_the_robots_that_are_given(robot: object) -> None:
     record = {"robot": robot, "scene": [], "start": READY, "goal": {"joints": READY}}
-    with pytest.raises(rd.InputError, match=r"unknown robot .*; known: panda"):
-        problem_from_record(record, {"panda": rd.load_robot("panda")})
+    refuses(r"unknown robot .*; known: panda", problem_from_record, record, {"panda": rd.load_robot("panda")})
 
 
 NAMED = [0.0, -np.pi / 4, 0.0, -0.75 * np.pi, 0.0, np.pi / 2, np.pi / 4]
@@ -327,8 +311,7 @@ def test_goals_are_given_as_in_python(goal: object, rows: list[list[float]]) -> 
     ],
 )
 def test_wrong_names_and_angles(changes: dict[str, object], message: str) -> None:
-    with pytest.raises(rd.InputError, match=re.escape(message)):
-        problem_from_record(BASIC | changes)
+    refuses(re.escape(message), problem_from_record, BASIC | changes)
 
 
 def test_roll_pitch_yaw_are_in_the_order_of_urdfs() -> None:

@@ -80,8 +80,7 @@ def by_hand() -> Robot:
 
 
 def shares(robot: Robot) -> tuple[float, int]:
-    """Fraction of free configurations with false collisions, and the number of configurations wrongly called
-    free."""
+    """Fraction of free configurations with false collisions, and the number of configurations wrongly called free."""
     q = np.random.default_rng(3).uniform(robot.lower, robot.upper, (3000, robot.dof))
     checker = CollisionChecker(robot, Scene())
     free = checker.free(q)

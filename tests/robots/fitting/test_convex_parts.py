@@ -50,8 +50,6 @@ FRAME = boxes(
 TUBE = trimesh.creation.annulus(0.08, 0.1, 0.3, sections=48)
 BOWL = trimesh.creation.icosphere(3, 0.1).slice_plane([0, 0, 0], [0, 0, -1])  # open
 MESHES = {"L": L, "frame": FRAME, "tube": TUBE, "bowl": BOWL}
-
-
 SLOW_MESHES = ("bowl", "tube")
 
 

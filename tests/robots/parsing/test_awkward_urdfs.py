@@ -11,6 +11,7 @@ import robotdiffuse as rd
 from helpers.awkward_urdfs import REFUSED, WORKS
 from helpers.made_arms import BALL, chain, joint, link, row, written
 from helpers.quick_preparation import QUICK, coarse_grids
+from helpers.refusals import refuses
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.robots.fitting import preparation
 from robotdiffuse.robots.fitting.preparation import LARGE_REACH, PreparationSettings, add_robot
@@ -53,9 +54,7 @@ def test_awkward_arms_are_prepared_and_plan(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_cannot_work_is_refused_by_one_line_that_says_what_to_do(name: str, tmp_path: Path) -> None:
     make, message = REFUSED[name]
-    with pytest.raises(rd.InputError, match=message) as raised:
-        add_robot(make(tmp_path), out=tmp_path / "robot", settings=QUICK)
-    assert "\n" not in str(raised.value)
+    refuses(message, add_robot, make(tmp_path), out=tmp_path / "robot", settings=QUICK)
     assert not (tmp_path / "robot").exists()
 
 
@@ -90,8 +89,7 @@ def test_an_arm_that_is_never_free_is_refused_with_the_pair_to_allow(tmp_path: P
 
 
 def test_parts_are_finer_where_they_touch_in_vain(tmp_path: Path) -> None:
-    """Goals of Fetch and Baxter collided falsely: the arm touches convex parts of the torso, but not the
-    torso."""
+    """Goals of Fetch and Baxter collided falsely: the arm touches convex parts of the torso, but not the torso."""
     walls = [
         trimesh.creation.box(np.subtract(high, low), trimesh.transformations.translation_matrix(middle))
         for low, high in (

@@ -20,7 +20,7 @@ from robotdiffuse.visualization.live.session import NO_MOTION, VALID
 
 PATIENCE = 300.0
 """[s]; a new machine compiles first."""
-SETTINGS = rd.ExplorerSettings(time_limit=2.0)
+SETTINGS = rd.ExplorerSettings(time_limit=1.0, look_attempts=2, max_looks=2)
 until = partial(waiting.state_when, patience=PATIENCE)
 
 

@@ -5,6 +5,7 @@ import re
 
 import pytest
 
+from helpers.refusals import refuses
 from robotdiffuse import InputError, Problem, load_robot
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.visualization.live.session import first_problem, problem_for, problem_text, uploaded_problem
@@ -26,11 +27,6 @@ def test_problems_go_out_and_come_back(demo: Problem) -> None:
 def test_every_arm_has_a_first_problem(name: str) -> None:
     problem = problem_for(load_robot(name))
     assert problem.robot.name == name
-
-
-def test_a_problem_and_a_robot_at_once() -> None:
-    with pytest.raises(InputError, match=r"p\.yaml names its robot; give a problem or --robot ur5, not both"):
-        first_problem("p.yaml", "ur5")
 
 
 GOOD = """robot: panda
@@ -63,8 +59,7 @@ def test_what_is_wrong_with_an_uploaded_problem_is_one_line(text: str, wrong: st
     assert re.search(wrong, str(error.value)), error.value
 
 
-def test_uploads_that_are_no_text_or_too_long(demo: Problem) -> None:
-    with pytest.raises(InputError, match=r"p\.yaml is not UTF-8 text"):
-        uploaded_problem(b"\xff\xfe", "p.yaml", demo.robot)
-    with pytest.raises(InputError, match="at most 5000000 are read"):
-        uploaded_problem(b" " * 5_000_001, "p.yaml", demo.robot)
+def test_a_problem_and_a_robot_at_once_and_uploads_that_are_no_text_or_too_long(demo: Problem) -> None:
+    refuses(r"p\.yaml is not UTF-8 text", uploaded_problem, b"\xff\xfe", "p.yaml", demo.robot)
+    refuses("at most 5000000 are read", uploaded_problem, b" " * 5_000_001, "p.yaml", demo.robot)
+    refuses(r"p\.yaml names its robot; give a problem or --robot ur5, not both", first_problem, "p.yaml", "ur5")

@@ -22,7 +22,6 @@ from robotdiffuse.visualization.live.server import PageServer, free_port
 
 VALID = "[data-validity=valid]"
 INVALID = "[data-validity=invalid]"
-
 until = partial(waiting.until, patience=PATIENCE)
 pytestmark = MARKS
 

@@ -10,7 +10,7 @@ pytest.importorskip("viser", reason="live needs viser: pip install 'robotdiffuse
 
 import viser
 
-import robotdiffuse as rd
+from helpers.refusals import refuses
 from robotdiffuse.visualization.live import server as module
 from robotdiffuse.visualization.live.server import free_port, is_loopback, may_connect
 
@@ -60,15 +60,10 @@ def test_elsewhere_the_path_is_the_token() -> None:
         assert not may_connect(path, host, None, "token")
 
 
-def test_a_port_that_is_taken_and_a_host_that_is_none() -> None:
+def test_loopback_ports_that_are_taken_and_hosts_that_are_none() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         number = taken.getsockname()[1]
-        with pytest.raises(rd.InputError, match=f"port {number} of 127.0.0.1 cannot be used: .*--port"):
-            free_port("127.0.0.1", number)
-    with pytest.raises(rd.InputError, match="--host is 'no such host'"):
-        free_port("no such host", 0)
-
-
-def test_loopback() -> None:
+        refuses(f"port {number} of 127.0.0.1 cannot be used: .*--port", free_port, "127.0.0.1", number)
+    refuses("--host is 'no such host'", free_port, "no such host", 0)
     assert all(is_loopback(host) for host in ("127.0.0.1", "::1", "localhost"))
     assert not any(is_loopback(host) for host in ("0.0.0.0", "", "localhost.example"))

@@ -12,6 +12,7 @@ import yaml
 
 import robotdiffuse as rd
 from helpers.made_arms import read_urdf
+from helpers.refusals import refuses
 from robotdiffuse.core.input_files import read_yaml
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_about, rotation_from_quaternion, transform
 from robotdiffuse.problems.files import ProblemEntry, load_motion_bench_maker, load_problems, problem_record
@@ -88,8 +89,7 @@ def test_folder() -> None:
     assert problem.robot.locked == {"panda_finger_joint1": 0.065, "panda_finger_joint2": 0.065}
     assert [shape.name for shape in problem.scene.shapes] == ["can", "board"]
     assert bad.problem is None
-    with pytest.raises(rd.InputError, match=r"request0002.yaml: goal: panda_joint1 is 3.1 rad; its limits are -2.8"):
-        bad.load()
+    refuses(r"request0002.yaml: goal: panda_joint1 is 3.1 rad; its limits are -2.8", bad.load)
     assert [entry.name for entry in load_problems(MOTION_BENCH_MAKER)] == [good.name, bad.name]
     robot = rd.load_robot("panda")
     assert load_motion_bench_maker(MOTION_BENCH_MAKER, robot)[0].load().robot.locked == problem.robot.locked
@@ -97,8 +97,7 @@ def test_folder() -> None:
 
 
 def test_unusable_folders(tmp_path: Path) -> None:
-    with pytest.raises(rd.InputError, match=r"has no files scene\*.yaml"):
-        load_motion_bench_maker(tmp_path)
+    refuses(r"has no files scene\*.yaml", load_motion_bench_maker, tmp_path)
     shutil.copy(MOTION_BENCH_MAKER / "scene0001.yaml", tmp_path)
     [entry] = load_motion_bench_maker(tmp_path)
     assert "request0001.yaml does not exist" in entry.error
@@ -213,27 +212,18 @@ def matrix(names: list[str], pairs: list[tuple[str, str]], **defaults: bool) -> 
     }
 
 
-def test_pairs_of_links_and_objects_count() -> None:
+def test_pairs_of_links_and_objects_count_and_defaults_decide_where_no_pair_does() -> None:
     names = ["hand", "finger", "can", "stale"]
     found = matrix_contacts(matrix(names, [("hand", "can"), ("hand", "finger"), ("stale", "can")]), ["can", "board"], LINKS)
     assert found == {"can": ("hand",)}
-
-
-def test_defaults_decide_where_no_pair_does() -> None:
     data = matrix(["hand", "can"], [], can=True, board=True, finger=False)
     assert matrix_contacts(data, ["can", "board"], LINKS) == {"board": ("hand",)}
     assert matrix_contacts(matrix([], [], can=True), ["can"], LINKS) == {"can": LINKS}
     assert matrix_contacts(None, ["can"], LINKS) == {}
     rows = {"entry_names": ["hand", "<octomap>"], "entry_values": [[0, 1], [1, 0]]}
     assert matrix_contacts(rows, ["octomap"], LINKS) == {"octomap": ("hand",)}
-
-
-@pytest.mark.parametrize(
-    "data", [{"entry_names": ["hand", "can"], "entry_values": [[0, 1]]}, {"entry_names": "hand"}, ["hand"]]
-)
-def test_a_damaged_matrix_is_an_error(data: object) -> None:
-    with pytest.raises(rd.InputError, match="allowed_collision_matrix"):
-        matrix_contacts(data, ["can"], LINKS)
+    for damaged in ({"entry_names": ["hand", "can"], "entry_values": [[0, 1]]}, {"entry_names": "hand"}, ["hand"]):
+        refuses("allowed_collision_matrix", matrix_contacts, damaged, ["can"], LINKS)
 
 
 def test_a_scene_and_a_problem_file_allow_contacts(tmp_path: Path) -> None:
@@ -245,7 +235,6 @@ def test_a_scene_and_a_problem_file_allow_contacts(tmp_path: Path) -> None:
     file.write_text(yaml.safe_dump(data))
     scene, _ = read_moveit_scene(file, rd.load_robot("panda"))
     assert scene.allowed_contacts == ((names[0], ("panda_hand",)),)
-
     problem = {"robot": "panda", "scene": "scene0001.yaml", "request": "request0001.yaml"}
     (tmp_path / "problem.yaml").write_text(yaml.safe_dump(problem | {"allowed_contacts": {names[1]: "all"}}))
     loaded = rd.load_problem(tmp_path / "problem.yaml")
@@ -281,19 +270,17 @@ def test_files_of_another_robot_are_refused_by_its_joints(tmp_path: Path) -> Non
     text = str(raised.value)
     assert "robot_state.joint_state has values of gripper_finger1_joint, movable joints that ur5 lacks" in text
     assert "robot_model_name is ur5_robotiq85" in text and "its own are shoulder_pan_joint, " in text
-    with pytest.raises(rd.InputError, match=r"scene0001.yaml: .* gripper_finger1_joint"):
-        read_moveit_scene(tmp_path / "scene0001.yaml", rd.load_robot("ur5"))
+    refuses(r"scene0001.yaml: .* gripper_finger1_joint", read_moveit_scene, tmp_path / "scene0001.yaml", rd.load_robot("ur5"))
     [entry] = load_motion_bench_maker(tmp_path, rd.load_robot("ur5"))
     assert "gripper_finger1_joint" in entry.error
     scene = read_yaml(tmp_path / "scene0001.yaml")
     assert isinstance(scene, dict)
     del scene["robot_state"]["joint_state"]
     (tmp_path / "scene0001.yaml").write_text(yaml.safe_dump(scene))
-    with pytest.raises(rd.InputError, match=r"start_state.joint_state has values of gripper_finger1_joint"):
-        rd.load_problem(file)
+    refuses(r"start_state.joint_state has values of gripper_finger1_joint", rd.load_problem, file)
 
 
-def test_joints_that_the_robot_lacks_can_be_ignored(tmp_path: Path) -> None:
+def test_joints_that_the_robot_lacks_can_be_ignored_and_another_model_name_is_a_note(tmp_path: Path) -> None:
     file = ur5_files(tmp_path, "ur5_robotiq85", ["gripper_finger1_joint"])
     notes = rd.load_problem(file, ignore_joints=True).notes
     assert "the scene's robot_model_name is ur5_robotiq85; planned for ur5" in notes
@@ -301,9 +288,6 @@ def test_joints_that_the_robot_lacks_can_be_ignored(tmp_path: Path) -> None:
     [entry] = load_motion_bench_maker(tmp_path, rd.load_robot("ur5"), ignore_joints=True)
     assert entry.load().notes == notes
     read_moveit_scene(tmp_path / "scene0001.yaml", rd.load_robot("ur5"), ignore_joints=True)
-
-
-def test_another_model_name_with_known_joints_is_a_note(tmp_path: Path) -> None:
     notes = rd.load_problem(ur5_files(tmp_path, "ur5_lab", [])).notes
     assert notes == ("the scene's robot_model_name is ur5_lab; planned for ur5",)
     assert rd.load_problem(ur5_files(tmp_path, "ur5", [])).notes == ()
@@ -316,8 +300,7 @@ def test_fixed_joints_of_the_robot_are_known_where_they_stand(tmp_path: Path) ->
     request = read_yaml(tmp_path / "request0001.yaml")
     change(request, ["start_state", "joint_state", "position", 6], 0.3)  # type: ignore[arg-type]
     (tmp_path / "request0001.yaml").write_text(yaml.safe_dump(request))
-    with pytest.raises(rd.InputError, match=f"has values of {fixed}, movable joints that ur5 lacks"):
-        rd.load_problem(file)
+    refuses(f"has values of {fixed}, movable joints that ur5 lacks", rd.load_problem, file)
 
 
 def test_a_mimic_joint_elsewhere_than_its_master_puts_it_is_a_note(tmp_path: Path) -> None:
@@ -345,12 +328,6 @@ def pose_constraint() -> dict[str, Any]:
     }
 
 
-def test_several_goal_constraints_are_a_set() -> None:
-    data = request_data()
-    data["goal_constraints"].append(data["goal_constraints"][0])
-    assert len(moveit_request(data, moveit_frames({})).joint_goals) == 2
-
-
 def asked(folder: Path, data: dict[str, Any]) -> ProblemEntry:
     """The first of MotionBenchMaker's problems with this request."""
     for file in MOTION_BENCH_MAKER.glob("*0001.yaml"):
@@ -359,8 +336,10 @@ def asked(folder: Path, data: dict[str, Any]) -> ProblemEntry:
     return load_motion_bench_maker(folder)[0]
 
 
-def test_a_goal_without_a_joint_is_refused(tmp_path: Path) -> None:
+def test_several_goal_constraints_are_a_set_and_one_without_a_joint_is_refused(tmp_path: Path) -> None:
     data = request_data()
+    data["goal_constraints"].append(deepcopy(data["goal_constraints"][0]))
+    assert len(moveit_request(data, moveit_frames({})).joint_goals) == 2
     del data["goal_constraints"][0]["joint_constraints"][3]
     assert "goal_constraints[0] has no panda_joint4" in asked(tmp_path, data).error
 
@@ -441,9 +420,7 @@ WRONG_REQUESTS: dict[str, tuple[object, str]] = {
 @pytest.mark.parametrize("case", WRONG_REQUESTS)
 def test_wrong_requests(case: str) -> None:
     data, message = WRONG_REQUESTS[case]
-    with pytest.raises(rd.InputError, match=message) as raised:
-        moveit_request(data, moveit_frames({}))
-    assert "\n" not in str(raised.value)
+    refuses(message, moveit_request, data, moveit_frames({}))
 
 
 Z = np.array([0.0, 0.0, 1.0])
@@ -518,8 +495,7 @@ def test_poses_compose_from_the_base_outwards() -> None:
 def test_scene_in_the_world_of_a_robot_whose_base_moves_there_is_refused(tmp_path: Path) -> None:
     robot = mounted(tmp_path, "prismatic")
     fixed = {"transform": {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1]}, "child_frame_id": "world"}
-    with pytest.raises(rd.InputError, match="a joint moves base in world"):
-        place(at("world", fixed_frame_transforms=[fixed]), robot)
+    refuses("a joint moves base in world", place, at("world", fixed_frame_transforms=[fixed]), robot)
     assert place(at("base"), robot) == [0, 0, 0]
 
 
@@ -551,8 +527,7 @@ def test_scene_in_a_frame_that_the_robot_is_placed_in(tmp_path: Path) -> None:
         place(at("world", **state("odom", [3, 0, 0])), panda)
     for named in ("world", "panda_link0", ""):
         assert place(at("world", **state(named, [3, 0, 0])), panda) == [-3, 0, 0]
-    with pytest.raises(rd.InputError, match="has 2 transforms; it must have one"):
-        place(at("world", **state("odom", [3, 0, 0], [0, 0, 0])), panda)
+    refuses("has 2 transforms; it must have one", place, at("world", **state("odom", [3, 0, 0], [0, 0, 0])), panda)
 
 
 def test_links_of_the_robot_are_frames_where_they_stand(tmp_path: Path) -> None:
@@ -575,5 +550,4 @@ def test_links_of_the_robot_are_frames_where_they_stand(tmp_path: Path) -> None:
     assert place(at(""), robot) == [-2, 1, -7.8]
     fixed = {"transform": {"translation": [9, 9, 9], "rotation": [0, 0, 0, 1]}, "child_frame_id": "stand"}
     assert place(at("stand", fixed_frame_transforms=[fixed]), robot) == [0, 0, -0.3]
-    with pytest.raises(rd.InputError, match=r"unknown frame_id of header: 'arm'; known: base, camera, map"):
-        place(at("arm"), robot)
+    refuses(r"unknown frame_id of header: 'arm'; known: base, camera, map", place, at("arm"), robot)
