@@ -533,44 +533,38 @@ UNEQUAL_NOTE = (
     "† not at equal time: this planner or the reference ended before the limit. `bench run --equal-time` "
     "repeats such calls until the limit."
 )
-NOTES = """\ - A call counts for a limit if its own limit was at least as long, or if it ended by itself
-before its limit, since more
-  time would change nothing. A table compares the problems on which all its planners have such a call.
+NOTES = """\
+- A call counts for a limit if its own limit was at least as long, or if it ended by itself before its
+  limit, since more time would change nothing. A table compares the problems on which all its planners have
+  such a call.
 - success: share of problems with a verified motion found by the limit, with the 95 % interval over problems
-(Wilson). A
-  motion that a call returned up to 10 % or 50 ms after its own limit counts: planners stop in time, and
-  validation follows.
-- collision: share of problems on which the validator refused the planner's last path because it collides. -
-link length: the paper's path length, the sum of the path lengths of all links that joints move. It is the
-mean over
-  the problems that the planner itself solved, so planners that solve only easy problems have short paths. If
-  a call continued after the limit and returned a shorter path, the length at the limit is estimated by the
-  length of the returned path, scaled by the ratio of the joint lengths.
+  (Wilson). A motion that a call returned up to 10 % or 50 ms after its own limit counts: planners stop in
+  time, and validation follows.
+- collision: share of problems on which the validator refused the planner's last path because it collides.
+- link length: the paper's path length, the sum of the path lengths of all links that joints move. It is the
+  mean over the problems that the planner itself solved, so planners that solve only easy problems have
+  short paths. If a call continued after the limit and returned a shorter path, the length at the limit is
+  estimated by the length of the returned path, scaled by the ratio of the joint lengths.
 - joint length / a planner: median ratio of the length in joint space to that of the reference planner, on
-problems that
-  both solve, with its 95 % interval (bootstrap over problems). Both planners must use up the limit, so that
-  the ratio is at equal time. restarted: a planner that ends earlier is called again with other seeds until
-  all its calls together have used up the limit, and its shortest path counts. Computing trajectories of the
-  other paths is not counted.
+  problems that both solve, with its 95 % interval (bootstrap over problems). Both planners must use up the
+  limit, so that the ratio is at equal time. restarted: a planner that ends earlier is called again with
+  other seeds until all its calls together have used up the limit, and its shortest path counts. Computing
+  trajectories of the other paths is not counted.
 - first: median time to the first path of solved problems. returns: mean time until the planner returns.
-Anytime planners
-  use up the limit, and unsolved problems count with the limit.
+  Anytime planners use up the limit, and unsolved problems count with the limit.
 - ComScore: as in the paper, the mean of success, collision, length and time until the planner returns, each
-scaled from 0
-  for the worst row of the table to 1 for the best. It depends on the rows of the table; rows with restarts
-  are left out. `robotdiffuse reproduce table1` computes it among the paper's rows.
+  scaled from 0 for the worst row of the table to 1 for the best. It depends on the rows of the table; rows
+  with restarts are left out. `robotdiffuse reproduce table1` computes it among the paper's rows.
 - Quality: means of the returned motions over the solved problems, with 95 % intervals. clearance: a lower
-bound of the
-  distance to obstacles (scene), between links of the arm (self), and the smaller of the two (min). over
-  straight line: duration divided by the shortest time along the straight line without obstacles and jerk
-  limits. stops: how often the whole arm stops on the way. peak and mean jerk: of the joint with the largest
-  jerk. bending: integral of the squared second derivative of the path, divided by the squared length. jerk:
-  logarithm of the dimensionless jerk, lower is smoother. sparc: spectral arc length of the speed of the
-  joints or of the tip, closer to 0 is smoother.
-- p of success: McNemar's exact test. p of joint length: Wilcoxon's signed-rank test. Neither is corrected for
-the number
-  of comparisons. With several seeds, a problem counts as solved if it is solved with more than half of the
-  seeds."""
+  bound of the distance to obstacles (scene), between links of the arm (self), and the smaller of the two
+  (min). over straight line: duration divided by the shortest time along the straight line without obstacles
+  and jerk limits. stops: how often the whole arm stops on the way. peak and mean jerk: of the joint with
+  the largest jerk. bending: integral of the squared second derivative of the path, divided by the squared
+  length. jerk: logarithm of the dimensionless jerk, lower is smoother. sparc: spectral arc length of the
+  speed of the joints or of the tip, closer to 0 is smoother.
+- p of success: McNemar's exact test. p of joint length: Wilcoxon's signed-rank test. Neither is corrected
+  for the number of comparisons. With several seeds, a problem counts as solved if it is solved with more
+  than half of the seeds."""
 """Notes below the tables, in Markdown."""
 
 
