@@ -9,17 +9,9 @@ import pytest
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 SCRIPTS = sorted(file.stem for file in FOLDER.glob("*.py") if file.stem != "common")
-NEEDS = {
-    "certificates": ("ompl",),
-    "constraints": ("pybullet",),
-    "moving_obstacles": ("pybullet",),
-    "mujoco_models": ("mujoco",),
-    "peers": ("pybullet",),
-    "planning_requests": ("pybullet", "pinocchio"),
-    "robots": ("pybullet",),
-    "scene_code": ("accelerate", "matplotlib", "zarr"),
-    "server": ("fastapi", "httpx"),
-}
+NEEDS = dict.fromkeys(("constraints", "moving_obstacles", "peers", "robots"), ("pybullet",))
+NEEDS |= {"certificates": ("ompl",), "mujoco_models": ("mujoco",), "planning_requests": ("pybullet", "pinocchio")}
+NEEDS |= {"scene_code": ("accelerate", "matplotlib", "zarr"), "server": ("fastapi", "httpx")}
 """Packages of extras that a script needs."""
 REPORTS = FOLDER / "results"
 NO_SCRIPT = "no longer kept"

@@ -33,16 +33,9 @@ def true(tmp_path_factory: pytest.TempPathFactory) -> tuple[FilePath, rd.Problem
     robot = rd.load_robot("panda")
     table = rd.Box([0.5, 0.0, 0.194], [0.6, 1.6, 0.1], name="table")
     ball = rd.MovingObstacle(rd.Sphere([0.5, 1.4, 0.5], 0.1, "ball"), velocity=[0.0, -0.05, 0.0])
-    problem = rd.Problem(
-        robot,
-        rd.Scene([table]),
-        START,
-        GOAL,
-        waypoints=[MIDDLE],
-        moving=[ball],
-        constraints=[rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], 0.5)],
-        payload=rd.Payload(1.0, [0.0, 0.0, 0.05], HAND),
-    )
+    cone = rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], 0.5)
+    asked = {"waypoints": [MIDDLE], "moving": [ball], "constraints": [cone], "payload": rd.Payload(1.0, [0.0, 0.0, 0.05], HAND)}
+    problem = rd.Problem(robot, rd.Scene([table]), START, GOAL, **asked)  # type: ignore[arg-type]
     ends = rd.Path(robot.joint_names, np.array([START, MIDDLE]))
     half = time_parameterize(robot, ends, lambda _: True, lambda _: True)
     positions = np.concatenate([half.positions, half.positions[1:] + np.subtract(GOAL, MIDDLE)])

@@ -42,18 +42,9 @@ def test_parts_replace_those_of_the_config(trained: list[PlannerTraining]) -> No
     assert run(*TRAIN, "--config", "paper") == 0
     assert run(*TRAIN, "--config", "table2_unet", "--denoiser", "decoder_only") == 0
     changed, paper, row = trained
-    assert changed == replace(
-        paper,
-        denoiser="unet",
-        denoiser_settings=UNetSettings.paper_size(),
-        objective="noise",
-        sampler="ddim",
-        target="residual",
-        waypoints=64,
-        progressive=False,
-        condition_drop=0.2,
-        device="cpu",
-    )
+    wanted = {"denoiser": "unet", "denoiser_settings": UNetSettings.paper_size(), "objective": "noise", "sampler": "ddim"}
+    wanted |= {"target": "residual", "waypoints": 64, "progressive": False, "condition_drop": 0.2, "device": "cpu"}
+    assert changed == replace(paper, **wanted)
     assert row.denoiser == "decoder_only" and row.denoiser_settings is None
 
 

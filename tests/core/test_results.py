@@ -27,24 +27,11 @@ def trajectory() -> rd.Trajectory:
 
 @pytest.fixture
 def solved(trajectory: rd.Trajectory) -> rd.PlanResult:
-    return rd.PlanResult(
-        status=rd.Status.SOLVED,
-        reason="found by a straight line",
-        planner="rrt_connect",
-        robot="panda",
-        planning_time=0.01,
-        seed=3,
-        stage="straight line",
-        path=rd.Path(NAMES, trajectory.positions[[0, 3]]),
-        trajectory=trajectory,
-        min_clearance=0.02,
-        scene_clearance=0.02,
-        self_clearance=0.05,
-        notes=("start clamped",),
-        goal_index=2,
-        progress=((0.002, 3.5), (0.008, 3.0)),
-        refused="scene_collision",
-    )
+    path = rd.Path(NAMES, trajectory.positions[[0, 3]])
+    found = rd.Status.SOLVED, "found by a straight line", "rrt_connect", "panda", 0.01, 3, "straight line", path, trajectory
+    more = {"min_clearance": 0.02, "scene_clearance": 0.02, "self_clearance": 0.05, "notes": ("start clamped",)}
+    more |= {"goal_index": 2, "progress": ((0.002, 3.5), (0.008, 3.0)), "refused": "scene_collision"}
+    return rd.PlanResult(*found, **more)  # type: ignore[arg-type]
 
 
 def test_solved_result_round_trip(solved: rd.PlanResult, tmp_path: Path) -> None:

@@ -319,7 +319,7 @@ def test_other_weights_of_the_same_name_are_refused(tmp_path: Path, monkeypatch:
     ],
 )
 def test_bad_settings_are_told_before_anything_is_made(tmp_path: Path, change: dict, match: str) -> None:
-    refuses(match, bench.run_bench, replace(settings(tmp_path / "out"), **change), quiet, quiet)
+    refuses(match, lambda: bench.run_bench(replace(settings(tmp_path / "out"), **change), quiet, quiet))
     assert not (tmp_path / "out" / "records").exists()
 
 

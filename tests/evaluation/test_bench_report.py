@@ -20,16 +20,8 @@ from robotdiffuse.evaluation.report import draw_plot
 from robotdiffuse.evaluation.runs import RESTARTED, Record, record_of_row, record_path
 from robotdiffuse.problems.held_out import Case, held_out_problem
 
-RUN = {
-    "date": "2026-01-02 03:04",
-    "processor": "Abacus_9 & sons",
-    "cores": 4,
-    "python": "3.12",
-    "versions": {"numpy": "2.0"},
-    "workers": 1,
-    "problems": ["rop"],
-    "seeds": 3,
-}
+RUN = {"date": "2026-01-02 03:04", "processor": "Abacus_9 & sons", "cores": 4, "python": "3.12", "versions": {"numpy": "2.0"}}
+RUN |= {"workers": 1, "problems": ["rop"], "seeds": 3}
 MEASURES = {"tip_length": 1.0, "turning": 0.5, "min_clearance": 0.01, "duration": 2.0, "jerk": 10.0}
 MEASURES |= {"sparc_joint": -2.0, "sparc_tip": -2.0}
 

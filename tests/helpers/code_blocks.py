@@ -126,14 +126,8 @@ def motion_bench_maker(folder: Path) -> None:
     shutil.copytree(ROOT / "tests" / "files" / "motion_bench_maker", folder / "motion_bench_maker")
 
 
-PREPARED: dict[str, Callable[[Path], None]] = {
-    "bench_arm": bench_arm,
-    "cloud.ply": a_cloud,
-    "example_arm": example_arm,
-    "motion_bench_maker": motion_bench_maker,
-    "rop": rop_data,
-    "shelf.stl": shelf,
-}
+PREPARED: dict[str, Callable[[Path], None]] = {"cloud.ply": a_cloud, "rop": rop_data, "shelf.stl": shelf}
+PREPARED |= {made.__name__: made for made in (bench_arm, example_arm, motion_bench_maker)}
 
 
 @dataclass
@@ -221,11 +215,5 @@ def _toml(page: Notebook, block: Block) -> None:
     tomllib.loads(block.code)
 
 
-TRIED: dict[str, Callable[[Notebook, Block], None]] = {
-    "python": _python,
-    "yaml": _yaml,
-    "sh": _sh,
-    "text": lambda page, block: None,
-    "xml": _content,
-    "toml": _toml,
-}
+TRIED: dict[str, Callable[[Notebook, Block], None]] = {"python": _python, "yaml": _yaml, "sh": _sh, "xml": _content}
+TRIED |= {"text": lambda page, block: None, "toml": _toml}

@@ -13,14 +13,8 @@ from robotdiffuse.core.transforms import transform
 from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.robots.robot import Robot
 
-TIPS = {
-    "panda": "panda_hand",
-    "iiwa": "lbr_iiwa_link_7",
-    "xarm7": "link7",
-    "ur5": "tool0",
-    "awkward": "tool",
-    "two_arms": "left_hand",
-}
+TIPS = {"panda": "panda_hand", "iiwa": "lbr_iiwa_link_7", "xarm7": "link7", "ur5": "tool0"}
+TIPS |= {"awkward": "tool", "two_arms": "left_hand"}
 DESCRIPTIONS = {
     "panda": "panda_description/urdf/panda.urdf",
     "xarm7": "xarm_description/urdf/xarm7.urdf",

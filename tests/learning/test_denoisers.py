@@ -146,16 +146,9 @@ def encoder_for(name: str) -> str:
 
 def model_with(name: str, null_condition: bool = False) -> MotionNetwork:
     torch.manual_seed(0)
-    encoder = encoder_for(name)
-    settings = replace(
-        small_model().settings,
-        encoder=encoder,
-        encoder_settings=SMALL_ENCODERS[encoder],
-        denoiser=name,
-        denoiser_settings=SMALL[name],
-        waypoints=12,
-        null_condition=null_condition,
-    )
+    kind = encoder_for(name)
+    parts = {"encoder": kind, "encoder_settings": SMALL_ENCODERS[kind], "denoiser": name, "denoiser_settings": SMALL[name]}
+    settings = replace(small_model().settings, waypoints=12, null_condition=null_condition, **parts)
     model = MotionNetwork(RobotIdentity.of(box_arm()), settings)
     torch.nn.init.normal_(model.denoiser.out.weight, std=0.2)
     if model.null_condition is not None:

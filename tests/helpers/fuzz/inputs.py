@@ -516,22 +516,5 @@ def _npz(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     return lambda: import_npz(file, folder / "set")
 
 
-KINDS: dict[str, Make] = {
-    "problem": _problem,
-    "moveit": _moveit,
-    "cloud": _cloud,
-    "mesh": _mesh,
-    "urdf": _urdf,
-    "result": _result,
-    "bundle": _bundle,
-    "http": _http,
-    "socket": _socket,
-    "motion": _motion,
-    "certificate": _certificate,
-    "depth": _depth,
-    "upload": _upload,
-    "head": _head,
-    "settings": _settings,
-    "weights": _weights,
-    "npz": _npz,
-}
+_MAKERS = (_problem, _moveit, _cloud, _mesh, _urdf, _result, _bundle, _http, _socket, _motion, _certificate, _depth, _upload)
+KINDS: dict[str, Make] = {make.__name__[1:]: make for make in (*_MAKERS, _head, _settings, _weights, _npz)}

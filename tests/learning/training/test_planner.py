@@ -40,19 +40,9 @@ WAYPOINTS = 48
 
 
 def planner_settings(data, **changes) -> PlannerTraining:
-    settings = PlannerTraining(
-        data=str(data),
-        encoder=str(data.parent / "encoder"),
-        minutes=None,
-        samples=160,
-        batch=16,
-        warmup_steps=3,
-        learning_rate=3e-3,
-        turned_copies=0,
-        denoiser_settings=SMALL_DENOISER,
-        validation_problems=1,
-    )
-    return replace(settings, **changes)
+    settings = PlannerTraining(data=str(data), encoder=str(data.parent / "encoder"), denoiser_settings=SMALL_DENOISER)
+    short = {"minutes": None, "samples": 160, "batch": 16, "warmup_steps": 3, "learning_rate": 3e-3, "validation_problems": 1}
+    return replace(settings, turned_copies=0, **short | changes)
 
 
 @pytest.mark.slow
@@ -128,7 +118,7 @@ def test_losses_are_computed_where_the_model_is(denoiser, data, arm):
 def test_device_is_checked(data, tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     for name, message in (("tpu", "unknown device 'tpu'; known: cpu, cuda"), ("cuda", "no CUDA device")):
-        refuses(message, train_planner, planner_settings(data, device=name), str(tmp_path / "out"))
+        refuses(message, lambda name=name: train_planner(planner_settings(data, device=name), str(tmp_path / "out")))
     Processes("cpu")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: True)

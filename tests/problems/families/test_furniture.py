@@ -11,14 +11,8 @@ from robotdiffuse.scenes.scene_arrays import BOX, PackedScenes
 from robotdiffuse.scenes.shapes import Shape
 
 BASE = np.array([[0, 0, 0.1, 0.15], [-0.1, 0, 0.05, 0.1]])
-FURNITURE: dict[str, furniture.Furniture] = {
-    "shelf": furniture.SHELF,
-    "crate": furniture.CRATE,
-    "table": furniture.TABLE,
-    "clutter": furniture.CLUTTER,
-    "kitchen": furniture.KITCHEN,
-    "cabinet": furniture.CABINET,
-}
+NAMES = ("shelf", "crate", "table", "clutter", "kitchen", "cabinet")
+FURNITURE: dict[str, furniture.Furniture] = {name: getattr(furniture, name.upper()) for name in NAMES}
 every_family = pytest.mark.parametrize("name", FURNITURE)
 
 
