@@ -207,7 +207,7 @@ BODY = "<mujoco><worldbody><body>{}<geom size='1'/></body></worldbody></mujoco>"
 )
 def test_bad_models_are_one_line(text: str, wanted: str, tmp_path: Path) -> None:
     (tmp_path / "m.xml").write_text(text)
-    refuses(wanted, UrdfTree(tmp_path / "m.xml", {}).robot)
+    refuses(wanted, lambda: UrdfTree(tmp_path / "m.xml", {}).robot())
 
 
 PLACED = """
