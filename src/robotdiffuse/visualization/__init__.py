@@ -1,4 +1,4 @@
-"""Pictures, HTML replays and the interactive page. Only the command line imports this package."""
+"""Pictures, HTML replays and the interactive page. Of the other packages, only `cli` imports this one."""
 
 from robotdiffuse.visualization.picture import PictureSettings, write_comparison, write_picture
 from robotdiffuse.visualization.replay_page import write_problem, write_replay

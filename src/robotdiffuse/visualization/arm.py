@@ -1,4 +1,4 @@
-"""An arm as it is drawn, and the motions and figures that are shown of it."""
+"""The arm in pictures and on pages: its surfaces, its motions, and facts about a motion."""
 
 import numpy as np
 from jaxtyping import Float
@@ -20,16 +20,16 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.visual_meshes import has_visual
 
 UNTIMED_SPEED = 0.8
-"""Speed in joint space at which a path without times is shown [rad/s]."""
+"""Speed in joint space at which a path without times is played [rad/s]."""
 TRACE_POINTS = 120
-"""Number of configurations along a motion of which the trace is drawn, and by which views are chosen."""
+"""Default number of configurations along a motion for drawing the tool's trace and for choosing the view."""
 
 
 class DrawnArm:
-    """The surfaces of a robot on each of its dof + 1 frames, and the point of its tool that leaves a trace.
+    """The surfaces of a robot on each of its dof + 1 frames, and the point of its tool that draws the trace.
 
-    The point lies on the z axis of the tip link, as far out as the surfaces on its frame reach: between the
-    fingertips of a gripper.
+    The point is on the z axis of the tip link, as far out as the surfaces on the tip's frame extend: for a
+    gripper, this is between the fingertips.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -38,34 +38,37 @@ class DrawnArm:
         for link, surface in link_surfaces(robot).items():
             by_frame[robot.link_frame(link)].append(surface.moved(robot.T_frame_link(link)))
         self.surfaces = [join(surfaces) for surfaces in by_frame]
-        """In the coordinates of each frame."""
+        """One surface for each frame, in the coordinates of the frame [m]."""
         self.tool_frame = robot.link_frame(robot.tip)
         T_frame_tip = robot.T_frame_link(robot.tip)
-        along = (self.surfaces[self.tool_frame].vertices - T_frame_tip[:3, 3]) @ T_frame_tip[:3, 2]
-        self.tool_point = T_frame_tip[:3, 3] + max(0.0, along.max(initial=0.0)) * T_frame_tip[:3, 2]
-        """In the coordinates of the tool's frame [m]."""
+        heights = (self.surfaces[self.tool_frame].vertices - T_frame_tip[:3, 3]) @ T_frame_tip[:3, 2]
+        self.tool_point = T_frame_tip[:3, 3] + max(0.0, heights.max(initial=0.0)) * T_frame_tip[:3, 2]
+        """The point that draws the trace, in the coordinates of frame `tool_frame` [m]."""
 
     def frames(self, q: Float[ndarray, "*batch dof"]) -> Float[ndarray, "*batch frames 4 4"]:
-        """T_base_frame of all frames in each configuration."""
+        """T_base_frame of all dof + 1 frames at each configuration."""
         T = forward_frames(self.robot, q.reshape(-1, self.robot.dof))
         return T.reshape(*q.shape[:-1], *T.shape[1:])
 
     def posed(self, q: Configuration, begin: int = 0) -> Surface:
-        """The arm in a configuration, from frame `begin` on; 1 leaves out the base."""
+        """The surface of the arm at a configuration, in the base frame. Only frames from `begin` on are
+        included: 1 leaves out the base."""
         poses = zip(self.surfaces[begin:], self.frames(q)[begin:], strict=True)
         return join([surface.moved(T) for surface, T in poses])
 
     def tool_points(self, q: Configurations) -> Points:
-        """Positions of the tool [m]."""
+        """Positions of the tool point in the base frame [m]."""
         return self.frames(q)[:, self.tool_frame, :3] @ np.append(self.tool_point, 1.0)
 
     def trace(self, q: Configurations, count: int = TRACE_POINTS) -> Points:
-        """Positions of the tool at equal steps in joint space along a polyline [m]."""
+        """Positions of the tool point at `count` configurations, equally spaced along a path in joint space
+        [m]."""
         return self.tool_points(dense(q, count))
 
 
 def dense(q: Configurations, count: int) -> Configurations:
-    """`count` configurations equally spaced along a polyline in joint space; one if it does not move."""
+    """`count` configurations, equally spaced along a path in joint space; one configuration if the path has
+    no length."""
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(q, axis=0), axis=1))])
     return q[:1] if s[-1] == 0 else interpolated(np.linspace(0, s[-1], count), s, q)
 
@@ -81,8 +84,8 @@ def timed(motion: Path | Trajectory) -> tuple[Values, Configurations]:
 def facts(
     motion: Path | Trajectory, result: PlanResult | None, robot: Robot | None = None
 ) -> list[tuple[str, str]]:
-    """Labels and values of facts about a motion, for headers and captions; of a robot whose visual meshes are
-    not bundled, how it is drawn."""
+    """Labels and values of facts about a motion, for headers and captions. With `robot`, they also say if the
+    robot is drawn by its collision geometry, because no visual meshes are bundled."""
     length = result.path_length if result is not None else None
     if length is None:
         length = Path(motion.joint_names, motion.positions).length

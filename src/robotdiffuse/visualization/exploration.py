@@ -1,4 +1,8 @@
-"""What was known and done during an exploration: as a picture, as a page, and as the live page shows it."""
+"""Pictures and pages of an exploration: what was known about the scene over time, and the steps of the arm.
+
+The planner calls a step of an exploration an act (`RecordedAct`). A look is a step that moves the arm to take
+a view with its camera.
+"""
 
 import base64
 from collections import Counter
@@ -38,61 +42,66 @@ from robotdiffuse.visualization.picture import (
 from robotdiffuse.visualization.replay_page import page_data, page_shapes, page_text
 
 LIKELY = 0.5
-"""Voxels of unknown space that are occupied with a larger probability are shown as predicted."""
+"""Voxels of unknown space with a larger predicted probability of being occupied are shown as predicted."""
 UNKNOWN = (0x6E, 0x7B, 0x8C)
 """sRGB color of the boundary of unknown space."""
 LOOK_COLOR = (0xD9, 0x8A, 0x12)
-"""sRGB color of the pyramid that shows where a camera looks."""
+"""sRGB color of the camera's view pyramid at a look."""
 FRUSTUM_DEPTH = 0.25
-"""Length of the pyramid that shows where a camera looks [m]."""
+"""Length of this pyramid [m]."""
 READING_TIME = 1.5
-"""Pages rest before each step, for its reason to be read [s]."""
+"""Pause before each step on pages, so that the reason of the step can be read [s]."""
 MAX_MOMENTS = 6
+"""Largest number of moments in a picture."""
 TILE = PictureSettings(width=720, height=450, ghosts=2)
+"""Size and contents of the picture of one moment."""
 GAP = 6
-"""Space between two moments [pixels]."""
+"""Space between the pictures of two moments [pixels]."""
 GAP_COLOR = (0xFF, 0xFF, 0xFF)
 UNKNOWN_ALPHA = 0.27
 PREDICTED_ALPHA = 0.55
 SHARE_COLORS = ((0x8A, 0x93, 0xA0), UNKNOWN)
-"""Colors of the labels of the shares that were seen free, and unknown."""
+"""Colors of the labels "seen free" and "unknown"."""
 CAPTION_SIZE = 1.7
+"""Factor on the size of a caption's letters."""
 FADE = (0.7, 0.95)
-"""Where moments fade behind their caption, and how much; see `faded_below`."""
+"""Where pictures of moments fade behind their caption, and how much; arguments of `faded_below`."""
 WHITE = (0xFF, 0xFF, 0xFF)
 LAYERS = (
     {"name": "Occupied", "color": OBSERVED, "opacity": 1.0, "order": 0},
     {"name": "Predicted", "color": ASSUMED, "opacity": 0.6, "order": 1},
     {"name": "Unknown", "color": UNKNOWN, "opacity": 0.28, "order": 20},
 )
-"""Sets of voxels on the page, in the order in which see-through ones are drawn."""
+"""Layers of voxels on the page; `order` is the order in which see-through layers are drawn."""
 Voxels = Bool[ndarray, "nx ny nz"]
 
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """An act, and what was known when it was chosen and during its motion."""
+    """A step of the exploration, and what was known about the scene when it was chosen and during its
+    motion."""
 
     number: int
-    """From 1 on."""
+    """Number of the step, counted from 1."""
     act: RecordedAct
+    """The step."""
     views: list[RecordedView]
-    """The last view before the act, then those that were taken during its motion."""
+    """The last view before the step, then the views that were taken during its motion."""
 
     @property
     def known(self) -> RecordedView:
-        """What was known when the act was chosen."""
+        """What was known when the step was chosen: the map after the last view before it."""
         return self.views[0]
 
 
 def shares(known: RecordedView) -> list[tuple[str, str]]:
-    """Labels and values of what was known."""
+    """Labels and values of the fractions of the map that were seen free, and unknown."""
     parts = (("seen free", known.free), ("unknown", known.unknown))
     return [(name, f"{100 * voxels.mean():.0f} %") for name, voxels in parts]
 
 
 def moments(explorer: RecordedExplorer) -> list[Moment]:
-    """All acts for which something was known, in order."""
+    """The moments of all steps before which there was a view, in order."""
     recorded = []
     for number, act in enumerate(explorer.acts):
         before = [view for view in explorer.views if view.act < number]
@@ -103,7 +112,7 @@ def moments(explorer: RecordedExplorer) -> list[Moment]:
 
 
 def title(act: RecordedAct) -> str:
-    """What the arm does in an act."""
+    """The name of a step, with the duration of its motion."""
     step = act.step
     duration = act.duration
     name = {DONE: "at the goal"}.get(step.kind, step.kind)
@@ -113,9 +122,13 @@ def title(act: RecordedAct) -> str:
 def shown_voxels(
     view: RecordedView, act: RecordedAct | None, in_known_scene: Voxels
 ) -> tuple[tuple[Voxels, Voxels], ...]:
-    """What is shown after a view, with the prediction of an act, without the scene that is known anyway: the
-    voxels inside and outside of the occupied, the predicted (unknown, and probably occupied) and the unknown
-    layer; the faces between them are shown."""
+    """The layers to show after a view: occupied, predicted (unknown, and probably occupied) and unknown
+    voxels.
+
+    A layer is a pair of voxel sets, inside and outside; the faces between both sets are shown. The prediction
+    is that of `act`; without an act there is none. Voxels in the scene that is known without views are left
+    out.
+    """
     occupied = view.occupied & ~in_known_scene
     unknown = view.unknown & ~in_known_scene
     probability = None if act is None else act.predicted
@@ -124,7 +137,7 @@ def shown_voxels(
 
 
 def in_known_scene(explorer: RecordedExplorer) -> Voxels:
-    """The voxels at or in the scene that is known without views."""
+    """The voxels in or near obstacles that are known without views."""
     if not explorer.scene.shapes:
         return np.zeros(MAP.shape, np.bool_)
     centers = MAP.centers(np.indices(MAP.shape).reshape(3, -1).T)
@@ -134,8 +147,8 @@ def in_known_scene(explorer: RecordedExplorer) -> Voxels:
 
 
 def frustum(explorer: RecordedExplorer, act: RecordedAct) -> list[Points]:
-    """The edges of the pyramid that the arm's first camera sees at the end of a look, as polylines in the
-    base frame [m]; none for other acts."""
+    """The edges of the view pyramid of the arm's first camera at the end of a look, as polylines in the base
+    frame [m]; an empty list for other steps."""
     if act.T_base_camera is None:
         return []
     camera = explorer.cameras[0]
@@ -149,10 +162,11 @@ def frustum(explorer: RecordedExplorer, act: RecordedAct) -> list[Points]:
 
 
 def faces_between(inside: Voxels, outside: Voxels) -> tuple[Int[ndarray, "n"], Mask]:
-    """The faces between a voxel of one set and one of another, in order, and whether the one inside comes
-    first along the axis.
+    """The numbers of all faces between a voxel of the set `inside` and a voxel of the set `outside`, in
+    ascending order, and whether the voxel inside comes first along the axis.
 
-    A face has one number: axis · voxels + the flat index of the voxel before it along that axis.
+    The number of a face is axis · (number of voxels) + the flat index of the voxel before the face along the
+    axis.
     """
     numbers = []
     first = []
@@ -171,8 +185,8 @@ def faces_between(inside: Voxels, outside: Voxels) -> tuple[Int[ndarray, "n"], M
 
 
 def faces_surface(inside: Voxels, outside: Voxels, color: Color) -> Surface:
-    """The faces between two sets of voxels, of a map, as a surface in the base frame; normals
-    point out of the set inside, and corners are counterclockwise as seen from there."""
+    """The faces between two sets of voxels of the map, as a surface in the base frame. Normals point out of
+    the set `inside`, and corners are counterclockwise when seen against the normal."""
     numbers, first = faces_between(inside, outside)
     axis, flat = np.divmod(numbers, inside.size)
     at = np.stack(np.unravel_index(flat, inside.shape), axis=1)
@@ -181,8 +195,8 @@ def faces_surface(inside: Voxels, outside: Voxels, color: Color) -> Surface:
     vertices = np.stack([corner, corner + across, corner + across + up, corner + up], axis=1)
     normals = np.where(first[:, None], along, -along)
     triangles = np.array([[0, 1, 2], [0, 2, 3]])
-    wound = np.where(first[:, None, None], triangles, triangles[:, ::-1])
-    faces = (4 * np.arange(len(numbers))[:, None, None] + wound).reshape(-1, 3)
+    corner_orders = np.where(first[:, None, None], triangles, triangles[:, ::-1])
+    faces = (4 * np.arange(len(numbers))[:, None, None] + corner_orders).reshape(-1, 3)
     vertices = vertices.reshape(-1, 3) * MAP.edge + MAP.low
     return Surface(vertices, normals.repeat(4, axis=0), painted(color, len(vertices)), faces)
 
@@ -190,12 +204,13 @@ def faces_surface(inside: Voxels, outside: Voxels, color: Color) -> Surface:
 def write_exploration_picture(
     explorer: RecordedExplorer, scene: Scene, file: str | FilePath, settings: PictureSettings = TILE
 ) -> None:
-    """Write the moments of an exploration as one .png: at most MAX_MOMENTS, the first and the last included.
+    """Write up to MAX_MOMENTS moments of an exploration as one .png, including the first and the last two.
 
-    Each shows the arm's motion among what was known when it was chosen: voxels seen occupied (blue),
-    predicted ones (violet), the boundary of unknown space (gray, see-through), and at the end of a look what
-    the camera will see (a pyramid). scene: the true one, from which the view is chosen. settings: of each
-    moment. Raises InputError for another ending or a file that cannot be written.
+    The picture of a moment shows the arm's motion and what was known when it was chosen: voxels seen occupied
+    (blue), predicted voxels (violet), the boundary of unknown space (gray, see-through), and for a look the
+    camera's view pyramid at its end. `scene` is the true scene; it is used only to choose the view.
+    `settings` are those of the picture of one moment. Raises InputError for a file name with another ending,
+    or a file that cannot be written.
     """
     path = check_output(file, (".png",))
     all_moments = moments(explorer)
@@ -209,7 +224,8 @@ def write_exploration_picture(
 
 
 def _chosen(count: int) -> list[int]:
-    """The first moment, the last two, and others between them."""
+    """Indices of the moments to show: all, or the first one, the last two, and evenly spaced ones in
+    between."""
     if count <= MAX_MOMENTS:
         return list(range(count))
     return [*np.linspace(0, count - 3, MAX_MOMENTS - 2).round().astype(int), count - 2, count - 1]
@@ -248,7 +264,7 @@ def _tile(
 
 
 def _joined(tiles: list[Image.Image]) -> Image.Image:
-    """The pictures in rows of two or three."""
+    """One image with the pictures in rows of two or three."""
     columns = min(len(tiles), 3 if len(tiles) > 4 else 2)
     rows = -(-len(tiles) // columns)
     width = tiles[0].width + GAP
@@ -260,10 +276,10 @@ def _joined(tiles: list[Image.Image]) -> Image.Image:
 
 
 def write_exploration(explorer: RecordedExplorer, scene: Scene, file: str | FilePath) -> None:
-    """Write an exploration as a self-contained .html file, with what was known after each view.
+    """Write an exploration as a self-contained .html file, which shows what was known after each view.
 
-    scene: the true one, which the page can show. Raises InputError for another ending or a file that cannot
-    be written.
+    `scene` is the true scene, which the page can show too. Raises InputError for a file name with another
+    ending, or a file that cannot be written.
     """
     target = check_output(file, (".html", ".htm"))
     robot = explorer.robot
@@ -292,12 +308,13 @@ def write_exploration(explorer: RecordedExplorer, scene: Scene, file: str | File
 
 
 def _page_time(time: float, act: int) -> float:
-    """The time on the page of a time during an act."""
+    """Time on the page, where each step begins with a pause, of a `time` during the step with this index
+    [s]."""
     return round(time + READING_TIME * (act + 1), 4)
 
 
 def _whole_motion(explorer: RecordedExplorer) -> Trajectory:
-    """All motions with the pauses between them."""
+    """The motions of all steps as one trajectory, with the pauses between them."""
     times = []
     positions = []
     for number, act in enumerate(explorer.acts):
@@ -311,7 +328,8 @@ def _whole_motion(explorer: RecordedExplorer) -> Trajectory:
 
 
 def _known(explorer: RecordedExplorer) -> list[dict[str, Any]]:
-    """Times, and the faces of each layer that come or go, after each view and each prediction."""
+    """For each view and each step: the time on the page, and for each layer the faces that appear or
+    disappear."""
     known_scene = in_known_scene(explorer)
     before = [np.zeros(0, np.int64) for _ in LAYERS]
     states = []
@@ -329,8 +347,8 @@ def _known(explorer: RecordedExplorer) -> list[dict[str, Any]]:
 
 
 def _packed(numbers: Int[ndarray, "n"]) -> str:
-    """Ascending numbers in base64: the differences from one to the next, in groups of 7 bits, the lowest
-    first, of which all but the last are marked."""
+    """Ascending numbers in base64. The difference of each number to the one before is stored in bytes of 7
+    bits, lowest bits first; the 8th bit is set in all but the last byte of a difference."""
     steps = np.diff(numbers, prepend=0)
     groups = np.stack([steps >> shift & 127 for shift in (0, 7, 14, 21)], axis=1)
     used = np.stack([np.ones(len(steps), bool), *(steps >= 1 << shift for shift in (7, 14, 21))], axis=1)

@@ -1,5 +1,5 @@
-"""Draws a motion as a PNG picture, in software, without GPU, window or browser, from where the camera sees
-most of the arm and its trace."""
+"""Draws a motion as a PNG picture, in software: without GPU, window or browser. The view is chosen so that
+most of the arm and its trace are visible."""
 
 import io
 from collections.abc import Mapping, Sequence
@@ -27,12 +27,13 @@ from robotdiffuse.visualization.arm import TRACE_POINTS, DrawnArm, dense, facts
 from robotdiffuse.visualization.rasterizer import blend_ghost, draw, shade
 
 AZIMUTHS = 18
+"""Number of azimuths of candidate views."""
 ELEVATIONS = np.radians((15.0, 25.0))
-"""Candidate views: number of azimuths, and elevations [rad]."""
+"""Elevations of candidate views [rad]."""
 VERTICAL_FIELD = np.radians(28)
 """Vertical field of view [rad]."""
 MAX_FRAMING_DISTANCE = 1.3
-"""Obstacles are framed up to this distance from the middle of the arm [m]."""
+"""The view is framed to include obstacles up to this distance from the middle of the motion [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +52,7 @@ class Camera:
 
     @property
     def rotation(self) -> Rotation:
-        """R_camera_base: right, down, forward."""
+        """R_camera_base; its rows are the directions right, down and forward."""
         forward = (self.target - self.eye) / np.linalg.norm(self.target - self.eye)
         right = np.cross(forward, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
@@ -65,7 +66,8 @@ class Camera:
         return np.stack(columns, axis=1).astype(np.float32)
 
     def rays(self) -> Rotation:
-        """Matrix from (x, y, 1) in pixels to the direction in the base frame with depth 1."""
+        """Matrix that maps (x, y, 1), with x and y in pixels, to the ray through the pixel in the base frame,
+        with depth 1."""
         f = self.focal
         pixel = np.array([[1 / f, 0, -0.5 * self.width / f], [0, 1 / f, -0.5 * self.height / f], [0, 0, 1]])
         return self.rotation.T @ pixel
@@ -74,7 +76,8 @@ class Camera:
 def drawn_by(
     camera: Camera, surface: Surface
 ) -> tuple[Float[ndarray, "h w"], Int[ndarray, "h w"], Float[ndarray, "v 3"]]:
-    """Nearness and face at each pixel, and the vertices on the screen; see `rasterizer.draw`."""
+    """Nearness and index of the visible face at each pixel, and the vertices on the screen; see
+    `rasterizer.draw`."""
     near = np.zeros((camera.height, camera.width), np.float32)
     ident = np.zeros(near.shape, np.int32)
     screen = camera.project(surface.vertices)
@@ -93,9 +96,10 @@ def framed(
     size: tuple[int, int],
     free: tuple[float, float],
 ) -> Camera:
-    """A camera in the direction `toward`, as close as all points fit.
+    """A camera in the direction `toward` from the points, as close as possible with all points in the
+    picture.
 
-    size: width and height [pixels]. free: fractions of the height to leave free above and below.
+    `size` is width and height [pixels]; `free` are the fractions of the height to leave free above and below.
     """
     target = 0.5 * (points.min(0) + points.max(0))
     distance = 1.0
@@ -109,8 +113,8 @@ def framed(
         distance = max((np.abs(x) / side - z).max(), (y / bottom - z).max(), (y / top - z).max(), 0.3)
         u = x / (z + distance)
         v = y / (z + distance)
-        off = 0.5 * np.array([u.min() + u.max(), v.min() + v.max() - top - bottom])
-        target = target + distance * rotation[:2].T @ off
+        offset = 0.5 * np.array([u.min() + u.max(), v.min() + v.max() - top - bottom])
+        target = target + distance * rotation[:2].T @ offset
     return Camera(target + distance * toward, target, *size)
 
 
@@ -123,9 +127,9 @@ def best_view(
     free: tuple[float, float],
     azimuth: float | None = None,
 ) -> Camera:
-    """The framed view, of AZIMUTHS x ELEVATIONS, that shows most of the arm and its trace.
+    """The framed view that shows most of the arm and its trace, among AZIMUTHS x ELEVATIONS.
 
-    azimuth: the only one to look from, from the x axis of the base [rad]; None: the best.
+    `azimuth` fixes the azimuth, measured from the x axis of the base [rad]; None: the best one is chosen.
     """
     moving = np.concatenate([arm.vertices, ghosts.vertices, trace])
     middle = 0.5 * (moving.min(0) + moving.max(0))
@@ -158,7 +162,8 @@ def view_of_motion(
 
 
 def _score(camera: Camera, arm: Surface, ghosts: Surface, trace: Points, obstacles: Surface) -> float:
-    """Visible fraction of the arm, plus half that of the ghosts, plus the visible length of the trace."""
+    """Score of a view: the visible fraction of the arm, plus half the visible fraction of the ghosts, plus
+    the visible length of the trace relative to the height of the picture."""
     hidden, _, _ = drawn_by(camera, obstacles)
     score = 0.0
     for part, weight in ((arm, 1.0), (ghosts, 0.5)):
@@ -177,13 +182,14 @@ def _score(camera: Camera, arm: Surface, ghosts: Surface, trace: Points, obstacl
 
 SUPERSAMPLING = 2
 """Number of rendered pixels per pixel along each side."""
+# numbers of directional lights for the sky and for the main light, and the edges of their shadow maps
+# [pixels]
 SKY_LIGHTS = 60
 SKY_MAP = 320
-# Number of lights of the sky and of the main light, and edge length of the shadow map of each [pixels].
 KEY_LIGHTS = 28
 KEY_MAP = 768
 KEY_DIRECTION = np.array([0.35, -0.45, 0.82])
-"""Direction towards the main light, in a frame whose x axis points from the scene to the camera."""
+"""Direction towards the main light, in a frame with z up and x from the scene to the camera."""
 KEY_SPREAD = 0.075
 """Angular radius of the main light [rad], for soft shadows."""
 TUBE_SIDES = 10
@@ -191,14 +197,15 @@ TUBE_SIDES = 10
 TUBE_RADIUS = 0.006
 """Radius of the trace [m]."""
 CAPTION_COLOR = (0xF2, 0xF4, 0xF6)
-"""Color to which the picture fades behind the caption."""
+"""sRGB color to which the picture fades behind the caption."""
 COMPARED = ((0xE3, 0xA8, 0x12), (0xCF, 0x33, 0x3B), (0x2F, 0x6F, 0xD0), (0x8B, 0x55, 0xB8))
 """sRGB colors of the traces of several motions in one picture."""
 MOVED_ALPHA = 0.22
-"""Opacity of moving obstacles along their way."""
+"""Opacity of later poses of moving obstacles."""
 TRACE_STEPS = 240
-"""Number of configurations along a motion of which the trace is drawn."""
+"""Number of configurations along a motion for drawing the tool's trace."""
 WHITE = (0xFF, 0xFF, 0xFF)
+# sRGB color and opacity of the safety shell
 SHELL_COLOR = (0x35, 0xB8, 0x5C)
 SHELL_ALPHA = 0.2
 MARGINS = (0.05, 0.11)
@@ -207,7 +214,7 @@ MARGINS = (0.05, 0.11)
 
 @dataclass(frozen=True, eq=False)
 class ClearSurface:
-    """A see-through surface, of which the part nearest to the camera is drawn."""
+    """A see-through surface. Only its part nearest to the camera is drawn."""
 
     surface: Surface
     tint: Vector
@@ -227,10 +234,10 @@ class PictureSettings(Settings, name="picture"):
     ghosts: Natural = 5
     """Number of see-through arms from the start towards the goal."""
     azimuth: float | None = None
-    """Azimuth of the camera, from the x axis of the base [rad]; None: from where most of the motion can be
-    seen."""
+    """Azimuth of the camera, measured from the x axis of the base [rad]; None: where most of the motion is
+    visible."""
     shell: NotNegative = 0.0
-    """Thickness of the see-through safety shell about the arm [m]; 0: none."""
+    """Thickness of a see-through safety shell around the arm at the goal [m]; 0: no shell."""
 
 
 def write_picture(
@@ -246,9 +253,9 @@ def write_picture(
 ) -> None:
     """Write a picture of a motion as .png.
 
-    The arm at the goal is solid, earlier poses are see-through, and a tube follows the tool. Of `moving`
-    obstacles, the pose at the start is solid, and later ones are see-through. `result` adds
-    its figures to the caption. Raises InputError for another ending or a file that cannot be written.
+    The arm is solid at the goal and see-through at earlier configurations; a tube shows the tool's trace.
+    `moving` obstacles are solid at the pose at the start, and see-through at later poses. `result` adds facts
+    to the caption. Raises InputError for a file name with another ending, or a file that cannot be written.
     """
     path = check_output(file, (".png",))
     settings = settings or PictureSettings()
@@ -266,10 +273,10 @@ def write_comparison(
     settings: PictureSettings | None = None,
     moving: Sequence[MovingObstacle] = (),
 ) -> None:
-    """Write a picture of several motions by name, of one arm in one scene, as .png.
+    """Write a picture of several motions of one arm in one scene as .png. `motions` are given by name.
 
-    The arm is that of the first motion; each motion has a trace of its own color. Raises InputError as
-    `write_picture` does, and for more motions than there are colors.
+    The arm is drawn along the first motion; each motion has a trace in its own color. Raises InputError in
+    the cases in which `write_picture` raises it, and for more motions than there are colors.
     """
     path = check_output(file, (".png",))
     if not 0 < len(motions) <= len(COMPARED):
@@ -297,7 +304,7 @@ def write_captioned(
 
 
 def save_png(image: Image.Image, path: FilePath) -> None:
-    """Write an image at once."""
+    """Write an image as PNG; the file is written atomically."""
     buffer = io.BytesIO()
     image.save(buffer, "PNG", optimize=False)
     write_atomically(path, buffer.getvalue())
@@ -314,12 +321,21 @@ def render(
     clear: Sequence[ClearSurface] = (),
     moving: Sequence[MovingObstacle] = (),
 ) -> tuple[np.ndarray, Camera]:
-    """The picture without its caption, uint8 [height, width, 3], and the camera that took it.
+    """Draws the picture of a motion without its caption.
 
-    camera: where to look from; without one, from where most of the motion can be seen.
-    others: further motions, of which the trace is drawn; all traces then have the colors COMPARED.
-    added, clear: further surfaces in the base frame, solid and see-through.
-    moving: obstacles that are solid where they are at the start, and see-through later.
+    Args:
+        robot: The robot.
+        scene: Its static obstacles.
+        motion: The motion along which the arm is drawn.
+        settings: Size and contents of the picture.
+        camera: The camera; None: a view that shows most of the motion is chosen.
+        others: Further motions for which only traces are drawn; all traces then have the colors COMPARED.
+        added: Further solid surfaces in the base frame.
+        clear: Further see-through surfaces in the base frame.
+        moving: Obstacles that are solid at the pose at the start, and see-through at later poses.
+
+    Returns:
+        The picture, uint8 [height, width, 3], and its camera.
     """
     arm = DrawnArm(robot)
     obstacles = drawables(scene, moving)
@@ -331,33 +347,35 @@ def render(
     traces = [arm.trace(item.positions, TRACE_STEPS) for item in (motion, *others)]
     if camera is None:
         size = settings.width, settings.height
-        faint = join([ghost for ghost, _ in ghosts])
-        camera = best_view(goal, faint, traces[0], surroundings, size, MARGINS, settings.azimuth)
+        all_ghosts = join([ghost for ghost, _ in ghosts])
+        camera = best_view(goal, all_ghosts, traces[0], surroundings, size, MARGINS, settings.azimuth)
     large_camera = Camera(
         camera.eye, camera.target, SUPERSAMPLING * settings.width, SUPERSAMPLING * settings.height
     )
     colors = [(color, color) for color in COMPARED] if others else [(START, GOAL)]
     tubes = [tube(points, *ends) for points, ends in zip(traces, colors, strict=False)]
-    over = []
+    see_through = []
     if isinstance(motion, Trajectory):
         times = np.linspace(0.0, motion.duration, settings.ghosts + 1)[1:]
-        # the first obstacle is drawn over the others
+        # drawn in reverse order, so that the first obstacle is drawn over the others
         for item in reversed([item for item in obstacles if item.moving is not None and item.moving.known]):
-            over += [ClearSurface(item.surface_at(time), linear(item.color), MOVED_ALPHA) for time in times]
+            see_through += [
+                ClearSurface(item.surface_at(time), linear(item.color), MOVED_ALPHA) for time in times
+            ]
     ghosts.sort(key=lambda ghost: -float(np.linalg.norm(ghost[0].vertices.mean(0) - large_camera.eye)))
     for ghost, share in ghosts:
         color = linear(START) * (1 - share) + linear(GOAL) * share
-        over.append(ClearSurface(ghost, color, 0.50 if share == 0 else 0.26))
+        see_through.append(ClearSurface(ghost, color, 0.50 if share == 0 else 0.26))
     if settings.shell:
-        over.append(ClearSurface(_shell(arm, q[-1], settings.shell), linear(SHELL_COLOR), SHELL_ALPHA))
-    image = _paint(large_camera, join([goal, surroundings, *tubes, *added]), [*clear, *over])
+        see_through.append(ClearSurface(_shell(arm, q[-1], settings.shell), linear(SHELL_COLOR), SHELL_ALPHA))
+    image = _paint(large_camera, join([goal, surroundings, *tubes, *added]), [*clear, *see_through])
     s = SUPERSAMPLING
     image = image.reshape(settings.height, s, settings.width, s, 3).mean(axis=(1, 3))
     return _to_srgb(image), camera
 
 
 def _shell(arm: DrawnArm, q: Configuration, thickness: float) -> Surface:
-    """The covering spheres of the arm, enlarged by the thickness of the shell [m]."""
+    """The safety shell: the covering spheres of the arm at q, enlarged by a thickness [m]."""
     spheres = placed_spheres(arm.robot, q)
     return join([_ball(sphere[:3], sphere[3] + thickness, WHITE, 3) for sphere in spheres])
 
@@ -372,7 +390,8 @@ def _ball(center: Vector, radius: float, color: Color, subdivisions: int) -> Sur
 
 
 def _paint(camera: Camera, solid: Surface, clear: Sequence[ClearSurface]) -> Float[ndarray, "h w 3"]:
-    """Linear colors of the solid surfaces with the see-through ones over them, in their order."""
+    """Linear colors of the picture: the solid surfaces, and over them the see-through surfaces in their
+    order."""
     near, ident, screen = drawn_by(camera, solid)
     image = np.zeros((*near.shape, 3), np.float32)
     view = (camera.eye, camera.rays())
@@ -417,7 +436,7 @@ def _cone(toward: Vector, count: int) -> Points:
 
 
 def _axes(toward: Vector) -> Rotation:
-    """Right-handed axes whose third is the direction."""
+    """Right-handed axes, as rows, with the direction as the third axis."""
     right = np.cross([0.0, 1.0, 0.0] if abs(toward[1]) < 0.9 else [1.0, 0.0, 0.0], toward)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(toward, right), toward])
@@ -431,8 +450,8 @@ def _light_maps(solid: Surface, toward: Points, size: int) -> tuple:
         low = solid.vertices.min(0).clip(-2.5, 2.5)
         high = solid.vertices.max(0).clip(-2.5, 2.5)
         center = 0.5 * (low + high)
-        away = np.linalg.norm(solid.vertices - center, axis=1)
-        radius = max(radius, min(3.0, float(away.max())))
+        distances = np.linalg.norm(solid.vertices - center, axis=1)
+        radius = max(radius, min(3.0, float(distances.max())))
     scale = 0.49 * size / radius
     axes = np.stack([_axes(d) for d in toward])
     maps = np.zeros((len(toward), size, size), np.float32)
@@ -447,8 +466,7 @@ def _light_maps(solid: Surface, toward: Points, size: int) -> tuple:
 
 
 def tube(points: Points, first: Color, last: Color) -> Surface:
-    """A round tube along a polyline, colored from the first to the last color, with spheres at both
-    ends."""
+    """A round tube along a polyline, with spheres at both ends. Its color changes from `first` to `last`."""
     balls = [_ball(points[i], 2.2 * TUBE_RADIUS, color, 2) for i, color in ((0, first), (-1, last))]
     n = len(points)
     if n < 2:
@@ -458,7 +476,7 @@ def tube(points: Points, first: Color, last: Color) -> Surface:
     across = np.empty_like(points)
     previous = _axes(along[0])[0]
     for i in range(n):
-        # Parallel transport, so that the tube does not pinch in turns.
+        # parallel transport of the cross-section, so that the tube is not twisted or pinched in turns
         previous = previous - along[i] * (along[i] @ previous)
         previous = previous / max(float(np.linalg.norm(previous)), 1e-9)
         across[i] = previous
@@ -479,7 +497,7 @@ def tube(points: Points, first: Color, last: Color) -> Surface:
 
 
 def linear(rgb: Color) -> Vector:
-    """The linear color of an sRGB color."""
+    """The linear color, in [0, 1], of an sRGB color."""
     return _linear_array(np.array(rgb) / 255.0)
 
 
@@ -488,7 +506,8 @@ def _linear_array(srgb: Float[ndarray, "*n 3"]) -> Float[ndarray, "*n 3"]:
 
 
 def _to_srgb(image: Float[ndarray, "h w 3"]) -> np.ndarray:
-    """Linear colors as sRGB bytes; highlights roll off smoothly."""
+    """Converts linear colors to sRGB bytes. Values above a knee are compressed smoothly instead of
+    clipped."""
     knee = 0.75
     over = np.maximum(image - knee, 0)
     image = np.minimum(image, knee) + (1 - knee) * (1 - np.exp(-over / (1 - knee)))
@@ -497,9 +516,10 @@ def _to_srgb(image: Float[ndarray, "h w 3"]) -> np.ndarray:
 
 
 def faded_below(pixels: np.ndarray, begin: float = 0.84, most: float = 0.8) -> np.ndarray:
-    """The picture faded at its lower edge, so that the caption is readable.
+    """The picture, faded towards its lower edge so that the caption is readable.
 
-    begin: where it begins to fade, as a share of the height. most: how much it is faded at the edge.
+    It begins to fade at the fraction `begin` of the height. `most` is the fraction by which it is faded at
+    the edge.
     """
     rise = (np.linspace(0, 1, len(pixels)) - begin).clip(0, None)[:, None, None] / (1 - begin)
     cover = most * rise * rise * (3 - 2 * rise)
@@ -513,8 +533,8 @@ def caption(
     colors: Sequence[Color] = (),
     enlarged: float = 1.0,
 ) -> None:
-    """Write title and figures in the lower left corner. colors: of the labels; without any, gray.
-    enlarged: factor of the size of the letters."""
+    """Draws a title, and facts as pairs of label and value, in the lower left corner. `colors` are those of
+    the labels; without colors, labels are gray. `enlarged` is a factor on the size of the letters."""
     scale = enlarged * image.width / 1600
     pen = ImageDraw.Draw(image)
     title_font = ImageFont.load_default(max(8, 30 * scale))

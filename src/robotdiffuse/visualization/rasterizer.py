@@ -1,5 +1,5 @@
-"""Compiled triangle rasterizer and shading of pictures: no GPU or window, the same pixels on every
-machine."""
+"""Compiled triangle rasterizer and shading of pictures. It needs no GPU or window, and gives the same pixels
+on every machine."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from robotdiffuse.core.kernels import kernel
 
 GROUND_RADIUS = 3.2
 """Radius of the visible ground [m]."""
-# Linear colors: of the ground and its lines, of the background at the top and the bottom, and of the lights.
+# linear colors of the ground and its lines, of the background at the top and at the bottom, and of the lights
 GROUND = 0.8148, 0.8308, 0.8550
 GROUND_LINES = 0.5457, 0.5841, 0.6376
 BACKGROUND = (0.9301, 0.9387, 0.9560), (0.7913, 0.8148, 0.8469)
@@ -31,9 +31,10 @@ def _dot(a, b):
 def draw(near, ident, screen, faces):
     """Draw triangles into a z-buffer.
 
-    near[h, w]: nearness, any measure that is linear on the screen (1/z for perspective); larger is nearer,
-    and only larger values are drawn. ident[h, w]: index of the visible face. screen[v, 3]: x and y in pixels,
-    and nearness; triangles with a nearness of 0 or less are skipped.
+    near[h, w] is the buffer of nearness: a measure that is linear on the screen (1/z for perspective) and
+    larger for nearer points. ident[h, w] is the index of the visible face. Both are updated where a triangle
+    is nearer than the buffer. screen[v, 3] are the vertices: x and y in pixels, and nearness. Triangles with
+    a nearness of 0 or less at a vertex are skipped.
     """
     h, w = near.shape
     for f in range(faces.shape[0]):
@@ -66,10 +67,11 @@ def draw(near, ident, screen, faces):
 
 @kernel()
 def _lit(light, at, n, first):
-    """Cosine-weighted fraction of directional lights that reach a point, by every fourth light from `first`.
+    """Fraction of directional lights that reach a point `at` with normal n, weighted by the cosine of their
+    angles. Only every fourth light from `first` on is used.
 
-    Each light has an orthographic map of the surfaces nearest to it. The point is moved along its normal so
-    that surfaces do not shadow themselves.
+    Each light has an orthographic depth map of the surfaces nearest to it. The point is moved along its
+    normal, so that surfaces do not shadow themselves.
     """
     maps, directions, scale, center = light
     bias = 2 / scale
@@ -85,7 +87,7 @@ def _lit(light, at, n, first):
             continue
         column = int(_dot(x, d[0]) * scale + 0.5 * size)
         row = int(_dot(x, d[1]) * scale + 0.5 * size)
-        # a texel of a surface seen edge-on spans more depth
+        # a texel of a surface that the light meets at a flat angle spans more depth
         beyond = _dot(x, d[2]) + bias * min(4.0, 0.5 / cosine) + 100.0
         inside = 0 <= column < size and 0 <= row < size
         if not (inside and maps[k, row, column] > beyond):
@@ -95,7 +97,8 @@ def _lit(light, at, n, first):
 
 @kernel()
 def _grid(x, y, spacing, width, footprint):
-    """Coverage of a pixel by the lines of a grid on the ground, softened by the pixel's footprint."""
+    """Coverage of a pixel by the lines of a grid on the ground; lines are blurred by the pixel's footprint
+    [m]."""
     best = 0.0
     for value in (x, y):
         off = abs(value - spacing * np.floor(value / spacing + 0.5))
@@ -106,10 +109,11 @@ def _grid(x, y, spacing, width, footprint):
 
 @kernel()
 def _surface(row, column, near, seen, camera, height):
-    """The surface at a pixel: depth (0 for none), the ray with depth 1 through its middle, the normal towards
-    the eye, the perspective-correct weights of the face's corners, and whether it is solid.
+    """The surface that is visible at a pixel.
 
-    height: of the ground [m].
+    Returns its depth (0 without a surface), the ray with depth 1 through the middle of the pixel, the normal
+    towards the eye, the perspective-correct weights of the face's corners, and whether it is a solid surface
+    rather than the ground. `height` is the height of the ground [m].
     """
     ident, screen, faces, normals, _ = seen
     eye, rays = camera
@@ -151,12 +155,13 @@ def _mixed(rows, corners, weights):
 
 @kernel()
 def shade(image, near, seen, camera, height, sky, key):
-    """Compute the linear color of every pixel of the solid surfaces and the ground.
+    """Compute the linear color of every pixel: solid surfaces, ground and background.
 
-    camera: (eye[3], rays[3, 3]) so that the ray through pixel (x, y) is rays @ (x, y, 1), with z-depth 1.
-    seen: (ident, screen, faces, normals, colors) of the surfaces. height: of the ground [m]. sky, key: (maps,
-    axes, scale, center) of lights. Each pixel uses a quarter of the lights, a different one for each pixel in
-    a square of four, which become one pixel of the picture.
+    `camera` is (eye[3], rays[3, 3]); the ray through pixel (x, y) is rays @ (x, y, 1), with z-depth 1. `seen`
+    is (ident, screen, faces, normals, colors) of the surfaces, and `height` the height of the ground [m].
+    `sky` and `key` are (maps, axes, scale, center) of the lights of the sky and of the main light. Each pixel
+    uses a quarter of the lights: in a square of four pixels, which become one pixel of the picture, each uses
+    another quarter.
     """
     h, w = near.shape
     eye, rays = camera
@@ -201,12 +206,13 @@ def shade(image, near, seen, camera, height, sky, key):
 
 @kernel()
 def blend_ghost(image, solid, near, seen, camera, toward, tint, alpha):
-    """Blend one see-through arm over the image: its nearest surface, more opaque where it is seen edge-on."""
+    """Blend one see-through surface over the image. Only its nearest part is drawn; it is more opaque where
+    it is seen at a flat angle."""
     h, w = near.shape
     ident, _, faces, normals, colors = seen
     for row in range(h):
         for column in range(w):
-            # It must be slightly nearer than the solid arm: links that only turn about their axis coincide.
+            # it must be slightly nearer than the solid surfaces, since links of both arms may coincide
             if near[row, column] <= 1.003 * solid[row, column]:
                 continue
             _, ray, n, weights, _ = _surface(row, column, near, seen, camera, -np.inf)

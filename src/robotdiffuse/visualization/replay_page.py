@@ -1,5 +1,6 @@
-"""Writes 3D replays of motions as single HTML files, for any browser with WebGL, offline: of one motion, of
-problems without one, galleries of several, and replays in notebook cells."""
+"""Writes 3D replays of motions: single HTML files that work offline in any browser with WebGL. There are
+pages for a motion, for a problem without a motion, galleries of several motions, and replays in notebook
+cells."""
 
 import base64
 import html
@@ -64,11 +65,11 @@ from robotdiffuse.visualization.picture import (
 )
 
 MAX_ROW_RATE = 60.0
-"""Largest number of rows of the motion per second; the page interpolates between them."""
+"""Largest number of rows of the motion per second in a page, which interpolates between rows."""
 TRACK_RATE = 30.0
-"""Poses of moving obstacles per second."""
+"""Number of poses of a moving obstacle per second in a page."""
 MAX_ROWS = 3000
-"""Largest number of rows of the motion."""
+"""Largest number of rows of the motion, and of poses of a moving obstacle, in a page."""
 VIEW_SIZE = (1600, 1000)
 """Window size for which the first view is chosen [pixels]."""
 VIEW_MARGINS = (0.09, 0.15)
@@ -88,9 +89,10 @@ def write_replay(
 ) -> None:
     """Write a replay of a motion as a self-contained .html file.
 
-    `result` adds its figures to the header. For `candidates`, other paths of the same robot, the traces of
-    the tool are shown. `moving` obstacles move along with a timed motion. A path without times plays at
-    constant speed in joint space. Raises InputError for another ending or a file that cannot be written.
+    `result` adds facts to the header. `candidates` are other paths of the same robot; only the tool's traces
+    along them are shown. `moving` obstacles move while a timed motion is played. A path without times is
+    played at constant speed in joint space. Raises InputError for a file name with another ending, or a file
+    that cannot be written.
     """
     target = check_output(file, (".html", ".htm"))
     count = len(scene.shapes) + len(moving)
@@ -100,7 +102,8 @@ def write_replay(
 
 
 def page_text(title: str, data: dict[str, Any], script: str = "") -> str:
-    """A page with the data of `page_data`. script: name of a file that runs after `replay.js`."""
+    """The HTML text of a page with the data of `page_data`. `script` is the name of a file in the folder
+    `page` that runs after `replay.js`."""
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
     page = files("robotdiffuse.visualization") / "page"
     parts = {
@@ -124,7 +127,7 @@ def page_data(
     candidates: Sequence[Path] = (),
     moving: Sequence[MovingObstacle] = (),
 ) -> dict[str, Any]:
-    """What the page reads; see `write_replay`."""
+    """The data of a page, in the form that `replay.js` reads; for the arguments see `write_replay`."""
     arm = DrawnArm(robot)
     obstacles = drawables(scene, moving)
     times, positions = _thinned(*timed(motion))
@@ -167,7 +170,8 @@ def page_data(
 
 
 def _thinned(times: Values, positions: Configurations) -> tuple[Values, Configurations]:
-    """At most MAX_ROW_RATE rows per second and MAX_ROWS in all; shorter motions stay unchanged."""
+    """Resamples a motion to at most MAX_ROW_RATE rows per second and MAX_ROWS rows. Motions with fewer rows
+    are not changed."""
     max_rows = int(min(MAX_ROWS, max(2, np.ceil(MAX_ROW_RATE * times[-1]) + 1)))
     if len(times) <= max_rows:
         return times, positions
@@ -176,8 +180,8 @@ def _thinned(times: Values, positions: Configurations) -> tuple[Values, Configur
 
 
 def _track(obstacle: Drawable, motion: Path | Trajectory) -> list[list[float]]:
-    """How the obstacle has moved from its first pose at equal steps of the motion's time: x y z, and the
-    quaternion wxyz."""
+    """The obstacle's motion relative to its first pose, in the base frame: rows of x y z and wxyz at evenly
+    spaced times of the robot's motion."""
     if not isinstance(motion, Trajectory):
         return [[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]
     count = int(min(MAX_ROWS, np.ceil(TRACK_RATE * motion.duration) + 1))
@@ -190,7 +194,7 @@ def _track(obstacle: Drawable, motion: Path | Trajectory) -> list[list[float]]:
 
 
 def _spheres(robot: Robot) -> list[list[float | int]]:
-    """Frame, x, y, z and radius of each covering sphere."""
+    """For each covering sphere: the index of its frame, and x, y, z and radius in this frame [m]."""
     rows = []
     for link, spheres in robot.spheres.items():
         T = robot.T_frame_link(link)
@@ -202,12 +206,13 @@ def _spheres(robot: Robot) -> list[list[float | int]]:
 
 
 def page_shapes(scene: Scene) -> list[dict[str, Any]]:
-    """The obstacles for the page."""
+    """The obstacles of a scene, in the form that the page reads."""
     return [_shape(obstacle) for obstacle in drawables(scene)]
 
 
 def _shape(obstacle: Drawable) -> dict[str, Any]:
-    """An obstacle for the page: its fields, or packed geometry."""
+    """An obstacle in the form that the page reads: its fields, or packed geometry for meshes and point
+    clouds."""
     shape = obstacle.shape
     color = obstacle.color
     if isinstance(shape, Triangulated):
@@ -223,12 +228,12 @@ def _shape(obstacle: Drawable) -> dict[str, Any]:
 
 
 def page_surface(name: str, surface: Surface, color: Color) -> dict[str, Any]:
-    """A surface in the base frame for the page, in one color."""
+    """A surface in the base frame with one color, in the form that the page reads."""
     return {"kind": "mesh", "name": name, "color": color, "surface": _packed(surface, colored=False)}
 
 
 def _packed(surface: Surface, colored: bool = True) -> dict[str, Any]:
-    """Geometry in base64: 16-bit vertices, 8-bit normals and colors."""
+    """A surface as base64 texts: 16-bit vertices, 8-bit normals and colors, and faces."""
     low, step, vertices = _quantized(surface.vertices)
     wide_indices = len(surface.vertices) >= 2**16
     packed = {
@@ -245,7 +250,8 @@ def _packed(surface: Surface, colored: bool = True) -> dict[str, Any]:
 
 
 def _quantized(points: Points) -> tuple[list[float], float, str]:
-    """Lowest corner, step and the points as 16-bit multiples of the step in base64."""
+    """The points' lower corner, a step [m], and the points relative to the corner as 16-bit multiples of the
+    step in base64."""
     if len(points) == 0:
         return [0.0, 0.0, 0.0], 1.0, ""
     low = points.min(0)
@@ -264,22 +270,24 @@ def _rounded(values: np.ndarray | float, digits: int) -> Any:
 COLLIDING = (0xD0, 0x1F, 0x2B)
 """sRGB color of links that collide."""
 OFFSET = 0.0015
-"""Offset of these along their normals, so that they cover the arm in its own colors [m]."""
+"""Distance by which their surfaces are moved outwards, so that they cover the arm in its own colors [m]."""
 START_ALPHA = 0.5
+"""Opacity of the arm at the start in pictures."""
 AXES = ((0xC9, 0x3C, 0x3C), (0x3C, 0x9A, 0x4B), (0x3C, 0x64, 0xC9))
 """sRGB colors of the axes of goal poses."""
 AXIS_LENGTH = 0.12
-"""[m]"""
+"""Length of these axes [m]."""
 UNREACHED = StateValidity("no configuration within the joint limits")
 
 
 def write_problem(problem: Problem, file: str | FilePath, result: PlanResult | None = None) -> None:
     """Write a problem without a motion as .html or .png.
 
-    The arm is drawn at the start and at the goal; in pictures the start is see-through, on pages the goal.
-    Links that collide are red, and goal poses have axes. Of several goals, the first free one is drawn, or
-    else the first. Moving obstacles are where they begin. `result` holds the reason for the missing
-    motion. Raises InputError for another ending or a file that cannot be written.
+    The arm is drawn at the start and at the goal; in pictures the arm at the start is see-through, on pages
+    the arm at the goal. Colliding links are red, and goal poses are drawn as axes. Of several goals, the
+    first free one is drawn; if none is free, the first one. Moving obstacles are drawn at their first pose.
+    `result` gives the reason why there is no motion. Raises InputError for a file name with another ending,
+    or a file that cannot be written.
     """
     target = check_output(file, (".html", ".htm", ".png"))
     goal, validity = _goal_state(problem)
@@ -291,7 +299,7 @@ def write_problem(problem: Problem, file: str | FilePath, result: PlanResult | N
     poses = (pose for goal in _goals(problem) for pose in poses_of(goal))
     T_world_poses = [T_world_base @ pose.T_base_frame for pose in poses]
     near_poses = [Sphere(T[:3, 3], AXIS_LENGTH) for T in T_world_poses]
-    framed = scene.with_shapes([*scene.shapes, *near_poses])  # what the camera shows
+    framed = scene.with_shapes([*scene.shapes, *near_poses])  # the view includes goal poses
     arm = DrawnArm(robot)
     marks = [*_colliding_links(arm, states, list(validities.values())), *_axes(T_world_poses)]
     facts = [(label, state.reason or "free") for label, state in validities.items()]
@@ -317,12 +325,13 @@ def write_problem(problem: Problem, file: str | FilePath, result: PlanResult | N
 
 
 def _goals(problem: Problem) -> Sequence[OneGoal]:
-    """The goals of which one must be reached."""
+    """The alternative goals of a problem: one of them must be reached."""
     return problem.goal.goals if isinstance(problem.goal, AnyGoal) else (problem.goal,)
 
 
 def _goal_state(problem: Problem) -> tuple[Configuration | None, StateValidity]:
-    """The first free configuration of the goal, or else the first one; None if none reaches it."""
+    """The first free goal configuration, or else the first goal configuration, and its validity; None if no
+    configuration reaches the goal."""
     rng = np.random.default_rng(0)
     first = None
     for goal in _goals(problem):
@@ -338,11 +347,13 @@ def _goal_state(problem: Problem) -> tuple[Configuration | None, StateValidity]:
 def _colliding_links(
     arm: DrawnArm, states: Configurations, validities: list[StateValidity]
 ) -> list[tuple[Surface, Color]]:
-    """The surfaces of the links that collide in each state, and their color."""
+    """The surfaces of the colliding links at each of the configurations `states`, and their color."""
     robot = arm.robot
     links = link_surfaces(arm.robot)
     marks = []
-    for q, validity in zip(states, validities, strict=False):  # there may be no goal state
+    for q, validity in zip(
+        states, validities, strict=False
+    ):  # without a goal configuration, states are fewer
         T_base_frame = arm.frames(q)
         for link in validity.links:
             T_base_link = T_base_frame[robot.link_frame(link)] @ robot.T_frame_link(link)
@@ -351,8 +362,9 @@ def _colliding_links(
 
 
 def _raised(surface: Surface) -> Surface:
-    """The surface in the color of collisions, a little larger."""
-    _, corner = np.unique(surface.vertices, axis=0, return_inverse=True)  # edges have a vertex on each side
+    """The surface in the color of collisions, moved outwards by OFFSET."""
+    # vertices at one point share a mean normal: sharp edges have a vertex for each adjacent face
+    _, corner = np.unique(surface.vertices, axis=0, return_inverse=True)
     corner = corner.reshape(-1)
     normals = np.stack([np.bincount(corner, column) for column in surface.normals.T], axis=1)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
@@ -361,7 +373,7 @@ def _raised(surface: Surface) -> Surface:
 
 
 def _axes(poses: list[Pose]) -> list[tuple[Surface, Color]]:
-    """The axes of poses, and their colors."""
+    """The axes of poses as tubes, and their colors."""
     axes = []
     for T in poses:
         for axis, color in enumerate(AXES):
@@ -431,7 +443,7 @@ show(0, false);
 
 @dataclass(frozen=True, eq=False)
 class GalleryEntry:
-    """A motion in a gallery."""
+    """A motion in a gallery, with its scene."""
 
     title: str
     caption: str
@@ -448,10 +460,10 @@ def write_gallery(
     title: str,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Write a gallery as .html; it opens offline.
+    """Write a gallery of motions as a self-contained .html file.
 
-    `progress` is called with the number of motions drawn so far and in all. Raises InputError for another
-    ending or a file that cannot be written.
+    `progress` is called with the number of motions drawn so far and the total number. Raises InputError for a
+    file name with another ending, or a file that cannot be written.
     """
     target = check_output(file, (".html", ".htm"))
     replays = []
@@ -472,14 +484,20 @@ def write_gallery(
 
 
 def _shared(pages: list[str]) -> dict[str, list]:
-    """Pages split into parts, each stored once, because all share the 3D library and the robot."""
-    cut = [re.split(r'(?=<script)|(?="scene":)', page) for page in pages]
-    places = {part: i for i, part in enumerate(dict.fromkeys(part for parts in cut for part in parts))}
-    return {"parts": list(places), "pages": [[places[part] for part in parts] for parts in cut]}
+    """Splits pages into parts and stores equal parts once, since all pages share the 3D library and the
+    robot. Returns the parts, and for each page the indices of its parts."""
+    split_pages = [re.split(r'(?=<script)|(?="scene":)', page) for page in pages]
+    part_indices = {
+        part: i for i, part in enumerate(dict.fromkeys(part for parts in split_pages for part in parts))
+    }
+    return {
+        "parts": list(part_indices),
+        "pages": [[part_indices[part] for part in parts] for parts in split_pages],
+    }
 
 
 def _thumbnail(robot: Robot, entry: GalleryEntry) -> str:
-    """A small JPEG in base64."""
+    """A small JPEG picture of a motion, in base64."""
     pixels, _ = render(robot, entry.scene, entry.motion, THUMBNAIL, moving=entry.moving)
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, "JPEG", quality=88)
@@ -502,14 +520,14 @@ class Replay:
 def show(result: PlanResult | ResultFile, problem: Problem | None = None, height: int = 560) -> Replay:
     """The replay of a result, for the last line of a notebook cell.
 
-    Elsewhere in a cell, use `display(rd.show(result))`. Without a motion it shows the start, the goal and the
-    links that collide.
+    Elsewhere in a cell, use `display(rd.show(result))`. If the result has no motion, the start, the goal and
+    colliding links are shown.
 
     Args:
-        result: A result of `plan`, or a result file.
-        problem: Needed only if the result does not contain it; results of `plan`, and files saved with their
-            problem, do.
-        height: Height of the cell [pixels].
+        result: A result of `plan`, or a result file. problem: The problem, needed only if the result does not
+        contain it. Results of `plan`, and files that were saved
+            with their problem, contain it.
+        height: Height of the replay [pixels].
 
     Raises:
         InputError: Outside a notebook, and if the problem is unknown.
@@ -533,7 +551,7 @@ def show(result: PlanResult | ResultFile, problem: Problem | None = None, height
 
 
 def result_page(problem: Problem, result: PlanResult) -> str:
-    """The page of a result: its replay, or without a motion the problem."""
+    """The HTML page of a result: the replay of its motion, or, if it has no motion, the problem."""
     motion = result.trajectory or result.path
     with TemporaryDirectory() as folder:
         file = FilePath(folder) / "replay.html"
@@ -545,6 +563,6 @@ def result_page(problem: Problem, result: PlanResult) -> str:
 
 
 def _in_notebook() -> bool:
-    """Whether this runs in a Jupyter kernel; does not import IPython."""
+    """Whether this process is a Jupyter kernel; IPython is not imported for it."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return hasattr(shell, "kernel")

@@ -1,4 +1,5 @@
-"""The interactive page: a session, which is independent of browsers, and its view in the browser."""
+"""The interactive page: a session, which does not depend on browsers, and a page that shows it in
+browsers."""
 
 from robotdiffuse.core.errors import needs
 

@@ -1,7 +1,8 @@
-"""An exploration that happens while it is watched: its session, and the page that shows it in browsers.
+"""A live exploration: its session, and the page that shows it in browsers.
 
-In the session one thread chooses steps and executes them at the motion's speed; visitors only say whether it
-may go on.
+A thread of the session chooses steps and executes them at the speed of the motion. Visitors can pause, step,
+restart and change the options. The planner calls a step an act (`RecordedAct`); a look is a step that moves
+the arm to take a view.
 """
 
 import html
@@ -74,30 +75,29 @@ from robotdiffuse.visualization.live.session import (
     Validity,
 )
 
-# Phases: at rest until a visitor lets it go on, choosing a step, executing it, and after the last step.
+# phases: paused before a step, choosing a step, executing it, and after the last step
 WAITING = "waiting"
 CHOOSING = "choosing"
 MOVING = "moving"
 ENDED = "ended"
-# What visitors want: a pause, one step and then a pause, or all steps.
+# modes that visitors choose: paused, one step and then a pause, or all steps
 PAUSED = "paused"
 STEPPING = "stepping"
 RUNNING = "running"
 CLEAR_OPACITY = 0.6
-"""Opacity of predicted voxels, and of those that a view is to show."""
+"""Opacity of predicted voxels, and of the unknown voxels that a look shall observe."""
 UNKNOWN_OPACITY = 0.2
-"""Opacity of the boundary of unknown space, which is drawn where it faces the viewer, so that it never hides
-the arm."""
-# Length of the pyramid of the camera on the arm [m], and its color.
+"""Opacity of the boundary of unknown space."""
+# length of the pyramid that stands for the camera on the arm [m], and its color
 CAMERA_SIZE = 0.12
 CAMERA_COLOR = (40, 48, 58)
 SPEEDS = (0.1, 10.0)
-"""Bounds of the slider of the speed."""
+"""Bounds of the speed slider, as factors on the motion's own speed."""
 PROMISES = {
     STRICT: "only through space seen free",
     PROBABILISTIC: "where the stated confidence is high enough",
 }
-"""Policies in plain words."""
+"""Where each policy lets the arm move, in words for the page."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,30 +110,32 @@ class ExplorationState:
     mode: str = PAUSED
     phase: str = WAITING
     speed: float = 1.0
-    """Speed of motions, as a multiple of their own."""
+    """Speed at which motions are shown, as a factor on their own speed."""
     explorer: RecordedExplorer | None = None
-    """The explorer; other threads read its cameras and known scene, its own thread changes the rest."""
+    """The explorer. Only the session's thread changes it; other threads may read its cameras and its known
+    scene."""
     acts: tuple[RecordedAct, ...] = ()
-    """Steps so far; while moving the last one is under way."""
+    """All steps so far. In the phase MOVING, the last step is being executed."""
     known: RecordedView | None = None
     """The latest view, and what is known after it."""
     violation: str = ""
-    """Why the validator refuses the last motion in the true scene."""
+    """Why the validator refuses the last motion in the true scene; empty if it accepts the motion."""
     failure: str = ""
-    """Why the exploration cannot go on, in one line."""
+    """Why the exploration cannot go on, in one line; empty if it can."""
 
 
 class _OutdatedError(Exception):
-    """The exploration was restarted or closed."""
+    """Raised in the thread of an exploration that was restarted or closed."""
 
 
 class ExplorationSession:
-    """The state of the exploration and its thread. `on_change` is called after each change, by any thread."""
+    """The state of an exploration and its thread. `on_change` is called after each change of the state, from
+    any thread."""
 
     def __init__(
         self, problem: Problem, settings: ExplorerSettings, noise: bool, seed: int, speed: float = 1.0
     ) -> None:
-        """Begins paused, at the problem's start."""
+        """The exploration is paused at the problem's start until `set_mode` is called."""
         self.problem = problem
         self._seed = seed
         self.on_change: Callable[[], None] = lambda: None
@@ -144,7 +146,8 @@ class ExplorationSession:
         self._task = LatestTask(self._explore, "explore")
 
     def set_mode(self, mode: str) -> None:
-        """Pause, take one step (the one under way, if there is one), or run."""
+        """Set the mode: PAUSED, STEPPING or RUNNING. STEPPING executes one step, or the rest of the current
+        step."""
         self._change(self._run == 0, mode=mode)
 
     def set_speed(self, speed: float) -> None:
@@ -152,7 +155,8 @@ class ExplorationSession:
         self._change(False, speed=speed)
 
     def restart(self, policy: str | None = None, noise: bool | None = None) -> None:
-        """Begin anew, with another policy or noise if given. Raises InputError for an unknown policy."""
+        """Start again from the beginning, with another policy or noise if given. Raises InputError for an
+        unknown policy."""
         old = self.state
         settings = old.settings if policy is None else replace(old.settings, policy=policy)
         noise = old.noise if noise is None else noise
@@ -160,7 +164,7 @@ class ExplorationSession:
         self._change(True, **vars(new))
 
     def _change(self, begin: bool, **changes: Any) -> None:
-        """Change the state; `begin` starts the exploration with it, from the beginning."""
+        """Change fields of the state. With `begin`, the exploration then starts from the beginning."""
         with self._changed:
             self.state = replace(self.state, **changes)
             if begin:
@@ -170,7 +174,7 @@ class ExplorationSession:
         self.on_change()
 
     def close(self) -> None:
-        """End the thread as soon as the step that it may be choosing is found."""
+        """End the thread. If it is choosing a step, it ends when the step is chosen."""
         with self._changed:
             self._run += 1
             self._changed.notify_all()
@@ -214,7 +218,8 @@ class ExplorationSession:
                 )
 
     def _execute(self, run: int, explorer: RecordedExplorer) -> None:
-        """Execute the last step, in which the views are those that were taken during its motion."""
+        """Show the execution of the last step: move the arm along its motion, and show each view at the time
+        at which it was taken."""
         moment = moments(explorer)[-1]
         act = moment.act
         self._update(run, phase=MOVING, acts=tuple(explorer.acts), known=moment.known)
@@ -242,7 +247,7 @@ class ExplorationSession:
         return state
 
     def _wait_while_paused(self, run: int) -> bool:
-        """Whether it was paused."""
+        """Wait until the mode is not PAUSED; returns whether it was PAUSED."""
         with self._changed:
             paused = self.state.mode == PAUSED
             self._changed.wait_for(lambda: run != self._run or self.state.mode != PAUSED)
@@ -252,7 +257,7 @@ class ExplorationSession:
 
 
 class ExplorationPage(LivePage):
-    """The page of an exploration, which runs from when the first browser opens it."""
+    """The page of an exploration. The exploration runs when the first browser opens the page."""
 
     session: ExplorationSession
 
@@ -314,9 +319,11 @@ class ExplorationPage(LivePage):
             (self._unknown, lambda _: self._redraw()),
             (self._true, lambda _: self._redraw()),
         ]
-        for widget, do in changes:
-            # changes by the page itself have no client
-            widget.on_update(lambda event, do=do: event.client and do(event.target.value))
+        for widget, on_change in changes:
+            # only changes by visitors have a client; the page itself also sets widgets
+            widget.on_update(
+                lambda event, on_change=on_change: event.client and on_change(event.target.value)
+            )
 
     def _draw(self) -> None:
         state = self.session.state
@@ -344,7 +351,7 @@ class ExplorationPage(LivePage):
                 self._show_act(explorer, under_way)
 
     def _show_camera(self, explorer: RecordedExplorer) -> None:
-        """Attach the first camera to the arm."""
+        """Draw the arm's first camera as a pyramid that moves with the arm."""
         camera = explorer.cameras[0]
         robot = explorer.robot
         T = robot.T_frame_link(camera.link) @ camera.T_link_camera
@@ -363,7 +370,8 @@ class ExplorationPage(LivePage):
     def _show_voxels(
         self, known: RecordedView | None, act: RecordedAct | None, under_way: RecordedAct | None
     ) -> None:
-        """Show what is known, with the prediction of a step, and what the look under way is to show."""
+        """Show what is known, the prediction of the step `act`, and the voxels that the step being executed,
+        `under_way`, shall observe."""
         if known is None:
             return
         occupied, predicted, unknown = shown_voxels(known, act, self._known_scene)
@@ -385,7 +393,8 @@ class ExplorationPage(LivePage):
                 add_surface(self.server, f"/{name}", surface, color, opacity)
 
     def _show_act(self, explorer: RecordedExplorer, act: RecordedAct | None) -> None:
-        """Show the trace of a step's motion, and of a look also its end and what is seen there."""
+        """Show the trace of a step's motion and, for a look, the arm at its end and the view pyramid
+        there."""
         draw_trace(self.server, self._drawn, None if act is None else act.trajectory)
         look = act if act is not None and act.step.kind == LOOK else None
         self._look.show(None if look is None else look.waypoints[-1])
@@ -395,9 +404,8 @@ class ExplorationPage(LivePage):
 
     def _show_panel(self, state: ExplorationState) -> None:
         paused = state.mode == PAUSED
-        if self._changes.new(
-            "options", state.settings, state.noise, state.speed
-        ):  # else a change on its way is undone
+        # only if they changed: else a visitor's change that has not arrived yet would be undone
+        if self._changes.new("options", state.settings, state.noise, state.speed):
             set_value(self._policy, state.settings.policy)
             set_value(self._noise, state.noise)
             set_value(self._speed, float(np.clip(state.speed, *SPEEDS)))
@@ -410,7 +418,8 @@ class ExplorationPage(LivePage):
 
 
 def exploration_badge(state: ExplorationState) -> Validity:
-    """Kind and text of the badge: the step under way or the end, with its reason and confidence."""
+    """The badge of a state: the current step or the end of the exploration, with its reason and
+    confidence."""
     if state.failure:
         return Validity(INVALID, "failed", (state.failure,))
     if not state.acts or state.phase == CHOOSING:
@@ -432,8 +441,8 @@ def exploration_badge(state: ExplorationState) -> Validity:
     if act.step.confidence is not None:
         confidence = np.floor(1000 * act.step.confidence) / 10  # never rounded up to 100 %
         lines.append(f"stated confidence that it is free: {confidence:g} %")
-    rest = ", paused" if state.mode == PAUSED and state.phase != ENDED else ""
-    return Validity(kind, headline + rest, (*lines, *_shares(state)))
+    pause_text = ", paused" if state.mode == PAUSED and state.phase != ENDED else ""
+    return Validity(kind, headline + pause_text, (*lines, *_shares(state)))
 
 
 def _shares(state: ExplorationState) -> tuple[str, ...]:

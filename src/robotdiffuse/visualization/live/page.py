@@ -1,4 +1,4 @@
-"""The page: shows a session in browsers with viser, and its control panel."""
+"""The interactive page: shows a session in browsers with viser, with a control panel."""
 
 import contextlib
 import html
@@ -52,21 +52,21 @@ from robotdiffuse.visualization.live.session import (
 )
 from robotdiffuse.visualization.replay_page import result_page
 
-# Sizes of gizmos, as fractions of the arm's reach.
+# sizes of gizmos (transform controls), as fractions of the arm's reach
 GIZMO_SIZE = 0.23
 SMALL_GIZMO_SIZE = 0.16
 BADGE_COLORS = {VALID: "#0f8f6f", INVALID: "#c92f2f", NO_MOTION: "#b26a00", PENDING: "#6b7684"}
 JOINT_COLORS = ("#4f7fd9", "#10a37f", "#d97b5c", "#8a63d2", "#c2a23a", "#4fa3b8", "#c96a9a", "#7a8794")
 """Colors of joints in the plot."""
 NO_OBSTACLE = "(none)"
-"""Option of the dropdown for no selected obstacle."""
+"""Entry of the dropdown if no obstacle is selected."""
 PLOTS = ("position", "velocity", "acceleration")
 NOTIFICATION_TIME = 8.0
-"""Time that notifications stay [s]."""
+"""Time for which notifications are shown [s]."""
 
 
 class LivePage(ABC):
-    """Shows the state of a session to all browsers that the server lets in, until it is closed."""
+    """Shows the state of a session in all browsers that the server accepts, until the page is closed."""
 
     def __init__(self, session: Any, server: PageServer, robot: Robot) -> None:
         self.session = session
@@ -81,7 +81,7 @@ class LivePage(ABC):
         """Stop serving and end all threads."""
         self.session.close()
         self._drawing.close()
-        with self._open:  # what is being drawn is still sent
+        with self._open:  # waits until the current drawing is complete
             self._closed = True
         self.server.stop()
 
@@ -99,11 +99,11 @@ class LivePage(ABC):
 
     @abstractmethod
     def _draw(self) -> None:
-        """Draw what has changed; only this task draws."""
+        """Draw what has changed. It is called only by the drawing task's thread."""
 
 
 class Page(LivePage):
-    """The page on which visitors plan."""
+    """The page on which visitors change a problem and plan."""
 
     session: Session
 
@@ -125,7 +125,7 @@ class Page(LivePage):
         session.start()
 
     def select(self, name: str) -> None:
-        """Select an obstacle by name; "" for none."""
+        """Select an obstacle by name; an empty name selects no obstacle."""
         self._selected = name
         self._redraw()
 
@@ -150,7 +150,7 @@ class Page(LivePage):
         violation = None if state.validation is None else state.validation.report.violation
         if new("robot", robot):
             self._new_robot(robot)
-        self._drawn.frames(problem.start)  # compiles here, since nothing is sent within the block
+        self._drawn.frames(problem.start)  # compiles before the atomic block, in which nothing is sent
         with self.server.atomic():
             self._panel.show(state, validity(state), selected)
             if new("scene", problem.scene, selected):
@@ -222,27 +222,27 @@ class Page(LivePage):
         self._panel.show_time(at, self.player.duration)
 
     def _show_moving(self, at: float) -> None:
-        """Show the moving obstacles where they are at a time of the motion [s]."""
+        """Show the moving obstacles at their poses at a time of the motion [s]."""
         obstacles = drawables(Scene(), self.session.state.problem.moving)
         with self._lock:
             self._moving.show(obstacles, time=at)
 
     def seek(self, at: float) -> None:
-        """Stop at a time of the motion [s]."""
+        """Stop playing, and go to a time of the motion [s]."""
         self.set_playing(False)
         self.player.seek(at)
 
     def set_playing(self, playing: bool) -> None:
-        """Play the motion, or stop."""
+        """Play the motion, or stop playing."""
         self.player.set_playing(playing)
         self._panel.show_playing(playing)
 
 
 class _Gizmo:
-    """A transform control; `moved` is called with its pose while it is dragged."""
+    """A transform control. `moved` is called with its pose while a visitor drags it."""
 
     def __init__(self, server: viser.ViserServer, name: str, size: float, moved: Any) -> None:
-        """size: as a fraction of the arm's reach."""
+        """`size` is a fraction of the arm's reach."""
         self.handle = server.scene.add_transform_controls(name, depth_test=False, visible=False)
         self.size = size
         self._held = False
@@ -261,11 +261,11 @@ class _Gizmo:
             self._moved(T)
 
     def close(self) -> None:
-        """End its thread."""
+        """End the gizmo's thread."""
         self._moving.close()
 
     def show(self, T: Pose | None) -> None:
-        """Move to a pose, unless it is being dragged; hide for None."""
+        """Move the gizmo to a pose, unless it is being dragged; None hides it."""
         if T is not None and not self._held:
             place(self.handle, T)
         self.handle.visible = T is not None
@@ -297,7 +297,7 @@ class Panel:
         self._play.on_click(lambda _event: page.set_playing(self._play.label == "Play"))
 
     def _on(self, widget: Any, do: Callable[[Any], object]) -> None:
-        """Call `do` when a visitor changes a widget; show its InputError as a notification."""
+        """Call `do` when a visitor changes a widget. An InputError of `do` is shown as a notification."""
 
         @widget.on_update
         def _(event: viser.GuiEvent) -> None:
@@ -305,7 +305,7 @@ class Panel:
                 self._guarded(event, lambda: do(event))
 
     def _guarded(self, event: viser.GuiEvent, do: Callable[[], object]) -> None:
-        """Call `do`; show its InputError as a notification to the visitor."""
+        """Call `do`. An InputError of `do` is shown to the visitor as a notification."""
         try:
             do()
         except InputError as error:
@@ -450,9 +450,9 @@ class Panel:
         self._joints = []
         limits = zip(robot.joint_names, robot.lower, robot.upper, robot.continuous, strict=True)
         with self._joints_box:
-            for name, low, high, turns in limits:
-                low, high = (-np.pi, np.pi) if turns else (float(low), float(high))
-                # for short labels
+            for name, low, high, is_continuous in limits:
+                low, high = (-np.pi, np.pi) if is_continuous else (float(low), float(high))
+                # rounded outwards, so that labels are short
                 low = np.floor(100 * low) / 100
                 high = np.ceil(100 * high) / 100
                 widget = self._server.gui.add_slider(name, min=low, max=high, step=0.001, initial_value=low)
@@ -507,9 +507,9 @@ class Panel:
 
 
 def plotted(robot: Robot, motion: Trajectory, kind: str) -> tuple[np.ndarray, ...]:
-    """Plot data: times, each joint in % of its limits, and the limits 100 and -100.
+    """Data of the plot: times, the values of each joint in percent of its limit, and the limits 100 and -100.
 
-    Position 0 % is the middle of the range; the limit of a continuous joint is half a turn.
+    A position of 0 % is the middle of the joint's range. For continuous joints, 100 % is half a turn.
     """
     if kind == "velocity":
         values = motion.velocities / robot.velocity
@@ -524,7 +524,7 @@ def plotted(robot: Robot, motion: Trajectory, kind: str) -> tuple[np.ndarray, ..
 
 
 def set_value(widget: Any, value: object) -> None:
-    """Set a widget, without a message to browsers if it already has the value."""
+    """Set the value of a widget. If it has the value already, no message is sent to browsers."""
     if widget.value != value:
         widget.value = value
 
@@ -535,7 +535,7 @@ def _send(event: viser.GuiEvent, name: str, content: bytes) -> None:
 
 
 def badge_html(validity: Validity, planning: bool = False) -> str:
-    """A colored box with a headline and lines."""
+    """HTML of the badge: a colored box with a headline and lines."""
     lines = "".join(f"<div>{html.escape(line)}</div>" for line in validity.lines)
     busy = " · planning" if planning and validity.kind != PENDING else ""
     return (
@@ -555,23 +555,25 @@ def _stages_html(seconds: tuple[tuple[str, float], ...]) -> str:
 
 
 POSE_RATE = 30.0
-"""Poses of a motion that are precomputed per second, beside the last one."""
+"""Number of poses per second of a motion that are precomputed, in addition to the last pose."""
 RED = (0xD6, 0x3B, 0x3B)
 GAMMA = 2.2
-# Points of the tool's trace along an edge of a tree; most edges drawn per tree, the first ones.
+"""Exponent for converting sRGB colors to linear ones, approximately."""
 EDGE_POINTS = 6
+"""Number of points of the tool's trace along an edge of a search tree."""
 MAX_EDGES = 4000
+"""Largest number of edges that are drawn per tree; the first edges are drawn."""
 TREES = ("/trees/start", "/trees/goal")
 GHOST_OFFSET = 0.002
-"""Offset of a see-through arm along its normals, so that it covers the solid arm at the same place [m];
-scaled by its opacity over GHOST_OPACITY."""
-# Line widths, as fractions of the arm's reach.
+"""Distance by which the surfaces of a see-through arm are moved outwards, so that it covers the solid arm at
+the same place [m]. It is multiplied by the arm's opacity over GHOST_OPACITY."""
+# line widths, as fractions of the arm's reach
 TRACE_WIDTH = 0.0094
 TREE_WIDTH = 0.0028
 GHOST_OPACITY = 0.3
-"""Opacity of the start and goal arms."""
+"""Opacity of the arms at start and goal."""
 HIGHLIGHT = 0.35
-"""Amount of white in the color of the selected obstacle."""
+"""Fraction of white that is mixed into the color of the selected obstacle."""
 
 
 def add_surface(
@@ -598,7 +600,8 @@ class Arm:
         color: Color | None = None,
         opacity: float | None = None,
     ) -> None:
-        """Draw in the robot's own colors, or in one color, see-through and without the base."""
+        """Without `color`, the arm has its own colors. With `color`, it is drawn in this color and without
+        the base. `opacity` makes it see-through."""
         self._server = server
         self._drawn = drawn
         self.root = server.scene.add_frame(f"/{name}", show_axes=False, visible=False)
@@ -615,28 +618,29 @@ class Arm:
                 add_surface(server, f"/{name}/{i}/{k}", part, part_color, opacity)
 
     def show(self, q: Configuration | None) -> None:
-        """Show the arm in a configuration; hide it for None."""
+        """Show the arm at a configuration; None hides it."""
         self.show_frames(None if q is None else self._drawn.frames(q))
 
     def show_frames(self, T_base_frame: Float[ndarray, "frames 4 4"] | None) -> None:
-        """Show the arm with its frames at these poses; hide it for None."""
+        """Show the arm with its frames at these poses; None hides it."""
         if T_base_frame is not None:
-            turns = Rotation.from_matrix(T_base_frame[:, :3, :3]).as_quat(scalar_first=True)
+            quaternions = Rotation.from_matrix(T_base_frame[:, :3, :3]).as_quat(scalar_first=True)
             with self._server.atomic():
-                for frame, T, wxyz in zip(self._frames, T_base_frame, turns, strict=True):
+                for frame, T, wxyz in zip(self._frames, T_base_frame, quaternions, strict=True):
                     frame.position = T[:3, 3]
                     frame.wxyz = wxyz
         self.root.visible = T_base_frame is not None
 
 
 def place(node: Any, T: Pose) -> None:
-    """Move a node; viser sends no message to browsers if it is there."""
+    """Move a node of the 3D scene to a pose. If it is there already, viser sends no message to browsers."""
     node.position = T[:3, 3]
     node.wxyz = quaternion_from_rotation(T[:3, :3])
 
 
 class Obstacles:
-    """The obstacles in the 3D scene. Moved obstacles are moved; changed ones are drawn again."""
+    """The obstacles in the 3D scene. Obstacles that only moved are moved, and obstacles that changed are
+    drawn again."""
 
     def __init__(self, server: viser.ViserServer, clicked: Callable[[str], None] = lambda _: None) -> None:
         self._server = server
@@ -644,7 +648,7 @@ class Obstacles:
         self._nodes: dict[str, tuple[object, Any]] = {}
 
     def show(self, obstacles: Sequence[Drawable], selected: str = "", time: float = 0.0) -> None:
-        """Update to obstacles where they are at a time [s], and highlight the selected one."""
+        """Show obstacles at their poses at a time [s], and highlight the selected obstacle."""
         names = {obstacle.name for obstacle in obstacles}
         for name in [name for name in self._nodes if name not in names]:
             self._nodes.pop(name)[1].remove()
@@ -658,14 +662,14 @@ class Obstacles:
             place(self._nodes[obstacle.name][1], obstacle.frame(time))
 
     def _draw(self, obstacle: Drawable, selected: bool) -> Any:
-        """A node in the obstacle's own frame."""
+        """Adds a node with the geometry in the obstacle's own frame."""
         color = obstacle.color
         name = obstacle.name
         if selected:
             r, g, b = (round(c + HIGHLIGHT * (255 - c)) for c in color)
             color = r, g, b
         obstacle_frame = obstacle.own
-        node = f"/obstacles/{name.encode().hex()}"  # viser takes slashes in names for a tree
+        node = f"/obstacles/{name.encode().hex()}"  # a plain "/" would add a level to the tree
         if isinstance(obstacle_frame.shape, PointCloud):
             points = thinned(obstacle_frame.shape.points).astype(np.float32)
             return self._server.scene.add_point_cloud(
@@ -677,7 +681,7 @@ class Obstacles:
 
 
 def _appearance(shape: Shape) -> object:
-    """A key of the shape's geometry without its pose."""
+    """A key that is equal for shapes with equal geometry, whatever their poses."""
     if isinstance(shape, Mesh):
         return "mesh", shape.vertices.tobytes(), shape.faces.tobytes()
     if isinstance(shape, PointCloud):
@@ -688,7 +692,8 @@ def _appearance(shape: Shape) -> object:
 
 
 def draw_trace(server: viser.ViserServer, arm: DrawnArm, motion: Trajectory | None) -> None:
-    """Draw the trace of the tool, colored from start to goal."""
+    """Draw the trace of the tool along a motion, with colors from that of the start to that of the goal; None
+    removes it."""
     if motion is None:
         server.scene.remove_by_name("/trace")
         return
@@ -699,7 +704,7 @@ def draw_trace(server: viser.ViserServer, arm: DrawnArm, motion: Trajectory | No
 
 
 def draw_trees(server: viser.ViserServer, arm: DrawnArm, trees: tuple[Tree, ...]) -> None:
-    """Draw the tool traces along the edges of both search trees, in the colors of start and goal."""
+    """Draw the tool's traces along the edges of both search trees, in the colors of start and goal."""
     for name, color, tree in zip(TREES, (START, GOAL), trees or (None, None), strict=True):
         edges = [] if tree is None else _edges(arm, tree)
         colors = [np.array(color, float)] * len(edges)
@@ -718,15 +723,15 @@ def _edges(arm: DrawnArm, tree: Tree) -> list[Float[ndarray, "points 3"]]:
 def draw_lines(
     server: viser.ViserServer, name: str, lines: list[ndarray], colors: list[ndarray], width: float
 ) -> None:
-    """Draw polylines, each in one color or with a color for each point; remove the node without any.
+    """Draw polylines, each in one color or with a color for each point. Without lines, the node is removed.
 
-    `width` [m]; colors in sRGB, converted because viser expects linear ones.
+    `width` is in [m]. Colors are sRGB; they are converted because viser expects linear colors.
     """
     if not lines:
         server.scene.remove_by_name(name)
         return
     points = np.concatenate([np.stack([line[:-1], line[1:]], axis=1) for line in lines])
-    along = [np.broadcast_to(color, line.shape) for color, line in zip(colors, lines, strict=True)]
-    ends = np.concatenate([np.stack([color[:-1], color[1:]], axis=1) for color in along])
+    point_colors = [np.broadcast_to(color, line.shape) for color, line in zip(colors, lines, strict=True)]
+    ends = np.concatenate([np.stack([color[:-1], color[1:]], axis=1) for color in point_colors])
     linear = np.round(255 * (ends / 255) ** GAMMA).astype(np.uint8)
     server.scene.add_line_segments(name, points.astype(np.float32), linear, thickness=width)

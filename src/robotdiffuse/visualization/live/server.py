@@ -1,9 +1,9 @@
 """The server of a page: viser with access control, lights, a floor and a first view.
 
-viser by itself accepts every connection. This server checks each browser before any data is sent: the address
-that it connects to must end with the token, or, without a token, name this machine (which stops DNS
-rebinding); a page of another origin is refused. Without a check, viser serves only its own web page (HTML and
-JavaScript).
+viser by itself accepts every connection. This server checks each browser before it sends data of the session.
+If there is a token, the address that the browser connects to must end with it. Without a token, the address
+must name this machine, which prevents DNS rebinding. Pages of other origins are refused. Viser's own web page
+(HTML and JavaScript) is served without a check.
 """
 
 import hmac
@@ -26,20 +26,21 @@ from robotdiffuse.visualization.picture import VERTICAL_FIELD, view_of_motion
 
 FLOOR_SIZE = 4.7
 """Edge length of the floor, as a multiple of the arm's reach."""
-# Window size for which the first view is chosen [pixels], and the fractions of its height left free.
 VIEW_SIZE = (900, 800)
+"""Window size for which the first view is chosen [pixels]."""
 VIEW_MARGINS = (0.06, 0.06)
+"""Fractions of the window's height that the first view leaves free above and below."""
 LIGHTS = (2.0, (-2.0, -3.0, 5.0)), (1.1, (3.0, 2.0, 3.0)), (0.7, (-3.0, 3.0, 1.0))
 """Intensity and position of each light."""
 PANEL_OFFSET = 0.2
 """How far the arm is moved to the left, so that the control panel does not cover it, as a fraction of the
 window's height."""
 POLICY_VIOLATION = 1008
-"""WebSocket close code for clients that may not connect."""
+"""WebSocket close code for refused clients."""
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address can be reached only from this machine."""
+    """Whether a host name or address is a loopback address, which only this machine can reach."""
     try:
         return host == "localhost" or ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:
@@ -47,7 +48,7 @@ def is_loopback(host: str) -> bool:
 
 
 def free_port(host: str, port: int) -> int:
-    """The port; a free one for 0. Raises InputError if it cannot be listened on."""
+    """The port, or a free port for 0. Raises InputError if the server cannot listen on it."""
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
@@ -67,7 +68,7 @@ def free_port(host: str, port: int) -> int:
 
 
 def may_connect(path: str, host: str, origin: str | None, token: str) -> bool:
-    """Whether a browser may connect, by the path, Host and Origin of its request."""
+    """Whether a browser may connect, judged by the path and the headers Host and Origin of its request."""
     if origin is not None and _part(origin, "netloc") != host:
         return False
     if token:
@@ -76,7 +77,7 @@ def may_connect(path: str, host: str, origin: str | None, token: str) -> bool:
 
 
 def _part(url: str, name: str) -> str:
-    """A part of a URL; "" if it is not one."""
+    """A part of a URL, such as "netloc"; an empty string for an invalid URL."""
     try:
         return getattr(urlsplit(url), name) or ""
     except ValueError:
@@ -84,15 +85,15 @@ def _part(url: str, name: str) -> str:
 
 
 class PageServer(viser.ViserServer):
-    """A silent viser server that checks who connects, without viser's public share URLs.
+    """A viser server that checks each browser, prints no messages, and offers no public share URLs.
 
-    Raises AttributeError for a version of viser with other internals.
+    It uses internals of viser: raises AttributeError for a version of viser with other internals.
     """
 
     def __init__(self, host: str, port: int) -> None:
-        """On hosts that others can reach, browsers need a random token."""
+        """If other machines can reach `host`, a random token is required of browsers."""
         self.token = "" if is_loopback(host) else secrets.token_urlsafe(16)
-        # viser prints its own address; other threads' output is left alone
+        # suppresses the address that viser prints in this thread
         with rich.get_console().capture():
             super().__init__(host, port, verbose=False)
         websock = self._websock_server
@@ -104,8 +105,8 @@ class PageServer(viser.ViserServer):
             headers = request.headers
             hosts = headers.get_all("Host")
             origins = headers.get_all("Origin") or [None]
-            alone = len(hosts) == len(origins) == 1
-            if not (alone and may_connect(request.path, hosts[0], origins[0], self.token)):
+            single_headers = len(hosts) == len(origins) == 1
+            if not (single_headers and may_connect(request.path, hosts[0], origins[0], self.token)):
                 await connection.close(POLICY_VIOLATION)
 
         websock.on_client_connect(check)
@@ -121,11 +122,11 @@ class PageServer(viser.ViserServer):
         return f"http://{place}" + (f"?websocket=ws://{place}{self.token}" if self.token else "")
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """None: a browser must not open a tunnel from the internet to the page."""
+        """Returns None, so that browsers cannot request a public tunnel to the page."""
         return None
 
     def stop(self) -> None:
-        """Stop without the message that viser's thread would print."""
+        """Stop the server, suppressing the message that viser's thread prints."""
         loop = self._websock_server._background_event_loop
         assert loop is not None, "the server runs"
         loop.call_soon_threadsafe(rich.get_console().begin_capture)
@@ -154,7 +155,8 @@ class PageServer(viser.ViserServer):
         )
 
     def set_first_view(self, arm: DrawnArm, problem: Problem, q: Configurations) -> None:
-        """Set the view of new browsers so that the arm is visible in all configurations, beside the panel."""
+        """Set the view of new browsers so that the arm is visible beside the panel, at all configurations q
+        [n, dof]."""
         view = view_of_motion(arm, drawables(problem.scene), q, VIEW_SIZE, VIEW_MARGINS)
         height = 2 * np.tan(VERTICAL_FIELD / 2) * np.linalg.norm(view.target - view.eye)
         aside = PANEL_OFFSET * height * view.rotation[0]

@@ -1,7 +1,8 @@
-"""State of the page: the current problem, the motion shown, and whether it is valid. Independent of browsers.
+"""State of the interactive page: the current problem, the shown motion, and whether the motion is valid. The
+session does not depend on browsers.
 
-Changes return at once; invalid ones raise InputError and leave the session unchanged. Four threads do the
-work, each on its most recent request: one plans, one validates the motion shown in the current scene, and two
+Changes return at once; invalid changes raise InputError and leave the session unchanged. Four threads do the
+work, each on its most recent request. One plans, one validates the shown motion in the current scene, and two
 solve inverse kinematics for dragged goal and start poses.
 """
 
@@ -45,32 +46,33 @@ NEW_OBSTACLES: dict[str, Callable[[Vector, float], Shape]] = {
     "cylinder": lambda center, size: Cylinder(center, 0.75 * size, 3 * size),
     "capsule": lambda center, size: Capsule(center, 0.75 * size, 2.5 * size),
 }
-"""Makers of new obstacles, by kind, from their center and the radius of a sphere of similar size [m]."""
-# Bounds of a dimension [m].
+"""Functions that make new obstacles, by kind, from the center and a size: the radius of a sphere of similar
+size [m]."""
+# bounds of the dimensions of obstacles [m]
 MIN_DIMENSION = 0.01
 MAX_DIMENSION = 2.0
 AXES = ("x", "y", "z")
 ORIENTED = (Box, Cylinder, Capsule, Mesh)
-"""Shapes that can be rotated. Rotating a sphere has no effect, and point clouds store no pose."""
-# Position of new obstacles and radius of a new sphere, as fractions of the arm's reach.
+"""Shapes that can be rotated by dragging. Rotating a sphere has no effect, and point clouds store no pose."""
+# position of new obstacles, and radius of a new sphere, as fractions of the arm's reach
 NEW_POSITION = np.array([0.5, 0.0, 0.5])
 NEW_RADIUS = 0.094
 TREE_PLANNERS = ("robotdiffuse", "aorrtc", "rrt_connect")
 """Planners whose search trees can be shown."""
 QUICK_IK = InverseKinematicsSettings(max_rounds=2, patience=1)
-"""Inverse kinematics while dragging: few attempts, because many poses are out of reach."""
+"""Settings of inverse kinematics while dragging: few attempts, because many poses are out of reach."""
 
 
 DEMO_FILE = "shelf.yaml"
 FAMILY = "shelf"
 MAX_UPLOAD_SIZE = 5_000_000
-"""Largest problem file [bytes]."""
+"""Largest size of an uploaded problem file [bytes]."""
 FILE_FIELDS = ("file", "request", "views")
-"""Fields of a problem that name files on the server."""
+"""Fields of a problem that refer to files, which uploads may not contain."""
 MAX_SAMPLES = 1000
 """Largest number of random configurations that are tried for a free start and goal."""
 NO_FILES = "the page reads no other files; open this problem with `robotdiffuse live PROBLEM`"
-# Kinds of badges: green, red, no motion, not validated yet.
+# kinds of badges: valid motion, invalid motion, no motion, not validated yet
 VALID = "valid"
 INVALID = "invalid"
 NO_MOTION = "none"
@@ -80,24 +82,24 @@ COLLISIONS = ("scene_collision", "self_collision")
 
 @dataclass(frozen=True)
 class PageOptions(Settings):
-    """How the page plans."""
+    """Planning options of the page."""
 
     planner: Annotated[str, OneOf(PLANNERS)] = DEFAULT_PLANNER
     """Name of the planner, in PLANNERS."""
     time_limit: Annotated[float, Bound(above=0.0, most=60.0)] = 1.0
     """Time limit of each call [s]."""
     follow: bool = True
-    """Plan again after each change."""
+    """Whether the page plans again after each change."""
     trees: bool = False
-    """Show the search trees of the last plan."""
+    """Whether the search trees of the last plan are shown."""
 
 
 @dataclass(frozen=True)
 class Validation:
-    """The validator's report on the motion shown."""
+    """The validator's report on the shown motion."""
 
     version: int
-    """Version of the problem that the motion was validated for."""
+    """Version of the state for which the motion was validated."""
     report: Report
     seconds: float
     """Time that validation took [s]."""
@@ -110,25 +112,26 @@ class State:
     problem: Problem
     options: PageOptions = PageOptions()
     version: int = 0
-    """Counts the changes of the problem and the options."""
+    """Number of changes of the problem and the options so far."""
     planning: bool = False
     """Whether a plan for this version is being computed."""
     answer: PlanResult | None = None
-    """Result for this version; None until there is one."""
+    """The planner's result for this version; None until it is known."""
     failure: str = ""
-    """Why the planner could not run, in one line."""
+    """Why the planner could not run, in one line; empty if it could."""
     motion: PlanResult | None = None
-    """The result whose motion is shown: the last one with a motion."""
+    """The result with the shown motion: the last result that has a motion."""
     validation: Validation | None = None
-    """Validation of the motion shown; of an earlier version until the new one is done."""
+    """Validation of the shown motion. Until the validation for this version is complete, it is one of an
+    earlier version."""
     seconds: tuple[tuple[str, float], ...] = ()
     """Name and time [s] of each stage of the last plan."""
     goal_frame: str = ""
-    """The link that represents the goal."""
+    """The link that visitors drag to move the goal."""
     goal_pose: Pose = field(default_factory=lambda: np.eye(4))
-    """T_base_frame of this link, which is dragged; of the first goal if there are several."""
+    """T_base_frame of this link at the goal; of the first goal if there are several."""
     goal_configuration: Configuration | None = None
-    """A configuration at the goal; None if none was found."""
+    """A configuration that reaches the goal; None if no such configuration was found."""
 
     @property
     def obstacles(self) -> dict[str, Shape]:
@@ -137,7 +140,8 @@ class State:
 
 
 class Session:
-    """The state of the page and its threads. `on_change` is called after each change, from any thread."""
+    """The state of the page and its threads. `on_change` is called after each change of the state, from any
+    thread."""
 
     def __init__(self, problem: Problem, options: PageOptions = PageOptions()) -> None:
         self.on_change: Callable[[], None] = lambda: None
@@ -156,7 +160,7 @@ class Session:
         self._changed()
 
     def close(self) -> None:
-        """Start no more work; running calls end in their own time."""
+        """Start no more work. Running calls are not interrupted."""
         for thread in (self._planning_task, self._validation_task, self._goal_task, self._start_task):
             thread.close()
 
@@ -187,14 +191,14 @@ class Session:
                 self.on_change()
 
     def plan_now(self) -> None:
-        """Plan now, even if automatic planning is off."""
+        """Plan now, also if automatic planning (`PageOptions.follow`) is off."""
         with self._lock:
             self._set(planning=True)
             self._planning_task.submit(self.state.version)
         self.on_change()
 
     def move_goal(self, T_base_frame: Pose) -> None:
-        """Set the goal to a pose of the goal's link, or of the tip."""
+        """Set the goal to a pose of the link `State.goal_frame`."""
         with self._lock:
             state = self.state
             goal = _posed(state.problem.goal, state.goal_frame, T_base_frame)
@@ -210,11 +214,13 @@ class Session:
             self._changed()
 
     def move_start(self, T_base_tip: Pose) -> None:
-        """Set the start to the nearest configuration with the tip at a pose, if there is one."""
+        """Set the start to the nearest configuration with the tip at a pose, if such a configuration is
+        found."""
         self._start_task.submit(T_base_tip)
 
     def add_obstacle(self, kind: str, center: Vector | None = None) -> str:
-        """Add an obstacle and return its name. Default center [m]: in front of the arm, at half its reach."""
+        """Add an obstacle and return its name. The default center [m] is in front of the arm, at half the
+        arm's reach."""
         with self._lock:
             if kind not in NEW_OBSTACLES:
                 raise unknown_name("kind of obstacle", kind, NEW_OBSTACLES)
@@ -225,7 +231,8 @@ class Session:
             return [*self.state.obstacles][-1]
 
     def change_obstacle(self, name: str, change: Callable[[Shape], Shape | None]) -> None:
-        """Replace an obstacle, or delete it for None. Raises InputError for an unknown name."""
+        """Replace an obstacle by the result of `change`; if that is None, delete it. Raises InputError for an
+        unknown name."""
         with self._lock:
             obstacles = self.state.obstacles
             if name not in obstacles:
@@ -240,7 +247,7 @@ class Session:
         self._changed()
 
     def _changed(self) -> None:
-        """Validate the motion shown again, and plan again if `follow` is on."""
+        """Validate the shown motion again, and plan again if `follow` is on."""
         with self._lock:
             state = self.state
             version = state.version + 1
@@ -255,7 +262,7 @@ class Session:
     # Work of the threads
 
     def _publish(self, fits: Callable[[State], bool], **changes: Any) -> None:
-        """Change the state if what was computed still fits it."""
+        """Change the state to computed results, unless they no longer fit the current state."""
         with self._lock:
             if not fits(self.state):
                 return
@@ -275,7 +282,7 @@ class Session:
         self._publish(fits, validation=validation)
 
     def _find_goal_configuration(self, T_base_frame: Pose) -> None:
-        """Find a configuration at the goal, close to the previous one."""
+        """Find a configuration that reaches the goal, close to the previous one."""
         state = self.state
         previous = state.goal_configuration
         robot = state.problem.robot
@@ -304,10 +311,10 @@ class Session:
             current = self.state.version == version
             if current:
                 self._set(planning=False, answer=result, failure=failure, seconds=seconds)
-            # an outdated motion is still shown if it is free in the current scene
+            # a motion for an outdated version is still shown if it is free in the current scene
             same_robot = self.state.problem.robot is state.problem.robot
             violation = None if validation is None else validation.report.violation
-            # the goal moves while the target is dragged
+            # an outdated motion may miss the goal, which moves while it is dragged
             free = violation is None or violation.kind == "goal"
             if same_robot and validation is not None and (current or free):
                 self._set(motion=result, validation=validation)
@@ -316,7 +323,8 @@ class Session:
         self.on_change()
 
     def _solve(self, state: State) -> tuple[PlanResult | None, str, tuple[tuple[str, float], ...]]:
-        """The planner's result, or why it failed, and the times of its stages."""
+        """Plans for a state. Returns the planner's result, or None and the reason why it failed, and the
+        times of its stages."""
         options = state.options
         problem = state.problem
         try:
@@ -351,8 +359,8 @@ def _configuration_at(
 
 
 def _opened(problem: Problem, options: PageOptions) -> State:
-    """The state of a problem whose goal is represented by one link, its pose, and, for a joint goal, its
-    configuration."""
+    """The state for a new problem. Its goal is represented by the pose of one link and, for a joint goal, by
+    a configuration."""
     goal = problem.goal
     robot = problem.robot
     if isinstance(goal, AnyGoal):
@@ -366,7 +374,8 @@ def _opened(problem: Problem, options: PageOptions) -> State:
 
 
 def _posed(goal: Goal, frame: str, T_base_frame: Pose) -> PoseGoal | PosesGoal:
-    """The goal with another pose of one link; tolerances and the poses of other links stay."""
+    """The goal with another pose of one link. Tolerances and the poses of other links are unchanged. A joint
+    goal becomes a pose goal."""
     if isinstance(goal, PoseGoal):
         return replace(goal, T_base_frame=T_base_frame)
     if isinstance(goal, PosesGoal):
@@ -388,14 +397,14 @@ def _validated(problem: Problem, motion: PlanResult, version: int) -> Validation
 
 
 def moved_to(shape: Shape, T_base_handle: Pose) -> Shape:
-    """The shape with its handle at a pose; shapes without an orientation are not rotated."""
+    """The shape, moved so that its handle has a pose. Shapes without an orientation are not rotated."""
     if not isinstance(shape, ORIENTED):
         T_base_handle = transform(T_base_handle[:3, 3])
     return shape.moved(T_base_handle @ inverse(own_frame(shape)))
 
 
 def dimensions(shape: Shape) -> dict[str, float]:
-    """The adjustable dimensions of a shape by name [m]; none for meshes and point clouds."""
+    """The adjustable dimensions of a shape by name [m]; empty for meshes and point clouds."""
     if isinstance(shape, Box):
         return {f"size {axis}": float(value) for axis, value in zip(AXES, shape.size, strict=True)}
     if isinstance(shape, Sphere):
@@ -425,13 +434,14 @@ class Validity:
     """Kind and text of the badge."""
 
     kind: str
+    """VALID, INVALID, NO_MOTION or PENDING."""
     headline: str
     lines: tuple[str, ...] = ()
 
 
 def validity(state: State) -> Validity:
-    """The badge of a state: clearances, or link, obstacle, depth and time of a violation, or why there is no
-    motion."""
+    """The badge of a state: the clearances of the shown motion; or link, obstacle, depth and time of its
+    violation; or the reason why there is no motion."""
     why_not = state.failure
     if not why_not and state.answer is not None and not state.answer.solved:
         why_not = f"{state.answer.status.value}: {state.answer.reason}"
@@ -468,9 +478,9 @@ def _distance(meters: float | None) -> str:
 
 
 def first_problem(file: str | None, robot: str | None) -> Problem:
-    """The first problem of the page: from a file, for a robot, or the demo.
+    """The first problem of the page: read from a file, made for a robot, or the demo if neither is given.
 
-    Raises InputError if both are given, and for a bad file or robot.
+    Raises InputError if both are given, and for an invalid file or robot.
     """
     if file is not None and robot is not None:
         raise InputError(f"{file} names its robot; give a problem or --robot {robot}, not both")
@@ -483,8 +493,8 @@ def first_problem(file: str | None, robot: str | None) -> Problem:
 
 
 def problem_for(robot: Robot) -> Problem:
-    """A problem of the family shelf for the arm; if there is none, between two free configurations in an
-    empty scene."""
+    """A problem of the family shelf for the robot. If the family cannot be drawn for it, the problem is
+    between two free configurations in an empty scene."""
     rng = np.random.default_rng(0)
     try:
         return load_family(FAMILY).draw(robot, rng).problem(robot)
@@ -504,8 +514,8 @@ def problem_for(robot: Robot) -> Problem:
 def uploaded_problem(content: bytes, name: str, robot: Robot) -> Problem:
     """The problem in an uploaded file.
 
-    It may name known robots and the one on the page, but no files on the server. Raises InputError, which
-    begins with the name of the file.
+    The problem may name known robots and the robot of the page, but no files on the server. Raises InputError
+    with a message that begins with the name of the uploaded file.
     """
     if len(content) > MAX_UPLOAD_SIZE:
         raise InputError(f"{name} has {len(content)} bytes; at most {MAX_UPLOAD_SIZE} are read")
@@ -522,7 +532,7 @@ def uploaded_problem(content: bytes, name: str, robot: Robot) -> Problem:
 
 
 def _check_contained(data: object, robot: Robot) -> None:
-    """Raises InputError if the data of a problem file names files."""
+    """Raises InputError if the data of a problem file refers to other files or unknown robots."""
     if not isinstance(data, dict):
         return  # the problem reader rejects it
     robot_name = data.get("robot")
@@ -549,16 +559,16 @@ def problem_text(problem: Problem) -> bytes:
 
 
 FRAME_RATE = 30.0
-"""Calls of `Player.show` per second while playing."""
+"""Number of calls per second of a Player's function `show` while it plays."""
 END_PAUSE = 0.7
-"""Pause at the end of a motion before it repeats [s]."""
+"""Pause at the end of a motion before it is played again [s]."""
 Work = TypeVar("Work")
 
 
 class LatestTask(Generic[Work]):
-    """Calls `do` in a thread of its own with the most recent request.
+    """A thread that calls `do` with the most recent request.
 
-    A request that has not begun is dropped when a newer one arrives. Errors of `do` are logged.
+    A pending request is dropped when a newer one arrives. Errors of `do` are logged.
     """
 
     def __init__(self, do: Callable[[Work], None], name: str) -> None:
@@ -595,19 +605,20 @@ class LatestTask(Generic[Work]):
 
 
 class Changes:
-    """The values that were last shown, by name."""
+    """Remembers the values that were last shown, by name, to find changes."""
 
     def __init__(self) -> None:
         self._shown: dict[str, tuple[object, ...]] = {}
 
     def new(self, what: str, *values: object) -> bool:
-        """Whether values differ from the last ones; of arrays and such the identity counts."""
+        """Whether values differ from the last values with the name `what`, and remember them. Numbers, texts
+        and tuples are compared by value, other objects by identity."""
         last_values = self._shown.get(what)
         self._shown[what] = values
         return last_values is None or not all(map(_same, last_values, values))
 
     def forget(self, *names: str) -> None:
-        """Values of these names are new the next time."""
+        """Forget the values of these names, so that their next values count as new."""
         for name in names:
             self._shown.pop(name, None)
 
@@ -618,7 +629,7 @@ def _same(known: object, value: object) -> bool:
 
 
 class Player:
-    """Calls `show` with the time in the motion [s]; while playing, from a thread of its own, in a loop."""
+    """Plays a motion in a loop: a thread calls `show` with the time in the motion [s]."""
 
     def __init__(self, show: Callable[[float], None]) -> None:
         self._show = show
@@ -641,14 +652,15 @@ class Player:
             (self._playing.set if playing else self._playing.clear)()
 
     def load(self, duration: float) -> None:
-        """Switch to a motion of this duration [s], at the same fraction of it."""
+        """Switch to a motion of this duration [s]; the time is set to the same fraction of the motion as
+        before."""
         with self._lock:
             share = self.time / self.duration if self.duration else 0.0
             self.duration = duration
             self.seek(min(share, 1.0) * duration)
 
     def seek(self, at: float) -> None:
-        """Go to a time [s], clipped to the motion."""
+        """Go to a time of the motion [s]; times beyond its ends are clipped."""
         with self._lock:
             self.time = min(max(at, 0.0), self.duration)
             self._show(self.time)

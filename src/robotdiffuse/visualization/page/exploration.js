@@ -1,9 +1,9 @@
-// --- An exploration: what was known over time. It runs after replay.js; data.exploration is written by exploration_page.py.
+// --- An exploration: what was known over time. This runs after replay.js; exploration.py writes data.exploration.
 
-const told = data.exploration;
-const [NX, NY, NZ] = told.shape;
+const recording = data.exploration;
+const [NX, NY, NZ] = recording.shape;
 
-// Numbers of faces, as the differences from one to the next in groups of 7 bits, the lowest first.
+// Face indices, stored as differences from one to the next in groups of 7 bits, the lowest first.
 function numbers(text) {
   const out = [];
   let last = 0, value = 0, shift = 0;
@@ -15,7 +15,7 @@ function numbers(text) {
   return out;
 }
 
-// What is in one of two ascending lists and not in both.
+// The numbers that are in exactly one of two ascending lists.
 function toggled(a, b) {
   const out = [];
   let i = 0, j = 0;
@@ -38,7 +38,7 @@ function quads(faces) {
     const along = UNITS[axis], across = UNITS[(axis + 1) % 3], up = UNITS[(axis + 2) % 3];
     [[0, 0], [1, 0], [1, 1], [0, 1]].forEach(([s, t], k) => {
       for (let c = 0; c < 3; c++) {
-        position[12 * n + 3 * k + c] = told.low[c] + told.edge * (at[c] + along[c] + s * across[c] + t * up[c]);
+        position[12 * n + 3 * k + c] = recording.low[c] + recording.edge * (at[c] + along[c] + s * across[c] + t * up[c]);
         normal[12 * n + 3 * k + c] = 127 * along[c];
       }
     });
@@ -52,7 +52,7 @@ function quads(faces) {
 }
 
 // A see-through layer writes its depth first, so that only its nearest faces are tinted.
-const layers = told.layers.map((layer) => {
+const layers = recording.layers.map((layer) => {
   const clear = layer.opacity < 1, group = new THREE.Group();
   const solid = new THREE.MeshStandardMaterial({ color: color(layer.color), roughness: 0.8, side: THREE.DoubleSide,
     transparent: clear, opacity: layer.opacity, depthWrite: !clear });
@@ -71,25 +71,25 @@ const layers = told.layers.map((layer) => {
 });
 layers.forEach((layer, l) => {
   let faces = [];
-  for (const known of told.known) {
+  for (const known of recording.known) {
     faces = toggled(faces, numbers(known.layers[l]));
     layer.states.push(faces);
   }
 });
 
-const LOOK = color(told.look_color);
-const looks = told.acts.map((act) => {
+const LOOK = color(recording.look_color);
+const looks = recording.acts.map((act) => {
   const group = new THREE.Group();
   for (const edge of act.look) group.add(trace(edge, 0.004, () => LOOK, 1));
   group.visible = false;
   scene.add(group);
   return group;
 });
-const lookArm = new Arm(ghostMaterials(told.look_color, 7), 1);
+const lookArm = new Arm(ghostMaterials(recording.look_color, 7), 1);
 lookArm.group.visible = false;
 
 const trueScene = new THREE.Group();
-for (const shape of told.true_scene) {
+for (const shape of recording.true_scene) {
   const object = obstacle(shape);
   object.castShadow = object.receiveShadow = false;
   if (shape.kind !== "point_cloud") Object.assign(object.material, { transparent: true, opacity: 0.3, depthWrite: false });
@@ -101,11 +101,11 @@ scene.add(trueScene);
 const steps = document.createElement("ol");
 steps.id = "steps";
 steps.className = "panel";
-const rows = told.acts.map((act, i) => {
-  const row = document.createElement("li"), title = document.createElement("b"), more = document.createElement("span");
+const rows = recording.acts.map((act, i) => {
+  const row = document.createElement("li"), title = document.createElement("b"), details = document.createElement("span");
   title.textContent = act.title;
-  more.textContent = `${act.reason} (${act.known})`;
-  row.append(title, more);
+  details.textContent = `${act.reason} (${act.known})`;
+  row.append(title, details);
   row.onclick = () => scrub(act.time / (duration || 1));
   steps.append(row);
   return row;
@@ -115,9 +115,9 @@ document.body.append(steps);
 startArm.group.visible = false;
 $("toggles").firstChild.setAttribute("aria-pressed", false);
 
-// Toggles of the layers, with their color, before the others.
+// The toggles of the layers, marked with their colors, come before the others.
 const first = $("toggles").firstChild;
-const before = (name, objects, rgb) => {
+const addToggle = (name, objects, rgb) => {
   toggle(name, objects);
   const button = $("toggles").lastChild;
   if (rgb) {
@@ -127,15 +127,15 @@ const before = (name, objects, rgb) => {
   }
   $("toggles").insertBefore(button, first);
 };
-told.layers.forEach((layer, l) => before(layer.name, [layers[l].group], layer.color));
-before("Next look", [new THREE.Group()], told.look_color);
-const wanted = $("toggles").children[told.layers.length];
-before("True scene", [trueScene]);
+recording.layers.forEach((layer, l) => addToggle(layer.name, [layers[l].group], layer.color));
+addToggle("Next look", [new THREE.Group()], recording.look_color);
+const lookToggle = $("toggles").children[recording.layers.length];
+addToggle("True scene", [trueScene]);
 
-const latest = (list, at) => Math.max(0, list.findLastIndex((one) => one.time <= at + 1e-6));
+const latest = (list, at) => Math.max(0, list.findLastIndex((entry) => entry.time <= at + 1e-6));
 let shownKnown = -1;
 function follow(at) {
-  const k = latest(told.known, at), a = latest(told.acts, at);
+  const k = latest(recording.known, at), a = latest(recording.acts, at);
   if (k !== shownKnown) {
     layers.forEach((layer) => {
       layer.meshes[0].geometry.dispose();
@@ -144,13 +144,13 @@ function follow(at) {
     });
     shownKnown = k;
   }
-  const on = wanted.getAttribute("aria-pressed") === "true";
+  const on = lookToggle.getAttribute("aria-pressed") === "true";
   looks.forEach((look, i) => { look.visible = on && i === a; });
-  lookArm.group.visible = on && told.acts[a].end !== null;
-  if (told.acts[a].end !== null) lookArm.pose(frames(told.acts[a].end));
+  lookArm.group.visible = on && recording.acts[a].end !== null;
+  if (recording.acts[a].end !== null) lookArm.pose(frames(recording.acts[a].end));
   rows.forEach((row, i) => row.setAttribute("aria-current", i === a));
   dirty = true;
 }
-wanted.addEventListener("click", () => follow(time));
+lookToggle.addEventListener("click", () => follow(time));
 followers.push(follow);
 follow(time);
