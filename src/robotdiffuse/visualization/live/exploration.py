@@ -257,7 +257,7 @@ class ExplorationSession:
 
 
 class ExplorationPage(LivePage):
-    """The page of an exploration. The exploration runs when the first browser opens the page."""
+    """The page of an exploration. The exploration starts when a browser first opens the page."""
 
     session: ExplorationSession
 
