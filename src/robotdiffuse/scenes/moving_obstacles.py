@@ -39,10 +39,11 @@ POSE_TOLERANCE = 1e-6
 class MovingObstacle(Value):
     """A shape with its pose at time 0, in the frame of the robot's base, and one of three motions.
 
-    velocity: the shape keeps its orientation and moves at a constant velocity forever. times and poses: the
-    pose of the shape's frame at each time. Between these times, the shape moves on straight lines at constant
-    speed and turns at a constant rate. Before the first and after the last time it stands still. max_speed:
-    the motion is unknown, but no point of the shape is faster than this.
+    velocity: the shape keeps its orientation and moves at a constant velocity forever.
+    times and poses: the pose of the shape's frame at each time. Between these times, the shape moves on
+    straight lines at constant speed and turns at a constant rate. Before the first and after the last time it
+    stands still.
+    max_speed: the motion is unknown, but no point of the shape is faster than this.
 
     Raises InputError unless exactly one of these motions is given, and for values that are not finite, times
     that do not increase, poses that jump (a point is faster than MAX_POINT_SPEED), a first pose that is not

@@ -140,8 +140,10 @@ value. It returns the value to store, or raises InputError."""
 class Sphere(Shape):
     """A ball.
 
-    center: x y z in the frame of the robot's base [m]. radius: [m]. name: name in results, commands and
-    allowed contacts; a scene appends a number to names that are not unique.
+    center: x y z in the frame of the robot's base [m].
+    radius: [m].
+    name: the sphere's name in results, commands and allowed contacts; a scene appends a number to names that
+    are not unique.
     """
 
     center: GivenVector
@@ -196,10 +198,11 @@ class _Posed(Shape):
 class Box(_Posed):
     """A box of any orientation.
 
-    center: middle of the box, x y z in the frame of the robot's base [m]. size: full edge lengths along the
-    box's own x, y and z [m]. wxyz: orientation as a quaternion, scalar first; default: along the axes of the
-    base. name: name in results, commands and allowed contacts; a scene appends a number to names that are not
-    unique.
+    center: middle of the box, x y z in the frame of the robot's base [m].
+    size: full edge lengths along the box's own x, y and z [m].
+    wxyz: orientation as a quaternion, scalar first; default: along the axes of the base.
+    name: the box's name in results, commands and allowed contacts; a scene appends a number to names that are
+    not unique.
     """
 
     center: GivenVector

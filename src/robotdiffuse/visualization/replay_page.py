@@ -524,9 +524,9 @@ def show(result: PlanResult | ResultFile, problem: Problem | None = None, height
     colliding links are shown.
 
     Args:
-        result: A result of `plan`, or a result file. problem: The problem, needed only if the result does not
-        contain it. Results of `plan`, and files that were saved
-            with their problem, contain it.
+        result: A result of `plan`, or a result file.
+        problem: The problem, needed only if the result does not contain it. Results of `plan`, and files that
+            were saved with their problem, contain it.
         height: Height of the replay [pixels].
 
     Raises:

@@ -127,8 +127,10 @@ def _stretch_free(space, a, b, s, t, padding, block, work):
 
 @kernel(nogil=True)
 def motions_free(space, path):
-    """Whether the straight motion between each two consecutive rows of path[n, dof] is free of collision, [n
-    - 1]; row 0 itself is not checked."""
+    """Whether the straight motion from each row of path[n, dof] to the next is free of collision, [n - 1].
+
+    Row 0 itself is not checked.
+    """
     work = make_workspace(space.robot, space.scene)
     block = np.empty((path.shape[1], W), np.float32)
     out = np.empty(len(path) - 1, np.bool_)
