@@ -247,8 +247,8 @@ def empty_regions(
     is_empty &= beside[1] < NEAR_SHARE * beside[0]
     is_empty[0] = False
     height, width = depth.shape
-    empty = is_empty[regions].repeat(2, 0).repeat(2, 1)[:height, :width] & no_return
-    return empty if is_empty.any() else None
+    empty = is_empty[regions].repeat(2, 0).repeat(2, 1)
+    return empty[:height, :width] & no_return if is_empty.any() else None
 
 
 GRAZED_WIDTH = 0.04

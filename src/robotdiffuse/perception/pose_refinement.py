@@ -180,8 +180,7 @@ class PoseRefinement:
             if camera.link is not None and is_on(self._robot, camera.link, camera.T, T, q):
                 return number
         stated = np.repeat(np.maximum(view.pose_deviation, 1e-5), 3) / PRIOR_DEVIATIONS
-        mounts = (mount for mount in self._on_arm if is_on(self._robot, *mount, T, q))
-        link, nominal = next(mounts, (None, T))
+        link, nominal = next((mount for mount in self._on_arm if is_on(self._robot, *mount, T, q)), (None, T))
         camera = _Camera(link, nominal, stated, np.zeros(6), np.diag(stated**2))
         self._cameras.append(camera)
         return len(self._cameras) - 1

@@ -42,10 +42,11 @@ def unit_notes(problem: Problem) -> tuple[str, ...]:
         and distances.min() > reach
         and not (has_seen_points or problem.views or problem.moving)
     ):
-        several = len(distances) > 1
-        subject = f"all {len(distances)} obstacles are" if several else f"the obstacle {shapes[0].name} is"
-        nearest = distances.min()
-        distance_text = f"beyond the arm's reach of {reach:.1f} m, at least {nearest:.1f} m from its base"
+        count = len(distances)
+        subject = f"all {count} obstacles are" if count > 1 else f"the obstacle {shapes[0].name} is"
+        distance_text = (
+            f"beyond the arm's reach of {reach:.1f} m, at least {distances.min():.1f} m from its base"
+        )
         messages = (f"check the units: {subject} {distance_text}; {ADVICE}",)
     return messages
 
