@@ -110,7 +110,8 @@ class StepsResult:
     """The verified motion of each step, None for `Attach` and `Detach`. If a step failed, its result is the
     last one."""
     workspace: Any
-    """The `Workspace` after these steps, with the obstacles and held objects as they are then."""
+    """The `Workspace` after these steps, with the obstacles and held objects as they are then; if a step
+    failed, as it was before that step."""
     reason: str
     """A sentence: "solved in ... steps", or which step failed and why."""
     planning_time: float

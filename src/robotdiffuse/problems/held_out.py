@@ -2,7 +2,7 @@
 
 A problem is trivial if the straight line from the start to a goal configuration passes the validator. It is
 hard if it is not trivial and a search solves it. JSON lines files store each problem with whether it is
-trivial and the length that the search found; every benchmark reads these files.
+trivial and the length of the shortest known path; every benchmark reads these files.
 """
 
 import itertools
@@ -53,7 +53,8 @@ class Case:
     trivial: bool
     """Whether the straight line to a goal configuration passes the validator."""
     reference: float | None = None
-    """Length of the shortest known path [rad]; None if no search ran, or none found a path."""
+    """Length of the shortest known path [rad]: of the straight line if trivial, else of a search's path; None
+    if no search ran, or none found a path."""
     problem_set: str = ""
     """Name of the problem set: the name of a family, or of a file or folder without its ending."""
 
@@ -74,7 +75,7 @@ def held_out_problem(family: str, number: int) -> Problem:
     index = list(FAMILIES).index(family)
     rng = np.random.default_rng([SEED, number] if index == 0 else [SEED, 10 + index, number])
     if index > 1:
-        rng.random()  # discarded: the first published problems were generated with this additional number
+        rng.random()  # keeps the published problems, whose generator drew one number more
     robot = load_robot("panda")
     return load_family(family).draw(robot, rng).problem(robot)
 

@@ -14,8 +14,9 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape
 
 MAX_EXTENT = 10.0
-"""A mesh or a cloud gets a note if its longest edge exceeds this; a view, if half of its depths do [m]. Other
-shapes get a note only if their shortest edge exceeds it: a floor may be wide, but it is flat."""
+"""A mesh or a cloud gets a note if the longest edge of its bounding box exceeds this; a view, if half of its
+depths do [m]. Other shapes get a note only if the shortest edge exceeds it: a floor may be wide, but is flat.
+"""
 VIEW_STRIDE = 4
 """Only every fourth row and column of a depth image is checked."""
 MIN_POINTS_IN_ARM = 10
@@ -34,7 +35,7 @@ def unit_notes(problem: Problem) -> tuple[str, ...]:
     notes = [_size_note(shapes[i], extents[i]) for i in large]
     notes += [_view_note(i, view, reach) for i, view in enumerate(problem.views)]
     messages = tuple(note for note in notes if note)
-    solid = [not _is_empty(shape) for shape in shapes]
+    solid = [i for i, shape in enumerate(shapes) if not _is_empty(shape)]
     distances = _distances(bounds[solid])
     if (
         not messages
@@ -43,7 +44,7 @@ def unit_notes(problem: Problem) -> tuple[str, ...]:
         and not (has_seen_points or problem.views or problem.moving)
     ):
         count = len(distances)
-        subject = f"all {count} obstacles are" if count > 1 else f"the obstacle {shapes[0].name} is"
+        subject = f"all {count} obstacles are" if count > 1 else f"the obstacle {shapes[solid[0]].name} is"
         distance_text = (
             f"beyond the arm's reach of {reach:.1f} m, at least {distances.min():.1f} m from its base"
         )

@@ -22,8 +22,8 @@ SIGNALS = signal.SIGINT, signal.SIGTERM
 
 
 class _Server(uvicorn.Server):
-    """Stops at the first signal after running requests have finished, and refuses waiting ones; the second
-    signal stops it at once."""
+    """At the first signal, it refuses waiting requests, lets running ones finish, and stops; at the second
+    signal, it stops at once."""
 
     def __init__(self, config: uvicorn.Config, pool: WorkerPool) -> None:
         super().__init__(config)
@@ -57,7 +57,7 @@ def serve(robots: dict[str, Robot], settings: ServeSettings, say: Callable[[str]
     LOG.addHandler(handler)
     LOG.setLevel(logging.INFO)
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
-    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)  # TCP, for asyncio
+    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     with listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

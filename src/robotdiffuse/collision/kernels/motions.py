@@ -127,9 +127,8 @@ def _stretch_free(space, a, b, s, t, padding, block, work):
 
 @kernel(nogil=True)
 def motions_free(space, path):
-    """Whether the straight motion from each row of path[n, dof] to the next is free of collision, [n - 1].
-
-    Row 0 itself is not checked.
+    """For each row of path[n, dof] but the last, whether the straight motion to the next row is free of
+    collision: bool[n - 1]. Row 0 itself is not checked.
     """
     work = make_workspace(space.robot, space.scene)
     block = np.empty((path.shape[1], W), np.float32)

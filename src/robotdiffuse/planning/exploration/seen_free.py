@@ -35,8 +35,8 @@ PARTS = 4
 """Near goals, voxels are split into this many parts along each edge."""
 NOT_SEEN_FREE = "not seen free"
 MIN_FREE_SHARE = 0.8
-"""Searches fail if less than this share of the space that the arm fills at the goal but not at the start was
-seen free: see benchmarks/results/exploring.txt."""
+"""Of the space that the arm fills at the goal but not at the start, at least this share must have been seen
+free before a motion to the goal is searched: with less, searches fail (benchmarks/results/exploring.txt)."""
 WALL = 2.0
 """Thickness of the walls around the map [m]."""
 
@@ -74,7 +74,7 @@ def not_seen_free(
 
 
 def near_ends(known: OccupancyMap, ends: Sequence[Configuration]) -> Voxels:
-    """The voxels around the arm at these configurations, which count as free, at least in part."""
+    """The voxels within CARVING_MARGIN of the arm at these configurations, or partly within it."""
     return MAP.filled(known.robot, ends, CARVING_MARGIN + MAP.edge / 2)
 
 
@@ -127,8 +127,8 @@ def _walls() -> list[Box]:
 
 
 BORDER = np.float32(1.0)
-"""Width of the margin around a ball that is checked as well in filtered images: the filter moves edges by
-about one pixel."""
+"""In filtered images, pixels up to this far outside a ball's outline must see past it too [pixels], since
+the filter moves edges by about one pixel."""
 LITTLE_UNSEEN = 1e-3
 """If less than this part of the surface was not seen, messages say where it is."""
 KEY_DECIMALS = 5
@@ -136,7 +136,7 @@ KEY_DECIMALS = 5
 
 
 class GoalSeen:
-    """The balls on the arm's surface at goal configurations that nothing has shown to be free."""
+    """Says which balls on the arm's surface, at goal configurations, nothing has shown to be free yet."""
 
     def __init__(self, robot: Robot, known: OccupancyMap, views: ViewMemory, required: bool) -> None:
         """views: the kept views, which count for new goals as well. required: whether goals must be seen; if

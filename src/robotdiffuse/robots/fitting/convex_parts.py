@@ -29,8 +29,7 @@ sheets."""
 
 
 def convex_hull(points: Points) -> ConvexMesh:
-    """Convex hull with outward faces. A point set that is thinner than `MIN_THICKNESS` in a direction is
-    thickened to it first."""
+    """Convex hull with outward faces. The points are `thickened` first."""
     points = thickened(points)
     hull = ConvexHull(points)
     used, index = np.unique(hull.simplices, return_inverse=True)
@@ -43,8 +42,8 @@ def convex_hull(points: Points) -> ConvexMesh:
 
 
 def thickened(points: Points) -> Points:
-    """The points. Along each principal axis in which the set is thinner than `MIN_THICKNESS`, two copies
-    shifted by half of it to both sides replace the points."""
+    """The points; along each principal axis in which the set is thinner than `MIN_THICKNESS`, two copies
+    shifted by plus and minus `MIN_THICKNESS / 2` replace them."""
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     for axis in axes[np.ptp(points @ axes.T, axis=0) < MIN_THICKNESS]:
         points = np.concatenate([points - axis * MIN_THICKNESS / 2, points + axis * MIN_THICKNESS / 2])
@@ -234,7 +233,8 @@ class PartSettings(Settings, name="convex parts"):
     concavity: Positive = 0.007
     """How far the hull of a part may stick out of the mesh [m]."""
     most: Count = 16
-    """Largest number of parts per link."""
+    """Largest number of parts of a link; more for links of many surfaces (two parts for each), and
+    TIGHT_PART_FACTOR times as many with tight places."""
     voxels: Count = 400_000
     """Approximate number of voxels of the grid that measures concavity."""
     finest: Positive = 0.0015
