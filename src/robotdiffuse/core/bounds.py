@@ -1,5 +1,5 @@
-"""Checks of numbers that users give: converted to arrays, kept within bounds that all other code can handle,
-and read-only where they belong to a value."""
+"""Checks numbers that users give: converts them to arrays within bounds that all other code can handle, and
+makes the arrays of dataclasses read-only, see `Value`."""
 
 from dataclasses import MISSING, fields
 from typing import Any, TypeVar

@@ -1,5 +1,5 @@
-"""Problem sets by name: held-out problems of the families, and problems from files and folders. Problems are
-checked once and then stored."""
+"""Problem sets by name: held-out problems of the families (kinds of random problems), and problems from files
+and folders. Problems are checked once and then stored."""
 
 import hashlib
 import itertools
@@ -80,7 +80,8 @@ def gather_cases(names: list[str], count: int | None, out: FilePath, report: Pro
     """
     repeated_names = repeated(problem_set_name(text) for text in names)
     if repeated_names:
-        raise InputError(f"problems name {', '.join(sorted(repeated_names))} twice; rename a file or folder")
+        twice = ", ".join(sorted(repeated_names))
+        raise InputError(f"problems has {twice} twice; leave one out, or rename its file or folder")
     return [case for text in names for case in _set(text, count, out / "problems", report)]
 
 
@@ -111,13 +112,13 @@ def _set(text: str, count: int | None, folder: FilePath, report: Progress) -> li
     elif source.is_file() and (stored := read_json(source))["sha256"] != about["sha256"]:
         raise InputError(
             f"{folder} has problems called {name} that were read from {stored['source']}; those in {text} "
-            "are others: rename them, or use another folder"
+            "have another content: rename them, or use another output folder"
         )
     return _of_set(case_store.cases()[:count], name)
 
 
 def _content_hash(place: FilePath) -> str:
-    """SHA-256 of the problem files of a set. Scene and mesh files that these refer to are not included."""
+    """SHA-256 of the problem files of a set. Mesh files are not included."""
     digest = hashlib.sha256()
     for part in _parts(place):
         for file in [part] if part.is_file() else sorted(part.glob("*.yaml")):

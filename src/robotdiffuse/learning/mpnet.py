@@ -23,8 +23,8 @@ Differences from the paper:
   about as many outputs as in the paper. With half, Pnet learns far less in this shorter training.
 - A training sample is a random row of one of our demonstrations and the row 0.7 rad further along the path
   (the paper: neighboring vertices of optimized RRT* paths). On average, 0.7 rad is a sixth of a path, and the
-  straight steps are 0.3 % shorter than the path. The step has the same length everywhere; if it were a
-  fraction of the path's length, the same inputs could have different targets.
+  straight steps are 0.3 % shorter than the path. The step has the same length everywhere but at
+  the goal; if it were a fraction of the path's length, the same inputs could have different targets.
 - Half of the samples have a random later waypoint as their goal, since bidirectional planning and replanning
   need steps to such goals.
 """
@@ -53,8 +53,8 @@ from robotdiffuse.scenes.surface_points import PANDA_REGION, VisibleRegion
 Clouds = Float[Tensor, "batch points 3"]
 Configurations = Float[Tensor, "batch dof"]
 CURVE_REACH = 16.0
-"""The region's reach is scaled to this [m] before points are sorted along the space-filling curve, which
-then fills the region."""
+"""Points are scaled so that the region's reach is this [m] before they are sorted along a space-filling
+curve, whose cells have a fixed size."""
 PRETRAINING = 0.1
 """Share of the training, at its beginning, in which Enet is trained as an auto-encoder."""
 SUB_GOALS = 0.5

@@ -37,7 +37,7 @@ def in_camera(T, x, y, z):
 @kernel()
 def rectangle(x, y, z, r, intrinsics, h, w):
     """First and last row, first and last column of the pixels that a sphere in the camera's frame may cover;
-    the last is below the first if it covers none. h, w: height and width of the image."""
+    if it covers none, a last index is smaller than its first. h, w: height and width of the image."""
     fx, fy, cx, cy = intrinsics
     if z + r <= _ZERO:
         return 0, -1, 0, -1
@@ -86,7 +86,7 @@ def _intersect(solid, ox, oy, oz, dx, dy, dz):
 
     solid: a row of `SceneArrays.solids`.
     """
-    # half edges a, solid[13] and c, and the radius r of the ball; solid[16] is 1 for a cylinder
+    # a box with half edges a, solid[13] and c, or, if solid[16] is 1, a cylinder; enlarged by the radius r
     a = solid[12]
     c = solid[14]
     r = solid[15]
@@ -228,7 +228,7 @@ def ray_cast(
     robot: Robot | None = None,
     configuration: Configuration | None = None,
 ) -> DepthView:
-    """The depth image of a scene, and of the covering spheres of a robot if one is given.
+    """The depth image of a scene, and of the covering spheres of a robot if it and a configuration are given.
 
     size: width and height [pixels]; intrinsics: see DepthView. Depth is infinite for pixels without an
     obstacle within MAX_RANGE. Raises InputError for shapes other than spheres, boxes, cylinders and capsules.

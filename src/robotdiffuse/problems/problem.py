@@ -1,9 +1,10 @@
 """Problem: a robot, a scene, a start and a goal, and optionally depth views of the scene.
 
-The functions before the class check its fields: each returns the value that the problem stores, or raises
-InputError.
+The functions before the class check its fields: they raise InputError for a wrong value, and most return the
+value that the problem stores.
 
-As with shapes, the constructors check their arguments themselves: see `no_type_check` in scenes/shapes.py.
+`no_type_check` keeps type checkers from checking the constructor at run time, since it checks its arguments
+itself (see scenes/shapes.py).
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -32,8 +32,8 @@ REQUIRED_PROGRESS = 0.5
 
 
 @inner_kernel()
-def forward(q, offsets, tool, kinds, frame, T, axes, origins):
-    """Write the axes and origins of the first `frame` joints, and the pose of the tool into T [3, 4].
+def forward(q, offsets, tool, kinds, length, T, axes, origins):
+    """Write the axes and origins of the first `length` joints, and the pose of the tool into T [3, 4].
 
     q [dof] is the configuration, offsets [dof, 4, 4], tool [4, 4] and kinds [dof] are as in `IKChain`; axes
     and origins are [dof, 3], in the base frame.
@@ -41,7 +41,7 @@ def forward(q, offsets, tool, kinds, frame, T, axes, origins):
     T[:] = 0.0
     for i in range(3):
         T[i, i] = 1.0
-    for j in range(frame):
+    for j in range(length):
         step(T, offsets[j], kinds[j] == PRISMATIC, q[j], T)
         for i in range(3):
             axes[j, i] = T[i, 2]
@@ -96,10 +96,10 @@ def pose_error(T, target, rows, rotation_weight, error):
 
 
 @inner_kernel()
-def _jacobian(T, axes, origins, kinds, frame, rows, rotation_weight, J):
+def _jacobian(T, axes, origins, kinds, length, rows, rotation_weight, J):
     """Write the geometric Jacobian of the tool into J [6, dof], with the rotation rows times
     `rotation_weight`."""
-    for j in range(frame):
+    for j in range(length):
         ax = axes[j, 0]
         ay = axes[j, 1]
         az = axes[j, 2]
@@ -123,14 +123,14 @@ def _jacobian(T, axes, origins, kinds, frame, rows, rotation_weight, J):
 
 
 @inner_kernel()
-def damped_step(J, error, damping, rows, frame, held, A, y, step):
+def damped_step(J, error, damping, rows, length, held, A, y, step):
     """Write step = J^T (J J^T + damping I)^-1 error; the columns of J and entries of step for held joints
     count as zero."""
     # A = J J^T + damping I, its Cholesky factor, and the two triangular solves
     for i in range(rows):
         for k in range(i + 1):
             total = damping if i == k else 0.0
-            for j in range(frame):
+            for j in range(length):
                 if not held[j]:
                     total += J[i, j] * J[k, j]
             A[i, k] = total
@@ -150,7 +150,7 @@ def damped_step(J, error, damping, rows, frame, held, A, y, step):
         for k in range(i + 1, rows):
             total -= A[k, i] * y[k]
         y[i] = total / A[i, i]
-    for j in range(frame):
+    for j in range(length):
         total = 0.0
         if not held[j]:
             for i in range(rows):
@@ -214,7 +214,7 @@ def solve_seeds(seeds, known, wanted, chain, target, parameters):
     the tool shall reach, and parameters are `IKParameters`. Returns the new configurations [k, dof] and the
     number of seeds that were used.
     """
-    offsets, tool, kinds, frame, lower, upper = chain
+    offsets, tool, kinds, length, lower, upper = chain
     position_only, rotation_weight, position_tolerance, rotation_tolerance, max_iterations, min_distance = (
         parameters
     )
@@ -238,7 +238,7 @@ def solve_seeds(seeds, known, wanted, chain, target, parameters):
     for s in range(len(seeds)):
         seeds_used = s + 1
         q = seeds[s].copy()
-        forward(q, offsets, tool, kinds, frame, T, axes, origins)
+        forward(q, offsets, tool, kinds, length, T, axes, origins)
         cost = pose_error(T, target, rows, rotation_weight, error)
         damping = INITIAL_DAMPING
         checked_cost = cost
@@ -255,26 +255,26 @@ def solve_seeds(seeds, known, wanted, chain, target, parameters):
                     break
                 checked_cost = cost
             if jacobian_outdated:
-                _jacobian(T, axes, origins, kinds, frame, rows, rotation_weight, J)
+                _jacobian(T, axes, origins, kinds, length, rows, rotation_weight, J)
                 jacobian_outdated = False
             # hold joints that the step would push through a limit, and solve for the others again
             fixed[:] = False
-            damped_step(J, error, damping * cost, rows, frame, fixed, A, y, step)
+            damped_step(J, error, damping * cost, rows, length, fixed, A, y, step)
             limit_hit = False
-            for j in range(frame):
+            for j in range(length):
                 if kinds[j] != CONTINUOUS and (
                     (q[j] <= lower[j] and step[j] < 0.0) or (q[j] >= upper[j] and step[j] > 0.0)
                 ):
                     fixed[j] = limit_hit = True
             if limit_hit:
-                damped_step(J, error, damping * cost, rows, frame, fixed, A, y, step)
+                damped_step(J, error, damping * cost, rows, length, fixed, A, y, step)
             for j in range(dof):
                 trial[j] = q[j]
-                if j < frame:
+                if j < length:
                     trial[j] += step[j]
                     if kinds[j] != CONTINUOUS:
                         trial[j] = min(max(trial[j], lower[j]), upper[j])
-            forward(trial, offsets, tool, kinds, frame, T, axes, origins)
+            forward(trial, offsets, tool, kinds, length, T, axes, origins)
             trial_cost = pose_error(T, target, rows, rotation_weight, trial_error)
             if trial_cost < cost:
                 q[:] = trial

@@ -149,7 +149,7 @@ def _check_tree(robot: Robot) -> None:
             name = leaders[name]
     table_links = {link for table in robot.tables for link in table.links}
     if not {*robot.tips, *robot.meshes, *table_links} <= links:
-        raise ValueError("the tip, meshes or a table of an unknown link")
+        raise ValueError("the tip, a mesh or a table names a link that no joint has")
     if any((rows[:, 3] <= 0).any() for rows in robot.spheres.values() if len(rows)):
         raise ValueError("spheres without a size")
 
@@ -166,7 +166,8 @@ def _to_json(robot: Robot, source: dict[str, Any]) -> dict:
         "name": robot.name,
         "source": source,
         "units": "metres, radians, seconds, kilograms; quaternions wxyz; spheres are x y z radius in the "
-        "link's frame; inertias mass x y z of its centre xx xy xz yy yz zz about it, along the link's axes",
+        "link's frame; inertias are: mass; x y z of the center of mass; xx xy xz yy yz zz about it, along "
+        "the link's axes",
         "base": robot.base,
         "tip": robot.tip,
         **({"other_tips": list(robot.other_tips)} if robot.other_tips else {}),
@@ -296,7 +297,7 @@ def _joint_from_json(data: dict) -> Joint:
         or not min(rates) >= MIN_RATE
         or not max(rates) < np.inf
     ):
-        raise ValueError(f"joint {name}: limits")
+        raise ValueError(f"joint {name}: lower is above upper, or a limit is out of range")
     if not abs(np.linalg.norm(axis) - 1) < AXIS_LENGTH_TOLERANCE:
         raise ValueError(f"joint {name}: an axis of length 1 expected")
     if kind == "continuous":
@@ -307,7 +308,7 @@ def _joint_from_json(data: dict) -> Joint:
         mimic = Mimic(str(master), float(multiplier), float(offset))
     effort = float(data.get("effort", 0.0))
     if not 0 <= effort <= MAX_COORDINATE:
-        raise ValueError(f"joint {name}: effort")
+        raise ValueError(f"joint {name}: effort is {effort:g}; it must be from 0 to {MAX_COORDINATE:g}")
     return Joint(*ends, axis, **limits, mimic=mimic, effort=effort)
 
 

@@ -279,7 +279,7 @@ def lzf_unpacked(packed: bytes, size: int) -> bytes:
     while at < len(packed) and len(out) <= size:
         control = packed[at]
         at += 1
-        if control < 32:  # control + 1 bytes follow unpacked
+        if control < 32:  # the next control + 1 bytes are literal: they are copied
             out += packed[at : at + control + 1]
             at += control + 1
             continue

@@ -100,7 +100,7 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
     """Uncertainty of the mean velocity of each step, from the resolution of positions."""
     share = 1 + settings.rate_slack
     """Factor on limits, for the tolerance."""
-    nothing = settings.rate_slack * np.where(robot.velocity > 0, robot.velocity, _peak(v, mean))
+    rest_tolerance = settings.rate_slack * np.where(robot.velocity > 0, robot.velocity, _peak(v, mean))
     """Velocity that counts as zero, for each joint."""
 
     def limited(kind: str, what: str, rates: ndarray, limit: ndarray, allowed: ndarray) -> _Check:
@@ -114,14 +114,14 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
     rule = "but motions begin and end at rest"
     if begins.any():
         rule = "but the motion is to begin at the problem's start_velocity and end at rest"
-    yield _Check("rest", "velocity", v, at_ends, nothing, lambda *_: rule)
+    yield _Check("rest", "velocity", v, at_ends, rest_tolerance, lambda *_: rule)
 
     limits = robot.velocity
     onwards = "mean velocity from here to the next row"
     yield limited("jump", onwards, mean, limits, settings.jump * limits + blur)
     # An error of a step's mean velocity m changes the cubic's velocities by up to 3/2 of it, and its
     # accelerations by 6 times it divided by the step's duration (see trajectories/cubics.py).
-    onwards = "velocity by its positions from here to the next row"
+    onwards = "greatest velocity of the cubic to the next row"
     yield limited("velocity", onwards, cubics.extremes.velocity, limits, share * limits + 1.5 * blur)
     yield limited("velocity", "velocity", v, limits, share * limits)
 
@@ -139,7 +139,13 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
     yield limited(
         "acceleration", "mean acceleration by its positions", second, limits, share * limits + unsure
     )
-    yield limited("acceleration", "acceleration by its positions", peaks, limits, share * limits + bent)
+    yield limited(
+        "acceleration",
+        "greatest acceleration of the cubic to the next row",
+        peaks,
+        limits,
+        share * limits + bent,
+    )
     yield limited("acceleration", "mean acceleration by its velocities", change, limits, share * limits)
     yield limited("acceleration", "acceleration", a, limits, share * limits)
 
@@ -147,7 +153,7 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
     measured = np.maximum(_peak(a, second, change), settings.rate_slack * robot.acceleration)
     strongest = np.where(limits > 0, np.minimum(share * limits, 2 * measured), 2 * measured)
     spent = np.divide(change**2, strongest, out=np.zeros_like(change), where=strongest > 0)
-    possible = np.maximum(strongest - spent, 0.0) * step / 4 + nothing
+    possible = np.maximum(strongest - spent, 0.0) * step / 4 + rest_tolerance
     """Allowed difference between mean velocities and the means of the rows' velocities."""
     off = np.abs(mean - (v[1:] + v[:-1]) / 2)
     allowed = possible + blur
@@ -206,7 +212,7 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
 
     limits = robot.acceleration
     for window in AVERAGING_WINDOWS:
-        second, unsure = _second_differences(trajectory, begins, window, resolution, nothing)
+        second, unsure = _second_differences(trajectory, begins, window, resolution, rest_tolerance)
         description = f"mean acceleration by its positions over {1e3 * window:g} ms and more"
         yield limited("acceleration", description, second, limits, share * limits + unsure)
 
@@ -249,7 +255,7 @@ def _second_differences(
     begins: JointValues,
     window: float,
     resolution: float,
-    nothing: JointValues,
+    rest_tolerance: JointValues,
 ) -> tuple[JointRows, JointRows]:
     """Mean accelerations about each row and their uncertainty, from the positions at the row and at the
     nearest rows at least `window` [s] before and after it. Before the motion, the arm moves with the velocity
@@ -264,7 +270,7 @@ def _second_differences(
     after = (clock[high] - times)[:, None]
     spacing = (before + after) / 2
     outside = (low == 0).astype(float) + (high == len(clock) - 1)
-    unsure = 2 * resolution * (1 / before + 1 / after) + outside[:, None] * nothing
+    unsure = 2 * resolution * (1 / before + 1 / after) + outside[:, None] * rest_tolerance
     return ((rows[high] - q) / after - (q - rows[low]) / before) / spacing, unsure / spacing
 
 

@@ -1,5 +1,5 @@
-"""Compiled exact Euclidean distance transform of a grid: finds the nearest voxel with points for every
-voxel."""
+"""Compiled exact Euclidean distance transform of a grid: finds, for each voxel, the nearest one that contains
+points."""
 
 import numpy as np
 
@@ -17,7 +17,8 @@ def nearest_voxels(run):
     """For each voxel the squared distance to the nearest voxel with points [voxels²], and the value of `run`
     at this nearest voxel.
 
-    run int32[nx, ny, nz] is -1 for voxels without points; at least one voxel has points. The transform goes
+    run int32[nx, ny, nz] is the number of the voxel's group of points, -1 without points; at least one voxel
+    has points. The transform goes
     axis by axis (A. Meijster, J. Roerdink, W. Hesselink, 2000).
     """
     nx, ny, nz = run.shape
