@@ -1,12 +1,12 @@
-"""Clearances and displacements over stretches of a motion, of which proofs consist.
+"""Bounds of clearances and displacements over stretches (intervals) of a motion, of which proofs consist.
 
-A stretch is free for a claim (a link against the scene, or two links) if the clearance in the middle of the
-stretch exceeds the largest displacement of any point of the link from there to anywhere on the stretch.
-Clearances are those of the robot's spheres, or of its convex meshes by planes that separate them from what is
-near. For two links, only joints that move one of them and not the other count: those after the last joint
-that both have in common.
+A claim is that a link is free of the scene or of another link. A stretch is free for a claim if the clearance
+of the link in the middle of the stretch exceeds its displacement: the largest distance of any point of the
+link, anywhere on the stretch, from its place in the middle. Clearances are those of the robot's covering
+spheres, or those of its convex meshes by separating planes. For two links, only joints that move exactly one
+of them count: those after the last joint that moves both.
 
-The geometry is the checker's own: distances of points to obstacles, and how far these reach in a direction.
+The geometry is the checker's own: distances of points to obstacles, and support functions of obstacles.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -28,27 +28,32 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated
 
 CLEARANCE_CAP = 1.0
-"""Larger clearances are reported as this [m]."""
+"""Larger clearances count as this [m]."""
 PLANE_RANGE = 0.2
-"""Elements of surfaces further from a part's ball than this are taken to be at this distance, without planes
-[m]."""
+"""Triangles and points further than this from the ball around a part count as this far away and need no
+planes [m]."""
 EXACT_TRIANGLE_RANGE = 4.0
-"""Triangles further away than this many times their size are replaced by balls around them."""
+"""A triangle is replaced by the ball around it at distances of more than this many radii of the ball."""
 MAX_ARRAY_SIZE = 1_000_000
-"""Numbers in a temporary array at most, about."""
+"""Approximate largest number of elements of a temporary array."""
 
 
 class Rounded(NamedTuple):
-    """The Minkowski sum of a box, a disc about its z axis and a ball: a sphere, box, cylinder or capsule."""
+    """The Minkowski sum of a box, a disc in the box's x-y plane and a ball. Each size may be 0, so this is a
+    sphere, box, cylinder or capsule."""
 
     center: Vector
     R: Rotation
+    """Rotation of the box in the base frame."""
     half: Vector
+    """Half edge lengths of the box [m]."""
     disc: float
+    """Radius of the disc [m]."""
     rounding: float
+    """Radius of the ball [m]."""
 
     def reach(self, n: Float[ndarray, "k 3"]) -> Values:
-        """The maximum of n · x over its points x, for unit vectors n (its support function)."""
+        """The support function: the maximum of n · x over the body's points x, for each unit vector n."""
         local = n @ self.R
         across = np.hypot(local[:, 0], local[:, 1])
         return n @ self.center + np.abs(local) @ self.half + self.disc * across + self.rounding
@@ -61,7 +66,8 @@ class Surface(NamedTuple):
     radius: float
 
     def reach(self, n: Float[ndarray, "k 3"]) -> Float[ndarray, "m k"]:
-        """The largest height of each element of the surface in each direction n."""
+        """The support function of each element: the maximum of n · x over its points x, for each unit vector
+        n."""
         return (self.corners @ n.T).max(axis=1) + self.radius
 
 
@@ -69,13 +75,13 @@ class Obstacles:
     """The obstacles of a scene."""
 
     def __init__(self, scene: Scene) -> None:
-        """Raises InputError for a shape that certificates do not support."""
+        """Raises InputError if the scene has a shape that certificates do not support."""
         shapes = [s for s in scene.shapes if not (isinstance(s, PointCloud) and len(s.points) == 0)]
         self.names = tuple(shape.name for shape in shapes)
         self.bodies: tuple[Rounded | Surface, ...] = tuple(map(_body, shapes))
         rounded = [(i, body) for i, body in enumerate(self.bodies) if isinstance(body, Rounded)]
         self._at = np.array([i for i, _ in rounded], int)
-        # to transform points into the frames of all bodies at once
+        # rotations and translations by which points are transformed to the frames of all bodies at once
         self._turns = np.concatenate([np.zeros((3, 0)), *(body.R for _, body in rounded)], axis=1)
         self._shifts = np.concatenate([np.zeros(0), *(body.center @ body.R for _, body in rounded)])
         self._half = np.array([body.half for _, body in rounded]).reshape(-1, 3)
@@ -95,7 +101,7 @@ class Obstacles:
         return distances_to_each
 
     def near(self, center: Vector, radius: float) -> tuple[Rounded | Surface, ...]:
-        """The bodies; a surface is reduced to elements near a ball, at least to those within PLANE_RANGE."""
+        """The bodies, with surfaces reduced to the elements that may be within PLANE_RANGE of a ball."""
         return tuple(
             self._indices[i].near(center, radius + PLANE_RANGE) if isinstance(body, Surface) else body
             for i, body in enumerate(self.bodies)
@@ -104,7 +110,8 @@ class Obstacles:
     def _to_rounded(self, points: ndarray) -> ndarray:
         local = (points @ self._turns - self._shifts).reshape(len(points), -1, 3)
         out = np.maximum(np.abs(local) - self._half, 0.0)
-        # the disc: the distance from the box across the axis, less its radius
+        # the disc is perpendicular to the z axis, so its radius is subtracted from the distance across the
+        # axis
         across = np.maximum(np.hypot(out[..., 0], out[..., 1]) - self._disc, 0.0)
         return np.hypot(across, out[..., 2]) - self._rounding
 
@@ -143,8 +150,8 @@ class _Index:
         self._classes = [(KDTree(middles), rows, size) for middles, rows, size in _by_size(surface.corners)]
 
     def distances(self, points: Points) -> Values:
-        """Distances to the nearest element [m], at most CLEARANCE_CAP: exact where it is near, else to a ball
-        around it."""
+        """Lower bounds of the distances of points to the surface [m], at most CLEARANCE_CAP: exact for near
+        elements; distances to balls around the elements for others."""
         nearest = np.full(len(points), CLEARANCE_CAP)
         for tree, rows, size in self._classes:
             to_middle = tree.query(points)[0]
@@ -163,7 +170,7 @@ class _Index:
         return np.minimum(nearest - self.surface.radius, CLEARANCE_CAP)
 
     def near(self, center: Vector, reach: float) -> Surface:
-        """The elements that come within a distance of a point, and possibly others."""
+        """The elements that come within `reach` [m] of a point, and possibly others."""
         reach += self.surface.radius
         element_rows = [
             rows[tree.query_ball_point(center, reach + size)] for tree, rows, size in self._classes
@@ -174,8 +181,8 @@ class _Index:
 
 
 def _by_size(corners: Float[ndarray, "m c 3"]) -> Iterator[tuple[ndarray, ndarray, float]]:
-    """Groups of elements of similar size: their middles, their rows, and the radius of balls about the
-    middles that contain them."""
+    """Groups of elements of similar size. For each group: middles of the elements, their rows, and the radius
+    of balls about the middles that contain them."""
     middles = corners.mean(axis=1)
     sizes = np.sqrt(((corners - middles[:, None]) ** 2).sum(axis=-1)).max(axis=1)
     octaves = np.ceil(np.log2(np.maximum(sizes, 1e-6))).astype(int)
@@ -185,7 +192,8 @@ def _by_size(corners: Float[ndarray, "m c 3"]) -> Iterator[tuple[ndarray, ndarra
 
 
 def _to_triangles(p: Points, triangles: Float[ndarray, "n 3 3"]) -> Values:
-    """Distances of points to one triangle each: to its plane if the foot point is inside, else to an edge."""
+    """Distance of each point to its triangle: to the triangle's plane if the foot point is inside, otherwise
+    to the nearest edge."""
     a, b, c = np.moveaxis(triangles, 1, 0)
     normal = np.cross(b - a, c - a)
     area = np.sqrt((normal**2).sum(axis=1))
@@ -203,65 +211,75 @@ def _to_triangles(p: Points, triangles: Float[ndarray, "n 3 3"]) -> Values:
 
 
 SCENE = "scene"
-"""Stands for the scene where a claim names the other link, so no link may have this name."""
+"""Name of the scene in `Claim.against`, so no link may have this name."""
 
 
 class Claim(NamedTuple):
-    """What has to be proved for the whole motion: that a link is free of the scene, or of another link."""
+    """What must be proved for the whole motion: that a link is free of the scene, of a moving obstacle or of
+    another link."""
 
     link: str
     against: str
-    """SCENE, the name of a moving obstacle, or the other link, which is nearer to the base."""
+    """SCENE, the name of a moving obstacle, or the name of the other link, which no more joints move."""
 
 
 class Stretches(NamedTuple):
-    """Stretches of a motion, each for one claim; a place is a row plus the share of the way to the next."""
+    """Stretches (intervals) of a motion, each for one claim. A place on the motion is the index of a row plus
+    the fraction of the way to the next row."""
 
     claim: Int[ndarray, "n"]
     """Index of the claim."""
     start: Values
+    """Place where the stretch begins."""
     stop: Values
+    """Place where the stretch ends."""
 
     def some(self, rows: ndarray) -> "Stretches":
-        """The stretches of these rows, given by indices or a mask."""
+        """A selection of the stretches, by indices or a mask."""
         return Stretches(self.claim[rows], self.start[rows], self.stop[rows])
 
 
 class Plane(NamedTuple):
-    """A plane that separates a part of a link from something else, in the middle of a stretch."""
+    """The normal of a plane that separates a part of a link from another body, in the middle of a stretch."""
 
     stretch: int
+    """Index of the stretch."""
     part: int
     """Index of the link's convex mesh, or of its sphere if it has no mesh."""
     other: int
     """Index of the scene's obstacle, or of the other link's part."""
     normal: tuple[float, float, float]
-    """Points towards the link, in the base frame."""
+    """Unit normal in the base frame, which points towards the link."""
 
 
 class Part(NamedTuple):
-    """A convex part of a link: the convex hull of vertices, inflated by a radius, and a ball around it."""
+    """A convex part of a link: the convex hull of vertices, inflated by a radius."""
 
     vertices: Points
     faces: Int[ndarray, "f 3"]
-    """Empty for a single vertex."""
+    """Faces of the hull; empty for a single vertex."""
     rounding: float
+    """Radius of the inflation [m]."""
     center: Vector
+    """Center of a ball that contains the part."""
     radius: float
+    """Radius of this ball [m]."""
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of stretches."""
+    """Bounds of clearance and displacement for each of several stretches; see the docstring of the module."""
 
     clearance: Values
-    """In the middles of the stretches [m], at most CLEARANCE_CAP."""
+    """Lower bound of the clearance in the middle of the stretch [m], at most CLEARANCE_CAP."""
     displacement: Values
-    """Displacement of any point of the link from the middle to anywhere on the stretch [m]."""
+    """Upper bound of the displacement of any point of the link from the middle to anywhere on the stretch
+    [m]."""
 
 
 class Prover:
-    """Computes bounds for a robot in a scene along straight lines through configurations, or near them."""
+    """Computes bounds for a robot in a scene, along straight lines through configurations or within a known
+    distance of the lines."""
 
     def __init__(
         self,
@@ -270,8 +288,9 @@ class Prover:
         q: Configurations,
         off: JointRows | None = None,
     ) -> None:
-        """`off`: how far the motion leaves the straight line from each configuration to the next; 0 if it is
-        None."""
+        """off: how far each joint may leave the straight line from each configuration to the next [rad] or
+        [m];
+        None: 0."""
         self.robot = robot
         self.q = q
         self.off = np.zeros_like(q[1:]) if off is None else off
@@ -287,7 +306,7 @@ class Prover:
             [[scene.may_touch(link, name) for name in self.obstacles.names] for link in self.linkage.links],
             bool,
         ).reshape(len(self.linkage.links), len(self.obstacles.names))
-        """[links, obstacles] whether contact is allowed; such pairs are not checked."""
+        """[links, obstacles]: whether contact is allowed; such pairs are not checked."""
         balls = [_balls(robot, link) for link in self.linkage.links]
         self._balls = np.concatenate([np.zeros((0, 4)), *balls])
         counts = [len(rows) for rows in balls]
@@ -296,8 +315,8 @@ class Prover:
 
     @cached_property
     def claims(self) -> tuple[Claim, ...]:
-        """Moving links against the scene, and pairs of links that move relative to each other and may not
-        touch."""
+        """All claims: each moving link against the scene, and each pair of links that move relative to each
+        other and may not touch."""
         moved = {link: self._moved[self._of[link]] for link in self.links}
         level = {link: int(joints.sum()) for link, joints in moved.items()}
         moving = [Claim(link, SCENE) for link in self.links if level[link] > 0]
@@ -317,7 +336,8 @@ class Prover:
         return (1 - share) * self.q[low] + share * self.q[high]
 
     def spans(self, start: ndarray, stop: ndarray, middle: ndarray) -> JointRows:
-        """Largest distance of each joint from the middle of a stretch to anywhere on it [rad] or [m]."""
+        """For each stretch and joint, the largest distance from its position in the middle to its position
+        anywhere on the stretch [rad] or [m]."""
         q = self.at(middle)
         spans = np.maximum(np.abs(self.at(start) - q), np.abs(self.at(stop) - q))
         first = np.floor(start).astype(int) + 1
@@ -333,7 +353,7 @@ class Prover:
         return spans + self.deviations(start, stop)
 
     def deviations(self, start: ndarray, stop: ndarray) -> JointRows:
-        """How far each joint leaves the straight lines along stretches [rad] or [m]."""
+        """For each stretch and joint, how far it may leave the straight lines [rad] or [m]."""
         if not len(self.off):
             return np.zeros((len(start), self.q.shape[1]))
         first = np.minimum(np.floor(start).astype(int), len(self.off) - 1)
@@ -341,7 +361,7 @@ class Prover:
         return np.maximum.reduceat(np.concatenate([self.off, 0 * self.off[:1]]), edges)[::2]
 
     def bounds(self, stretches: Stretches, by_planes: ndarray, planes: list[Plane]) -> Bounds:
-        """Bounds of stretches, by `planes` for those that `by_planes` marks, else by the spheres."""
+        """Bounds of stretches: by `planes` where `by_planes` is true, otherwise by the covering spheres."""
         ends, inverse_indices = np.unique(
             np.column_stack([stretches.start, stretches.stop]), axis=0, return_inverse=True
         )
@@ -370,8 +390,8 @@ class Prover:
         return Bounds(clearance, displacement)
 
     def _expand(self, links: ndarray) -> tuple[ndarray, ndarray, ndarray]:
-        """All balls of the given links: the row in `links` and index of each ball, and the first ball of each
-        row."""
+        """All balls of the given links. Returns for each ball its row in `links` and its index, and for each
+        row the position of its first ball in these arrays."""
         counts = self._first[links + 1] - self._first[links]
         begin = np.cumsum(counts) - counts
         row = np.repeat(np.arange(len(links)), counts)
@@ -387,9 +407,11 @@ class Prover:
         spans: ndarray,
         distances: Callable[[ndarray, ndarray, ndarray], ndarray] | None = None,
     ) -> tuple[ndarray, ndarray]:
-        """Clearances of the balls of links and upper bounds on their displacement by the joints `moved` [m].
+        """For each link, the clearance of its balls and an upper bound on their displacement [m].
 
-        distances: from each ball's row in `links`, its posture and its center; None: only displacement.
+        links: indices of links. moved: for each, the joints that count. posture: for each, the row in
+        `postures` and `spans`. distances: computes the distance of each ball's center to the other body, from
+        the ball's row in `links`, its posture and its center; None: clearances are not computed.
         """
         row, ball, begin = self._expand(links)
         at = posture[row]
@@ -436,7 +458,8 @@ class Prover:
         return clearance, went + near_displacement
 
     def _to_links(self, postures: Postures, at: ndarray, centers: ndarray, link: ndarray) -> ndarray:
-        """Distances of points to the spheres of one link each [m]."""
+        """The distance of each point to the spheres of its link [m]. at: the posture; link: the link's
+        index."""
         distances = np.empty(len(at))
         step = MAX_ARRAY_SIZE // 64
         for first in range(0, len(at), step):
@@ -459,9 +482,10 @@ class Prover:
     ) -> tuple[ndarray, ndarray]:
         """Clearance and displacement of the `marked` stretches by planes.
 
-        For each pair of a part and an obstacle (or a part of the other link), the clearance is the greater of
-        two: that of the balls around the parts, and the widest gap that a plane shows. What remains of it
-        along the stretch is bounded likewise. The results are the minima over the pairs.
+        Pairs of a part of the link and an obstacle (or a part of the other link) are bounded one by one. The
+        clearance of a pair is the greater of the gap between the balls around them and the widest gap that a
+        plane shows. The margin of a pair is a lower bound of its gap anywhere on the stretch, computed in the
+        same way. The results are the smallest clearance, and its difference from the smallest margin.
         """
         normals: dict[tuple[int, int, int], list[tuple[float, float, float]]] = {}
         for plane in planes:
@@ -474,6 +498,7 @@ class Prover:
         centers = [part.center for k in in_scene for part in standing[k]]
         to_scene = iter(self.obstacles.distances(np.array(centers).reshape(-1, 3)))
         for k, (claim, T) in enumerate(places):
+            # joints that move only the link, and joints that move only the other link
             mine = self._moved[self._of[claim.link]]
             theirs = np.zeros(len(self.linkage.slides), bool)
             if claim.against != SCENE:
@@ -515,15 +540,15 @@ class Prover:
         return clearance, clearance - margin
 
     def others(self, claim: Claim, T: ndarray, part: Part) -> Sequence[Rounded | Surface | Part]:
-        """The bodies that a part of a link is checked against; of a surface only the elements that are
-        near."""
+        """The bodies that a part of a link is checked against; surfaces are reduced to their near
+        elements."""
         if claim.against == SCENE:
             return self.obstacles.near(part.center, part.radius)
         return placed(self.parts[claim.against], T[self._of[claim.against]])
 
     def balls_apart(self, part: Part, bodies: Sequence[Rounded | Surface | Part]) -> Float[ndarray, "bodies"]:
-        """Distances of the ball around a part to the obstacles, or to the balls around parts of a link
-        [m]."""
+        """Distances of the ball around a part to each obstacle, or to the balls around the parts of another
+        link [m]."""
         parts_of_link = [body for body in bodies if isinstance(body, Part)]
         if not parts_of_link:
             return self.obstacles.distances(part.center[None])[0] - part.radius
@@ -533,7 +558,8 @@ class Prover:
 
 
 def _steps(prover: Prover, start: float, stop: float) -> JointRows:
-    """Differences from the middle of a stretch to its start, its stop and the waypoints between."""
+    """Differences of configurations from that in the middle of a stretch: of its start, its stop and the rows
+    between them."""
     waypoints_between = np.arange(int(np.floor(start)) + 1, int(np.ceil(stop)))
     ends = prover.at(np.array([start, (start + stop) / 2, stop]))
     return np.concatenate([ends[[0, 2]], prover.q[waypoints_between]]) - ends[1]
@@ -547,8 +573,8 @@ def gaps(
 ) -> Float[ndarray, "*elements k"]:
     """Widths of the gaps that planes with these unit normals show between a part and a body [m].
 
-    For a surface, one width per element. `nearer`: how far each vertex of the part has moved against the
-    normal.
+    For a surface, one width per element. nearer: how far each vertex of the part has moved against each
+    normal [m]; None: not at all.
     """
     heights = normals @ part.vertices.T
     nearest = (heights if nearer is None else heights - nearer).min(axis=1) - part.rounding
@@ -558,7 +584,7 @@ def gaps(
 
 
 def placed(parts: tuple[Part, ...], T: Pose) -> list[Part]:
-    """Parts in the base frame, T being the pose of their link."""
+    """Parts of a link in the base frame. T: T_base_link."""
     R = T[:3, :3]
     t = T[:3, 3]
     return [part._replace(vertices=part.vertices @ R.T + t, center=R @ part.center + t) for part in parts]
@@ -597,11 +623,11 @@ def _ball(vertices: ndarray) -> tuple[ndarray, float]:
 
 
 class MovingProver(Prover):
-    """Computes bounds for a robot among moving obstacles along straight lines through configurations at
-    times, or near them.
+    """Computes bounds for a robot among moving obstacles, along straight lines through configurations at
+    given times or within a known distance of the lines.
 
-    A stretch is free of an obstacle if the clearance of the link's spheres in its middle, in place and time,
-    exceeds the sum of the largest displacements of any point of the link and of the obstacle from there until
+    The clearance of a stretch is that of the link's spheres at its middle, with the obstacle where it is at
+    that time. The displacement is the sum of those of the link and of the obstacle, from the middle until
     either end.
     """
 

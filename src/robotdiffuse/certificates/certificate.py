@@ -28,7 +28,7 @@ STRETCH_FIELDS = ("start", "stop", "by_planes", "clearance", "displacement")
 
 @dataclass(frozen=True, eq=False)
 class Certificate(MotionProof):
-    """A motion, what was proved of it, and the proof, which can be checked and saved."""
+    """A motion and its proof, which can be checked and saved."""
 
     def __repr__(self) -> str:
         return one_line(self)
@@ -37,8 +37,8 @@ class Certificate(MotionProof):
         """Check the whole proof again.
 
         Args:
-            problem: The problem that the motion is to solve; None: the one in the certificate.
-            at_most: Largest tolerances that the proof may use; None: those of the validator.
+            problem: The problem that the motion is to solve; None: the problem in the certificate.
+            at_most: Largest tolerances that the proof may use; None: the validator's default tolerances.
 
         Returns:
             What was checked, and each requirement that is not proved.
@@ -68,7 +68,7 @@ def load_certificate(file: str | FilePath) -> Certificate:
         file: A file that `Certificate.save` or `robotdiffuse verify --certificate` wrote.
 
     Raises:
-        InputError: For a file that cannot be read or holds no certificate.
+        InputError: For a file that cannot be read, and for one that is not a valid certificate file.
     """
     record = read_json(file)
     if not is_certificate(record):
@@ -205,9 +205,11 @@ class Field(NamedTuple):
     """A field of a certificate file."""
 
     read: Callable[[str, Any], Any]
+    """Checks and converts a JSON value, given the field's name and the value."""
     write: Callable[[Any], Any] = lambda value: value
+    """Converts the attribute to a JSON value."""
     attribute: str = ""
-    """The attribute of `Certificate`, where it has another name."""
+    """Name of the attribute of `Certificate`; empty: the field's name."""
 
 
 NUMBERS = Field(_vector, lambda array: array.tolist())
@@ -230,5 +232,5 @@ FIELDS = {
     "torques": Field(_named_bounds),
     "jerks": Field(_named_bounds),
 }
-"""Fields of files, in their order, besides the mark and the version."""
+"""Fields of files after the mark and the version, in their order."""
 REQUIRED = {f.name for f in fields(MotionProof) if f.default is f.default_factory is MISSING}

@@ -1,8 +1,9 @@
 """The checker of proofs. It needs no search and shares no code with the validator.
 
-The proof must contain every claim that follows from the robot, and the stretches of each claim must cover the
-motion without a gap. The checker recomputes clearance and displacement of every stretch: they must agree with
-the proof, and the clearance must exceed the displacement. So a proof that passes is right, whoever wrote it.
+The proof must contain every claim that follows from the robot (see `bounds.py`), and the stretches of each
+claim must cover the motion without a gap. The checker recomputes the clearance and displacement of every
+stretch. They must agree with the proof, and the clearance must exceed the displacement. So a proof that
+passes is right, no matter how it was made.
 """
 
 from collections.abc import Iterator
@@ -37,17 +38,18 @@ from robotdiffuse.robots.robot import Robot
 
 VALIDATOR = Tolerances()
 NORMAL_TOLERANCE = 1e-9
-"""Normals of planes have length 1 within this."""
+"""Largest difference of the length of a plane's normal from 1."""
 COVER_TOLERANCE = 1e-6
-"""Corners of a link's meshes may stick out of its spheres by this [m]."""
+"""Largest distance of a corner of a link's meshes from the link's spheres [m]."""
 
 
 @dataclass(frozen=True)
 class Findings:
-    """What re-checking found."""
+    """The result of checking a proof."""
 
     differences: tuple[str, ...]
-    """One line for each difference from the proof; empty if the proof holds."""
+    """One line for each difference from the proof and each requirement that is not proved; empty if the proof
+    holds."""
 
     @property
     def valid(self) -> bool:
@@ -57,12 +59,13 @@ class Findings:
 def check(
     certificate: MotionProof, problem: Problem | None = None, at_most: Tolerances = VALIDATOR
 ) -> Findings:
-    """Re-check a proof for a problem, by default the one in its file, with tolerances of at most `at_most`.
+    """Check a proof for a problem; None: the problem in the certificate. Its tolerances must not exceed
+    `at_most`.
 
-    Robot, scene and motion must have the content that was certified. The motion must keep the limits all
-    along its cubics, begin at the start, stop at or pass the waypoints and end at the goal, and every stretch
-    must be proved free. `requirements.not_checked` says what is left to the validator. Raises InputError if
-    neither the file nor the caller gives a problem, and for shapes that certificates do not support.
+    Robot, scene and motion must have the content that was certified. The motion must keep the limits along
+    its cubics, begin at the start, stop at each waypoint or pass it within its blend, and end at the goal.
+    Every stretch must be proved free. `requirements.not_checked` lists what only the validator checks. Raises
+    InputError if there is no problem, and for shapes that certificates do not support.
     """
     if problem is None:
         if certificate.problem is None:
@@ -98,7 +101,8 @@ def check(
 
 
 def _cover_errors(robot: Robot) -> Iterator[str]:
-    """Links whose spheres, by which most stretches are proved, do not cover their meshes."""
+    """A message for each link with meshes that its spheres do not cover, since spheres prove most
+    stretches."""
     for link, meshes in robot.meshes.items():
         if link not in robot.spheres or not len(robot.spheres[link]) or not meshes:
             continue
@@ -111,7 +115,7 @@ def _cover_errors(robot: Robot) -> Iterator[str]:
 
 
 def _proof_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
-    """Differences in the proof in the scene and between links, and in that among moving obstacles."""
+    """Errors in the proof for the scene and between links, and in the proof for moving obstacles."""
     motion = certificate.motion
     places = motion, certificate.between
     along = configurations(*places), deviations(*places)
@@ -136,8 +140,8 @@ def _proof_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
 def _bound_errors(
     prover: Prover, proof: StretchProof, kinds: dict[str, ndarray], stated: dict[str, float]
 ) -> Iterator[str]:
-    """Differences in stretches and bounds. `kinds` marks the stretches of each kind of clearance; `stated`
-    holds the clearance that the proof states for each kind [m]."""
+    """Errors in the stretches and bounds of a proof. kinds: a mask of the stretches for each kind of
+    clearance ("scene", "self"). stated: the clearance that the proof states for each kind [m]."""
     stretches = proof.stretches
     claim_indices = {claim: k for k, claim in enumerate(prover.claims)}
     for claim in proof.claims:
@@ -195,14 +199,14 @@ def _bound_errors(
 
 
 def _gaps(proof: StretchProof, last: float) -> Iterator[str]:
-    """Gaps between the stretches of a claim, from the first row of the motion to the last."""
+    """A message for each claim with stretches that do not cover the motion from row 0 to row `last`."""
     stretches = proof.stretches
     for k, claim in enumerate(proof.claims):
         rows = np.flatnonzero(stretches.claim == k)
         start = stretches.start[rows]
         stop = stretches.stop[rows]
         edges = np.concatenate([[0.0], stop]), np.concatenate([start, [last]])
-        # A motion of one row has no gap even without stretches, but then its row is not proved.
+        # A motion of one row has no gap without stretches, but its row must be proved by one.
         empty = not len(rows)
         broken = np.flatnonzero((edges[0] != edges[1]) | np.append(stop < start, empty))
         if len(broken):
@@ -211,7 +215,7 @@ def _gaps(proof: StretchProof, last: float) -> Iterator[str]:
 
 
 def describe_claim(claim: Claim) -> str:
-    """A claim in words: 'panda_link5 against the scene'."""
+    """A claim in words, e.g. "panda_link5 against the scene"."""
     return f"{claim.link} against {'the scene' if claim.against == SCENE else claim.against}"
 
 

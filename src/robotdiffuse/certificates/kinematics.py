@@ -1,6 +1,6 @@
 """The checker's own kinematics in NumPy: poses of links, and bounds on their displacement.
 
-It uses only a robot's joints, and nothing that planners or the validator derive from them.
+It uses only a robot's joints, and no arrays that planners or the validator compute from the joints.
 """
 
 from functools import cached_property
@@ -56,8 +56,8 @@ class Linkage:
         return np.stack([moved[link] for link in self.links])
 
     def place(self, q: Configurations, link: str | None = None) -> Postures:
-        """Poses at configurations. With `link`, only the links between the base and that link; the rest is
-        0."""
+        """Poses at configurations. If `link` is given, only links from the base to it are placed; rotations
+        and positions of other links are 0."""
         n, dof = q.shape
         T = np.zeros((n, len(self.links), 4, 4))
         T[:, :, 3, 3] = 1.0
@@ -101,8 +101,8 @@ class Linkage:
         return chain[::-1]
 
     def levers(self, link: str, q: Configurations) -> Float[ndarray, "joints"]:
-        """Upper bounds on the distance of a link's origin from the axes of the planned joints that move it,
-        in order [m]; 1 for a joint that slides. `q` holds the extreme positions of a motion."""
+        """Upper bounds on the distance of a link's origin from the axis of each planned joint that moves it,
+        base first [m]; 1 for a prismatic joint. q: the extreme positions of a motion, in rows."""
         bounds = list[float]()
         length = 0.0
         for joint in reversed(self._up_to(link)):
@@ -118,7 +118,8 @@ class Linkage:
     def rates(
         self, postures: Postures, link: str
     ) -> tuple[Int[ndarray, "joints"], Float[ndarray, "n joints 3"]]:
-        """The planned joints that move a link, and the derivatives of its origin by each of them [m]."""
+        """The planned joints that move a link, and the derivatives of its origin's position by each joint
+        [m/rad] or [m/m]."""
         k = self.links.index(link)
         joints = np.flatnonzero(self.moved[k])
         arms = postures.T[:, k, None, :3, 3] - postures.origins[:, joints]
@@ -134,12 +135,15 @@ class Linkage:
         moved: Bool[ndarray, "m dof"],
         spans: JointRows,
     ) -> Values:
-        """Upper bound on the displacement of any point of balls [m] when joints move by up to `spans`.
+        """Upper bound on the displacement of any point of balls [m] if joints move by up to `spans`.
 
-        Balls are given at their places in the postures of `rows`; `moved` marks the joints that move them,
-        seen from a body before these joints. Turning the last joint first, joint j moves a ball that later
-        joints have displaced by d on a circle of radius at most its distance from the axis plus d, so by at
-        most spans_j times that. Axes of earlier joints are still where they are in the posture.
+        rows: the posture of each ball, and its row in `spans`. centers, radii: each ball at its place in this
+        posture. moved: the joints that count for each ball.
+
+        Joints are moved one after the other, the last joint first, so the axes of earlier joints are still at
+        their places in the posture. When joint j moves, later joints have displaced a point by at most d. So
+        the point moves on a circle with a radius of at most its distance from the axis in the posture plus d,
+        by at most spans_j times this radius.
         """
         went = np.zeros(len(rows))
         for j in reversed(range(len(self.slides))):
@@ -160,15 +164,16 @@ class Linkage:
         normals: Float[ndarray, "k 3"],
         off: JointValues | float = 0.0,
     ) -> Float[ndarray, "k v"]:
-        """Upper bound on the movement of points against unit vectors [m].
+        """Upper bound on the movement of each point against each unit normal [m].
 
-        Joints move from their posture to anywhere within `off` of the straight lines through `steps`, which
-        are differences from it. Only the joints `moved_by` count, each behind the one before.
+        origins, axes: of the joints in a posture. moved_by: the joints that move the points, base first.
+        steps: differences from the posture; the joints move anywhere on the straight lines between these, or
+        within `off` of the lines.
 
-        To first order a point's movement along the normal is a linear function of the joints, with its
-        minimum at one of the steps, less what `off` adds. The remainder is at most
-        sum_k L_k D_k (D_k / 2 + sum_{j<k} D_j), because the second derivative of the point by joints j <= k
-        is at most its greatest distance L_k from axis k.
+        To first order, a point's movement along a normal is linear in the joints, so its minimum is at one of
+        the steps, less what `off` adds. With spans D and the greatest distance L_k of the point from axis k,
+        the remainder is at most sum_k L_k D_k (D_k / 2 + sum_{j<k} D_j), because the second derivative of the
+        point by joints j <= k is at most L_k.
         """
         moving_joints = moved_by.tolist()
         off = np.broadcast_to(off, steps.shape[1])
@@ -180,13 +185,13 @@ class Linkage:
         towards = off[moving_joints] @ np.abs(along) - (steps[:, moving_joints] @ along).min(axis=0)
         towards = towards.reshape(len(normals), len(points))
         went = np.zeros(len(points))
-        rest = np.zeros(len(points))
+        remainder = np.zeros(len(points))
         for i in reversed(range(len(moving_joints))):
             j = moving_joints[i]
             arm = lengths[i] if self.slides[j] else lengths[i] + went
             went = went + spans[j] * arm
-            rest += spans[j] * arm * (spans[j] / 2 + spans[moving_joints[:i]].sum())
-        return np.minimum(np.maximum(towards, 0.0) + rest, went)
+            remainder += spans[j] * arm * (spans[j] / 2 + spans[moving_joints[:i]].sum())
+        return np.minimum(np.maximum(towards, 0.0) + remainder, went)
 
 
 def _times(R: Float[ndarray, "n 3 3"], right: Float[ndarray, "3 m"]) -> Float[ndarray, "n 3 m"]:
@@ -200,21 +205,25 @@ def cross_matrix(axis: Vector) -> Rotation:
 
 
 class Cubics(NamedTuple):
-    """The cubics from each row to the next; their accelerations are linear in time, and 0 for a path."""
+    """The cubics from each row of a motion to the next. Their accelerations are linear in time, and 0 for a
+    path."""
 
     times: Values
-    """When each cubic begins [s]."""
+    """Time at which each cubic begins [s]."""
     steps: Float[ndarray, "m 1"]
-    """Durations of the steps [s]."""
+    """Duration of each cubic [s]."""
     positions: Configurations
-    """At the start of each cubic."""
+    """Positions at the start of each cubic."""
     velocities: JointRows
+    """Velocities at the start of each cubic."""
     start: JointRows
-    """Acceleration at the start of each."""
+    """Accelerations at the start of each cubic."""
     end: JointRows
+    """Accelerations at the end of each cubic."""
 
     def at(self, row: Int[ndarray, "n"], time: Values) -> tuple[Configurations, JointRows, JointRows]:
-        """Positions, velocities and accelerations of cubics `time` seconds after they begin."""
+        """Positions, velocities and accelerations on the cubics with the indices `row`, `time` [s] after each
+        begins."""
         t = time[:, None]
         a = self.start[row]
         jerk = (self.end[row] - a) / self.steps[row]
@@ -227,22 +236,23 @@ class Cubics(NamedTuple):
         )
 
     def rows(self, times: Values) -> Int[ndarray, "n"]:
-        """The cubic at each time; at a row, the one that begins there."""
+        """Index of the cubic at each time; at a row's time, the cubic that begins there."""
         return np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 1)
 
     @property
     def pulls(self) -> JointRows:
-        """The greatest absolute acceleration of each."""
+        """The greatest absolute acceleration of each cubic and joint."""
         return np.maximum(np.abs(self.start), np.abs(self.end))
 
     @property
     def jerks(self) -> JointRows:
-        """The absolute jerk of each."""
+        """The absolute jerk of each cubic and joint."""
         return np.abs(self.end - self.start) / self.steps
 
     @property
     def speeds(self) -> JointRows:
-        """The greatest absolute velocity of each, which is at an end or where the acceleration is 0."""
+        """The greatest absolute velocity of each cubic and joint, which is at an end or where the
+        acceleration is 0."""
         curve = self.end - self.start
         share = np.clip(np.divide(-self.start, curve, out=np.zeros_like(curve), where=curve != 0), 0.0, 1.0)
         extremal = self.velocities + self.steps * share * (self.start + share * curve / 2)
@@ -251,7 +261,8 @@ class Cubics(NamedTuple):
 
     @property
     def turns(self) -> Configurations:
-        """Positions of each joint where a cubic has its extremes, or elsewhere on it if it has none."""
+        """Positions that include the extremes of each joint inside each cubic: two rows per cubic, at the
+        roots of the velocity, or at an end of the cubic where there is no root inside."""
         v = self.velocities / self.steps
         curve = self.end - self.start
         root = np.sqrt(np.maximum(self.start**2 - 2 * curve * v, 0.0))
@@ -268,8 +279,8 @@ class Cubics(NamedTuple):
 
     def deviations(self, times: Values) -> JointRows:
         """Upper bounds on how far each joint leaves the straight lines between its positions at these times,
-        among which are those of all rows: an eighth of its greatest acceleration times the square of the
-        time."""
+        which include the times of all rows: an eighth of its greatest acceleration between two times,
+        multiplied by the square of the time between them."""
         row = self.rows(times[:-1])
         max_acceleration = 0.0
         for end in (times[:-1], times[1:]):
@@ -277,23 +288,23 @@ class Cubics(NamedTuple):
         return max_acceleration * np.diff(times)[:, None] ** 2 / 8
 
     def jumps(self) -> JointRows:
-        """By how much the acceleration jumps at each row; before and after the motion it is 0."""
+        """The jump of the acceleration at each row, with zero acceleration before and after the motion."""
         none = np.zeros_like(self.start[:1])
         return np.abs(np.concatenate([self.start, none]) - np.concatenate([none, self.end]))
 
 
 def clock(motion: Path | Trajectory) -> Values:
-    """The times of a motion's rows; of a path, their numbers."""
+    """The times of a trajectory's rows; for a path, the indices of its rows."""
     return motion.times if isinstance(motion, Trajectory) else np.arange(len(motion.positions), dtype=float)
 
 
 def places_of(motion: Path | Trajectory, between: Values) -> Values:
-    """The `clock` of the rows, and of places between them, in order."""
+    """The `clock` of the rows and the places `between` them, in order."""
     return np.sort(np.concatenate([clock(motion), between]), kind="stable")
 
 
 def cubics_of(motion: Path | Trajectory) -> Cubics:
-    """The cubics of a trajectory whose times increase; the straight lines of a path, whose `clock` counts."""
+    """The cubics of a trajectory with increasing times; for a path, its straight lines, by its `clock`."""
     times = clock(motion)
     steps = np.diff(times)[:, None]
     q = motion.positions

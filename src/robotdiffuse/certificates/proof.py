@@ -1,5 +1,5 @@
-"""Data classes for the proof of a motion: what was proved, and the bounds that prove it. Also hashes of the
-parts of robots, scenes and motions, by which the checker can name the part that differs."""
+"""Data classes for the proof of a motion: what was proved, and the bounds that prove it. Also content hashes
+of the parts of robots, scenes and motions, by which the checker names the parts that differ."""
 
 import hashlib
 import json
@@ -20,7 +20,7 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud, Shape, Triangulated
 
 BOUND_TOLERANCE = 1e-6
-"""A recomputed bound may differ from the written one by this [m] or [rad], because files round."""
+"""A recomputed bound may differ from the bound in the proof by this [m] or [rad], because files round."""
 DECIMALS = 7
 """Number of decimals of bounds [m] in files."""
 
@@ -46,23 +46,23 @@ class Tolerances:
     rate_slack: float = 0.01
     """Fraction of the robot's limits."""
     chord: float = 1e-3
-    """How far the cubics through the rows may leave the straight lines that were certified [rad] or [m]."""
+    """How far a joint may leave the certified straight lines on the cubics between rows [rad] or [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class StretchProof:
-    """For each claim (a link against the scene, or two links against each other), stretches of the motion and
-    the bounds that show each stretch to be free."""
+    """Stretches (intervals) of the motion for each claim, with the bounds that prove each stretch free. A
+    claim is that a link is free of the scene or of another link."""
 
     claims: tuple[Claim, ...]
     stretches: Stretches
     by_planes: Bool[ndarray, "n"]
-    """Whether planes between convex meshes prove the stretch; else the covering spheres do."""
+    """Whether planes between convex meshes prove the stretch; otherwise the covering spheres do."""
     clearance: Values
-    """Clearance in the middle of each stretch [m], rounded down."""
+    """Clearance of the link in the middle of each stretch [m], rounded down."""
     displacement: Values
-    """Upper bound on how far any point of the link moves from its place in the middle of the stretch [m],
-    rounded up."""
+    """Upper bound on the distance of any point of the link, anywhere on the stretch, from its place in the
+    middle of the stretch [m], rounded up."""
     planes: tuple[Plane, ...]
 
 
@@ -80,12 +80,12 @@ class MotionProof:
     tolerances: Tolerances
     motion: Path | Trajectory
     between: Values
-    """Further certified configurations between the rows: times on the cubics through the rows [s]; for a
-    path, row plus share of the way to the next."""
+    """Places between the rows at which the proof has further configurations: times on the cubics between rows
+    [s]; for a path, the index of a row plus the fraction of the way to the next row."""
     scene_clearance: float
-    """Lower bound on the distance of all moving links to all obstacles, all along the motion [m]."""
+    """Lower bound on the distance of all moving links to all obstacles along the whole motion [m]."""
     self_clearance: float
-    """Lower bound on the distance between links that are checked against each other, all along the motion
+    """Lower bound on the distance between links that are checked against each other, along the whole motion
     [m]."""
     proof: StretchProof
     problem: dict[str, Any] | None = None
@@ -95,15 +95,16 @@ class MotionProof:
     moving: StretchProof | None = None
     """Proof among moving obstacles; None without such obstacles."""
     constraints: tuple[tuple[str, float], ...] = ()
-    """For each quantity of a path constraint its name and an upper bound all along the motion [m] or
+    """Name of each quantity that a path constraint limits, and its upper bound along the whole motion [m] or
     [rad]."""
     torque_samples: Values = field(default_factory=lambda: np.zeros(0))
-    """Further places at which torques are computed, besides the rows; in the same form as `between`."""
+    """Places between the rows at which torques are computed too; in the form of `between`."""
     torques: tuple[tuple[str, float], ...] = ()
-    """For each joint its name and an upper bound of its torque with the payload all along [N m] or [N]."""
+    """Name of each joint, and an upper bound of its torque with the payload along the whole motion [N m] or
+    [N]."""
     jerks: tuple[tuple[str, float], ...] = ()
-    """For each joint its name and its largest jerk [rad/s³] or [m/s³], if accelerations are linear between
-    the rows; empty for a path, and if accelerations jump at the ends of the motion."""
+    """Name of each joint and its largest jerk along the cubics [rad/s³] or [m/s³]. Empty for a path, and for
+    a trajectory with accelerations that jump or are not those of its cubics."""
 
 
 HASH_LENGTH = 16
@@ -131,7 +132,7 @@ def robot_parts(robot: Robot) -> dict[str, str]:
 
 
 def scene_parts(scene: Scene) -> dict[str, str]:
-    """Hashes of the obstacles, by name, and of the contacts that are allowed."""
+    """Hashes of the obstacles, by name, and of the allowed contacts."""
     parts = {shape.name: _hash(shape.kind, *_numbers(shape)) for shape in scene.shapes}
     for name, links in scene.allowed_contacts:
         parts[f"links that may touch {name}"] = _hash(links if isinstance(links, str) else sorted(links))
@@ -139,8 +140,8 @@ def scene_parts(scene: Scene) -> dict[str, str]:
 
 
 def request_parts(problem: Problem) -> dict[str, str]:
-    """Hashes of moving obstacles with their motions, of path constraints, and of the payload with all that
-    torques depend on: inertias, effort limits and the base's pose."""
+    """Hashes of moving obstacles with their motions, of path constraints, and of the payload. The payload's
+    hash includes everything that torques depend on: inertias, effort limits and the base's pose."""
     parts = {}
     if problem.payload is not None:
         robot = problem.robot
@@ -165,7 +166,7 @@ def request_parts(problem: Problem) -> dict[str, str]:
 
 
 def hash_of(motion: Path | Trajectory) -> str:
-    """Hash of a motion, without any rounding."""
+    """Hash of a motion's exact numbers and joint names."""
     rates = (motion.times, motion.velocities, motion.accelerations) if isinstance(motion, Trajectory) else ()
     digest = hashlib.sha256(json.dumps(list(motion.joint_names)).encode())
     for array in (motion.positions, *rates):

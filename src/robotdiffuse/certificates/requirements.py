@@ -1,19 +1,20 @@
 """The checker's own tests of every requirement except freedom from collision: limits, start, goal, rates,
 path constraints and torques.
 
-Path constraints: between two configurations, the joints move by dq at constant rates. The origin p of a frame
-then deviates from its chord by at most an eighth of its second derivative. That derivative is at most
-sum_jk |dq_j dq_k| L_max(j,k), where L_k is an upper bound on the distance of p from joint axis k during the
-motion. The distance to a convex body is a convex function: along the chord it is at most the larger of its
-values at the two ends, and the deviation is added. An axis of the frame deviates from its chord by at most
-(sum_j |dq_j|)² / 8. The angle between two rotating frames changes no faster than the sum of their speeds of
-rotation.
+Path constraints: from one configuration to the next, each joint j moves by dq_j at a constant rate. The
+origin p of a frame then deviates from the chord (the straight line between its two positions) by at most an
+eighth of its second derivative. This derivative is at most sum_jk |dq_j dq_k| L_max(j,k), where L_k is an
+upper bound on the distance of p from the axis of joint k during the motion. The distance of a point to a
+convex body is a convex function. So along the chord, it is at most the larger of its values at the two ends;
+the deviation is added. An axis of the frame deviates from its own chord by at most (sum_j |dq_j|)² / 8. The
+angle between two rotating frames changes at most at the sum of their speeds of rotation.
 
-Torques are sampled at the rows of the motion and at points between them. Between two samples, positions
-follow a cubic or a straight line, and velocities and accelerations are its derivatives; accelerations may
-jump at rows. A torque deviates from linear interpolation by at most an eighth of its largest second
-derivative times the square of the interval. Torques are sums and products of vectors that rotate with the
-links, so the product rule bounds that derivative in terms of bounds on the motion of links and joints.
+Torques are computed at samples: the rows of the motion and places between them. Between two samples,
+positions follow a cubic or a straight line, and velocities and accelerations are its derivatives.
+Accelerations may jump at rows. A torque deviates from linear interpolation by at most an eighth of its
+largest second derivative times the square of the interval. Torques are sums and products of vectors that
+rotate with the links. So the product rule bounds the second derivative by bounds on the motion of links and
+joints.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -54,13 +55,15 @@ from robotdiffuse.robots.bodies import Inertia
 from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.robots.robot import Robot
 
-# Maximum number of times that a step is halved, and of intervals at a time, to prove a frame's speed limit.
+# To prove a frame's speed limit, intervals are halved at most MAX_HALVINGS times; at most MAX_OPEN are halved
+# at once.
 MAX_HALVINGS = 24
 MAX_OPEN = 100_000
 MIN_LINE_LENGTH = 1e-3
-"""Along a shorter Cartesian line the frame is taken to rotate in place [m]."""
+"""On a Cartesian line shorter than this, the frame counts as rotating in place [m]."""
 SAME_POSE = 1e-3
-"""Largest difference, in [m] and in entries of R, of goal poses that count as one end of a Cartesian line."""
+"""Goal poses with differences up to this, in position [m] and entries of the rotation matrix, are the same
+end of a Cartesian line."""
 
 
 class ConstraintBound(NamedTuple):
@@ -68,31 +71,33 @@ class ConstraintBound(NamedTuple):
 
     name: str
     limit: float
-    """[m] or [rad]"""
+    """Largest allowed value of the quantity [m] or [rad]."""
     bounds: Values
-    """From each configuration to the next."""
+    """Upper bound of the quantity from each configuration to the next."""
 
 
 class _FrameMotion(NamedTuple):
     """Motion of a frame from each of n + 1 configurations to the next."""
 
     p: Points
+    """Position of its origin at each configuration [m]."""
     R: ndarray
+    """Its rotation at each configuration."""
     turn: Values
-    """Upper bound of its rotation [rad]."""
+    """Upper bound of the angle by which the frame rotates, for each of the n steps [rad]."""
     travel: Values
-    """Upper bound of the path length of its origin [m]."""
+    """Upper bound of the path length of its origin in each step [m]."""
     deviation: Values
-    """Upper bound of the origin's distance from the chord [m]."""
+    """Upper bound of the origin's distance from the chord in each step [m]."""
     sensitivity: Values
-    """Upper bound of the origin's displacement if every joint is off by 1 rad or 1 m [m]."""
+    """Upper bound of the origin's displacement if every joint is displaced by 1 rad or 1 m [m]."""
     joints: int
     """Number of joints that move the frame."""
 
 
 def constraint_bounds(problem: Problem, q: Configurations, chord: float) -> list[ConstraintBound]:
-    """Bounds for the straight lines through the configurations, and for every motion whose joints stay within
-    `chord` [rad] or [m] of these lines.
+    """Bounds of the quantities that path constraints limit, from each configuration to the next. They hold
+    for every motion that stays within `chord` [rad] or [m] of the straight lines in each joint.
 
     Raises InputError for a Cartesian line if the goal is not a single pose.
     """
@@ -127,12 +132,12 @@ def constraint_bounds(problem: Problem, q: Configurations, chord: float) -> list
 
 
 def frame_speed_errors(problem: Problem, motion: Trajectory, slack: float) -> list[str]:
-    """A message for each frame that is not proved to stay below its constraint's speed limit, raised by the
-    fraction `slack`, along the cubics of the motion.
+    """A message for each frame that is not proved to keep its constraint's speed limit along the cubics. The
+    limit may be exceeded by the fraction `slack`.
 
     A velocity deviates from linear interpolation by at most an eighth of its second derivative times the
-    square of the interval. A derivative of a position by several joints is at most the lever arm of the last
-    of these joints.
+    square of the interval. The derivative of a position by several joints is at most the lever arm of the
+    last of these joints.
     """
     linkage = Linkage(problem.robot)
     lines = []
@@ -199,7 +204,7 @@ def _frame_motion(linkage: Linkage, postures: Postures, q: ndarray, frame: str) 
 
 def _allowed_box(constraint: Constraint, *ends: Pose) -> tuple[Vector, Rotation, Vector]:
     """The box in which a constraint keeps a frame's origin: center, rotation and half sizes, which may be 0
-    or infinite. `ends` are those of a Cartesian line."""
+    or infinite. ends: start and goal pose of a Cartesian line."""
     if isinstance(constraint, PositionBox):
         T = constraint.T_base_box
         assert T is not None  # ensured by the constructor
@@ -224,7 +229,8 @@ def _distances(points: Points, center: Vector, R: Rotation, half: Vector) -> Val
 
 
 def _line_poses(problem: Problem, linkage: Linkage, line: CartesianLine) -> tuple[Pose, Pose]:
-    """T_base_frame at start and goal."""
+    """T_base_frame at the start and at the goal of a Cartesian line. Raises InputError if the goal does not
+    determine one pose."""
     k = linkage.links.index(line.frame)
     start = linkage.place(problem.start[None]).T[0]
     goal = problem.goal
@@ -241,8 +247,8 @@ def _line_poses(problem: Problem, linkage: Linkage, line: CartesianLine) -> tupl
 
 
 def _angle_bounds(along: _FrameMotion, chord: float, *ends: Pose) -> Values:
-    """Upper bounds on the angle between the frame's orientation and the one interpolated for its position on
-    the line."""
+    """Upper bounds, for each step, on the angle between the frame's orientation and the orientation that is
+    interpolated for its position on the line."""
     T_start, T_goal = ends
     displacement = T_goal[:3, 3] - T_start[:3, 3]
     length = float(np.linalg.norm(displacement))
@@ -268,14 +274,14 @@ def _angle_bounds(along: _FrameMotion, chord: float, *ends: Pose) -> Values:
 
 
 def _angles(first: ndarray, second: ndarray) -> Values:
-    """Angles between rotations, from the norm of their difference, which is accurate near 0 too."""
+    """Angles between rotations [rad], from the norm of their difference, which is accurate near 0 as well."""
     return 2 * np.arcsin(np.clip(np.linalg.norm(first - second, axis=(1, 2)) / np.sqrt(8), 0.0, 1.0))
 
 
 GRAVITY = 9.81
 """Gravitational acceleration along -z of the world [m/s²]."""
 MIN_MASS = 1e-9
-"""Smaller masses are ignored [kg]."""
+"""A payload with a smaller mass is ignored [kg]."""
 
 
 Bound = Float[ndarray, "3 m"]
@@ -291,10 +297,10 @@ def _product(factor: ndarray, other: ndarray) -> ndarray:
 
 
 def torque_bounds(problem: Problem, motion: Path | Trajectory, samples: Values) -> JointRows:
-    """Upper bounds of each joint's torque from each sample to the next [N m] or [N].
+    """Upper bounds of each joint's absolute torque from each sample to the next [N m] or [N].
 
-    Torques are sampled at the rows and at `samples` between them: times, or for a path the row numbers plus
-    the fraction of the way to the next row.
+    Torques are computed at the rows and at `samples` between them: times, or for a path the index of a row
+    plus the fraction of the way to the next row.
     """
     ends, durations, bounds = _intervals(motion, samples)
     torques = np.abs([inverse_dynamics(problem, *end) for end in ends]).max(axis=0)
@@ -361,7 +367,7 @@ def _newton_euler(
 
     at_base: the motion of the base: its rotation as `of_joint` and `of_body` need it, its angular velocity,
         which is 0, its angular acceleration, and the acceleration of its origin, opposite to gravity.
-    of_joint: takes a joint, its number (None if it is not planned) and the rotation of the parent link.
+    of_joint: takes a joint, its index (None if it is not planned) and the rotation of the parent link.
         Returns the arm from the parent's origin to the child's; the axis, and the joint's velocity and
         acceleration along it, None for a joint that is not planned; and the rotation of the child link.
     of_body: takes a body, its link and the link's rotation. Returns the arm to the center of mass, and a
@@ -405,8 +411,9 @@ def _newton_euler(
 
 
 def _second_derivative_bounds(problem: Problem, bounds: ndarray) -> JointRows:
-    """Upper bounds on the second derivatives of torques from each sample to the next: the Newton-Euler
-    equations with a `Bound` in place of each vector. The rotation of a link is the `Bound` of its rate."""
+    """Upper bounds on the second derivatives of torques from each sample to the next, by the Newton-Euler
+    equations with a `Bound` in place of each vector. In place of a link's rotation is the `Bound` of its
+    angular velocity."""
     robot = problem.robot
     still = np.zeros((3, bounds.shape[2]))
     slides = Linkage(robot).slides
@@ -437,7 +444,8 @@ def _second_derivative_bounds(problem: Problem, bounds: ndarray) -> JointRows:
 
 
 def _rotating(length: float, rotation: Bound) -> Bound:
-    """The `Bound` of a vector that is fixed to a link, from its length and the `Bound` of the link's rate."""
+    """The `Bound` of a vector that is fixed to a link, from its length and the `Bound` of the link's angular
+    velocity."""
     return length * np.stack([1 + 0 * rotation[0], rotation[0], rotation[1] + rotation[0] ** 2])
 
 
@@ -453,30 +461,31 @@ def _link_inertias(problem: Problem) -> dict[str, list[Inertia]]:
 
 
 AVERAGING_WINDOWS = (1e-3, 4e-3, 16e-3)
-"""Windows over which mean accelerations are tested [s]. The longer ones are used where rows are closer than
-the first: there, the tolerance of positions would hide any acceleration between consecutive rows."""
+"""Windows over which mean accelerations are tested [s]. If any rows are closer than the first window, the
+longer windows are used as well, because the tolerance of positions hides accelerations between such rows."""
 AGREEMENT = 0.5
-"""Largest difference between the accelerations of the rows and those of the cubics next to them, as a
+"""Largest difference between the acceleration of a row and those of the cubics before and after it, as a
 fraction of the joint's largest acceleration."""
 REST_SHARE = 0.01
-"""For AGREEMENT, the largest acceleration counts as at least this fraction of the joint's limit."""
+"""Smallest value of this largest acceleration, as a fraction of the joint's limit."""
 JUMP = 1e-6
-"""Largest jump of an acceleration in a motion with stated jerks, as a fraction of the joint's limit."""
+"""Largest jump of an acceleration in a motion for which jerks are stated, as a fraction of the joint's
+limit."""
 MIN_JERK = 1e-6
 """Jerks below this are rounding errors [rad/s³] or [m/s³]."""
-# Samples that show whether a motion passes within a blend: largest spacing, as a fraction of the blend, and
-# largest number per step.
+# Samples at which a motion is tested for passing within a blend: largest distance between them, as a fraction
+# of the blend, and largest number from one row to the next.
 BLEND_SHARE = 0.25
 MAX_BLEND_SAMPLES = 10_000
 MIN_TIME = 1e-12
-"""Shorter intervals count as this long [s], so that mean rates over them are finite."""
+"""Smallest time by which a displacement is divided [s], so that mean rates are finite."""
 
 
 def configurations(motion: Path | Trajectory, between: Values) -> Configurations:
     """The rows of a motion and further configurations between them, in order.
 
-    `between`: times [s] on the cubics through the rows' positions and velocities; for a path, the row numbers
-    plus the fraction of the way to the next row, on the straight line between them.
+    between: times on the cubics between rows [s]; for a path, the index of a row plus the fraction of the way
+    to the next row, on the straight line between them.
     """
     cubics = cubics_of(motion)
     rows = cubics.rows(between)
@@ -485,17 +494,18 @@ def configurations(motion: Path | Trajectory, between: Values) -> Configurations
 
 
 def deviations(motion: Path | Trajectory, between: Values) -> JointRows:
-    """Upper bounds on how far each joint deviates from the straight lines between the `configurations`."""
+    """Upper bounds on how far each joint leaves the straight line from each of the `configurations` to the
+    next [rad] or [m]."""
     return cubics_of(motion).deviations(places_of(motion, between))
 
 
 def not_covered(problem: Problem, motion: Path | Trajectory) -> str:
-    """The requirement of the problem that no certificate of such a motion can prove; "" if there is none."""
+    """The requirement of the problem that a certificate of this motion cannot prove; "" if there is none."""
     return "moving, without times" if problem.moving and isinstance(motion, Path) else ""
 
 
 def not_checked(problem: Problem, motion: Path | Trajectory) -> list[str]:
-    """Descriptions of what the checker does not check and leaves to the validator."""
+    """Descriptions of what the checker does not check; only the validator does."""
     path = isinstance(motion, Path)
     parts = {
         "sharp reversals": True,
@@ -535,8 +545,8 @@ def requirement_errors(problem: Problem, certificate: MotionProof) -> Iterator[s
 
 
 def place_errors(problem: Problem, certificate: MotionProof) -> list[str]:
-    """Errors that would make the other tests meaningless: joints of another robot, times that do not begin at
-    0 or do not increase, and samples of the proof that are not between the rows of the motion."""
+    """Errors that would make all other tests meaningless: joints of another robot, times that do not begin at
+    0 or do not increase, and places in the proof that are not between the rows of the motion."""
     motion = certificate.motion
     robot = problem.robot
     if tuple(motion.joint_names) != robot.joint_names:
@@ -569,7 +579,7 @@ def cubic_jerks(robot: Robot, motion: Path | Trajectory) -> JointValues | None:
 
 
 def _jerk_errors(robot: Robot, motion: Trajectory, certificate: MotionProof) -> Iterator[str]:
-    """Jerks that are larger than those that the proof states, if it states any."""
+    """A message for each joint with a larger jerk than the proof states, if it states jerks."""
     stated = dict(certificate.jerks)
     if not stated:
         return
@@ -614,8 +624,8 @@ def _waypoint_errors(problem: Problem, motion: Path | Trajectory, tolerances: To
 
 
 def _torque_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
-    """Torque limits that are not shown to be kept with the payload, and torques that differ from the
-    proof."""
+    """A message for each torque bound that differs from the proof, and for each torque that is not proved to
+    be within its limit with the payload."""
     motion = certificate.motion
     stated = certificate.torques
     if problem.payload is None:
@@ -631,7 +641,8 @@ def _torque_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
 
 
 def _constraint_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
-    """Path constraints that are not shown to be kept, and bounds that differ from the proof."""
+    """A message for each bound that differs from the proof, and for each path constraint that is not proved
+    to be kept."""
     if not problem.constraints and not certificate.constraints:
         return
     q = configurations(certificate.motion, certificate.between)
@@ -647,7 +658,8 @@ def _constraint_errors(problem: Problem, certificate: MotionProof) -> Iterator[s
 def _stated_errors(
     what: str, stated: Iterable[tuple[str, float]], most: Iterable[float], limits: Iterable[float]
 ) -> Iterator[str]:
-    """Bounds that differ from the proof, and limits that they do not show to be kept."""
+    """A message for each bound that differs from the bound in the proof, and for each bound that exceeds its
+    limit."""
     for (name, written), bound, limit in zip(stated, most, limits, strict=True):
         if not abs(bound - written) <= BOUND_TOLERANCE:
             yield f"{what}: the bound of {name} is {bound:.6f}, not {written:.6f}"
@@ -658,8 +670,9 @@ def _stated_errors(
 def _rate_errors(
     robot: Robot, motion: Trajectory, certificate: MotionProof, start_velocity: JointValues
 ) -> Iterator[str]:
-    """Joints that exceed a limit of velocity or acceleration by any of several measures, cubics that leave
-    the certified straight lines, and motions that do not begin at the required velocity or end at rest."""
+    """A message for each joint that exceeds a velocity or acceleration limit, by any of several measures; if
+    cubics leave the certified straight lines; and if the motion does not begin at the required velocity or
+    end at rest."""
     tolerances = certificate.tolerances
     times = motion.times
     step = np.diff(times)[:, None]
@@ -675,8 +688,8 @@ def _rate_errors(
     speed = robot.velocity
     acceleration = robot.acceleration
     change = np.diff(v, axis=0) / step
-    # an error of the mean velocity enters the cubic's velocity times up to 3/2, its acceleration times 6 /
-    # step
+    # an error of the mean velocity changes the cubic's velocities by up to 3/2 of it, and its accelerations
+    # by 6 / step times it
     acceleration_slack = 6 * position_slack / step**2
     yield from _agreement_errors(robot, motion, cubics, start_velocity, acceleration_slack)
     for quantity, values, limit, slack in (
@@ -700,7 +713,7 @@ def _rate_errors(
     )
     fine_steps = step.min(initial=np.inf) < AVERAGING_WINDOWS[0]
     for window in AVERAGING_WINDOWS if fine_steps else AVERAGING_WINDOWS[:1]:
-        # before the first row the arm moves at its start velocity, and after the last it stands still
+        # before the first row, the arm moves at its start velocity; after the last row, it rests
         at = np.concatenate([[times[0] - window], times, [times[-1] + window]])
         rows = np.concatenate([q[:1] - window * start_velocity, q, q[-1:]])
         first = np.searchsorted(at, times - window, side="right") - 1
@@ -746,11 +759,11 @@ def _exceeded(
 def _excess_displacement(
     motion: Trajectory, rate_factor: float, position_slack: float, speed: JointValues
 ) -> JointRows:
-    """The largest excess, over all pairs of rows, of each joint's displacement over what its velocity limit
-    allows in that time [1, dof].
+    """For each joint, the largest excess of its displacement between two rows over what its velocity limit
+    allows in the time between them, over all pairs of rows [1, dof].
 
-    Each step between the two rows adds a tolerance of `position_slack`, less for a step shorter than
-    the first averaging window. The caller allows it once more, for the two rows themselves.
+    For each step between the two rows, a tolerance of `position_slack` is allowed; less for a step shorter
+    than the first averaging window. The caller allows this tolerance once more, for the two rows themselves.
     """
     step = np.diff(motion.times)[:, None]
     q = motion.positions
@@ -765,7 +778,8 @@ def _excess_displacement(
 def _agreement_errors(
     robot: Robot, motion: Trajectory, cubics: Cubics, start_velocity: JointValues, acceleration_slack: ndarray
 ) -> Iterator[str]:
-    """Joints whose accelerations at the rows are not close to those of the cubics next to them."""
+    """A message for each joint with an acceleration at a row that is not close to those of the cubics before
+    and after the row."""
     before = np.concatenate([cubics.start[:1], cubics.end])
     after = np.concatenate([cubics.start, cubics.end[-1:]])
     a = motion.accelerations
@@ -786,10 +800,10 @@ def _agreement_errors(
 def at_goal(
     robot: Robot, goal: Goal, q: Configurations, tolerances: Tolerances, blend: float = 0.0
 ) -> Bool[ndarray, "n"]:
-    """Which configurations reach a goal, or pass within `blend` of it.
+    """Whether each configuration reaches a goal, or is within `blend` of it.
 
-    `blend` is a distance in joint space for a joint goal, and of positions for a pose, measured from the box
-    of its position tolerances if it has them.
+    blend: for a joint goal, a distance in joint space [rad, L2]; for a pose, the distance of positions [m],
+    from the box of its position tolerances if it has any.
     """
     if isinstance(goal, AnyGoal):
         return np.any([at_goal(robot, part, q, tolerances, blend) for part in goal.goals], axis=0)

@@ -1,8 +1,8 @@
 """The search for a proof, which the checker can re-check without a search.
 
-For each claim, a motion that the validator accepts is split until every stretch is proved by the checker's
-own bounds. Where spheres are too coarse, planes between the nearest points of convex bodies, which Coal
-finds, prove it.
+For each claim (see `bounds.py`), the motion is split into stretches until the checker's own bounds prove
+every stretch. If the covering spheres are too coarse, separating planes of convex bodies are used, which are
+perpendicular to the line between the bodies' nearest points. Coal finds these points.
 """
 
 # Coal's Python module has no type information.
@@ -60,9 +60,9 @@ from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.validation.validator import DEFAULT, VerifySettings, check_motion, verify
 
 MAX_PLANES = 64
-"""Largest number of planes between a part and a surface; concave surfaces need several."""
+"""Largest number of planes between a part and a surface; a concave surface needs several."""
 NORMAL_DECIMALS = 10
-"""Number of decimals of normals in files, whose length must be 1 within 1e-9."""
+"""Number of decimals of normals in files; the length of a normal must be 1 within 1e-9."""
 
 Normal = tuple[float, float, float]
 
@@ -87,8 +87,11 @@ class PlaneFinder:
         )
 
     def planes(self, todo: Stretches, rows: ndarray, needed: Values) -> list[Plane]:
-        """Planes for the stretches of these rows; pairs of bodies with balls further apart than `needed` [m]
-        need none, and bodies that touch have none."""
+        """Separating planes for some of the stretches in `todo`, by their indices `rows`.
+
+        needed: for each of these stretches, the clearance that it needs [m]. Pairs of bodies with balls
+        further apart get no plane. Bodies that touch have no separating plane.
+        """
         prover = self.prover
         middle = (todo.start[rows] + todo.stop[rows]) / 2
         postures = prover.linkage.place(prover.at(middle))
@@ -127,8 +130,8 @@ class PlaneFinder:
 
 
 def _around(first: _Body, part: Part, surface: Surface, needed: float) -> Iterator[Normal]:
-    """Planes that together separate all near elements of a surface by `needed`, starting with the nearest
-    one."""
+    """Normals of planes that together separate all elements of a surface from a part by `needed` [m]; the
+    plane for the nearest element is first. Ends early if an element touches the part."""
     shown_gaps = np.full(len(surface.corners), -np.inf)
     order = np.argsort(np.sqrt(((surface.corners - part.center) ** 2).sum(axis=-1)).min(axis=1))
     tried_elements = np.zeros(len(order), bool)
@@ -151,7 +154,7 @@ def _around(first: _Body, part: Part, surface: Surface, needed: float) -> Iterat
 
 
 def _normal(first: _Body, second: _Body) -> Normal | None:
-    """Unit vector from the nearest point of the second body to that of the first; None if they touch."""
+    """Unit vector from the second body to the first, between their nearest points; None if they touch."""
     request = coal.DistanceRequest()
     result = coal.DistanceResult()
     coal.distance(first.geometry, coal_pose(first.T), second.geometry, coal_pose(second.T), request, result)
@@ -170,33 +173,34 @@ def _hull(part: Part) -> _Body:
 
 
 CLEARANCE_SHARE = 0.5
-"""The proof shows this fraction of the clearances that the validator certifies; a larger fraction needs more
-stretches."""
+"""Clearance that is proved, as a fraction of the clearance that the validator certifies. A larger fraction
+needs more stretches."""
 CHORD_SHARE = 0.05
-"""The straight lines that replace the cubics displace no point by more than this fraction of the
+"""Largest displacement of any point by replacing cubics with straight lines, as a fraction of the
 clearance."""
 MAX_SPLIT = 8
-"""A stretch is split into at most this many parts at a time."""
+"""Largest number of parts into which a stretch is split at once."""
 PLANES_BELOW = 0.02
-"""If the clearance of the spheres is below this, planes are tried: the spheres stick out by about as much
-[m]."""
+"""Planes are tried if the clearance of the spheres is below this, which is about how far spheres stick out of
+meshes [m]."""
 PLANES_DISPLACEMENT = 0.1
 """Largest displacement of stretches for which planes are tried [m]."""
 ROUNDING_RESERVE = 2e-6
-"""Margin added to each target clearance so that rounded bounds still prove it [m]."""
+"""Margin added to each target clearance, so that rounded bounds still prove the clearance [m]."""
 MAX_STRETCHES = 200_000
+"""Largest number of stretches that are tried, and of places in a proof."""
 PLACE_DECIMALS = 7
+"""Number of decimals of places: the ends of stretches."""
 MAX_HALVINGS = 20
-"""Largest number of halvings of the step between two configurations, to prove path constraints or torques
-there."""
+"""Largest number of times that the step between two rows is halved to prove path constraints or torques."""
 
 
 class NotValidError(InputError):
-    """The motion is not valid, so it cannot be certified."""
+    """The validator refuses the motion, so it cannot be certified."""
 
 
 def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySettings = DEFAULT) -> Certificate:
-    """Prove that a motion is valid, in a form that a small separate program checks.
+    """Prove that a motion is valid, in a form that a small independent checker can check without a search.
 
     Args:
         problem: The problem that the motion solves.
@@ -204,7 +208,7 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
         settings: Tolerances of the validator.
 
     Raises:
-        NotValidError: If the validator rejects the motion; an InputError with the first violation.
+        NotValidError: If the validator refuses the motion; a subclass of InputError that names the violation.
         InputError: For obstacles and requirements that certificates do not support, and if no proof of
             reasonable size is found.
     """
@@ -283,10 +287,11 @@ def _refined(
     bounds_of: Callable[[Values], tuple[Sequence[str], Float[ndarray, "n b"], Any]],
     what: str,
 ) -> tuple[Values, tuple[tuple[str, float], ...]]:
-    """Places between the rows (see `MotionProof.between`) from each of which to the next some bounds are
-    within their limits, and the bounds by name.
+    """Places between the rows (see `MotionProof.between`), added until all bounds are within their limits
+    between neighboring places; and the name and largest value of each bound.
 
-    bounds_of: names, bounds from each place to the next, and limits.
+    bounds_of: computes names, bounds from each place to the next [n, b], and limits. what: for the message.
+    Raises InputError if this needs too many places.
     """
     for _ in range(MAX_HALVINGS):
         names, bounds, limits = bounds_of(places)
@@ -310,8 +315,8 @@ def _record(problem: Problem) -> dict[str, object] | None:
 
 
 def _between(motion: Path | Trajectory, chord: float) -> Values:
-    """Times between the rows such that the cubics leave the straight lines between them by at most
-    `chord`."""
+    """Times between the rows at which configurations are added, so that no joint leaves the straight lines
+    between configurations by more than `chord` [rad] or [m]."""
     cubics = cubics_of(motion)
     off = (cubics.pulls * cubics.steps**2 / 8).max(axis=1)
     parts = np.maximum(np.ceil(np.sqrt(off / chord)), 1).astype(int)
@@ -324,8 +329,8 @@ def _between(motion: Path | Trajectory, chord: float) -> Values:
 
 
 def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[str, float]]:
-    """A proof of all claims, and the clearance that it shows by kind (SCENE or ""); `least` is asked for
-    [m]."""
+    """A proof of all claims, and the clearance that it proves for each kind of claim: SCENE for the scene, ""
+    for pairs of links. least: the clearance to prove for each kind [m]."""
     count = len(prover.claims)
     last = float(len(prover.q) - 1)
     todo = Stretches(np.arange(count), np.zeros(count), np.full(count, last))
@@ -378,7 +383,8 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[
 
 
 def _check_parts_are_apart(prover: Prover, stretches: Stretches) -> None:
-    """Raise InputError if one of these stretches, without separating planes, is of a grazing pair."""
+    """Raise InputError if one of these stretches is for two links that are free only by their exact surfaces
+    (`Robot.grazing`), so that no separating planes exist."""
     for k in stretches.claim.tolist():
         claim = prover.claims[k]
         if frozenset((claim.link, claim.against)) in prover.robot.grazing:
@@ -391,9 +397,9 @@ def _check_parts_are_apart(prover: Prover, stretches: Stretches) -> None:
 def _cut(
     todo: Stretches, clearance: ndarray, displacement: ndarray, target: ndarray, which: ndarray
 ) -> Stretches:
-    """The stretches that are not proved, each split into as many parts as its displacement requires."""
+    """The stretches marked by `which`, each split into as many parts as its displacement requires."""
     spare = np.maximum(clearance - target, displacement / MAX_SPLIT)
-    # where spheres are too coarse, parts are made short enough for planes
+    # if the spheres are too coarse, the parts are made short enough for planes
     split_factor = np.where(
         clearance < PLANES_BELOW, displacement / PLANES_DISPLACEMENT, 1.2 * displacement / spare
     )
@@ -414,6 +420,8 @@ def _cut(
 
 
 def _join(prover: Prover, done: list[StretchProof]) -> tuple[StretchProof, dict[str, float]]:
+    """Join proofs of stretches, sorted by claim and place; and the proved clearance of each kind (see
+    `_prove`)."""
     claim, start, stop = (np.concatenate(parts) for parts in zip(*(f.stretches for f in done), strict=True))
     order = np.lexsort((start, claim))
     place = np.empty(len(order), int)
