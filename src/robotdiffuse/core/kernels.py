@@ -1,4 +1,5 @@
-"""Decorators of compiled functions, and the account of the time that Numba takes; see `loading.py`."""
+"""Decorators that compile functions with Numba, the folder for compiled code, and the measurement of Numba's
+time as loading time (see `loading.py`)."""
 
 import os
 import re
@@ -21,8 +22,8 @@ from robotdiffuse.core import loading
 
 
 def _without_scipy(module: str) -> None:
-    """Import a module of Numba without SciPy, which it imports only to choose an algorithm for
-    `np.convolve`."""
+    """Import a module of Numba while SciPy cannot be imported. Numba needs SciPy there only to choose an
+    algorithm for `np.convolve`."""
     blas = "scipy.linalg.cython_blas"
     if blas not in sys.modules:
         sys.modules[blas] = None  # pyright: ignore[reportArgumentType]  (makes the import fail)
@@ -32,14 +33,14 @@ def _without_scipy(module: str) -> None:
             del sys.modules[blas]
 
 
-_without_scipy("numba.np.arraymath")  # SciPy would take a ninth of the time of a plan by search
+_without_scipy("numba.np.arraymath")  # importing SciPy would take 11 % of the time of a `plan` command
 
-# For each error that type inference meets, thousands in a large function, Numba would let colorama replace
-# sys.stdout and sys.stderr and restore what they were, even if another thread has set others since.
+# Type inference meets thousands of errors in a large function. For each, Numba would let colorama replace
+# sys.stdout and sys.stderr and then restore them, even if another thread has replaced them in the meantime.
 errors.ColorShell = nullcontext  # type: ignore[misc]
 
 
-# before the checksum at the end of a file of compiled code, which Numba itself does not read
+# Marks the checksum at the end of a file of compiled code; Numba ignores what follows its own data.
 CHECKSUM = b"crc32"
 PACKAGE = Path(__file__).parents[1]
 MODULE = re.compile(rb"\b%s(?:\.\w+)+" % PACKAGE.name.encode())
@@ -49,8 +50,8 @@ NAME = re.compile(rb"\w+")
 
 @cache
 def cache_folder() -> Path:
-    """The folder for compiled code: NUMBA_CACHE_DIR, or one in the user's cache, or a temporary one where
-    that cannot be written, as in a container without a home."""
+    """The folder for compiled code: NUMBA_CACHE_DIR, or a folder in the user's cache. If it is not writable,
+    as in a container without a home, a temporary folder."""
     # unlike Path.expanduser, this leaves ~ as it is for a user without a home
     user = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     folder = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(user, PACKAGE.name))
@@ -72,8 +73,8 @@ def cache_folder() -> Path:
 
 
 def is_writable(folder: Path) -> bool:
-    """Whether a file can be written in the folder; permissions alone do not show that a disk is read-only.
-    False for ~, a home that is not known."""
+    """Whether a file can be written in the folder, by writing one, since permissions do not show that a disk
+    is read-only. False for a path in ~ that was not expanded, because the user has no home."""
     if folder.parts[:1] == ("~",):
         return False
     try:
@@ -85,8 +86,8 @@ def is_writable(folder: Path) -> bool:
 
 
 class _Locator(caching._SourceFileBackedLocatorMixin, caching._CacheLocator):
-    """Numba's place for the compiled code of one module: a folder named by the module and a digest of what it
-    is compiled from, so that installations of one version share it and others do not."""
+    """The folder for the compiled code of one module, as Numba asks for it. Its name contains a digest of the
+    modules from which the code is compiled, so that only installations with the same modules share it."""
 
     def __init__(self, function: Callable, file: str) -> None:
         self._py_file = file
@@ -110,8 +111,8 @@ def _folder_name(module: str) -> str:
 
 
 def _compiled_from(module: str) -> set[str]:
-    """The modules whose code or constants are compiled into a module: itself, what it imports of the package
-    and, where that is compiled too, what those import."""
+    """The modules with code or constants that are compiled into a module: the module, the modules of the
+    package that it imports, and the imports of imported modules with compiled code."""
     modules: set[str] = set()
     waiting = [module]
     while waiting:
@@ -126,7 +127,7 @@ def _compiled_from(module: str) -> set[str]:
 
 @cache
 def _imported(module: str) -> frozenset[str]:
-    """Modules of the package that a module imports as a whole."""
+    """The modules of the package that a module imports, or from which it imports names."""
     imports = [match.groups() for match in IMPORT.finditer(_source(module))]
     parts = {(source + b"." + name).decode() for source, names in imports for name in NAME.findall(names)}
     return frozenset(source.decode() for source, _ in imports).union(filter(_source, parts))
@@ -134,7 +135,7 @@ def _imported(module: str) -> frozenset[str]:
 
 @cache
 def _source(module: str) -> bytes:
-    """The text of a module of the package; empty if there is none of that name."""
+    """The text of a module of the package; empty if there is no module with this name."""
     file = PACKAGE.parent.joinpath(*module.split("."))
     for source in (file.with_suffix(".py"), file / "__init__.py"):
         with suppress(OSError):
@@ -157,7 +158,7 @@ class _CacheImpl(caching.CompileResultCacheImpl):
 
 
 class _CacheFile(caching.IndexDataCacheFile):
-    """Numba's files of compiled code with a checksum, for damaged machine code would end the process."""
+    """Numba's files of compiled code, with a checksum, because damaged machine code would end the process."""
 
     def _dump(self, obj: Any) -> bytes:
         data = super()._dump(obj)
@@ -175,8 +176,8 @@ class _CacheFile(caching.IndexDataCacheFile):
         super()._save_index(overloads)
 
     def _load_index(self) -> dict:
-        """The index, or an empty one if a module that it names has changed: its classes may have other
-        fields, or be gone."""
+        """The index; an empty one if a module that it names has changed, since the module's classes may have
+        other fields now, or be gone."""
         index = Path(self._index_path)
         self._source_stamp = _named_in(index.read_bytes()) if index.is_file() else ""
         return super()._load_index()
@@ -198,7 +199,8 @@ class _Cache(caching.FunctionCache):
 
     @contextmanager
     def _guard_against_spurious_io_errors(self) -> Iterator[None]:
-        """Around reading and writing: what cannot be read is compiled anew; a full disk is no error."""
+        """Around reading and writing: after an error, the function's cached code is dropped, so that it is
+        compiled again. A full disk is not an error."""
         try:
             yield
         except Exception:  # pickle raises errors of many kinds
@@ -207,7 +209,7 @@ class _Cache(caching.FunctionCache):
 
 
 class _Listener(event.Listener):
-    """Counts the work of Numba's compiler as loading: reading from the cache, compiling, writing."""
+    """Counts the time of Numba's compiler as loading time: reading from the cache, compiling, writing."""
 
     def on_start(self, event: event.Event) -> None:
         if event.kind == LOCK:
@@ -220,7 +222,7 @@ class _Listener(event.Listener):
             loading.end()
 
 
-# Events of Numba: it holds its lock while it reads from the cache too, and compiles within that.
+# Events of Numba: its lock is held while it reads from the cache and while it compiles.
 LOCK = "numba:compiler_lock"
 COMPILE = "numba:compile"
 for kind in (LOCK, COMPILE):
@@ -230,7 +232,7 @@ for kind in (LOCK, COMPILE):
 def kernel(**options: Any) -> Callable[[Callable], Any]:
     """A decorator that compiles a function that Python calls; `options` are those of `numba.njit`."""
 
-    compiler: Any = njit  # its type stubs lack the options of Numba's targets
+    compiler: Any = njit  # the type stubs of njit lack some options
 
     def compiled(function: Callable) -> Any:
         dispatcher = compiler(no_cfunc_wrapper=True, **options)(function)
@@ -243,9 +245,9 @@ def kernel(**options: Any) -> Callable[[Callable], Any]:
 def inner_kernel(**options: Any) -> Callable[[Callable], Any]:
     """A decorator that compiles a function that only compiled code calls.
 
-    The code by which Python would call it is left out: for robots and scenes, tuples of many arrays, it takes
-    a quarter of the compile time. Numba compiles all that a function calls again as a part of it, so
-    functions with one caller are better inlined (`inline="always"`).
+    The wrapper by which Python would call the function is left out: for robots and scenes, which are tuples
+    of many arrays, the wrapper takes a quarter of the compile time. Numba also compiles a called function as
+    a part of its caller, so functions with one caller should be inlined (`inline="always"`).
     """
 
     def compiled(function: Callable) -> Any:
@@ -254,7 +256,8 @@ def inner_kernel(**options: Any) -> Callable[[Callable], Any]:
         def refuse(*_: Any, **__: Any) -> None:
             raise TypeError(f"{function.__name__} is an inner kernel: only compiled code calls it")
 
-        # Python finds no code to call, which would end the process, and asks for it
+        # Without registered code, a call from Python asks for compilation, and `refuse` raises an error. A
+        # call of code without a wrapper would end the process.
         dispatcher._insert = lambda *_: None
         dispatcher._compile_for_args = refuse
         return dispatcher
@@ -267,8 +270,8 @@ def allocation_free(
 ) -> Callable[[Callable], Any]:
     """A decorator that compiles a function without Numba's reference counting; an inner kernel by default.
 
-    Counting references to the arrays in every call would take two thirds of the collision kernel's time. Such
-    a function must not allocate memory, nor assign an array to a slice.
+    Counting references to arrays in every call would take two thirds of the collision kernel's time. A
+    function without reference counting must not allocate memory or assign an array to a slice.
     """
     options: dict[str, Any] = {"fastmath": fastmath, "inline": inline, "forceinline": forceinline}
     return (inner_kernel if inner else kernel)(_nrt=False, **options)

@@ -37,7 +37,7 @@ def loading() -> Iterator[None]:
 
 
 def begin() -> None:
-    """Begin a block of `loading`."""
+    """Begin a block of loading time."""
     if _clock.depth == 0:
         _clock.began = time.perf_counter()
         _clock.compiles = False
@@ -45,7 +45,7 @@ def begin() -> None:
 
 
 def end() -> None:
-    """End a block of `loading`."""
+    """End a block of loading time."""
     _clock.depth -= 1
     if _clock.depth == 0:
         took = time.perf_counter() - _clock.began

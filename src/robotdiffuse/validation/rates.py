@@ -54,18 +54,18 @@ def rate_violations(
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         begins = np.zeros(robot.dof) if start_velocity is None else start_velocity
         for check in _checks(robot, cubics or Cubics(trajectory), settings, begins):
-            right = check.off <= check.allowed
-            if right.all():
+            within = check.deviation <= check.allowed
+            if within.all():
                 continue
-            wrong = ~right
+            wrong = ~within
             i = int(np.flatnonzero(wrong.any(axis=1))[0])
-            beyond = np.where(wrong, np.nan_to_num(check.off - check.allowed, nan=np.inf), 0.0)
+            beyond = np.where(wrong, np.nan_to_num(check.deviation - check.allowed, nan=np.inf), 0.0)
             j = int(beyond[i].argmax())
             time = float(trajectory.times[i])
             if check.kind not in first_violations or time < first_violations[check.kind].time:
                 name = robot.joint_names[j]
                 rate = abs(float(check.rates[i, j]))
-                message = f"{name} at {time:.3f} s: its {check.what} is {rate:.6g}, {check.right(i, j)}"
+                message = f"{name} at {time:.3f} s: its {check.what} is {rate:.6g}, {check.expected(i, j)}"
                 first_violations[check.kind] = Violation(
                     check.kind, time, message, name, None, float(beyond[i, j])
                 )
@@ -79,11 +79,11 @@ class _Check(NamedTuple):
     what: str
     """The rate in words."""
     rates: JointRows
-    off: JointRows
+    deviation: JointRows
     """Deviation of the rates from the expected value (0 for limits)."""
     allowed: Float[ndarray, "#n dof"]
     """Allowed deviation."""
-    right: Callable[[int, int], str]
+    expected: Callable[[int, int], str]
     """The end of a message: the expected value, by row and joint."""
 
 
@@ -96,9 +96,9 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
     step = cubics.steps
     mean = cubics.extremes.mean
     change = np.diff(v, axis=0) / cubics.steps
-    blur = 2 * settings.limit_slack / step
+    mean_error = 2 * settings.limit_slack / step
     """Uncertainty of the mean velocity of each step, from the resolution of positions."""
-    share = 1 + settings.rate_slack
+    limit_factor = 1 + settings.rate_slack
     """Factor on limits, for the tolerance."""
     rest_tolerance = settings.rate_slack * np.where(robot.velocity > 0, robot.velocity, _peak(v, mean))
     """Velocity that counts as zero, for each joint."""
@@ -117,55 +117,65 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
     yield _Check("rest", "velocity", v, at_ends, rest_tolerance, lambda *_: rule)
 
     limits = robot.velocity
-    onwards = "mean velocity from here to the next row"
-    yield limited("jump", onwards, mean, limits, settings.jump * limits + blur)
+    rate_name = "mean velocity from here to the next row"
+    yield limited("jump", rate_name, mean, limits, settings.jump * limits + mean_error)
     # An error of a step's mean velocity m changes the cubic's velocities by up to 3/2 of it, and its
     # accelerations by 6 times it divided by the step's duration (see trajectories/cubics.py).
-    onwards = "greatest velocity of the cubic to the next row"
-    yield limited("velocity", onwards, cubics.extremes.velocity, limits, share * limits + 1.5 * blur)
-    yield limited("velocity", "velocity", v, limits, share * limits)
+    rate_name = "greatest velocity of the cubic to the next row"
+    yield limited(
+        "velocity", rate_name, cubics.extremes.velocity, limits, limit_factor * limits + 1.5 * mean_error
+    )
+    yield limited("velocity", "velocity", v, limits, limit_factor * limits)
 
     # Second differences of positions. Mirrored steps before the first and after the last row let the mean
     # velocity over both steps be the velocity at the end: `begins`, and 0.
-    around = _padded(2 * begins - mean[:1], mean, -mean[-1:])
-    length = _padded(step[:1], step, step[-1:])
-    unsure = _padded(blur[:1], blur, blur[-1:])
-    spacing = (length[1:] + length[:-1]) / 2
-    second = (around[1:] - around[:-1]) / spacing
-    unsure = (unsure[1:] + unsure[:-1]) / spacing
+    means = _padded(2 * begins - mean[:1], mean, -mean[-1:])
+    durations = _padded(step[:1], step, step[-1:])
+    uncertainty = _padded(mean_error[:1], mean_error, mean_error[-1:])
+    spacing = (durations[1:] + durations[:-1]) / 2
+    second = (means[1:] - means[:-1]) / spacing
+    uncertainty = (uncertainty[1:] + uncertainty[:-1]) / spacing
     limits = robot.acceleration
     peaks = cubics.extremes.acceleration
-    bent = 6 * blur / step
+    cubic_error = 6 * mean_error / step
     yield limited(
-        "acceleration", "mean acceleration by its positions", second, limits, share * limits + unsure
+        "acceleration",
+        "mean acceleration by its positions",
+        second,
+        limits,
+        limit_factor * limits + uncertainty,
     )
     yield limited(
         "acceleration",
         "greatest acceleration of the cubic to the next row",
         peaks,
         limits,
-        share * limits + bent,
+        limit_factor * limits + cubic_error,
     )
-    yield limited("acceleration", "mean acceleration by its velocities", change, limits, share * limits)
-    yield limited("acceleration", "acceleration", a, limits, share * limits)
+    yield limited(
+        "acceleration", "mean acceleration by its velocities", change, limits, limit_factor * limits
+    )
+    yield limited("acceleration", "acceleration", a, limits, limit_factor * limits)
 
     # The greatest acceleration between rows is assumed to be at most twice the greatest measured one.
     measured = np.maximum(_peak(a, second, change), settings.rate_slack * robot.acceleration)
-    strongest = np.where(limits > 0, np.minimum(share * limits, 2 * measured), 2 * measured)
+    strongest = np.where(limits > 0, np.minimum(limit_factor * limits, 2 * measured), 2 * measured)
+    # With accelerations up to A, the mean velocity of a step of h seconds, in which the velocity changes by d
+    # h, differs from the mean of both velocities by at most (A - d² / A) h / 4.
     spent = np.divide(change**2, strongest, out=np.zeros_like(change), where=strongest > 0)
     possible = np.maximum(strongest - spent, 0.0) * step / 4 + rest_tolerance
     """Allowed difference between mean velocities and the means of the rows' velocities."""
-    off = np.abs(mean - (v[1:] + v[:-1]) / 2)
-    allowed = possible + blur
+    difference = np.abs(mean - (v[1:] + v[:-1]) / 2)
+    allowed = possible + mean_error
     yield _Check(
         "rates",
         "mean velocity from here to the next row",
         mean,
-        off,
+        difference,
         allowed,
         lambda i, j: f"but the velocities of these rows are {v[i, j]:.6g} and {v[i + 1, j]:.6g}",
     )
-    if len(a) > 1 and (off <= allowed).all():  # otherwise velocities, and so the cubics, are wrong
+    if len(a) > 1 and (difference <= allowed).all():  # otherwise velocities, and so the cubics, are wrong
         start = cubics.extremes.start
         end = cubics.extremes.end
         before = _padded(start[:1], end)
@@ -175,13 +185,14 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
         outside = np.maximum(low - a, a - high)
         if begins.any():
             outside[0] = 0.0  # the unknown motion before the start may have had any acceleration
-        near = settings.rate_agreement * np.where(limits > 0, np.minimum(limits, measured), measured)
+        agreement = settings.rate_agreement * np.where(limits > 0, np.minimum(limits, measured), measured)
         yield _Check(
             "rates",
             "acceleration",
             a,
             outside,
-            near + np.maximum(_padded(bent[:1], bent), _padded(bent, bent[-1:])),
+            agreement
+            + np.maximum(_padded(cubic_error[:1], cubic_error), _padded(cubic_error, cubic_error[-1:])),
             lambda i, j: f"but the cubics beside it have {low[i, j]:.6g} to {high[i, j]:.6g}",
         )
 
@@ -190,11 +201,11 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
     # The tests between rows that are further apart: from an earlier row, at which the excess is largest.
     times = trajectory.times
     resolution = settings.limit_slack
-    onwards = "mean velocity from an earlier row to here"
+    rate_name = "mean velocity from an earlier row to here"
     limits = robot.velocity
-    first, span = _worst_earlier_row(times, q, (times - times[0])[:, None] * share * limits)
+    first, span = _worst_earlier_row(times, q, (times - times[0])[:, None] * limit_factor * limits)
     moved = _change_since(q, first) / span
-    yield limited("velocity", onwards, moved, limits, share * limits + 2 * resolution / span)
+    yield limited("velocity", rate_name, moved, limits, limit_factor * limits + 2 * resolution / span)
 
     stated_positions = _cumulative(step * (v[1:] + v[:-1]) / 2)
     allowed = _cumulative(step * possible)
@@ -203,7 +214,7 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
     stated = _change_since(stated_positions, first) / span
     yield _Check(
         "rates",
-        onwards,
+        rate_name,
         moved,
         np.abs(moved - stated),
         (_change_since(allowed, first) + 2 * resolution) / span,
@@ -212,9 +223,9 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
 
     limits = robot.acceleration
     for window in AVERAGING_WINDOWS:
-        second, unsure = _second_differences(trajectory, begins, window, resolution, rest_tolerance)
+        second, uncertainty = _second_differences(trajectory, begins, window, resolution, rest_tolerance)
         description = f"mean acceleration by its positions over {1e3 * window:g} ms and more"
-        yield limited("acceleration", description, second, limits, share * limits + unsure)
+        yield limited("acceleration", description, second, limits, limit_factor * limits + uncertainty)
 
 
 def _cumulative(steps: JointRows) -> JointRows:
@@ -234,14 +245,14 @@ def _worst_earlier_row(
     beyond = np.full(way.shape, -np.inf)
     first = np.broadcast_to(rows, way.shape)
     for signed in (way, -way):
-        room = signed - allowed
-        min_room = np.minimum.accumulate(room, axis=0)
-        at = np.maximum.accumulate(np.where(room <= min_room, rows, 0), axis=0)
+        excess = signed - allowed
+        min_excess = np.minimum.accumulate(excess, axis=0)
+        at = np.maximum.accumulate(np.where(excess <= min_excess, rows, 0), axis=0)
         # shifted by one row to exclude the row itself
-        min_room = _padded(room[:1], min_room[:-1])
+        min_excess = _padded(excess[:1], min_excess[:-1])
         at = _padded(first[:1], at[:-1])
-        first = np.where(room - min_room > beyond, at, first)
-        beyond = np.maximum(beyond, room - min_room)
+        first = np.where(excess - min_excess > beyond, at, first)
+        beyond = np.maximum(beyond, excess - min_excess)
     return first, np.maximum(times[:, None] - times[first], MIN_TIME)
 
 
@@ -270,8 +281,8 @@ def _second_differences(
     after = (clock[high] - times)[:, None]
     spacing = (before + after) / 2
     outside = (low == 0).astype(float) + (high == len(clock) - 1)
-    unsure = 2 * resolution * (1 / before + 1 / after) + outside[:, None] * rest_tolerance
-    return ((rows[high] - q) / after - (q - rows[low]) / before) / spacing, unsure / spacing
+    uncertainty = 2 * resolution * (1 / before + 1 / after) + outside[:, None] * rest_tolerance
+    return ((rows[high] - q) / after - (q - rows[low]) / before) / spacing, uncertainty / spacing
 
 
 def _padded(*rows: ndarray) -> ndarray:
