@@ -284,7 +284,7 @@ def test_other_problems_of_the_same_name_are_refused(tmp_path: Path) -> None:
     other = str(tmp_path / "b" / "mine.jsonl")
     for _ in range(2):
         assert len(gather_cases([first], None, tmp_path / "out", quiet)) == 1
-    with pytest.raises(rd.InputError, match=r"problems called mine that were read from .*; those in .* others"):
+    with pytest.raises(rd.InputError, match=r"problems called mine that were read from .*; those in .* another content"):
         gather_cases([other], None, tmp_path / "out", quiet)
     (tmp_path / "rop.jsonl").write_text(lines[0])
     refuses("have the name of the family rop", gather_cases, [str(tmp_path / "rop.jsonl")], None, tmp_path / "out", quiet)

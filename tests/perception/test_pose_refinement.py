@@ -66,7 +66,7 @@ def test_errors_of_poses_are_found_again(seed: int) -> None:
         assert (error < stated).all()
     assert error.max() < 0.005 and stated.max() < 0.012, "of the camera on the arm"
     error, now = displaced(poses.refined(off(standing, 10 + seed)), standing)
-    assert (error < now).all() and now.max() < 1.01 * displaced(first, standing)[1].max()
+    assert (error < now).all() and now.max() < 1.05 * displaced(first, standing)[1].max()
 
 
 def test_views_that_state_no_error_stay_as_they_are() -> None:

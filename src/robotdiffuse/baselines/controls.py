@@ -158,8 +158,8 @@ def fixed_vias(robot: Robot) -> Configurations:
 
 @lru_cache(maxsize=2)
 def library(data: str, robot: Robot) -> Trajectories:
-    """Motions of the training split from the first shards of a data set, without trivial motions: those with
-    a free straight line from start to goal."""
+    """Motions of the training split from the first shards of a data set. Trivial motions, whose straight line
+    from start to goal is free, are left out."""
     rows = islice(read_rows(data, robot, WAYPOINTS), LIBRARY_SHARDS)
     train = SPLITS.index("train")
     return np.concatenate([part.q[(part.split == train) & ~part.shard["line_free"]] for part in rows])

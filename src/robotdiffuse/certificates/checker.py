@@ -1,9 +1,11 @@
-"""The checker of proofs. It needs no search and shares no code with the validator.
+"""The checker of proofs. It needs no search and shares no code with the validator but the data types.
 
-The proof must contain every claim that follows from the robot (see `bounds.py`), and the stretches of each
-claim must cover the motion without a gap. The checker recomputes the clearance and displacement of every
-stretch. They must agree with the proof, and the clearance must exceed the displacement. So a proof that
-passes is right, no matter how it was made.
+A claim says that a link stays clear of the scene, or of another link. It is proved for stretches of the
+motion, intervals between rows: the clearance in the middle of a stretch exceeds the displacement, which is
+how far the link can move within it. The proof must contain every claim that follows from the robot (see
+`bounds.py`), and the stretches of each claim must cover the motion without a gap. The checker recomputes the
+clearance and displacement of every stretch. They must agree with the proof, and the clearance must exceed the
+displacement. So a proof that passes is right, no matter how it was made.
 """
 
 from collections.abc import Iterator
@@ -101,8 +103,8 @@ def check(
 
 
 def _cover_errors(robot: Robot) -> Iterator[str]:
-    """A message for each link with meshes that its spheres do not cover, since spheres prove most
-    stretches."""
+    """A message for each link with corners of meshes outside its spheres, since spheres prove most stretches.
+    That spheres cover all of the meshes is proved when a robot is prepared."""
     for link, meshes in robot.meshes.items():
         if link not in robot.spheres or not len(robot.spheres[link]) or not meshes:
             continue
@@ -126,10 +128,10 @@ def _proof_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
     yield from _bound_errors(prover, proof, {"scene": ~of_pairs, "self": of_pairs}, stated)
     moving = certificate.moving
     if moving is not None and not problem.moving:
-        yield "proof: there is one among moving obstacles, which the problem has not"
+        yield "proof: it has a part on moving obstacles, which the problem does not have"
     elif problem.moving and isinstance(motion, Trajectory):
         if moving is None:
-            yield "proof: there is none among moving obstacles"
+            yield "proof: the part on moving obstacles is missing"
             return
         prover = MovingProver(problem.robot, problem.moving, along[0], places_of(*places), along[1])
         yield from _bound_errors(
@@ -185,7 +187,7 @@ def _bound_errors(
             rule = (
                 "not positive"
                 if not stated_clearance > 0
-                else f"more than the {CLEARANCE_CAP:g} m that are measured"
+                else f"more than {CLEARANCE_CAP:g} m, the largest clearance that a proof can state"
             )
             yield f"proof: its {quantity} clearance is {stated_clearance:g} m, which is {rule}"
         unproved = np.flatnonzero(marked & ~(margin >= stated_clearance - BOUND_TOLERANCE))

@@ -32,7 +32,7 @@ READY = "ready"
 """Named pose at which `demo --explore` starts, if the robot has it."""
 EXPLORE_TIME_LIMIT = 2.0
 """Time limit of each search of `demo --explore` [s]."""
-# Largest number of problems drawn for another arm, and the time limit of the search for each [s].
+# Largest number of random problems tried for another arm, and the time limit of the search for each [s].
 MAX_DRAWS = 50
 DRAW_TIME_LIMIT = 1.0
 
@@ -91,7 +91,7 @@ def shelf_problem(robot: str) -> Problem:
     rng = np.random.default_rng(0)
     search = load_planner("aorrtc")
     family = family_for(FAMILY, arm)
-    with Spinner(f"drawing a problem for {arm.name}"):
+    with Spinner(f"choosing a random problem for {arm.name}"):
         for _ in range(MAX_DRAWS):
             problem = family.draw(arm, rng).problem(arm)
             result = search.plan(problem, DRAW_TIME_LIMIT, until=FIRST)

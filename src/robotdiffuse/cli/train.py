@@ -76,7 +76,7 @@ def run_planner(arguments: Namespace) -> None:
         # the config's settings are for its own denoiser; another one gets settings of the same size
         options["denoiser_settings"] = DENOISERS.defaults(arguments.denoiser).paper_size()
     if {"denoiser", "objective", "waypoints"} & set(options):
-        options["progressive"] = False  # the stages are for the config's own parts
+        options["progressive"] = False  # its stages suit the config's own denoiser, objective and waypoints
     if "encoder" in config:
         options.setdefault("encoder", config["encoder"])
     if arguments.config == "paper" and "encoder" not in options:
@@ -204,7 +204,7 @@ def train_for_robot(
         copy_bundled_encoder(work / "encoder")
     report = train_planner(settings, str(work))
     network = "trajectory_prior" if settings.encoder is None else "model"
-    # the description last: its presence means that the weights are complete
+    # NAME.json is written last: if it exists, the weights are complete
     for file in sorted(work.glob(f"{network}.*"), key=lambda file: file.suffix == ".json"):
         write_atomically(weights_dir / file.name, file.read_bytes(), make_folder=True)
     return report, weights_dir

@@ -13,7 +13,7 @@ MAX_COORDINATE = 1e4
 """Largest absolute coordinate, size or joint value [m] or [rad]. At 10 km, adjacent float32 numbers are about
 1 mm apart; compiled code adds a margin for this error."""
 MIN_SIZE = 1e-9
-"""Smallest size [m]; float32 loses a smaller size when it is added to a coordinate."""
+"""Smallest size [m]: what is smaller is an error in units; float32 numbers near 1 m are 1e-7 m apart."""
 # Smallest limit of a joint's velocity, acceleration or jerk, and largest value of these rates, in SI units.
 MIN_RATE = 1e-6
 MAX_RATE = 1e6
@@ -88,8 +88,8 @@ def for_kernels(array: ndarray, dtype: type = np.float64) -> ndarray:
 
 
 def _writable(array: ndarray) -> bool:
-    """Whether the array's memory can be written to: through the array, through an array that it is a view of,
-    or, for memory that NumPy does not own, possibly through the owner (anything but bytes)."""
+    """Whether the array's memory may be written to, through this array or one that it is a view of. Memory of
+    an owner outside NumPy counts as writable unless the owner is `bytes`."""
     owner: Any = array
     while isinstance(owner, ndarray):
         if owner.flags.writeable:

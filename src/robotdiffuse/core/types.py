@@ -75,10 +75,10 @@ REST = 1e-3
 MAX_SAMPLE_RATE = 1e5
 """Largest rate at which trajectories are resampled [Hz]."""
 ACCELERATION_GAIN = 1.005
-"""Largest ratio of a joint's greatest acceleration after resampling to that before, without averaging."""
+"""`resample` averages the rows if a joint's greatest acceleration grows by more than this factor..."""
 ACCELERATION_SHARE = 0.25
-"""Largest difference between a resampled row's acceleration and that of the cubic that begins or ends there,
-without averaging, as a fraction of the joint's greatest acceleration."""
+"""... or if the acceleration of a row and that of the cubic that begins or ends there differ by more than
+this fraction of the joint's greatest acceleration."""
 TIME_TOLERANCE = 1e-9
 """A time at most this long before the start or after the end of a trajectory counts as that end; resampled
 rows are at least this far apart [s]."""

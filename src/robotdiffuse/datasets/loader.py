@@ -27,7 +27,8 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 
 SHARDS_PER_BLOCK = 16
-"""Number of shards whose rows are shuffled together. 16 shards of 500 rows map 57 MB."""
+"""Number of shards whose rows are shuffled together. 16 shards of 500 rows are 57 MB of
+memory-mapped files."""
 MAX_THREADS = 8
 """Largest number of threads that prefetch batches."""
 
@@ -152,7 +153,7 @@ class RopDataset(Dataset[dict[str, Tensor]]):
     def batches(
         self, batch_size: int, shuffle: bool = True, generator: torch.Generator | None = None
     ) -> Iterator[RopBatch]:
-        """One epoch of batches, prefetched by as many threads as PyTorch uses.
+        """One epoch of batches, prefetched by as many threads as PyTorch uses, at most MAX_THREADS.
 
         Rows are shuffled within blocks of 16 shards, and shards among blocks, so that reads are local.
 

@@ -383,8 +383,8 @@ def _cloud(cloud: PointCloud, frame: str) -> PointCloudMessage:
 
 
 def _transforms(problem: Problem, poses: dict[str, Pose], at: int) -> FrameTransforms:
-    """A message with the poses of frames. poses: pose in the base frame, for each link except the base and
-    each moving obstacle. at: time [ns]."""
+    """A message with the poses of frames. poses: pose in the base frame of each moving obstacle and
+    of each link but the base. at: time [ns]."""
     update = FrameTransforms()
     robot = problem.robot
     frames = {frame: (robot.base, T) for frame, T in poses.items()}
@@ -443,8 +443,8 @@ DECOMPRESSORS: dict[Any, Any] = {
     bz2.decompress: bz2.BZ2Decompressor,
     lz4.frame.decompress: lz4.frame.LZ4FrameDecompressor,
 }
-"""Decompressors that can stop before the end of a chunk of a ROS 1 bag, by the function of rosbags that they
-replace."""
+"""Decompressors that can stop before the end of a chunk of a ROS 1 bag, by the function that rosbags
+calls in their place."""
 VERSION = 9
 """Version of the bag's metadata. ROS 2 Humble, which is older, ignores fields that it does not know."""
 
@@ -552,10 +552,11 @@ class Recording(NamedTuple):
 
         allowed: largest size of all the messages together [bytes].
         """
+        left = allowed
         for topic, at, content, read in self.records(topics) if topics else ():
-            allowed -= len(content)
-            if allowed < 0:
-                raise InputError(f"the messages of {', '.join(topics)} take more than {MAX_UNPACKED:,} bytes")
+            left -= len(content)
+            if left < 0:
+                raise InputError(f"the messages of {', '.join(topics)} take more than {allowed:,} bytes")
             yield topic, at, read(content)
 
 

@@ -31,13 +31,14 @@ class SavedModule(nn.Module):
     """A network that is saved in files, see `checkpoint`."""
 
     def exports(self) -> dict[str, bytes]:
-        """Contents of the ONNX files that planning runs, by the ending after the network's name; empty for a
-        network that planning runs with PyTorch."""
+        """The ONNX files that planning runs: the contents of each, by the ending that follows the network's
+        name in its file name; empty for a network that planning runs with PyTorch."""
         return {}
 
 
 class Network(SavedModule):
-    """A network for one robot, made from a `RobotIdentity` and settings of the class that NETWORKS names."""
+    """A network for one robot, made from a `RobotIdentity` and settings, whose class is in the network's
+    entry of `weight_files.NETWORKS`."""
 
     robot: RobotIdentity
     settings: Any
@@ -70,7 +71,7 @@ def exported(
     inputs: Mapping[str, Tensor],
     dynamic: Mapping[str, Mapping[int, str]],
 ) -> bytes:
-    """A function of a module as the contents of an ONNX file. The module is frozen.
+    """A function of a module as the contents of an ONNX file. Freezes the module.
 
     call: the function; it is called with the inputs by position.
     inputs: an example of each input, by the name that the input gets in the file.

@@ -127,7 +127,8 @@ NETWORKS = Registry(
         ),
     },
 )
-"""An entry's kind is the command after `robotdiffuse train` that trains it; empty: `baseline NAME`."""
+"""The last value of an entry, its kind, is what follows `robotdiffuse train` in the command that trains the
+network; if it is missing, that is `baseline NAME`."""
 
 
 FORMAT = 2
@@ -236,7 +237,8 @@ def _identity(name: str, folder: FilePath) -> RobotIdentity:
 
 
 def folder_of(folder: str | FilePath) -> FilePath:
-    """The folder of weights for its path or, if the folder comes with the package, for its name."""
+    """The folder that the argument denotes: an existing path, else the name of a bundled folder of
+    weights."""
     place = FilePath(folder)
     return place if os.path.exists(place) or not os.path.isdir(BUNDLED / folder) else BUNDLED / folder
 

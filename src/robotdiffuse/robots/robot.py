@@ -482,8 +482,9 @@ def _with_body(robot: Robot, content: BodyContent) -> Robot:
 
 
 def scaled(robot: Robot, scale: float) -> Robot:
-    """The arm without attached bodies, with all its lengths, spheres and meshes scaled by a factor. Limits in
-    radians are unchanged."""
+    """The arm without attached bodies, with the offsets of its joints, the position limits of prismatic ones,
+    its spheres and its convex meshes scaled by a factor. All else is unchanged, also inertias and
+    surfaces."""
     arm = robot.arm
     prismatic = {joint.name for joint in arm.joints if joint.kind == "prismatic"}
 
@@ -535,7 +536,10 @@ def named_pose(robot: Robot, field: str, name: str) -> list[float]:
     complete = [pose for pose, values in robot.poses.items() if {*robot.joint_names} <= values.keys()]
     if not complete:
         values = f"a list of {robot.dof} numbers: {', '.join(robot.joint_names)}"
-        raise InputError(f"{field} is {shown(name)}; it must be {values} ({robot.name} has no named poses)")
+        raise InputError(
+            f"{field} is {shown(name)}; it must be {values} ({robot.name} has no named pose with values for "
+            "all planned joints)"
+        )
     if name not in robot.poses:
         raise unknown_name(f"pose in {field}:", name, complete)
     advice = f"; poses with all planned joints: {', '.join(complete)}"

@@ -310,7 +310,7 @@ READERS: dict[str, Callable[[Path], ndarray]] = {
 }
 
 
-def default_radius(file: str | Path) -> float:
-    """Default radius of the points of a file [m]: the radius of the sphere around a voxel for an octomap,
-    else POINT_RADIUS."""
-    return cover_radius(read_octomap(file)[1]) if Path(file).suffix.lower() == ".bt" else POINT_RADIUS
+def default_radius(file: str | Path, scale: float = 1.0) -> float:
+    """Default radius of the points of a file [m]: POINT_RADIUS, or for an octomap the radius of the sphere
+    around a voxel, in units of the file times `scale`."""
+    return scale * cover_radius(read_octomap(file)[1]) if Path(file).suffix.lower() == ".bt" else POINT_RADIUS

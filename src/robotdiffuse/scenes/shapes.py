@@ -318,7 +318,7 @@ class PointCloud(Shape):
             file: A .ply, .pcd, .xyz, .csv, .npy or .npz file, or the occupied voxels of an octomap (.bt), in
                 the frame of the base.
             point_radius: Radius of the sphere around each point [m]; None: 1 cm, or for an octomap the radius
-                of the sphere around a voxel, both times `scale`.
+                of the sphere around a voxel, which is scaled.
             scale: Meters for each unit of the file: 0.001 for millimeters.
             name: Name of the obstacle, for messages and allowed contacts.
 
@@ -329,7 +329,7 @@ class PointCloud(Shape):
         for note in notes:
             warnings.warn(note, stacklevel=2)
         scale = positive("point_cloud", "scale", scale)
-        point_radius = scale * default_radius(file) if point_radius is None else point_radius
+        point_radius = default_radius(file, scale) if point_radius is None else point_radius
         if scale == 1:
             return cls(points, point_radius, str(Path(file).absolute()), name)
         # without `file`, since problem files cannot state its scale
@@ -474,9 +474,9 @@ class HeightMap(_Posed, Triangulated):
 
     heights: heights along z [m], with rows along y and columns along x. Cells with a height that is not a
     number are holes.
-    cell: distance between neighboring points of the grid [m]. xyz, wxyz: pose of the height map's frame in
-    the frame of the robot's base. Its origin is the first point of the
-        grid, at height 0.
+    cell: distance between neighboring points of the grid [m].
+    xyz, wxyz: pose of the height map's frame in the frame of the robot's base. The origin of the height map's
+        frame is the first point of the grid, at height 0.
     name: see `Box`.
     """
 

@@ -50,8 +50,10 @@ class WorkerPool:
 
     def __init__(self, robots: dict[str, Robot], settings: ServeSettings) -> None:
         self.settings, self.metrics = settings, Metrics()
-        self.admitted = self.arriving = 0
-        """Number of admitted requests; received data of requests that are still incomplete [bytes]."""
+        self.admitted = 0
+        """Number of requests that wait or run."""
+        self.arriving = 0
+        """Received data of requests that have not arrived completely [bytes]."""
         self.stopping = False
         bare = {name: replace(robot) for name, robot in robots.items()}  # without compiled arrays
         self._workers = Workers(settings.workers, worker.prepare, (bare, settings), 0.0, keep_ready=True)
@@ -161,8 +163,8 @@ class Metrics:
         self.registry = CollectorRegistry()
         self._requests = Counter(
             "requests",
-            "Answers of the worker pool by endpoint and HTTP status code; each line of a batch counts, "
-            "refused and cancelled requests do not.",
+            "Answers of the worker pool by endpoint and HTTP status code; each line of a batch counts; "
+            "requests refused because the queue is full, and cancelled ones, do not.",
             ("endpoint", "code"),
             namespace=PREFIX,
             registry=self.registry,

@@ -136,12 +136,12 @@ def on_cpu(module: Module) -> Module:
 
 
 FREE_SETTINGS = ("minutes", "samples", "threads", "checkpoint_seconds", "data", "encoder", "device")
-"""Settings that may differ between the parts of one run."""
+"""Settings that may be changed when a run is resumed."""
 BAR_WIDTH = 24
 """Width of the progress bar [characters]. Bar and figures then fit into 80 columns; a line that wraps would
 be printed again at every update."""
 LOG_EVERY = 50
-"""Number of training steps between two rows of log.csv."""
+"""log.csv gets a row every so many steps, and at each checkpoint."""
 MAX_ROLLBACKS = 5
 """A run counts as diverged after this many returns to a checkpoint."""
 
@@ -152,7 +152,7 @@ class Validation(NamedTuple):
     loss: float
     """Loss on held-out data."""
     success: float | None = None
-    """Share of held-out problems that the network solves by itself; None: not measured."""
+    """Share of held-out problems whose single sample is free; None: not measured."""
 
 
 class TrainingTask(ABC):
@@ -177,7 +177,7 @@ class TrainingTask(ABC):
         """Figures on held-out data; every call uses the same data."""
 
     def finish(self) -> dict[str, float]:
-        """The figures of the trained network."""
+        """The metrics of the trained network, by name."""
         loss, success = self.validate(1.0)
         return {"validation": loss} | ({} if success is None else {"success": success})
 
@@ -494,7 +494,7 @@ def _progress(shown: bool) -> Progress:
 
 
 def train(task: TrainingTask, out: str) -> dict[str, float]:
-    """Train to the end and write the files into the folder `out`; returns the figures.
+    """Train to the end and write the files into the folder `out`; returns the metrics.
 
     The same call continues a run that was interrupted. If torchrun started several processes, all of them
     call this function and get the same result, see `TrainingRun`. Raises InputError if the folder holds a

@@ -65,17 +65,18 @@ READOUT_POSITIONS = np.stack(
 MAX_READOUT_DISTANCE = 0.3
 """Distances are clipped to plus and minus this [m]."""
 REGULARIZATION = 1e-7
-"""The paper's lambda: weight of the sum of squared weights, in the unit of the reconstruction's loss."""
+"""The paper's lambda: factor of the sum of the network's squared weights, which is added to the loss."""
 RELATIVE_RIDGE = 1e-3
-"""Regularization of the fit, relative to the mean variance of a code's numbers."""
+"""Ridge regularization of `linear_readout`, relative to the mean variance of the entries of the
+embeddings."""
 
 
 def train_encoder(settings: EncoderTraining, out: str) -> dict[str, float]:
     """Train an auto-encoder; write encoder.safetensors and encoder.json into the folder `out`.
 
-    The same call continues a run that was interrupted. Returns errors on new clouds [m]: those of the
-    reconstruction, see the encoder's `loss`, and of `linear_readout`; and `samples`. Raises the errors of
-    `loop.train`.
+    The same call continues a run that was interrupted. Returns the errors on new clouds [m] that the
+    encoder's `loss` and `linear_readout` report, and `samples`, the number of training samples. Raises the
+    errors of `loop.train`.
     """
     return train(_EncoderTask(settings, Processes(settings.device)), out)
 
@@ -245,7 +246,7 @@ class PlannerTask(MotionTask):
             frozen = None if settings.jointly else load_encoder(settings.encoder)
             encoder = frozen or make_encoder(settings.encoder, settings.encoder_settings)
         model = MotionNetwork(RobotIdentity.of(robot), model_settings(settings, encoder))
-        # codes are computed on the CPU: the frozen encoder stays there
+        # the model's copy moves to the device; the encoder itself stays on the CPU, where scenes are encoded
         model.encoder = copy.deepcopy(encoder)
         super().__init__(settings, robot, frozen, processes)
         self.title = model.settings.network
@@ -255,7 +256,7 @@ class PlannerTask(MotionTask):
         )
         self.module = self.model = model.to(processes.device)
         self.identity = {"robot": robot.name} | self._encoder_fingerprint("encoder_fingerprint")
-        # on the CPU, batches are computed and validation problems are sampled
+        # for computing batches, and for sampling motions of the validation problems
         self._on_cpu = on_cpu(model)
         self.clearances = packed_clearances(robot, model.settings)
         self._loss = PlannerLoss(model, robot, settings, processes)

@@ -74,7 +74,8 @@ def not_seen_free(
 
 
 def near_ends(known: OccupancyMap, ends: Sequence[Configuration]) -> Voxels:
-    """The voxels within CARVING_MARGIN of the arm at these configurations, or partly within it."""
+    """The voxels whose centers are within CARVING_MARGIN and half an edge of the arm at these
+    configurations."""
     return MAP.filled(known.robot, ends, CARVING_MARGIN + MAP.edge / 2)
 
 
@@ -136,7 +137,8 @@ KEY_DECIMALS = 5
 
 
 class GoalSeen:
-    """Says which balls on the arm's surface, at goal configurations, nothing has shown to be free yet."""
+    """Keeps, for each goal configuration, the balls on the arm's surface that are not yet shown to be
+    free."""
 
     def __init__(self, robot: Robot, known: OccupancyMap, views: ViewMemory, required: bool) -> None:
         """views: the kept views, which count for new goals as well. required: whether goals must be seen; if

@@ -252,7 +252,7 @@ def explore(
     beside: DepthView | None = None,
 ) -> Iterator[Event]:
     """Explore the problem's scene from its start to its goal, and yield each step. Ends with a step without a
-    motion, or after a collision.
+    motion, or after a motion that the validator refuses in the true scene.
 
     The cameras on the arm take images during each motion.
 

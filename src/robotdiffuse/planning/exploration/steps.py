@@ -73,9 +73,9 @@ class ExplorerSettings(Settings, name="explorer"):
     time_limit: Positive = 1.0
     """Time limit of each search [s]."""
     max_looks: Natural = 8
-    """Maximum number of views on the way to a goal."""
+    """Maximum number of looks (motions to a viewpoint, with an image there) on the way to a goal."""
     look_attempts: Count = 4
-    """Maximum number of viewpoints of a camera to which a step searches a motion, the best first."""
+    """For each camera, a step tries to plan a motion to at most this many viewpoints, the best first."""
     predict: bool = True
     """Whether the occupancy completion network weighs viewpoints and gives confidences, if it covers the
     arm's reach."""
