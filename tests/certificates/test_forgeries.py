@@ -208,7 +208,7 @@ FORGED: dict[str, tuple[Callable[[Record], object], str]] = {
     "more clearance": (of_widest("clearance", lambda x: [v + 1e-3 for v in x]), "proof: clearance of"),
     "less displacement": (of_widest("displacement", lambda x: [0.0 for _ in x]), "proof: displacement of"),
     "endless clearance": (of_widest("clearance", lambda x: [1e308 for _ in x]), "clearance"),
-    "clearance of 5 m": (set_to("scene_clearance", to=5.0), "more than the 1 m that are measured"),
+    "clearance of 5 m": (set_to("scene_clearance", to=5.0), "more than 1 m, the largest"),
     "clearance below 0": (set_to("self_clearance", to=-1.0), "not positive"),
     "no moving claim": (lambda record: record["moving"].pop(), "is missing"),
     "less displacement beside what moves": (
@@ -219,7 +219,7 @@ FORGED: dict[str, tuple[Callable[[Record], object], str]] = {
         lambda record: record["moving"][0]["stop"].__setitem__(-1, record["moving"][0]["stop"][-1] - 0.5),
         "proof: .*ball is missing from row",
     ),
-    "nothing about what moves": (set_to("moving", to=None), "none among moving obstacles"),
+    "nothing about what moves": (set_to("moving", to=None), "the part on moving obstacles is missing"),
     # tolerances
     "a negative tolerance": (set_to("tolerances", "limit_slack", to=-1.0), "must not be negative"),
     "a narrower chord": (set_to("tolerances", "chord", to=1e-9), "its cubics leave the straight lines"),

@@ -98,6 +98,8 @@ def test_scenes_in_meters_have_no_notes_on_units() -> None:
     floor = rd.Box([0, 0, -0.6], [30, 30, 1], name="floor")
     assert _notes() == _notes(floor) == _notes(rd.Sphere([0.5, 0.3, 0.6], 0.1), rd.Sphere([0, 9, 0], 0.1)) == ()
     assert _notes(rd.PointCloud(CUBE), rd.PointCloud(np.zeros((0, 3)))) == ()
+    [note] = _notes(rd.PointCloud(np.zeros((0, 3))), rd.Sphere([0, 5, 0], 0.2, name="ball"))
+    assert "the obstacle ball is beyond" in note, "it named the empty cloud"
 
 
 def test_a_depth_image_in_millimeters_is_noted() -> None:

@@ -368,4 +368,6 @@ def test_meshes_and_clouds_from_files_with_a_scale(tmp_path: Path) -> None:
         cloud = rd.PointCloud.from_file(tmp_path / "cloud.npy", 0.02, scale=0.001)
     np.testing.assert_allclose(cloud.points, [[0.1, 0, 0]])
     assert cloud.point_radius == 0.02
+    with pytest.warns(UserWarning, match="not finite"):
+        assert rd.PointCloud.from_file(tmp_path / "cloud.npy", scale=0.001).point_radius == 0.01, "it was 10 µm"
     refuses(r"mesh\.scale is 0; it must be a positive number", rd.Mesh.from_file, tmp_path / "cube.stl", scale=0)

@@ -302,7 +302,7 @@ def test_goals_are_given_as_in_python(goal: object, rows: list[list[float]]) -> 
     ("changes", "message"),
     [
         ({"goal": {"joints": "home"}}, "unknown pose in goal.joints: 'home'"),
-        ({"robot": "iiwa14", "start": "home"}, "(iiwa14 has no named poses)"),
+        ({"robot": "iiwa14", "start": "home"}, "(iiwa14 has no named pose with values for all planned joints)"),
         (
             {"scene": [{"box": {"center": [1, 0, 0], "size": [1] * 3, "rpy": [0] * 3, "wxyz": [1] * 4}}]},
             "scene[0].box has wxyz and rpy; it must have one of them",
