@@ -7,9 +7,9 @@ import pytest
 
 from helpers.fuzz.inputs import KINDS, outcome_of
 
-COUNTS = dict.fromkeys(("problem", "moveit", "mesh", "urdf"), 80) | dict.fromkeys(("bundle", "upload", "weights"), 50)
-COUNTS |= {"cloud": 500, "result": 200, "http": 120, "socket": 60, "motion": 30, "certificate": 120, "depth": 40}
-COUNTS |= {"head": 250, "settings": 40, "npz": 40}
+COUNTS = {"problem": 80, "moveit": 80, "mesh": 80, "urdf": 80, "bundle": 50, "upload": 50, "weights": 50, "cloud": 500}
+COUNTS |= {"result": 200, "http": 120, "socket": 60, "motion": 30, "certificate": 120, "depth": 40, "head": 250}
+COUNTS |= {"settings": 40, "npz": 40}
 SLOW = {"settings", "socket"}
 """These load PyTorch, or start a server."""
 

@@ -9,7 +9,7 @@ import pytest
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 SCRIPTS = sorted(file.stem for file in FOLDER.glob("*.py") if file.stem != "common")
-NEEDS = dict.fromkeys(("constraints", "moving_obstacles", "peers", "robots"), ("pybullet",))
+NEEDS = {script: ("pybullet",) for script in ("constraints", "moving_obstacles", "peers", "robots")}
 NEEDS |= {"certificates": ("ompl",), "mujoco_models": ("mujoco",), "planning_requests": ("pybullet", "pinocchio")}
 NEEDS |= {"scene_code": ("accelerate", "matplotlib", "zarr"), "server": ("fastapi", "httpx")}
 """Packages of extras that a script needs."""

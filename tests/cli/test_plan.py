@@ -5,6 +5,7 @@ import os
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -48,12 +49,12 @@ def test_files_are_written_though_nobody_reads_what_is_printed(tmp_path: Path, m
     assert rd.load_result("r.json").result.solved
 
 
-def melon(y: float) -> dict[str, object]:
+def melon(y: float) -> dict[str, Any]:
     return {"scene": [{"sphere": {"center": [0.3, y, 0.5], "radius": 0.2, "name": "melon"}}]}
 
 
 FAR = {"frame": "panda_hand", "xyz": [2.0, 0.0, 0.5], "wxyz": [1, 0, 0, 0]}
-NO_PLAN = {
+NO_PLAN: dict[str, tuple[dict[str, Any], str, str]] = {
     "start in collision": (melon(-0.45), "invalid_start", "melon"),
     "goal in collision": (melon(0.45), "invalid_goal", "melon"),
     "pose out of reach": ({"goal": {"pose": FAR}}, "unreachable_goal", "panda_hand"),

@@ -1,5 +1,6 @@
 """A workspace: obstacles that come, move and go, held objects, lines, a base elsewhere, lists of steps."""
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -153,7 +154,7 @@ def test_short_lines_and_turns_about_the_tool_point(way: float, turn: float, ang
         (lambda _: rd.MoveRelative([0, 0.1]), r"xyz is .*; it must be 3 finite numbers"),
     ],
 )
-def test_bad_input(call: object, message: str) -> None:
+def test_bad_input(call: Callable[..., object], message: str) -> None:
     space = panda()
     space.add(rd.Sphere([0.5, 0.0, 0.6], 0.2, name="ball"))
     refuses(message, call, space)
