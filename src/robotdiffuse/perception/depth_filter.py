@@ -50,9 +50,9 @@ def median_filter(depth):
 
 SQUARE = 11
 """Edge of the squares in which flat surfaces are smoothed [pixels]."""
-FLATNESS = 3.0
+FLATNESS = 2.0
 """A square is flat if the variance of inverse depth about the fitted plane is at most this many times the
-variance of the noise."""
+variance of the noise. With more, small objects would be taken for noise."""
 
 
 def smoothed(depth: Float32[ndarray, "h w"], spread: float) -> tuple[Float32[ndarray, "h w"], float]:
