@@ -132,7 +132,8 @@ def test_points_of_a_pose_that_may_be_off_are_larger_and_leave_start_and_goals_f
     apart = points[distances.min(axis=1) > 0]
     outside = shown.point_shapes(apart, PANDA, rd.Scene([]), START, START[None], errors[: len(apart)])
     assert CollisionChecker(PANDA, rd.Scene(outside)).free(START[None])[0]
-    noisy = shown.point_shapes(points, PANDA, rd.Scene([]), START, START[None], errors[:, ::-1])
+    noise = errors[:, ::-1] / shown.END_SPREADS
+    noisy = shown.point_shapes(points, PANDA, rd.Scene([]), START, START[None], noise)
     assert {shape.point_radius for shape in noisy} == {shown.POINT_RADIUS, shown.MIN_POINT_RADIUS}
     assert sum(len(shape.points) for shape in noisy) == len(kept), "noise may put points of the arm this deep"
 

@@ -307,6 +307,8 @@ def seen_shapes(
     return point_shapes(points, robot, known, start, goals, point_errors(views, points))
 
 
+END_SPREADS = 3.0
+"""Noise of up to this many standard deviations must not make a free start or goal invalid."""
 ERROR_STEP = 0.005
 """Errors of poses are rounded up to multiples of this; points of equal error form one shape [m]."""
 
@@ -327,9 +329,9 @@ def point_shapes(
     radius, at least MIN_POINT_RADIUS. Noise does not enlarge points: it puts the nearest points of a surface
     in front of the surface anyway.
 
-    Two kinds of points are left out because they may be displaced by the sum of their errors: those inside
-    the arm at start or goals by less than this sum, and those nearer to a known shape than KNOWN_DISTANCE
-    plus this sum.
+    Two kinds of points are left out because their errors may have displaced them: those inside the arm at
+    start or goals by less than the error of the pose plus END_SPREADS times the noise, and those nearer to a
+    known shape than KNOWN_DISTANCE plus both errors.
 
     errors: see `point_errors`. enlarged: whether the error of the pose is added to the radius.
     """
@@ -340,11 +342,12 @@ def point_shapes(
     shapes = list[SeenPoints]()
     for shift in np.unique(shifts):
         alike = points[shifts == shift]
-        error = shift + errors[shifts == shift, 1].max()
+        noise = errors[shifts == shift, 1].max()
         if arrays is not None:
-            alike = alike[~near_scene(arrays, alike, np.float32(KNOWN_DISTANCE + error))]
+            alike = alike[~near_scene(arrays, alike, np.float32(KNOWN_DISTANCE + shift + noise))]
         distances = sphere_distances(alike, ends)
         remaining = np.ones(len(alike), np.bool_)
+        error = shift + END_SPREADS * noise
         if error:
             remaining = (distances >= MIN_POINT_RADIUS) | (distances < -error)
         padded = POINT_RADIUS + enlarged * shift * np.array((1.0, 2 / 3, 1 / 3, 0.0))
