@@ -319,8 +319,8 @@ class Problem(Value):
     views: tuple[DepthView, ...] = ()
     """Depth images of the scene."""
     unknown: str | None = None
-    """Policy for space that no view observed, one of UNKNOWN_POLICIES; None: predicted where the completion
-    network covers the arm's reach, else padded. Ignored without views."""
+    """Policy for space that no view observed, one of UNKNOWN_POLICIES; None: predicted if the completion
+    network covers the arm's whole reach, else padded. Ignored without views."""
     T_world_base: Pose | None = None
     """Pose of the base in the world, for files and pictures; None: the base's frame is the world's frame.
     Scene, goal and views of a Problem are always in the base's frame; `in_world` accepts them in the
