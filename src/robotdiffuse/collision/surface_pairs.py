@@ -24,7 +24,7 @@ from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot
 
 MAX_OVERLAP = 0.005
-"""Overlap of convex parts beyond which links count as colliding whatever their surfaces do [m]."""
+"""Overlap of convex parts beyond which links count as colliding, without a test of their surfaces [m]."""
 RAYS = np.array([[0.6137, 0.5291, 0.5861], [-0.7313, 0.3917, -0.5583], [0.1723, -0.8839, 0.4348]])
 """Directions of the rays that tell whether a point is inside a surface; oblique, so that few rays run along
 an edge or a face."""

@@ -76,7 +76,7 @@ reach that differs by less than 1 cm."""
 
 @once_per_robot
 def covers(robot: Robot) -> bool:
-    """Whether the network predicts all voxels that the arm can reach, judged by random configurations."""
+    """Whether the network predicts all voxels that the arm reaches in random configurations."""
     lower, upper = (
         np.where(robot.prismatic, limit, np.clip(limit, -np.pi, np.pi))
         for limit in (robot.lower, robot.upper)

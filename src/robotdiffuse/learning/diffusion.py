@@ -204,7 +204,7 @@ def ddpm(
     predict: Predict, schedule: NoiseSchedule, draw_noise: DrawNoise, steps: int, eta: float = 1.0
 ) -> Samples:
     """Samples by DDPM, ancestral sampling (Ho et al. 2020): the sampler of the paper, with all T levels, of
-    MPD and of EDMP. All noise is drawn afresh, whatever `eta` is."""
+    MPD and of EDMP. All noise is drawn afresh, for any `eta`."""
     return ddim(predict, schedule, draw_noise, steps, eta=1.0)
 
 

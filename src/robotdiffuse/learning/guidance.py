@@ -102,7 +102,7 @@ def _push_away(cost, gradient, push, out):
     """Writes to out[dof] the Gauss-Newton step -g 2c / (g.g) of the collision cost c with gradient g, at most
     `push` [rad] long.
 
-    The step just clears a single contact, whatever the scale of the cost. Returns 1 if there is a contact,
+    The step just clears a single contact, at any scale of the cost. Returns 1 if there is a contact,
     else 0.
     """
     out[:] = _ZERO

@@ -80,7 +80,7 @@ def mistakes(view: DepthView) -> Iterator[tuple[str, DepthView]]:
 
 
 def camera_note(view: DepthView, robot: Robot, start: Configuration) -> str:
-    """What is wrong with a view's camera, judged by the arm in the image; "" if nothing is wrong, or if too
+    """What is wrong with a view's camera, as the arm in the image shows; "" if nothing is wrong, or if too
     little of the arm is visible. The last 32 results are cached, as several calls may use the same view.
 
     start: the arm's configuration if the view states none.

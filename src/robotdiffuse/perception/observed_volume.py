@@ -132,23 +132,23 @@ def _hide_arm(depth, empty, intrinsics, spheres):
 
 def usable_image(
     view: DepthView, robot: Robot, q: Configuration, margin: float
-) -> tuple[Float32[ndarray, "h w"], float, Float32[ndarray, "n 4"]]:
-    """The view's filtered image, its noise, and the arm's spheres in the camera's frame, inflated by the
-    margin [m], by noise and by the error of the camera's pose.
+) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "n 4"]]:
+    """The view's filtered image, and the arm's spheres in the camera's frame, inflated by the margin [m], by
+    noise and by the error of the camera's pose.
 
     Pixels where nothing seems to be in range are infinite if the view states its range, otherwise EMPTY. Near
     a surface in the image, they are -d instead of infinite, where d is the surface's depth; see `open_depth`.
     If their rays meet the arm, they are -NEAREST.
     """
     T = view.T_base_camera
-    depth, spread, _ = filtered(view)
+    depth = filtered(view).depth
     arm = placed_spheres(robot, q)
     spheres = grown_for_errors(arm, view)
     spheres[:, :3] = (spheres[:, :3] - T[:3, 3]) @ T[:3, :3]
     spheres[:, 3] += margin
     spheres = spheres.astype(np.float32)
     if view.cloud is not None:
-        return depth, spread, spheres
+        return depth, spheres
     intrinsics = np.array(view.intrinsics, np.float32)
     arm_pixels = _arm_pixels(depth, intrinsics, spheres)
     empty = empty_regions(view.depth, view.range, arm_pixels)
@@ -159,7 +159,7 @@ def usable_image(
         # it enlarges the rectangles of pixels that must all be free.
         outline = np.column_stack([spheres[:, :3], arm[:, 3] + view.pose_deviation[0]]).astype(np.float32)
         _hide_arm(depth, empty, intrinsics, outline)
-    return depth, spread, spheres
+    return depth, spheres
 
 
 @kernel(fastmath=FASTMATH)
@@ -339,8 +339,8 @@ def _half_sizes(T, x, y, half, error):
 
 @kernel(fastmath=FASTMATH)
 def _state_of_block(first, intrinsics, T, low, voxel, errors, size, factor, table, missing):
-    """OUT or FREE if all voxels of a block have this state, judged by the rectangle that the block covers in
-    the image; -1 if its voxels must be tested one by one.
+    """OUT or FREE if the rectangle that a block covers in the image shows that all of its voxels have this
+    state; -1 if the voxels must be tested one by one.
 
     first: indices of the block's first voxel. size: height and width of the image.
     """
@@ -580,8 +580,9 @@ def carve_view(
     are points of the arm, plus an allowance for noise [m]. narrowed: free space is narrowed by this fraction
     of the largest error of the camera's pose.
     """
-    depth, spread, spheres = usable_image(view, robot, q, arm_margin)
+    depth, spheres = usable_image(view, robot, q, arm_margin)
     position, angle = narrowed * np.array(view.pose_deviation)
+    farthest = MAX_DEPTH if view.range is None else view.range
     state = np.empty(grid.shape, np.uint8)
     depth_behind = np.empty(grid.shape, np.float32)
     counts = np.empty(grid.shape, np.int32)
@@ -591,7 +592,7 @@ def carve_view(
         view.T_base_camera.astype(np.float32),
         spheres,
         *grid.frame,
-        np.array([position, angle, spread, MAX_DEPTH if view.range is None else view.range], np.float32),
+        np.array([position, angle, filtered(view).spread, farthest], np.float32),
         state,
         depth_behind,
         counts,

@@ -1,6 +1,6 @@
 """Compiled lower bounds of the distances between convex meshes and shapes along short motions.
 
-A plane that separates two convex bodies proves that they do not touch, whatever algorithm found the plane.
+A plane that separates two convex bodies proves that they do not touch, no matter how the plane was found.
 The algorithm of Gilbert, Johnson and Keerthi (GJK, 1988) finds the best plane for the poses in the middle of
 the motion, starting from the plane of the previous motion. The bound needs only this plane: it is the
 smallest gap, along the plane's normal, between the vertices of one body and the other body during the motion.

@@ -208,7 +208,8 @@ class GoalSeen:
         them when an image was taken."""
         for view in views:
             assert view.configuration is not None  # the map takes no other views
-            depth, _, _ = usable_image(view, self._robot, view.configuration, 0.0)
+            depth, _ = usable_image(view, self._robot, view.configuration, 0.0)
+            noise = MARGIN_SPREADS * filtered(view).edge_spread
             seen = self._distances(balls, view.configuration) < -BALL_RADIUS
             see_through(
                 depth,
@@ -216,8 +217,8 @@ class GoalSeen:
                 view.T_base_camera.astype(np.float32),
                 balls,
                 np.float32(BALL_RADIUS),
-                np.array([*view.pose_deviation, MARGIN_SPREADS * filtered(view).edge_spread], np.float32),
-                BORDER if filtered(view).spread else np.float32(0),
+                np.array([*view.pose_deviation, noise], np.float32),
+                BORDER if noise else np.float32(0),
                 seen,
             )
             balls = balls[~seen]

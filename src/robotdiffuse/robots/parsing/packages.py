@@ -82,8 +82,8 @@ def _folders(variable: str) -> list[Path]:
 
 
 def is_xacro(file: Path, root: ET.Element) -> bool:
-    """Whether a file must be compiled by xacro, judged by its name, its elements, and expressions in
-    attributes."""
+    """Whether a file must be compiled by xacro: its name says so, or it has elements of xacro, or expressions
+    in attributes."""
     return ".xacro" in file.name.lower() or any(
         "xacro" in element.tag.rpartition("}")[0]
         or any("${" in value or "$(" in value for value in element.attrib.values())

@@ -178,7 +178,7 @@ MAX_HAND_FINGER_JOINTS = 3
 """Largest number of movable joints per finger of a gripper with another number of fingers."""
 MIN_ARM_JOINTS = 4
 """Smallest number of movable joints of an arm if there are several chains. After this many joints, three or
-more branches form a hand, whatever the number of joints per finger."""
+more branches form a hand, with any number of joints per finger."""
 
 
 class Arm(NamedTuple):

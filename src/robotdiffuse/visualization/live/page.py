@@ -681,7 +681,7 @@ class Obstacles:
 
 
 def _appearance(shape: Shape) -> object:
-    """A key that is equal for shapes with equal geometry, whatever their poses."""
+    """A key that is equal for shapes with equal geometry, at any poses."""
     if isinstance(shape, Mesh):
         return "mesh", shape.vertices.tobytes(), shape.faces.tobytes()
     if isinstance(shape, PointCloud):

@@ -68,7 +68,7 @@ def free_port(host: str, port: int) -> int:
 
 
 def may_connect(path: str, host: str, origin: str | None, token: str) -> bool:
-    """Whether a browser may connect, judged by the path and the headers Host and Origin of its request."""
+    """Whether a browser may connect, by the path and the headers Host and Origin of its request."""
     if origin is not None and _part(origin, "netloc") != host:
         return False
     if token:
