@@ -1,4 +1,4 @@
-"""The code of a package is at most as long as CONTRIBUTING.md allows, in tokens, which ignore layout."""
+"""The code of each package has at most as many tokens as CONTRIBUTING.md allows; tokens ignore layout."""
 
 import ast
 import io

@@ -1,4 +1,4 @@
-"""Forged certificates: whoever alters a true one, hashes included, is refused with the reason."""
+"""Forged certificates: a valid certificate that was altered, hashes included, is refused with the reason."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""There is always a folder for compiled code, even in a read-only installation; damaged files of it."""
+"""The cache of compiled code: there is always a folder for it, even in a read-only installation; damaged files."""
 
 import io
 import os

@@ -1,4 +1,4 @@
-"""Readers of untrusted files, of meshes too, return a value or raise one line, for any content."""
+"""Readers of untrusted files, including meshes, return a value or raise a one-line error, for any content."""
 
 import ast
 import copy

@@ -1,4 +1,4 @@
-"""Loading takes no time of a call, and what is prepared does; Ctrl-C ends programs."""
+"""Loading does not count as time of a call, but preparing a scene does; Ctrl-C ends programs."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""One table, two renderers: every cell is there, what would be formatting is escaped, the best is marked."""
+"""Tables in Markdown and in the terminal: all cells appear, markup is escaped, the best value is marked."""
 
 import re
 from io import StringIO

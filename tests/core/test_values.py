@@ -1,4 +1,4 @@
-"""Values hold arrays that nobody can write to: verdicts, and what is prepared, are kept by identity."""
+"""Arrays of values are read-only, since verdicts and prepared data are cached by the identity of the value."""
 
 import copy
 import pickle

@@ -1,6 +1,6 @@
-"""Arguments of the wrong type are an InputError of one line, for every public function that takes them.
+"""Arguments of the wrong type raise a one-line InputError, for every public function.
 
-In a process of its own: in this one beartype, which tests switch on, would refuse it first.
+The calls run in a separate process: in this one, beartype, which the tests enable, would raise an error first.
 """
 
 import subprocess

@@ -1,4 +1,4 @@
-"""Data sets of motions that were made elsewhere."""
+"""Data sets of motions from other sources."""
 
 from pathlib import Path
 

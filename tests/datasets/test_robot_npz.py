@@ -1,4 +1,4 @@
-"""The authors' layout: what is written in it, and the data set that is made of it, come back the same."""
+"""The file layout of the paper's authors: exported motions are equal when read, and make an equal data set."""
 
 import zipfile
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The data set on disk: same bytes for the same arrays, nothing half-written, clear words about damage."""
+"""The data set on disk: same bytes for the same arrays, no partial files, one-line errors for damage."""
 
 import errno
 import json

@@ -1,4 +1,4 @@
-"""Clouds made in batches: on the surfaces, uniform by area."""
+"""Clouds made in batches: points lie on the surfaces and are uniform by area."""
 
 import numpy as np
 import torch

@@ -1,4 +1,4 @@
-"""Public functions document their parameters as Google's style has it, and their examples run."""
+"""Public functions document their parameters in Google's style, and their examples run."""
 
 import doctest
 import inspect

@@ -1,4 +1,4 @@
-"""Each example of docs/extending.md is written as a module, registered by its line, and used."""
+"""Each example of docs/extending.md is saved as a module, added to its table by its line, and used."""
 
 import sys
 from collections.abc import Iterator

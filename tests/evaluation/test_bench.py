@@ -1,4 +1,4 @@
-"""bench run: every call is a record; crashes, overruns and exceptions are failures; killed runs go on."""
+"""bench run: every call makes a record; crashes, overruns and exceptions are failures; killed runs can be continued."""
 
 import json
 import os

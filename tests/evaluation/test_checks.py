@@ -1,4 +1,4 @@
-"""The check of a data set: what is wrong is found, by both validators, and named; what is right passes."""
+"""The check of a data set: both validators find and name wrong motions, and accept correct ones."""
 
 import sys
 from dataclasses import replace

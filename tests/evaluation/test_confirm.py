@@ -1,4 +1,4 @@
-"""bench confirm: PyBullet agrees with what was solved, and finds a motion that was tampered with."""
+"""bench confirm: PyBullet accepts solved motions, and finds a motion that was tampered with."""
 
 from dataclasses import replace
 from pathlib import Path

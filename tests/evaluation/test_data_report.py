@@ -1,4 +1,4 @@
-"""The figures of a data set by hand, and the page that shows them."""
+"""The figures of a data set against figures by hand, and the page that shows them."""
 
 import re
 

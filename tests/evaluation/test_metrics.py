@@ -1,4 +1,4 @@
-"""Figures of motions whose values are known, the criteria of success one by one, statistics, and ComScore."""
+"""Metrics on motions with known values, each criterion of success, statistics, and ComScore."""
 
 from dataclasses import replace
 from math import comb

@@ -1,4 +1,4 @@
-"""Runs: methods take turns, kept records are not made again, planners and networks are validated."""
+"""Runs: methods alternate, stored records are not made again, motions of planners and networks are validated."""
 
 from collections.abc import Iterator
 from dataclasses import replace

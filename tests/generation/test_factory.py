@@ -1,4 +1,4 @@
-"""The data factory: the same data whatever happens, and motions that are what they claim to be."""
+"""The data factory: the same data after any interruption, and motions that agree with their records."""
 
 import json
 import multiprocessing

@@ -1,4 +1,4 @@
-"""The data factory, the bench and plan_many on Ray: nodes come and go, the data stay the same."""
+"""The data factory, the bench and plan_many on Ray: the data stay the same while nodes join and leave."""
 
 import os
 import socket

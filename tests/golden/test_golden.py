@@ -1,6 +1,6 @@
-"""Held-out problems are what they were: digests of their numbers, their count and norm and their projection
-on a fixed random direction. Processors differ in the last bits. `python tests/golden/test_golden.py` writes
-the digests anew; a commit that does says which and why."""
+"""Held-out problems have not changed: digests of their numbers are equal within a tolerance, since processors
+differ in the last bits. A digest consists of the count, the norm and the projection on a fixed random
+direction. `python tests/golden/test_golden.py` writes new digests; such a commit says which changed and why."""
 
 import json
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Awkward URDFs, made: what works, and what is refused by one line that says what to do."""
+"""Generated awkward URDFs: some work, the others are refused by a one-line error that says what to do."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,7 @@
 """The code blocks of Markdown pages, and how each kind is tried.
 
 All blocks of a page are tried in order, in one empty folder and with one set of Python names. Comments before
-a block say more of it; they show nowhere:
+a block, which pages do not show, say more about it:
 
     <!-- file: NAME -->    the block is the content of this file, for what comes after it
     <!-- needs: NAME -->   one of PREPARED is put into the folder first

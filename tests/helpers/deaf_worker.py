@@ -1,4 +1,4 @@
-"""A worker that does not let go of the interpreter, as compiled code does not, and its parent."""
+"""A parent process and a worker that holds Python's global lock (GIL) for a while, as compiled code may."""
 
 import ctypes
 import os

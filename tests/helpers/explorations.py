@@ -1,4 +1,4 @@
-"""A recorded exploration for the tests of what is made of one."""
+"""A recorded exploration, for tests of what shows or reads one."""
 
 from functools import cache
 

@@ -1,4 +1,4 @@
-"""Robots with inertias, and motions that swing them about."""
+"""Robots with inertias, and motions that swing them."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""URDFs of arms of balls, which are fitted with spheres in no time, put together from single joints."""
+"""Generated URDFs: arms put together from single joints, with balls as links, which spheres fit at once."""
 
 from collections.abc import Iterable
 from pathlib import Path

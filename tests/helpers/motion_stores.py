@@ -1,4 +1,4 @@
-"""Small data sets of straight motions whose records are true, for tests of what validates and shows data."""
+"""Small data sets of straight motions with correct records, for tests of code that validates or shows data."""
 
 from pathlib import Path
 

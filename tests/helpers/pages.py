@@ -1,4 +1,4 @@
-"""What the pages of replays hold."""
+"""The data in the pages of replays."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Errors of users: each is one line."""
+"""Checks that a call raises a one-line InputError."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""`robotdiffuse serve` in a process of its own, which knows a planner that fails in every way."""
+"""`robotdiffuse serve` in a separate process, with an additional planner that fails on request."""
 
 import os
 import re

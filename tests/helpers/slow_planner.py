@@ -1,4 +1,4 @@
-"""A planner that returns when the test lets it."""
+"""A planner that returns only when the test says so."""
 
 import threading
 

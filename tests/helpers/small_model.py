@@ -1,4 +1,4 @@
-"""A small model of motions for the arm of boxes, untrained: for tests of what is built around one."""
+"""A small, untrained diffusion model for the arm of boxes, for tests of code that uses a model."""
 
 import shutil
 import tempfile

@@ -1,4 +1,4 @@
-"""Small data sets in the form of the data factory, made without planning, for tests of what reads them."""
+"""Small data sets in the format of the data factory, made without planning, for tests of code that reads them."""
 
 from pathlib import Path
 from typing import Any

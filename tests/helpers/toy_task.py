@@ -1,4 +1,4 @@
-"""A training that is over in no time."""
+"""A training that takes almost no time."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Waiting for what threads and servers do."""
+"""Waits until threads or servers reach a state."""
 
 import time
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Round trips of exported motions, motions of other programs, and cases that failed."""
+"""Round trips of exported motions, motions of other programs, and cases that failed earlier."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""What tests of networks share."""
+"""Fixtures that tests of networks share."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Guidance: what it may change, that it helps, and its steps against formulas written out here in NumPy."""
+"""Guidance: it keeps start and goal, reduces collisions, and its steps agree with formulas in NumPy."""
 
 from dataclasses import replace
 

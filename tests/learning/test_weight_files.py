@@ -1,4 +1,4 @@
-"""Weight files that are no files, or that name others."""
+"""Weight files that are pipes or links to devices, or that refer to other files."""
 
 import os
 from pathlib import Path

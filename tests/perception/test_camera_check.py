@@ -1,4 +1,4 @@
-"""A camera checked against the arm in its image, which is drawn by balls on the surfaces of its meshes."""
+"""The check of a camera by the arm in its image; the images of the arm are drawn by balls on its meshes."""
 
 from dataclasses import replace
 from functools import cache

@@ -1,4 +1,4 @@
-"""Noise of depth images: its size as estimated, and what the filter leaves."""
+"""Noise of depth images: its estimated size, and the noise that remains after the filter."""
 
 from dataclasses import replace
 from functools import cache

@@ -1,4 +1,4 @@
-"""What depth views tell of the space: views made by hand, a wall most of all."""
+"""Free, occupied and unknown voxels from depth views that are made by hand, mostly of a wall."""
 
 import numpy as np
 import pytest

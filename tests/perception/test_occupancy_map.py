@@ -1,4 +1,4 @@
-"""Maps of voxels from many views, against the scenes that the views are of."""
+"""Voxel maps from many views, against the scenes that the views show."""
 
 from dataclasses import replace
 from functools import cache

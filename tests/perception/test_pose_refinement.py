@@ -1,4 +1,4 @@
-"""Poses of cameras refined by what they see: errors that were added to true poses are found again."""
+"""Camera poses refined by the images: errors that were added to true poses are found."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What views add to a problem: points on obstacles alone, whatever noise, arm and known shapes."""
+"""Points that views add to a problem: only points on obstacles, with noise, with the arm in view, and beside known shapes."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Unknown space that a motion crosses and its voxels, sampled worlds in which it is free, confidence."""
+"""Unknown voxels that a motion sweeps, sampled worlds in which the motion is free, and its confidence."""
 
 from itertools import pairwise
 

@@ -1,4 +1,4 @@
-"""What a call of a planner records: shorter and shorter paths, refusals of the validator, compile time."""
+"""Records of a planner's call: ever shorter paths, refusals of the validator, compile time."""
 
 import numpy as np
 import pytest

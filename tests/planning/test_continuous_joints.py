@@ -1,4 +1,4 @@
-"""Joints that turn without end: values a turn apart are the same, and motions take the short way."""
+"""Continuous joints: values that differ by a whole turn are equal, and motions take the short way."""
 
 from dataclasses import replace
 from pathlib import Path as FilePath

@@ -1,4 +1,4 @@
-"""Explorer: what its motions promise, against scenes that it sees by simulated cameras alone."""
+"""Explorer: its motions keep its policy in scenes that it knows only by simulated cameras."""
 
 from dataclasses import replace
 from itertools import islice, pairwise

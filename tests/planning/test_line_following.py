@@ -1,5 +1,5 @@
-"""Straight lines of the tool: motions lie on them at every millisecond, by forward kinematics of cubics
-through the rows; lines that end early say where and why."""
+"""Straight lines of the tool: motions lie on the lines at every millisecond, by forward kinematics of the cubics
+through the rows; if a line cannot be followed to its end, the result says where it ends and why."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Where to look next: from where what the motion crosses is in plain sight."""
+"""The next view: a pose from which nothing hides the space that the motion crosses."""
 
 from dataclasses import replace
 

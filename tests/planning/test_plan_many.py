@@ -1,4 +1,4 @@
-"""Many problems: results in order, as alone; a process that dies costs one problem."""
+"""plan_many: results in order, equal to those of single calls; a process that dies costs only one problem."""
 
 import subprocess
 import sys

@@ -1,5 +1,5 @@
-"""Poses as goals: the nearest configuration, tolerances of arms of few joints, several goals; a pose for each
-of several links: configurations that bring all of them there, verdicts, files."""
+"""Poses as goals: the nearest configuration, tolerances for arms of few joints, several goals. Goals with a pose
+for each of several links: inverse kinematics, validation, files."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace

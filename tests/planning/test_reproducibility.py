@@ -1,4 +1,4 @@
-"""The same seed gives the same motion: again in one process, and in another one with other threads."""
+"""The same seed gives the same motion: in a second call, and in a process with another number of threads."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""A workspace: obstacles that come, move and go, held objects, lines, a base elsewhere, lists of steps."""
+"""A workspace: obstacles that are added, moved and removed, held objects, lines, a moved base, lists of steps."""
 
 from collections.abc import Callable
 from itertools import pairwise

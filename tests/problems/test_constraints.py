@@ -1,4 +1,4 @@
-"""Path constraints: what is refused, files, and proofs beside dense sampling and finite differences."""
+"""Path constraints: errors, files, and proofs against dense sampling and finite differences."""
 
 from collections.abc import Callable
 from dataclasses import replace

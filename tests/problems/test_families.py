@@ -1,4 +1,4 @@
-"""Every family of the table: its problems are usable, repeatable and what it says of itself."""
+"""Every family of the table: its problems can be planned, are repeatable and keep the family's settings."""
 
 from dataclasses import asdict, replace
 

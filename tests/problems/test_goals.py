@@ -1,4 +1,4 @@
-"""Goals with tolerances, of several, relative to objects; waypoints."""
+"""Goals with tolerances, several goals, goals relative to objects; waypoints."""
 
 from dataclasses import replace
 from pathlib import Path

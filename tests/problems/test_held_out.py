@@ -1,4 +1,4 @@
-"""Held-out problems: one rule for what they are worth, kept and gone on with."""
+"""Held-out problems: which ones count as hard, in a cache file that can be continued."""
 
 from pathlib import Path
 

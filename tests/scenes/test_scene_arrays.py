@@ -1,4 +1,4 @@
-"""Packed scenes: there and back, floors apart, distances as the shapes' own, also when they are turned."""
+"""Scenes packed in arrays: round trips, floors stored separately, distances equal to those of the shapes, turned ones too."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Timing: limits, rest at both ends, geometry that stays on verified ground."""
+"""Timing: limits hold, motions begin and end at rest, and they stay on the path or its checked rounded corners."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Explorations: moments, faces of voxels, the strip of pictures, and the page, also in a browser."""
+"""Drawings of explorations: their moments, faces of voxels, the strip of pictures, and the page, also in a browser."""
 
 import base64
 from pathlib import Path

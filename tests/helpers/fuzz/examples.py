@@ -1,4 +1,4 @@
-"""Files and requests that are right, which fuzzing damages."""
+"""Valid files and requests, which fuzzing damages."""
 
 from typing import Any
 

@@ -1,9 +1,9 @@
 """The kind `socket`: damaged requests to a running `robotdiffuse serve`, over its socket.
 
-The server must answer each with 2xx, 4xx or 503, errors as one line of JSON, or close the connection if a
-request was never complete, within LIMIT. Now and then a good request must get the answer that it got at
-first, and the server may hold no more memory than before, and no requests or connections. This server waits
-for clients for less time than `robotdiffuse serve` does, so that inputs take less time.
+Within LIMIT, the server must answer each request with 2xx, 4xx or 503, with errors as one line of JSON; it
+may close the connection instead if the request was never complete. From time to time, a valid request must
+get the same answer as at first; the server must then hold no further requests or connections and no more
+memory than before. This server has shorter timeouts for clients than `robotdiffuse serve`, to save time.
 """
 
 import atexit

@@ -1,4 +1,4 @@
-"""Training data: random scenes, cached codes, turned copies, splits, and data that do not fit."""
+"""Training data: cached embeddings, turned copies, splits, and errors for unsuitable data."""
 
 import shutil
 from dataclasses import replace

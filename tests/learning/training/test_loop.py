@@ -1,4 +1,4 @@
-"""The training loop: steps that are not finite."""
+"""The training loop: losses and gradients that are not finite."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Policies for unknown space: assumptions only add obstacles, with start and goal carved free; what results say."""
+"""Policies for unknown space: assumptions only add obstacles, keep start and goal free, and are named in results."""
 
 from dataclasses import replace
 from pathlib import Path

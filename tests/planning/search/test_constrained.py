@@ -1,5 +1,5 @@
-"""Planning under path constraints: motions keep them at every millimeter, by kinematics that share no code
-with search and validator; starts and goals that cannot are reported."""
+"""Planning under path constraints: motions keep the constraints at every millimeter, by kinematics that share
+no code with search and validator; starts and goals that violate a constraint are reported."""
 
 from dataclasses import replace
 from itertools import pairwise

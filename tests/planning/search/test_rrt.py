@@ -1,4 +1,4 @@
-"""AORRTC and RRT-Connect: paths below the bound, shorter with time; requests, ends near contact, reasons."""
+"""AORRTC and RRT-Connect: paths below the length bound, shorter with time; starts and goals near contact; reasons."""
 
 import re
 import time

@@ -1,4 +1,4 @@
-"""Furniture scenes: as their settings say, regions free, nothing in the base."""
+"""Furniture scenes: they keep their settings, their regions are free, and nothing is inside the base."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""MuJoCo models: frames, limits and collisions against MuJoCo itself; scenes; what cannot be planned with."""
+"""MuJoCo models: frames, limits and collisions against MuJoCo itself; scenes; models that are refused."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The exploration that is watched: its steps one by one, pauses, restarts and errors, without a browser."""
+"""The exploration of the live page, without a browser: single steps, pauses, restarts and errors."""
 
 import time
 from collections.abc import Iterator
