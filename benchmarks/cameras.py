@@ -22,8 +22,8 @@ Records are kept in FILE and not made again; --report prints their tables.
 --weights adds the method 'predicted' with other weights of the occupancy completion network, folders of
 `train completion`; such methods are named by the folder. Weights that were trained without some families are
 tried on these families. --fit prints the constants RATES of perception/unknown_space.py, from problems with
-even numbers. Settings were chosen on these problems too, and --odd leaves them out of the report. --times
-prints the CPU time of the network.
+even numbers. Settings were also chosen on problems with even numbers; --odd leaves these out of the report.
+--times prints the CPU time of the network.
 
 --next-view plans a motion from one view, and again with a second view: from the pose that `next_view`
 proposes, from a random one of the poses that `next_view` can choose, and from the first camera's pose turned
@@ -89,9 +89,9 @@ METHODS = {
     "padded": "padded",
     "predicted": PREDICTED,
 }
-TRUE = "true voxels"
+TRUE_VOXELS = "true voxels"
 """Method `predicted` with the true occupancy of the voxels of 2 cm in place of the network's prediction."""
-BY = "predicted by "
+PREDICTED_BY = "predicted by "
 """Method `predicted` with other weights: this text and the name of the folder with the weights."""
 # Number of timed calls of the network, and of calls before them.
 TIMED_CALLS = 140
@@ -105,7 +105,7 @@ Row = dict[str, Any]
 RECORDED = DepthNoise(spread=0.004, correlation=1.5, missing=0.01, zeros=True)
 """Noise as in recordings of sensors: errors of neighboring pixels have a correlation of 0.8, and 0 stands for
 "no return" and for "nothing in range"."""
-OFF = (0.005, float(np.radians(1.0)))
+POSE_ERROR = (0.005, float(np.radians(1.0)))
 """Error of a camera's calibration: position [m] and angle [rad]."""
 POSE, NOISE, RANGE, FAR = "pose not stated", "noise not stated", "range not stated", "0 taken as far"
 """Steps of docs/how_to/real_camera.md that are skipped."""
@@ -116,7 +116,8 @@ class Images(NamedTuple):
 
     noise: DepthNoise | None = None
     off: bool = False
-    """Whether the stated pose of each camera is off by OFF, in a direction and about an axis drawn once."""
+    """Whether the stated pose of each camera is off by POSE_ERROR, in a direction and about an axis that are
+    drawn once for each camera."""
     skipped: str = ""
     """The error that is not stated, or the mistake: one of POSE, NOISE, RANGE and FAR; "": none."""
 
@@ -126,15 +127,15 @@ class Images(NamedTuple):
         if self.off:
             rng = np.random.default_rng([seed, view.depth.size])
             shift, axis = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
-            T[:3, 3] += OFF[0] * T[:3, :3] @ shift
-            T[:3, :3] @= Rotation.from_rotvec(OFF[1] * axis).as_matrix()
+            T[:3, 3] += POSE_ERROR[0] * T[:3, :3] @ shift
+            T[:3, :3] @= Rotation.from_rotvec(POSE_ERROR[1] * axis).as_matrix()
         return replace(
             view,
             depth=np.where(view.depth == 0, np.inf, view.depth) if self.skipped == FAR else view.depth,
             T_base_camera=T,
             range=None if self.skipped == RANGE else view.range or MAX_RANGE,
             noise=None if self.skipped == NOISE else self.noise,
-            pose_deviation=OFF if self.off and self.skipped != POSE else (0.0, 0.0),
+            pose_deviation=POSE_ERROR if self.off and self.skipped != POSE else (0.0, 0.0),
         )
 
 
@@ -162,8 +163,8 @@ def with_walls(problem: Problem) -> Problem:
 
 def problems(family: str, count: int, known: set[int]) -> Iterator[tuple[int, Problem]]:
     """Held-out problems of a family, or problems of a folder, with their numbers. The straight line does not
-    solve them, and a search in the true scene does. known: numbers of such problems that are known already;
-    up to the largest of these, no other problem is tried."""
+    solve them, and a search in the true scene does. known: numbers of problems that are already known to
+    be of this kind; up to the largest of these numbers, no other problem is tried."""
     numbered = (
         ((i, held_out_problem(family, i)) for i in itertools.count())
         if family in FAMILIES
@@ -189,7 +190,7 @@ def unknown_scene(problem: Problem) -> Scene:
 
 
 def _hard(problem: Problem) -> bool:
-    trivial = line_length(problem, lambda of, path: verify(of, path).valid) is not None
+    trivial = line_length(problem, lambda case, path: verify(case, path).valid) is not None
     return not trivial and PLANNER.plan(problem, time_limit=SEARCH_LIMIT, until=FIRST).solved
 
 
@@ -197,8 +198,8 @@ def views(
     problem: Problem, family: str, number: int, count: int, noise: DepthNoise | None, cameras: str = RING
 ) -> list[DepthView]:
     """Depth views of the problem's scene from random cameras, with the arm at its start."""
-    place = list(FAMILIES).index(family) if family in FAMILIES else zlib.crc32(Path(family).name.encode())
-    rng = np.random.default_rng([SEED, place, number, 14])
+    source = list(FAMILIES).index(family) if family in FAMILIES else zlib.crc32(Path(family).name.encode())
+    rng = np.random.default_rng([SEED, source, number, 14])
     taken = []
     inner = Scene([shape for shape in problem.scene.shapes if shape.name != WALL])
     for _ in range(count):
@@ -216,7 +217,7 @@ def plan(problem: Problem, partial: Problem, method: str, network: Completion | 
     problem: with the true scene. partial: with the known scene and the views. network: a completion network
     in place of the bundled one.
     """
-    voxels = true_voxels(unknown_scene(problem)).astype(np.float32) if method == TRUE else None
+    voxels = true_voxels(unknown_scene(problem)).astype(np.float32) if method == TRUE_VOXELS else None
     began = time.process_time()
     if network is not None:
         voxels = predict(observe(partial.views, partial.robot, partial.start), network)
@@ -243,23 +244,23 @@ def is_free(problem: Problem, result: PlanResult) -> bool:
     return verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
 
 
-PLACE = ("views", "images", "walls", "cameras")
-"""Arguments that identify records."""
+SETTING_NAMES = ("views", "images", "walls", "cameras")
+"""Arguments that a record contains, so that --report can group the records by them."""
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Make the records that are missing."""
-    networks = {BY + Path(folder).name: exported_completion(folder) for folder in arguments.weights}
+    networks = {PREDICTED_BY + Path(folder).name: exported_completion(folder) for folder in arguments.weights}
     methods = [*arguments.methods, *networks]
     records = JsonLines(Path(arguments.records))
     images = IMAGES[arguments.images]
-    place = {name: vars(arguments)[name] for name in PLACE}
-    done = {(r["family"], r["number"], r["method"]) for r in records.rows if place.items() <= r.items()}
+    setting = {name: vars(arguments)[name] for name in SETTING_NAMES}
+    done = {(r["family"], r["number"], r["method"]) for r in records.rows if setting.items() <= r.items()}
     each = arguments.problems // len(arguments.families)
     warm = True
     for family in arguments.families:
-        known = {row["number"] for row in records.rows if row["family"] == family}
-        for number, problem in progress(list(problems(family, each, known)), family):
+        numbers = {row["number"] for row in records.rows if row["family"] == family}
+        for number, problem in progress(list(problems(family, each, numbers)), family):
             missing = [method for method in methods if (family, number, method) not in done]
             if not missing:
                 continue
@@ -267,8 +268,7 @@ def run(arguments: argparse.Namespace) -> None:
             taken = views(problem, family, number, arguments.views, images.noise, arguments.cameras)
             taken = [images.stated(view, number) for view in taken]
             began = time.process_time()
-            known = known_scene(problem)
-            partial = Problem(problem.robot, known, problem.start, problem.goal, views=taken)
+            partial = Problem(problem.robot, known_scene(problem), problem.start, problem.goal, views=taken)
             spent = time.process_time() - began
             if warm:
                 PLANNER.warm_up(problem, TIME_LIMIT)
@@ -276,7 +276,7 @@ def run(arguments: argparse.Namespace) -> None:
                 warm = False
             for method in missing:
                 row = plan(problem, partial, method, networks.get(method))
-                records.append({"family": family, "number": number, **place, "view_time": spent, **row})
+                records.append({"family": family, "number": number, **setting, "view_time": spent, **row})
 
 
 def table(rows: list[Row], title: str) -> None:
@@ -284,8 +284,8 @@ def table(rows: list[Row], title: str) -> None:
     assumption used, times, and motions free in each family."""
     families = list(dict.fromkeys(row["family"] for row in rows))
     lines = []
-    others = dict.fromkeys(row["method"] for row in rows if row["method"].startswith(BY))
-    for method in [*METHODS, *others, TRUE]:
+    others = dict.fromkeys(row["method"] for row in rows if row["method"].startswith(PREDICTED_BY))
+    for method in [*METHODS, *others, TRUE_VOXELS]:
         of_method = [row for row in rows if row["method"] == method]
         if not of_method:
             continue
@@ -311,17 +311,22 @@ def table(rows: list[Row], title: str) -> None:
                 *(f"{100 * share:.0f}" for share in shares),
             )
         )
-    columns = ["%", "problems", "free in the true scene", "plans", "of them free"]
-    columns += ["first assumption", "of it free", "ms", *(Path(family).name for family in families)]
+    columns = ["%", "problems", "free in the true scene", "plans", "of plans free"]
+    columns += ["first assumption", "of these free", "ms", *(Path(family).name for family in families)]
     print_table(title, columns, lines)
-    base = {name: _free(rows, name) for name in [*METHODS, *others, TRUE]}
-    pairs = [("padded", "as seen"), ("predicted", "as seen"), ("predicted", "padded"), (TRUE, "predicted")]
+    free_by_method = {name: _free(rows, name) for name in [*METHODS, *others, TRUE_VOXELS]}
+    pairs = [
+        ("padded", "as seen"),
+        ("predicted", "as seen"),
+        ("predicted", "padded"),
+        (TRUE_VOXELS, "predicted"),
+    ]
     pairs += [(other, baseline) for other in others for baseline in ("as seen", "padded", "predicted")]
     for a, b in pairs:
-        common = base[a].keys() & base[b].keys()
+        common = free_by_method[a].keys() & free_by_method[b].keys()
         if common:
             pair = compare(
-                *(np.array([1.0 if base[m][k] else np.nan for k in sorted(common)]) for m in (a, b))
+                *(np.array([1.0 if free_by_method[m][k] else np.nan for k in sorted(common)]) for m in (a, b))
             )
             gain = 100 * (pair.a_only - pair.b_only) / len(common)
             print(f"{a} over {b}: {gain:+.1f} points, p = {pair.p_success:.2g} (McNemar, exact)")
@@ -337,9 +342,11 @@ def _free(rows: list[Row], method: str) -> dict[tuple[str, int], bool]:
     return {(row["family"], row["number"]): row["free"] for row in rows if row["method"] == method}
 
 
-def calibration(rows: list[Row], of: str) -> None:
-    """Print the stated confidence against the fraction of motions that are free, for each method. of: the
-    source of the problems, for the title."""
+def calibration(rows: list[Row], source: str) -> None:
+    """Print the stated confidence against the fraction of motions that are free, for each method.
+
+    source: the source of the problems, for the title.
+    """
     for method in METHODS:
         planned = [row for row in rows if row["method"] == method and row["solved"]]
         if not planned:
@@ -347,10 +354,10 @@ def calibration(rows: list[Row], of: str) -> None:
         stated = np.array([row["confidence"] for row in planned])
         free = np.array([row["free"] for row in planned], float)
         lines = [
-            (f"{i / 5:.1f} to {(i + 1) / 5:.1f}", n, f"{said:.2f}", f"{was:.2f}")
-            for i, n, said, was in fifths(stated, free)
+            (f"{i / 5:.1f} to {(i + 1) / 5:.1f}", count, f"{confidence:.2f}", f"{rate:.2f}")
+            for i, count, confidence, rate in fifths(stated, free)
         ]
-        print_table(f"Confidence of {method}, {of}", ["stated", "motions", "mean", "free"], lines)
+        print_table(f"Confidence of {method}, {source}", ["stated", "motions", "mean", "free"], lines)
         whole = f"{len(planned)} motions, {stated.mean():.2f} stated, {free.mean():.2f} free"
         print(f"{whole}, expected error {expected_error(stated, free):.3f}\n")
 
@@ -367,18 +374,19 @@ def fifths(stated: Values, free: Values) -> list[tuple[int, int, float, float]]:
 
 def expected_error(stated: Values, free: Values) -> float:
     """The expected calibration error over fifths."""
-    return sum(n * abs(said - was) for _, n, said, was in fifths(stated, free)) / len(stated)
+    errors = [count * abs(confidence - rate) for _, count, confidence, rate in fifths(stated, free)]
+    return sum(errors) / len(stated)
 
 
 def report(rows: list[Row]) -> None:
     """Print the tables for each combination of number of views, images, walls and cameras."""
-    places = dict.fromkeys(tuple(row[name] for name in PLACE) for row in rows)
-    for place in places:
-        of_place = [row for row in rows if tuple(row[name] for name in PLACE) == place]
-        count, images, walls, cameras = place
+    settings = dict.fromkeys(tuple(row[name] for name in SETTING_NAMES) for row in rows)
+    for setting in settings:
+        with_setting = [row for row in rows if tuple(row[name] for name in SETTING_NAMES) == setting]
+        count, images, walls, cameras = setting
         title = f"views: {count}, images: {images}, {'a room' if walls else 'no walls'}, cameras: {cameras}"
         for own_families in (True, False):
-            chosen = [row for row in of_place if (row["family"] in FAMILIES) == own_families]
+            chosen = [row for row in with_setting if (row["family"] in FAMILIES) == own_families]
             if chosen:
                 table(chosen, f"{'Families' if own_families else 'Other problems'}, {title}")
                 calibration(chosen, "families" if own_families else "other problems")
@@ -419,8 +427,8 @@ def run_next_view(records: str, families: list[str], count: int) -> None:
     file = JsonLines(Path(records))
     done = {(row["family"], row["number"]) for row in file.rows}
     for family in families:
-        known = {number for of, number in done if of == family}
-        drawn = list(problems(family, count // len(families), known))
+        numbers = {number for name, number in done if name == family}
+        drawn = list(problems(family, count // len(families), numbers))
         for number, problem in progress(drawn, family):
             if (family, number) not in done:
                 row = {"family": family, "number": number}
@@ -480,27 +488,44 @@ def report_next_view(rows: list[Row]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Planning on depth views, validated in the true scene.")
-    parser.add_argument("--problems", type=int, default=300, help="of all families together (300)")
+    parser.add_argument(
+        "--problems", type=int, default=300, help="number of problems, of all families together (300)"
+    )
     parser.add_argument(
         "--families",
         nargs="+",
         default=list(FAMILIES),
         help="families, or folders of MotionBenchMaker (all families)",
     )
-    method_names = [*METHODS, TRUE]
+    method_names = [*METHODS, TRUE_VOXELS]
     parser.add_argument(
-        "--methods", nargs="+", default=method_names, choices=method_names, metavar="NAME", help="(all)"
+        "--methods",
+        nargs="+",
+        default=method_names,
+        choices=method_names,
+        metavar="NAME",
+        help="methods to compare (all)",
     )
-    parser.add_argument("--views", type=int, default=1, help="(1)")
-    parser.add_argument("--images", default=IDEAL, choices=IMAGES, metavar="NAME", help="(ideal)")
-    parser.add_argument("--walls", action="store_true", help="a room around the scene")
-    parser.add_argument("--cameras", default=RING, choices=CAMERAS, help="where they stand (ring)")
-    parser.add_argument("--weights", nargs="*", default=[], metavar="FOLDER", help="of completion networks")
-    parser.add_argument("--records", default="unknown_space.jsonl", help="(unknown_space.jsonl)")
-    parser.add_argument("--next-view", action="store_true", help="second views")
+    parser.add_argument("--views", type=int, default=1, help="number of views (1)")
+    parser.add_argument(
+        "--images",
+        default=IDEAL,
+        choices=IMAGES,
+        metavar="NAME",
+        help="errors of images and poses, by name (ideal)",
+    )
+    parser.add_argument("--walls", action="store_true", help="put a room around the scene")
+    parser.add_argument("--cameras", default=RING, choices=CAMERAS, help="places of the cameras (ring)")
+    parser.add_argument(
+        "--weights", nargs="*", default=[], metavar="FOLDER", help="folders of weights of completion networks"
+    )
+    parser.add_argument(
+        "--records", default="unknown_space.jsonl", help="file of the records (unknown_space.jsonl)"
+    )
+    parser.add_argument("--next-view", action="store_true", help="plan with second views")
     parser.add_argument("--report", action="store_true", help="print the tables of the records")
-    parser.add_argument("--odd", action="store_true", help="report problems with odd numbers alone")
-    parser.add_argument("--fit", action="store_true", help="print the constants of the confidence")
+    parser.add_argument("--odd", action="store_true", help="report only problems with odd numbers")
+    parser.add_argument("--fit", action="store_true", help="print the constants of the stated confidence")
     parser.add_argument("--times", action="store_true", help="print the time of the network")
     arguments = parse(parser, problems=1, families=["rop"], methods=["as seen", "predicted"])
     if arguments.smoke:

@@ -3,9 +3,9 @@
     python benchmarks/certificates.py [--motions 100] [--resolution 0.01] [--commands 3]
 
 Prints benchmarks/results/certificates.txt. Planners of OMPL plan held-out problems of furniture and dense
-obstacles, without simplification. Their checker tests states that are a fraction of the space's extent apart
-(0.01 is OMPL's default). Their paths are cut into waypoints at this distance, as MoveIt does, so each
-waypoint is free on the exact meshes. The reference is Coal on these meshes every 0.002 rad. The
+obstacles, without simplification. OMPL checks a motion at states whose distance is a fraction (--resolution)
+of the space's extent; OMPL's default is 0.01. Paths are cut into waypoints at this distance, as MoveIt does,
+so each waypoint is free on the exact meshes. The reference is Coal on these meshes every 0.002 rad. The
 validator checks each motion; valid motions are certified, and the certificates checked. Times are CPU times
 of warm calls in one process, the least of three. Commands are timed by wall time, each in a process of its
 own, `verify` and `certificate check` alternating.
@@ -68,7 +68,7 @@ class Checked(NamedTuple):
     reference_free: bool
     """Whether the configurations between them, every REFERENCE_STEP, are free too."""
     report: Report
-    """Of the validator."""
+    """The validator's report."""
 
 
 def motions(count: int, resolution: float) -> Iterator[Motion]:
@@ -147,7 +147,7 @@ class Cost(NamedTuple):
     write: float
     check: float
     size: float
-    """[kB]"""
+    """Size of the certificate's file [kB]."""
     stretches: int
     planes: int
     share: float
@@ -204,9 +204,11 @@ def commands(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="What certificates catch, and what they cost.")
-    parser.add_argument("--motions", type=int, default=100, help="of OMPL's planners (100)")
-    parser.add_argument("--resolution", type=float, default=0.01, help="of their checks (0.01)")
-    parser.add_argument("--commands", type=int, default=3, help="calls of each command (3)")
+    parser.add_argument("--motions", type=int, default=100, help="number of motions of OMPL's planners (100)")
+    parser.add_argument(
+        "--resolution", type=float, default=0.01, help="resolution of the checks of OMPL's planners (0.01)"
+    )
+    parser.add_argument("--commands", type=int, default=3, help="number of calls of each command (3)")
     arguments = parse(parser, motions=2, commands=1)
     ou.setLogLevel(ou.LOG_NONE)
     print(header("numpy", "coal", "ompl", "numba"))
@@ -235,7 +237,7 @@ def main() -> None:
             "motions",
             "all waypoints free",
             "collide between",
-            "of these caught",
+            "of them caught",
             "refused",
             "missed",
         ],
@@ -263,7 +265,7 @@ REQUESTS: dict[str, dict[str, Any]] = {
 }
 
 
-def of_requests(folder: Path, count: int) -> None:
+def measure_requests(folder: Path, count: int) -> None:
     """Print what the certificate of one motion over a table costs, for each kind of request."""
     robot = rd.load_robot("panda")
     rows = []
@@ -296,7 +298,7 @@ def measure(drawn: list[Motion], validated: list[Checked], folder: Path, count: 
     failed = 0
     verified = list[float]()
     checked = list[float]()
-    of_requests(folder, count)
+    measure_requests(folder, count)
     problems = list({id(motion.problem): motion.problem for motion in drawn}.values())
     for motion, checks in progress(list(zip(drawn, validated, strict=True)), "certifying"):
         if checks.report.valid:

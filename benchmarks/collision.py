@@ -265,11 +265,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Speed, soundness and tightness of collision checking.")
     parser.add_argument("--problems", type=Path, help="folder with MotionBenchMaker families")
     parser.add_argument(
-        "--configurations", type=int, default=1_000_000, help="of the soundness check (1000000)"
+        "--configurations",
+        type=int,
+        default=1_000_000,
+        help="number of configurations of the soundness check (1000000)",
     )
-    parser.add_argument("--scenes", type=int, default=SCENES, help=f"of each speed ({SCENES})")
-    parser.add_argument("--each", type=int, default=8, help="problems of each family, for paths (8)")
-    parser.add_argument("--families", nargs="+", default=list(FAMILIES), help="for paths (all)")
+    parser.add_argument(
+        "--scenes", type=int, default=SCENES, help=f"number of scenes for each speed ({SCENES})"
+    )
+    parser.add_argument(
+        "--each", type=int, default=8, help="number of problems of each family whose paths are checked (8)"
+    )
+    parser.add_argument(
+        "--families", nargs="+", default=list(FAMILIES), help="families whose paths are checked (all)"
+    )
     arguments = parse(parser, configurations=200, scenes=1, each=1, families=["rop"])
     robot = load_robot("panda")
     count = arguments.scenes

@@ -59,7 +59,9 @@ def progress(items: Sequence[Item], title: str) -> Iterable[Item]:
 def parse(parser: argparse.ArgumentParser, **smallest: object) -> argparse.Namespace:
     """Parse the command line. With `--smoke`, the arguments named in `smallest` get the values given
     there."""
-    parser.add_argument("--smoke", action="store_true", help="the smallest size, to see that the script runs")
+    parser.add_argument(
+        "--smoke", action="store_true", help="run at the smallest size, to see that the script works"
+    )
     arguments = parser.parse_args()
     if arguments.smoke:
         vars(arguments).update(smallest)

@@ -325,8 +325,8 @@ def compared(kind: str, number: int, with_peer: bool) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Path constraints: upright cups and straight lines.")
-    parser.add_argument("--number", type=int, default=200, help="of problems of each kind (200)")
-    parser.add_argument("--kinds", default="upright,line", help="(upright,line)")
+    parser.add_argument("--number", type=int, default=200, help="number of problems of each kind (200)")
+    parser.add_argument("--kinds", default="upright,line", help="kinds of constraints (upright,line)")
     parser.add_argument("--without-peer", action="store_true", help="leave sscbirrt out")
     arguments = parse(parser, number=1, without_peer=True)
     use_processor_time()

@@ -182,10 +182,16 @@ def loader(trajectories: int, threads_tried: list[int]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Making data sets, and reading them.")
-    parser.add_argument("part", choices=("cost", "loader"), nargs="?", default="cost", help="(cost)")
-    parser.add_argument("--problems", type=int, default=1000, help="of the cost (1000)")
-    parser.add_argument("--trajectories", type=int, default=20_000, help="of the loader (20000)")
-    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="of the loader (1 2)")
+    parser.add_argument(
+        "part", choices=("cost", "loader"), nargs="?", default="cost", help="what to measure (cost)"
+    )
+    parser.add_argument("--problems", type=int, default=1000, help="number of problems, for cost (1000)")
+    parser.add_argument(
+        "--trajectories", type=int, default=20_000, help="number of trajectories, for loader (20000)"
+    )
+    parser.add_argument(
+        "--threads", type=int, nargs="+", default=[1, 2], help="numbers of threads, for loader (1 2)"
+    )
     arguments = parse(parser, problems=2, trajectories=300, threads=[1])
     print(header("torch", "numpy", "numba", "zarr"))
     if arguments.part == "cost" or arguments.smoke:

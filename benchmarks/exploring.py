@@ -243,12 +243,11 @@ def run(arguments: argparse.Namespace) -> None:
     }
     warm = False
     for family in arguments.families:
-        usable_problems = (
-            one for one in problems(family, MAX_PROBLEMS, set()) if usable(one[1], arguments.clear)
-        )
+        drawn = problems(family, MAX_PROBLEMS, set())
+        usable_problems = ((number, problem) for number, problem in drawn if usable(problem, arguments.clear))
         end = arguments.skip + arguments.problems // len(arguments.families)
-        usable_problems = list(islice(usable_problems, arguments.skip, end))
-        for number, problem in progress(usable_problems, family):
+        chosen = list(islice(usable_problems, arguments.skip, end))
+        for number, problem in progress(chosen, family):
             for method in arguments.methods:
                 if (family, number, method) in done:
                     continue
@@ -276,10 +275,10 @@ def report(rows: list[Row]) -> None:
             if of_method:
                 lines.append(line(method, of_method))
         if lines:
-            columns = ["method", "problems", "reached, %", "collisions", "looks a leg, mean / p90"]
+            columns = ["method", "problems", "reached, %", "collisions", "looks per leg, mean / p90"]
             source = "Families" if own else "Other problems"
             title = f"{source}, images: {images}, {'a room' if walls else 'no walls'}"
-            print_table(title, [*columns, "CPU s a leg, median / p90"], lines)
+            print_table(title, [*columns, "CPU s per leg, median / p90"], lines)
     print("CPU time is the Explorer's (observe and next), without simulated images and the validation.")
 
 
@@ -301,16 +300,38 @@ def line(method: str, rows: list[Row]) -> tuple[str | int, ...]:
 def main() -> None:
     parser = argparse.ArgumentParser(description="An arm explores simulated scenes.")
     method_names = [*ONCE, *METHODS]
-    parser.add_argument("--problems", type=int, default=28, help="of all families together (28)")
-    parser.add_argument("--skip", type=int, default=0, help="the first of each family (0)")
-    parser.add_argument("--clear", type=float, default=0.0, help="least clearance of start and goal [m] (0)")
-    parser.add_argument("--families", nargs="+", default=list(FAMILIES), help="(all)")
     parser.add_argument(
-        "--methods", nargs="+", default=method_names, choices=method_names, metavar="NAME", help="(all)"
+        "--problems", type=int, default=28, help="number of problems, of all families together (28)"
     )
-    parser.add_argument("--images", default=IDEAL, choices=IMAGES, metavar="NAME", help="(ideal)")
-    parser.add_argument("--walls", action="store_true", help="a room around the scene")
-    parser.add_argument("--records", default="exploring.jsonl", help="(exploring.jsonl)")
+    parser.add_argument(
+        "--skip", type=int, default=0, help="number of first problems of each family that are left out (0)"
+    )
+    parser.add_argument(
+        "--clear", type=float, default=0.0, help="smallest clearance of start and goal [m] (0)"
+    )
+    parser.add_argument(
+        "--families",
+        nargs="+",
+        default=list(FAMILIES),
+        help="families, or folders of MotionBenchMaker (all families)",
+    )
+    parser.add_argument(
+        "--methods",
+        nargs="+",
+        default=method_names,
+        choices=method_names,
+        metavar="NAME",
+        help="methods to compare (all)",
+    )
+    parser.add_argument(
+        "--images",
+        default=IDEAL,
+        choices=IMAGES,
+        metavar="NAME",
+        help="errors of images and poses, by name (ideal)",
+    )
+    parser.add_argument("--walls", action="store_true", help="put a room around the scene")
+    parser.add_argument("--records", default="exploring.jsonl", help="file of the records (exploring.jsonl)")
     parser.add_argument("--report", action="store_true", help="only print the tables of the records")
     arguments = parse(parser, problems=1, families=["rop"], methods=["strict"])
     use_processor_time()

@@ -85,8 +85,8 @@ def first_path(problem: Problem, seed: int) -> FirstPath | None:
 def main() -> None:
     parser = argparse.ArgumentParser(description="CPU time until a search has its first path.")
     parser.add_argument("--sets", nargs="+", default=[*FAMILIES, *OTHER_ARMS], help="families or folders")
-    parser.add_argument("--problems", type=int, default=100, help="problems of each set (100)")
-    parser.add_argument("--seeds", type=int, default=2, help="searches of each problem (2)")
+    parser.add_argument("--problems", type=int, default=100, help="number of problems of each set (100)")
+    parser.add_argument("--seeds", type=int, default=2, help="number of searches of each problem (2)")
     arguments = parse(parser, sets=["shelf"], problems=2, seeds=1)
     print(header("numba", "numpy"))
     rows = []

@@ -50,8 +50,8 @@ from robotdiffuse.robots import load_robot
 
 PANDA = load_robot("panda")
 PARTS = ("alone", "controls")
-# The number of gradient steps that take equal CPU time: measured on this many problems and rounds, between
-# these two numbers of steps.
+# For the number of gradient steps that take as much CPU time as the network: number of problems and of rounds
+# that are timed, and two numbers of steps, between which times are interpolated.
 TIMED = 10
 TIMED_ROUNDS = 4
 TIMED_STEPS = (10, 60)
@@ -61,7 +61,7 @@ class Summary(NamedTuple):
     """A column of a table, and the function that computes its figure from the records of a method."""
 
     column: Column
-    of: Callable[[Sequence[Record]], Cell]
+    compute: Callable[[Sequence[Record]], Cell]
 
 
 def _solved(records: Sequence[Record]) -> Cell:
@@ -103,9 +103,9 @@ LENGTH = Summary(Column("length*", "", ".3f", "less"), _ratio)
 CPU = Summary(Column("CPU ms median / p95", better="less"), _cpu)
 
 
-def summary(title: str, of: Mapping[str, Sequence[Record]], figures: Sequence[Summary]) -> Table:
-    """A table with a row for each method. of: the records of each method."""
-    rows = [(name, *(figure.of(records) for figure in figures)) for name, records in of.items()]
+def summary(title: str, records: Mapping[str, Sequence[Record]], figures: Sequence[Summary]) -> Table:
+    """A table with a row for each method. records: those of each method."""
+    rows = [(name, *(figure.compute(own) for figure in figures)) for name, own in records.items()]
     return Table.of(title, [Column(""), *(figure.column for figure in figures)], rows)
 
 
@@ -211,10 +211,14 @@ def report_alone(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="The network alone.")
-    parser.add_argument("--parts", default="alone", help=f"of {','.join(PARTS)} (alone)")
-    parser.add_argument("--families", default=",".join(FAMILIES), help="of problems (all)")
-    parser.add_argument("--problems", type=int, default=500, help="non-trivial ones of each family (500)")
-    parser.add_argument("--cases", type=Path, help="folder that keeps what is known of the problems")
+    parser.add_argument(
+        "--parts", default="alone", help=f"parts of {','.join(PARTS)}, separated by commas (alone)"
+    )
+    parser.add_argument("--families", default=",".join(FAMILIES), help="families of problems (all)")
+    parser.add_argument(
+        "--problems", type=int, default=500, help="number of non-trivial problems of each family (500)"
+    )
+    parser.add_argument("--cases", type=Path, help="folder that caches which problems are drawn")
     parser.add_argument("--weights", help="folder of a trained model; default: the bundled one")
     arguments = parse(parser, parts=",".join(PARTS), families="rop", problems=2)
     parts = parts_of(arguments.parts, PARTS)
@@ -232,7 +236,7 @@ def main() -> None:
         print_worth_of_inputs(alone)
     print(
         "\n* joint-space length against a path of `aorrtc`, mean of ratios\n"
-        "single: share of samples that pass the validator; best: problems with one that does; with "
+        "single: share of samples that pass the validator; best: share of problems with such a sample; with "
         "95 %\nintervals. Times are CPU time, as the machine may do other work."
     )
 

@@ -96,7 +96,7 @@ def followed(robot: Robot, start: ndarray, end: ndarray) -> ndarray | None:
 
 
 def measured(kind: str, number: int, searched: int) -> None:
-    """Plan `number` lines or screw motions, the first `searched` of them also by search, and print a
+    """Plan `number` lines or screw motions, the first `searched` solved ones also by search, and print a
     table."""
     aorrtc = rd.load_planner("aorrtc")
     search = rd.load_planner("aorrtc")
@@ -128,20 +128,20 @@ def measured(kind: str, number: int, searched: int) -> None:
         ratios.append(answers[i].duration / min(best, answers[i].duration))
     reversals = [reversed_accelerations(answer.trajectory) for answer in answers if answer.solved]
     table = [
-        ("that the plain follower follows", f"{number} of {tried} drawn"),
-        ("of these returned", f"{sum(solved)} ({by_following} by following)"),
+        ("followed by the plain follower", f"{number} of {tried} drawn"),
+        ("solved by aorrtc, of these", f"{sum(solved)} ({by_following} by following)"),
         (
             "CPU time of the call, median / p95",
             f"{np.median(seconds):.1f} / {np.percentile(seconds, 95):.1f} ms",
         ),
         (
-            "reversals of acceleration of the tool, median / most",
+            "reversals of acceleration, median / largest",
             f"{np.median(reversals):.0f} / {max(reversals)}",
         ),
     ]
     if ratios:
         durations = f"{np.median(ratios):.3f} / {np.percentile(ratios, 95):.3f} / {max(ratios):.3f}"
-        title = f"duration by the best of search and this, median / p95 / most of {len(ratios)}"
+        title = f"duration over the best of aorrtc and search, median / p95 / largest of {len(ratios)}"
         table.append((title, durations))
     print_table(f"{kind}s", ("", "aorrtc"), table)
     for i in range(number):
@@ -160,9 +160,12 @@ def reversed_accelerations(trajectory: rd.Trajectory) -> int:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Straight lines and screws in furniture.")
     parser.add_argument("--lines", type=int, default=200, help="number of lines (200)")
-    parser.add_argument("--screws", type=int, default=100, help="number of screws (100)")
+    parser.add_argument("--screws", type=int, default=100, help="number of screw motions (100)")
     parser.add_argument(
-        "--searched", type=int, default=20, help="of each kind that the search tries too (20)"
+        "--searched",
+        type=int,
+        default=20,
+        help="number of lines and of screw motions that are also planned by search (20)",
     )
     arguments = parse(parser, lines=2, screws=2, searched=1)
     use_processor_time()

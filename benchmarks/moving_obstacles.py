@@ -25,6 +25,7 @@ from robotdiffuse.core.transforms import transform
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.simulation.validator import PyBulletOracle
 
+# Largest speed [m/s] and radius [m] of the balls.
 SPEED = 0.4
 RADIUS = 0.1
 START = [-1.0, 0.3, 0, -1.8, 0, 2.1, 0.8]
@@ -58,8 +59,8 @@ def scene(robot: Robot, count: int, seed: int) -> tuple[rd.MovingObstacle, ...]:
         speed = SPEED * rng.uniform(0.5, 1.0)
         before = rng.uniform(0.8, 3.5)
         ends = [through - speed * before * direction, through + speed * rng.uniform(2.0, 4.0) * direction]
-        legs = np.linalg.norm(ends[1] - ends[0]) / speed
-        times = legs * np.arange(4)
+        crossing_time = np.linalg.norm(ends[1] - ends[0]) / speed
+        times = crossing_time * np.arange(4)
         places = [ends[i % 2] for i in range(4)]
         ball = rd.MovingObstacle(
             rd.Sphere(ends[0], RADIUS), times=times, poses=[transform(place) for place in places]
@@ -72,7 +73,7 @@ def scene(robot: Robot, count: int, seed: int) -> tuple[rd.MovingObstacle, ...]:
 
 
 def problem_of(robot: Robot, balls: tuple[rd.MovingObstacle, ...]) -> rd.Problem:
-    """The problem with the trajectories of the balls."""
+    """The problem among balls with known trajectories."""
     return rd.Problem(robot, rd.Scene([FLOOR]), START, GOAL, moving=balls)
 
 
@@ -83,10 +84,10 @@ class Run:
     arrived: bool = False
     took: float = 0.0
     """Time until the arm rests at the goal [s]."""
-    moving: bool = False
-    """Whether the arm was in contact while it moved."""
-    resting: bool = False
-    """Whether the arm was in contact while it was at rest."""
+    contact_moving: bool = False
+    """Whether the arm was in contact with an obstacle while it moved."""
+    contact_resting: bool = False
+    """Whether the arm was in contact with an obstacle while it was at rest."""
     steps: list[float] = field(default_factory=list)
     """CPU time of each step except the first, which does not search yet [ms]."""
 
@@ -99,11 +100,14 @@ def check(
     at: float,
     moves: bool,
 ) -> None:
-    """Record in `run` whether the arm is in contact at a time `at` [s]. moves: whether the arm moves then."""
+    """Record in `run` whether the arm is in contact at configuration q and time `at` [s].
+
+    moves: whether the arm moves at this time.
+    """
     oracle.set_scene(rd.Scene([FLOOR, *(ball.at(at) for ball in balls)]))
     if oracle.check_frames(q[None]) is not None:
-        run.moving = run.moving or moves
-        run.resting = run.resting or not moves
+        run.contact_moving = run.contact_moving or moves
+        run.contact_resting = run.contact_resting or not moves
 
 
 def looped(settings: rd.ReplannerSettings) -> Callable[[rd.Problem, PyBulletOracle, int], Run]:
@@ -114,18 +118,18 @@ def looped(settings: rd.ReplannerSettings) -> Callable[[rd.Problem, PyBulletOrac
         balls = problem.moving
         tracked = tuple(rd.MovingObstacle(ball.shape, max_speed=SPEED) for ball in balls)
         loop = rd.Replanner(replace(problem, moving=tracked), settings, seed)
-        doing = None
+        executed = None
         for k in range(int(RUN_LIMIT / PERIOD)):
             now = k * PERIOD
             began = time.process_time()
             command = loop.step({ball.name: ball.pose(now) for ball in balls}, now)
             if k:
                 run.steps.append(1e3 * (time.process_time() - began))
-            if doing is not None:
+            if executed is not None:
                 for at in np.arange(now, now + PERIOD - 1e-9, CHECK_PERIOD):
-                    q, moves = followed(doing.motion, at - doing.begins)
+                    q, moves = followed(executed.motion, at - executed.begins)
                     check(run, oracle, balls, q, at, moves)
-            doing = command
+            executed = command
             if command.arrived:
                 run.arrived = True
                 run.took = command.begins
@@ -158,7 +162,7 @@ def followed(motion: rd.Trajectory, time: float) -> tuple[np.ndarray, bool]:
 
 
 def late(until: float) -> bool:
-    """Whether this much CPU time has been spent."""
+    """Whether the CPU time of this process exceeds `until` [s]."""
     return time.process_time() > until
 
 
@@ -187,8 +191,8 @@ def row(name: str, count: int, runs: list[Run]) -> tuple[str, ...]:
     return (
         f"{count} balls, {name}",
         str(len(runs)),
-        share(sum(not run.moving for run in runs)),
-        share(sum(not (run.moving or run.resting) for run in runs)),
+        share(sum(not run.contact_moving for run in runs)),
+        share(sum(not (run.contact_moving or run.contact_resting) for run in runs)),
         share(len(done)),
         f"{np.median(done):.2f}" if done else "",
         *spent,
@@ -197,9 +201,11 @@ def row(name: str, count: int, runs: list[Run]) -> tuple[str, ...]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Obstacles that cross an arm's way.")
-    parser.add_argument("--runs", type=int, default=100, help="for each number of balls (100)")
-    parser.add_argument("--lattice-runs", type=int, default=5, help="of D* Lite, with one ball (5)")
-    parser.add_argument("--balls", type=int, nargs="*", default=[1, 3, 5], help="(1 3 5)")
+    parser.add_argument("--runs", type=int, default=100, help="number of runs for each number of balls (100)")
+    parser.add_argument(
+        "--lattice-runs", type=int, default=5, help="number of runs of D* Lite, with one ball (5)"
+    )
+    parser.add_argument("--balls", type=int, nargs="*", default=[1, 3, 5], help="numbers of balls (1 3 5)")
     arguments = parse(parser, runs=1, lattice_runs=1, balls=[1])
     print(header("numba", "numpy", "pybullet"))
     robot = rd.load_robot("panda")

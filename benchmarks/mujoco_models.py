@@ -195,8 +195,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Robots from MuJoCo models beside MuJoCo.")
     parser.add_argument("models", nargs="*", type=Path, help="MJCF files (that of the example)")
     parser.add_argument("--prepared", type=Path, help="folder that keeps the prepared robots")
-    parser.add_argument("--configurations", type=int, default=1000, help="(1000)")
-    parser.add_argument("--motions", type=int, default=40, help="problems that are planned and executed (40)")
+    parser.add_argument(
+        "--configurations", type=int, default=1000, help="number of random configurations (1000)"
+    )
+    parser.add_argument(
+        "--motions", type=int, default=40, help="number of problems that are planned and executed (40)"
+    )
     arguments = parse(parser, configurations=20, motions=2)
     print(header("mujoco", "coal"))
     use_processor_time()

@@ -153,9 +153,9 @@ def _mean(records: Sequence[Record], key: str) -> Figure | None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="How motions of the network differ from those of search.")
-    parser.add_argument("--families", default="rop,rop_dense,shelf,crate,table", help="of problems")
-    parser.add_argument("--problems", type=int, default=60, help="of each family (60)")
-    parser.add_argument("--cases", type=Path, help="folder that keeps what is known of the problems")
+    parser.add_argument("--families", default="rop,rop_dense,shelf,crate,table", help="families of problems")
+    parser.add_argument("--problems", type=int, default=60, help="number of problems of each family (60)")
+    parser.add_argument("--cases", type=Path, help="folder that caches which problems are drawn")
     arguments = parse(parser, families="rop", problems=2)
     families = parts_of(arguments.families, FAMILIES)
     use_processor_time()

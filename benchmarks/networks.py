@@ -79,7 +79,7 @@ def speed(calls: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--calls", type=int, default=40, help="of each network (40)")
+    parser.add_argument("--calls", type=int, default=40, help="number of timed calls of each network (40)")
     arguments = parse(parser, calls=1)
     print(header("numpy", "numba", "onnxruntime", "torch"))
     speed(arguments.calls)

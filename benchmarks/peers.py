@@ -228,10 +228,15 @@ def main() -> None:
     parser.add_argument(
         "--problems", type=Path, help="folder with MotionBenchMaker families (one problem of the package)"
     )
-    parser.add_argument("--environments", type=Path, default=Path("peers"), help="of the peers (peers)")
+    parser.add_argument(
+        "--environments",
+        type=Path,
+        default=Path("peers"),
+        help="folder with an environment of each peer (peers)",
+    )
     parser.add_argument("--families", default="bookshelf_small_panda,box_panda,cage_panda")
-    parser.add_argument("--each", type=int, default=10, help="problems of each family (10)")
-    parser.add_argument("--peers", default=",".join(PEERS), help="separated by commas (all)")
+    parser.add_argument("--each", type=int, default=10, help="number of problems of each family (10)")
+    parser.add_argument("--peers", default=",".join(PEERS), help="peers, separated by commas (all)")
     arguments = parse(parser, each=1)
     names = arguments.families.split(",")
     print(header("numba", "coal", "pybullet"))

@@ -56,7 +56,7 @@ PANDA = load_robot("panda")
 SEED = 20261122
 PLANNERS = ("aorrtc", "rrt_connect")
 JERK = 100.0
-"""[rad/s³]"""
+"""Jerk limit in the part `timing` [rad/s³]."""
 FIRST_CALLS = 5
 """Number of equal calls until the first motion. The least CPU time counts, since other work on the machine
 only adds to it."""
@@ -68,8 +68,8 @@ MESH_STEP = 0.005
 
 
 def gather(folder: Path | None, families: Sequence[str], each: int) -> list[Case]:
-    """`each` problems of each family, and of each family of MotionBenchMaker in `folder`; the latter are
-    evenly spaced in the list of problems."""
+    """`each` problems of each family, and of each family of MotionBenchMaker in `folder`. Problems of
+    MotionBenchMaker are evenly spaced in the list of their family."""
     with TemporaryDirectory() as cache:
         cases = gather_cases([f"{name}_nontrivial" for name in families], each, Path(cache), print)
         published = [] if folder is None else gather_cases([str(folder)], None, Path(cache), print)
@@ -148,7 +148,7 @@ def lengths(cases: Sequence[Case], known: dict, limits: Sequence[float], seeds: 
                 row.append(f"{np.mean(ratios):.4f}" + (f" ({missing} unsolved)" if missing else ""))
             rows.append(row)
     columns = ["family", "planner", *(f"{limit:g} s" for limit in limits)]
-    notes = ("mean of lengths over the best known one of the solved; rrt_connect: restarts",)
+    notes = ("mean of the ratios to the best known length, over the solved problems; rrt_connect: restarts",)
     print_table("Length over best known at equal time", columns, rows, notes)
 
 
@@ -200,10 +200,13 @@ def timing(cases: Sequence[Case], count: int = TIMED_PATHS) -> None:
         longer.append(gentle.duration / fine.duration)
     rows = [
         ("CPU time, ms, median", f"{np.median(times):.2f}"),
-        ("greatest share of a velocity limit at 1 ms", f"{worst[0]:.6f}"),
-        ("greatest share of an acceleration limit at 1 ms", f"{worst[1]:.6f}"),
-        (f"greatest share of a jerk limit of {JERK:g} rad/s³ at 1 ms", f"{jerk:.6f}"),
-        ("duration with it over that without, median, most", f"{np.median(longer):.3f}, {max(longer):.3f}"),
+        ("largest fraction of a velocity limit, rows of 1 ms", f"{worst[0]:.6f}"),
+        ("largest fraction of an acceleration limit, rows of 1 ms", f"{worst[1]:.6f}"),
+        (f"largest fraction of a jerk limit of {JERK:g} rad/s³, rows of 1 ms", f"{jerk:.6f}"),
+        (
+            "duration with jerk limit over that without, median, largest",
+            f"{np.median(longer):.3f}, {max(longer):.3f}",
+        ),
     ]
     print_table(f"Timing of {len(times)} paths", ["", ""], rows)
 
@@ -264,15 +267,31 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Search: times, lengths, limits, collisions.")
     parser.add_argument("--problems", type=Path, help="folder with MotionBenchMaker families")
     parser.add_argument("--lengths", type=Path, help="reference lengths (JSON)")
-    parser.add_argument("--families", nargs="+", default=list(FAMILIES), help="(all)")
-    parser.add_argument("--each", type=int, default=25, help="problems of each family (25)")
-    parser.add_argument("--parts", default=",".join(PARTS), help="of the report, separated by commas (all)")
-    parser.add_argument("--limits", default="0.01,0.05,0.1,1", help="for lengths [s], separated by commas")
-    parser.add_argument("--seeds", type=int, default=1, help="of each problem, for lengths (1)")
-    parser.add_argument("--paths", type=int, default=TIMED_PATHS, help=f"that are timed ({TIMED_PATHS})")
-    parser.add_argument("--motions", type=int, default=400, help="that are checked on meshes (400)")
-    parser.add_argument("--seed", type=int, default=SEED, help=f"of the scenes of these ({SEED})")
-    parser.add_argument("--cpu", action="store_true", help="time limits of CPU time, beside other work")
+    parser.add_argument("--families", nargs="+", default=list(FAMILIES), help="families of problems (all)")
+    parser.add_argument("--each", type=int, default=25, help="number of problems of each family (25)")
+    parser.add_argument(
+        "--parts", default=",".join(PARTS), help="parts of the report, separated by commas (all)"
+    )
+    parser.add_argument(
+        "--limits",
+        default="0.01,0.05,0.1,1",
+        help="time limits of the comparison of lengths [s], separated by commas",
+    )
+    parser.add_argument(
+        "--seeds", type=int, default=1, help="number of seeds for each problem, for lengths (1)"
+    )
+    parser.add_argument(
+        "--paths", type=int, default=TIMED_PATHS, help=f"number of paths that are timed ({TIMED_PATHS})"
+    )
+    parser.add_argument(
+        "--motions", type=int, default=400, help="number of motions that are checked on meshes (400)"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=SEED, help=f"seed of the motions that are checked ({SEED})"
+    )
+    parser.add_argument(
+        "--cpu", action="store_true", help="time limits are CPU time, so that other work does not count"
+    )
     arguments = parse(parser, families=["rop"], each=2, limits="0.05", paths=3, motions=4)
     parts = parts_of(arguments.parts, PARTS)
     known = json.loads(arguments.lengths.read_text())["length"] if arguments.lengths else {}

@@ -252,7 +252,7 @@ def measured(title: str, every: list[NamedProblem], name: str) -> None:
             ("in collision by Coal", str(sum(s.coal > 0 for s in seen))),
             ("in collision by PyBullet", str(sum(s.pybullet for s in seen))),
             (
-                "held object or hand off its goal at the end, most, by PyBullet",
+                "largest distance of held object or hand from its goal at the end, by PyBullet",
                 f"{1e3 * max((s.off for s in seen), default=0.0):.3f} mm",
             ),
         ],
@@ -279,7 +279,7 @@ def attaching() -> None:
                 search_space(CollisionChecker(held, rd.Scene()), 0.02)
             spent.append(1e3 * (time.process_time() - began))
         rows.append((what, f"{np.median(spent):.0f} ms", f"{np.max(spent[1:]):.0f} ms"))
-    print_table("A box on the hand, CPU time of 30", ("", "median", "most"), rows)
+    print_table("A box on the hand, CPU time of 30", ("", "median", "largest"), rows)
 
 
 def sequences(number: int) -> Iterator[Problem]:
@@ -364,7 +364,7 @@ def blended(number: int, name: str) -> None:
             "over that with stops",
             "least to most",
             "without any stop",
-            "off a waypoint, most, over blend",
+            "largest distance from a waypoint, over blend",
             "CPU time",
         ),
         table,
@@ -382,19 +382,19 @@ def payloads(number: int, name: str) -> None:
         refused = 0
         spent = list[float]()
         for i in range(number):
-            free = held_out_problem(("shelf", "table")[i % 2], i // 2)
-            problem = replace(free, payload=rd.Payload(mass, [0.0, 0.0, 0.1], HAND))
-            bare = planner.plan(free, time_limit=MOTION_LIMIT, seed=i)
+            unloaded = held_out_problem(("shelf", "table")[i % 2], i // 2)
+            problem = replace(unloaded, payload=rd.Payload(mass, [0.0, 0.0, 0.1], HAND))
+            without_payload = planner.plan(unloaded, time_limit=MOTION_LIMIT, seed=i)
             began = time.process_time()
             result = planner.plan(problem, time_limit=MOTION_LIMIT, seed=i)
             spent.append(1e3 * (time.process_time() - began))
             refused += result.status.value in ("invalid_start", "invalid_goal")
-            if result.trajectory is None or bare.trajectory is None:
+            if result.trajectory is None or without_payload.trajectory is None:
                 continue
             motion = result.trajectory
             dynamics = Dynamics(problem.robot, rd.Payload(mass, [0.0, 0.0, 0.1], HAND))
             torques = dynamics.torques(motion.positions, motion.velocities, motion.accelerations)
-            ratios.append(motion.duration / bare.trajectory.duration)
+            ratios.append(motion.duration / without_payload.trajectory.duration)
             shares.append(float((np.abs(torques) / dynamics.limits).max()))
         rows.append(
             (
@@ -410,7 +410,7 @@ def payloads(number: int, name: str) -> None:
     columns = (
         "solved",
         "ends not held",
-        "duration over bare, median",
+        "duration over that without payload, median",
         "most",
         "torque over limit",
         "CPU time",
@@ -425,11 +425,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description="Held objects, tools, bases, waypoints, both hands, payloads."
     )
-    parser.add_argument("--parts", help=f"of {','.join(PARTS)} (all; carried with --scenes alone)")
-    parser.add_argument("--scenes", type=Path, help="folder of table_pick, for carried")
-    parser.add_argument("--places", type=int, default=1, help="of each scene (1)")
-    parser.add_argument("--number", type=int, default=120, help="of problems of each other kind (120)")
-    parser.add_argument("--planner", default="aorrtc", help="(aorrtc)")
+    parser.add_argument(
+        "--parts", help=f"parts of {','.join(PARTS)}, separated by commas (all; carried only with --scenes)"
+    )
+    parser.add_argument("--scenes", type=Path, help="folder of table_pick, for `carried`")
+    parser.add_argument(
+        "--places", type=int, default=1, help="number of places in each scene, for `carried` (1)"
+    )
+    parser.add_argument("--number", type=int, default=120, help="number of problems of each other kind (120)")
+    parser.add_argument("--planner", default="aorrtc", help="planner to use (aorrtc)")
     arguments = parse(parser, number=1)
     default = PARTS if arguments.scenes else PARTS[1:]
     parts = parts_of(arguments.parts or ",".join(default), PARTS)

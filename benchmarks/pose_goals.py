@@ -214,9 +214,9 @@ def several_rows(problems: int) -> list[list[str]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Goals as poses.")
     parser.add_argument("--robots", nargs="*", default=ROBOTS)
-    parser.add_argument("--starts", type=int, default=60, help="for each robot (60)")
-    parser.add_argument("--few", type=int, default=15, help="poses for each arm of few joints (15)")
-    parser.add_argument("--problems", type=int, default=20, help="with several goals (20)")
+    parser.add_argument("--starts", type=int, default=60, help="number of starts for each robot (60)")
+    parser.add_argument("--few", type=int, default=15, help="number of poses for each arm of few joints (15)")
+    parser.add_argument("--problems", type=int, default=20, help="number of problems with several goals (20)")
     arguments = parse(parser, robots=["ur5e"], starts=2, few=2, problems=2)
     print(header("numpy", "numba") + "; benchmarks/pose_goals.py")
     rows = [row for name in arguments.robots for row in length_rows(name, arguments.starts)]

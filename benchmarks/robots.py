@@ -188,13 +188,26 @@ def measure_inverse_kinematics(poses: int) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Robots of the package: problems, inverse kinematics.")
     parser.add_argument(
-        "--robots", nargs="+", choices=ROBOTS, default=list(ROBOTS), metavar="ROBOT", help="(all)"
+        "--robots",
+        nargs="+",
+        choices=ROBOTS,
+        default=list(ROBOTS),
+        metavar="ROBOT",
+        help="robots to measure (all)",
     )
-    parser.add_argument("--problems", type=int, default=200, help="for each robot (200)")
-    parser.add_argument("--out", metavar="FILE", help="for the tables so far")
-    parser.add_argument("--cpu", action="store_true", help="time limits of CPU time, beside other work")
-    parser.add_argument("--inverse-kinematics", action="store_true", help="of the Panda, not problems")
-    parser.add_argument("--poses", type=int, default=1000, help="for inverse kinematics (1000)")
+    parser.add_argument("--problems", type=int, default=200, help="number of problems for each robot (200)")
+    parser.add_argument("--out", metavar="FILE", help="file to which the tables are written after each robot")
+    parser.add_argument(
+        "--cpu", action="store_true", help="time limits are CPU time, so that other work does not count"
+    )
+    parser.add_argument(
+        "--inverse-kinematics",
+        action="store_true",
+        help="measure inverse kinematics of the Panda instead of planning",
+    )
+    parser.add_argument(
+        "--poses", type=int, default=1000, help="number of poses for inverse kinematics (1000)"
+    )
     arguments = parse(parser, robots=["panda"], problems=5, poses=5)
     head = header("numpy", "numba", "coal", "pybullet")
     tallies = {}

@@ -214,14 +214,18 @@ def fuzz(arguments: argparse.Namespace) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Damaged inputs, and data generation that is killed.")
-    parser.add_argument("part", choices=("fuzz", "faults"), nargs="?", default="fuzz", help="(fuzz)")
-    parser.add_argument("--seconds", type=float, default=600, help="of fuzz (600)")
+    parser.add_argument(
+        "part", choices=("fuzz", "faults"), nargs="?", default="fuzz", help="what to run (fuzz)"
+    )
+    parser.add_argument("--seconds", type=float, default=600, help="duration of `fuzz` (600)")
     parser.add_argument("--only", default=",".join(KINDS), help="kinds of inputs (all)")
-    parser.add_argument("--seed", type=int, default=0, help="(0)")
-    parser.add_argument("--trajectories", type=int, default=1000, help="of the data set (1000)")
-    parser.add_argument("--shard", type=int, default=10, help="trajectories in a file (10)")
-    parser.add_argument("--kills", type=int, default=10, help="(10)")
-    parser.add_argument("--workers", type=int, default=2, help="(2)")
+    parser.add_argument("--seed", type=int, default=0, help="seed (0)")
+    parser.add_argument(
+        "--trajectories", type=int, default=1000, help="number of trajectories of the data set (1000)"
+    )
+    parser.add_argument("--shard", type=int, default=10, help="number of trajectories in a file (10)")
+    parser.add_argument("--kills", type=int, default=10, help="number of kills (10)")
+    parser.add_argument("--workers", type=int, default=2, help="number of worker processes (2)")
     small = {"seconds": 10.0, "only": "head,cloud", "trajectories": 6, "shard": 2, "kills": 1, "workers": 1}
     arguments = parse(parser, **small)
     if arguments.part == "fuzz" or arguments.smoke:

@@ -514,10 +514,14 @@ def main() -> None:
     )
     parser.add_argument("--parts", default=",".join(PARTS))
     parser.add_argument("--rows", default=",".join(ROWS))
-    parser.add_argument("--out", type=Path, default=Path("runs/scene_code"), help="keeps data and networks")
-    parser.add_argument("--trajectories", type=int, default=140_000, help="motions to make")
-    parser.add_argument("--samples", type=int, default=1_600_000, help="of each training")
-    parser.add_argument("--encoder-samples", type=int, default=1_000_000, help="clouds for the auto-encoder")
+    parser.add_argument(
+        "--out", type=Path, default=Path("runs/scene_code"), help="folder that keeps data and networks"
+    )
+    parser.add_argument("--trajectories", type=int, default=140_000, help="number of motions to make")
+    parser.add_argument("--samples", type=int, default=1_600_000, help="number of samples of each training")
+    parser.add_argument(
+        "--encoder-samples", type=int, default=1_000_000, help="number of clouds for the auto-encoder"
+    )
     parser.add_argument("--problems", type=int, default=300)
     parser.add_argument("--plot", type=Path, default=Path("scene_code.png"))
     arguments = parse(parser, trajectories=40, samples=128, encoder_samples=64, problems=2)

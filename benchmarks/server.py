@@ -175,12 +175,14 @@ def workers_of(process: int) -> list[int]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="A server under load.")
-    parser.add_argument("--seconds", type=float, default=600.0, help="of load (600)")
-    parser.add_argument("--clients", type=int, default=8, help="(8)")
-    parser.add_argument("--workers", type=int, default=max(1, (os.cpu_count() or 2) - 1), help="(cores - 1)")
-    parser.add_argument("--kills", type=int, default=5, help="of workers (5)")
-    parser.add_argument("--problems", type=int, default=10, help="of each family (10)")
-    parser.add_argument("--planner", default="robotdiffuse", help="(robotdiffuse)")
+    parser.add_argument("--seconds", type=float, default=600.0, help="duration of the load (600)")
+    parser.add_argument("--clients", type=int, default=8, help="number of clients (8)")
+    parser.add_argument(
+        "--workers", type=int, default=max(1, (os.cpu_count() or 2) - 1), help="number of workers (cores - 1)"
+    )
+    parser.add_argument("--kills", type=int, default=5, help="number of workers that are killed (5)")
+    parser.add_argument("--problems", type=int, default=10, help="number of problems of each family (10)")
+    parser.add_argument("--planner", default="robotdiffuse", help="planner to use (robotdiffuse)")
     small = {"seconds": 4.0, "clients": 2, "workers": 1, "kills": 1, "problems": 1, "planner": "rrt_connect"}
     arguments = parse(parser, **small)
     print(header("numpy", "numba", "fastapi", "uvicorn"), "\n")

@@ -143,9 +143,9 @@ def main() -> None:
 
     known = parts(0)
     parser = argparse.ArgumentParser(description="The same bits from a cold and from a warm cache.")
-    parser.add_argument("--seed", type=int, default=0, help="(0)")
-    parser.add_argument("--only", default=",".join(known), help="some of the parts (all)")
-    parser.add_argument("--first-plan", action="store_true", help="only the cost of a first plan")
+    parser.add_argument("--seed", type=int, default=0, help="seed (0)")
+    parser.add_argument("--only", default=",".join(known), help="names of parts, separated by commas (all)")
+    parser.add_argument("--first-plan", action="store_true", help="measure only the cost of a first plan")
     parser.add_argument("--work", help=argparse.SUPPRESS)
     arguments = parse(parser, only="pairs of links")
     names = parts_of(arguments.only, known)

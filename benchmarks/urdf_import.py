@@ -322,11 +322,24 @@ def report(outcomes: dict[str, Outcome]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description="URDFs prepared as `robot add` does, made and found ones.")
     cases = (*MADE, *FOUND)
-    parser.add_argument("--cases", nargs="+", choices=cases, default=cases, metavar="CASE", help="(all)")
-    parser.add_argument("--sites", nargs="+", default=[], metavar="FOLDER", help="with unpacked packages")
-    parser.add_argument("--samples", type=int, default=2000, help="random configurations on a table (2000)")
-    parser.add_argument("--problems", type=int, default=50, help="of furniture, for each arm (50)")
-    parser.add_argument("--one", nargs=2, metavar=("CASE", "URDF"), help="in this process, as JSON")
+    parser.add_argument(
+        "--cases", nargs="+", choices=cases, default=cases, metavar="CASE", help="URDFs to prepare (all)"
+    )
+    parser.add_argument(
+        "--sites", nargs="+", default=[], metavar="FOLDER", help="folders with unpacked packages"
+    )
+    parser.add_argument(
+        "--samples", type=int, default=2000, help="number of random configurations on a table (2000)"
+    )
+    parser.add_argument(
+        "--problems", type=int, default=50, help="number of furniture problems for each arm (50)"
+    )
+    parser.add_argument(
+        "--one",
+        nargs=2,
+        metavar=("CASE", "URDF"),
+        help="prepare one URDF in this process and print the outcome as JSON",
+    )
     arguments = parse(parser, cases=[next(iter(WORKS)), next(iter(REFUSED))], samples=100, problems=3)
     if arguments.one:
         name, urdf = arguments.one

@@ -275,8 +275,8 @@ def choices(models: list[str]) -> dict[str, Callable[[Row], tuple[list[Row], Row
     """Rules for choosing a motion, by name: functions from a record to the motions that are compared, the
     chosen motion, and the name of the score that states its confidence."""
 
-    def by(score: str, of: Callable[[Row], list[Row]]) -> Callable[[Row], tuple[list[Row], Row, str]]:
-        return lambda row: (of(row), shortest_of_best(of(row), score), score)
+    def by(score: str, candidates: Callable[[Row], list[Row]]) -> Callable[[Row], tuple[list[Row], Row, str]]:
+        return lambda row: (candidates(row), shortest_of_best(candidates(row), score), score)
 
     def stated_by(score: str) -> Callable[[Row], tuple[list[Row], Row, str]]:
         return lambda row: (called(row), shortest_of_best(called(row)), score)
@@ -284,15 +284,15 @@ def choices(models: list[str]) -> dict[str, Callable[[Row], tuple[list[Row], Row
     def every(row: Row) -> list[Row]:
         return row["motions"]
 
-    def least(of: Callable[[Row], float]) -> Callable[[Row], tuple[list[Row], Row, str]]:
-        return lambda row: (every(row), min(every(row), key=of), STATED)
+    def least(figure: Callable[[Row], float]) -> Callable[[Row], tuple[list[Row], Row, str]]:
+        return lambda row: (every(row), min(every(row), key=figure), STATED)
 
     return {
         CALL: by(STATED, called),
         "first motion": by(STATED, lambda row: every(row)[:1]),
-        "motion of more time": by(STATED, lambda row: _of(row, CONVERGED) or every(row)[:1]),
-        "first motions": by(STATED, lambda row: _of(row, FIRST)),
-        "p > 0.03 before": by(STATED, lambda row: _of(row, CAREFUL_KIND) or called(row)),
+        "motion of more time": by(STATED, lambda row: _of_kind(row, CONVERGED) or every(row)[:1]),
+        "first motions": by(STATED, lambda row: _of_kind(row, FIRST)),
+        "p > 0.03 before": by(STATED, lambda row: _of_kind(row, CAREFUL_KIND) or called(row)),
         "all": by(STATED, every),
         "all, least unseen near": least(lambda motion: motion["features"][UNSEEN_NEAR]),
         "all, least probability": least(lambda motion: motion["risk"]),
@@ -301,7 +301,7 @@ def choices(models: list[str]) -> dict[str, Callable[[Row], tuple[list[Row], Row
     }
 
 
-def _of(row: Row, kind: str) -> list[Row]:
+def _of_kind(row: Row, kind: str) -> list[Row]:
     return [motion for motion in row["motions"] if motion["kind"] == kind]
 
 
@@ -363,7 +363,7 @@ def compared(title: str, rows: list[Row], models: list[str]) -> None:
         )
         lines.append((name, share, pair.a_only, pair.b_only, f"{pair.p_success:.2g}", *figures))
     any_free = np.mean([any(motion["free"] for motion in row["motions"]) for row in rows])
-    random = [np.mean([motion["free"] for motion in _of(row, FIRST)]) for row in rows]
+    random = [np.mean([motion["free"] for motion in _of_kind(row, FIRST)]) for row in rows]
     more = 100 * (base - random)
     low, high = bootstrap_interval(more)
     gain = f"a call over a random first motion: {more.mean():+.1f} points ({low:.1f} to {high:.1f})"
@@ -387,9 +387,16 @@ def cpu_time(row: Row, motions: list[Row]) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Choosing among motions on one view, by learned confidence.")
-    parser.add_argument("--rounds", type=int, default=40, help="problems of each family (40)")
-    parser.add_argument("--families", nargs="+", default=[*FAMILIES], help="families or folders (families)")
-    parser.add_argument("--records", default="view_ranking.jsonl", help="(view_ranking.jsonl)")
+    parser.add_argument("--rounds", type=int, default=40, help="number of problems of each family (40)")
+    parser.add_argument(
+        "--families",
+        nargs="+",
+        default=[*FAMILIES],
+        help="families, or folders of MotionBenchMaker (all families)",
+    )
+    parser.add_argument(
+        "--records", default="view_ranking.jsonl", help="file of the records (view_ranking.jsonl)"
+    )
     parser.add_argument("--report", action="store_true", help="print the tables of the records")
     arguments = parse(parser, rounds=2, families=["rop"])
     print(header("numba", "numpy", "onnxruntime", "torch"))

@@ -110,8 +110,10 @@ def grasps(number: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Workspace: repeated calls, many grasp poses.")
-    parser.add_argument("--calls", type=int, default=3000, help="with a moved obstacle each (3000)")
-    parser.add_argument("--grasps", type=int, default=30, help="sets of 20 grasp poses (30)")
+    parser.add_argument(
+        "--calls", type=int, default=3000, help="number of calls, each with a moved obstacle (3000)"
+    )
+    parser.add_argument("--grasps", type=int, default=30, help="number of sets of 20 grasp poses (30)")
     arguments = parse(parser, calls=5, grasps=1)
     use_processor_time()
     print(header("numba", "numpy"))

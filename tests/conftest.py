@@ -23,7 +23,8 @@ COMPILED = re.compile(rf"^\s*(import numba\b|from numba\b|from {_KERNELS} import
 
 
 def checked_modules() -> list[str]:
-    """All modules without compiled functions. Packages are left out: a name covers all that is below it."""
+    """All modules without compiled functions. Packages are left out, since the name of a package covers all
+    modules below it."""
     return [
         ".".join(file.relative_to(SOURCE.parent).with_suffix("").parts)
         for file in sorted(SOURCE.rglob("*.py"))
@@ -32,9 +33,10 @@ def checked_modules() -> list[str]:
 
 
 def parse_in_one_thread_at_a_time() -> None:
-    """CPython 3.11 counts the depth of the syntax trees of all threads together (gh-106905): parsing in two ends in
-    "SystemError: AST constructor recursion depth mismatch", and a live page has no plan. The hook parses each module when it is
-    imported, and NumPy and beartype parse later too: it is not enough to lock the hook, or to import all modules first."""
+    """CPython 3.11 counts the depth of the syntax trees of all threads together (gh-106905). If two threads
+    parse at once, the error is "SystemError: AST constructor recursion depth mismatch", and a live page has
+    no plan. The hook parses each module when it is imported, and NumPy and beartype parse later, so it is
+    not enough to lock the hook or to import all modules first."""
     parse = ast.parse
     parsing = threading.RLock()
 
@@ -46,8 +48,8 @@ def parse_in_one_thread_at_a_time() -> None:
 
 
 def keep_dimensions_of_shapes_alone() -> None:
-    """jaxtyping binds the arguments of every call, to compare the dimensions of its shapes. That took a large
-    part of the suite's time: functions without shapes are left to beartype."""
+    """jaxtyping binds the arguments of every call, to compare the dimensions of shapes. That took a large part
+    of the suite's time, so only beartype checks functions without shapes."""
     jaxtyped = jaxtyping.jaxtyped
 
     def checked(*, typechecker: Callable[[Any], Any]) -> Callable[[Any], Any]:
@@ -72,7 +74,7 @@ settings.load_profile("suite")
 
 @pytest.fixture(autouse=True, scope="session")
 def apart_from_the_users_robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """What tests prepare is not found by those after them, nor left to whoever runs them."""
+    """Robots that a test prepares are neither found by later tests nor left in the user's folder."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path_factory.mktemp("robots")))
         yield
@@ -80,14 +82,15 @@ def apart_from_the_users_robots(tmp_path_factory: pytest.TempPathFactory) -> Ite
 
 @pytest.fixture(autouse=True)
 def cpu_clock(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Planners' limits are CPU time, so that a loaded machine changes no answer; pages play motions in real time."""
+    """Planners' time limits are CPU time, so that a loaded machine changes no result; pages play motions in
+    real time."""
     if request.path.parent.name != "live":
         monkeypatch.setattr(time, "perf_counter", time.process_time)
 
 
 @pytest.fixture
 def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Light and ghosts take seconds to draw; a small picture tells as much to a test."""
+    """Light and ghosts take seconds to draw, and a small picture suffices for a test."""
     import robotdiffuse.visualization.exploration  # noqa: F401  with the settings' class in its annotations
     from robotdiffuse.visualization import picture, replay_page
 

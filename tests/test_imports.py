@@ -107,7 +107,7 @@ def test_no_module_imports_itself_through_others() -> None:
 
 
 def _module(full: str, names: dict[str, Path]) -> str | None:
-    """The module that a full name is of, or in."""
+    """The module that a full name denotes or is in."""
     while full:
         if full in names:
             return full
@@ -125,7 +125,8 @@ def defined_names(tree: ast.AST) -> Iterator[str]:
 
 
 def used_names(tree: ast.AST) -> Iterator[str]:
-    """Names that a module takes from others: imported, attributes, and strings that `setattr` takes."""
+    """Names that a module uses from other modules: imported names, attributes, and strings that `setattr`
+    takes."""
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom):
             yield from (alias.name for alias in node.names)
@@ -164,7 +165,7 @@ def test_import_loads_nothing_heavy() -> None:
 
 
 def test_a_plan_by_search_loads_what_it_needs_and_no_more(tmp_path: Path) -> None:
-    """What it does not need takes longer to load than planning."""
+    """Loading further modules would take longer than planning."""
     problem = tmp_path / "problem.yaml"
     problem.write_text(
         "robot: panda\nscene: []\nstart: [0, -0.785, 0, -2.356, 0, 1.571, 0.785]\n"

@@ -36,7 +36,8 @@ def test_a_pose_is_reached_by_rows_of_one_time_step_within_the_limits_given() ->
 
 
 def test_rows_begin_after_the_start_and_last_until_controllers_have_settled() -> None:
-    """ManiSkill lets go of a sphere right after the last row; without a pause the arm lagged by 5 mm."""
+    """ManiSkill lets go of a sphere right after the last row; without a pause, the arm was still 5 mm from its
+    goal."""
     made = planner()
     result = made.plan_qpos([QPOS + 0.2], QPOS, time_step=0.05, planning_time=10.0)
     off = np.abs(result["position"] - QPOS[:7] - 0.2).max(axis=1)
@@ -46,7 +47,8 @@ def test_rows_begin_after_the_start_and_last_until_controllers_have_settled() ->
 
 
 def test_fingers_need_not_be_equally_far_open() -> None:
-    """The second one follows the first; in a grasp they differ by a millimeter, and the plan was refused."""
+    """Regression: the second finger mimics the first. In a grasp they differ by a millimeter, and the call was
+    refused."""
     made = planner()
     first, second = FINGERS
     follows = Mimic(first, 1.0, 0.0)
@@ -150,7 +152,7 @@ def test_a_moved_base_keeps_obstacles_held_objects_and_allowed_contacts() -> Non
 
 
 def test_where_no_motion_turns_evenly_one_that_turns_otherwise_has_a_note() -> None:
-    """A turn in place by 35 degrees with the arm nearly stretched, from ManiSkill's LiftPegUpright."""
+    """A rotation in place by 35 degrees with the arm nearly stretched, from ManiSkill's LiftPegUpright."""
     made = Planner("panda", "panda_hand_tcp", user_joint_names=JOINTS + FINGERS, srdf="")
     arm = [-0.1748361, 1.1052635, 0.3719087, -0.3689424, -0.3424939, 1.4765055, 0.748881]
     q = np.array([*arm, 0.0237, 0.0236])

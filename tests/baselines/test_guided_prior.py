@@ -161,7 +161,7 @@ def test_spaced_levels(spaced, steps: int) -> None:
 
 
 def test_the_precision_is_that_of_the_process() -> None:
-    """Against the covariance of the process propagated from a vague first state."""
+    """Compares with the covariance of the process, propagated from a first state with a large variance."""
     waypoints = 8
     vague = 1e3 * np.eye(2)
     transition = np.array([[1.0, 1.0], [0.0, 1.0]])
@@ -198,7 +198,8 @@ def lines(count: int) -> Float[ndarray, "count waypoints dof"]:
 
 @pytest.mark.parametrize("between", [0, 1, 3])
 def test_gradient_of_the_collision_cost(between: int) -> None:
-    """Along itself; where spheres enter a margin and at corners of boxes it has kinks, hence 3 %."""
+    """Compares with the difference of costs along the gradient. The cost has kinks where spheres enter a margin
+    and at corners of boxes, so the tolerance is 3 %."""
     q = lines(3)
     costs, gradient = guided_prior.collision_gradient(CHECKER, q, 0.05, 0.01, between)
     size = np.sqrt((gradient**2).sum((1, 2)))[:, None, None]

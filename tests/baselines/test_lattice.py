@@ -40,7 +40,7 @@ def arm_problem(seed: int) -> tuple[CollisionChecker, np.ndarray, np.ndarray, np
 
 
 def least_cost(checker: CollisionChecker, start: np.ndarray, goals: np.ndarray, most_joints: int) -> float:
-    """By Dijkstra's algorithm over the whole graph."""
+    """The least cost by Dijkstra's algorithm over the whole graph."""
     origin = start.astype(float)
     low = np.ceil((ARM.lower - origin) / SPACING).astype(int)
     high = np.floor((ARM.upper - origin) / SPACING).astype(int)

@@ -30,8 +30,8 @@ def problem(*goals: np.ndarray, scene: rd.Scene = WALL) -> rd.Problem:
 
 
 def plan(planner: type[ompl.OmplPlanner], problem: rd.Problem, seed: int = 1, limit: float = 0.5) -> rd.PlanResult:
-    """Plan with a short time limit for anytime planners, which use all of it, and a longer one where a busy
-    machine finds no path in it."""
+    """Plan. Anytime planners use all of their time, so they get a short limit; the others get a longer one, for
+    busy machines."""
     if not planner.anytime:
         limit = 120.0
     result = planner().plan(problem, time_limit=limit, seed=seed)
@@ -57,7 +57,7 @@ def test_a_goal_where_the_arm_stands_and_an_end_when_no_path_can_be_shorter(plan
 
 @pytest.mark.timeout(300)
 def test_prm_with_many_goals_ends():
-    """Regression: its two threads deadlocked on the roadmap's and Python's locks."""
+    """Regression: the two threads of OMPL's PRM deadlocked on the locks of its roadmap and of Python."""
     rng = np.random.default_rng(0)
     many = problem(*(RIGHT + 0.1 * rng.standard_normal((20, 7))))
     for seed in range(5):

@@ -115,7 +115,8 @@ def test_reach_is_the_greatest_of_points_on_the_surface() -> None:
 
 @given(st.integers(0, 10_000))
 def test_nothing_moves_further_than_its_displacement(seed: int) -> None:
-    """Random postures within the spans: every sphere, and every pair of links seen from the nearer one."""
+    """Random configurations within the spans of joint values: every sphere, and every pair of links in the
+    frame of the link nearer to the base."""
     rng = np.random.default_rng(seed)
     robot = rd.load_robot("panda")
     ends = rng.uniform(robot.lower, robot.upper, (2, robot.dof))
@@ -139,7 +140,7 @@ def test_nothing_moves_further_than_its_displacement(seed: int) -> None:
 
 @given(st.integers(0, 10_000))
 def test_no_point_goes_further_against_a_normal_than_its_approach(seed: int) -> None:
-    """Vertices of the hand along a bent path, seen from the base and from a link between."""
+    """Vertices of the hand along a bent path, in the frames of the base and of a link between base and hand."""
     rng = np.random.default_rng(seed)
     robot = rd.load_robot("panda")
     linkage = Linkage(robot)
@@ -175,13 +176,15 @@ def test_unknown_shapes_are_refused_by_name() -> None:
 
 
 def test_a_link_that_is_called_like_the_scene_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Claims against the link were taken for claims against the scene, so the pair was not proved."""
+    """Regression: claims about a link with this name were taken for claims about the scene, so the pair was not
+    proved."""
     monkeypatch.setattr(proofs, "SCENE", "l2")
     refuses("a link called 'l2'", proofs.Prover, box_arm(), rd.Scene(), np.zeros((2, 3)))
 
 
 def test_bounds_hold_for_cubics_that_leave_the_straight_lines() -> None:
-    """Along the cubics, clearances are at least what is left of those in the middle of the straight lines."""
+    """Along the cubics, the clearance is at least the clearance in the middle of the straight line minus the
+    displacement."""
     rng = np.random.default_rng(0)
     robot = box_arm()
     for _ in range(12):

@@ -69,7 +69,7 @@ def test_motions_that_are_not_valid_and_certificates_without_their_problem_are_r
 
 
 def test_the_checker_loads_neither_compiled_code_nor_coal() -> None:
-    """It is independent of the validator's code, and starts in a fraction of the time."""
+    """The checker is independent of the validator's code, and starts in a fraction of the validator's time."""
     code = (
         "import sys, robotdiffuse.certificates.checker, robotdiffuse.problems.files\n"
         "print([m for m in ('numba', 'coal', 'torch') if m in sys.modules])\n"
@@ -112,7 +112,8 @@ def test_short_steps_hide_no_rate_from_the_checker(name: str, monkeypatch: pytes
 
 @pytest.mark.parametrize("with_times", [False, True])
 def test_an_empty_proof_of_one_row_is_none(with_times: bool) -> None:
-    """Start and goal inside a box: a motion of one row has no gap even without stretches."""
+    """Start and goal are inside a box. A motion of one row has no intervals that stretches could miss, so an
+    empty proof must be refused too."""
     robot = box_arm()
     here = np.zeros((1, 3))
     problem = rd.Problem(robot, rd.Scene([rd.Box([0.3, 0, 0], [2, 2, 2])]), here[0], rd.JointGoal(here))
@@ -129,7 +130,7 @@ def test_an_empty_proof_of_one_row_is_none(with_times: bool) -> None:
 
 
 def test_tolerances_are_those_of_the_validator() -> None:
-    """The checker does not import the validator."""
+    """The checker has its own copy of the tolerances, since it does not import the validator."""
     settings = VerifySettings()
     for name, value in asdict(Tolerances()).items():
         assert getattr(settings, name) == value

@@ -29,7 +29,8 @@ Record = dict[str, Any]
 
 @pytest.fixture(scope="module")
 def true(tmp_path_factory: pytest.TempPathFactory) -> tuple[FilePath, rd.Problem]:
-    """A motion with a stop at a waypoint, above a near table, beside a moving ball, with a load, a cone and a speed limit."""
+    """A valid motion with a stop at a waypoint, close to a table, beside a moving ball, with a payload, an axis
+    cone and a speed limit."""
     robot = rd.load_robot("panda")
     table = rd.Box([0.5, 0.0, 0.194], [0.6, 1.6, 0.1], name="table")
     ball = rd.MovingObstacle(rd.Sphere([0.5, 1.4, 0.5], 0.1, "ball"), velocity=[0.0, -0.05, 0.0])
@@ -50,7 +51,7 @@ def true(tmp_path_factory: pytest.TempPathFactory) -> tuple[FilePath, rd.Problem
 
 
 def sealed(record: Record) -> None:
-    """Recompute all hashes of the motion and the problem, as a forger does."""
+    """Recomputes all hashes of the motion and the problem, as a forger would."""
     motion = record["motion"]
     rows = {name: np.array(motion[name], float) for name in motion if name != "joint_names"}
     made = rd.Trajectory if "times" in rows else rd.Path
@@ -60,12 +61,12 @@ def sealed(record: Record) -> None:
 
 
 def entry(record: Record, planes: bool = True) -> Record:
-    """The claim with most planes, or with most stretches."""
+    """The claim with the most planes, or with the most stretches."""
     return max(record["proof"], key=lambda one: len(one["planes"] if planes else one["start"]))
 
 
 def set_to(*path: str | int, to: Any) -> Callable[[Record], None]:
-    """A forgery that sets one value."""
+    """Makes a forgery that sets one value."""
 
     def forge(record: Record) -> None:
         place: Any = record
@@ -84,7 +85,7 @@ def scaled_rows(name: str, factor: float) -> Callable[[Record], None]:
 
 
 def scaled_time(factor: float) -> Callable[[Record], None]:
-    """All rates agree with each other."""
+    """Scales times, velocities and accelerations so that they agree with each other."""
 
     def forge(record: Record) -> None:
         for name, power in (("times", 1), ("velocities", -1), ("accelerations", -2)):
@@ -116,7 +117,7 @@ def of_widest(name: str, change: Callable[[Any], Any], planes: bool = False) -> 
 
 
 def each_row(change: Callable[[list[Any]], object]) -> Callable[[Record], None]:
-    """A forgery that changes positions, rates and times alike."""
+    """Makes a forgery that changes positions, velocities and times of each row."""
 
     def forge(record: Record) -> None:
         for name in ("positions", "velocities", "accelerations", "times"):
@@ -126,26 +127,27 @@ def each_row(change: Callable[[list[Any]], object]) -> Callable[[Record], None]:
 
 
 def sparse(record: Record) -> None:
-    """Two rows at rest, far apart, without anything between."""
+    """Keeps only two rows at rest, far apart, and nothing between them."""
     each_row(lambda rows: rows.__delitem__(slice(1, -1)))(record)
     record.update(between=[], looks=[], jerks=[])
 
 
 def without_rates(record: Record) -> None:
-    """A path: velocities and moving obstacles would go unchecked."""
+    """Makes the motion a path, whose velocities and moving obstacles would not be checked."""
     for name in ("times", "velocities", "accelerations"):
         del record["motion"][name]
     record.update(between=[], looks=[], jerks=[])
 
 
 def without_stop(record: Record) -> None:
-    """The row in the middle, at which the motion stops, is left out."""
+    """Leaves out the row in the middle, at which the motion stops."""
     middle = record["motion"]["positions"].index(MIDDLE)
     each_row(lambda rows: rows.__delitem__(middle))(record)
 
 
 def bulge(record: Record) -> None:
-    """A velocity that the positions do not have, opposite at the two neighbors, on a joint at rest."""
+    """Adds velocities, opposite at two neighboring rows, to a joint at rest. The positions do not have these
+    velocities."""
     for row, speed in ((40, 0.5), (41, -0.5)):
         record["motion"]["velocities"][row][6] = speed
 
@@ -156,7 +158,7 @@ def reversed_proof(record: Record) -> None:
 
 
 def of_claims(**changes: Callable[[Record], Any]) -> Callable[[Record], None]:
-    """A forgery of every claim: fields from a claim's content."""
+    """Makes a forgery that sets fields of every claim, each computed by a function from the claim."""
 
     def forge(record: Record) -> None:
         for claim in record["proof"]:
@@ -169,7 +171,7 @@ FIELDS = ("start", "stop", "clearance", "displacement", "by_planes", "planes")
 
 
 def without(name: str, **rest: Any) -> Callable[[Record], None]:
-    """A problem that lacks a field, and a certificate that says nothing about it."""
+    """Makes a forgery that removes a field of the problem; `rest` are fields of the certificate that it sets."""
 
     def forge(record: Record) -> None:
         del record["problem"][name]

@@ -51,7 +51,7 @@ def test_each_is_proved_and_its_file_holds(asked: str, tmp_path: FilePath) -> No
 
 
 def test_bounds_of_constraints_are_bounds() -> None:
-    """Against the validator's values at dense samples, also for prismatic joints."""
+    """Compares with the validator's values at dense samples, also for prismatic joints."""
     rng = np.random.default_rng(0)
     for k in range(40):
         robot = PANDA if k % 2 else box_arm()
@@ -77,7 +77,8 @@ def test_bounds_of_constraints_are_bounds() -> None:
 
 
 def test_bounds_in_time_are_bounds() -> None:
-    """Anywhere on a stretch, all spheres are at least clearance minus displacement from a rotating box."""
+    """At every time of a stretch, the distance of all spheres to a rotating box is at least clearance minus
+    displacement."""
     rng = np.random.default_rng(1)
     times = np.linspace(0.0, 1.0, 6)
     poses = np.tile(np.eye(4), (3, 1, 1))
@@ -98,7 +99,7 @@ def test_bounds_in_time_are_bounds() -> None:
 
 
 def refused(certificate: rd.Certificate, problem: rd.Problem, wanted: str) -> None:
-    """With forged hashes too."""
+    """Asserts that the certificate is refused for the problem, even with forged hashes."""
     found = replace(certificate, request_parts=request_parts(problem)).check(problem).differences
     assert any(wanted in line for line in found), found
 

@@ -22,7 +22,7 @@ PAYLOAD = rd.Payload(1.5, [0.05, 0.0, 0.1], None, [0.01, 0.02, 0.03])
 
 @cache
 def certified() -> tuple[rd.Problem, rd.Certificate]:
-    """A motion at the limit of a joint's torque."""
+    """A certified motion at the torque limit of a joint."""
     payload = rd.Payload(3.0, [0.0, 0.0, 0.1])
     problem = rd.Problem(rd.load_robot("panda"), rd.Scene(), LOW, FAR, payload=payload)
     motion = rd.plan(problem, time_limit=20.0).trajectory
@@ -48,7 +48,8 @@ def test_dynamics_are_pinocchios(name: str) -> None:
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("step", [0.2, 0.02])
 def test_bounds_are_bounds(name: str, step: float) -> None:
-    """Against torques of motions with a row at each of many samples, by which nothing of the motion changes."""
+    """Compares with torques at many samples, made by adding a row at each sample, which does not change the
+    motion."""
     problem = loaded(name)
     rng = np.random.default_rng(1)
     for _ in range(5):

@@ -89,7 +89,7 @@ def test_help_and_version(said: Said) -> None:
     ],
 )
 def test_output_that_leads_nowhere(command: str, status: int, said: str) -> None:
-    """No traceback, and not the status of a problem without a plan."""
+    """There is no traceback, and the exit status differs from that of a problem without a motion."""
     line = command.format(f"{sys.executable} -m robotdiffuse robot info panda")
     ended = subprocess.run(["bash", "-c", line], capture_output=True, text=True)
     assert (ended.returncode, ended.stderr.strip()) == (status, f"robotdiffuse: {said}" if said else "")
@@ -140,7 +140,7 @@ def test_a_module_of_the_current_folder_adds_planners(tmp_path: Path, monkeypatc
 
 
 def test_a_log_says_what_is_compiled(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
-    """Without a terminal, `demo` was silent for a minute and a half on a new machine."""
+    """Regression: without a terminal, `demo` printed nothing for a minute and a half on a new machine."""
     monkeypatch.setattr(console, "SPINNER_DELAY", 0.0)
     monkeypatch.setattr(console, "LOG_INTERVAL", 0.01)
     with console.Spinner("planning"):
@@ -153,7 +153,8 @@ def test_a_log_says_what_is_compiled(monkeypatch: pytest.MonkeyPatch, capsys: py
 
 
 def test_a_spinner_that_ends_as_it_appears_gives_stdout_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A plan of two seconds printed its result to standard error: rich had replaced sys.stdout for good."""
+    """Regression: a plan of two seconds printed its result to standard error, since rich had replaced
+    sys.stdout for good."""
     ending = threading.Event()
     stop = console.Spinner.stop
 
@@ -176,7 +177,7 @@ def test_a_spinner_that_ends_as_it_appears_gives_stdout_back(monkeypatch: pytest
 
 
 def test_progress_without_a_terminal_is_a_line_at_once(capsys: pytest.CaptureFixture) -> None:
-    """`data check` of a few motions said nothing for 25 s."""
+    """Regression: `data check` of a few motions printed nothing for 25 s."""
     with console.progress("checking motions") as update:
         update(0, 4)
         assert capsys.readouterr().err == "checking motions: 0 of 4\n"
@@ -217,7 +218,7 @@ def test_the_schema_refuses_what_files_may_not_hold(changes: dict[str, object]) 
 
 
 def completed(script: str, *words: str) -> list[str]:
-    """What bash proposes for the last of these words."""
+    """What bash proposes to complete the last of these words."""
     line = " ".join(f'"{word}"' for word in words)
     asks = f"COMP_WORDS=({line}); COMP_CWORD={len(words) - 1}; _robotdiffuse"
     asks += "; printf '%s\\n' \"${COMPREPLY[@]}\""

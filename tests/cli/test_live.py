@@ -37,7 +37,7 @@ def test_bad_input_is_one_line(said: Said, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def hears(url: str, token: str = "", **fields: str) -> bool:
-    """Whether a browser gets data of the page at this address."""
+    """Whether a browser at this address gets data of the page."""
     websockets = pytest.importorskip("websockets.sync.client")
     speaks = [f"viser-v{pytest.importorskip('viser').__version__}"]
     with websockets.connect(f"{url}{token}", subprotocols=speaks, additional_headers=fields) as browser:
@@ -66,7 +66,7 @@ def test_elsewhere_no_browser_gets_data_without_the_token() -> None:
 
 
 def test_on_this_machine_pages_of_other_origins_get_no_data() -> None:
-    """A page of another site may find the port; its connection is closed before any data is sent."""
+    """A web page of another site may find the port; its connection is closed before any data is sent."""
     from robotdiffuse.visualization.live.page import Page
     from robotdiffuse.visualization.live.server import PageServer, free_port
     from robotdiffuse.visualization.live.session import PageOptions, Session, first_problem

@@ -39,7 +39,7 @@ def test_plan_writes_files_that_view_and_verify_read(tmp_path: Path, said: Said)
 
 
 def test_files_are_written_though_nobody_reads_what_is_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """`plan problem.yaml --out r.json | head -1` wrote nothing."""
+    """Regression: `plan problem.yaml --out r.json | head -1` wrote no file."""
     problem = write_problem(tmp_path)
     read, write = os.pipe()
     os.close(read)
@@ -72,7 +72,7 @@ def test_no_plan_is_status_1_with_the_reason(case: str, tmp_path: Path, said: Sa
 
 
 def test_what_has_no_motion_is_drawn(tmp_path: Path, said: Said) -> None:
-    """`view problem.yaml` was refused, and `plan --out bad.html` wrote nothing and said so neither."""
+    """Regression: `view problem.yaml` was refused, and `plan --out bad.html` neither wrote a file nor said so."""
     problem = write_problem(tmp_path, **melon(0.45))
     outs = ("--out", "bad.html", "--out", "bad.json", "--out", "bad.csv")
     assert "not written: bad.csv: there is no motion" in said(1, "plan", problem, "--planner", "rrt_connect", *outs)
@@ -160,7 +160,7 @@ def test_the_demo_of_another_arm_is_not_solved_by_the_straight_line() -> None:
 
 
 def test_plan_ignores_joints_where_it_is_told_to(tmp_path: Path, said: Said) -> None:
-    """`plan --ignore-joints` was accepted, and did nothing."""
+    """Regression: `plan --ignore-joints` was accepted, but had no effect."""
     state = "robot_state: {joint_state: {name: [gripper], position: [0.1]}}"
     Path("stranger.yaml").write_text(state)
     Path("problem.json").write_text(json.dumps(PROBLEM | {"scene": "stranger.yaml"}))

@@ -14,7 +14,7 @@ TRAIN = ["train", "planner", "--data", "d", "--encoder", "dgcnn", "--out", "o"]
 
 @pytest.fixture
 def trained(monkeypatch: pytest.MonkeyPatch) -> list[PlannerTraining]:
-    """The settings of the trainings that are asked for, in place of these."""
+    """Records the settings of requested trainings instead of training."""
     trained: list[PlannerTraining] = []
 
     def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:

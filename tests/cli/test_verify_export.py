@@ -51,7 +51,7 @@ def test_a_certificate_is_written_and_checked(planned: Path, said: Said) -> None
 
 @pytest.mark.parametrize("command", ["export {} --out m.csv", "export {} --out m.rosbag2", "verify {} --certificate c.json"])
 def test_a_full_disk_is_status_3(command: str, planned: Path, said: Said) -> None:
-    """It was 2, as bad input, and scripts could not tell them apart."""
+    """Regression: the status was 2, that of bad input, so scripts could not distinguish the two."""
     with full_disk():
         error = said(3, *command.format(planned / "r.json").split())
     assert error.count("\n") == 1 and "cannot be written" in error

@@ -40,7 +40,8 @@ def test_clearances_are_exact(name: str) -> None:
 
 
 def check_free(robot: rd.Robot, scene: rd.Scene, q: ndarray, padding: float = 0.0) -> None:
-    """The check answers with the signs of the least distances by the oracles, which are of both kinds."""
+    """Asserts that the check agrees with the sign of the oracles' smallest distances, and that both signs
+    occur."""
     to_scene = oracles.link_distances(robot, scene, q).min(axis=1) - padding
     least = np.minimum(to_scene, oracles.pair_distances(robot, q).min(axis=1, initial=1))
     clear = np.abs(least) > oracles.TOLERANCE
@@ -104,7 +105,7 @@ def test_links_with_any_number_of_spheres(count: int) -> None:
 
 
 def test_configurations_beyond_the_limits() -> None:
-    """The tables of close links do not cover these, so the spheres decide."""
+    """The tables of pairs of links do not cover these configurations, so the spheres decide."""
     robot = oracles.with_spheres("panda")
     q = np.random.default_rng(0).uniform(2 * robot.lower, 2 * robot.upper, (4000, robot.dof))
     check_free(robot, rd.Scene(), q)
@@ -215,7 +216,7 @@ def test_adding_an_obstacle_compiles_nothing() -> None:
 
 
 def cost(robot: rd.Robot, scene: rd.Scene, q: ndarray, margin: float, self_margin: float) -> ndarray:
-    """The squared hinge loss over all spheres and pairs of spheres, by the oracles."""
+    """The squared hinge loss over all spheres and pairs of spheres, computed by the oracles."""
     index = {link: i for i, link in enumerate(robot_groups(robot))}
     centers, radii = oracles.sphere_centers(robot, q)
     total = np.zeros(len(q))

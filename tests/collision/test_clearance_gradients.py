@@ -27,7 +27,8 @@ def configurations(*shape: int, seed: int = 0) -> np.ndarray:
 
 
 def test_inputs_are_the_same_in_training_and_planning() -> None:
-    """In scenes of different size at once; clearances do not depend on the gradients beside them."""
+    """Scenes of different size in one batch. The clearances do not depend on whether gradients are computed
+    too."""
     rng = np.random.default_rng(1)
     scenes = [family.scene(rng) for family in (ROP, ROP_DENSE, ROP_DENSE)]
     scenes.append(rd.Scene(scenes[0].shapes[:1]))
@@ -46,7 +47,7 @@ def test_inputs_are_the_same_in_training_and_planning() -> None:
 
 
 def test_gradients_are_those_of_the_clearances() -> None:
-    """Against automatic differentiation of the signed distance of training's losses."""
+    """Compares with automatic differentiation of the signed distance that training losses use."""
     q = configurations(400).astype(np.float64)
     scene = rd.Scene(SHAPES.shapes[:2])
     checker = CollisionChecker(PANDA, scene)

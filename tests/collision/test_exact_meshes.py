@@ -35,7 +35,7 @@ def test_box_links_against_a_sphere_in_closed_form(x: float, y: float, z: float,
 
 
 def test_links_without_meshes_are_their_spheres() -> None:
-    """The arm with one sphere at each link's origin in place of meshes."""
+    """An arm that has one sphere at each link's origin instead of meshes."""
     spheres = {f"l{i}": np.array([[0.0, 0.0, 0.0, 0.04]]) for i in (1, 2, 3)}
     obstacles = [
         rd.Box((0.5, 0.5, 0), (0.2, 0.3, 2)),
@@ -79,7 +79,8 @@ def test_degenerate_point_clouds(points: np.ndarray) -> None:
 
 
 def test_a_link_deep_in_a_point_cloud_and_an_empty_cloud() -> None:
-    """Depth at the deepest point: the middle of the box, less far from the side than from the top."""
+    """The depth is that of the deepest point, the middle of the box, which is nearer to the side than to the
+    top."""
     points = np.stack([np.full(21, 0.25), np.linspace(-0.02, 0.02, 21), np.zeros(21)], axis=1)
     exact = ExactCollision(box_arm(), rd.Scene([rd.PointCloud(points, 0.01)]))
     assert exact.link_distances(Q0)[0].distance == pytest.approx(-HALF_WIDTH - 0.01, abs=1e-5)
@@ -89,7 +90,7 @@ def test_a_link_deep_in_a_point_cloud_and_an_empty_cloud() -> None:
 
 
 def test_equal_points_are_one() -> None:
-    """150,000 equal points took the validator 10 s: Coal asked each of them."""
+    """Regression: 150,000 equal points took the validator 10 s, since Coal computed the distance of each."""
     two = np.array([[1.0, 0.12, 0.0], [-0.0, 0.5, 0.3]])
     cloud = rd.PointCloud(np.repeat(two, 500, axis=0) * 1.0, 0.01)
     assert np.array_equal(cloud.distinct_points, two)

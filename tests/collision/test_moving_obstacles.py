@@ -22,7 +22,7 @@ AXIS = np.array([0.0, 0.6, 0.8])
 
 
 def obstacle(k: int, rng: np.random.Generator) -> rd.MovingObstacle:
-    """Obstacles of every shape and every kind of motion in turn."""
+    """An obstacle; its shape and kind of motion depend on the number, so that all combinations occur."""
     at = rng.uniform([-0.2, -0.8, 0.2], [0.9, 0.8, 1.0])
     velocity = 0.4 * rng.normal(size=3)
     shape = [
@@ -40,10 +40,9 @@ def obstacle(k: int, rng: np.random.Generator) -> rd.MovingObstacle:
 
 
 def as_coal_sees(moves: rd.MovingObstacle, times: np.ndarray, q: np.ndarray) -> tuple[float | None, float]:
-    """The first of the moments at which they touch, and the least distance at those looked at until then.
-
-    Where they are far apart, those are left out at which they cannot be nearer than MOVED.
-    """
+    """The first checked time at which arm and obstacle touch by Coal, and the smallest distance at the times
+    checked before. Where they are far apart, times at which they cannot have come nearer than MOVED are left
+    out."""
     moments = np.arange(0.0, times[-1], STEP)
     k = 0
     least = np.inf
@@ -59,7 +58,7 @@ def as_coal_sees(moves: rd.MovingObstacle, times: np.ndarray, q: np.ndarray) -> 
 
 
 def test_certificate_is_coals_verdict() -> None:
-    """Of a motion there and back at constant speed."""
+    """For a motion there and back at constant speed."""
     rng = np.random.default_rng(3)
     times = np.linspace(0.0, 3.0, 3)
     q = np.stack([START, END, START])
@@ -79,7 +78,7 @@ def test_certificate_is_coals_verdict() -> None:
 
 
 def test_what_is_unknown_is_anywhere_that_it_can_be() -> None:
-    """At rest beside a ball that may come at 0.1 m/s, the arm is free until that can be there."""
+    """The arm rests beside a ball that may approach at 0.1 m/s: it is free until the ball can have reached it."""
     ball = rd.Sphere([0.3, 0.0, 1.4], 0.1)
     gap = min(d.distance for d in ExactCollision(PANDA, rd.Scene([ball])).link_distances(START))
     validator = MovingCollision(PANDA, [rd.MovingObstacle(ball, max_speed=0.1)], 1e-4, 0.5)
@@ -90,7 +89,7 @@ def test_what_is_unknown_is_anywhere_that_it_can_be() -> None:
 
 
 def test_one_that_goes_faster_is_not_missed_between_rows() -> None:
-    """A ball at 80 m/s is in the arm for a few milliseconds between two rows."""
+    """A ball at 80 m/s is inside the arm for a few milliseconds between two rows."""
     ball = rd.MovingObstacle(rd.Sphere([0.35, -40.0, 0.5], 0.05), velocity=[0, 80, 0])
     sweep = MovingCollision(PANDA, [ball], 1e-4, 0.5).sweep(np.array([0.0, 1.0]), np.stack([START, START]))
     assert sweep.contact is not None and sweep.contact.time == pytest.approx(0.5, abs=0.01)

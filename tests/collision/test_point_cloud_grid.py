@@ -16,7 +16,7 @@ from robotdiffuse.collision.point_cloud_grid import cover_triangles, thin_points
 
 
 def test_a_point_cloud_is_many_spheres() -> None:
-    """Far enough apart that thinning joins none."""
+    """The points are so far apart that thinning joins none of them."""
     robot = oracles.with_spheres("panda")
     rng = np.random.default_rng(0)
     points = rng.uniform([-0.8, -0.8, 0.0], [0.8, 0.8, 1.2], (60, 3))
@@ -35,7 +35,7 @@ def test_a_point_cloud_is_many_spheres() -> None:
 
 
 def test_the_nearest_of_a_dense_cloud() -> None:
-    """The search in cells must not miss a point that the grid promises."""
+    """The search in grid cells must not miss the nearest point."""
     robot = oracles.with_spheres("box_arm")
     rng = np.random.default_rng(3)
     points = rng.normal(size=(3000, 3))
@@ -61,7 +61,7 @@ def test_empty_and_distant_clouds_are_empty_scenes() -> None:
 
 
 def test_points_just_beyond_the_reach_count() -> None:
-    """They limit the clearance and, with padding, the freedom of an arm that is stretched out."""
+    """These points limit the clearance of a stretched-out arm and, with padding, collide with it."""
     robot = oracles.with_spheres("box_arm")
     scene = rd.Scene([rd.PointCloud([[1.32, 0.0, 0.0]], 0.01)])
     q = np.zeros((1, 3))

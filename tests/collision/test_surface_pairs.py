@@ -26,7 +26,7 @@ EMPTY = rd.Scene(())
 
 
 def boxes(*ends: tuple[tuple[float, ...], tuple[float, ...]]) -> Surface:
-    """Closed boxes from their lowest to their highest corners, which share no vertices."""
+    """Closed boxes from their lowest to their highest corners; boxes share no vertices."""
     vertices = []
     faces = []
     for low, high in ends:
@@ -54,7 +54,8 @@ def arm(wall: Surface, link: Surface, grazing: bool = True) -> rd.Robot:
 
 @cache
 def channel(grazing: bool = True) -> rd.Robot:
-    """A plate with lips at its ends: its convex part reaches LIP towards the arm, over the hollow between."""
+    """A plate with a lip at each end. Its convex part also fills the hollow between the lips, which reach LIP
+    towards the arm."""
     y = 0.5 * np.sin(TURN) + 0.02 + GAP
     plate = ((-0.6, y, -0.05), (0.9, y + 0.02, 0.05))
     lips = (((x, y - LIP, -0.05), (x + 0.02, y + 0.02, 0.05)) for x in (-0.62, 0.9))
@@ -118,7 +119,7 @@ def test_motions_out_of_and_into_grazing_are_planned_and_certified(turned: bool)
 
 
 def test_a_motion_within_grazing_is_certified_or_refused_as_the_meshes_are() -> None:
-    """Between ends that are apart, the second motion pushes the link into the wall."""
+    """Start and goal are free in both motions; the second motion pushes the link into the wall on its way."""
     robot = channel()
     problem = rd.Problem(robot, EMPTY, closer(0.0005), rd.JointGoal(closer(0.004)[None]))
     along = np.stack([closer(0.0005), closer(0.0015), closer(0.004), [0.0, 0.0]])
@@ -152,7 +153,7 @@ def test_folders_keep_the_surfaces_and_refuse_those_of_other_meshes(tmp_path: Pa
 
 
 def test_baxters_torso_and_arms_graze_as_trimesh_finds_too() -> None:
-    """In a configuration, found by sampling, in which convex parts of the torso and a link overlap."""
+    """At a sampled configuration in which convex parts of the torso and a link overlap."""
     robot = rd.load_robot("baxter_left")
     q = np.array([-1.5766, -0.088, -0.5168, 1.6863, -2.2078, -0.4002, 1.5902])
     links = ("torso", "left_lower_forearm")

@@ -24,7 +24,7 @@ def fresh() -> None:
 
 
 def test_the_supported_version_of_numba_is_installed() -> None:
-    """`core.kernels` and `collision.kernels.simd` use what Numba does not promise to keep."""
+    """`core.kernels` and `collision.kernels.simd` use internals of Numba, which may change between versions."""
     assert numba.__version__.startswith("0.68."), "port core/kernels.py and collision/kernels/simd.py first"
 
 
@@ -37,7 +37,7 @@ def test_compiled_code_has_a_writable_folder_of_its_own(tmp_path: Path, monkeypa
 
 
 def test_a_temporary_folder_is_used_if_nothing_else_is_writable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Numba raised RuntimeError in a read-only installation without a home."""
+    """Regression: Numba raised RuntimeError in a read-only installation without a home folder."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(kernels, "is_writable", lambda folder: False)
     with pytest.warns(UserWarning, match=f"kept in {tmp_path}.*NUMBA_CACHE_DIR"):
@@ -46,7 +46,7 @@ def test_a_temporary_folder_is_used_if_nothing_else_is_writable(tmp_path: Path, 
 
 
 def test_a_user_without_a_home_has_no_writable_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """pathlib raised RuntimeError for a user without HOME who is not in the password file."""
+    """Regression: pathlib raised RuntimeError for a user without HOME who is not in the password file."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(os.path, "expanduser", lambda path: path)
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
@@ -59,7 +59,7 @@ def test_a_user_without_a_home_has_no_writable_cache(tmp_path: Path, monkeypatch
 
 
 def test_importing_the_package_touches_no_file(tmp_path: Path) -> None:
-    """It removed files of the user's cache, those of other packages too."""
+    """Regression: the import removed files of the user's cache, also those of other packages."""
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache"), "NUMBA_CACHE_DIR": ""}
     subprocess.run([sys.executable, "-c", "import robotdiffuse"], env=environment, check=True)
     assert not list(tmp_path.iterdir())
@@ -106,8 +106,8 @@ print(first(Pair(a=1, b=2)), sum(first.stats.cache_hits.values()))
 
 
 def test_what_compiled_code_depends_on_makes_it_compile_anew(tmp_path: Path) -> None:
-    """Numba raised ModuleNotFoundError after modules had moved, and kept the layout of a changed class and
-    the code and constants of other modules."""
+    """Regression: Numba raised ModuleNotFoundError after modules had moved, and kept the old layout of a
+    changed class and old code and constants of other modules."""
     package = tmp_path / "here" / "arm"
 
     def write(**files: str) -> None:
@@ -139,8 +139,8 @@ def test_what_compiled_code_depends_on_makes_it_compile_anew(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("name", ["stdout", "stderr"])
 def test_compiling_in_a_thread_leaves_the_streams_alone(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Output of the tests went elsewhere: Numba let colorama replace both streams for each error that type
-    inference meets, and restore what they had been, though another thread had set others since."""
+    """Regression: output of tests was lost. For each error of type inference, Numba lets colorama replace both
+    standard streams and then restores the previous ones, even if another thread has replaced them meanwhile."""
     streams: list[io.StringIO] = []
 
     class Stream(io.StringIO):
@@ -173,7 +173,7 @@ DAMAGE: dict[str, Callable[[bytes], bytes]] = {
 def test_damaged_files_of_compiled_code_are_compiled_anew(
     damage: str, ending: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A truncated file was a traceback in every run until somebody deleted it."""
+    """Regression: a truncated file caused a traceback in every run until somebody deleted it."""
     monkeypatch.setattr(kernels, "cache_folder", lambda: tmp_path)
 
     def hits() -> int:
@@ -188,7 +188,7 @@ def test_damaged_files_of_compiled_code_are_compiled_anew(
 
 
 def test_compiled_code_runs_where_it_cannot_be_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A full disk ended a plan with an error."""
+    """Regression: a full disk ended a plan with an error."""
     folder = tmp_path / "folder"
     folder.write_text("this is no folder")
     monkeypatch.setattr(kernels, "cache_folder", lambda: folder)

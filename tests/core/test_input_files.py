@@ -215,7 +215,7 @@ def test_messages_quote_sixty_characters() -> None:
 
 @pytest.mark.parametrize("kind", sorted(NAMED))
 def test_a_pipe_that_a_mesh_file_names_is_not_waited_for(kind: str, tmp_path: Path) -> None:
-    """A .gltf whose buffer is a named pipe hung."""
+    """Regression: reading a .gltf file whose buffer is a named pipe never ended."""
     for name, content in NAMED[kind].items():
         (tmp_path / name).write_bytes(content)
     assert len(read_triangles(tmp_path / f"model.{kind}")[1]) == 12
@@ -240,7 +240,7 @@ def test_arrays_of_python_objects_are_refused(tmp_path: Path) -> None:
 
 
 def test_errors_keep_their_kind_and_their_lines_where_they_are_copied_or_located() -> None:
-    """The listed lines were joined into one."""
+    """Regression: the lines of a list in an error were joined into one."""
     error = InputError("it is wrong:", ["a b", "c"])
     assert str(copy.copy(error)) == str(error) == "it is wrong:\n  a b\n  c"
     with pytest.raises(OutputError) as caught, located("a.json"):
@@ -252,7 +252,7 @@ PICKLING = {"pickle", "dill", "joblib", "shelve", "marshal"}
 
 
 def test_nothing_unpickles_files() -> None:
-    """Worker processes exchange pickled objects through the standard library; files never hold any."""
+    """Files never contain pickled objects; only worker processes exchange them, through the standard library."""
     assert list(SOURCE.rglob("*.py"))
     for file in SOURCE.rglob("*.py"):
         text = file.read_text()
@@ -343,7 +343,7 @@ def corners(file: Path, notes: list[str] | None = None) -> ndarray:
 
 
 def test_collada_is_read_in_meters(tmp_path: Path) -> None:
-    """100 mm were read as 100 m."""
+    """Regression: 100 mm were read as 100 m."""
     notes: list[str] = []
     np.testing.assert_allclose(corners(collada(tmp_path, "0.001"), notes), 1e-3 * np.diag([1, 2, 3]))
     assert notes == ["part.dae is in units of 0.001 m; it is read in meters"]
@@ -365,7 +365,7 @@ def test_the_up_axis_of_collada_becomes_z(up: str, expected: list[list[int]], tm
 
 
 def test_gltf_stands_upright(tmp_path: Path) -> None:
-    """A wall of 1 x 2 x 0.1 m, which glTF gives with y up, lay flat."""
+    """Regression: a wall of 1 x 2 x 0.1 m, given with y up as in glTF, lay flat."""
     trimesh.creation.box([1, 2, 0.1]).export(tmp_path / "wall.glb")
     notes: list[str] = []
     vertices, _ = read_triangles(tmp_path / "wall.glb", notes=notes)
@@ -389,7 +389,8 @@ def test_a_pointer_of_git_lfs_and_gltf_that_asks_for_memory_are_refused(tmp_path
 
 
 def test_small_collada_files_cannot_fill_the_memory(tmp_path: Path) -> None:
-    """2^40 uses of a triangle, in 6 kB, took more than a minute; a polygon of a billion corners 8 GB."""
+    """Regression: a file of 6 kB that uses a triangle 2^40 times took more than a minute; a polygon of a
+    billion corners took 8 GB."""
     twice = '<node id="n{0}"><instance_node url="#n{1}"/><instance_node url="#n{1}"/></node>'
     nodes = "".join(twice.format(i, i + 1) for i in range(40)) + '<node id="n40"><instance_geometry url="#g"/></node>'
     scene = '<node><instance_node url="#n0"/></node>'

@@ -97,7 +97,7 @@ def _built(clock: Clock):
 
 
 def test_compile_time_is_all_of_the_block_that_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The note once gave 17.6 s of 95 s."""
+    """Regression: the note gave 17.6 s of 95 s."""
     clock = stop_clock(monkeypatch)
     count = len(compiled)
     before = compile_seconds()
@@ -116,14 +116,15 @@ def test_compile_time_is_all_of_the_block_that_compiles(monkeypatch: pytest.Monk
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_first_calls_load_outside_their_time() -> None:
-    """`rd.plan` in a fresh process timed out while it loaded: each load here takes far longer than the limit."""
+    """Regression: `rd.plan` in a fresh process timed out while it loaded. Here each load takes far longer than
+    the limit."""
     done = subprocess.run([sys.executable, "-c", FIRST_CALLS], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert [line.split()[0] for line in done.stdout.splitlines()] == ["solved"] * 7, done.stdout
 
 
 def test_python_cannot_call_an_inner_kernel() -> None:
-    """Without code for Python, the call would end the process."""
+    """Inner kernels have no wrapper for Python; without this check, a call would end the process."""
 
     @inner_kernel()
     def plus_one(x):
@@ -189,7 +190,7 @@ def test_a_motion_whose_timing_takes_too_long_is_a_time_out(more: dict, monkeypa
 
 
 def test_a_motion_too_long_to_be_validated_ends_the_search() -> None:
-    """It went on until its time ran out, and did not say why."""
+    """Regression: the search used up its time limit, and the reason did not name the validation."""
     joints = tuple(replace(joint, velocity=1e-6) for joint in PANDA.joints)
     slow = rd.Problem(replace(PANDA, joints=joints), rd.Scene(), LEFT, RIGHT)
     result = RRTConnect().plan(slow, 600.0)
@@ -213,7 +214,7 @@ def test_meshes_end_with_the_time() -> None:
 
 @pytest.mark.parametrize("cloud", [False, True])
 def test_a_tree_of_the_validator_that_takes_too_long_is_refused(cloud: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The start collides, so the exact meshes are asked where."""
+    """The start collides, so the exact meshes are needed to say where."""
     tip = link_pose(PANDA, LEFT, PANDA.tip)[:3, 3]
     vertices = wall().vertices - wall().vertices.mean(axis=0) + tip
     asked = problem(rd.PointCloud(vertices, 0.01) if cloud else rd.Mesh(vertices, wall().faces))
@@ -260,7 +261,7 @@ with exit_on_interrupt(lambda: print("tidy", flush=True)):
 
 
 def test_ctrl_c_is_not_lost_in_callbacks() -> None:
-    """`robot add` ran on for minutes after Ctrl-C was pressed while compiled code was loaded."""
+    """Regression: `robot add` ran on for minutes after Ctrl-C was pressed while compiled code was loaded."""
     # background jobs of a shell ignore SIGINT
     heard = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
     ended = subprocess.run([sys.executable, "-c", heard + SWALLOWING], capture_output=True, text=True)

@@ -143,7 +143,7 @@ def test_not_a_result_file(text: str, message: str, tmp_path: Path) -> None:
 
 
 def test_threads_that_write_one_file_leave_one_of_their_texts(tmp_path: Path) -> None:
-    """They shared a temporary file, which one moved away while another wrote it."""
+    """Regression: the threads shared a temporary file, which one of them renamed while another wrote it."""
     file = tmp_path / "a.json"
     errors = list[Exception]()
     texts = [letter * 100_000 for letter in "ab"]
@@ -174,7 +174,7 @@ def test_an_interrupted_write_leaves_no_temporary_file(tmp_path: Path, monkeypat
 
 
 def test_a_row_that_is_not_written_whole_is_dropped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The next row continued its line, which no reader understood then."""
+    """Regression: the next row was appended to the incomplete line, and no reader understood the line."""
     lines = JsonLines(tmp_path / "a.jsonl")
     lines.append({"a": 1})
 

@@ -117,7 +117,7 @@ def test_assignments_that_are_wrong(text: str, message: str) -> None:
 
 
 def test_tuples_of_a_fixed_length_have_it() -> None:
-    """It raised IndexError for weights whose description lacked a number; found by fuzzing."""
+    """Regression: weights whose description lacked a number raised IndexError; found by fuzzing."""
     refuses(r"region.center is \[0.0, 0.1\]; it must have 3 entries", VisibleRegion.from_json, {"center": [0.0, 0.1]}, "region")
 
 
@@ -152,7 +152,7 @@ ONE = Rop(obstacles=(1, 1))
 
 @pytest.fixture
 def one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rop:
-    """A family in a module of its own, added at run time."""
+    """A family in a separate module, added at run time."""
     (tmp_path / "one_obstacle.py").write_text(FAMILY)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setitem(FAMILIES, "one", Entry("one_obstacle:ONE", "for tests"))
@@ -184,7 +184,7 @@ def test_adopted_entries_are_in_registries_made_later() -> None:
 
 @pytest.fixture
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Registry:
-    """A registry, and an installed package with two entry points for it, one of which is broken."""
+    """A registry, and an installed package with two entry points for it, one of them broken."""
     package = tmp_path / "orchard-1.0.dist-info"
     package.mkdir()
     (package / "METADATA").write_text("Metadata-Version: 2.1\nName: orchard\nVersion: 1.0\n")

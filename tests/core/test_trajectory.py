@@ -10,7 +10,7 @@ from robotdiffuse.validation.validator import VerifySettings
 
 
 def cubic(steps: int = 7) -> Trajectory:
-    """A minimum-acceleration motion, whose positions are one cubic: rows at uneven times."""
+    """A minimum-acceleration motion, whose positions are one cubic, with rows at uneven times."""
     t = np.linspace(0.0, 1.0, steps) ** 1.3 * 2.0
     u = (t / 2.0)[:, None]
     far = np.array([[1.0, -0.5, 0.2]])
@@ -32,8 +32,8 @@ def smooth(legs: int = 1, rate: float = 40.0) -> Trajectory:
 
 
 def pulse(step: float = 0.004, count: int = 6) -> Trajectory:
-    """Two pulses of acceleration, the second one braking, each `count` steps up and down at constant jerk: at
-    125 Hz, the first and the last step have most of it."""
+    """Two pulses of acceleration, the second one braking. Each has `count` steps up and `count` steps down at
+    constant jerk, so that most of a pulse lies in a few rows at 125 Hz."""
     half = np.concatenate([np.arange(count), np.arange(count, 0, -1)])
     a = 2.0 * np.concatenate([half, -half, [0]])[:, None] * np.array([[1.0, 0.5, -1.0]]) / count
     v = np.concatenate([np.zeros((1, 3)), np.cumsum((a[1:] + a[:-1]) / 2 * step, axis=0)])
@@ -89,7 +89,7 @@ def test_resampled_rates_still_keep_limits(rate):
 @pytest.mark.parametrize("rate", [30, 125, 1000])
 @pytest.mark.parametrize("size", [1e-6, 1e-5, 1e-4, 3e-4, 1e-2])
 def test_short_motions_stay_valid_when_resampled(size, rate):
-    """Their accelerations swing within a row or two, and are 0 at both ends."""
+    """The accelerations of these motions swing within a row or two, and are 0 at both ends."""
     start = np.array([0.1, 0.2, 0.3])
     problem = Problem(box_arm(), Scene(), start, start + size * np.array([1.0, 0.7, -1.0]))
     motion = load_planner("straight_line").plan(problem).trajectory
@@ -104,7 +104,7 @@ def test_saved_at_a_rate(tmp_path):
 
 
 def test_a_trajectory_of_one_row_rests_there():
-    """Its positions were not numbers, and resampling gave it two rows at the same time."""
+    """Regression: positions were NaN, and resampling gave two rows at the same time."""
     motion = cubic()
     one = Trajectory(motion.joint_names, *(getattr(motion, name)[:1] for name in ("times", *ROWS)))
     state = one.at(np.zeros(2))

@@ -86,7 +86,7 @@ VALUES: dict[type[Value], Callable[[], Value]] = {
 
 
 def kinds(base: type[Value] = Value) -> Iterator[type[Value]]:
-    """Of values, that are no mere bases of others."""
+    """All classes of values, except abstract bases."""
     for kind in base.__subclasses__():
         if kind.__module__.startswith("robotdiffuse."):
             yield from kinds(kind)
@@ -95,7 +95,7 @@ def kinds(base: type[Value] = Value) -> Iterator[type[Value]]:
 
 
 def arrays(value: object, name: str = "") -> Iterator[tuple[str, ndarray]]:
-    """All that a value holds, with what it derives from itself."""
+    """All arrays of a value, including cached properties."""
     if isinstance(value, ndarray):
         yield name, value
     elif isinstance(value, Value):
@@ -164,7 +164,7 @@ def test_views_of_what_can_be_written_to_are_copied() -> None:
 
 
 def test_a_verdict_is_of_the_scene_as_it_is() -> None:
-    """A sphere cannot be moved into the way of a motion that was found free."""
+    """A sphere cannot be moved into a motion that was found free."""
     path = rd.Path(box_arm().joint_names, ROWS)
     task = rd.Problem(box_arm(), rd.Scene([rd.Sphere([-1, 0, 0], 0.1)]), ROWS[0], ROWS[1])
     assert rd.verify(task, path).valid
@@ -199,7 +199,7 @@ print(len(signatures) > 0, read_only)
 
 
 def test_nothing_is_compiled_for_read_only_arrays() -> None:
-    """All that a plan and its check need would be compiled twice. In a process of its own: tests call kernels
-    with arrays of their own."""
+    """Otherwise all kernels of a plan and its validation would be compiled twice. In a separate process, since
+    tests call kernels with arrays of their own."""
     done = subprocess.run([sys.executable, "-c", SIGNATURES], capture_output=True, text=True, timeout=300)
     assert done.stdout == "True []\n", done.stdout + done.stderr

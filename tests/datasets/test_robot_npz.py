@@ -23,7 +23,7 @@ GOAL = np.array([1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 
 
 def made(folder: Path) -> Path:
-    """Straight motions between two spheres, the first one through one of them."""
+    """Straight motions between two spheres; the first motion passes through a sphere."""
     rows = []
     for i in range(3):
         spheres = rd.Sphere([0.5 + i, 0.0, 0.5], 0.25), rd.Sphere([-0.9, 0.1 * i, 0.4], 0.25)
@@ -97,7 +97,7 @@ def test_what_was_exported_is_a_data_set_again(tmp_path):
 
 
 def test_a_header_that_breaks_off_is_one_line(tmp_path):
-    """NumPy gives it to Python's tokenizer, whose errors are no ValueErrors; found by fuzzing."""
+    """NumPy passes the header to Python's tokenizer, whose errors are no ValueErrors; found by fuzzing."""
     file = tmp_path / "robot.npz"
     with zipfile.ZipFile(file, "w") as archive:
         header = b"{'descr': '<f4', 'shape': (3,"

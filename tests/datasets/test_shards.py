@@ -199,7 +199,7 @@ def test_manifest(tmp_path):
 
 @pytest.mark.parametrize("value", [None, [], {}, [[]], {"a": 1}, "", -1, 10**30])
 def test_values_of_the_wrong_type_in_a_manifest_are_damage(tmp_path, value):
-    """The name of the robot as a list, and families as a list, ended `data check` with a traceback."""
+    """Regression: a list as the name of the robot, or a list of families, ended `data check` with a traceback."""
     shards.write_manifest(tmp_path, manifest_of(ARM))
     file = tmp_path / "manifest.json"
     data = json.loads(file.read_text())
@@ -244,7 +244,7 @@ def test_without_zarr(tmp_path, arrays, monkeypatch):
 
 @pytest.mark.parametrize("name", ["manifest.json", "shard_00000.zarr/seed/zarr.json", "robot.npz"])
 def test_a_pipe_in_a_data_set_is_not_waited_for(tmp_path, arrays, name):
-    """It hung."""
+    """Regression: reading never ended."""
     shards.write_shard(tmp_path, 0, arrays, {})
     (tmp_path / name).unlink(missing_ok=True)
     os.mkfifo(tmp_path / name)

@@ -23,7 +23,7 @@ def some_scenes(n: int, k: int, seed: int = 0):
 
 
 def depths(kinds: ndarray, params: ndarray, points: ndarray) -> ndarray:
-    """How deep each point [m, 3] is inside each shape [k] of a scene [m], below zero outside: by hand."""
+    """Depth [m, 3] of each point inside each shape [k] of a scene [m], negative outside, computed by hand."""
     out = np.full((len(kinds), len(points)), -np.inf)
     for i, (kind, row) in enumerate(zip(kinds, params.astype(np.float64), strict=True)):
         local = points - row[:3]

@@ -10,7 +10,7 @@ FILES = sorted(set(re.findall(r"`([\w/]+\.py)`", PAGE)))
 
 
 def test_every_named_file_exists() -> None:
-    """Rows name the folder once; further files of the row, and kernels, by a shorter path."""
+    """A row of the page names a folder once; further files of the row have shorter paths."""
     missing = [name for name in FILES if not (ROOT / name).is_file() and not any(SOURCE.rglob(name))]
     assert not missing, f"docs/architecture.md names {missing}"
 

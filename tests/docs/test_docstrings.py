@@ -14,7 +14,7 @@ NAMES = sorted(getattr(rd, "__all__"))  # noqa: B009  (the stub does not name it
 
 
 def public_functions(name: str) -> Iterator[Callable[..., object]]:
-    """The function of a public name, or the public methods of a class that it defines itself."""
+    """The function with a public name, or the public methods that a class defines itself."""
     value = getattr(rd, name)
     if inspect.isfunction(value):
         yield value
@@ -30,7 +30,7 @@ def parameters(function: Callable[..., object]) -> set[str]:
 
 
 def documented(function: Callable[..., object]) -> set[str]:
-    """Names below Args, as griffe reads them for the reference."""
+    """Names below `Args:`, as griffe reads them for the reference."""
     sections = griffe.Docstring(inspect.getdoc(function) or "").parse("google", warnings=False)
     return {
         argument.name.lstrip("*")

@@ -30,7 +30,7 @@ TABLES: tuple[dict[str, Any], ...] = (*(PLANNERS, FAMILIES, METRICS, SHAPES), *(
 
 @pytest.fixture(scope="module")
 def names(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
-    """What the page's Python made, while its lines are in the tables."""
+    """The names that the page's Python defines, while its entries are in the tables."""
     folder = tmp_path_factory.mktemp("extending")
     tables = [dict(table) for table in TABLES]
     notebook = Notebook(folder)

@@ -103,7 +103,8 @@ def test_a_planner_of_the_program_itself_is_refused(tmp_path: Path, monkeypatch:
 
 
 def test_a_metric_of_an_imported_module_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """`bench run --import` measured it in no planner's process."""
+    """Regression: the processes of planners did not import the module of `bench run --import`, so the metric
+    was missing."""
     (tmp_path / "counted.py").write_text(
         "from robotdiffuse.evaluation.metrics import METRICS, Metric\n"
         'METRICS["legs"] = Metric("legs", "", "less", ".0f", lambda motion: len(motion.path.positions) - 1)\n'
@@ -143,7 +144,7 @@ def test_killed_run_completes_without_repeating_or_losing_a_result(tmp_path: Pat
 
 
 def test_runs_that_are_left_and_restarts_where_time_is_left(tmp_path: Path) -> None:
-    """What ended by itself is not asked again with more time."""
+    """Calls that ended by themselves are not repeated with a longer time limit."""
     cases = gather_cases(["rop"], 3, tmp_path, quiet)
     ran_out = replace(RECORD, name="rop/1", status="timeout", time=1.0, progress=())
     crashed = replace(RECORD, name="rop/2", status="crashed", time=0.0, progress=())
@@ -186,7 +187,8 @@ def test_a_planner_is_restarted_until_its_time_is_used_up(tmp_path: Path) -> Non
 
 
 def test_planners_take_turns_with_each_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever else the machine does then hits them alike; so many calls are made at once all the time."""
+    """Other work on the machine then affects all planners alike. The number of simultaneous calls stays
+    constant."""
     calls = []
     at_once = [0]
     most = [0]
@@ -275,7 +277,7 @@ def test_problems_of_files_and_folders(tmp_path: Path) -> None:
 
 
 def test_other_problems_of_the_same_name_are_refused(tmp_path: Path) -> None:
-    """Those of the first file of a name were returned for any other."""
+    """Regression: problems of the first file with a name were used for every other file with this name."""
     lines = [json.dumps(problem_record(held_out_problem("rop", i))) for i in range(2)]
     for folder, line in zip("ab", lines, strict=True):
         (tmp_path / folder).mkdir()
@@ -291,7 +293,7 @@ def test_other_problems_of_the_same_name_are_refused(tmp_path: Path) -> None:
 
 
 def test_other_weights_of_the_same_name_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Their calls counted as made, or shared a row."""
+    """Regression: calls with other weights of the same name were not made, or were put into the same row."""
     monkeypatch.setattr(bench, "keep_records", lambda *_: 0)
     for parent, digest in (("a", "1"), ("b", "2")):
         (tmp_path / parent / "best").mkdir(parents=True)

@@ -35,7 +35,8 @@ def record(planner: str, name: str, limit: float, **fields: object) -> Record:
 def solved(
     planner: str, name: str, limit: float, progress: list[tuple[float, float]], time: float | None = None, **fields: object
 ) -> Record:
-    """A record of a motion of which the links go three times as far [m] as the joints [rad]."""
+    """A record of a motion for which the paths of the links are three times as long [m] as the path in joint
+    space [rad]."""
     length = progress[-1][1]
     values = {
         "status": "solved",
@@ -54,7 +55,8 @@ def failed(planner: str, name: str, limit: float, time: float, **fields: object)
 
 
 def write(folder: Path, records: list[Record], counts: dict[float, int | None] | None = None) -> Path:
-    """A run for each time limit, of all its planners; `counts`: problems that it was given, if not all."""
+    """Writes a run for each time limit, with all of its planners. `counts`: the numbers of problems of the
+    runs, if not all."""
     (folder / "records").mkdir(parents=True)
     for record in records:
         with record_path(folder, record.planner).open("a") as stream:
@@ -205,7 +207,7 @@ def cells(table: Table, heading: str) -> dict[str, str]:
 
 
 def test_lengths_are_compared_at_equal_time(tmp_path: Path) -> None:
-    """Planners that end early are restarted, in rows of their own; what used up its time needs none."""
+    """Planners that end early are restarted, in rows of their own; planners that use up the limit are not."""
     records = []
     for i in range(3):
         name = f"rop/{i}"
@@ -309,7 +311,7 @@ def test_the_command_writes_everything(small, tmp_path, capsys):
 
 
 def test_no_legend_or_name_is_clipped() -> None:
-    """Names of planners with settings ended at the edge of a plot."""
+    """Regression: names of planners with settings were cut off at the edge of a plot."""
     pytest.importorskip("matplotlib")
     sizes = []
     for name in ("a", "robotdiffuse:iterations=5000+restarts"):

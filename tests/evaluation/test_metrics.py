@@ -58,7 +58,8 @@ def test_lengths_of_an_arm_of_two_links(rows, joint, link, tip, turned):
 
 
 def test_bending_of_a_sine_by_hand() -> None:
-    """q = (u, a sin(pi k u)), in its length's unit; a small amplitude leaves its speed even."""
+    """q = (u, a sin(pi k u)), in units of the path's length; since the amplitude is small, the speed is nearly
+    constant."""
     u = np.linspace(0, 1, 4001)
     a = 0.003
     k = 3
@@ -70,13 +71,13 @@ def test_bending_of_a_sine_by_hand() -> None:
 
 @given(st.floats(0.3, 8), st.floats(0.05, 6))
 def test_dimensionless_jerk_of_minimum_jerk_is_720(duration: float, amplitude: float) -> None:
-    """Whatever its duration and amplitude: the integral of the squared jerk is 720 A^2 / T^5."""
+    """For any duration T and amplitude A: the integral of the squared jerk is 720 A^2 / T^5."""
     motion = minimum_jerk(duration, np.zeros(2), np.array([0.6, 0.8]) * amplitude)
     assert metrics.log_dimensionless_jerk(motion) == pytest.approx(np.log(720), abs=0.01)
 
 
 def test_jerk_of_jumps_of_the_acceleration_by_hand() -> None:
-    """Full speed up, then full braking: three jumps of a, 2a and a, each spread over a row of 10 ms."""
+    """Full acceleration, then full braking: three jumps of a, 2a and a, each spread over a row of 10 ms."""
     t = np.linspace(0, 2, 201)
     a = 1.5
     acceleration = np.where(t < 1, a, -a)
@@ -187,7 +188,7 @@ def test_paired_success_is_the_exact_test_of_mcnemar() -> None:
 
 
 def test_paired_lengths_are_the_signed_ranks_of_wilcoxon() -> None:
-    """C. Darwin's maize: ranks 24 against 96, of which 1,352 of the 2^15 signs are as far from even."""
+    """C. Darwin's maize data: rank sums 24 and 96; 1,352 of the 2^15 sign patterns are at least as extreme."""
     differences = np.array([6, 8, 14, 16, 23, 24, 28, 29, 41, -48, 49, 56, 60, -67, 75])
     lengths = np.random.default_rng(0).uniform(1, 9, 15)
     found = statistics.compare(lengths * np.exp(differences / 1000), lengths)

@@ -90,7 +90,7 @@ def test_a_planner_in_this_process_gives_the_bench_records() -> None:
 
 
 def test_a_motion_that_stands_still_is_not_planned_again() -> None:
-    """A length of 0 counted as no path."""
+    """Regression: a path of length 0 was taken for no path."""
     problem = rd.Problem(PANDA, rd.Scene(), START, rd.JointGoal(START[None]))
     found = RRTConnect().plan(problem, time_limit=2.0, seed=0)
     first = replace(found, path=rd.Path(PANDA.joint_names, START[None]))

@@ -51,7 +51,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_folder_called_like_a_robot_does_not_hide_it_from_nodes(tmp_path, monkeypatch):
-    """Nodes got the path of any folder of this name in the working folder."""
+    """Regression: if the working folder contained a folder with the robot's name, nodes got its path instead of
+    the robot."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "panda").mkdir()
     assert not names_a_file("panda") and names_a_file("./panda") and rd.load_robot("panda") is PANDA
@@ -64,7 +65,8 @@ def rows(folder: Path) -> dict[str, ndarray]:
 
 
 def test_the_same_data_with_more_workers_and_after_an_interruption(folder: Path, tmp_path: Path) -> None:
-    """What a killed run leaves: a manifest, a finished shard, half of another and half a manifest."""
+    """A killed run leaves a manifest, a finished shard, and incomplete files of another shard and of a
+    manifest."""
     shutil.copy(folder / "manifest.json", tmp_path)
     shutil.copytree(folder / "shard_00001.zarr", tmp_path / "shard_00001.zarr")
     kept = (tmp_path / "shard_00001.zarr").stat().st_mtime_ns
@@ -288,8 +290,8 @@ def test_motions_are_free_reach_a_goal_and_keep_their_distance(name: str) -> Non
 
 
 def test_goals_a_turn_away_are_taken_the_short_way() -> None:
-    """Of an arm whose joints turn twice, a seventh of the motions went the long way round, to a goal that the
-    validator did not know."""
+    """Regression: for an arm whose joints have a range of two turns, a seventh of the motions went the long way
+    round, to a goal that the validator did not know."""
     robot = rd.load_robot("ur5e")
     far = list[int]()
     settings = GenerationSettings(robot="ur5e", mix={"rop": 1.0}, target="pose", goals=1, waypoints=16)
@@ -345,7 +347,7 @@ def test_killed_at_a_random_moment_it_ends_in_the_same_data(undisturbed, tmp_pat
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [0, 1])
 def test_ctrl_c_stops_all_in_one_line(count: int, tmp_path: Path) -> None:
-    """As a terminal does it, to all processes: while the workers start, and while they work."""
+    """Ctrl-C reaches all processes, as in a terminal: while the workers start, and while they work."""
     run = factory_runs.start(tmp_path, TRAJECTORIES, SHARD, WAYPOINTS, 2)
     while len(factory_runs.members(run.pid)) < 3:
         assert run.poll() is None
@@ -361,7 +363,7 @@ def test_ctrl_c_stops_all_in_one_line(count: int, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(undisturbed, tmp_path, monkeypatch):
-    """Files may not grow beyond a kilobyte: the system's error, as that of a full disk, at any file."""
+    """Files cannot grow beyond a kilobyte, so that writing any file fails as on a full disk."""
     monkeypatch.setattr(factory, "on_this_machine", factory_runs.in_this_process)
     most = resource.getrlimit(resource.RLIMIT_FSIZE)
 

@@ -43,7 +43,7 @@ def box() -> trimesh.Trimesh:
 
 
 def degenerate() -> trimesh.Trimesh:
-    """With triangles of no area, repeated corners, and points of no triangle."""
+    """A mesh with triangles of no area, repeated corners, and points that belong to no triangle."""
     mesh = box()
     faces = np.concatenate([mesh.faces, [[0, 0, 1], [2, 2, 2], [0, 1, 0]]])
     vertices = np.concatenate([mesh.vertices, mesh.vertices[:2], [[0.0, 0.0, 0.0]]])

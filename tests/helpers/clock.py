@@ -6,13 +6,13 @@ import pytest
 
 
 class Clock:
-    """The time [s]."""
+    """A clock that shows the same time [s] until a test changes it."""
 
     now = 0.0
 
 
 def stop_clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    """Put a still clock in place of `time.perf_counter`."""
+    """Puts a clock that stands still in place of `time.perf_counter`."""
     clock = Clock()
     monkeypatch.setattr(time, "perf_counter", lambda: clock.now)
     return clock

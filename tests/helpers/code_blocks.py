@@ -82,7 +82,7 @@ def code_blocks(page: Path) -> list[Block]:
 
 
 def a_cloud(folder: Path) -> None:
-    """cloud.ply: the points of a wall beside the arm."""
+    """Writes cloud.ply: the points of a wall beside the arm."""
     import trimesh
 
     side = np.linspace(-0.3, 0.3, 30)
@@ -98,31 +98,31 @@ def _rop(home: Path) -> Path:
 
 
 def rop_data(folder: Path) -> None:
-    """rop: a data set of 12 motions."""
+    """Writes rop: a data set of 12 motions."""
     shutil.copytree(_rop(folder.parent), folder / "rop")
 
 
 def bench_arm(folder: Path) -> None:
-    """The robot of arm.urdf, with few, fat spheres: `robot add` itself takes a minute."""
+    """Prepares the robot of arm.urdf with few, large spheres, since `robot add` takes a minute."""
     with coarse_grids():
         add_robot("arm.urdf", base="base", limits="joint_limits.yaml", settings=QUICK)
 
 
 def example_arm(folder: Path) -> None:
-    """The robot of examples/data/arm.urdf, with few, fat spheres."""
+    """Prepares the robot of examples/data/arm.urdf with few, large spheres."""
     with coarse_grids():
         add_robot("examples/data/arm.urdf", settings=QUICK)
 
 
 def shelf(folder: Path) -> None:
-    """shelf.stl: a board."""
+    """Writes shelf.stl: a board."""
     import trimesh
 
     trimesh.creation.box((0.3, 0.8, 0.02)).export(folder / "shelf.stl")
 
 
 def motion_bench_maker(folder: Path) -> None:
-    """motion_bench_maker: scenes and requests of MoveIt."""
+    """Writes motion_bench_maker: scenes and requests of MoveIt."""
     shutil.copytree(ROOT / "tests" / "files" / "motion_bench_maker", folder / "motion_bench_maker")
 
 
@@ -132,13 +132,13 @@ PREPARED |= {made.__name__: made for made in (bench_arm, example_arm, motion_ben
 
 @dataclass
 class Notebook:
-    """A page as it is tried: its folder, and the names that its Python has made so far."""
+    """The state of a page while its blocks are tried: its folder, and the Python names defined so far."""
 
     folder: Path
     names: dict[str, Any] = field(default_factory=lambda: {"__name__": "__main__"})
 
     def try_block(self, block: Block) -> None:
-        """Raises whatever is wrong with a block."""
+        """Tries a block. Raises an error if something is wrong with it."""
         for name in block.needs:
             PREPARED[name](self.folder)
         if "file" in block.marks:
@@ -203,7 +203,7 @@ def _command(words: list[str], run: bool) -> None:
 
 
 def _pip(words: list[str]) -> None:
-    """Its extras exist."""
+    """Checks that the extras of a pip command exist."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     for word in words:
         for extra in re.findall(r"\[(.+)\]", word):

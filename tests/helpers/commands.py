@@ -15,7 +15,7 @@ PROBLEM = {"robot": "panda", "scene": [BALL], "start": START, "goal": {"joints":
 
 
 def run(*argv: object) -> int:
-    """The exit status of a command."""
+    """Runs a command; returns its exit status."""
     try:
         return main([str(value) for value in argv])
     except SystemExit as end:

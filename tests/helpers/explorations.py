@@ -17,7 +17,7 @@ ZONE = ((-0.36, -0.36, 0.0), (0.36, 0.36, 0.7))
 
 @cache
 def recorded() -> tuple[rd.Problem, RecordedExplorer]:
-    """A Panda goes from one side of a wall to the other, as far as it gets with two looks."""
+    """A Panda explores its way from one side of a wall to the other, with at most two looks."""
     panda = rd.load_robot("panda")
     problem = rd.Problem(panda, rd.Scene([FLOOR, WALL]), HOME, BEYOND)
     settings = ExplorerSettings(time_limit=1.0, look_attempts=2, max_looks=2)

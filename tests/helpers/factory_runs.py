@@ -19,19 +19,19 @@ COMMAND = (sys.executable, "-c", f"{HEARS_CTRL_C}; {RUN}")
 
 
 def in_this_process(call: Callable[..., Any], calls: Sequence[tuple], _workers: int) -> Results:
-    """As `processes.on_this_machine`, but without processes."""
+    """Like `processes.on_this_machine`, but makes the calls in this process."""
     for number, arguments in enumerate(calls):
         yield number, call(*arguments)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """All files of a folder, hidden ones too, byte for byte."""
+    """The contents of all files of a folder, hidden ones too."""
     files = (file for file in sorted(folder.rglob("*")) if file.is_file())
     return {str(file.relative_to(folder)): file.read_bytes() for file in files}
 
 
 def start(out: Path, trajectories: int, shard: int, waypoints: int, workers: int) -> subprocess.Popen[str]:
-    """The command, as the first of a process group of its own."""
+    """Starts the command in a process group of its own."""
     sizes = {"trajectories": trajectories, "shard": shard, "waypoints": waypoints, "workers": workers}
     options = [text for name, value in sizes.items() for text in (f"--{name}", str(value))]
     return subprocess.Popen(
@@ -48,7 +48,7 @@ def shards(out: Path) -> int:
 
 
 def wait_for_shards(run: subprocess.Popen[str], out: Path, count: int) -> None:
-    """Until the folder holds so many shards, or the command has ended."""
+    """Waits until the folder contains this number of shards, or the command has ended."""
     until(lambda: shards(out) >= count or run.poll() is not None, 300.0)
 
 
@@ -64,7 +64,7 @@ def group_ends(group: int, seconds: float = 120.0) -> bool:
 
 
 def members(group: int) -> list[int]:
-    """Processes of a group that run; those that have ended and only wait to be collected do not count."""
+    """The running processes of a group; ended processes that only wait to be collected do not count."""
     found = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:

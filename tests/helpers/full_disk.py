@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def full_disk(size: int = 100) -> Iterator[None]:
-    """Within the block files of this process cannot grow beyond `size` bytes, as on a full disk."""
+    """A context in which files of this process cannot grow beyond `size` bytes, as on a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:

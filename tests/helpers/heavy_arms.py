@@ -13,7 +13,7 @@ TURNED = transform(np.array([0.1, 0.0, 0.3]), rotation_about(np.array([0.6, 0.0,
 
 
 def pendulum(effort: float = 10.0) -> Robot:
-    """A rod of 2 kg and 1 m that hangs down at 0, about y."""
+    """A rod of 2 kg and 1 m that rotates about y and hangs down at 0."""
     y = np.array([0.0, 1.0, 0.0])
     hinge = Joint("hinge", "revolute", "base", "rod", np.eye(4), y, -3.0, 3.0, 2.0, 8.0, 80.0, effort=effort)
     rod = inertia_of([2.0, 0.0, 0.0, -0.5, 2 / 12, 0, 0, 2 / 12, 0, 0])
@@ -21,7 +21,7 @@ def pendulum(effort: float = 10.0) -> Robot:
 
 
 def sliding() -> Robot:
-    """Turns, slides, turns and slides, about and along axes of all directions."""
+    """An arm with two revolute and two prismatic joints in turn, with axes in various directions."""
     kinds = ("revolute", "prismatic", "revolute", "prismatic")
     axes = np.eye(3)[[2, 0, 1, 2]]
     joints = []
@@ -38,7 +38,7 @@ ROBOTS = {"panda": lambda: rd.load_robot("panda"), "ur5": lambda: rd.load_robot(
 
 
 def wild(robot: Robot, rng: np.random.Generator, step: float) -> Trajectory:
-    """Random rows, as far apart as they are fast; accelerations are whatever they say."""
+    """Random rows. Positions differ by as much as the velocities imply; the accelerations are arbitrary."""
     v, a = rng.uniform(-1, 1, (2, 6, robot.dof)) * np.stack([robot.velocity, robot.acceleration])[:, None]
     q = rng.uniform(-1, 1, robot.dof) + np.concatenate([np.zeros((1, robot.dof)), np.cumsum((v[1:] + v[:-1]) / 2, 0)]) * step
     return Trajectory(robot.joint_names, step * np.arange(6.0), q, v, a)

@@ -23,7 +23,7 @@ def line(start: ndarray, goal: ndarray, waypoints: int = WAYPOINTS) -> ndarray:
 
 
 def record(robot: Robot, scene: Scene, q: ndarray, family: int = 0, line_free: bool = True) -> dict[str, ndarray]:
-    """The row of a motion; the last goal is missing, the second one was not reached."""
+    """The row of a motion. The last goal is missing, and the second one was not reached."""
     goals = np.full((GOALS, robot.dof), np.nan)
     costs = np.full(GOALS, np.nan)
     goals[0] = q[-1]
@@ -54,7 +54,7 @@ def record(robot: Robot, scene: Scene, q: ndarray, family: int = 0, line_free: b
 def write_motions(
     folder: Path, robot: Robot, rows: list[dict[str, ndarray]], shard: int = 100, waypoints: int = WAYPOINTS
 ) -> Manifest:
-    """A data set of these rows without a floor, so many in a shard."""
+    """Writes a data set of these rows without a floor, with this number of rows in a shard."""
     of = {"families": {name: {} for name in FAMILIES}, "floors": dict.fromkeys(FAMILIES)}
     manifest = manifest_of(robot, waypoints, trajectories=len(rows), shard=shard, **of)
     write_manifest(folder, manifest)
@@ -66,7 +66,7 @@ def write_motions(
 
 
 def random_motions(robot: Robot, n: int) -> list[dict[str, ndarray]]:
-    """Short straight motions among obstacles that are out of reach, of both families in turn."""
+    """Short straight motions among obstacles that are out of reach, alternately of both families."""
     rng = np.random.default_rng(0)
     rows = []
     for i in range(n):

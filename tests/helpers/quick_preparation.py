@@ -22,7 +22,7 @@ QUICK = PreparationSettings(
 
 @contextmanager
 def coarse_grids() -> Iterator[None]:
-    """Spheres are fitted on a tenth of the grid points."""
+    """A context in which spheres are fitted on a tenth of the grid points."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sphere_fitting, "GRID_POINTS", sphere_fitting.GRID_POINTS // 10)
         yield

@@ -8,7 +8,7 @@ from robotdiffuse.core.errors import InputError
 
 
 def refuses(message: str, call: Callable[..., object], *arguments: object, **more: object) -> None:
-    """The call raises an InputError of one line in which the pattern is found."""
+    """Asserts that the call raises a one-line InputError in which the pattern is found."""
     with pytest.raises(InputError, match=message) as error:
         call(*arguments, **more)
     assert "\n" not in str(error.value)

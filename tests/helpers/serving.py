@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[2]
 def serving(
     *arguments: str, stderr: int = subprocess.DEVNULL, **environment: str
 ) -> Iterator[tuple[httpx.Client, subprocess.Popen]]:
-    """A client of a server that is ready, and its process, which ends afterwards."""
+    """A context with a client of a server that is ready, and the server's process, which ends with the context."""
     paths = os.pathsep.join((str(ROOT / "src"), str(ROOT / "tests")))
     process = subprocess.Popen(
         [sys.executable, "-m", "helpers.serving", "serve", "--port", "0", *arguments],

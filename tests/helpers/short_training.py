@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 
 def trained(network: nn.Module, loss_at: Callable[[int], Tensor], steps: int, rate: float) -> list[float]:
-    """The loss of each step, by the number of which `loss_at` gives it."""
+    """The loss of each step of a training; `loss_at` gives the loss for the number of a step."""
     optimizer = torch.optim.AdamW(network.parameters(), rate)
     losses = []
     for step in range(steps):

@@ -11,7 +11,7 @@ MAX_WAIT = 300.0
 
 
 class SlowPlanner(AORRTC):
-    """AORRTC that waits for `go` before it returns, and raises an error for an obstacle named broken."""
+    """AORRTC that waits for `go` before it returns, and raises an error if an obstacle is named broken."""
 
     name = "slow"
     calls: list[Problem] = []  # noqa: RUF012

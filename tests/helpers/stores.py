@@ -38,7 +38,7 @@ def manifest_of(robot: Robot, waypoints: int = WAYPOINTS, **changes: Any) -> Man
 
 
 def random_arrays(robot: Robot, n: int, rng: Generator, waypoints: int = WAYPOINTS) -> dict[str, ndarray]:
-    """Arrays of a shard: bows between random ends among spheres and boxes."""
+    """Arrays of a shard: bent motions between random configurations, among spheres and boxes."""
     s = np.linspace(0, 1, waypoints)[:, None]
     ends = rng.uniform(0.6 * robot.lower, 0.6 * robot.upper, (2, n, 1, robot.dof))
     bow = rng.uniform(-0.3, 0.3, (n, 1, robot.dof)) * np.sin(np.pi * s)
@@ -79,7 +79,7 @@ def random_arrays(robot: Robot, n: int, rng: Generator, waypoints: int = WAYPOIN
 
 
 def write_store(folder: Path, robot: Robot, sizes: tuple[int, ...], waypoints: int = WAYPOINTS) -> Manifest:
-    """A manifest and a shard of each size."""
+    """Writes a manifest, and a shard of each size."""
     rng = np.random.default_rng(0)
     manifest = manifest_of(robot, waypoints)
     write_manifest(folder, manifest)

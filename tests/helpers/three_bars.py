@@ -17,7 +17,7 @@ def bar(length: float) -> ConvexMesh:
 
 
 def three_bars() -> Robot:
-    """Three bars: a turning pillar, a hinge with its axis off z, a slide."""
+    """Three bars: a rotating pillar, a hinge whose axis is not parallel to z, and a slide."""
     quarter = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     z = np.array([0.0, 0, 1])
     y = np.array([0.0, 1, 0])

@@ -13,7 +13,8 @@ from robotdiffuse.learning.training.loop import Processes, TrainingTask, Validat
 
 
 class ToyTask(TrainingTask):
-    """A linear layer whose squared weights are the loss, with a factor by the number of the call."""
+    """A linear layer. The loss is the sum of its squared weights times a factor, which depends on the number of
+    the call."""
 
     title = "toy"
 
@@ -34,4 +35,4 @@ class ToyTask(TrainingTask):
         return Validation(0.0)
 
     def save(self, folder: Path, training: dict[str, Any]) -> None:
-        """Nothing is kept."""
+        """Saves nothing."""

@@ -18,7 +18,8 @@ STOP_AFTER = 3
 
 
 def two(settings: PlannerTraining, out: Path) -> None:
-    """A run undisturbed, one that is cut in two, and a toy whose second process meets what is not finite."""
+    """Trains without interruption, then with one; and runs a toy training whose second process gets a loss that
+    is not finite."""
     original = TrainingRun.step
 
     def first_step_kept(self):

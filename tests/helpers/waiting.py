@@ -6,7 +6,7 @@ from typing import Any
 
 
 def until(holds: Callable[[], object], patience: float, about: Callable[[], object] = lambda: "") -> None:
-    """Wait until `holds()`, for at most `patience` [s]; a failure shows `about()`."""
+    """Waits until `holds()`, for at most `patience` [s]; the message of a failure is `about()`."""
     end = time.monotonic() + patience
     while not holds():
         assert time.monotonic() < end, about()
@@ -14,6 +14,6 @@ def until(holds: Callable[[], object], patience: float, about: Callable[[], obje
 
 
 def state_when(session: Any, holds: Callable[[Any], object], patience: float) -> Any:
-    """The state of a page's session, as soon as it holds."""
+    """Waits until the state of a page's session satisfies `holds`; returns the state."""
     until(lambda: holds(session.state), patience, lambda: session.state)
     return session.state

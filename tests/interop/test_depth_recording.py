@@ -62,7 +62,7 @@ def stamp(seconds: float) -> dict[str, int]:
 
 
 def pose(parent: str, child: str, at: float, turn: float = 0.0, x: float = 0.0) -> dict[str, Any]:
-    """A transform with a turn about z."""
+    """A transform with a rotation about z."""
     rotation = {"x": 0.0, "y": 0.0, "z": np.sin(turn / 2), "w": np.cos(turn / 2)}
     place = {"translation": {"x": x, "y": 0.0, "z": 0.0}, "rotation": rotation}
     return {"header": {"stamp": stamp(at), "frame_id": parent}, "child_frame_id": child, "transform": place}
@@ -80,8 +80,8 @@ def camera(frame: str, at: float, encoding: str, unit: float, zeros: int = 0) ->
 
 
 def recording(file: Path, change: Callable[[dict[str, Any]], object] = lambda messages: None) -> Path:
-    """One image of 16 bits at 1.05 s, joint states and transforms every 0.1 s, and a camera on a link whose
-    pose on it is static. `change` changes the messages by topic."""
+    """A recording with one image of 16 bits at 1.05 s, joint states and transforms every 0.1 s, and a camera
+    that is fixed to a link. `change` changes the messages by topic."""
     info, image = camera("camera_optical", 1.05, "16UC1", 1e-3)
     names = list(reversed(PANDA.joint_names))
     messages: dict[str, Any] = {
@@ -146,7 +146,7 @@ def test_bags_hold_what_mcap_files_do(name: str, tmp_path: Path) -> None:
 
 
 def realsense(file: Path, compression: Writer1.CompressionFormat | None = None, zeros: int = 0) -> Path:
-    """A bag as librealsense writes it: depth in units of 0.1 mm, no joint states and no transforms."""
+    """A bag as librealsense writes it: depth in units of 0.1 mm, without joint states and transforms."""
     info, image = camera("0", 3.0, "mono16", 1e-4, zeros)
     bag = Writer1(file)
     if compression is not None:
@@ -200,14 +200,15 @@ def with_velocities_alone(messages: dict[str, Any]) -> None:
 def test_only_joint_states_near_in_time_and_with_positions_count(
     change: Callable[[dict[str, Any]], object], at: float, tmp_path: Path
 ) -> None:
-    """One far away was interpolated with, and one without positions was reported as damage."""
+    """Regression: a joint state far away in time was used for interpolation, and one without positions was
+    reported as damage."""
     [(_, view)] = rd.read_depth_views(recording(tmp_path / "r.mcap", change), PANDA)
     assert view.configuration is not None
     np.testing.assert_allclose(view.configuration, HOME + at, atol=1e-9)
 
 
 def test_continuous_joints_are_interpolated_the_short_way(tmp_path: Path) -> None:
-    """Halfway between 3.13 and -3.13 rad a joint was taken to be at 0."""
+    """Regression: halfway between 3.13 and -3.13 rad, a joint was taken to be at 0."""
     gen3 = rd.load_robot("gen3")
 
     def of_gen3(messages: dict[str, Any]) -> None:
@@ -222,7 +223,7 @@ def test_continuous_joints_are_interpolated_the_short_way(tmp_path: Path) -> Non
 
 
 def test_an_image_without_a_joint_state_leaves_the_rest(tmp_path: Path) -> None:
-    """It ended the reading for good."""
+    """Regression: such an image ended the reading."""
 
     def early_too(messages: dict[str, Any]) -> None:
         [image] = messages["/camera/image_rect"]
@@ -263,7 +264,8 @@ def test_other_files_and_topics_are_refused(tmp_path: Path) -> None:
 
 
 def history() -> depth_recording.TransformHistory:
-    """A link that turns by 1 rad in 0.1 s, logged in the wrong order, and a camera fixed to it."""
+    """Transforms of a link that turns by 1 rad in 0.1 s, logged in the wrong order, and of a camera fixed to
+    it."""
     out = depth_recording.TransformHistory()
     out.add(pose("base", "link", 5.1, 1.0), static=False)
     out.add(pose("base", "link", 5.0, 0.0), static=False)

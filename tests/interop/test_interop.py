@@ -84,7 +84,8 @@ def refuse(file: Path, message: str, topic: str | None = None) -> None:
 
 
 def in_mcap(file: Path) -> tuple[dict[str, Any], list[Any], dict[str, bytes], list[tuple[str, str]]]:
-    """Entities of the scene by name, frames at each time, attachments, and topic and type of each message."""
+    """The contents of an MCAP file: entities of the scene by name, frames at each time, attachments, and topic
+    and type of each message."""
     from mcap.reader import make_reader
     from mcap_protobuf.decoder import DecoderFactory
 
@@ -132,7 +133,7 @@ def test_a_urdf_goes_along(tmp_path: Path) -> None:
 
 
 def in_rrd(file: Path, column: str) -> dict[str, list[Any]]:
-    """The values of a column by entity, empty for those that lack it."""
+    """The values of a column by entity; empty for entities without this column."""
     from rerun.chunk import RrdReader
 
     found: dict[str, list[Any]] = {}
@@ -158,7 +159,7 @@ def test_rerun_recordings_hold_the_joints(planned: Planned, tmp_path: Path) -> N
 def test_a_recording_that_unpacks_to_gigabytes_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, compression: str
 ) -> None:
-    """A file of 105 kB took 6 GB."""
+    """Regression: a file of 105 kB took 6 GB of memory."""
     from mcap.writer import CompressionType, Writer
 
     monkeypatch.setattr(ros2, "MAX_UNPACKED", 100_000)
@@ -189,7 +190,7 @@ def test_a_motion_of_too_many_messages_is_refused(planned: Planned, tmp_path: Pa
 
 @pytest.mark.parametrize("ending", sorted([*WRITERS, *TRAJECTORY_ENDINGS]))
 def test_a_disk_that_fills_up_is_one_line(planned: Planned, tmp_path: Path, ending: str) -> None:
-    """ROS 2 bags and Rerun's recordings ended with tracebacks of SQLite and of Rerun."""
+    """Regression: ROS 2 bags and Rerun's recordings ended with tracebacks of SQLite and of Rerun."""
     problem, trajectory = planned
     with full_disk(4096), pytest.raises(OutputError, match=r"m\.\w+ cannot be written: ") as caught:
         write_motion(problem, trajectory, tmp_path / f"m{ending}")
@@ -392,7 +393,7 @@ def test_a_missing_extra_says_what_to_install(
 
 
 def test_motions_are_published_to_a_rosbridge(planned: Planned, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Subscribers had no time to match the publisher, which sent and ended at once."""
+    """Regression: the publisher sent and ended at once, before subscribers had connected to it."""
     from websockets.sync.server import serve
 
     from robotdiffuse.interop import recorded_motion
@@ -424,7 +425,7 @@ def test_no_rosbridge_is_one_line() -> None:
 
 
 def test_a_bag_replaces_a_link_to_one(tmp_path: Path) -> None:
-    """It failed, since a folder cannot be renamed to a link."""
+    """Regression: writing failed, since a folder cannot be renamed to a link."""
     link = tmp_path / "m.rosbag2"
     first = tmp_path / "first.rosbag2"
     write_motion(PROBLEM, MOTION, first)
@@ -436,7 +437,7 @@ def test_a_bag_replaces_a_link_to_one(tmp_path: Path) -> None:
 
 
 def test_a_bag_that_cannot_be_replaced_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The old bag was removed before the new one was in its place."""
+    """Regression: the old bag was removed before the new one was complete."""
     bag = tmp_path / "m.rosbag2"
     write_motion(PROBLEM, MOTION, bag)
     move = Path.replace
@@ -452,7 +453,7 @@ def test_a_bag_that_cannot_be_replaced_stays(tmp_path: Path, monkeypatch: pytest
 
 
 def test_two_exports_to_one_bag_do_not_share_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each deleted the half-written bag of the other."""
+    """Regression: each export deleted the incomplete bag of the other."""
     bag = tmp_path / "m.rosbag2"
     to_message = ros2.to_message
 
@@ -467,7 +468,7 @@ def test_two_exports_to_one_bag_do_not_share_a_folder(tmp_path: Path, monkeypatc
 
 
 def test_mcap_shows_moving_obstacles_in_frames_of_their_own_and_where_the_base_stands(tmp_path: Path) -> None:
-    """They were left out."""
+    """Regression: moving obstacles and the pose of the base were left out."""
     write_motion(PROBLEM, MOTION, tmp_path / "m.mcap")
     entities, frames, _, _ = in_mcap(tmp_path / "m.mcap")
     assert entities["cart"].frame_id == "moving/cart" and entities["cart"].cubes[0].pose.position.x == 0.0
@@ -479,7 +480,7 @@ def test_mcap_shows_moving_obstacles_in_frames_of_their_own_and_where_the_base_s
 
 
 def test_rerun_shows_moving_obstacles_and_where_the_base_stands(tmp_path: Path) -> None:
-    """Both were left out."""
+    """Regression: moving obstacles and the pose of the base were left out."""
     write_motion(PROBLEM, MOTION, tmp_path / "m.rrd")
     found = in_rrd(tmp_path / "m.rrd", "Transform3D:translation")
     assert found["/scene/cart"] == [[2.0, 0.0, 0.0], [3.0, 0.0, 0.0]]

@@ -7,5 +7,5 @@ from robotdiffuse.learning.motion_network import MotionNetwork
 
 @pytest.fixture
 def no_export(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Weights are saved without the ONNX files, which take seconds: for tests that read them by PyTorch."""
+    """Weights are saved without ONNX files, whose export takes seconds, for tests that read weights by PyTorch."""
     monkeypatch.setattr(MotionNetwork, "exports", lambda _: {})

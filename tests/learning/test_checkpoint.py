@@ -34,7 +34,7 @@ def test_checkpoint_round_trip(tmp_path):
 
 
 def test_wrong_robot_is_refused(tmp_path):
-    """Also one with the same joints and dimensions: its clearances would belong to other links."""
+    """Even a robot with equal joints and dimensions is refused: its clearances would belong to other links."""
     save_small_model(tmp_path)
     arm = box_arm()
     bare = replace(arm, spheres={link: arm.spheres[link] for link in ("l1", "l2")})

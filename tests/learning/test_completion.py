@@ -168,7 +168,7 @@ def test_temperature_and_calibration() -> None:
 
 
 def test_nothing_is_predicted_beyond_reach() -> None:
-    """Training covers no voxels there, so the network would predict walls a meter around the arm."""
+    """Training has no voxels there, so the network would predict walls a meter around the arm."""
     unknown = np.zeros(SHAPE, np.uint8)
     p = exported_completion()(unknown, unknown)
     reachable = training.reachable().repeat(2, 0).repeat(2, 1).repeat(2, 2)
@@ -177,7 +177,8 @@ def test_nothing_is_predicted_beyond_reach() -> None:
 
 @pytest.mark.parametrize("family", ["rop_dense", "shelf", "kitchen"])
 def test_bundled_weights_are_better_than_a_constant(family: str) -> None:
-    """Average precision over unknown voxels of 2 cm above the ground; a constant has the share of occupied ones."""
+    """Average precision over unknown voxels of 2 cm above the ground; that of a constant is the fraction of
+    occupied voxels."""
     samples = draw_samples((family,), PANDA, range(11, 19))
     network = exported_completion()
     above = training.voxel_centers()[..., 2] > 0.02

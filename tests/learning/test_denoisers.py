@@ -111,7 +111,8 @@ def test_fused_and_unfused_attention_agree(monkeypatch, causal):
 
 
 def test_unet_pads_and_crops():
-    """Nothing is added to a length that can be halved often enough; others are extended by the last waypoint."""
+    """Motions are padded by their last waypoint to a length that can be halved often enough; such lengths are
+    not padded."""
     for waypoints, padding in ((12, 0), (13, 3), (254, 2), (1, 3)):
         network = denoiser("unet", waypoints)
         assert network.padding == padding

@@ -112,7 +112,7 @@ def test_points_out_of_the_region_do_not_count(name):
 
 @with_weights
 def test_gradients_reach_every_parameter(name):
-    """Some clouds are empty, and one has fewer points than neighbors: no gradient may be NaN there."""
+    """Some clouds are empty, and one has fewer points than neighbors; nevertheless no gradient may be NaN."""
     encoder = small(name)
     clouds = torch.cat([cloud(40, 6), torch.zeros(2, 40, 3)])
     clouds[5, 2:] = 0.0
@@ -153,8 +153,8 @@ def test_settings_are_read_by_name(name):
 
 
 def test_arranged_clouds():
-    """Points are sorted like the ordered clouds of `surface_clouds`, and thinned or repeated evenly.
-    Both round coordinates to a millionth of the largest."""
+    """Points are sorted like the ordered clouds of `surface_clouds`, and evenly thinned or repeated. Both round
+    coordinates to a millionth of the largest one."""
     encoder = encoders.make_encoder("points", encoders.PointsSettings(code=120, cloud=40))
     scenes = random_scenes(20, 12, np.random.default_rng(0))
     clouds = partial(surface_clouds, scenes, region=encoder.settings.region)
@@ -170,7 +170,7 @@ def test_arranged_clouds():
 
 
 def test_edge_convolution_is_the_maximum_over_edges():
-    """Against the layer as in the paper, edge by edge."""
+    """Compares with the layer as in the paper, computed edge by edge."""
     torch.manual_seed(0)
     layer = networks.EdgeConvolution(5, 7, 4)
     few = networks.neighbors(torch.tensor([[[0.0], [1.0], [3.0], [1.1]]]), torch.arange(4)[None] < 3, 4)[0]

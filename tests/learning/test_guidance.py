@@ -81,7 +81,7 @@ def random_motions(seed: int, count: int = 4, waypoints: int = 32) -> ndarray:
 
 
 def formulas(guidance: CollisionGuidance, q: ndarray) -> dict[str, ndarray]:
-    """The enabled costs of trajectories [count, waypoints, dof], [count]: in rad², of collisions in m²."""
+    """The enabled costs of trajectories [count, waypoints, dof], [count]: in rad²; costs of collision in m²."""
     margins = {"collision": guidance.settings.margin, "self_collision": guidance.settings.self_margin}
     found = {"length": 0.5 * (np.diff(q, axis=1) ** 2).sum((1, 2))}
     for name, margin in margins.items():
@@ -110,7 +110,7 @@ def test_steps_descend(name: str, seed: int) -> None:
 
 
 def test_a_full_step_is_newton_s() -> None:
-    """The formula is smallest in the waypoint that a round moves last."""
+    """The formula has its minimum at the waypoint that a round moves last."""
     guidance = CollisionGuidance(CROWDED, ALONE["length"])
     middle = (PANDA.lower + PANDA.upper) * 0.35
     q = 0.3 * random_motions(2, count=1, waypoints=7) + middle.astype(np.float32)
@@ -124,7 +124,8 @@ def test_a_full_step_is_newton_s() -> None:
 
 
 def test_together_they_reach_a_free_and_short_path_that_none_reaches_alone() -> None:
-    """A zigzag through a ball: pushes alone leave the zigzag, length alone the ball."""
+    """A zigzag through a ball: the cost of collision alone leaves the zigzag, and the cost of length alone
+    leaves the path in the ball."""
     checker = CollisionChecker(box_arm(), Scene([Sphere([1.02, 0.55, 0.0], 0.08)]))
     t = np.linspace(0.0, 1.0, 24, dtype=np.float32)[:, None]
     line = np.array([-0.8, 0.6, 0.6], np.float32) + t * np.array([1.6, 0.0, 0.0], np.float32)

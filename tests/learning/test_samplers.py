@@ -29,8 +29,8 @@ def best_predictor(schedule: NoiseSchedule) -> Callable[[np.ndarray, int], np.nd
 
 
 def exact_moments(name: str, schedule: NoiseSchedule, steps: int, eta: float) -> tuple[np.ndarray, np.ndarray]:
-    """Exact mean and covariance of the samples. A sample is affine in the noises that are drawn, so one
-    sample without noise and one with a unit in each component of each draw determine both."""
+    """Exact mean and covariance of the samples. A sample is an affine function of the drawn noises, so two
+    kinds of samples determine both: without noise, and with a unit in one component of one draw."""
     draws = 0
     impulses = np.zeros((1 + 2 * (steps + 1), steps + 1, 2))
     impulses[1:] = np.eye(2 * (steps + 1)).reshape(-1, steps + 1, 2)
@@ -46,7 +46,7 @@ def exact_moments(name: str, schedule: NoiseSchedule, steps: int, eta: float) ->
 
 @pytest.mark.parametrize("name", SAMPLERS)
 def test_stochastic_samples_have_the_data_s_moments(name):
-    """With all noise drawn afresh, the covariance converges at first order."""
+    """If all noise is drawn anew in each step, the error of the covariance is proportional to the step size."""
     schedule = cosine_schedule(1024)
     steps = [32, 64, 128, 256]
     moments = [exact_moments(name, schedule, n, 1.0) for n in steps]
@@ -82,7 +82,7 @@ def network(x: np.ndarray, level: int) -> np.ndarray:
 
 
 def draws_for(steps: int) -> list[np.ndarray]:
-    """The first noise, and that of every step, as a torch.Generator of seed 1 gives them."""
+    """The first noise and that of every step, as a torch.Generator with seed 1 draws them."""
     generator = torch.Generator().manual_seed(1)
     later = [torch.randn(4, 3, generator=generator, dtype=torch.float64).numpy() for _ in range(steps)]
     return [np.random.default_rng(0).standard_normal((4, 3)), *later]
@@ -165,7 +165,8 @@ def test_objective_round_trip(name, as_given):
 @pytest.mark.parametrize("limit", [5.0, 100.0])
 @pytest.mark.parametrize("name", OBJECTIVES)
 def test_objectives_weigh_levels_alike(name, limit):
-    """The weighted error of the output is that of the clean trajectory wherever the weight is below the limit."""
+    """The weighted error of the output equals that of the clean trajectory wherever the weight is below its
+    limit."""
     schedule = cosine_schedule()
     objective = OBJECTIVES.make(name)
     t = np.arange(1, 200)

@@ -13,7 +13,7 @@ from robotdiffuse.learning.weight_files import checked_bytes, read_description
 
 @pytest.mark.parametrize("name", ["pipe", "endless"])
 def test_a_pipe_and_a_link_to_a_device_are_not_read(name: str, tmp_path: Path) -> None:
-    """Reading the first never began, reading the second never ended."""
+    """Reading the pipe would never begin, reading the device would never end."""
     for file in ("model.json", "model.onnx"):
         if name == "pipe":
             os.mkfifo(tmp_path / file)
@@ -29,7 +29,7 @@ def test_a_nested_description_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_network_reads_no_other_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """ONNX Runtime took its weights from the current folder."""
+    """Regression: ONNX Runtime read weights from a file in the current folder."""
     onnx = pytest.importorskip("onnx")
     number = onnx.TensorProto.FLOAT
     weights = onnx.numpy_helper.from_array(np.ones(4, np.float32), "w")

@@ -24,7 +24,7 @@ T = looking_at(np.array([1.2, -0.8, 0.9]), np.array([0.2, 0.0, 0.4]))
 
 
 def seen(q: ndarray, seed: int = 0) -> rd.DepthView:
-    """The image that a sensor with correlated noise has of the arm and the scene."""
+    """An image of the arm and the scene by a sensor with correlated noise."""
     view = ray_cast(SCENE, T, K, (320, 240))
     balls = surface_balls(PANDA, q)
     rows = np.zeros((len(balls), 17), np.float32)
@@ -65,7 +65,8 @@ MISTAKES = {
 
 @pytest.mark.parametrize("name", MISTAKES)
 def test_mistakes_in_poses_are_named(name: str) -> None:
-    """Planned on without a note, with points of walls and arm anywhere."""
+    """Regression: problems with such poses were planned without a note, with points of walls and arm at wrong
+    places."""
     wrong = replace(at_home(), T_base_camera=MISTAKES[name](T))
     assert name in camera_note(wrong, PANDA, HOME)
     result = rd.load_planner("aorrtc").plan(rd.Problem(PANDA, rd.Scene([]), HOME, HOME + 0.1, views=[wrong]))

@@ -32,7 +32,8 @@ def view_from(distance: float) -> rd.DepthView:
 @pytest.mark.parametrize("distance", (1.2, 2.5))
 @pytest.mark.parametrize("correlation", (0.0, 1.5, 2.5))
 def test_the_estimated_noise_is_that_of_the_sensor(spread: float, distance: float, correlation: float) -> None:
-    """Differences of neighboring pixels showed an eighth of noise that is correlated as recorded."""
+    """Regression: the differences of neighboring pixels, which have correlated errors, showed only an eighth of
+    recorded noise."""
     noise = DepthNoise(spread=spread, correlation=correlation)
     noisy = noise.applied(view_from(distance), np.random.default_rng(0))
     found, neighbors = patch_noise(noisy.depth)
@@ -56,7 +57,7 @@ def test_noise_is_measured_on_images_of_a_still_scene() -> None:
 
 @pytest.mark.parametrize("correlation", (0.0, 1.5))
 def test_flat_surfaces_are_smoothed_and_edges_and_thin_things_stay(correlation: float) -> None:
-    """Noise that is correlated as recorded passes the median; planned motions kept away from it."""
+    """Regression: correlated noise of recorded sensors passes the median, so motions kept away from it."""
     v, u = np.mgrid[:120, :160]
     clean = 1 / (0.4 + 0.001 * u + 0.0005 * v)
     clean[40:80, 60:110] = 1.0
@@ -93,7 +94,8 @@ def test_small_objects_are_not_smoothed_away(correlation: float) -> None:
 
 
 def test_zeros_are_told_from_nothing_in_range() -> None:
-    """An open world, seen by a sensor that gives 0 for both, was never seen free."""
+    """Regression: an open space was never seen free by a sensor that gives 0 both for no return and for nothing
+    in range."""
     clean = view_from(1.2)
     clean = replace(clean, depth=np.where(clean.depth < 2.0, clean.depth, np.inf), range=2.0)
     noisy = DepthNoise(spread=0.003, correlation=1.5, missing=0.02, zeros=True)
@@ -118,7 +120,7 @@ def test_zeros_are_told_from_nothing_in_range() -> None:
 
 @pytest.mark.parametrize("height", (0.55, 0.6))
 def test_a_board_seen_almost_edge_on_is_not_empty(height: float) -> None:
-    """Regression: its surface gives no return, like the open space behind it, and was seen free."""
+    """Regression: the board gives no return, like the open space behind it, and was seen as free."""
     board = rd.Scene([rd.Box((0.5, 0.0, 0.5), (0.4, 0.8, 0.02))])
     T = looking_at(np.array([1.6, 0.1, height]), np.array([0.5, 0.0, 0.5]), roll=0.1)
     clean = ray_cast(board, T, (FOCAL, FOCAL, 159.5, 119.5), (320, 240))
@@ -129,7 +131,7 @@ def test_a_board_seen_almost_edge_on_is_not_empty(height: float) -> None:
 
 
 def test_rays_through_the_arm_are_not_empty() -> None:
-    """A gripper too near to be measured is 0 too; what is behind it was not seen."""
+    """A gripper too near to be measured gives 0 too; the space behind it was not seen."""
     T = looking_at(np.array([0.9, 0.0, 0.8]), np.array([0.0, 0.0, 0.8]))
     view = ray_cast(rd.Scene([]), T, (FOCAL, FOCAL, 159.5, 119.5), (320, 240), PANDA, HOME)
     few = np.zeros((240, 320))
@@ -141,8 +143,8 @@ def test_rays_through_the_arm_are_not_empty() -> None:
 
 
 def test_the_arm_beside_its_own_camera_leaves_open_space_open() -> None:
-    """Regression: nearness of the arm made regions beside it surfaces too near to be measured, and the
-    gripper, 9 mm beside the camera and widened by 15 mm, hid half of the image: looks showed nothing."""
+    """Regression: regions beside the near arm counted as surfaces too near to be measured. The gripper, 9 mm
+    beside the camera and enlarged by 15 mm, hid half of the image, so looks showed nothing."""
     camera = wrist_camera(PANDA)
     q = np.array([-0.9, -1.6, -1.4, -2.3, 0.1, 1.1, -1.1])
     T = camera.poses(PANDA, q[None])[0]
@@ -156,7 +158,8 @@ def test_the_arm_beside_its_own_camera_leaves_open_space_open() -> None:
 
 
 def test_a_straight_edge_is_not_the_end_of_the_image() -> None:
-    """Regression: a board's edge along a row counted as a crop though there is something beyond it."""
+    """Regression: a board's edge along a row was taken for the border of a cropped image, although there are
+    returns beyond it."""
     depth = np.zeros((240, 320))
     depth[100:] = 1.0
     assert empty_regions(depth, 2.0) is None, "cropped, perhaps"
@@ -185,7 +188,8 @@ def test_the_filter_takes_the_median_of_the_returns_and_adds_none_but_in_single_
 
 @pytest.mark.parametrize("distance", (1.5, 3.0))
 def test_points_of_the_arm_are_taken_away_with_noise_too(distance: float) -> None:
-    """A fixed margin of 2 cm left points of the arm, three deviations from it, and starts collided."""
+    """Regression: a fixed margin of 2 cm left points of the arm at three deviations of the noise, so starts
+    were in collision."""
     view = DepthNoise().applied(view_from(distance), np.random.default_rng(1))
     points = seen_points([view], PANDA, HOME)
     above = points[(np.abs(points[:, 1]) < 0.12) & (points[:, 2] > 0.25)]
@@ -226,7 +230,8 @@ def test_noise_is_as_its_settings_say() -> None:
 
 @pytest.mark.parametrize("angle", (0.1, 0.25))
 def test_a_floor_at_a_grazing_angle_gives_no_return(angle: float) -> None:
-    """A floor 1 m below a camera that looks ahead: a row sees it at its angle below the horizon."""
+    """A floor 1 m below a horizontal camera: each row of pixels sees the floor at the row's angle below the
+    horizon."""
     focal = 200.0
     rows = np.arange(1, 150)
     depth = np.broadcast_to((focal / rows)[:, None], (len(rows), 40))

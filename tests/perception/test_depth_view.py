@@ -168,7 +168,8 @@ def test_what_is_wrong_in_a_file(entry: object, message: str, tmp_path: Path) ->
 
 
 def test_points_that_were_seen_are_sampled_as_a_cloud() -> None:
-    """The network was asked for a scene with a kind of point cloud, and its surface looked for a mesh."""
+    """Regression: the network needed surface points of a scene with a kind of point cloud, and the sampling
+    looked for a mesh."""
     points = np.random.default_rng(0).uniform(0.2, 0.5, (50, 3))
     found = sample_surface(rd.Scene([SeenPoints(points, 0.01)]), 20, np.random.default_rng(1))
     assert len(found) == 20 and all((point == points).all(axis=1).any() for point in found)
@@ -181,7 +182,7 @@ def test_intrinsics_as_a_mapping_or_a_matrix() -> None:
 
 
 def test_small_images_cannot_fill_the_memory(tmp_path: Path) -> None:
-    """A PNG of 350 kB unpacked to gigabytes, and an EXR image took 48 s."""
+    """Regression: a PNG of 350 kB unpacked to gigabytes, and an EXR image took 48 s."""
     huge = np.zeros((4097, 4096), np.uint16)
     Image.fromarray(huge).save(tmp_path / "huge.png")
     np.savez_compressed(tmp_path / "huge.npz", huge)

@@ -22,7 +22,7 @@ WALL = 0.83
 
 
 def camera(x: float = 1.6, y: float = 0.0, z: float = 0.5, back: bool = False) -> np.ndarray:
-    """T_base_camera: looking along -x; from behind, along x."""
+    """T_base_camera of a camera that looks along -x or, from behind, along x."""
     T = np.eye(4)
     sign = -1.0 if back else 1.0
     T[:3, :3] = np.array([[0, 0, -sign], [sign, 0, 0], [0, -1, 0]])
@@ -44,7 +44,8 @@ def centers() -> np.ndarray:
 
 
 def ahead(seen: ObservedVolume) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Along x, right ahead of the camera: the places of the voxels, occupied, free, behind."""
+    """For the voxels along x straight ahead of the camera: their places, and whether they are occupied, free,
+    behind a surface."""
     j, k = (int((at - low) / VOXEL) for at, low in zip((0.01, 0.51), LOW[1:], strict=True))
     return centers()[:, j, k, 0], seen.occupied[:, j, k], seen.free[:, j, k], seen.behind[:, j, k]
 
@@ -71,7 +72,7 @@ def test_what_is_beside_the_image_is_out_of_view() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_free_voxels_hold_no_point_of_any_pixel(seed: int) -> None:
-    """Of random discs before a wall: neither do points lie in free voxels, nor does a disc hide a corner."""
+    """Random discs in front of a wall: no point lies in a free voxel, and no disc hides a corner of one."""
     rng = np.random.default_rng(seed)
     u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     depth = flat(2.5)

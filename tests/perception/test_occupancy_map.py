@@ -48,7 +48,8 @@ def test_free_voxels_hold_no_obstacle_and_most_of_the_space_is_seen(noisy: bool)
 
 
 def test_what_obstacles_may_reach_is_free_only_by_a_margin_of_the_own_error() -> None:
-    """Regression: points enlarged by the error of a far camera closed gaps, however near one looked."""
+    """Regression: points enlarged by the pose error of a far camera closed gaps, even if a near camera saw the
+    gaps free."""
     known = OccupancyMap(PANDA)
     far = replace(view_from(0.3), pose_deviation=(0.005, 0.0175))
     known.add(far)
@@ -85,7 +86,7 @@ def test_a_view_counts_once_and_the_order_does_not_matter() -> None:
 
 
 def test_a_voxel_is_the_same_wherever_its_block_begins() -> None:
-    """Voxels of a block that are all free, or all out of the image, are decided at once."""
+    """If all voxels of a block are free, or all are outside of the image, they are decided together."""
     states = []
     for shift in (0.0, MAP.edge):
         x, y, z = (side + shift for side in MAP.low)

@@ -28,7 +28,7 @@ POINTS = np.stack(np.meshgrid((-0.5, 0.0, 0.5), (-0.5, 0.0, 0.5), (0.1, 0.8)), a
 
 
 def off(view: rd.DepthView, seed: int) -> rd.DepthView:
-    """The view with a pose that is off by what is stated."""
+    """The view with a pose error as large as stated."""
     rng = np.random.default_rng(seed)
     shift, axis = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
     error = np.eye(4)
@@ -43,7 +43,8 @@ def beside(q: np.ndarray, seed: int = 0) -> rd.DepthView:
 
 
 def displaced(view: rd.DepthView, true: rd.DepthView) -> tuple[np.ndarray, np.ndarray]:
-    """How far a pose displaces points around the arm, and how far it may [m]."""
+    """How far the pose error of a view displaces points around the arm, and the stated bound of the
+    displacement [m]."""
     T = true.T_base_camera
     in_camera = (POINTS - T[:3, 3]) @ T[:3, :3]
     x = in_camera[(in_camera[:, 2] > 0.1) & (np.linalg.norm(in_camera, axis=1) < 2)]

@@ -29,7 +29,8 @@ def seen_in(depth: np.ndarray, noise: float = 0.0, border: int = 0, radius: floa
 
 
 def returns(depth: np.ndarray, ball: np.ndarray, radius: float, more: int) -> np.ndarray | None:
-    """The pixels that a ball projects to, by points on its surface; None if some are outside of the image."""
+    """The pixels that a ball projects to, computed from points on its surface; None if some are outside of the
+    image."""
     ways = RNG.standard_normal((400, 3))
     points = (ball + radius * ways / np.linalg.norm(ways, axis=1)[:, None] - T[:3, 3]) @ T[:3, :3]
     fx, fy, cx, cy = INTRINSICS
@@ -116,7 +117,7 @@ def test_balls_cover_the_spheres_of_a_link_without_meshes() -> None:
 
 
 def check_covered(robot: rd.Robot, points: dict[str, np.ndarray]) -> None:
-    """Points in frames of links are within the arm's balls at Q."""
+    """Asserts that points, given in the frames of links, are within the arm's balls at Q."""
     tree = KDTree(visibility.surface_balls(robot, Q))
     for link, of_link in points.items():
         T = robot.fk(Q, link)

@@ -26,7 +26,7 @@ T = transform(np.array([2.0, 0.0, 0.5]), np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 
 
 
 def picture(balls: ndarray) -> ndarray:
-    """Depth of balls from T; 0 where there is none."""
+    """The depth image of balls as seen from the pose T; 0 where there is no ball."""
     depth = depth_of_balls(balls, T, K, (160, 120))
     return np.where(np.isfinite(depth), depth, 0.0)
 
@@ -77,7 +77,8 @@ def test_the_scene_is_what_is_known_and_what_was_seen() -> None:
 
 
 def test_points_that_an_end_is_near_are_bare() -> None:
-    """A goal close to an obstacle stays valid: what is added to points for safety must not end it."""
+    """A goal close to an obstacle stays valid: the radius that is added to points for safety must not make it
+    invalid."""
     sphere = placed_spheres(PANDA, GOAL)[-1]
     near = np.array([[sphere[0] + sphere[3] + 0.105, *sphere[1:3], 0.1]])
     problem = rd.Problem(PANDA, rd.Scene(), START, GOAL, views=[view(near)])
@@ -118,7 +119,8 @@ def test_what_the_arm_holds_is_not_seen_as_an_obstacle() -> None:
 
 
 def test_points_of_a_pose_that_may_be_off_are_larger_and_leave_start_and_goals_free() -> None:
-    """Checks join large points to larger spheres: starts collided with points that did not touch them."""
+    """Regression: checks enlarge large points further, so starts were in collision with points that do not
+    touch the arm."""
     error = 0.04
     spheres = placed_spheres(PANDA, START)
     rng = np.random.default_rng(0)
@@ -139,7 +141,7 @@ def test_points_of_a_pose_that_may_be_off_are_larger_and_leave_start_and_goals_f
 
 
 def test_each_point_is_larger_by_what_its_own_view_may_be_off() -> None:
-    """Regression: all points were as large as those seen from farthest away, and left no way between them."""
+    """Regression: all points were as large as those seen from farthest away, which closed passages."""
     points = np.random.default_rng(0).uniform(1.5, 2.5, (500, 3))
     errors = point_errors([replace(view(BALL_ROW), pose_deviation=(0.005, 0.02))], points)
     by_hand = 0.005 + 0.02 * np.linalg.norm(points - T[:3, 3], axis=1)

@@ -48,7 +48,7 @@ def test_a_certain_voxel_in_the_way_leaves_no_world_free() -> None:
 
 
 def test_near_voxels_are_occupied_together() -> None:
-    """As independent ones, 1,000 voxels with a probability of 0.01 would be free in no world."""
+    """If they were independent, 1,000 voxels with a probability of 0.01 would be free in no world."""
     near = np.zeros(FINE_SHAPE, np.bool_)
     near[50:60, 50:60, 30:40] = True
     probability = np.full(FINE_SHAPE, 0.01, np.float32)
@@ -57,7 +57,8 @@ def test_near_voxels_are_occupied_together() -> None:
 
 @pytest.mark.parametrize("more", [0, 9])
 def test_nothing_that_may_be_occupied_is_free_in_every_world(more: int) -> None:
-    """Also in a grid larger than the observed volume, as the map of an exploration is: an index was out of bounds."""
+    """Regression: in a grid larger than the observed volume, such as the map of an exploration, an index was
+    out of bounds."""
     shape = tuple(size + more for size in FINE_SHAPE)
     assert free_share(np.zeros(shape, np.float32), np.ones(shape, np.bool_)) == 1
     assert free_share(np.ones(shape, np.float32), np.ones(shape, np.bool_)) == 0
@@ -74,7 +75,7 @@ def test_confidence_falls_with_the_predicted_probability_or_is_the_rate_of_the_a
 
 
 def test_only_what_the_arm_fills_at_the_ends_is_left_out_without_a_margin() -> None:
-    """A hand that grazes an unseen cupboard beside its goal stated a confidence of 0.98."""
+    """Regression: the stated confidence was 0.98 for a hand that grazes an unseen cupboard beside its goal."""
     path = rd.Path(PANDA.joint_names, np.stack([START, START + 0.015, START]))
     filled = FINE.filled(PANDA, [START])
     arguments = PANDA, START[None], np.ones(FINE_SHAPE, np.bool_), np.full(FINE_SHAPE, 0.01, np.float32)

@@ -36,7 +36,8 @@ def planned(planner: str, start: list[float], goal: object, scene: rd.Scene | No
     ("planner", "turns"), [("rrt_connect", 0), ("aorrtc", -5), ("robotdiffuse", 1), ("shared_tree_rrt_star", 1)]
 )
 def test_from_3_to_minus_3_is_a_short_way(planner: str, turns: int) -> None:
-    """0.28 rad across half a turn, from wherever the joint really is; it was 6 rad."""
+    """The short way is 0.28 rad across half a turn, whatever whole turns the start has. Regression: it was 6
+    rad."""
     start = 3.0 + 2 * np.pi * turns
     path = planned(planner, [start, 0.0, 0.0], [-3.0, 0.0, 0.0])
     assert path.length == pytest.approx(2 * np.pi - 6, abs=1e-6)
@@ -51,7 +52,8 @@ def test_a_pose_is_reached_across_half_a_turn_and_the_long_way_where_something_b
 
 
 def test_values_wrapped_to_half_a_turn_are_no_motion_but_those_of_a_file_are_unwrapped() -> None:
-    """A path was valid, the long way round; the same rows with times turned at 1571 rad/s."""
+    """Regression: a path with wrapped values was valid, the long way round; with times, its rows turned at 1571
+    rad/s."""
     problem = rd.Problem(ARM, rd.Scene(), [3.0, 0.0, 0.0], [-3.0, 0.0, 0.0])
     motion = rd.load_planner("aorrtc").plan(problem).trajectory
     wrapped = (motion.positions + np.pi) % (2 * np.pi) - np.pi
@@ -80,7 +82,8 @@ def test_images_of_a_goal() -> None:
 
 
 def test_limits_of_a_continuous_joint() -> None:
-    """The validator knows none; a file that gives some makes it revolute, and robots keep which it is."""
+    """The validator checks no limits of continuous joints. A file that gives limits makes the joint revolute,
+    and saved robots keep the kind of the joint."""
     assert rd.Problem(ARM, rd.Scene(), [50.0, 0.0, 0.0], [0.0, 0.0, 0.0]).start[0] == 50.0
     narrow = with_limits(ARM, {"j0": {"lower": -1.0}})
     assert (narrow.planned_joints[0].kind, narrow.lower[0], narrow.upper[0]) == ("revolute", -1.0, np.pi)

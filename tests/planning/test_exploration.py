@@ -91,7 +91,8 @@ def test_strict_motions_enter_no_voxel_that_was_not_seen_free() -> None:
 
 
 def test_nothing_further_than_the_margin_from_a_goal_is_exempt() -> None:
-    """Corners of voxels that count as free were up to 4.7 cm away, where 2 cm was said."""
+    """Regression: corners of voxels that count as free were up to 4.7 cm away, though the documented margin was
+    2 cm."""
     rng = np.random.default_rng(0)
     known = OccupancyMap(PANDA)
     for low in rng.uniform(MAP.low, (0.8, 0.8, 1.0), size=(300, 3)):
@@ -160,7 +161,7 @@ def test_what_keeps_the_arm_from_going_is_said() -> None:
 
 
 def test_a_strict_arm_does_not_look_for_a_goal_outside_of_the_map() -> None:
-    """It used up its looks on goals that no motion within the map reaches."""
+    """Regression: the arm used up its looks for goals that no motion within the map reaches."""
     long = rd.load_robot("ur10")
     stretched = np.zeros(6)
     folded = np.array([0.0, -1.2, 2.0, -0.8, 1.5, 0.0])
@@ -174,7 +175,8 @@ def test_a_strict_arm_does_not_look_for_a_goal_outside_of_the_map() -> None:
 
 
 def test_a_look_is_found_where_a_narrow_gap_alone_leads_out() -> None:
-    """Searches to looks that were chosen first failed in four scenes where a tree gets out."""
+    """Regression: searches to viewpoints that were chosen first failed in four scenes in which a tree of
+    motions gets out."""
     known = OccupancyMap(PANDA)
     known.declare_free(((-1.1, 0.3, 0.0), (1.1, 1.1, 1.1)))
     scene = rd.Scene(not_seen_free(known, rd.Scene(), HOME))
@@ -226,7 +228,8 @@ def test_where_no_look_can_be_reached_the_arm_leaves_a_goal_by_the_way_in() -> N
 
 
 def test_without_the_network_a_motion_through_space_seen_free_is_certain_enough() -> None:
-    """Under `probabilistic` the arm never stopped looking: the highest confidence was a rate of 0.82."""
+    """Regression: under `probabilistic` the arm never stopped looking, since the highest stated confidence was
+    0.82."""
     settings = rd.ExplorerSettings(policy="probabilistic", predict=False, time_limit=1.0)
     one = rd.Explorer(PANDA, [simulated.wrist_camera(PANDA)], rd.Scene([FLOOR]), ZONE, settings)
     one.observe(simulated.camera_beside(PROBLEM, None, 0))
@@ -245,7 +248,8 @@ ABOVE_AND_BESIDE = ((1.3, -0.5, 0.6), (-0.3, 1.1, 0.9), (0.4, 1.3, 0.2))
 
 
 def test_a_goal_behind_a_plate_is_refused_until_views_show_it() -> None:
-    """`strict` takes it on trust: all of this motion is within 2 cm of the arm at its ends."""
+    """Without `see_goal`, `strict` accepts the goal unseen: the whole motion is within 2 cm of the arm at its
+    start or goal."""
     with pytest.raises(rd.InputError, match=r"explorer.see_goal is true and explorer.policy 'probabilistic'"):
         rd.ExplorerSettings(policy="probabilistic", see_goal=True)
     plate = rd.Box((1.0, 0.7, 0.6), (0.02, 0.8, 1.2), wxyz=(0.94, 0, 0, 0.34))

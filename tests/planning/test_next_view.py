@@ -34,7 +34,8 @@ def result(problem: Problem) -> PlanResult:
 
 
 def test_what_hides_counts_as_often_as_it_is_there() -> None:
-    """One voxel, cameras to both sides of it along x; before one of them something that is there by half."""
+    """One voxel between two cameras along x. In front of one camera is a voxel that is occupied with
+    probability 0.5."""
     filled = np.zeros((20, 9, 9), np.float32)
     filled[14, 4, 4] = 0.5
     voxel = np.array([[8, 4, 4]])
@@ -56,7 +57,7 @@ def test_what_hides_counts_as_often_as_it_is_there() -> None:
 
 
 def test_the_arm_hides_what_is_behind_it() -> None:
-    """Single voxels, beside and behind what the ray caster shows of the arm."""
+    """Single voxels, beside the arm and behind it as the ray caster sees the arm."""
     filled = np.zeros((60, 60, 50), np.float32)
     low = np.array([-0.6, -0.6, 0.0], np.float32)
     edge = np.float32(0.02)

@@ -101,7 +101,7 @@ def test_warming_up_loads_what_a_plan_needs_by_default() -> None:
 
 
 def test_at_most_nine_functions_lead_to_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    """docs/architecture.md lists them; the tests' checks of types do not count."""
+    """docs/architecture.md lists these functions; the type checks of the tests do not count."""
     depths = set[int]()
     search = rrt_kernel.search
 

@@ -71,7 +71,7 @@ def test_both_hands_are_brought_to_their_poses() -> None:
 
 
 def test_links_that_share_a_joint_are_brought_there_together(tmp_path: Path) -> None:
-    """Each arm alone turns the waist as it likes; both hands need one value of it."""
+    """For one arm alone, the waist may have any value; for both hands, it must have one value."""
     arms = (chain("waist_link", row(side, 6)) for side in ("left_", "right_"))
     parts = chain("base", ["waist"]), *arms
     robot = read_urdf(written(tmp_path, *parts), group="both")
@@ -93,7 +93,7 @@ def test_the_validator_names_the_hand_that_is_elsewhere() -> None:
 
 
 def test_constraints_are_kept_at_the_poses() -> None:
-    """The left hand's orientation is free, but its axis is to stay upright within 0.1 rad."""
+    """The left hand's orientation is free, but its axis must stay within 0.1 rad of upright."""
     start, there = free()[:2]
     right = link_pose(baxter(), there, "right_gripper")
     down = transform(np.array([0.7, 0.25, 0.4]), np.diag([1.0, -1.0, -1.0]))
@@ -167,8 +167,8 @@ def apart(robot: rd.Robot, count: int, seed: int = 5) -> ndarray:
 
 
 def followed(robot: rd.Robot, start: ndarray, shift: ndarray) -> ndarray | None:
-    """Where the joints are after the tip has moved straight on by `shift`, by the least motion; None if it
-    cannot. Well-conditioned ways alone."""
+    """The configuration after the tip has moved straight by `shift`, with the smallest joint motion; None if
+    the arm cannot, or comes close to a singularity."""
     q = start.copy()
     T = link_pose(robot, q, robot.tip)
     target = T.copy()
@@ -190,7 +190,7 @@ def followed(robot: rd.Robot, start: ndarray, shift: ndarray) -> ndarray | None:
 
 @pytest.mark.parametrize("arm", ARMS)
 def test_a_pose_where_the_hand_is_costs_no_motion(arm: str) -> None:
-    """An iiwa14 moved by 3.2 rad."""
+    """Regression: an iiwa14 moved by 3.2 rad."""
     robot = rd.load_robot(arm)
     for k, start in enumerate(apart(robot, 2)):
         start = start + 2 * np.pi * np.where(robot.continuous, k, 0)
@@ -202,7 +202,7 @@ def test_a_pose_where_the_hand_is_costs_no_motion(arm: str) -> None:
 
 @pytest.mark.parametrize("arm", ARMS)
 def test_a_pose_nearby_is_reached_by_the_nearest_configuration(arm: str) -> None:
-    """Alone, after a waypoint, as one of several goals, and along a straight line."""
+    """As the only goal, after a waypoint, as one of several goals, and along a straight line."""
     robot = rd.load_robot(arm)
     rng = np.random.default_rng(2)
     for start in apart(robot, 12):
@@ -241,7 +241,7 @@ def four_joints(folder: Path) -> rd.Robot:
 @pytest.mark.parametrize("arm", ["so101", "four joints"])
 @pytest.mark.parametrize("kind", ["any orientation", "±0.5 rad", "1 mm off"])
 def test_arms_of_few_joints_reach_poses_with_tolerances(arm: str, kind: str, tmp_path: Path) -> None:
-    """0 of 15 were reached: poses drawn within the tolerances need six joints."""
+    """Regression: 0 of 15 poses were reached, since poses drawn within the tolerances need six joints."""
     robot = rd.load_robot("so101") if arm == "so101" else four_joints(tmp_path)
     rng = np.random.default_rng(1)
     rpy = {"any orientation": [np.pi] * 3, "±0.5 rad": [0.5] * 3, "1 mm off": None}[kind]
@@ -273,7 +273,7 @@ def many_grasps() -> tuple[rd.Problem, ndarray]:
 
 
 def tried(monkeypatch: pytest.MonkeyPatch, seconds: float) -> list[ndarray]:
-    """The configurations of each goal, once they are asked for, which takes so long on a clock of its own."""
+    """The configurations of each goal that was tried. Each trial takes `seconds` on a clock of the test."""
     found = []
     clock = [0.0]
     each_pose = pose_goals.each_pose
@@ -290,7 +290,7 @@ def tried(monkeypatch: pytest.MonkeyPatch, seconds: float) -> list[ndarray]:
 
 
 def test_of_several_goals_each_is_tried_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Blocked goals took the whole effort of inverse kinematics before the search began."""
+    """Regression: for blocked goals, inverse kinematics made all of its attempts before the search began."""
     goals = tried(monkeypatch, 0.0)
     monkeypatch.setattr(pose_goals, "at_pose", lambda *_: pytest.fail("a goal is tried again"))
     problem, q_free = many_grasps()
@@ -304,7 +304,7 @@ def test_of_several_goals_each_is_tried_once(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_of_several_goals_no_more_are_tried_late(monkeypatch: pytest.MonkeyPatch) -> None:
-    """After half of the time limit the search begins with what is free."""
+    """After half of the time limit, the search begins with the free configurations found by then."""
     goals = tried(monkeypatch, 0.1)
     problem, _ = many_grasps()
     assert isinstance(problem.goal, rd.AnyGoal)

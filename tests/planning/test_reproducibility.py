@@ -31,7 +31,8 @@ print("compiled", len(compiled))
 
 
 def motions(threads: int) -> list[str]:
-    """A line for each motion, of a process that compiles nothing: one that does may differ in last bits."""
+    """A line for each motion, printed by a process that does not compile; in a process that compiles, the last
+    bits may differ."""
     counts = dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS"), str(threads))
     for _ in range(2):
         done = subprocess.run(
@@ -59,8 +60,8 @@ def test_the_same_seed_gives_the_same_motion() -> None:
 
 @pytest.mark.parametrize("planner", ["aorrtc", "rrt_connect"])
 def test_the_first_call_and_later_ones_give_the_same_path_although_paths_are_refused(planner, monkeypatch):
-    """The time of validations in earlier calls decided when later calls validated, and a refused path changes
-    what the search does next."""
+    """Regression: the duration of validations in earlier calls decided when later calls validated, and a
+    refused path changes what the search does next."""
     accepted = Verifier.path
     refusals = list[float]()
 

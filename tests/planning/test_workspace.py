@@ -40,7 +40,7 @@ def test_motions_are_for_the_obstacles_as_they_are_then() -> None:
 
 
 def test_poses_are_in_the_world() -> None:
-    """The same scene and goal, in the frame of a base that stands elsewhere, give the same motion."""
+    """The same scene and goal relative to a base that stands elsewhere give the same motion."""
     here, there = panda(), panda(T_world_base=T_WORLD_BASE)
     ball = rd.Sphere([0.5, 0.0, 0.6], 0.2, name="ball")
     pose = here.pose(RIGHT)
@@ -80,7 +80,7 @@ def test_the_nearest_goal_that_a_line_leads_to() -> None:
 
 
 def test_a_limit_that_has_run_out_before_the_line_is_planned() -> None:
-    """It was refused as negative: "time_limit is -0.00085"."""
+    """Regression: the error was "time_limit is -0.00085"."""
     space = panda(T_world_base=T_WORLD_BASE)
     end = space.pose(READY) @ rd.pose([0.0, 0.0, 0.05])
     for corners in ((), (end,)):
@@ -229,7 +229,7 @@ def test_pick_and_place_is_verified_step_by_step() -> None:
 
 
 def test_grasps_whose_line_is_blocked_are_left_for_others() -> None:
-    """The can stands between two walls, so that the hand comes down to it across one direction only."""
+    """The can stands between two walls, so the hand can come down to it in one orientation only."""
     space = table_with_can()
     for side in (-1, 1):
         space.add(rd.Box([0.5, -0.3 + side * 0.075, 0.09], [0.2, 0.02, 0.18], name=f"wall {side}"))

@@ -39,7 +39,8 @@ def problem(*constraints: Constraint, robot: rd.Robot = PANDA) -> rd.Problem:
 
 
 def true_values(made: rd.Problem, constraint: Constraint, q: np.ndarray) -> list[float]:
-    """By the book: what `PathConstraints.values` says of one constraint at one configuration."""
+    """The values of a constraint at a configuration, which `PathConstraints.values` must return, by the
+    definition of the constraint."""
     T = link_pose(made.robot, q, constraint.frame)
     p = T[:3, 3]
     if isinstance(constraint, rd.AxisCone):
@@ -75,7 +76,8 @@ def test_values_are_those_of_the_book(constraint: Constraint) -> None:
 
 @pytest.mark.parametrize("constraint", EACH, ids=lambda one: one.kind)
 def test_what_is_proved_holds_at_every_sample_and_what_is_not_proved_does_not(constraint: Constraint) -> None:
-    """Limits a hair above and below the greatest of many samples: the proof tells one from the other."""
+    """With a limit slightly above the largest of many sampled values, the proof succeeds; with a limit slightly
+    below, it fails."""
     made = problem(constraint)
     rng = np.random.default_rng(1)
     ready = PathConstraints(made)
@@ -198,7 +200,7 @@ def test_every_kind_is_tested() -> None:
 @settings(max_examples=12)
 @given(st.integers(0, 2**31))
 def test_projection_onto_tolerances_of_goals_agrees_with_the_validator(seed: int) -> None:
-    """Roll, pitch and yaw near half a turn too, and tolerances of 0 and of any angle."""
+    """Also for roll, pitch and yaw near half a turn, for tolerances of 0, and for free angles."""
     rng = np.random.default_rng(seed)
     q = rng.uniform(PANDA.lower, PANDA.upper, (40, 7))
     xyz = rng.choice([0.0, 0.02, 0.3], 3)
@@ -216,7 +218,7 @@ def test_projection_onto_tolerances_of_goals_agrees_with_the_validator(seed: int
 
 
 def test_most_projections_onto_tolerances_of_a_reachable_goal_succeed() -> None:
-    """With wrong derivatives of roll, pitch and yaw hardly any did."""
+    """With wrong derivatives of roll, pitch and yaw, hardly any projection succeeded."""
     rng = np.random.default_rng(8)
     share = []
     for there in rng.uniform(0.8 * PANDA.lower, 0.8 * PANDA.upper, (10, 7)):

@@ -36,7 +36,8 @@ def test_rpy_of_a_rotation_is_scipys() -> None:
 
 
 def off(goal: rd.PoseGoal, xyz: Any, rpy: Any) -> bool:
-    """Whether a pose that far from the goal's is off, told by a goal that is as far the other way."""
+    """Whether a pose that differs from the goal's by xyz and rpy misses the goal. The pose is that of the arm
+    at START, and the goal is placed accordingly."""
     q = np.array(START)
     T = link_pose(ROBOT, q, goal.frame) @ inverse(transform(np.array(xyz, float), rotation_from_rpy(*map(float, rpy))))
     moved = rd.PoseGoal(goal.frame, T, goal.xyz_tolerance, goal.rpy_tolerance)
@@ -74,7 +75,7 @@ def test_a_box_of_positions_is_reached_where_its_middle_is_blocked() -> None:
 
 
 def test_a_box_of_positions_is_reached_where_only_its_middle_is_free() -> None:
-    """Projections end at the edges of the tolerances, which the obstacles block here."""
+    """Projections end at the edges of the tolerances, which are blocked by obstacles here."""
     middle = transform(np.array([0.5, 0.0, 0.35]), rotation_from_rpy(np.pi, 0.0, 0.0))
     blocks = [rd.Box([0.5, side * 0.42, 0.35], [0.6, 0.4, 0.7]) for side in (-1, 1)]
     wide = rd.PoseGoal("panda_hand", middle, [0.0, 0.35, 0.0], [0.0, 0.0, np.pi])
@@ -104,7 +105,7 @@ def test_one_motion_stops_at_waypoints_in_their_order() -> None:
 
 
 def nearest(trajectory: rd.Trajectory, goal: rd.PoseGoal | rd.JointGoal) -> float:
-    """How near the motion comes to a goal, on the cubics between its rows."""
+    """The smallest distance of the motion to a goal, on the cubics between the rows."""
     curve = CubicHermiteSpline(trajectory.times, trajectory.positions, trajectory.velocities)
     q = curve(np.linspace(0, trajectory.duration, 20_000))
     if isinstance(goal, rd.JointGoal):
@@ -208,7 +209,7 @@ def test_wrong_goals_are_one_line(case: str, tmp_path: Path) -> None:
 
 
 def test_poses_are_drawn_on_as_long_as_none_is_free() -> None:
-    """A pose on a line of 10 m, of which 3 % are in reach and free: 20 draws mostly miss them."""
+    """The goal is a line of 10 m, of which 3 % can be reached and are free, so 20 draws usually miss that part."""
     T = transform(np.array([0.5, 0.0, 0.35]), rotation_from_rpy(np.pi, 0.0, 0.0))
     block = rd.Box([0.65, 0.325, 0.5], [0.7, 1.35, 1.0], name="block")
     narrow = rd.PoseGoal("panda_hand", T, [0.0, 5.0, 0.0], [0.0, 0.0, np.pi])

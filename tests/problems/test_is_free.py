@@ -66,7 +66,7 @@ TO = [0.4, -0.7, 0.0, -2.3, 0.0, 1.571, 0.785]
 
 @cache
 def seen() -> rd.DepthView:
-    """A box beside the arm, by a camera in front of it."""
+    """A depth view of a box beside the arm, from a camera in front of the arm."""
     camera = looking_at(np.array([1.7, 0.0, 0.6]), np.array([0.4, 0.0, 0.3]))
     lens = (75.0, 75.0, 39.5, 29.5)
     box = rd.Box([0.0, -0.8, 0.3], [0.2, 0.2, 0.6])

@@ -131,7 +131,8 @@ def fail_without(file: str) -> bool:
 
 
 def test_ready_workers_are_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A worker that has compiled code is replaced once, as one that lacks memory to start is."""
+    """`prepare` returns True in the first process, as after compiling, so a second process replaces the first.
+    A killed worker is replaced too."""
     with Workers(1, fail_without, (str(tmp_path / "file"),), keep_ready=True) as workers:
         workers.start()
         [worker] = workers.workers
@@ -180,7 +181,8 @@ def test_shared_calls_of_a_script_that_processes_cannot_import_say_what_to_do(by
 
 
 def test_calls_while_the_first_process_starts_wait_for_it() -> None:
-    """A call that came meanwhile started the process again: both read the answers of one connection."""
+    """Regression: a call during the start of the process started it again, and both calls read the answers of
+    one connection."""
     with Workers(1, time.sleep, (0.5,), keep_ready=True) as workers:
         starting = threading.Thread(target=workers.start)
         starting.start()

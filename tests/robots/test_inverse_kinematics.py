@@ -46,7 +46,7 @@ def test_solutions_are_exact_distinct_and_within_limits(name: str) -> None:
 
 
 def test_ur5_has_at_most_eight_solutions() -> None:
-    """A 6R arm with a nearly spherical wrist and joints of one turn has the eight solutions of the textbook."""
+    """A 6R arm with a nearly spherical wrist and joints of one turn has eight solutions."""
     robot = example_robot("ur5")
     rng = np.random.default_rng(5)
     counts = []
@@ -93,7 +93,8 @@ def test_unreachable_poses_give_nothing(xyz: tuple[float, float, float]) -> None
 
 
 def test_a_narrow_range_of_acceptance_is_found() -> None:
-    """Solutions close to rejected ones are tried too: here a range of 0.02 rad of the elbow is accepted."""
+    """Configurations near rejected solutions are tried too: here, only a range of 0.02 rad of the elbow is
+    accepted."""
     robot = example_robot("panda")
     rng = np.random.default_rng(8)
     T = link_pose(robot, (robot.lower + robot.upper) / 2, "panda_hand")

@@ -81,7 +81,8 @@ def test_files_keep_all_tips(tmp_path: Path) -> None:
 
 
 def test_spheres_parts_and_the_arms_of_one_robot_agree() -> None:
-    """Configurations that are free by spheres are free by parts; Baxter's left arm has the same poses as alone."""
+    """Configurations that are free by spheres are free by parts. The poses of Baxter's left arm equal those of
+    the robot `baxter_left`."""
     robot = two_arms()
     rng = np.random.default_rng(0)
     q = rng.uniform(robot.lower, robot.upper, (2000, robot.dof))
@@ -180,7 +181,8 @@ def test_a_tool_on_the_second_hand_is_its_tip_and_is_checked() -> None:
 
 
 def test_both_arms_reach_as_far_as_one() -> None:
-    """The reach used to sum the offsets of both arms, which doubled the width of lines on the live page."""
+    """Regression: the reach was the sum of the offsets of both arms, which doubled the width of lines on the
+    live page."""
     both, left, right = (rd.load_robot(f"baxter{arm}") for arm in ("", "_left", "_right"))
     assert reach(both) == pytest.approx(max(reach(left), reach(right)), rel=0.01)  # of random configurations
     assert reach_bound(both) <= max(reach_bound(left), reach_bound(right)) + 1e-9

@@ -17,7 +17,7 @@ HEAD = b"# Octomap OcTree binary file\n"
 
 
 def tree(keys: set[Key], level: int = TREE_DEPTH, low: Key = (-HALF, -HALF, -HALF)) -> bytes:
-    """The bytes of a tree whose voxels with these lower corners, in voxels, are occupied."""
+    """The bytes of an octree in which the voxels with these lower corners, in units of voxels, are occupied."""
     bits = 0
     below = b""
     edge = 2 ** (level - 1)
@@ -103,7 +103,7 @@ def test_wrong_height_maps() -> None:
 
 @pytest.mark.parametrize("edge", [1, 2, 4, 8])
 def test_the_shell_of_a_large_leaf_has_each_voxel_once(edge: int) -> None:
-    """74 bytes took 26 s, which went into looking for voxels that come twice."""
+    """Regression: 74 bytes took 26 s, spent on a search for repeated voxels."""
     places = range(edge)
     voxels = occupied_voxels(tree({(x, y, z) for x in places for y in places for z in places}), 1.0)
     assert len({tuple(voxel) for voxel in voxels}) == len(voxels) == edge**3 - max(edge - 2, 0) ** 3

@@ -25,7 +25,7 @@ AWAY = np.array([1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 
 
 def grasp(kind: str, contacts: dict[str, object]) -> rd.Problem:
-    """A Panda whose fingers are around an object, before it moves away past a ball."""
+    """A Panda whose fingers are around an object, and its motion away from there past a ball."""
     robot = rd.load_robot("panda")
     T = robot.fk(HOME, "panda_hand")
     at = T[:3, 3] + 0.09 * T[:3, 2]
@@ -63,7 +63,7 @@ def test_an_allowed_contact_is_allowed_everywhere(kind: str) -> None:
 
 
 def test_other_links_may_not_touch_it() -> None:
-    """The last link may touch the ball: a motion in which another one does is refused by all."""
+    """Only the last link may touch the ball: all checks refuse a motion in which another link touches it."""
     contacts = {"ball": ["l3"]}
     folded = JointPath(box_arm().joint_names, np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]]))
     free = rd.Problem(box_arm(), rd.Scene([BALL], contacts), folded.positions[0], folded.positions[1])

@@ -13,7 +13,7 @@ FLOOR = Box([0, 0, -0.05], [2, 2, 0.1], name="floor")
 
 
 def some_scenes(n: int, seed: int = 5) -> list[Scene]:
-    """Dense scenes with a floor, all their boxes turned anyhow."""
+    """Dense scenes with a floor, with all boxes turned at random."""
     rng = np.random.default_rng(seed)
     scenes = []
     for _ in range(n):

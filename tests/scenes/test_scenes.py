@@ -37,7 +37,7 @@ SHAPES: dict[str, Shape] = {
 
 
 def surface_distance(shape: Shape, points: ndarray) -> ndarray:
-    """How far points are from the surface, by another form than those that draw."""
+    """Distance of points from the surface of a shape, by other formulas than those that sample the surface."""
     if isinstance(shape, rd.PointCloud):
         return np.abs(points[:, None] - shape.points).max(axis=2).min(axis=1)
     if isinstance(shape, rd.Mesh):
@@ -114,7 +114,7 @@ def test_surface_keeps_to_the_region() -> None:
 
 
 def test_surface_of_nothing_visible() -> None:
-    """Nothing, out of reach, the floor alone, and an empty cloud."""
+    """An empty scene, a shape out of reach, the floor alone, and an empty cloud."""
     alone = rd.Sphere([5, 0, 0.5], 0.2), rd.Box([0, 0, -0.05], [2, 2, 0.1]), rd.PointCloud([])
     for shapes in ([], *([one] for one in alone)):
         assert sample_surface(rd.Scene(shapes), 64, np.random.default_rng(5)).shape == (0, 3)
@@ -211,7 +211,7 @@ def pcd(points: ndarray, storage: str) -> bytes:
 
 
 def lzf_packed(content: bytes) -> bytes:
-    """By LibLZF's format: literal bytes, and repetitions of what came before, overlapping ones too."""
+    """Data in LibLZF's format: literal bytes, and repetitions of earlier bytes, which may overlap."""
     out = bytearray()
     at = 0
     while at < len(content):

@@ -92,7 +92,7 @@ def test_a_plan_is_that_of_the_bare_planner_and_the_validator_agrees(server: htt
 
 
 def test_every_field_of_the_schema_may_be_sent_with_its_default(server: httpx.Client) -> None:
-    """`objective`, and null for `clearance` and `jerk`, were refused."""
+    """Regression: `objective`, and null for `clearance` and `jerk`, were refused."""
     buried = problem(scene=[{"sphere": {"center": [0, 0, 0.3], "radius": 0.5}}])
     fields = server.get("/openapi.json").json()["components"]["schemas"]["PlanRequest"]["properties"]
     defaults = {name: field["default"] for name, field in fields.items() if name != "problem"}
@@ -147,7 +147,7 @@ def test_a_batch_is_answered_line_by_line_in_order(server: httpx.Client) -> None
     ],
 )
 def test_wrong_requests_are_one_line(server: httpx.Client, path: str, body: Any, code: int, message: str) -> None:
-    """5,000 constraints kept a worker busy for 29 s."""
+    """Regression: 5,000 constraints kept a worker busy for 29 s."""
     content = body if isinstance(body, bytes) else json.dumps(body)
     answer = server.post(path, content=content, headers=JSON)
     assert answer.status_code == code and re.search(message, error(answer))
@@ -184,7 +184,7 @@ def test_lists_health_metrics_and_a_page_without_scripts(server: httpx.Client) -
 
 
 def test_the_interactive_page_has_an_answer_for_each_of_its_examples(server: httpx.Client) -> None:
-    """It fills requests with these."""
+    """The page fills its requests with these examples."""
     assert "SwaggerUIBundle(" in server.get("/docs").text
     schemas = server.get("/openapi.json").json()["components"]["schemas"]
     fields = schemas["PlanRequest"]["properties"]
@@ -205,7 +205,7 @@ def test_rows_of_a_motion_at_a_rate(server: httpx.Client) -> None:
 
 
 def test_a_request_that_needs_too_much_memory_costs_its_worker(server: httpx.Client) -> None:
-    """One of 4.5 MB took 6.2 GB."""
+    """Regression: a request of 4.5 MB took 6.2 GB."""
     renewed = gauge(server, "workers_renewed_total")
     with ThreadPoolExecutor(2) as threads:
         hungry = threads.submit(server.post, "/plan", json=asked(EATS, "faulty"))
@@ -236,7 +236,7 @@ def test_large_requests_take_little_time(server: httpx.Client) -> None:
 
 
 def test_slow_bodies_take_no_place_in_the_queue(server: httpx.Client) -> None:
-    """Twenty clients that sent a byte a second filled the queue."""
+    """Regression: twenty clients that sent a byte a second filled the queue."""
     head = b"POST /plan HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 99\r\n"
     address = server.base_url.host, server.base_url.port or 0
     with ExitStack() as stack:
@@ -264,7 +264,7 @@ def test_each_request_is_logged() -> None:
 
 @pytest.mark.parametrize(("seed", "line"), [(RAISES, "ValueError: no such thing"), (EXITS, "SystemExit: no license")])
 def test_a_planner_that_fails_stops_neither_server_nor_worker(server: httpx.Client, seed: int, line: str) -> None:
-    """Its SystemExit reached the server's event loop and stopped it."""
+    """Regression: the planner's SystemExit reached the server's event loop and stopped the server."""
     lost = gauge(server, "workers_lost_total")
     answer = server.post("/plan", json=asked(seed, "faulty"))
     assert answer.status_code == 500 and error(answer) == line

@@ -31,7 +31,7 @@ def motion(robot: rd.Robot, *waypoints: np.ndarray) -> rd.Trajectory:
 
 
 def test_a_motion_of_one_row_holds_still() -> None:
-    """The simulated arm was NaN."""
+    """Regression: positions of the simulated arm were NaN."""
     robot = box_arm()
     stay = np.full((1, 3), 0.1)
     run = replay(robot, rd.Scene(), rd.Trajectory(robot.joint_names, np.zeros(1), stay, 0 * stay, 0 * stay))
@@ -163,7 +163,7 @@ def test_command_without_pybullet(
 
 
 def test_moving_obstacles_are_contacts_where_the_validator_refuses_the_motion() -> None:
-    """`simulate` called a motion free that runs into one."""
+    """Regression: `simulate` called a motion free that runs into a moving obstacle."""
     robot = rd.load_robot("panda")
     end = PANDA_START * [-1, 1, 1, 1, 1, 1, 1]
     trajectory = motion(robot, PANDA_START, end)

@@ -29,7 +29,7 @@ def every_shape() -> rd.Scene:
 
 
 def far_pairs_only(robot: rd.Robot) -> rd.Robot:
-    """The robot with pairs of links no more than two joints apart allowed to touch."""
+    """The robot with allowed contact between links that are at most two joints apart."""
     pairs = combinations(robot.meshes, 2)
     near = [frozenset(p) for p in pairs if abs(robot.link_frame(p[0]) - robot.link_frame(p[1])) <= 2]
     return replace(robot, allowed_collisions=frozenset(near))
@@ -131,7 +131,7 @@ def test_point_clouds_agree_with_coal() -> None:
 
 
 def test_a_mesh_that_comes_again_takes_no_memory_again() -> None:
-    """PyBullet keeps what it was given of a mesh, 0.15 kB a triangle, after its body is removed too."""
+    """PyBullet keeps 0.15 kB for each triangle of a mesh, even after the mesh's body is removed."""
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
     panda = rd.load_robot("panda")
     home = np.zeros(7)

@@ -32,7 +32,8 @@ def test_no_jerk_limit_is_the_limit_of_great_jerk():
 
 @pytest.mark.parametrize("limits", [(1.0, 2.0, 5.0), (1.0, 2.0, 0.5), (9.0, 0.8, 5.0), (9.0, 9.0, 3.0), (0.2, 5.0, 1.0)])
 def test_goes_exactly_the_distance(limits):
-    """The farthest that an arm can get within this time, by a linear program in discrete time."""
+    """Compares with the largest distance that an arm can travel within this time, by a linear program in
+    discrete time."""
     v, a, j = limits
     time = float(straight_line_time(np.zeros(1), np.ones(1), *(np.array([x]) for x in limits)))
     n = 200

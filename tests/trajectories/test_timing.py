@@ -28,7 +28,7 @@ NO_JERK_LIMIT = TimingSettings(jerk=np.inf, sample_time=1e-4)
 
 
 def arm(velocity: tuple[float, ...] = VELOCITY, acceleration: tuple[float, ...] = ACCELERATION) -> rd.Robot:
-    """A chain of revolute joints; timing uses only its limits."""
+    """A chain of revolute joints, of which timing uses only the limits."""
     joints = tuple(
         Joint(f"j{i}", "revolute", f"l{i}", f"l{i + 1}", np.eye(4), np.array([0.0, 0.0, 1.0]), -3.0, 3.0, v, a)
         for i, (v, a) in enumerate(zip(velocity, acceleration, strict=True))
@@ -145,14 +145,14 @@ def test_corner_is_rounded_when_valid_and_stopped_at_when_not() -> None:
 
 @pytest.mark.parametrize("size", [1e-5, 1e-3, 0.02])
 def test_rows_of_the_shortest_pieces_agree(size: float) -> None:
-    """Regression: between two close stops, rows at sample times did not show the acceleration."""
+    """Regression: between two close stops, rows at sample times missed the acceleration."""
     q = np.tri(4, 7, -1)
     q[2:, 1] = size
     assert rates_agree(timed(q)) and rates_agree(timed(q, never))
 
 
 def test_only_the_corner_that_fails_is_tightened() -> None:
-    """An obstacle inside the first corner alone: the second keeps its rounding."""
+    """An obstacle is inside the first corner only, so the second corner keeps its rounding."""
     q = np.tri(4, 7, -1)
 
     def cuts(positions: np.ndarray, k: int) -> float:
@@ -214,7 +214,8 @@ def test_a_limit_of_jerk_is_kept_with_the_others(seed: int, count: int, jerk: fl
 def test_a_motion_from_a_start_velocity_keeps_all_limits_and_need_not_stop(
     seed: int, jerk: float, scale: float, ratio: float
 ) -> None:
-    """Velocities, accelerations and jerks every ms, on the way straight on and then around a corner."""
+    """Checks velocities, accelerations and jerks every ms, first along a straight line and then around a
+    corner."""
     robot = arm()
     rng = np.random.default_rng(seed)
     settings = TimingSettings(jerk=jerk, velocity_scale=scale, acceleration_scale=scale)
@@ -235,8 +236,8 @@ def test_a_motion_from_a_start_velocity_keeps_all_limits_and_need_not_stop(
 
 
 def test_a_limit_of_jerk_costs_what_it_must() -> None:
-    """One joint over a distance d takes no less than (32 d / j)^(1/3); it took 20 times that with
-    accelerations of seven fixed shares of the limits. A high limit costs a row at most."""
+    """One joint needs at least (32 d / j)^(1/3) for a distance d at jerk j. Regression: accelerations of seven
+    fixed fractions of the limits took 20 times that. A high jerk limit costs at most one row."""
     robot = arm((20.0,), (80.0,))
     free, slight, *gentle = (
         timed([[0.0], [1.0]], settings=TimingSettings(jerk=jerk), robot=robot).duration
@@ -273,7 +274,7 @@ def toppra_speeds(line: BlendedPolyline, grid: np.ndarray, velocity: np.ndarray,
 
 
 def toppra_duration(robot: rd.Robot, line: BlendedPolyline, settings: TimingSettings) -> float:
-    """Duration [s] of the motion along a line with toppra's speeds, slowed down as ours are."""
+    """Duration [s] of the motion along a line with toppra's speeds, reduced in the same way as ours."""
     grid = timing_grid(line, settings)
     speeds = toppra_speeds(line, grid, robot.velocity, robot.acceleration)
     assert speeds is not None
@@ -296,7 +297,7 @@ def test_durations_are_those_of_toppra(seed: int, deviation: float) -> None:
 
 @given(seed=st.integers(0, 2**32 - 1), narrow=st.sampled_from([0.0, 1e-4]))
 def test_the_estimated_time_is_near_the_exact_one(seed: int, narrow: float) -> None:
-    """It was 7 % short where a rounded corner began just after the start."""
+    """Regression: the estimate was 7 % too short where a rounded corner began just after the start."""
     rng = np.random.default_rng(seed)
     q = np.cumsum(rng.normal(0, 0.4, (rng.integers(3, 8), 7)), axis=0)
     deviations = 10 ** rng.uniform(-2, 0, len(q) - 2)
@@ -311,8 +312,8 @@ def test_the_estimated_time_is_near_the_exact_one(seed: int, narrow: float) -> N
 
 
 def test_a_slow_torso_has_a_timing() -> None:
-    """A corner where the torso turns back was gone so fast at a grid point that only a stop could follow: no
-    timing was found."""
+    """Regression: at a corner where the torso turns back, the speed at a grid point was so high that only a
+    stop could follow, and no timing was found."""
     fetch = (0.1, 1.25, 1.45, 1.57, 1.52, 1.57, 2.26, 2.26)
     robot = arm(fetch, tuple(4 * v for v in fetch))
     for seed in (1868, 2571, 2972):
@@ -330,8 +331,8 @@ def test_a_slow_torso_has_a_timing() -> None:
 )
 @example(seed=930, dof=8, count=7, scale=0.0, decades=4.0, kind="random")
 def test_every_path_has_a_timing(seed: int, dof: int, count: int, scale: float, decades: float, kind: str) -> None:
-    """Whatever the limits: speeds within them at the grid points, above 0 but at the ends, and no slower than
-    toppra's where these do not fall to nearly 0 on the way."""
+    """For any limits, speeds at the grid points are within the limits and above 0 except at both ends. They are
+    not below toppra's, except where toppra's speeds fall to nearly 0 on the way."""
     rng = np.random.default_rng(seed)
     velocity, acceleration = 10 ** rng.uniform(-decades / 2, decades / 2, (2, dof))
     q = np.cumsum(10**scale * rng.normal(0, 1, (count, dof)), axis=0)
@@ -376,7 +377,7 @@ def test_limits_that_make_a_motion_endless_are_refused(limit: float) -> None:
 
 @pytest.mark.parametrize("jerk", [None, 10.0])
 def test_rows_of_a_motion_without_end_are_counted(jerk: float | None) -> None:
-    """A joint limited to 1e-6 rad/s had 1e8 rows: MemoryError."""
+    """Regression: a joint limited to 1e-6 rad/s had 1e8 rows, which ended in a MemoryError."""
     robot = arm((1e-6,), (1.0,))
     t = timed([[0.0], [1.0]], settings=TimingSettings(jerk=jerk), robot=robot)
     assert t.duration == pytest.approx(1e6, rel=0.05) and len(t.times) <= speed_limits.MAX_ROWS + 3
@@ -385,13 +386,15 @@ def test_rows_of_a_motion_without_end_are_counted(jerk: float | None) -> None:
 
 @pytest.mark.parametrize("jerk", [2e3, 7.5e3, 1e5, 1e300])
 def test_rows_tell_the_acceleration_under_a_high_limit_of_jerk(jerk: float) -> None:
-    """It rose to its most between two rows, whose rates then did not agree: no motion was valid."""
+    """Regression: the acceleration had its peak between two rows, so velocities and positions of the rows
+    disagreed and no motion was valid."""
     q = np.cumsum(np.random.default_rng(0).normal(0, 0.5, (5, 7)), axis=0)
     assert rates_agree(timed(q, settings=TimingSettings(jerk=jerk)))
 
 
 def test_a_dense_path_is_driven_without_stops() -> None:
-    """46 of 46 waypoints of a sampled path were stops: its rows did not tell its accelerations."""
+    """Regression: 46 of 46 waypoints of a sampled path were stops, since its rows did not show its
+    accelerations."""
     rng = np.random.default_rng(3)
     along = np.linspace(0, 1, 48)[:, None]
     q = along * rng.normal(0, 1, 7) + np.sin(np.pi * along) * rng.normal(0, 0.4, 7)
@@ -401,7 +404,7 @@ def test_a_dense_path_is_driven_without_stops() -> None:
 
 
 def test_a_corner_in_a_narrow_passage_is_no_stop() -> None:
-    """A corner that was not free after two reductions of its rounding became a stop."""
+    """Regression: a corner that was not free after two reductions of its rounding became a stop."""
     q = np.tri(3, 7, -1)
 
     def free(piece: rd.Path | rd.Trajectory) -> bool:
@@ -413,7 +416,8 @@ def test_a_corner_in_a_narrow_passage_is_no_stop() -> None:
 
 @pytest.mark.parametrize("accepted", [6, 7, 8])
 def test_lower_accelerations_that_did_not_help_are_given_up(accepted: int) -> None:
-    """They stayed when the corners were tightened: such motions took 2.8 times as long as with stops."""
+    """Regression: the lower accelerations were kept when the corners were tightened, and such motions took 2.8
+    times as long as with stops."""
     calls = []
 
     def valid(_motion: rd.Trajectory) -> bool:
@@ -433,7 +437,8 @@ def test_joints_without_a_jerk_limit_have_the_stated_default() -> None:
 
 
 def test_a_corner_that_its_neighbor_leaves_more_room_is_checked_again() -> None:
-    """The second corner, accepted beside a wide neighbor, grew when that shrank, and left the clearance."""
+    """Regression: the second corner was accepted beside a wide neighbor. When the neighbor shrank, the second
+    corner grew without a check and came too close to an obstacle."""
     q = np.tri(4, 7, -1)
 
     def keeps(corner: np.ndarray) -> bool:
@@ -445,7 +450,7 @@ def test_a_corner_that_its_neighbor_leaves_more_room_is_checked_again() -> None:
 
 
 def test_a_timed_path_is_as_fast_as_its_timing() -> None:
-    """But for the margin that it leaves to the limits, about 4 % of accelerations."""
+    """Except for the margin that it leaves to the limits, about 4 % of accelerations."""
     robot = rd.load_robot("panda")
     waypoints = np.array([np.zeros(7), np.full(7, 0.8), np.linspace(0, 1, 7)])
     line = BlendedPolyline(waypoints, half_widths(waypoints, np.array([0.1])))

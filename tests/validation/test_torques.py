@@ -33,7 +33,8 @@ def test_no_torque_leaves_its_chord_by_more_than_its_bound(name: str, step: floa
 
 @pytest.mark.parametrize(("effort", "valid"), [(9.70, False), (9.73, True)])
 def test_a_peak_between_two_rows_is_found(effort: float, valid: bool) -> None:
-    """The torque is 9.81 N m in the horizontal, between two rows; the validator allows 1 % more."""
+    """The torque is 9.81 N m when the rod is horizontal, between two rows; the validator allows an excess of 1
+    %."""
     robot = pendulum(effort)
     path = rd.Path(("hinge",), np.array([[0.3], [2.84], [2.9]]))
     problem = rd.Problem(robot, rd.Scene(), path.positions[0], path.positions[-1], payload=rd.Payload(0.0))
@@ -49,7 +50,8 @@ def beyond(effort: float, pieces: Pieces) -> Excess | None:
 
 
 def test_a_peak_between_two_times_is_found() -> None:
-    """At a constant velocity, so that gravity alone counts; rows a second apart, none level."""
+    """At constant velocity, so that only gravity counts. Rows are a second apart, and the rod is horizontal at
+    none of them."""
     rows = np.pi / 2 + np.array([[-0.375], [-0.125], [0.125], [0.375]])
     motion = rd.Trajectory(("hinge",), np.arange(4.0), rows, np.full((4, 1), 0.25), np.zeros((4, 1)))
     found = beyond(9.66, trajectory_pieces(motion))
@@ -58,7 +60,8 @@ def test_a_peak_between_two_times_is_found() -> None:
 
 
 def test_torques_are_those_of_the_cubics() -> None:
-    """Two rows at rest: 12 rad/s² at both ends, whatever is written; gravity alone needs 2.4 N m."""
+    """Two rows at rest. The cubic has 12 rad/s² at both ends, whatever accelerations are written; gravity alone
+    needs 2.4 N m."""
     rows = np.array([[-0.25], [0.25]])
     still = np.zeros((2, 1))
     motion = rd.Trajectory(("hinge",), np.array([0.0, 0.5]), rows, still, still)
@@ -79,7 +82,7 @@ def test_a_motion_of_one_row_is_held() -> None:
 
 
 def test_a_torque_that_touches_its_limit_is_settled() -> None:
-    """Halving ends at a thousandth of the limit."""
+    """The halving of intervals ends at a thousandth of the limit."""
     limit = 9.81 / 1.01
     held = static_pieces(np.array([[1.0], [2.0]]))
     assert beyond(limit, held) and not beyond(1.002 * limit, held)

@@ -99,7 +99,7 @@ def test_a_thin_wall_between_two_waypoints_is_found(
 
 
 def scattered(rng: np.random.Generator) -> list[Shape]:
-    """Up to four shapes in the plane of the arm."""
+    """Up to four shapes at random places in the plane of the arm."""
     kinds = rng.choice(["sphere", "box", "cylinder"], rng.integers(0, 4))
     shapes = [random_shape(kind, rng) for kind in kinds]
     at = vector(*rng.uniform(-1.2, 1.2, 2), 0) + rng.normal(size=(30, 3)) * 0.1
@@ -150,7 +150,7 @@ def test_the_first_of_two_collisions_is_reported() -> None:
 
 
 def test_a_contact_with_two_obstacles_at_once_has_a_depth() -> None:
-    """The arm starts inside two obstacles: the deeper contact is reported in either order."""
+    """The arm starts inside two obstacles: the deeper contact is reported, in either order of the obstacles."""
     deep = rd.Sphere(vector(1.1, 0.02, 0), 0.1, "deep")
     shallow = rd.Sphere(vector(1.15, 0.12, 0), 0.1, "shallow")
     for shapes in ((deep, shallow), (shallow, deep)):
@@ -227,7 +227,7 @@ def test_twitching(spacing: float) -> None:
 
 
 def trajectory(duration: float) -> rd.Trajectory:
-    """The swing in a smooth motion from rest to rest, of this duration."""
+    """A smooth swing from rest to rest with this duration."""
     s = np.linspace(0, 1, 101)
     way = 3 * s**2 - 2 * s**3
     span = SWING[1] - SWING[0]
@@ -251,13 +251,14 @@ def verified(motion: rd.Trajectory, *shapes: Shape, robot: rd.Robot | None = Non
 
 
 def wrong_rates(motion: rd.Trajectory, robot: rd.Robot | None = None) -> dict[str, str]:
-    """What is wrong with the rates of a motion, which the validator refuses, by kind."""
+    """The messages of violations of velocities and accelerations, by kind. The validator must refuse the
+    motion."""
     assert not verified(motion, robot=robot).valid
     return {wrong.kind: wrong.message for wrong in rate_violations(robot or box_arm(), motion, RATES)}
 
 
 def test_trajectories() -> None:
-    """`rd.verify` took a trajectory for a path and called it valid at any speed."""
+    """Regression: `rd.verify` took a trajectory for a path and called it valid at any speed."""
     assert verified(trajectory(2.0)).valid
     refused(verified(trajectory(0.5)), "acceleration")
     # The peak speed is 1.5 * 1.2 / duration, the peak acceleration 6 * 1.2 / duration^2.
@@ -300,7 +301,8 @@ def test_wrong_shapes_of_a_trajectory_raise(name: str, cut: Callable[[np.ndarray
 
 @pytest.mark.parametrize(("factor", "jumps"), [(1.0, False), (1.02, False), (1.49, False), (1.6, True)])
 def test_times_compressed_under_rates_of_zero(factor: float, jumps: bool) -> None:
-    """Rates are recomputed where a trajectory conceals them; with its velocities it stops at each row."""
+    """If the velocities and accelerations of a trajectory are too small for its positions, they are computed
+    again. With its own velocities, this motion stops at each row."""
     good = trajectory(1.5 * 1.2 / 2.0 * 1.0001)  # as fast as the limit of 2 rad/s allows
     assert verified(good, robot=strong(1e3)).valid
     still = np.zeros_like(good.velocities)
@@ -320,7 +322,7 @@ def test_rates_that_are_not_those_of_the_positions(factor: float) -> None:
 
 @pytest.mark.parametrize("end", [0, -1])
 def test_motions_begin_and_end_at_rest(end: int) -> None:
-    """By their velocities, and by their positions if their velocities are 0."""
+    """By their velocities and, if these are 0, by their positions."""
     good = trajectory(2.0)
     moving = good.velocities.copy()
     moving[end, 0] = 0.5
@@ -334,8 +336,8 @@ def test_motions_begin_and_end_at_rest(end: int) -> None:
 
 @given(st.integers(0, 2**31), st.sampled_from([1e-4, 0.01, 0.05, 0.3]))
 def test_no_motion_within_the_limits_is_refused(seed: int, most: float) -> None:
-    """Full acceleration, coasting and braking in random turns, from rest to rest, at random rows and where
-    the acceleration jumps: the cubics are the motion."""
+    """Full acceleration, coasting and braking in random order, from rest to rest, with rows at random times and
+    where the acceleration jumps, so that the cubics equal the motion."""
     rng = np.random.default_rng(seed)
     robot = box_arm()
     limit = robot.acceleration[0]
@@ -357,7 +359,7 @@ def test_no_motion_within_the_limits_is_refused(seed: int, most: float) -> None:
 
 
 def in_micro_steps(step: float, time: float, way: float) -> rd.Trajectory:
-    """Evenly, in steps at the resolution of positions, with rates of zero."""
+    """A motion at constant speed, in steps at the resolution of positions, with written velocities of zero."""
     count = np.arange(round(way / step) + 1.0)
     rows = np.outer(count * step, [1, 0, 0])
     return rd.Trajectory(box_arm().joint_names, count * time, rows, 0 * rows, 0 * rows)
@@ -365,13 +367,15 @@ def in_micro_steps(step: float, time: float, way: float) -> rd.Trajectory:
 
 @pytest.mark.parametrize(("step", "time"), [(1.9e-6, 1e-8), (1.9e-6, 1e-7), (1.9e-6, 5e-7), (1.0, 5e-324)])
 def test_micro_steps_hide_no_velocity(step: float, time: float) -> None:
-    """Each of them within the resolution of positions, all of them 1.9 to 95 times as fast as the arm."""
+    """Each step is within the resolution of positions; together, the steps are 1.9 to 95 times as fast as the
+    arm."""
     assert "j0 at" in wrong_rates(in_micro_steps(step, time, max(step, 0.01)))["velocity"]
 
 
 @pytest.mark.parametrize("back", [False, True])
 def test_micro_steps_hide_no_acceleration(back: bool) -> None:
-    """Within the velocity limit, but from rest to 1.9 rad/s at once; and there and back in a millisecond."""
+    """The motion keeps the velocity limit, but goes from rest to 1.9 rad/s at once; with `back`, it moves back
+    and forth within a millisecond."""
     quick = in_micro_steps(1.9e-6, 1e-6, 0.01)
     if back:
         place = 1e-3 * np.abs((quick.times / 1e-3 + 0.5) % 1 - 0.5)
@@ -382,7 +386,7 @@ def test_micro_steps_hide_no_acceleration(back: bool) -> None:
 
 
 def test_rows_far_apart_are_validated_as_controllers_move_between_them() -> None:
-    """Out and back within one step: the rows are equal, but the arm moves between them."""
+    """The arm moves out and back within one step: both rows of the step have equal positions."""
     robot = box_arm()
     rows = np.zeros((4, 3))
     speed = np.zeros((4, 3))
@@ -428,7 +432,7 @@ def yes(_: object) -> bool:
 def between_rest(
     rows: np.ndarray, times: list[float], speeds: np.ndarray | None = None, robot: rd.Robot | None = None
 ) -> rd.Trajectory:
-    """A trajectory with these velocities, by default 0, and the accelerations of its cubics."""
+    """A trajectory with these velocities (by default 0) and the accelerations of its cubics."""
     v = np.zeros_like(rows) if speeds is None else speeds
     bare = rd.Trajectory((robot or box_arm()).joint_names, np.array(times), rows, v, np.zeros_like(rows))
     start, end = bare.cubic_accelerations
@@ -438,8 +442,8 @@ def between_rest(
 
 @pytest.mark.parametrize(("factor", "valid"), [(0.99, True), (1.03, False)])
 def test_rates_between_two_rows_are_those_of_the_cubic(factor: float, valid: bool) -> None:
-    """From rest to rest: velocities up to 1.5 times the mean velocity, at which rows look; accelerations up
-    to 6 times it over the duration, whose mean at both ends is 0."""
+    """From rest to rest, the cubic reaches 1.5 times the mean velocity. Its acceleration at both ends is 6
+    times the mean velocity over the duration, with a mean of 0."""
     robot = box_arm()
     times = [0.0, 1.5 * 1.2 / (factor * robot.velocity[0])]
     report = verified(between_rest(SWING, times), robot=strong(1e3))
@@ -451,7 +455,7 @@ def test_rates_between_two_rows_are_those_of_the_cubic(factor: float, valid: boo
 
 
 def test_limits_hold_between_rows() -> None:
-    """Two rows just below a limit, between which the cubic goes 1.25 mrad beyond it."""
+    """Both rows are just within a limit, and the cubic between them exceeds it by 1.25 mrad."""
     high = box_arm().upper[1] - 0.5e-3
     rows = np.array([[0, 2.5, 0], [0, high, 0], [0, high, 0], [0, 2.5, 0]])
     v = np.zeros((4, 3))
@@ -467,8 +471,8 @@ def test_limits_hold_between_rows() -> None:
 
 @given(st.floats(0.0, 1e-3), st.floats(1e-4, 3e-3))
 def test_clearance_is_that_of_the_cubic(bulge: float, gap: float) -> None:
-    """The cubic comes nearer to a wall than the straight lines between the rows: certified are 0.35 mm, and
-    the arm was 0.29 mm inside."""
+    """Regression: the cubic comes nearer to a wall than the straight lines between the rows; 0.35 mm were
+    certified, but the arm was 0.29 mm inside the wall."""
     rows = np.zeros((4, 3))
     v = np.zeros((4, 3))
     rows[0, 0] = rows[-1, 0] = -0.5
@@ -489,7 +493,7 @@ def test_clearance_is_that_of_the_cubic(bulge: float, gap: float) -> None:
 @pytest.mark.parametrize(("factor", "valid"), [(1.02, True), (0.96, False)])
 @pytest.mark.parametrize("count", [2, 3])
 def test_a_frame_keeps_its_speed_between_rows(factor: float, valid: bool, count: int) -> None:
-    """At the rows the arm rests; in between the hand moves at 1.5 times its mean speed."""
+    """The arm rests at the rows; between them the hand reaches 1.5 times its mean speed."""
     panda = rd.load_robot("panda")
     start = np.array([0.0, 0.2, 0.0, -1.9, 0.0, 2.1, 0.785])
     rows = start + np.outer(np.linspace(0, 0.3, count), np.eye(7)[0])
@@ -503,7 +507,7 @@ def test_a_frame_keeps_its_speed_between_rows(factor: float, valid: bool, count:
 
 
 def test_resampled_motions_keep_the_accelerations() -> None:
-    """Cubics between few rows overshoot where the acceleration jumps between them."""
+    """With few rows, the cubics overshoot where the acceleration jumps between rows."""
     robot = rd.load_robot("panda")
     rows = np.array([[0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785], [0.4, -0.5, 0.3, -2.0, 0.2, 1.8, 0.3]])
     problem = rd.Problem(robot, rd.Scene(), rows[0], rd.JointGoal(rows[-1:]))
@@ -522,7 +526,7 @@ def test_the_line_of_a_violation_names_the_place_once() -> None:
 
 
 def test_eight_threads_validate_motions_of_one_problem() -> None:
-    """The classes of the proof said that they were not safe for threads, and were shared by threads."""
+    """Regression: threads shared objects of the proof that are not safe for threads."""
     robot = rd.load_robot("panda")
     shapes = [
         rd.Box((0.5, 0.1, 0.4), (0.2, 0.2, 0.2)),

@@ -64,7 +64,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def numbers(text: str) -> list[int]:
-    """What the page decodes: differences in groups of 7 bits, the lowest first."""
+    """The numbers that the page decodes: differences in groups of 7 bits, the lowest bits first."""
     out = []
     last = 0
     value = 0

@@ -27,7 +27,7 @@ LINKS = {
 
 @cache
 def clad_arm(name: str) -> rd.Robot:
-    """Skew joints, one of them prismatic; each link is two boxes side by side, covered by spheres."""
+    """An arm with skew joints, one of them prismatic. Each link is two boxes side by side, covered by spheres."""
     rng = np.random.default_rng(0)
     robot = example_robot(name)
     meshes = {}
@@ -56,7 +56,7 @@ def scene_of(rng: np.random.Generator, cloud: bool) -> rd.Scene:
 
 
 def curve(rng: np.random.Generator, robot: rd.Robot, width: float) -> ndarray:
-    """Waypoints along a bent path of about this length, some of them repeated."""
+    """Waypoints along a bent path of about this length; some waypoints are repeated."""
     t = np.linspace(-1, 1, 9)[:, None]
     middle = rng.uniform(robot.lower, robot.upper)
     bend = np.abs(t) if rng.random() < 0.3 else t**2
@@ -70,7 +70,8 @@ robots = st.sampled_from(list(LINKS))
 
 @given(robots, seeds)
 def test_planes_part_as_far_as_coal_says(name: str, seed: int) -> None:
-    """From any initial guess, to the 2 % at which the search ends."""
+    """The separating plane found from any initial guess has Coal's distance, within the 2 % at which the search
+    ends."""
     rng = np.random.default_rng(seed)
     robot = clad_arm(name)
     scene = scene_of(rng, False)
@@ -96,8 +97,8 @@ def test_planes_part_as_far_as_coal_says(name: str, seed: int) -> None:
 
 @given(robots, seeds, st.booleans())
 def test_the_certificate_of_curved_motions(name: str, seed: int, cloud: bool) -> None:
-    """Among them those of links of several parts, of which the first alone may be clear: bounds that were
-    read off it settled pieces in which the others hit."""
+    """Some links have several convex parts. Regression: bounds were taken from the first part, so pieces in
+    which another part collides were certified."""
     rng = np.random.default_rng(seed)
     robot = clad_arm(name)
     scene = scene_of(rng, cloud)

@@ -114,7 +114,7 @@ def damaged(rng: np.random.Generator, content: bytes) -> bytes:
 
 
 def text_of(rng: np.random.Generator, data: Any, ending: str) -> bytes:
-    """Plain data as JSON or YAML, its values changed, or its bytes."""
+    """Plain data as JSON or YAML, with changed values or with damaged bytes."""
     by_value = rng.random() < 0.6
     data = mutated(rng, data) if by_value else data
     if ending in (".yaml", ".yml"):
@@ -126,7 +126,7 @@ def text_of(rng: np.random.Generator, data: Any, ending: str) -> bytes:
 
 
 def numbers_changed(rng: np.random.Generator, content: bytes) -> bytes:
-    """XML with bytes damaged or with attributes replaced."""
+    """XML with damaged bytes or with replaced attributes."""
     if rng.random() < 0.4:
         return damaged(rng, content)
     values = list(re.finditer(rb'"[^"]*"', content))
@@ -137,7 +137,7 @@ def numbers_changed(rng: np.random.Generator, content: bytes) -> bytes:
 
 
 def outcome(call: Callable[[], object]) -> tuple[str, str]:
-    """`answer`, `error` or `fault`, and the error message."""
+    """The outcome of an input, `answer`, `error` or `fault`, and the error message."""
     try:
         call()
     except InputError as error:
@@ -323,7 +323,7 @@ def _bundle(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
 
 def asked(rng: np.random.Generator, right: float = 0.0) -> tuple[str, bytes]:
-    """The endpoint of a request over HTTP, and its body; with probability `right` it is not damaged."""
+    """The endpoint of a request over HTTP, and the request's body, which is undamaged with probability `right`."""
     rows = np.linspace(examples.PROBLEM["start"], examples.PROBLEM["goal"]["joints"], 3).tolist()
     problem = (
         examples.PROBLEM
@@ -360,7 +360,7 @@ def _http(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
 
 def _socket(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    """Requests to a running `robotdiffuse serve`, which is itself checked now and then."""
+    """Requests to a running `robotdiffuse serve`. From time to time, the server itself is checked."""
     (what, body), (_, other) = asked(rng, 0.5), asked(rng, 0.5)
     sent = server.sent(rng, server.draft(rng, what, body, other), damaged)
     looks = rng.random() < 1 / server.INPUTS_BETWEEN_CHECKS
@@ -458,7 +458,7 @@ def _upload(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
 
 def _head(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    """Requests to the live page, which accepts them or not and never raises."""
+    """Headers of requests to the live page, which accepts or refuses them and never raises an error."""
     from robotdiffuse.visualization.live.server import may_connect
 
     token = ("", "abc")[rng.integers(2)]
@@ -501,7 +501,7 @@ def _weights(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]
 
 
 def _npz(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    """The authors' data sets."""
+    """Data sets in the file layout of the paper's authors."""
     from robotdiffuse.datasets.external import import_npz
 
     stream = io.BytesIO()

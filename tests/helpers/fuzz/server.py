@@ -68,7 +68,7 @@ SIZES = [*b"-1 ffffffffffffffffff x 0 5;a=b 0x5 7fffffff".split(), b"", b"5 ", b
 
 @dataclass
 class Draft:
-    """A request before it is written."""
+    """The parts of a request before it is sent."""
 
     method: bytes
     target: bytes
@@ -100,11 +100,11 @@ class Answer(NamedTuple):
 
 
 class WrongError(AssertionError):
-    """The server did what it must not."""
+    """The server did something that it must not do."""
 
 
 def draft(rng: np.random.Generator, what: str, body: bytes, other: bytes) -> Draft:
-    """A complete request, most often to plan or to verify; batches hold the other body too."""
+    """A complete request, usually to plan or to verify; batches contain both bodies."""
     which = rng.integers(10)
     if which < 5:
         return Draft(b"POST", b"/" + what.encode(), body)
@@ -118,7 +118,7 @@ def draft(rng: np.random.Generator, what: str, body: bytes, other: bytes) -> Dra
 
 
 def damage(rng: np.random.Generator, one: Draft) -> None:
-    """One change of a request's line, headers or framing."""
+    """Makes one change in the request's first line, headers or framing."""
     action = rng.integers(10)
     at = int(rng.integers(len(one.headers) + 1))
     name, value = (of[rng.integers(len(of))] for of in (NAMES, VALUES))
@@ -261,7 +261,7 @@ def _error(record: Any) -> str:
 
 
 def _read(client: socket.socket, stream: Any, until: float, head: bool) -> Answer | None:
-    """The next answer; None where the connection is closed before it begins."""
+    """The next answer; None if the connection is closed before an answer begins."""
 
     def line() -> bytes:
         client.settimeout(max(until - time.monotonic(), 0.001))
@@ -300,7 +300,7 @@ def _read(client: socket.socket, stream: Any, until: float, head: bool) -> Answe
 
 
 class Server:
-    """`robotdiffuse serve` in a process of its own that ends with this one."""
+    """`robotdiffuse serve` in a separate process, which ends with this one."""
 
     def __init__(self, plan: dict[str, Any], path: dict[str, Any]) -> None:
         """`plan`: a good request; `path`: a path for its problem."""
@@ -334,7 +334,8 @@ class Server:
         return answer.body
 
     def check(self) -> None:
-        """Raise WrongError unless the server is alive, answers right and holds no more memory than at first."""
+        """Raises WrongError unless the server is alive, answers correctly and uses no more memory than at
+        first."""
         if self.process.poll() is not None:
             raise WrongError(f"the server ended with {self.process.returncode}")
         if json.loads(self.answer(self.good))["waypoints"] != self.expected:
@@ -375,7 +376,7 @@ def _memory(pid: int) -> int:
 
 @cache
 def running_server() -> Server:
-    """Start it once; it ends with this process."""
+    """The server, which the first call starts; it ends with this process."""
     from helpers.fuzz.examples import JOINTS, PROBLEM
 
     problem = PROBLEM | {"scene": PROBLEM["scene"][:2]}

@@ -31,7 +31,7 @@ def test_losses_that_are_not_finite_are_skipped(tmp_path: Path) -> None:
 
 
 def test_the_average_follows_the_weights_with_the_decay_of_the_settings(tmp_path: Path) -> None:
-    """The first step copies; later ones keep step / (step + 10), at most `average`."""
+    """The first step copies the weights; in later steps the decay is step / (step + 10), at most `average`."""
     run = run_of(tmp_path, lambda call: 1.0)
     expected = None
     for step in range(1, 8):

@@ -47,7 +47,8 @@ def planner_settings(data, **changes) -> PlannerTraining:
 
 @pytest.mark.slow
 def test_two_processes_are_one_run(tmp_path, data, monkeypatch):
-    """A step of two processes equals one on the union of their batches; they resume and skip together."""
+    """A step of two processes equals one on both batches together. The processes resume together, and skip bad
+    steps together."""
     out = tmp_path / "two"
     settings = planner_settings(data, samples=160, gradient_norm=1e6, device="cpu")
     file = tmp_path / "two.json"
@@ -93,7 +94,7 @@ def test_two_processes_are_one_run(tmp_path, data, monkeypatch):
 
 @pytest.mark.parametrize("denoiser", DENOISERS)
 def test_losses_are_computed_where_the_model_is(denoiser, data, arm):
-    """On the meta device, which holds no numbers but refuses tensors of other devices as a GPU does."""
+    """On the meta device, which has no numbers but, like a GPU, refuses tensors of other devices."""
     losses = LossSettings(point=1.0, collision=1.0)
     changes = {"encoder": "points"} if denoiser == "cross_attention" else {}
     settings = planner_settings(data, denoiser=denoiser, denoiser_settings=None, losses=losses, condition_drop=0.5, **changes)
@@ -188,7 +189,8 @@ def test_every_choice_trains_and_plans(changes, tmp_path, data, arm, monkeypatch
 
 @pytest.mark.parametrize("objective", OBJECTIVES)
 def test_errors_in_the_workspace_have_the_same_weight_for_every_objective(data, arm, objective):
-    """With the weight of the output's error it would be 10,000 times too large for noise at the last level."""
+    """With the weight of the output's error, the loss would be 10,000 times too large for noise at the last
+    level."""
     encoder = load_encoder(data.parent / "encoder")
     loaded = load_data(str(data), arm, None, WAYPOINTS, print)
     settings = planner_settings(data, objective=objective)

@@ -110,7 +110,7 @@ def test_an_encoder_of_one_size_gets_clouds_of_that_size(monkeypatch: pytest.Mon
 
 
 def test_a_point_cloud_in_place_of_shapes() -> None:
-    """The same ball as points, as a camera sees it."""
+    """The ball of the problem as points, as a camera sees it."""
     points = sample_surface(PROBLEM.scene, 4000, np.random.default_rng(0))
     problem = rd.Problem(PANDA, rd.Scene([rd.PointCloud(points, 0.01)]), LEFT, rd.JointGoal(RIGHT[None]))
     result = Diffusion().plan(problem, time_limit=60.0)
@@ -128,7 +128,8 @@ def test_the_guidance_scale_reaches_the_network() -> None:
 
 
 def test_locked_joints_that_the_network_does_not_know_keep_the_weights() -> None:
-    """Fingers locked at another opening; with a locked arm joint the network would have fewer joints."""
+    """Fingers may be locked at another opening. A locked joint of the arm would change the number of the
+    network's joints."""
     for opening in (0.0, 0.065):
         robot = rd.load_robot("panda", locked={"panda_finger_joint1": opening})
         assert weights_for("model", robot) is not None and Diffusion().network(robot) is not None

@@ -98,7 +98,8 @@ def test_other_requests_hold_among_moving_obstacles(asked: str) -> None:
 
 
 def test_a_stop_at_a_waypoint_is_not_gone_through() -> None:
-    """The waypoint is on the straight line, where the motion would not stop by itself; a ball is there first."""
+    """The waypoint is on the straight line, so the motion would not stop by itself; a ball is at the waypoint
+    first."""
     middle = (START + END) / 2
     at = PANDA.fk(middle, "panda_hand")[:3, 3]
     ball = rd.MovingObstacle(rd.Sphere(at, 0.08, name="ball"), velocity=[0.3, 0, 0.3])
@@ -111,7 +112,8 @@ def test_a_stop_at_a_waypoint_is_not_gone_through() -> None:
 
 
 def test_corners_are_rounded_as_far_as_the_planner_certified() -> None:
-    """Where none is allowed, the motion stops at the corner; where little is, it passes slower than by the default."""
+    """If no rounding is allowed, the motion stops at the corner; if little is allowed, it passes more slowly
+    than by default."""
     middle = np.array([0.0, 0.9, 0, -1.8, 0, 2.1, 0.8])
     path = rd.Path(PANDA.joint_names, np.stack([START, middle, END]))
     shortest = []
@@ -123,7 +125,7 @@ def test_corners_are_rounded_as_far_as_the_planner_certified() -> None:
 
 
 def test_each_row_of_a_path_through_waypoints_has_its_corner_deviation() -> None:
-    """They were those of the last segment alone."""
+    """Regression: the deviations were those of the last segment only."""
     tight = rd.Problem(PANDA, rd.Scene([rd.Sphere([0.55, 0.0, 0.5], 0.15)]), START, END)
     mid = rd.load_planner("aorrtc").plan(tight, 10.0)
     assert mid.path is not None

@@ -56,7 +56,8 @@ def test_solved_means_free_of_what_was_seen(planner: Planner, unknown: str) -> N
 
 
 def test_predicted_obstacles_are_kept_clear_of(planner: Planner, tmp_path: Path) -> None:
-    """As seen, the path leads through the back of the box; with its voxels predicted, past it."""
+    """With only the seen points, the path leads through the back of the box; with predicted voxels, it avoids
+    the box."""
     truth = rd.Problem(PANDA, DEEP, START, GOAL)
     true = voxels_within(DEEP, FINE).astype(np.float32)
     through = planner.plan(partial("optimistic"), time_limit=2.0)
@@ -125,7 +126,7 @@ def test_assumptions_are_carved_free_at_the_ends() -> None:
     ("unknown", "depth"), [("optimistic", 0.0), ("padded", np.nan), ("predicted", np.inf), ("padded", -1.0)]
 )
 def test_images_without_returns_are_refused(planner: Planner, unknown: str, depth: float) -> None:
-    """A covered lens got a confidence of 0.995, and no note."""
+    """Regression: with a covered lens, the confidence was 0.995, without a note."""
     covered = replace(taken(DEEP), depth=np.full((60, 80), depth))
     result = unknown_space.plan_with_unknown_space(planner, partial(unknown, covered), REQUEST)
     assert result.status is rd.Status.NO_PATH and result.confidence is None
@@ -157,7 +158,8 @@ def test_a_fallback_to_another_assumption_is_a_note(planner: Planner) -> None:
 
 
 def test_confidence_falls_with_what_rays_do_not_tell(planner: Planner) -> None:
-    """With half an image lost 0.88 was stated, and 28 % were free."""
+    """Regression: with half of an image lost, the stated confidence was 0.88, but 28 % of the motions were
+    free."""
     view = taken(rd.Scene([FLOOR]))
     lost = view.depth.copy()
     lost[:, :100] = 0.0

@@ -206,7 +206,7 @@ def test_a_goal_in_collision_leaves_the_old_one() -> None:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_limits_hold_at_every_time_however_often_the_arm_brakes(seed: int) -> None:
-    """Random paths, jerk limits, steps and periods; each motion goes on exactly as the last one."""
+    """Random paths, jerk limits, steps and periods; each motion continues the last one without a jump."""
     rng = np.random.default_rng(seed)
     jerk = PANDA.acceleration * 10 ** rng.uniform(0.5, 3.0)
     jerk[rng.random(7) < 0.2] = np.inf

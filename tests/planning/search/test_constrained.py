@@ -99,7 +99,8 @@ def test_speed_of_a_line_is_kept_and_used() -> None:
 
 
 def test_validator_names_constraint_amount_and_place() -> None:
-    """The straight line in joint space turns the base joint: the hand is 103 mm off in its middle."""
+    """The straight line in joint space turns the base joint, so the hand is off by 103 mm in the middle of the
+    line."""
     straight = rd.Path(PANDA.joint_names, np.stack([START, GOAL]))
     found = rd.verify(problem([LINE]), straight).violation
     assert (found.kind, found.subject, found.other) == ("constraint", HAND, LINE.kind)
@@ -121,7 +122,7 @@ def test_violations_at_start_and_goal_are_reported() -> None:
 
 
 def test_a_goal_pose_with_tolerance_is_turned_until_it_keeps_the_constraint() -> None:
-    """A pose tilted by half a radian with any tilt allowed: few draws are upright."""
+    """The goal pose is tilted by half a radian, and any tilt is allowed; few random draws are upright."""
     T = transform(AT + np.array([0.0, 0.4, 0.1]), rotation_from_rpy(np.pi - 0.5, 0.0, 0.0))
     made = replace(problem([UPRIGHT]), goal=rd.PoseGoal(HAND, T, [0.02] * 3, [0.7, 0.7, np.pi]))
     result = rd.load_planner("aorrtc").plan(made, time_limit=20.0)
@@ -131,7 +132,7 @@ def test_a_goal_pose_with_tolerance_is_turned_until_it_keeps_the_constraint() ->
 
 @pytest.mark.parametrize("case", [0, 2])
 def test_more_iterations_give_no_slower_motion(case: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It returned the shortest path, whose motion may be slower than one found before."""
+    """Regression: the planner returned the shortest path, whose motion may be slower than one found before."""
     durations = []
     for paths in (1, 2, 4, 8):
         monkeypatch.setattr(rrt, "PATHS_TO_FIND", paths)

@@ -179,14 +179,15 @@ def test_simplification_and_shortcuts_keep_ends_and_freedom_and_do_not_lengthen(
 
 
 def test_a_long_detour_is_replaced() -> None:
-    """Regression: bounded rounds found nothing shorter than a first path around a shelf; restarts did."""
+    """Regression: with a bounded number of rounds, nothing shorter than a first path around a shelf was found;
+    restarts found a shorter path."""
     problem = replace(held_out_problem("shelf", 3), clearance=0.0)
     result = AORRTC(AORRTCSettings(patience=40_000)).plan(problem, time_limit=60.0)
     assert result.path.length < 8.0
 
 
 def test_a_step_of_nearly_a_whole_turn_is_two_steps() -> None:
-    """The way that is free turns a continuous joint by 5.84 rad, which the validator refuses as one step."""
+    """On the free way, a continuous joint turns by 5.84 rad, which the validator refuses as one step."""
     gen3 = rd.load_robot("gen3")
     start = np.array([0.22, 1.4, 0.0, 0.3, 0.0, 0.0, 0.0])
     goal = np.array([-0.22, 1.4, 0.0, 0.3, 0.0, 0.0, 0.0])
@@ -209,7 +210,7 @@ def test_a_line_that_is_always_refused_does_not_end_the_search(monkeypatch: pyte
 
 @pytest.mark.parametrize("end", ["start", "goal"])
 def test_ends_free_by_the_meshes_but_not_by_the_spheres_are_left_or_named(end, monkeypatch):
-    """Regression: one without a way out was an immediate timeout."""
+    """Regression: a start or goal without a way out was an immediate timeout."""
     ahead = PANDA.fk(READY, "panda_hand")[:3, 3] - [0.0, 0.0, 0.2]
     radii = np.arange(0.1, 0.05, -0.0002)
     scenes = (rd.Scene([rd.Sphere(ahead, radius, name="ball")]) for radius in radii)

@@ -60,7 +60,7 @@ def grid_optimum(checker: CollisionChecker, start: np.ndarray, goal: np.ndarray,
 
 
 def test_rrt_star_alone_converges_to_the_optimum() -> None:
-    """Choose-parent and rewiring without RRT-Connect and shortcuts: what asymptotic optimality promises."""
+    """Choose-parent and rewiring, without RRT-Connect and shortcuts, as asymptotic optimality requires."""
     scene = rd.Scene([rd.Sphere([0.75, 0.0, 0.0], 0.2), rd.Sphere([-0.3, 0.7, 0.0], 0.15)])
     checker = CollisionChecker(two_joints(), scene)
     axis = np.linspace(-2.8, 2.8, 281)
@@ -133,7 +133,8 @@ def test_nearest_nodes_are_those_of_brute_force(count: int, dof: int, most: int,
 
 
 def test_samples_fill_the_hyperspheroid_evenly() -> None:
-    """Every sample could lie on a shorter path; and the share in a smaller spheroid is that of its volume."""
+    """Every sample can lie on a shorter path, and the fraction of samples in a smaller spheroid is that of its
+    volume."""
     rng = np.random.default_rng(0)
     a, b = rng.normal(size=(2, 4)).astype(np.float32)
     wide = np.full(4, 100, np.float32)
@@ -213,7 +214,7 @@ def test_near_a_close_end_the_distance_is_relaxed() -> None:
 
 
 def test_a_gap_too_narrow_for_the_distance_lowers_it() -> None:
-    """One joint, one way: between two balls, 1.1 cm from either."""
+    """A robot with one joint must pass between two balls, 1.1 cm from each."""
     arm = two_joints()
     arm = arm.with_locked({arm.joint_names[1]: 0.0})
     checker = CollisionChecker(arm, rd.Scene([rd.Sphere([0.87, 0.0, side * 0.16], 0.1) for side in (1, -1)]))

@@ -32,7 +32,7 @@ def gaps(shape: Shape, points: np.ndarray) -> np.ndarray:
 
 @every_family
 def test_scenes_stand_on_the_ground_and_have_free_regions_in_reach(name: str) -> None:
-    """Nothing is in the base, and all of it packs."""
+    """No obstacle is inside the base, and all obstacles can be packed into arrays."""
     family = FURNITURE[name]
     rng = np.random.default_rng(0)
     assert family.max_obstacles <= 48

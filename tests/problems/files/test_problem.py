@@ -315,7 +315,7 @@ def test_wrong_names_and_angles(changes: dict[str, object], message: str) -> Non
 
 
 def test_roll_pitch_yaw_are_in_the_order_of_urdfs() -> None:
-    """In goals of a list, of which any will do, too."""
+    """Also in the goals of a list, any of which may be reached."""
     pose = {"pose": {"frame": "panda_hand", "xyz": [0.5, 0, 0.4], "rpy": [np.pi, 0, 0]}}
     goal = problem_from_record(BASIC | {"goal": [pose, "ready"]}).goal
     assert isinstance(goal, rd.AnyGoal)

@@ -45,7 +45,7 @@ def test_rare_collision_is_found_by_descent() -> None:
 
 
 def overlapping(lower: float, own: bool = True) -> Robot:
-    """Links a and c, two joints apart, whose meshes overlap while joint 2 is near zero."""
+    """A robot with links a and c, two joints apart, whose meshes overlap while joint 2 is near zero."""
     z = np.array([0, 0, 1.0])
     kind = "revolute" if own else "fixed"
     joints = [
@@ -70,8 +70,8 @@ def with_middle(robot: Robot) -> Robot:
 
 
 def carrying(held: dict[str, float] | None = None) -> Robot:
-    """A hand after what link m carries, fixed to it like Fetch's bellows to its lift; those of the vendor's
-    Fetch have a joint of their own, which planning holds."""
+    """A robot whose link m carries c and, behind a further joint, the hand. c is fixed to m or, with `held`,
+    connected by locked joints, as the bellows of the vendor's Fetch are to its lift."""
     robot = with_middle(overlapping(0.0, own=held is not None))
     z = np.array([0, 0, 1.0])
     turn = Joint("4", "revolute", "m", "hand", np.eye(4), z, -1.0, 1.0)
@@ -85,14 +85,15 @@ def carrying(held: dict[str, float] | None = None) -> Robot:
 
 
 def tucked(bend: float) -> Robot:
-    """Links of tucked arms touch each other."""
+    """The arm of boxes with a named pose in which links touch, as in tucked arms."""
     arm = box_arm()
     return replace(arm, poses={"tucked": dict(zip(arm.joint_names, (0.0, 2.2, bend), strict=True))})
 
 
 def thick(bound: float) -> Robot:
-    """The meshes of Baxter's forearm and wrist collide in half of the joint's range; the real links never do.
-    The range of a joint that makes a full turn proves nothing."""
+    """An arm whose first and last link collide in half of a joint's range, as the meshes of Baxter's forearm
+    and wrist do, although the real links do not. The range is evidence of a stop only if the joint makes
+    less than a full turn."""
     wide = limited(box_arm(), bound)
     last = wide.joint_names[2]
     joints = tuple(replace(j, lower=-0.2, upper=0.2) if j.name == last else j for j in wide.joints)
@@ -147,7 +148,7 @@ def test_share_of_collisions_by_hand() -> None:
 
 
 def test_false_collisions_of_parts_after_true_ones_are_counted() -> None:
-    """A box slides through two plates, whose convex part fills the space between them."""
+    """A box slides through two plates; the convex part of the plates fills the space between them."""
     plates = [trimesh.creation.box((0.02, 0.2, 0.2)).apply_translation((x, 0, 0)) for x in (0.0, 0.3)]
     box = trimesh.creation.box((0.04, 0.04, 0.04))
     surfaces = {

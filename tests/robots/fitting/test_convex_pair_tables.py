@@ -38,7 +38,7 @@ def box(size: tuple[float, ...], at: tuple[float, ...]) -> Surface:
 
 
 def disc(radius: float, thickness: float) -> Surface:
-    """Rotation about the x axis."""
+    """The surface of a disc whose axis is x."""
     turned = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0])
     mesh = trimesh.creation.cylinder(radius, thickness, transform=turned)
     return Surface(np.array(mesh.vertices), np.array(mesh.faces))
@@ -70,7 +70,7 @@ def made() -> Prepared:
 
 @cache
 def by_hand() -> Robot:
-    """The same without preparation, and with a table that calls the pair apart everywhere."""
+    """The robot of `fork` without preparation, with a wrong table, which says that the pair never touches."""
     robot, surfaces = fork()
     meshes = {link: tuple(convex_hull(one.vertices) for one in of) for link, of in surfaces.items()}
     spheres = {link: np.concatenate([cover(mesh) for mesh in of]) for link, of in meshes.items()}

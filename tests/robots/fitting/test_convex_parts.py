@@ -30,7 +30,7 @@ def _together(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
 
 
 def boxes(*corners: tuple[tuple[float, ...], tuple[float, ...]]) -> trimesh.Trimesh:
-    """Axis-aligned boxes [low, high] concatenated to one mesh, with inner walls where they meet."""
+    """A mesh of axis-aligned boxes [low, high], with inner walls where boxes meet."""
     made = [
         trimesh.creation.box(
             np.subtract(high, low), transform=trimesh.transformations.translation_matrix(np.add(low, high) / 2)
@@ -90,7 +90,7 @@ def test_a_frame_stays_open() -> None:
 
 
 def test_parts_stick_out_little_about_tight_places() -> None:
-    """A wide hole is filled within the tolerance, but not near a tight place."""
+    """Parts may fill a wide hole within the tolerance, but not a hole near a tight place."""
     coarse = PartSettings(concavity=0.2, voxels=20_000)
     tight = np.array([[0.06, 0.05, 0.06]])
     whole = convex_parts((surface(FRAME),), coarse)
@@ -119,7 +119,8 @@ def test_most_parts_are_a_bound() -> None:
 
 
 def test_a_part_of_a_thin_sheet_without_points_can_be_cut() -> None:
-    """The points on the other side of a sheet stood for both sides: a zero-size array."""
+    """Regression: points on one side of a sheet stood for both sides, which led to an error for an array of
+    size zero."""
     corners = np.array([[0, 0, 0], [0.3, 0, 0], [0.3, 0.3, 0.1], [0, 0.3, 0]])
     triangles = corners[[[0, 1, 2], [0, 2, 3]]]
     settings = PartSettings(voxels=5_000)

@@ -42,7 +42,7 @@ def gaps(points: np.ndarray, spheres: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_spheres_cover_and_hardly_stick_out(name: str) -> None:
-    """Nothing inside is left open either: a point of a cloud could be missed in a hole."""
+    """The spheres also cover the inside: otherwise a point of a cloud could be missed in a hole."""
     meshes = SHAPES[name]
     solid = Solid.of(meshes, TOLERANCE)
     spheres = fit_spheres(solid, Bounds(TOLERANCE), np.random.default_rng(0), QUICK)
@@ -65,7 +65,7 @@ def test_spheres_cover_and_hardly_stick_out(name: str) -> None:
 
 @pytest.mark.parametrize("size", [(0.002, 0.002, 0.002), (0.03, 0.02, 0.0005)])
 def test_what_is_finer_than_the_grid_is_covered_too(size: tuple[float, float, float]) -> None:
-    """Baxter's sonar ring is a ball of 1 mm, with no grid point inside."""
+    """Baxter's sonar ring is a ball of 1 mm, which contains no grid point."""
     meshes = (box(size),)
     solid = Solid.of(meshes, 0.009)
     spheres = fit_spheres(solid, Bounds(0.004), np.random.default_rng(0), QUICK)
@@ -73,7 +73,7 @@ def test_what_is_finer_than_the_grid_is_covered_too(size: tuple[float, float, fl
 
 
 def test_what_neighbors_hide_wholly_is_covered_too() -> None:
-    """Baxter's sonar ring is inside its torso; unlimited sphere sizes gave NaN."""
+    """Regression: Baxter's sonar ring is inside its torso, and unlimited sizes of spheres gave NaN."""
     solid = Solid.of((box((0.01, 0.01, 0.01)),), TOLERANCE)
     hidden = Bounds(TOLERANCE, lambda points: np.ones(len(points), dtype=bool))
     assert np.isfinite(solid.sphere_sizes(hidden).grid).all()
@@ -152,7 +152,7 @@ def test_contradictory_settings(bad: dict) -> None:
 
 
 def test_a_large_thin_plate_does_not_fill_the_memory() -> None:
-    """A plate of 1 m, 1 mm thick, was cut into 20 million cells before their number was looked at."""
+    """Regression: a plate of 1 m, 1 mm thick, was cut into 20 million cells before their number was checked."""
     plate = convex_hull(np.array(trimesh.creation.box([3.0, 3.0, 1e-3]).vertices))
     cells = Cells.of(Solid.of((plate,), 1e-3), Bounds(1e-3), 8.0, 5_000)
     assert 500 < len(cells.corners) <= 5_000

@@ -59,7 +59,7 @@ def test_what_cannot_work_is_refused_by_one_line_that_says_what_to_do(name: str,
 
 
 def on_a_lift(folder: Path) -> Path:
-    """An arm on a lift, with bellows on two held joints that always overlap the column behind it."""
+    """An arm on a lift, with bellows on two locked joints that always overlap the column behind it."""
     column = '<collision><origin xyz="-0.2 0 0.2"/><geometry><box size="0.05 0.05 0.6"/></geometry></collision>'
     lift = joint("lift", "base", "lift_link", "prismatic", axis="0 0 1", limits='lower="0" upper="0.2"')
     short = {"kind": "prismatic", "axis": "0 0 1", "limits": 'lower="0" upper="0.6"'}
@@ -75,7 +75,7 @@ def on_a_lift(folder: Path) -> Path:
 
 
 def test_an_arm_that_is_never_free_is_refused_with_the_pair_to_allow(tmp_path: Path) -> None:
-    """No configuration of the vendor's Fetch was free, yet the exit status was 0."""
+    """Regression: no configuration of the vendor's Fetch was free, but the exit status was 0."""
     pair = ("column", "bellows2_link")
     how = {"base": "base", "tip": "j3_link", "out": tmp_path / "robot", "settings": QUICK}
     with coarse_grids(), pytest.raises(rd.InputError, match="configuration collides with itself") as error:
@@ -89,7 +89,8 @@ def test_an_arm_that_is_never_free_is_refused_with_the_pair_to_allow(tmp_path: P
 
 
 def test_parts_are_finer_where_they_touch_in_vain(tmp_path: Path) -> None:
-    """Goals of Fetch and Baxter collided falsely: the arm touches convex parts of the torso, but not the torso."""
+    """Regression: goals of Fetch and Baxter were in false collision, since the arm touches convex parts of the
+    torso, but not the torso."""
     walls = [
         trimesh.creation.box(np.subtract(high, low), trimesh.transformations.translation_matrix(middle))
         for low, high in (

@@ -77,7 +77,7 @@ def arm(file: Path, tmp_path_factory: pytest.TempPathFactory) -> rd.Robot:
 
 
 def state_of(model: Any, robot: rd.Robot, q: np.ndarray) -> Any:
-    """MuJoCo's data at a configuration; other joints are where the robot holds them."""
+    """MuJoCo's data at a configuration of the robot; other joints have their locked values."""
     data = mujoco.MjData(model)
     values = dict(zip(robot.joint_names, q, strict=True)) | robot.locked
     for name, value in values.items():
@@ -114,7 +114,8 @@ def test_limits_poses_and_mimics_are_those_of_the_model(file: Path) -> None:
 
 
 def test_self_collisions_are_those_of_mujoco(file: Path, arm: rd.Robot) -> None:
-    """Deeper than 1 mm MuJoCo and the validator's meshes agree; what the model excludes is not checked."""
+    """On contacts deeper than 1 mm, MuJoCo and the validator's meshes agree. Pairs that the model excludes are
+    not checked."""
     model = mujoco.MjModel.from_xml_path(str(file))
     checker = CollisionChecker(arm, rd.Scene())
     rng = np.random.default_rng(1)
@@ -159,13 +160,13 @@ CLOTH = '<flexcomp name="cloth" type="grid" count="3 3 1" spacing="1 1 1" radius
     ],
 )
 def test_obstacles_that_are_no_solids_are_refused(assets: str, world: str, message: str) -> None:
-    """Soft bodies were left out without a word."""
+    """Regression: soft bodies were left out without a note."""
     model = mujoco.MjModel.from_xml_string(f"<mujoco>{assets}<worldbody>{world}</worldbody></mujoco>")
     refuses(message, rd.Scene.from_mujoco, model)
 
 
 def test_obstacles_without_names_have_numbers() -> None:
-    """As in scenes of Meta-World, which were refused for the empty name of a box."""
+    """Regression: scenes of Meta-World were refused, since a box has no name."""
     model = mujoco.MjModel.from_xml_string(BODY.format(""))
     assert [shape.name for shape in rd.Scene.from_mujoco(model).shapes] == ["geom0"]
 
@@ -230,7 +231,7 @@ PLACED = """
 
 @pytest.mark.parametrize("actuator", ["", "<actuator><position joint='x'/></actuator></mujoco>"])
 def test_a_base_on_slides_without_range_is_held(actuator: str, tmp_path: Path) -> None:
-    """As Fetch stands in Gymnasium-Robotics, where nothing moves them, and TidyBot, which drives on them."""
+    """As of Fetch in Gymnasium-Robotics, where nothing moves the slides, and of TidyBot, which drives on them."""
     (tmp_path / "m.xml").write_text(PLACED.replace("</mujoco>", actuator or "</mujoco>"))
     tree = UrdfTree(tmp_path / "m.xml", {})
     robot = tree.robot(srdf=tree.semantics)
@@ -285,7 +286,7 @@ HOLLOW = """
 
 
 def test_meshes_that_collide_are_hulls_as_for_mujoco(tmp_path: Path) -> None:
-    """A link with a hollow: MuJoCo collides with its hull, so a motion through the hollow is none."""
+    """A link has a hollow. MuJoCo collides with its hull, so a motion through the hollow is in collision."""
     legs = [trimesh.creation.box([0.1, 0.1, 0.3]).apply_translation([x, 0, 0]) for x in (-0.2, 0.2)]
     vertices = np.concatenate([leg.vertices for leg in legs])
     faces = np.concatenate([legs[0].faces, legs[1].faces + len(legs[0].vertices)])

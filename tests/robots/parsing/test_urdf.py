@@ -228,7 +228,7 @@ def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_quaternions_of_joints_turn_what_follows(tmp_path: Path) -> None:
-    """`quat_xyzw` was ignored."""
+    """Regression: `quat_xyzw` was ignored."""
     wxyz = quaternion_from_rotation(rotation_from_rpy(0.3, -0.4, 0.5))
     xyzw = " ".join(map(str, np.roll(wxyz, -1)))
     turned = {}
@@ -254,7 +254,8 @@ def test_a_mesh_without_volume_is_noted(tmp_path: Path) -> None:
 
 
 def test_preparations_of_one_urdf_that_differ_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first in the alphabet counted: a motion through the arm itself was called valid."""
+    """Regression: the first robot in alphabetical order was used, and a motion through the arm itself was
+    called valid."""
     monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
     file = written(tmp_path, chain("base", row("j", 3)))
     with coarse_grids():
@@ -378,7 +379,7 @@ def test_xacro_is_compiled_with_what_it_includes(tmp_path: Path) -> None:
 
 
 def test_xacro_includes_files_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In any working directory; a file named .urdf can contain xacro."""
+    """In any working directory. A file named .urdf can also contain xacro."""
     pytest.importorskip("xacrodoc")
     mesh(tmp_path / "some_arm")
     (tmp_path / "some_arm" / "part").mkdir()
@@ -408,7 +409,8 @@ def test_xacro_that_cannot_be_compiled_says_what_helps(tmp_path: Path, monkeypat
 
 
 def test_only_robot_add_compiles_xacro(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A problem, a result or a certificate that names a URDF ran the code in its expressions."""
+    """Regression: a problem, a result or a certificate that names a URDF ran the code in the URDF's
+    expressions."""
     monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
     namespace = "http://www.ros.org/wiki/xacro"
     property_ = f'<x:property xmlns:x="{namespace}" name="a" value="1"/>'
@@ -425,7 +427,7 @@ def test_only_robot_add_compiles_xacro(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_a_urdf_that_xacro_wrote_is_no_xacro(tmp_path: Path) -> None:
-    """It still declares the namespace."""
+    """Such a URDF still declares the namespace of xacro."""
     mesh(tmp_path)
     file = xacro(tmp_path, link("base") + PARTS, "made.urdf")
     assert UrdfTree(file, {}).robot().dof == 4

@@ -37,14 +37,14 @@ def page() -> Iterator[Page]:
 
 @pytest.fixture(scope="module")
 def view(page: Page) -> Iterator[Any]:
-    """A browser with the page open and a valid motion."""
+    """A browser with the open page and a valid motion."""
     with opened(page.server.url, height=500) as view:
         view.locator(VALID).wait_for()
         yield view
 
 
 def beside(view: Any, label: str) -> Any:
-    """The input with this label."""
+    """The input field with this label."""
     return view.get_by_text(label, exact=True).locator("xpath=following::input[not(@type='hidden')][1]")
 
 
@@ -93,7 +93,7 @@ def test_the_target_is_dragged(view: Any, page: Page) -> None:
 
 
 def drag_arrow(view: Any, page: Page, T: np.ndarray, axis: int) -> bool:
-    """Whether the target follows when the mouse drags an arrow of its gizmo, which may be seen end-on."""
+    """Whether the target follows when the mouse drags an arrow of its gizmo, which may point at the camera."""
     arrow = page.goal_gizmo.handle.scale * T[:3, axis]
     view.mouse.move(*on_screen(view, page, T[:3, 3] + 0.7 * arrow))
     time.sleep(0.1)
@@ -105,7 +105,7 @@ def drag_arrow(view: Any, page: Page, T: np.ndarray, axis: int) -> bool:
 
 
 def on_screen(view: Any, page: Page, point: np.ndarray) -> tuple[float, float]:
-    """Pixel of a point [m], from the camera that the browser reports."""
+    """Pixel of a point [m], computed from the camera that the browser reports."""
     [client] = page.server.get_clients().values()
     camera = client.camera
     x, y, z = rotation_from_quaternion(np.array(camera.wxyz)).T @ (point - camera.position)

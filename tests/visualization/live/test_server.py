@@ -16,7 +16,8 @@ from robotdiffuse.visualization.live.server import free_port, is_loopback, may_c
 
 
 def test_viser_is_silent_and_other_threads_print(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """While viser started or stopped, sys.stdout was replaced for all threads: others' output was lost."""
+    """Regression: while viser started or stopped, sys.stdout was replaced for all threads, and the output of
+    other threads was lost."""
     during = []
     for name in ("__init__", "stop"):
         own = getattr(viser.ViserServer, name)

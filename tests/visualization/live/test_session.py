@@ -49,7 +49,7 @@ def session() -> Iterator[live.Session]:
 
 
 def test_the_badge_turns_red_at_once_and_green_with_the_new_plan(session: live.Session) -> None:
-    """With an obstacle at the hand halfway through the motion, which was planned, validated and certified."""
+    """An obstacle is placed at the hand halfway through a motion that was planned, validated and certified."""
     state = session.state
     first = state.motion
     assert first is not None and first.trajectory is not None and first is state.answer
@@ -132,7 +132,7 @@ def test_obstacles_are_added_resized_and_deleted(session: live.Session) -> None:
 
 @pytest.fixture
 def slow(monkeypatch: pytest.MonkeyPatch) -> Iterator[live.Session]:
-    """A session whose planner waits for the test, and was called."""
+    """A session whose planner has been called and waits for the test."""
     monkeypatch.setitem(PLANNERS, "slow", Entry("helpers.slow_planner:SlowPlanner", "waits"))
     SlowPlanner.calls.clear()
     with started("slow") as session:

@@ -22,7 +22,7 @@ pytestmark = MARKS
 
 @pytest.fixture
 def view() -> Iterator[tuple[Any, live.ExplorationSession, dict[str, Any]]]:
-    """A browser at the page, the session, and what is drawn by name."""
+    """A browser at the page, the session, and the drawn objects by name."""
     problem = rd.Problem(rd.load_robot("panda"), rd.Scene([FLOOR, WALL]), HOME, BEYOND)
     session = live.ExplorationSession(problem, rd.ExplorerSettings(time_limit=5.0), False, 0, speed=0.1)
     page = live.ExplorationPage(session, PageServer("127.0.0.1", free_port("127.0.0.1", 0)))

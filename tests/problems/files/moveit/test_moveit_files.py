@@ -248,7 +248,7 @@ UR5_JOINTS = [
 
 
 def ur5_files(folder: Path, model: str, more: list[str]) -> Path:
-    """A problem file of `ur5`, beside a MoveIt scene and request of a robot with further joints."""
+    """A problem file of `ur5`, with a MoveIt scene and request of a robot that has further joints."""
     names = [*UR5_JOINTS, *more]
     zeros = [0.0] * (6 + len(more))
     here = {"joint_state": {"name": names, "position": zeros}}
@@ -263,7 +263,8 @@ def ur5_files(folder: Path, model: str, more: list[str]) -> Path:
 
 
 def test_files_of_another_robot_are_refused_by_its_joints(tmp_path: Path) -> None:
-    """A UR5 on the table took scenes of one on a stand with a gripper: 224 of 238 motions met something."""
+    """Regression: scenes of a UR5 on a stand with a gripper were used for a UR5 on a table, and 224 of 238
+    motions were in collision."""
     file = ur5_files(tmp_path, "ur5_robotiq85", ["gripper_finger1_joint"])
     with pytest.raises(rd.InputError) as raised:
         rd.load_problem(file)
@@ -329,7 +330,7 @@ def pose_constraint() -> dict[str, Any]:
 
 
 def asked(folder: Path, data: dict[str, Any]) -> ProblemEntry:
-    """The first of MotionBenchMaker's problems with this request."""
+    """The first problem of MotionBenchMaker, with this request."""
     for file in MOTION_BENCH_MAKER.glob("*0001.yaml"):
         shutil.copy(file, folder)
     (folder / "request0001.yaml").write_text(yaml.safe_dump(data))
@@ -467,14 +468,15 @@ def state(frame: str, *translations: list[float]) -> dict[str, Any]:
 
 
 def mounted(folder: Path, kind: str) -> rd.Robot:
-    """As `robot add --base base` keeps it, less the spheres, which take their time."""
+    """The robot as `robot add --base base` stores it, but without spheres, whose fitting takes long."""
     (folder / "mounted.urdf").write_text(MOUNTED.format(kind=kind))
     write_robot_folder(read_urdf(folder / "mounted.urdf", base="base"), folder / "mounted", {})
     return read_robot_folder(folder / "mounted")
 
 
 def test_poses_compose_from_the_base_outwards() -> None:
-    """The base stands at [1, 0, 0] and is turned; a frame, the object and its part are offset and turned."""
+    """The base is moved to [1, 0, 0] and turned; the frame, the object and its part each have an offset and a
+    rotation."""
     data = scene_data(**ball(header={"frame_id": "table"}, pose={"position": [0, 2, 0], "orientation": QUARTER}))
     data["robot_state"] = {"multi_dof_joint_state": {"transforms": [{"translation": [1, 0, 0], "rotation": QUARTER}]}}
     table = {"translation": [0, 0, 5], "rotation": QUARTER}
@@ -501,7 +503,8 @@ def test_scene_in_the_world_of_a_robot_whose_base_moves_there_is_refused(tmp_pat
 
 @pytest.mark.parametrize("wheels", WHEELS)
 def test_a_scene_places_what_a_mobile_base_carries(tmp_path: Path, wheels: str) -> None:
-    """Every scene of a Fetch whose URDF has joints for its wheels was refused: a joint moves its base."""
+    """Regression: every scene was refused for a Fetch whose URDF has joints for its wheels, since a joint moves
+    its base."""
     (tmp_path / "wheeled.urdf").write_text(WHEELED.format(above=WHEELS[wheels]))
     robot = read_urdf(tmp_path / "wheeled.urdf", base="base")
     assert robot.root == robot.base == "base"
@@ -515,7 +518,8 @@ def test_a_lift_is_no_mobile_base(tmp_path: Path) -> None:
 
 
 def test_scene_in_a_frame_that_the_robot_is_placed_in(tmp_path: Path) -> None:
-    """Objects in `odom`, where multi_dof_joint_state says that the root stands; `world` is then unknown."""
+    """Objects are given in `odom`, the frame in which multi_dof_joint_state places the root; `world` is then
+    unknown."""
     robot = mounted(tmp_path, "fixed")
     base_in_root = np.array([1, 2, 0.8])
     turn = rotation_about(Z, np.pi / 2).T
@@ -531,8 +535,9 @@ def test_scene_in_a_frame_that_the_robot_is_placed_in(tmp_path: Path) -> None:
 
 
 def test_links_of_the_robot_are_frames_where_they_stand(tmp_path: Path) -> None:
-    """Also a link called world that is not the root; a file cannot place a link of the robot anew. `robot add
-    --base` once dropped the transform between root and base: verified motions met obstacles by 8 cm."""
+    """A link named world is a frame even if it is not the root, and a file cannot give a link of the robot
+    another pose. Regression: `robot add --base` dropped the transform between root and base, and verified
+    motions were in collision by 8 cm."""
     text = MOUNTED.format(kind="fixed").replace(
         '<link name="world"/>',
         """<link name="map"/><link name="world"/><link name="camera"/>
