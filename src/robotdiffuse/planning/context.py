@@ -362,14 +362,16 @@ class PlanningContext:
         """Limits on timing in addition to the joint limits: speed limits of constraints, and torque limits
         with a payload."""
         constraints = self.validator.constraints
-        pace = None
+        frame_speeds = None
         if constraints is not None and len(constraints.speed_limited):
-            pace = FrameSpeedLimits(constraints.speeds, constraints.speed_limits)
-        if pace is None and self.validator.dynamics is None:
+            frame_speeds = FrameSpeedLimits(constraints.speeds, constraints.speed_limits)
+        if frame_speeds is None and self.validator.dynamics is None:
             return NO_EXTRA_LIMITS
-        return ExtraLimits(pace, self.validator.dynamics)
+        return ExtraLimits(frame_speeds, self.validator.dynamics)
 
     def _refuse(self, violation: Violation, end: float) -> None:
+        """Record the violation of a refused path or motion. end: value of `violation.time` at its end, which
+        is the last index of a path or the duration of a motion [s]."""
         self._refused = violation.kind
         self.refused_at = violation.time / end, violation.message
 

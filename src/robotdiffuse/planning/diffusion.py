@@ -6,7 +6,7 @@ If no sample is valid, the next batch is drawn from new noise, until time runs o
 and the straight line is not tried, so every solution comes from the network and its guidance.
 
 The paper's method is samples=1, repeat=false and weights of config `paper`, which do not take clearances as
-inputs. If guidance_steps is 0 as well, it is the row JPC of the paper's Table 2, which has no guidance.
+inputs. With guidance_steps=0 in addition, it is the method JPC of the paper's Table 2, without guidance.
 
 Path constraints add a cost to guidance. Before validation, the inner waypoints of each sample are projected
 onto the constraints; the validator proves that the constraints hold between waypoints as well. The network
@@ -58,10 +58,10 @@ class DiffusionSettings(SamplingSettings, LearnedSettings, name="diffusion"):
 def encode(
     model: "MotionModel", checker: CollisionChecker, points: int, rng: np.random.Generator
 ) -> Float[ndarray, "code"]:
-    """The embedding z of a scene, by the frozen encoder, of a cloud of `points` random points on its
-    surfaces; an encoder for clouds of a fixed size gets that number of points."""
+    """The embedding z of a scene: the output of the frozen encoder for `points` random points on the scene's
+    surfaces. An encoder for clouds of a fixed size gets that number of points."""
     encoder_settings = model.settings.encoder_settings
-    assert encoder_settings is not None  # only unconditional priors have none
+    assert encoder_settings is not None  # only unconditional priors have no encoder
     count = points if encoder_settings.any_size else encoder_settings.cloud
     return model.encode(sample_surface(checker.scene, count, rng, encoder_settings.region), rng)
 

@@ -69,8 +69,8 @@ class ExportedPlanner(LearnedPlanner[LearnedPlannerSettings]):
 
 
 def nearest_goals(start: Configuration, goals: Configurations, samples: int) -> Configurations:
-    """The goals among which a batch of `samples` samples is divided: as many of those nearest to the start as
-    get SAMPLES_PER_GOAL each, nearest first; at least one."""
+    """The goals among which a batch of `samples` samples is divided, the nearest to the start first. They are
+    so few that each gets at least SAMPLES_PER_GOAL samples; but there is at least one goal."""
     order = np.argsort(np.linalg.norm(goals - start, axis=1))
     return goals[order[: max(samples // SAMPLES_PER_GOAL, 1)]]
 

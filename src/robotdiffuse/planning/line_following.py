@@ -38,7 +38,7 @@ from robotdiffuse.trajectories.timing_kernel import fastest_speeds
 
 STAGE = "line"
 # Largest distance [m] and angle [rad] between neighboring poses of the line; smallest and largest number of
-# steps between poses (a long line has MAX_STEPS longer steps).
+# steps from pose to pose along the line (a long line has MAX_STEPS longer steps).
 STEP = 0.008
 TURN_STEP = 0.04
 MIN_STEPS = 6
@@ -58,8 +58,8 @@ stops early."""
 END_STEPS = np.array([0.1, 0.3, 0.7])
 """Null-space steps from one configuration of the end pose to seeds of others [rad, L2]."""
 LONGER = 1.08
-"""Largest ratio of the joint-space length of a path to another configuration of the end pose, to that of the
-path followed first."""
+"""A path that ends in another configuration of the end pose may be this many times as long in joint space as
+the path that was followed first."""
 HERE = 1e-5
 """The link is at the end of the line if each entry of its pose (translation [m] and rotation matrix) differs
 from the end pose by less than this."""
@@ -75,8 +75,9 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
     """The fastest of several motions that follow the line from the start and pass the validator.
 
     If there is no such motion, a failed result: its `fraction` and `reason` say how far the line can be
-    followed and what stops the arm. None for an `AnyGoal` or `PosesGoal`, and if the link is at the end of
-    the line already but the validator refuses to stay there, e.g. since the goal is another configuration.
+    followed and what stops the arm. None for an `AnyGoal` or `PosesGoal`. Also None if the link is at the end
+    of the line already, but the validator refuses that it stays there, e.g. since the goal is another
+    configuration.
     """
     problem = context.problem
     robot = context.problem.robot
@@ -193,8 +194,8 @@ def faster_ends(
     jacobian = link_jacobians(problem.robot, end[None], line.frame)[0][:constrained, arm]
     faster = list[tuple[float, Float[ndarray, "k dof"]]]()
     redundant = np.linalg.svd(jacobian)[2][constrained:]
-    # the zero offset follows the line to the same end again, with the other joints steered there from the
-    # start
+    # with the zero offset, the line is followed to the same end again, but joints are steered to this end
+    # from the start on
     offsets = [
         0 * redundant[:1],
         *(np.outer(steps, direction) for direction in redundant for steps in (END_STEPS, -END_STEPS)),
@@ -246,5 +247,7 @@ def _obstruction(robot: Robot, q: Float[ndarray, "dof"]) -> str:
     limit_distance = np.where(robot.continuous, np.inf, np.minimum(q - robot.lower, robot.upper - q))
     j = int(limit_distance.argmin())
     if limit_distance[j] < NEAR_LIMIT:
-        return f"{robot.joint_names[j]} is at its limit there, {q[j]:.3f} rad"
+        joint = robot.planned_joints[j]
+        unit = "m" if joint.kind == "prismatic" else "rad"
+        return f"{joint.name} is at its limit there, {q[j]:.3f} {unit}"
     return "the arm is at the edge of its reach there, or a joint would have to jump"

@@ -8,16 +8,17 @@ that cover all other space (`seen_free.py`). There are two exceptions: voxels wi
 arm at the start of a motion, and the space within 2 cm of the arm at its end. Seen points are obstacles there
 as well. With `see_goal`, the arm's surface at the goal must also have been seen free (`seen_free.GoalSeen`).
 The promise is as good as the map: if the scene does not change, and the camera's poses and errors are as
-stated, such a motion does not collide. Space that an obstacle may reach because of a pose's error counts as
-free only if a view sees it free by a margin of all of its own error, such as a view from nearby.
+stated, such a motion does not collide. Seen points may be displaced by the error of their camera's pose.
+Space within this error counts as free only if some view sees it free even with the largest error of its own
+pose, as views from nearby can.
 
 **Probabilistic.** The arm executes a motion whose stated `confidence` is high enough, and otherwise looks
-first. The confidence follows from the predicted probability of all unknown voxels that the motion sweeps,
-without those that the arm fills at the start and at the end.
+first. The confidence follows from the predicted occupancy probabilities of the unknown voxels that the motion
+sweeps, except voxels that the arm fills at the start or at the end.
 
-To choose a look, the Explorer plans a tentative motion among the seen obstacles alone; looks should show the
-unseen space that it would sweep. The motion of a look is subject to the policy as well. Under the
-probabilistic policy, a strict motion to the viewpoint is tried first.
+To choose a look, the Explorer plans a tentative motion to the goal among only the seen obstacles. Looks
+should show the unseen space that this motion would sweep. The motion of a look is subject to the policy as
+well. Under the probabilistic policy, a strict motion to the viewpoint is tried first.
 """
 
 from collections.abc import Iterable, Sequence
@@ -80,12 +81,12 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.tolerances import VerifySettings, goal_error
 
 PROBABILITY_BELOW = np.float32(0.1)
-"""Probability that an unknown voxel below the volume of the network is occupied: the share of the unknown
-voxels within reach that are occupied."""
+"""Assumed probability that an unknown voxel below the network's volume is occupied. About this share of the
+unknown voxels within reach is occupied."""
 NOTHING, DEFAULTS = Scene(()), ExplorerSettings()
 QUICK_FRACTION = 0.2
-"""Fraction of the time limit for a search after which a look or another search may follow. For searches
-within space seen free, it doubles with each look, since a motion is more likely the more space was seen."""
+"""Fraction of the time limit that a search gets if a look or another search may follow. For searches within
+space seen free, it doubles with each look: the more space was seen, the likelier is a motion."""
 TENTATIVE_MOTIONS = 2
 """Number of tentative motions among seen obstacles; looks are planned for the motion that sweeps the least
 unseen space."""
@@ -137,7 +138,8 @@ class Explorer:
         self._news: list[DepthView] = []
         """Views since the latest step."""
         self._beside: DepthView | None = None
-        """The latest view, before the latest step, of a camera that is not on the arm."""
+        """The last view of a camera that is not on the arm, among the views that the latest step took into
+        account."""
         self._free = self.map.free
         """Voxels that were free at the latest step."""
 
@@ -226,8 +228,8 @@ class Explorer:
     def wanted(self, path: Path) -> Voxels:
         """The voxels that looks should show.
 
-        They are the unknown voxels that a tentative motion sweeps and, if the goal must be seen, the voxels
-        of the arm's surface there that were not seen.
+        They are the unknown voxels that a tentative motion sweeps and, if the goal must be seen, the unseen
+        voxels at the arm's surface at the goal.
 
         Args:
             path: The tentative motion.
@@ -265,13 +267,14 @@ class Explorer:
         predicted = self.predicted() if policy == PROBABILISTIC else None
         may_look = bool(self.cameras) and self._looks < self.settings.max_looks
         limit = quick = self.settings.time_limit
-        if may_look and policy == STRICT:
+        if may_look and policy == STRICT:  # a short search; a look may show more free space
             quick = min(self._quick_limit * 2**self._looks, limit)
         motion = self._motion(problem, policy, predicted, quick, may_look)
         if self._may_go(motion, policy):
             return self._go(motion, policy)
         look = self._look(problem, policy, predicted, motion)
         skipped = policy == STRICT and motion.status is Status.NO_PATH
+        # without a look, search for the whole time limit, even if too little was seen free
         if look.kind == STUCK and (quick < limit or skipped):
             motion = self._motion(problem, policy, predicted, limit)
             if self._may_go(motion, policy):
@@ -290,7 +293,7 @@ class Explorer:
 
     def _go(self, motion: PlanResult, policy: str) -> Step:
         stated = motion.confidence if policy == PROBABILISTIC else None
-        free = "through space seen free alone"
+        free = "that stays in space seen free"
         if stated is not None:
             free = f"that is free with a probability of {stated:.3f}"
         return Step(GO, f"a motion {free}", policy, motion, stated)
@@ -322,24 +325,24 @@ class Explorer:
         if tentative.path is None:
             return Step(STUCK, f"no motion among what was seen: {tentative.reason}", policy)
         safe_motion = None
-        under = policy
+        safe_policy = policy
         if policy == PROBABILISTIC and predicted is not None:
             safe_motion = self._with_confidence(tentative, predicted)
         elif not to_view.any():
             safe_motion = self._within_seen_free(problem, tentative.path.positions, "as seen")
-            under = STRICT
-        if safe_motion is not None and self._may_go(safe_motion, under):
-            return self._go(safe_motion, under)
+            safe_policy = STRICT
+        if safe_motion is not None and self._may_go(safe_motion, safe_policy):
+            return self._go(safe_motion, safe_policy)
         predicted = self.predicted() if predicted is None else predicted
         # the motion of a look is through space seen free if possible, under both policies
         policies = (STRICT, PROBABILISTIC) if self.settings.policy == PROBABILISTIC else (policy,)
-        for under in policies:
-            look = self._way_to_look(problem, under, to_view, predicted)
+        for look_policy in policies:
+            look = self._way_to_look(problem, look_policy, to_view, predicted)
             if look is not None:
-                stated = look.confidence if under == PROBABILISTIC else None
+                stated = look.confidence if look_policy == PROBABILISTIC else None
                 self._looked_for |= to_view
                 why += "; look at unseen space on the way"
-                return Step(LOOK, why, under, look, stated, wanted=to_view)
+                return Step(LOOK, why, look_policy, look, stated, wanted=to_view)
         back = self._way_back(problem) if STRICT in policies else None
         if back is not None:
             return Step(LOOK, f"{why}; go back on the way in and look from there", STRICT, back)
@@ -352,7 +355,7 @@ class Explorer:
         wanted: Voxels,
         predicted: Probabilities | None,
     ) -> PlanResult | None:
-        """A motion under a policy to a viewpoint, one of those from which a camera sees most wanted voxels;
+        """A motion under a policy to one of the viewpoints from which a camera sees the most wanted voxels;
         None if no motion was found."""
         allowed = self._seen_free(problem) if policy == STRICT else problem
         tree = ReachableTree(self.robot, allowed.scene, problem.start)
@@ -419,8 +422,9 @@ class Explorer:
     def _least_unseen(self, as_seen: Problem) -> tuple[PlanResult, Voxels]:
         """A motion among seen obstacles, and the unseen voxels on it that looks should show.
 
-        It is the motion with the least unseen space of several; or a failed result if none was found. If
-        possible, motions avoid occupied voxels, and voxels that earlier looks failed to show.
+        Several motions are planned; the one that sweeps the least unseen space is returned, or a failed
+        result if none was found. If possible, motions avoid occupied voxels, and voxels that earlier looks
+        failed to show.
         """
         goals = as_seen.goal.positions if isinstance(as_seen.goal, JointGoal) else ()
         ends = near_ends(self.map, (as_seen.start, *goals))
@@ -472,7 +476,7 @@ class Explorer:
         if result.solved:
             return result
         why = "" if result.status is Status.TIMEOUT else f": {result.reason}"
-        return replace(result, reason=f"no motion through space seen free alone was found{why}")
+        return replace(result, reason=f"no motion that stays in space seen free was found{why}")
 
     def _probabilistic(
         self, problem: Problem, predicted: Probabilities | None, limit: float, to_goal: bool = True
@@ -508,7 +512,8 @@ class Explorer:
         return replace(motion, swept_probability=swept, confidence=stated)
 
     def _unknown(self, ends: Iterable[Configuration], predicted: Probabilities | None) -> UnknownSpace:
-        """The voxels that the map does not know, without those that the arm fills at these configurations."""
+        """The unknown voxels of the map, except voxels that the arm fills at the configurations `ends`."""
+        # voxels on rays without a return, which lower the confidence
         lost = np.pad(refined(self._views.volume().lost), ((0, 0), (0, 0), (LAYERS_BELOW, 0)))
         return UnknownSpace(self.robot, ends, self.map.unknown, predicted, 0.0, MAP, lost)
 
@@ -530,8 +535,8 @@ class Explorer:
     def predicted(self) -> Probabilities | None:
         """The predicted probability that each voxel is occupied; 0 in voxels that the map knows to be free.
 
-        None if the settings exclude the network, if it does not cover the arm's reach, and before the first
-        view.
+        None if the settings exclude the network, if the network does not cover the arm's reach, and before
+        the first view.
         """
         if not (len(self._views) and self.settings.predict):
             return None

@@ -39,7 +39,7 @@ RESOLUTION = 0.02
 CAPACITY = 2000
 """Maximum number of configurations in a tree."""
 PARTS = (0.25, 0.5, 1.0)
-"""Fractions of a path's length that may be executed."""
+"""Fractions of a path's length at which `first_parts` cuts it."""
 
 
 class ReachableTree:
@@ -83,14 +83,14 @@ class ReachableTree:
 
 
 def moved(robot: Robot, to: Configurations, others: Sequence[Configuration]) -> Float[ndarray, "n"]:
-    """How far the arm moves from the nearest of other configurations to each configuration of `to`: the mean
-    over its covering spheres [m]."""
+    """For each configuration of `to`, how far the arm moves to it from the nearest configuration of `others`:
+    the mean over the arm's covering spheres [m]."""
     reached, away = (np.stack([placed_spheres(robot, q)[:, :3] for q in rows]) for rows in (to, others))
     return np.min([np.linalg.norm(reached - other, axis=2).mean(axis=1) for other in away], axis=0)
 
 
 def first_parts(waypoints: Configurations) -> Iterator[Configurations]:
-    """The first parts of a path in order of their length, the whole path last."""
+    """Beginnings of a path, the shortest first and the whole path last."""
     at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1))])
     for part in PARTS:
         end = part * at[-1]
@@ -98,7 +98,8 @@ def first_parts(waypoints: Configurations) -> Iterator[Configurations]:
         yield np.concatenate([waypoints[at < end], last[None]])
 
 
-# The tree grows by TARGETS random targets in a round, until it has CONFIGURATIONS or after ROUNDS rounds.
+# In each round, the tree grows towards TARGETS random targets, until it has CONFIGURATIONS configurations or
+# after ROUNDS rounds.
 CONFIGURATIONS = 900
 TARGETS = 1200
 ROUNDS = 5
@@ -107,8 +108,9 @@ SPREADS = (0.3, 0.8, 2.0)
 LONGEST_STEP = 1.0
 """Longest extension towards a target [rad, joint-space L2]; most are much shorter, to pass gaps."""
 REFINEMENTS = (0.25, 0.1)
-"""Standard deviations of the targets about the best configurations, in two further rounds [rad]."""
-# Number of these best configurations, and of targets about each of them.
+"""Standard deviations of the targets about the configurations of the best scores, in two further rounds
+[rad]."""
+# Number of these configurations, and of targets about each of them.
 REFINED = 12
 NEIGHBORS = 15
 MAX_VOXELS = 1500
@@ -120,8 +122,8 @@ UNSEEN_WEIGHT = 0.05
 MIN_SEEN = 0.02
 """Viewpoints that see a smaller part of the total weight are not used."""
 CONFINED = 0.1
-"""An arm that can move no farther than this is confined by unseen space in its own shadow, which it hides
-from cameras beside it. It first moves as far as it can, so that its shadow moves [m]."""
+"""An arm that cannot move farther than this [m] is confined by space that it hides from the cameras beside
+it. It first moves as far as it can, so that these cameras see this space."""
 SIMILAR_LOOK = 0.2
 """A viewpoint nearer than this to an earlier one that did not show the wanted voxels counts less [rad]."""
 
@@ -158,8 +160,8 @@ def best_looks(
     of viewpoints nearby.
     hemmed_in: whether the arm cannot go back. The last path is then to the configuration in which the arm is
     farthest from where it was in all images; for a CONFINED arm it is also the first path.
-    beside: the latest image of a camera that does not move. It sees what the arm at a viewpoint no longer
-    hides.
+    beside: the latest image of a fixed camera. With the arm at a viewpoint, this camera may see wanted voxels
+    that the arm hides now.
     """
     robot = known.robot
     at = np.argwhere(wanted)
@@ -257,7 +259,8 @@ class NextView(Value):
 
     T_base_camera: Pose
     seen: float
-    """Expected part of the summed probability that a camera there sees, from 0 to 1."""
+    """Fraction of this space that a camera with this pose is expected to see, weighted by the probability
+    that the space is occupied."""
 
 
 def poses_around() -> list[Pose]:
@@ -271,10 +274,10 @@ def poses_around() -> list[Pose]:
 def next_view(problem: Problem, result: PlanResult, poses: Sequence[Pose] | None = None) -> NextView:
     """The camera pose that shows most of what a motion may collide with.
 
-    From this pose, a camera with the intrinsics of the first view sees the largest part of the predicted
-    probability of the unknown voxels that the motion sweeps. A voxel counts with the probability that nothing
-    hides it: neither seen or predicted obstacles nor the arm at the start. With a policy other than
-    "predicted", all swept unknown voxels have equal weight.
+    A camera with the intrinsics of the first view shall see most of the unknown voxels that the motion
+    sweeps. Each voxel counts with the predicted probability that it is occupied, times the probability that
+    nothing hides it: neither seen or predicted obstacles nor the arm at the start. With a policy other than
+    "predicted", the first factor is the same for all voxels.
 
     Args:
         problem: A problem with views.

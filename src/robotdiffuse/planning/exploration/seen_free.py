@@ -3,9 +3,10 @@ arm fills at a goal was seen free (`GoalSeen`).
 
 For the goal, voxels of 2 cm are too coarse: voxels that the arm touches there are rarely seen free as a
 whole. So small balls cover the arm's surface at the goal, and each ball must be free for one of four reasons:
-an image sees through it; it lies in voxels that the map knows to be free; a covering sphere of the arm
-contained it when an image was taken; or it is so near the arm at the start of the motion that it counts as
-free. The space inside the surface needs no view, since obstacles do not float.
+an image sees through it, which means that all of its pixels measure surfaces behind it; it lies in voxels
+that the map knows to be free; a covering sphere of the arm contained it when an image was taken; or it is so
+near the arm at the start of the motion that it counts as free. The space inside the surface needs no view,
+since obstacles do not float.
 """
 
 from collections.abc import Iterable, Sequence
@@ -86,7 +87,7 @@ def hardly_seen(known: OccupancyMap, start: Configuration, goal: Configuration) 
 
 
 def cover(known: OccupancyMap, known_scene: Scene, points: Points, edge: float, name: str) -> AssumedPoints:
-    """Balls that cover voxels, without the voxels in the known scene and those out of the arm's reach.
+    """Balls that cover voxels, except voxels in the known scene or out of the arm's reach.
 
     points: centers of the voxels [m]. edge: their edge [m]. name: of the obstacle.
     """
@@ -103,19 +104,20 @@ def least_unknown(known: OccupancyMap, goals: Configurations) -> Configuration:
 
 def reaches_outside(robot: Robot, q: Configuration) -> bool:
     """Whether the arm reaches out of the map: the centers of some of its covering spheres are outside."""
-    low, high = _ends_of_map()
+    low, high = _corners_of_map()
     centers = placed_spheres(robot, q)[:, :3]
     return bool(((centers < low) | (centers > high)).any())
 
 
-def _ends_of_map() -> tuple[Float[ndarray, "3"], Float[ndarray, "3"]]:
+def _corners_of_map() -> tuple[Float[ndarray, "3"], Float[ndarray, "3"]]:
+    """The low and the high corner of the map [m]."""
     low = np.array(MAP.low)
     return low, low + np.array(MAP.shape) * MAP.edge
 
 
 def _walls() -> list[Box]:
     """Boxes around the map."""
-    low, high = _ends_of_map()
+    low, high = _corners_of_map()
     walls = []
     for axis in range(3):
         for at, name in ((low[axis] - WALL / 2, "before"), (high[axis] + WALL / 2, "beyond")):
@@ -128,8 +130,8 @@ def _walls() -> list[Box]:
 
 
 BORDER = np.float32(1.0)
-"""In filtered images, pixels up to this far outside a ball's outline must see past it too [pixels], since
-the filter moves edges by about one pixel."""
+"""In filtered images, pixels up to this far outside a ball's outline must also see past the ball [pixels],
+since the filter moves edges by about one pixel."""
 LITTLE_UNSEEN = 1e-3
 """If less than this part of the surface was not seen, messages say where it is."""
 KEY_DECIMALS = 5

@@ -61,11 +61,11 @@ def stop_before(
     motion: Trajectory,
     time: float,
 ) -> Stop | None:
-    """The earliest stop of a motion from a time on, if views show an obstacle in the way of what remains of
-    it; otherwise None.
+    """The earliest stop of a motion from a time on, if views show an obstacle in the way of the remaining
+    motion; otherwise None.
 
     The stop is within the robot's limits of velocity, acceleration and jerk. Points in space that was free
-    before have appeared: these are padded, since only the front of the object that they belong to is seen.
+    before belong to an object that appeared; they are padded, since only its front is seen.
 
     views: views taken during the motion. free: `OccupancyMap.free` when the motion was planned. time: when a
     new command takes effect, in time of the motion [s]. Raises InputError for a time outside the motion.
@@ -128,11 +128,13 @@ def _rows(motion: Trajectory, time: float, delay: float, braking: float, ramp: f
         u = np.clip((times - delay) / braking, 0.0, 1.0)
         peak = 1 / (1 - ramp)
         remaining = 1 - u
+        # In the three parts, the deceleration rises, is constant and falls. Its integral is the loss of
+        # speed; u minus its second integral is the time of the motion that has passed, in braking times.
         parts = [u < ramp, u <= 1 - ramp]
         early = u - peak * u**3 / (6 * ramp)
         middle = u - peak * (u**2 / 2 - ramp * u / 2 + ramp**2 / 6)
-        ways = [early, middle, 0.5 - peak * remaining**3 / (6 * ramp)]
-        passed = np.where(times < delay, times, delay + braking * np.select(parts, ways[:2], ways[2]))
+        late = 0.5 - peak * remaining**3 / (6 * ramp)
+        passed = np.where(times < delay, times, delay + braking * np.select(parts, [early, middle], late))
         slower = [peak * u**2 / (2 * ramp), peak * (u - ramp / 2)]
         speed = 1 - np.select(parts, slower, 1 - peak * remaining**2 / (2 * ramp))
         slowing = -np.select(parts, [peak * u / ramp, peak + 0 * u], peak * remaining / ramp) / braking
