@@ -41,6 +41,9 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from common import FIRST, TIME_LIMIT, header, parse, print_table, progress, use_processor_time
@@ -59,6 +62,7 @@ from robotdiffuse.learning.completion import (
 from robotdiffuse.perception.depth_view import DepthNoise, DepthView
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.ray_caster import MAX_RANGE, ray_cast
+from robotdiffuse.perception.unknown_space import MIN_RISK
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.exploration.looks import next_view, poses_around
@@ -413,8 +417,18 @@ def times(families: list[str]) -> None:
 
 
 def fit(rows: list[Row]) -> None:
-    """Print the constants RATES of perception/unknown_space.py."""
+    """Print the constants RATES and ONE_VIEW of perception/unknown_space.py."""
     rows = [r for r in rows if r["solved"] and r["number"] % 2 == 0 and r["views"] == 1]
+    predicted = [row for row in rows if row["method"] == PREDICTED]
+    log_risk = np.log(np.maximum([row["risk"] for row in predicted], MIN_RISK))
+    free = np.array([row["free"] for row in predicted])
+
+    def loss(curve: Float[ndarray, "2"]) -> float:
+        odds = curve[0] + curve[1] * log_risk
+        return float((np.logaddexp(0, odds) - free * odds).sum())
+
+    if predicted:
+        print("ONE_VIEW:", minimize(loss, np.zeros(2)).x.round(2), f"of {len(predicted)}")
     rows = [row for row in rows if row["images"] == IDEAL and not row["walls"]]
     plain = [row for row in rows if row["risk"] is None]
     for assumption in dict.fromkeys(row["assumption"] for row in plain):

@@ -36,13 +36,7 @@ from robotdiffuse.evaluation.statistics import bootstrap_interval, compare, wils
 from robotdiffuse.learning.completion import predict
 from robotdiffuse.perception.depth_view import DepthNoise
 from robotdiffuse.perception.observed_volume import observe
-from robotdiffuse.perception.unknown_space import (
-    CARVING_MARGIN,
-    THRESHOLDS,
-    OccupiedVoxels,
-    confidence,
-    free_share,
-)
+from robotdiffuse.perception.unknown_space import CARVING_MARGIN, THRESHOLDS, OccupiedVoxels, confidence
 from robotdiffuse.perception.voxel_grid import COARSE, SHAPE, refined
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.pipeline import attempt
@@ -133,7 +127,7 @@ def record(problem: Problem, family: str, number: int, depth: str) -> Row:
             *(swept.sum(), *((swept & part).sum() / max(swept.sum(), 1) for part in parts)),
             *(means[near].sum(), highest[near].max(initial=0), _log_free(means[near])),
             *np.histogram(highest[near], BINS)[0],
-            *(crossed.free_share, free_share(predicted, refined(near)), length, result.trajectory.duration),
+            *(length, result.trajectory.duration),
         ]
         row = {"kind": kind, "threshold": threshold, "confidence": stated, "risk": crossed.risk}
         row |= {"length": length, "time": planned - began, "stating": stating}

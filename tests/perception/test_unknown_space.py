@@ -1,4 +1,4 @@
-"""Unknown voxels that a motion sweeps, sampled worlds in which the motion is free, and its confidence."""
+"""Unknown voxels that a motion sweeps, and its confidence."""
 
 from itertools import pairwise
 
@@ -7,15 +7,16 @@ import pytest
 
 import robotdiffuse as rd
 from robotdiffuse.collision.kernel_arrays import compile_robot
+from robotdiffuse.perception.observed_volume import ObservedVolume
 from robotdiffuse.perception.unknown_space import (
-    MAX_CONFIDENCE,
+    EXPLORED,
+    ONE_VIEW,
     RATES,
-    WORLDS,
     CrossedSpace,
     UnknownSpace,
     confidence,
-    explored_confidence,
-    free_share,
+    lost_regions,
+    probability_free,
 )
 from robotdiffuse.perception.voxel_grid import FINE, FINE_SHAPE, LOW, SHAPE, VOXEL, heaviest_part, surface, sweep
 from robotdiffuse.robots.kinematics import placed_spheres
@@ -23,55 +24,34 @@ from robotdiffuse.robots.kinematics import placed_spheres
 PANDA = rd.load_robot("panda")
 START = np.array([-0.9, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 TURNED = np.array([-1, 1, 1, 1, 1, 1, 1])
-RNG = np.random.default_rng(0)
 VOXELS = np.zeros(FINE_SHAPE, np.bool_)
 VOXELS[40:70, 40:50, 20:40] = True
-UNLIKELY = np.full(FINE_SHAPE, 1e-4, np.float32)
 
 
-@pytest.mark.parametrize("p", [0.05, 0.3, 0.9])
-def test_each_voxel_keeps_its_probability(p: float) -> None:
-    probability = np.full(FINE_SHAPE, p, np.float32)
-    shares = []
-    for at in RNG.integers(FINE_SHAPE, size=(100, 3)):
-        one = np.zeros(FINE_SHAPE, np.bool_)
-        one[tuple(at)] = True
-        shares.append(free_share(probability, one))
-    # four standard errors of one voxel's 256 worlds; the voxels' shares depend on each other
-    assert abs(np.mean(shares) - (1 - p)) < 4 * np.sqrt(p * (1 - p) / WORLDS)
+@pytest.mark.parametrize("curve", [ONE_VIEW, EXPLORED])
+def test_the_probability_that_a_motion_is_free_falls_with_its_risk(curve: tuple[float, float]) -> None:
+    stated = [probability_free(risk, curve) for risk in (0.0, 0.2, 1.0, 10.0, 100.0, 1e4)]
+    assert stated[0] == stated[1] and 0.95 < stated[1] < 1
+    assert all(0 < b < a for a, b in pairwise(stated[1:])) and stated[-1] < 0.05
 
 
-def test_a_certain_voxel_in_the_way_leaves_no_world_free() -> None:
-    certain = UNLIKELY.copy()
-    certain[tuple(np.argwhere(VOXELS)[0])] = 1.0
-    assert free_share(certain, VOXELS) == 0 and free_share(certain, ~VOXELS & (certain < 1)) > 0
-
-
-def test_near_voxels_are_occupied_together() -> None:
-    """If they were independent, 1,000 voxels with a probability of 0.01 would be free in no world."""
-    near = np.zeros(FINE_SHAPE, np.bool_)
-    near[50:60, 50:60, 30:40] = True
-    probability = np.full(FINE_SHAPE, 0.01, np.float32)
-    assert 0.9 < free_share(probability, near) < 0.99
-
-
-@pytest.mark.parametrize("more", [0, 9])
-def test_nothing_that_may_be_occupied_is_free_in_every_world(more: int) -> None:
-    """Regression: in a grid larger than the observed volume, such as the map of an exploration, an index was
-    out of bounds."""
-    shape = tuple(size + more for size in FINE_SHAPE)
-    assert free_share(np.zeros(shape, np.float32), np.ones(shape, np.bool_)) == 1
-    assert free_share(np.ones(shape, np.float32), np.ones(shape, np.bool_)) == 0
-    assert free_share(np.ones(shape, np.float32), np.zeros(shape, np.bool_)) == 1
-
-
-def test_confidence_falls_with_the_predicted_probability_or_is_the_rate_of_the_assumption() -> None:
-    crossed = [CrossedSpace(VOXELS, np.full(FINE_SHAPE, p, np.float32)) for p in (0, 0.01, 0.1, 0.5, 1)]
-    stated = [confidence("predicted, p > 0.1", one) for one in crossed]
-    assert stated[0] == MAX_CONFIDENCE and stated[-1] == 0 and all(b < a for a, b in pairwise(stated))
-    explored = [explored_confidence(risk) for risk in (0.0, 0.1, 1.0, 10.0, 1000.0)]
-    assert all(0 <= b <= a <= 1 for a, b in pairwise(explored))
+def test_confidence_follows_from_the_risk_or_is_the_rate_of_the_assumption() -> None:
+    likely = np.full(FINE_SHAPE, 0.01, np.float32)
+    stated = confidence("predicted, p > 0.1", CrossedSpace(VOXELS, likely))
+    assert np.isclose(stated, probability_free(0.01 * VOXELS.sum(), ONE_VIEW), rtol=1e-4)
+    half_lost = CrossedSpace(VOXELS, likely, lost_share=0.5)
+    assert confidence("predicted, p > 0.1", half_lost) == stated / 2
     assert all(confidence(name, CrossedSpace(VOXELS, None)) == rate for name, rate in RATES.items())
+
+
+def test_only_wide_regions_without_a_return_lower_the_confidence() -> None:
+    lost = np.zeros(SHAPE, np.bool_)
+    volume = ObservedVolume(lost, lost, lost, lost, np.zeros(SHAPE, np.float32), lost)
+    assert not lost_regions(volume).any()
+    lost[10:12, 10:30, 10:30] = True
+    assert not lost_regions(volume).any()
+    lost[30:34, 20:23, 4:9] = True
+    assert lost_regions(volume).sum() == 8 * 4 * 3 * 5
 
 
 def test_only_what_the_arm_fills_at_the_ends_is_left_out_without_a_margin() -> None:

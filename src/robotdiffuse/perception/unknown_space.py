@@ -3,28 +3,19 @@ the probability that this part is free.
 
 An assumption is a set of obstacles in addition to the observed ones. The space that the arm occupies at its
 start and goals is removed from them (carved out).
-
-The probability that a motion is free is the share of sampled worlds in which it is free. In a sampled world,
-a voxel is occupied if a smooth random field is below the voxel's probability of being occupied. Over the
-worlds, the field at any point is uniform between 0 and 1, so each voxel is occupied with its probability.
-Since the field is smooth, near voxels are occupied together, like those of real obstacles. Independent voxels
-would be too pessimistic: a motion through 1000 voxels, each free with probability 0.999, would be free with
-probability 0.37.
 """
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Bool, Float32
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for, reach_bound
-from robotdiffuse.core.kernels import kernel
-from robotdiffuse.core.loading import loading
 from robotdiffuse.core.types import Configuration, Path, Points
 from robotdiffuse.perception.depth_view import AssumedPoints
 from robotdiffuse.perception.observed_volume import ObservedVolume
@@ -33,11 +24,11 @@ from robotdiffuse.perception.voxel_grid import (
     COARSE,
     FINE,
     SHAPE,
-    VOXEL,
     Probabilities,
     VoxelGrid,
     Voxels,
     heaviest_part,
+    refined,
     surface,
 )
 from robotdiffuse.robots.robot import Robot
@@ -152,85 +143,24 @@ def occupied_assumption(volume: ObservedVolume, robot: Robot, known_scene: Scene
     return OccupiedVoxels("unknown is occupied", volume.unknown, robot, known_scene)
 
 
-TILE = 64
-"""Period of the random field along each axis, in coarse voxels: a power of two, larger than the observed
-volume."""
-
-
-def highest_in_cells(
-    probability: Probabilities, marked: Voxels
-) -> tuple[Int64[ndarray, "n 3"], Float32[ndarray, "n"]]:
-    """The highest probability of the marked fine voxels in each coarse voxel.
-
-    Returns the indices of the coarse voxels whose highest probability is above 0, and these probabilities,
-    sorted from the highest to the lowest.
-    """
-    highest = np.zeros([-(-size // 2) for size in marked.shape], np.float32)
-    np.maximum.at(highest, tuple(at // 2 for at in np.nonzero(marked)), probability[marked])
-    cells = np.argwhere(highest)
-    values = highest[tuple(cells.T)]
-    order = np.argsort(-values)
-    return cells[order], values[order]
-
-
-@kernel(nogil=True)
-def count_free(field, shifts, cells, values):
-    """The number of sampled worlds, each a shift of the field, in which no cell is occupied: the field is
-    nowhere below the cells' values.
-
-    field: float32[TILE, TILE, TILE], periodic. shifts: int64[m, 3]. cells: int64[n, 3], coarse voxels.
-    values: float32[n], probabilities.
-    """
-    free = 0
-    for s in range(len(shifts)):
-        blocked = False
-        for n in range(len(cells)):
-            i = cells[n, 0] + shifts[s, 0]
-            j = cells[n, 1] + shifts[s, 1]
-            k = cells[n, 2] + shifts[s, 2]
-            if field[i & (TILE - 1), j & (TILE - 1), k & (TILE - 1)] < values[n]:
-                blocked = True
-                break
-        free += not blocked
-    return free
-
-
-CORRELATION_LENGTH = 0.25
-"""Distance at which the field's correlation has fallen to exp(-1/2), before its values are made uniform [m].
-Chosen on the even-numbered problems of `benchmarks/cameras.py`."""
-WORLDS = 256
-"""Number of sampled worlds."""
-
-
-def free_share(probability: Probabilities, voxels: Voxels) -> float:
-    """The share of the sampled worlds in which all of these fine voxels are free.
-
-    probability: the probability that each fine voxel is occupied. Every call uses the same worlds.
-    """
-    return count_free(_field(), _shifts(), *highest_in_cells(probability, voxels)) / WORLDS
-
-
-@cache
-@loading()
-def _field() -> Float32[ndarray, "n n n"]:
-    """A periodic random field on coarse voxels; its values are evenly spread between 0 and 1."""
-    white = np.random.default_rng(0).standard_normal((TILE, TILE, TILE))
-    k = 2 * np.pi * np.fft.fftfreq(TILE, VOXEL)
-    squared = k[:, None, None] ** 2 + k[:, None] ** 2 + k**2
-    smooth = np.fft.ifftn(np.fft.fftn(white) * np.exp(-squared * CORRELATION_LENGTH**2 / 4)).real
-    ranks = np.empty(smooth.size, np.float32)
-    ranks[np.argsort(smooth, axis=None)] = (np.arange(smooth.size) + 0.5) / smooth.size
-    return ranks.reshape(smooth.shape)
-
-
-@cache
-def _shifts() -> Int64[ndarray, "worlds 3"]:
-    """How far the field is shifted in each world, in coarse voxels."""
-    return np.random.default_rng(1).integers(TILE, size=(WORLDS, 3))
-
-
 Box = tuple[tuple[float, ...], tuple[float, ...]]
 """Low and high corner [m]."""
+
+
+LOST_WIDTH = 3
+"""Smallest width [voxels of 4 cm] of regions without a return that lower the confidence. The images that the
+network was trained with had smaller ones."""
+
+
+def lost_regions(volume: ObservedVolume) -> Voxels:
+    """The fine voxels on rays without a return, in regions at least LOST_WIDTH wide."""
+    lost = volume.lost
+    if lost.any():
+        from scipy.ndimage import maximum_filter, minimum_filter
+
+        inner = minimum_filter(lost.view(np.uint8), LOST_WIDTH, mode="nearest")
+        lost = maximum_filter(inner, LOST_WIDTH, mode="nearest").view(np.bool_)
+    return refined(lost)
 
 
 class UnknownSpace:
@@ -251,7 +181,7 @@ class UnknownSpace:
         unknown: the voxels of the grid that no view saw.
         predicted: the probability that each voxel is occupied; None without a prediction.
         margin: voxels nearer to the arm at these configurations than this count as occupied by it [m].
-        lost: the unknown voxels on rays without a return.
+        lost: voxels on rays without a return, see `lost_regions`.
         """
         self._robot = robot
         self._grid = grid
@@ -287,11 +217,6 @@ class CrossedSpace:
         """The summed probability of the voxels; None without a prediction."""
         return None if self.probability is None else float(self.probability[self.voxels].sum(dtype=float))
 
-    @cached_property
-    def free_share(self) -> float | None:
-        """The share of sampled worlds in which all of the voxels are free; None without a prediction."""
-        return None if self.probability is None else free_share(self.probability, self.voxels)
-
     @property
     def region(self) -> Box | None:
         """The bounding box of the connected part of the voxels with the largest summed probability or,
@@ -317,42 +242,33 @@ the true scene. `python benchmarks/cameras.py --fit` prints these for the calibr
 UNSEEN_CONFIDENCE = 0.5
 """Largest confidence of a motion with an unseen share above MAX_UNSEEN_SHARE."""
 MAX_UNSEEN_SHARE = 0.99
-MAX_CONFIDENCE = 0.995
-"""Confidence of a motion that is free in every sampled world; the network and 256 worlds do not justify
-more."""
+
+# The log odds that a motion is free in the true scene are the first number plus the second times log(risk),
+# where risk is the summed probability that the voxels that the motion passes through are occupied.
+ONE_VIEW = (2.96, -0.75)
+"""Fitted to 387 motions from one view, by `python benchmarks/cameras.py --fit`."""
+EXPLORED = (4.05, -1.15)
+"""For motions of an Explorer, whose views left little unknown. Fitted to 493 motions of
+`benchmarks/exploring.py`, half of them with noise; see its report."""
+MIN_RISK = 0.2
+"""Smaller risks are raised to this."""
+
+
+def probability_free(risk: float, curve: tuple[float, float]) -> float:
+    """The probability that a motion with a risk is free in the true scene. curve: ONE_VIEW or EXPLORED."""
+    odds, slope = curve
+    return 1 / (1 + math.exp(-(odds + slope * math.log(max(risk, MIN_RISK)))))
 
 
 def confidence(assumption: str, crossed: CrossedSpace) -> float:
     """The probability that a motion under an assumption is free in the true scene.
 
-    It is the share of sampled worlds in which the motion is free, see `free_share`, or, without a prediction,
-    the rate of the assumption in RATES. It is at most UNSEEN_CONFIDENCE if views saw hardly any of the space
-    that the motion passes through. It is reduced in proportion to the share of this space on rays without a
-    return, even if the network predicts that this space is free.
+    It follows from the risk, or, without a prediction, it is the rate of the assumption in RATES. It is at
+    most UNSEEN_CONFIDENCE if views saw hardly any of the space that the motion passes through. It is reduced
+    in proportion to the share of this space on rays without a return, even if the network predicts that this
+    space is free.
     """
-    share = crossed.free_share
-    stated = RATES[assumption] if share is None else min(share, MAX_CONFIDENCE)
+    stated = RATES[assumption] if crossed.risk is None else probability_free(crossed.risk, ONE_VIEW)
     if crossed.unseen_share > MAX_UNSEEN_SHARE:
         stated = min(stated, UNSEEN_CONFIDENCE)
     return stated * (1 - crossed.lost_share)
-
-
-EXPLORED = (4.05, -1.15)
-"""The log odds that a motion of an Explorer is free are the first number plus the second times log(risk).
-
-They were fitted to 493 motions of `benchmarks/exploring.py`, half of them with noise; see its report. See
-`explored_confidence` for the risk.
-"""
-MIN_RISK = 0.2
-"""Smaller risks are raised to this."""
-
-
-def explored_confidence(risk: float) -> float:
-    """The probability that a motion is free in the true scene, if an Explorer's views left little unknown.
-
-    The share of sampled worlds would be too low here: sampled worlds suit the large regions that a single
-    view leaves unknown. risk: the predicted probability of being occupied, summed over the voxels that the
-    motion passes through.
-    """
-    odds, slope = EXPLORED
-    return 1 / (1 + math.exp(-(odds + slope * math.log(max(risk, MIN_RISK)))))

@@ -38,8 +38,8 @@ from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.occupancy_map import Corners, OccupancyMap, ViewMemory
 from robotdiffuse.perception.pose_refinement import PoseRefinement, is_on
 from robotdiffuse.perception.seen_points import point_shapes
-from robotdiffuse.perception.unknown_space import UnknownSpace, explored_confidence
-from robotdiffuse.perception.voxel_grid import LAYERS_BELOW, MAP, Probabilities, Voxels, refined, surface
+from robotdiffuse.perception.unknown_space import EXPLORED, UnknownSpace, lost_regions, probability_free
+from robotdiffuse.perception.voxel_grid import LAYERS_BELOW, MAP, Probabilities, Voxels, surface
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.exploration.looks import (
@@ -508,13 +508,12 @@ class Explorer:
         swept = crossed.risk
         stated = None
         if swept is not None and not self.map.is_blind:
-            stated = explored_confidence(swept) * (1 - crossed.lost_share)
+            stated = probability_free(swept, EXPLORED) * (1 - crossed.lost_share)
         return replace(motion, swept_probability=swept, confidence=stated)
 
     def _unknown(self, ends: Iterable[Configuration], predicted: Probabilities | None) -> UnknownSpace:
         """The unknown voxels of the map, except voxels that the arm fills at the configurations `ends`."""
-        # voxels on rays without a return, which lower the confidence
-        lost = np.pad(refined(self._views.volume().lost), ((0, 0), (0, 0), (LAYERS_BELOW, 0)))
+        lost = np.pad(lost_regions(self._views.volume()), ((0, 0), (0, 0), (LAYERS_BELOW, 0)))
         return UnknownSpace(self.robot, ends, self.map.unknown, predicted, 0.0, MAP, lost)
 
     def _planned(self, problem: Problem, limit: float, seed: int | None = None) -> PlanResult:

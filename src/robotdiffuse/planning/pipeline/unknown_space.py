@@ -37,6 +37,7 @@ from robotdiffuse.perception.unknown_space import (
     OccupiedVoxels,
     UnknownSpace,
     confidence,
+    lost_regions,
     occupied_assumption,
     padded_assumptions,
     predicted_assumptions,
@@ -208,9 +209,9 @@ def unknown_space_of(
     """The space that no view of the problem saw; the arm's space at the start and at goal configurations
     counts as free."""
     goals = problem.goal.positions if isinstance(problem.goal, JointGoal) else ()
-    lost = refined(volume.lost)
     ends = (problem.start, *goals)
-    return UnknownSpace(problem.robot, ends, refined(volume.unknown), predicted, lost=lost)
+    unknown = refined(volume.unknown)
+    return UnknownSpace(problem.robot, ends, unknown, predicted, lost=lost_regions(volume))
 
 
 def predicted_obstacles(problem: Problem) -> AssumedPoints:
