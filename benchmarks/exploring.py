@@ -160,28 +160,31 @@ def play(problem: Problem, family: str, number: int, method: str, images: Images
     known = known_scene(problem)
     legs = [replace(problem, start=HOME, goal=JointGoal(problem.start[None])), problem]
     [beside] = views(legs[0], family, number, 1, None)
-    seen = [measured(beside, np.inf, noise, rng)]
+    images_so_far = [measured(beside, np.inf, noise, rng)]
     reason = violation = ""
     reached = collided = False
-    about = METHODS.get(method, METHODS["strict"])
+    chosen_method = METHODS.get(method, METHODS["strict"])
     settings = ExplorerSettings(
-        policy=about.policy, time_limit=TIME_LIMIT, predict=about.predict, see_goal=about.see_goal
+        policy=chosen_method.policy,
+        time_limit=TIME_LIMIT,
+        predict=chosen_method.predict,
+        see_goal=chosen_method.see_goal,
     )
-    zone = free_zone(problem) if about.free_zone else None
-    kind = FrontierExplorer if about.frontier else TimedExplorer
+    zone = free_zone(problem) if chosen_method.free_zone else None
+    kind = FrontierExplorer if chosen_method.frontier else TimedExplorer
     explorer = kind(problem.robot, [camera], known, zone, settings)
     explorer.images = images
     explorer.number = number
     spent = list[float]()
     looks = list[int]()
-    if method not in ONCE and about.standing:
-        explorer.observe(seen[0])
+    if method not in ONCE and chosen_method.standing:
+        explorer.observe(images_so_far[0])
     for leg in legs:
         explorer.spent = 0.0
         if method in ONCE:
-            seen.append(taken(leg, camera, leg.start, noise, rng))
+            images_so_far.append(taken(leg, camera, leg.start, noise, rng))
             began = time.process_time()
-            stated = [images.stated(view, number) for view in seen]
+            stated = [images.stated(view, number) for view in images_so_far]
             partial = Problem(leg.robot, known, leg.start, leg.goal, views=stated, unknown=ONCE[method])
             result = plan_with_unknown_space(PLANNER, partial, PlanRequest(TIME_LIMIT, until=FIRST))
             explorer.spent = time.process_time() - began
@@ -190,7 +193,9 @@ def play(problem: Problem, family: str, number: int, method: str, images: Images
             collided = result.solved and not reached
             looks.append(0)
         else:
-            events = list(explore(leg, explorer, noise, number, seen[0] if about.standing else None))
+            events = list(
+                explore(leg, explorer, noise, number, images_so_far[0] if chosen_method.standing else None)
+            )
             reached = events[-1].step.kind == DONE
             collided = not all(event.free for event in events)
             looks.append(sum(event.step.kind == LOOK for event in events))

@@ -251,13 +251,13 @@ def main() -> None:
             )
     columns = ["model", "joints", "frames", "contacts", "missed", "extra"]
     columns += ["solved", "CPU ms", "touched", "lag mrad"]
-    about = (
+    explanation = (
         f"frames: largest difference from MuJoCo's at {arguments.configurations} configurations. contacts: "
         f"configurations in collision by MuJoCo; missed, extra: deeper than {1e3 * DEPTH:g} mm by MuJoCo "
         "alone, by RobotDiffuse alone. CPU: until the first motion, median. touched: motions during which "
         "MuJoCo has an unexpected contact; lag: the largest error of a joint on the way."
     )
-    print_table("MuJoCo models", columns, rows, (about, *notes))
+    print_table("MuJoCo models", columns, rows, (explanation, *notes))
 
 
 if __name__ == "__main__":

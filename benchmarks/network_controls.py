@@ -131,7 +131,9 @@ def report_diversity(cases_of: dict[str, list[Case]]) -> None:
         records_of = run_all(cases, methods, limit=PLANNER_LIMIT, title=f"{family}, diversity")
         # only problems on which both planners have several motions
         common = [
-            i for i in range(len(cases)) if all("apart" in of[i].measures for of in records_of.values())
+            i
+            for i in range(len(cases))
+            if all("apart" in records[i].measures for records in records_of.values())
         ]
         for name, records in records_of.items():
             compared = [records[i] for i in common]

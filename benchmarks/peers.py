@@ -290,13 +290,13 @@ def main() -> None:
         "free",
         "1 mm",
     ]
-    about = (
+    explanation = (
         f"solved: within {TIME_LIMIT:g} s of CPU time. CPU: until the answer, a timed motion. certified: by "
         "rd.verify along the lines between the rows; free: by Coal on the convex meshes every "
         f"{MESH_STEP:g} rad; 1 mm: no deeper contact by PyBullet."
     )
     sources = ", ".join(names if arguments.problems else ("shelf",))
-    print_table(f"{len(cases)} problems of {sources}", columns, rows, (about, *notes))
+    print_table(f"{len(cases)} problems of {sources}", columns, rows, (explanation, *notes))
 
 
 if __name__ == "__main__":

@@ -79,18 +79,18 @@ def gather(folder: Path | None, families: Sequence[str], each: int) -> list[Case
     return cases
 
 
-def best_known(cases: Sequence[Case], lengths: dict, found: Sequence[Record]) -> dict[str, float]:
+def best_known(cases: Sequence[Case], lengths: dict, records: Sequence[Record]) -> dict[str, float]:
     """The best known length of each problem, by its name [rad]: that of `lengths`, else the shortest length
-    in the records `found`."""
+    in the records."""
     best: dict[str, float] = {}
     for case in cases:
         name = f"{case.family.removesuffix('_panda')}/{case.name[-4:]}"
         if name in lengths:
             best[case.name] = lengths[name]["best_known"]
-    for record in found:
+    for record in records:
         if record.solved and record.name not in best:
             best[record.name] = min(
-                r.measures["joint_length"] for r in found if r.solved and r.name == record.name
+                r.measures["joint_length"] for r in records if r.solved and r.name == record.name
             )
     return best
 
@@ -130,19 +130,19 @@ def first(cases: Sequence[Case]) -> None:
 
 def lengths(cases: Sequence[Case], known: dict, limits: Sequence[float], seeds: int) -> None:
     """Print path lengths at equal time limits, relative to the best known ones."""
-    found: dict[tuple[str, float], list[Record]] = {}
+    by_call: dict[tuple[str, float], list[Record]] = {}
     for limit in limits:
         methods = {name: planned(warm(name, cases), until=TIME_LIMIT, clearance=0.0) for name in PLANNERS}
         for name, records in run_all(cases, methods, range(seeds), limit, title=f"{limit:g} s").items():
-            found[name, limit] = records
-    best = best_known(cases, known, [record for records in found.values() for record in records])
+            by_call[name, limit] = records
+    best = best_known(cases, known, [record for records in by_call.values() for record in records])
     rows = []
     for family, group in by_family(cases):
         inside = {case.name for case in group}
         for name in PLANNERS:
             row = [f"{family} ({len(group)})", name]
             for limit in limits:
-                records = [r for r in found[name, limit] if r.name in inside]
+                records = [r for r in by_call[name, limit] if r.name in inside]
                 ratios = [r.measures["joint_length"] / best[r.name] for r in records if r.solved]
                 missing = len(records) - len(ratios)
                 row.append(f"{np.mean(ratios):.4f}" + (f" ({missing} unsolved)" if missing else ""))

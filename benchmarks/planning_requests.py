@@ -142,11 +142,11 @@ def _place(scene: rd.Scene, whole: rd.Scene, rng: np.random.Generator) -> ndarra
         around = [shape.bounds + grown for shape in scene.shapes if shape is not top]
         low = at[2] - can.height / 2
         high = at[2] + can.height / 2
-        taken = any(
+        is_occupied = any(
             (b[0, :2] < at[:2]).all() and (at[:2] < b[1, :2]).all() and b[0, 2] < high and low < b[1, 2]
             for b in around
         )
-        if np.linalg.norm(at[:2]) < PLACE_REACH and not taken:
+        if np.linalg.norm(at[:2]) < PLACE_REACH and not is_occupied:
             return transform(at[:3])
 
 
@@ -217,9 +217,9 @@ def _off(problem: Problem, pose: PoseGoal, simulated: World) -> float:
         computeForwardKinematics=1,
     )
     T = np.eye(4) if problem.T_world_base is None else problem.T_world_base
-    there = inverse(T @ pose.T_base_frame) @ [*state[4], 1.0]
+    p_goal = inverse(T @ pose.T_base_frame) @ [*state[4], 1.0]
     allowed = np.zeros(3) if pose.xyz_tolerance is None else pose.xyz_tolerance
-    return float(np.maximum(np.abs(there[:3]) - allowed, 0.0).max())
+    return float(np.maximum(np.abs(p_goal[:3]) - allowed, 0.0).max())
 
 
 def measured(title: str, every: list[NamedProblem], name: str) -> None:
@@ -228,14 +228,14 @@ def measured(title: str, every: list[NamedProblem], name: str) -> None:
     planner.warm_up(every[0].problem, TIME_LIMIT)
     results = []
     longer = []
-    seen = []
+    checks = []
     for i, named in enumerate(progress(every, title)):
         result = planner.plan(named.problem, time_limit=SHORT, seed=i)
         long = result if result.solved else planner.plan(named.problem, time_limit=LONG, seed=i + 1)
         results.append(result)
         longer.append(long)
         if long.solved:
-            seen.append(checked(named, long))
+            checks.append(checked(named, long))
     solved = sum(r.solved for r in results)
     possible = sum(r.solved for r in longer)
     times = [1e3 * r.planning_time for r in results if r.solved]
@@ -248,12 +248,12 @@ def measured(title: str, every: list[NamedProblem], name: str) -> None:
                 "CPU time of planning, median / p95",
                 f"{np.median(times):.0f} / {np.percentile(times, 95):.0f} ms" if times else "-",
             ),
-            ("motions that are checked", str(len(seen))),
-            ("in collision by Coal", str(sum(s.coal > 0 for s in seen))),
-            ("in collision by PyBullet", str(sum(s.pybullet for s in seen))),
+            ("motions that are checked", str(len(checks))),
+            ("in collision by Coal", str(sum(s.coal > 0 for s in checks))),
+            ("in collision by PyBullet", str(sum(s.pybullet for s in checks))),
             (
                 "largest distance of held object or hand from its goal at the end, by PyBullet",
-                f"{1e3 * max((s.off for s in seen), default=0.0):.3f} mm",
+                f"{1e3 * max((s.off for s in checks), default=0.0):.3f} mm",
             ),
         ],
         [

@@ -174,20 +174,20 @@ def run_campaign(seconds: float, seed: int, kinds: tuple[str, ...]) -> Campaign:
             took = 0.0
             try:
                 ended = not pipe.poll(HANG_TIMEOUT)
-                result, said, took = ("fault", "it does not end", HANG_TIMEOUT) if ended else pipe.recv()
+                result, message, took = ("fault", "it does not end", HANG_TIMEOUT) if ended else pipe.recv()
             except EOFError:
                 worker.join()
                 ended = True
                 result = "fault"
-                said = f"the process ended with {worker.exitcode}"
+                message = f"the process ended with {worker.exitcode}"
             took = 0.0 if first else took  # the first input loads compiled code
             if took > CPU_LIMIT and kind != "socket":
                 result = "fault"
-                said = f"{took:.1f} s"
+                message = f"{took:.1f} s"
             campaign.counts[kind, result] += 1
             campaign.slowest[kind] = max(campaign.slowest[kind], took)
             if result == "fault":
-                campaign.faults.append(f"{kind} {number}: {said}")
+                campaign.faults.append(f"{kind} {number}: {message}")
             number = number + 1
             first = False
         worker.kill()

@@ -156,9 +156,12 @@ class Outcome:
     """Problems, and how many are solved within 1 and 10 s; None if none can be drawn."""
 
 
-def outcome(urdf: Path, found: Urdf | None, samples: int, problems: int) -> Outcome:
-    """Prepare one URDF in this process and plan with the robot."""
-    how = found or Urdf("")
+def outcome(urdf: Path, options: Urdf | None, samples: int, problems: int) -> Outcome:
+    """Prepare one URDF in this process and plan with the robot.
+
+    options: the base and group to prepare; None: defaults.
+    """
+    how = options or Urdf("")
     with TemporaryDirectory() as folder:
         try:
             report = add_robot(urdf, base=how.base, group=how.group, out=Path(folder) / "arm")

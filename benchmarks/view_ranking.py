@@ -184,8 +184,8 @@ def called(row: Row) -> list[Row]:
     """The motions that a call compares; see `planning/pipeline/unknown_space.py`."""
     first = [motion for motion in row["motions"] if motion["kind"] == FIRST]
     least = np.minimum.accumulate([motion["risk"] for motion in first])
-    enough = [i for i, risk in enumerate(least, 1) if risk <= _acceptable(i)]
-    return first[: enough[0] if enough else None] + [m for m in row["motions"] if m["kind"] == CONVERGED]
+    counts = [i for i, risk in enumerate(least, 1) if risk <= _acceptable(i)]  # after which a call stops
+    return first[: counts[0] if counts else None] + [m for m in row["motions"] if m["kind"] == CONVERGED]
 
 
 def _acceptable(motions: int) -> float:
