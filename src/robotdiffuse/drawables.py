@@ -53,11 +53,11 @@ class Surface:
     @property
     def by_color(self) -> list[tuple[Color, "Surface"]]:
         """The surface split by the colors of its faces."""
-        colors, number = np.unique(np.round(255 * self.colors).astype(int), axis=0, return_inverse=True)
-        of_face = number.reshape(-1)[self.faces[:, 0]]
+        colors, color_index = np.unique(np.round(255 * self.colors).astype(int), axis=0, return_inverse=True)
+        face_color = color_index.reshape(-1)[self.faces[:, 0]]
         parts = []
         for i, (r, g, b) in enumerate(colors.tolist()):
-            used, faces = np.unique(self.faces[of_face == i], return_inverse=True)
+            used, faces = np.unique(self.faces[face_color == i], return_inverse=True)
             arrays = self.vertices[used], self.normals[used], self.colors[used]
             parts.append(((r, g, b), Surface(*arrays, faces.reshape(-1, 3))))
         return parts

@@ -5,10 +5,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from robotdiffuse.cli.arguments import (
-    Namespace,
-    chosen,
-)
+from robotdiffuse.cli.arguments import Namespace, chosen
 from robotdiffuse.cli.console import progress
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import write_atomically

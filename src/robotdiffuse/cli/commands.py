@@ -26,7 +26,7 @@ from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.processes.ray_cluster import CLUSTERS
 
 Rows = tuple[Any, ...]
-"""Options, each a row of the arguments of `option`; keywords of argparse stand in a dictionary at its end."""
+"""Options: each row holds arguments of `option`, the last of them a dictionary if argparse needs keywords."""
 
 
 class Group(NamedTuple):
@@ -116,8 +116,8 @@ PLANNING = (
             ("--planner NAME", "see `robotdiffuse planner list` (default: robotdiffuse)"),
             (
                 "--weights FOLDER",
-                "weights of `robotdiffuse train`, for a learned planner, or panda_points, those of the "
-                "package without clearances as inputs (default: the bundled ones)",
+                "weights of a learned planner: a folder of `robotdiffuse train`, or panda_points, bundled "
+                "weights without clearances as inputs (default: those trained for the robot, or bundled)",
             ),
             (
                 "--set NAME=VALUE *",
@@ -141,8 +141,8 @@ PLANNING = (
             (
                 "--unknown POLICY",
                 "policy for space that the problem's views do not show: optimistic (free), padded, predicted "
-                "or occupied (default: the problem's; else predicted where the network covers the arm's "
-                "reach, or padded)",
+                "or occupied (default: the problem's; else predicted if the network covers the arm's reach, "
+                "otherwise padded)",
             ),
             IGNORE_JOINTS,
             (
@@ -258,7 +258,7 @@ PLANNING = (
                         "serve a page that shows the exploration while it happens, until Ctrl-C; it begins "
                         "when the page is first opened",
                     ),
-                    ("--speed X", "speed of the motions on it (1: real time)", positive, 1.0),
+                    ("--speed X", "speed of the motions on the page (default: 1, real time)", positive, 1.0),
                     *ADDRESS,
                 ),
             ),
@@ -829,7 +829,7 @@ BENCH = Command(
 )
 TABLE_1 = (
     ("--out FOLDER !", "folder for problems, results, page"),
-    ("--problems N", "problems of each kind of goal that are not trivial (default: 60)", count, 60),
+    ("--problems N", "nontrivial problems for each kind of goal (default: 60)", count, 60),
     ("--time-limit S", "time limit of a call [s] (default: 10)", positive, 10.0),
     (
         "--paper-weights FOLDER",

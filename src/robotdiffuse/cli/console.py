@@ -23,7 +23,7 @@ SPINNER_DELAY = 2.0
 STATUS_INTERVAL = 0.2
 LOG_INTERVAL = 5.0
 CAP_TOLERANCE = 1e-4
-"""Clearances are measured up to CLEARANCE_CAP; within this tolerance of it [m], "> 1 m" is printed."""
+"""Clearances nearer than this to CLEARANCE_CAP, the largest that is measured, are printed as "> 1 m" [m]."""
 COUNT_INTERVAL = 60.0
 """Time between two lines of `progress` where there is no terminal [s]."""
 ASSUMPTION_TEXTS = {"as seen": "what was seen", "unknown is occupied": "all that was not seen free"}

@@ -5,10 +5,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from robotdiffuse.cli.arguments import (
-    Namespace,
-    chosen,
-)
+from robotdiffuse.cli.arguments import Namespace, chosen
 from robotdiffuse.cli.console import progress
 from robotdiffuse.cli.view import open_in_browser
 from robotdiffuse.core.errors import InputError

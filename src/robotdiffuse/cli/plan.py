@@ -4,12 +4,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from robotdiffuse.cli.arguments import (
-    ENDINGS,
-    NO_PLAN,
-    SOLVED,
-    Namespace,
-)
+from robotdiffuse.cli.arguments import ENDINGS, NO_PLAN, SOLVED, Namespace
 from robotdiffuse.cli.compile_ahead import compiling_ahead
 from robotdiffuse.cli.console import Spinner, print_next_view, print_result
 from robotdiffuse.core.errors import InputError
@@ -66,9 +61,9 @@ def _problem(arguments: Namespace) -> Problem:
     unknown = arguments.unknown
     if unknown is not None:
         check_unknown("--unknown", unknown)
-    needing = "--next-view" if arguments.next_view else unknown and f"--unknown {unknown}"
-    if needing and not problem.views:
-        raise InputError(f"{needing} needs a problem with views; this one has none")
+    view_option = "--next-view" if arguments.next_view else unknown and f"--unknown {unknown}"
+    if view_option and not problem.views:
+        raise InputError(f"{view_option} needs a problem with views; this one has none")
     if unknown is not None:
         problem = replace(problem, unknown=unknown)
     return problem if arguments.blend is None else replace(problem, blend=arguments.blend)

@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.cli.arguments import (
-    Namespace,
-)
+from robotdiffuse.cli.arguments import Namespace
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.interrupts import exit_on_interrupt
 from robotdiffuse.core.tables import Column, Table, show

@@ -8,10 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from robotdiffuse.cli.arguments import (
-    Namespace,
-    chosen,
-)
+from robotdiffuse.cli.arguments import Namespace, chosen
 from robotdiffuse.cli.console import progress
 from robotdiffuse.core.errors import InputError, needs, shown
 from robotdiffuse.core.output_files import write_atomically
@@ -73,7 +70,7 @@ def run_planner(arguments: Namespace) -> None:
     options = chosen(arguments, ("data", "encoder", "robot", "device", *TRAINING_OPTIONS, *MODEL_OPTIONS))
     config = CONFIGS[arguments.config].changes
     if "denoiser" in options and config.get("denoiser_settings") is not None:
-        # the config's settings are for its own denoiser; another one gets settings of the same size
+        # the config's settings are for its own denoiser; another denoiser gets its paper-sized settings
         options["denoiser_settings"] = DENOISERS.defaults(arguments.denoiser).paper_size()
     if {"denoiser", "objective", "waypoints"} & set(options):
         options["progressive"] = False  # its stages suit the config's own denoiser, objective and waypoints

@@ -3,9 +3,7 @@
 import math
 from pathlib import Path
 
-from robotdiffuse.cli.arguments import (
-    Namespace,
-)
+from robotdiffuse.cli.arguments import Namespace
 from robotdiffuse.cli.console import clearances
 from robotdiffuse.core.errors import InputError, joined
 from robotdiffuse.core.output_files import check_output

@@ -10,12 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from robotdiffuse.cli.arguments import (
-    ENDINGS,
-    NO_PLAN,
-    SOLVED,
-    Namespace,
-)
+from robotdiffuse.cli.arguments import ENDINGS, NO_PLAN, SOLVED, Namespace
 from robotdiffuse.cli.verify import read_result, read_solved
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.input_files import read_json
@@ -140,10 +135,11 @@ def run_simulate(arguments: Namespace) -> int:
     for name in (entry.name for entry in problem.moving if not entry.known):
         print(f"note: the motion of {name} is not known; it stands still here")
     rms = float((executed.tip_errors**2).mean() ** 0.5)
-    joints = zip(executed.joint_names, executed.max_errors, executed.rms_errors, strict=True)
+    units = ("mm" if prismatic else "mrad" for prismatic in robot.prismatic)
+    joints = zip(executed.joint_names, executed.max_errors, executed.rms_errors, units, strict=True)
     rows = [
-        (f"error of {name}", f"{1e3 * maximum:.3f} mrad", f"{1e3 * root_mean_square:.3f} mrad")
-        for name, maximum, root_mean_square in joints
+        (f"error of {name}", f"{1e3 * maximum:.3f} {unit}", f"{1e3 * root_mean_square:.3f} {unit}")
+        for name, maximum, root_mean_square, unit in joints
     ]
     rows.append(("error of the tip", f"{1e3 * executed.tip_errors.max():.3f} mm", f"{1e3 * rms:.3f} mm"))
     verdict = "free" if executed.free else "contact"

@@ -35,7 +35,8 @@ EMPTY = np.float32(-1e-6)
 """Depth of a pixel without a return where nothing seems to be in range, in a view that states no range. The
 pixel shows nothing, but the voxels behind it are HIDDEN, not LOST."""
 MAX_DEPTH = np.float32(1e6)
-"""Depth of a pixel without an obstacle in range [m]; in minima, pixels without a return have it too."""
+"""Depth of a pixel without an obstacle in range [m]. Minima over pixels also use it for those without a
+return."""
 POOLED_FOCAL_LENGTH = 250.0
 """Images are downsampled by min-pooling while their focal length stays above this [pixels]: a voxel of 4 cm
 at a distance of 2 m is then 5 pixels wide."""
@@ -237,6 +238,7 @@ def _count_points(depth, arm, intrinsics, T, low, voxel, counts):
     fny = np.float32(ny)
     fnz = np.float32(nz)
     scale = _ONE / voxel
+    # camera position o, ray r and depth d in edges of voxels, from the grid's lower corner
     ox = (T[0, 3] - low[0]) * scale
     oy = (T[1, 3] - low[1]) * scale
     oz = (T[2, 3] - low[2]) * scale
@@ -271,10 +273,10 @@ def carve(depth, intrinsics, T, spheres, low, voxel, errors, state, behind, coun
     """Writes the state of each voxel [nx ny nz], its depth behind a surface [m], and its number of points.
 
     intrinsics: fx, fy, cx, cy. T: T_base_camera [4 4]. spheres: the arm's, in the camera's frame. low: lower
-    corner of the grid. voxel: edge of a voxel [m]. errors: four numbers: by how much free space is narrowed
-    at the camera [m] and in addition for each meter from it, the noise of depth at 1 m [m], and the sensor's
-    range [m]. counts: number of points in each voxel, less the outliers that MIN_POINT_FRACTION allows. All
-    arrays are float32, except state, uint8, and counts, int32.
+    corner of the grid. voxel: edge of a voxel [m]. errors: four numbers: free space is narrowed by the first
+    [m] plus the second [rad] times the distance from the camera; the third is the noise of depth at 1 m [m],
+    and the fourth the sensor's range [m]. counts: number of points in each voxel, less the outliers that
+    MIN_POINT_FRACTION allows. All arrays are float32, except state, uint8, and counts, int32.
     """
     nx, ny, nz = state.shape
     raw = usable_depth(depth, intrinsics[0])
@@ -363,6 +365,7 @@ def _state_of_block(first, intrinsics, T, low, voxel, errors, size, factor, tabl
     # u ± du, v ± dv: a rectangle of pixels that contains the rectangles of all voxels of the block
     error = errors[0] + errors[1] * far
     du, dv = _half_sizes(T, x, y, middle * voxel, error)
+    # at least 1 / (z - ez), as in `_carve_block`, for each voxel; ez / near allows for its own direction
     wider = (_ONE + ez / near) / near
     far = far + error * (_ONE + far / near) + errors[2] * far * far
     u = fx * x + cx
@@ -434,7 +437,7 @@ def _carve_block(
                     beyond = z + ez + errors[0] + aside + errors[2] * z * z
                     du0, dv0 = _half_sizes(T, x, y, half, _ZERO)
                     du, dv = _half_sizes(T, x, y, half, errors[0] + errors[1] * z)
-                    own_share = du0 * dv0 / (du * dv)  # of the rectangle, covered by the voxel itself
+                    own_share = du0 * dv0 / (du * dv)  # share of the rectangle that the voxel covers
                     du = fx * du / (z - ez)
                     dv = fy * dv / (z - ez)
                     u0 = int((u - du + _HALF) * share)
@@ -475,8 +478,7 @@ def _carve_block(
 @kernel()
 def add_evidence(state, counts, evidence, hit, miss, largest):
     """Add the evidence of a view for each voxel [nx ny nz]: `hit` for voxels with points, -`miss` for free
-    voxels. The sum is clipped to [-largest, largest]. Returns the number of these voxels that had no evidence
-    before."""
+    voxels. The sum is clipped to [-largest, largest]. Returns the number of voxels with a first evidence."""
     state = state.ravel()
     counts = counts.ravel()
     evidence = evidence.ravel()
@@ -512,9 +514,11 @@ class ObservedVolume:
     out_of_view: Bool[ndarray, "56 56 32"]
     """The voxel is outside all images."""
     behind: Float32[ndarray, "56 56 32"]
-    """How far the voxel is behind an observed surface, the minimum over all views [m]; 0 if behind none."""
+    """How far the voxel is behind an observed surface, the minimum over all views [m]; 0 if it is behind
+    none, or observed."""
     lost: Bool[ndarray, "56 56 32"]
-    """The voxel is unknown, on a ray of some view without a return though something should be in range."""
+    """The voxel is unknown and behind no surface; in some view its ray has no return, although something
+    should be in range."""
 
     @cached_property
     def unknown(self) -> Bool[ndarray, "56 56 32"]:
@@ -558,11 +562,11 @@ def _observed(view: DepthView, robot: Robot, start: Configuration) -> ObservedVo
     q = start if view.configuration is None else view.configuration
     if len(q) != robot.dof:
         raise InputError(f"view.configuration has {len(q)} numbers; {robot.name} plans {robot.dof} joints")
-    state, depth, counts = carve_view(view, robot, q, ARM_MARGIN, COARSE)
+    state, behind, counts = carve_view(view, robot, q, ARM_MARGIN, COARSE)
     occupied = counts > 0
-    depth[(state != BEHIND) | occupied] = 0.0
+    behind[(state != BEHIND) | occupied] = 0.0
     free, shadow, lost = ((state == kind) & ~occupied for kind in (FREE, SHADOW, LOST))
-    return ObservedVolume(occupied, free, shadow, state == OUT, depth, lost)
+    return ObservedVolume(occupied, free, shadow, state == OUT, behind, lost)
 
 
 def carve_view(

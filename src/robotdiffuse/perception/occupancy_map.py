@@ -59,7 +59,8 @@ class OccupancyMap:
         self._evidence = np.zeros(MAP.shape, np.float32)
         """Positive: occupied; negative: free; 0: unknown."""
         self._surely_free = np.zeros(MAP.shape, np.bool_)
-        """Voxels that a view sees free even with the largest error of its pose, and without points since."""
+        """Voxels that a view saw free, even with the largest error of its pose, and no later view saw
+        occupied."""
         self._doubted = np.zeros(MAP.shape, np.bool_)
         """See `doubt`."""
         self._seen_at = np.full(MAP.shape, -np.inf, np.float64)
@@ -255,9 +256,9 @@ class ViewMemory:
         """The mean of the points that the kept views observed in each cell of a grid [m], see `seen_points`,
         and how far each mean may be displaced, see `point_errors`.
 
-        Stray points are left out. These are points in free voxels of the map (`free`), which more views see
-        through, and, in noisy images, points of a single view without another point nearby, since a surface
-        gives several.
+        Stray points are left out: points in free voxels of the map (`free`), through which other views saw,
+        and, in noisy images, points of a single view without another point nearby, because a surface gives
+        several points.
         """
         every = np.concatenate([memory.points for memory in self._memories]).astype(np.float64)
         _, cell, counts = np.unique(_cells(every), return_inverse=True, return_counts=True)

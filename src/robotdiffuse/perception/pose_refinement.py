@@ -39,11 +39,11 @@ COLUMNS = 80
 SAME_SURFACE = 1.1
 """Largest ratio of two depths in a block that sees one surface."""
 MAX_POINTS = 600
-"""Maximum numbers of points on the arm and of other points that are matched in an image."""
+"""Maximum number of points on the arm that are matched in an image, and of points elsewhere."""
 NEIGHBORS = 13
 """Number of points from which a normal is estimated."""
 MAX_THICKNESS = 0.3
-"""Largest thickness of these points, relative to their width, on a flat surface."""
+"""A surface is flat if the thickness of NEIGHBORS points is below this fraction of their width."""
 ALIKE = 0.8
 """Smallest cosine of the angle between the normals of matched points."""
 FACING = 0.4
@@ -149,9 +149,9 @@ class PoseRefinement:
         if not any(view.pose_deviation) or view.cloud is not None or q is None or len(q) != self._robot.dof:
             return view
         number = self._camera(view, q)
-        mine = [image for image in self._images if image.camera == number]
-        if len(mine) < MAX_VIEWS and all(np.abs(s.configuration - q).max() > MIN_TURN for s in mine):
-            shows_scene = self._cameras[number].link is not None or not mine
+        earlier = [image for image in self._images if image.camera == number]
+        if len(earlier) < MAX_VIEWS and all(np.abs(s.configuration - q).max() > MIN_TURN for s in earlier):
+            shows_scene = self._cameras[number].link is not None or not earlier
             image = self._image(view, q, number, shows_scene)
             if len(image.points):
                 self._images.append(image)
@@ -192,8 +192,8 @@ class PoseRefinement:
         spread = filtered(view).spread
         spheres = grown_for_errors(placed_spheres(self._robot, q), view).astype(np.float32)
         on_arm = sphere_distances(placed(T, points), spheres) < ARM_DISTANCE
-        stands = self._cameras[camera].link is None
-        arm = on_arm if stands else np.zeros(len(points), np.bool_)
+        beside_arm = self._cameras[camera].link is None
+        arm = on_arm if beside_arm else np.zeros(len(points), np.bool_)
         use = np.zeros(len(points), np.bool_)
         for usable in (arm, flat & ~on_arm & shows_scene):
             at = np.flatnonzero(usable)
@@ -244,8 +244,8 @@ class PoseRefinement:
         def match(i: int, use: ndarray, n: Points, r: Values, error: float) -> _Match:
             """The match of points `use` of image i with surfaces.
 
-            n: the surfaces' normals in the base frame. r: the points' distances from them [m]. error:
-            standard deviation of the surfaces [m].
+            n: the surfaces' normals in the base frame. r: the points' distances from the surfaces [m].
+            error: standard deviation of the surfaces [m].
             """
             image = self._images[i]
             rows = np.zeros((len(use), len(unknowns)))
@@ -334,6 +334,7 @@ def _deviation(view: DepthView, T: Pose, covariance: Float[ndarray, "6 6"]) -> t
     points = points[MAP.contains(MAP.indices(placed(T, points)))]
     if not len(points):
         return view.pose_deviation
+    # derivatives of the points' displacements by the pose's error, and the displacements' covariances
     turned = np.cross(np.eye(3), points[:, None]).swapaxes(1, 2)
     shifts = np.concatenate([np.tile(np.eye(3), (len(points), 1, 1)), turned], axis=2)
     spread = shifts @ covariance @ shifts.swapaxes(1, 2)

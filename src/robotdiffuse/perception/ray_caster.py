@@ -86,7 +86,8 @@ def _intersect(solid, ox, oy, oz, dx, dy, dz):
 
     solid: a row of `SceneArrays.solids`.
     """
-    # a box with half edges a, solid[13] and c, or, if solid[16] is 1, a cylinder; enlarged by the radius r
+    # half edges a, solid[13], c of a box or, if solid[16] is 1, radius a and half height c of a cylinder;
+    # a ball of radius r enlarges the shape: a sphere is an enlarged point, a capsule an enlarged line
     a = solid[12]
     c = solid[14]
     r = solid[15]
@@ -188,6 +189,7 @@ def fill_voxels(solids, low, voxel, margin, out):
                 py = low[1] + (np.float32(j) + _HALF) * voxel - row[1]
                 for k in range(k0, min(k1, nz)):
                     pz = low[2] + (np.float32(k) + _HALF) * voxel - row[2]
+                    # how far the center is outside the half edges, along each axis of the solid
                     x = abs(row[3] * px + row[4] * py + row[5] * pz)
                     y = abs(row[6] * px + row[7] * py + row[8] * pz)
                     z = abs(row[9] * px + row[10] * py + row[11] * pz)

@@ -237,8 +237,8 @@ POINT_RADIUS = 0.01
 MIN_POINT_RADIUS = 0.001
 """Smallest radius of points near the arm at start or goal, so that they do not collide there [m]."""
 JOINED = 1.4
-"""Collision checks replace large points that are near each other by spheres with about this times their
-radius."""
+"""Collision checks replace large points that are near each other by spheres with about this factor times
+their radius."""
 ARM_DISTANCE = 0.02
 """Points within this distance of the arm, at its configuration in the view, are points of the arm [m];
 `grown_for_errors` adds an allowance for noise."""

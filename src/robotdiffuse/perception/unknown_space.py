@@ -105,8 +105,8 @@ class OccupiedVoxels(Assumption):
         return self.occupied & self.grid.within(spheres, CARVING_MARGIN + self.grid.edge / 2)
 
     def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> AssumedPoints:
-        """The occupied voxels next to voxels that are not: the arm starts outside and cannot get further in.
-        Voxels out of the arm's reach or in the known scene are left out."""
+        """The occupied voxels at the boundary of the occupied region; the arm, which starts outside, cannot
+        reach inner ones. Voxels out of the arm's reach or in the known scene are left out."""
         edge = self.grid.edge
         points = self.grid.centers(surface(self.occupied & ~self._touched(spheres)))
         points = points[np.linalg.norm(points, axis=1) < reach_bound(self.robot) + edge]
@@ -194,9 +194,9 @@ class UnknownSpace:
         """The unknown voxels that the arm passes through on a path."""
         swept = self._grid.swept(self._robot, path) & self._elsewhere
         crossed = swept & self.unknown
-        every = max(int(swept.sum()), 1)
-        lost = 0.0 if self._lost is None else float((crossed & self._lost).sum()) / every
-        return CrossedSpace(crossed, self.probability, self._grid, lost, float(crossed.sum()) / every)
+        swept_count = max(int(swept.sum()), 1)
+        lost = 0.0 if self._lost is None else float((crossed & self._lost).sum()) / swept_count
+        return CrossedSpace(crossed, self.probability, self._grid, lost, float(crossed.sum()) / swept_count)
 
 
 @dataclass(frozen=True, eq=False)

@@ -53,6 +53,7 @@ def seen_weights(robot, configurations, poses, intrinsics, size, reach, voxels, 
         oy = (T[1, 3] - low[1]) / edge
         oz = (T[2, 3] - low[2]) / edge
         for n in range(len(voxels)):
+            # the voxel's center, and the vector from it to the camera, in edges of voxels
             x = voxels[n, 0] + half
             y = voxels[n, 1] + half
             z = voxels[n, 2] + half
@@ -132,10 +133,10 @@ def see_through(depth, intrinsics, T, balls, radius, errors, border, seen):
 
     depth: float32[h, w], infinite where nothing is in range, 0 without a return, -d without a return where
     nothing is nearer than d. intrinsics: fx, fy, cx, cy. T: T_base_camera [4, 4]. balls: centers [n, 3] [m].
-    radius: of all balls [m]. errors: three numbers: the radius grows by the first at the camera [m] and in
-    addition by the second for each meter of distance; at a distance of 1 m, returns must be behind the ball
-    by the third [m], which grows with the square of the distance. border: width of the margin around the
-    projection that is checked as well [pixels]. seen: bool[n]. All numbers are float32.
+    radius: of all balls [m]. errors: three numbers: the radius grows by the first [m] plus the second [rad]
+    times the distance; returns must be behind the ball by the third [1/m] times the square of the distance.
+    border: width of the margin around the projection that is checked as well [pixels]. seen: bool[n]. All
+    numbers are float32.
     """
     raw = usable_depth(depth, intrinsics[0])
     h, w = raw.shape

@@ -262,7 +262,8 @@ class AccessLog:
 class AccessControl:
     """Middleware: checks the bearer token and, on loopback, that the Host header names this machine.
 
-    The Host check stops DNS rebinding: a page of another site whose name was made to resolve to 127.0.0.1.
+    The Host check stops DNS rebinding, in which a page of another site reaches this server by a name of its
+    own that resolves to 127.0.0.1.
     """
 
     def __init__(self, app: ASGIApp, settings: ServeSettings) -> None:
@@ -472,8 +473,8 @@ def endpoint_list(app: FastAPI) -> str:
 def _cancellable(
     name: str, running: dict[str, Callable[[], None]], tasks: list[asyncio.Task[Answer]]
 ) -> Iterator[None]:
-    """Within the block, the tasks of a request can be cancelled by its name; at the end they are
-    cancelled."""
+    """Within the block, the tasks of a request can be cancelled by its name. Tasks that the block leaves
+    unfinished are cancelled."""
 
     def cancel() -> None:
         for task in tasks:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from robotdiffuse.core.settings import Bound, Count, Natural, Positive, Settings
 
-# Time for a worker to compile code for a request, and to load code and weights, until it is killed [s].
+# Time until a worker is killed while it compiles code for a request, and while it loads code and weights [s].
 COMPILE_TIMEOUT = 300.0
 WARM_UP_TIMEOUT = 60.0
 GRACE_TIME = 5.0

@@ -80,8 +80,8 @@ _warm: set[tuple[str, str]] = set()
 
 
 def prepare(robots: dict[str, Robot], settings: ServeSettings) -> bool:
-    """Set up a new worker process. Returns whether it compiled code: then another one that loads the code
-    from the cache takes its place, so that all workers give the same numbers, bit for bit."""
+    """Set up a new worker process. Returns whether it compiled code. If so, a new process that loads the code
+    from the cache replaces it, so that all workers give the same numbers, bit for bit."""
     accept(robots, settings)
     memory_limit = settings.max_worker_memory
     resource.setrlimit(resource.RLIMIT_DATA, (memory_limit, memory_limit))
@@ -126,7 +126,7 @@ def respond(endpoint: str, body: bytes) -> Answer:
 def _answer_of(state: _State, endpoint: str, body: bytes) -> Answer:
     try:
         with cancel_check(_raise_if_cancelled):
-            check_cancelled()  # it may have been cancelled before it began
+            check_cancelled()  # the call may have been cancelled before it began
             return (answer_plan if endpoint == PLAN else answer_verify)(state, body)
     except InputError as error:
         return failed(400, str(error))

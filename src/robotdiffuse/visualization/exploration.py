@@ -48,7 +48,7 @@ UNKNOWN = (0x6E, 0x7B, 0x8C)
 LOOK_COLOR = (0xD9, 0x8A, 0x12)
 """sRGB color of the camera's view pyramid at a look."""
 FRUSTUM_DEPTH = 0.25
-"""Length of this pyramid [m]."""
+"""Height of the view pyramid [m]."""
 READING_TIME = 1.5
 """Pause before each step on pages, so that the reason of the step can be read [s]."""
 MAX_MOMENTS = 6

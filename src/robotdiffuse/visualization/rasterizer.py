@@ -77,7 +77,7 @@ def _lit(light, at, n, first):
     bias = 2 / scale
     size = maps.shape[1]
     x = at[0] + n[0] * bias - center[0], at[1] + n[1] * bias - center[1], at[2] + n[2] * bias - center[2]
-    got = 0.0
+    received = 0.0
     total = 0.0
     for k in range(first, maps.shape[0], 4):
         d = directions[k]
@@ -91,8 +91,8 @@ def _lit(light, at, n, first):
         beyond = _dot(x, d[2]) + bias * min(4.0, 0.5 / cosine) + 100.0
         inside = 0 <= column < size and 0 <= row < size
         if not (inside and maps[k, row, column] > beyond):
-            got += cosine
-    return got / total
+            received += cosine
+    return received / total
 
 
 @kernel()
@@ -119,12 +119,12 @@ def _surface(row, column, near, seen, camera, height):
     eye, rays = camera
     pixel = column + 0.5, row + 0.5, 1.0
     ray = _dot(rays[0], pixel), _dot(rays[1], pixel), _dot(rays[2], pixel)
-    none = 0.0, 0.0, 0.0
+    no_weights = 0.0, 0.0, 0.0
     up = 0.0, 0.0, 1.0
     if ray[2] < 0 and eye[2] > height and ray[2] / (height - eye[2]) > near[row, column]:
-        return (height - eye[2]) / ray[2], ray, up, none, False
+        return (height - eye[2]) / ray[2], ray, up, no_weights, False
     if near[row, column] <= 0:
-        return 0.0, ray, up, none, False
+        return 0.0, ray, up, no_weights, False
     i, j, k = _row(faces, ident[row, column])
     x0, y0, z0 = _row(screen, i)
     x1, y1, z1 = _row(screen, j)
@@ -189,6 +189,7 @@ def shade(image, near, seen, camera, height, sky, key):
             gloss = 0.0
             if solid:
                 base_color = _mixed(colors, _row(faces, ident[row, column]), weights)
+                # highlight of Blinn and Phong, by the half vector, and brighter edges
                 middle = toward[0] - ray[0] / norm, toward[1] - ray[1] / norm, toward[2] - ray[2] / norm
                 half = max(0.0, _dot(n, middle) / np.sqrt(_dot(middle, middle)))
                 edge = 1 + _dot(n, ray) / norm
@@ -206,13 +207,17 @@ def shade(image, near, seen, camera, height, sky, key):
 
 @kernel()
 def blend_ghost(image, solid, near, seen, camera, toward, tint, alpha):
-    """Blend one see-through surface over the image. Only its nearest part is drawn; it is more opaque where
-    it is seen at a flat angle."""
+    """Blend one see-through surface over the image. Only its nearest part is drawn, and more opaque where it
+    is seen at a flat angle.
+
+    solid, near: nearness of the solid surfaces and of this one. toward: direction of the main light. tint,
+    alpha: color and opacity. seen, camera: as in `shade`.
+    """
     h, w = near.shape
     ident, _, faces, normals, colors = seen
     for row in range(h):
         for column in range(w):
-            # it must be slightly nearer than the solid surfaces, since links of both arms may coincide
+            # slightly nearer than the solid surfaces: links of both arms may be at the same place
             if near[row, column] <= 1.003 * solid[row, column]:
                 continue
             _, ray, n, weights, _ = _surface(row, column, near, seen, camera, -np.inf)

@@ -270,13 +270,13 @@ def _rounded(values: np.ndarray | float, digits: int) -> Any:
 COLLIDING = (0xD0, 0x1F, 0x2B)
 """sRGB color of links that collide."""
 OFFSET = 0.0015
-"""Distance by which their surfaces are moved outwards, so that they cover the arm in its own colors [m]."""
+"""Distance by which the surfaces of colliding links are moved outwards, to hide the arm's own colors [m]."""
 START_ALPHA = 0.5
 """Opacity of the arm at the start in pictures."""
 AXES = ((0xC9, 0x3C, 0x3C), (0x3C, 0x9A, 0x4B), (0x3C, 0x64, 0xC9))
 """sRGB colors of the axes of goal poses."""
 AXIS_LENGTH = 0.12
-"""Length of these axes [m]."""
+"""Length of the axes of goal poses [m]."""
 UNREACHED = StateValidity("no configuration within the joint limits")
 
 
@@ -351,9 +351,8 @@ def _colliding_links(
     robot = arm.robot
     links = link_surfaces(arm.robot)
     marks = []
-    for q, validity in zip(
-        states, validities, strict=False
-    ):  # without a goal configuration, states are fewer
+    # not strict: if no configuration reaches the goal, `states` has only the start
+    for q, validity in zip(states, validities, strict=False):
         T_base_frame = arm.frames(q)
         for link in validity.links:
             T_base_link = T_base_frame[robot.link_frame(link)] @ robot.T_frame_link(link)
@@ -363,7 +362,7 @@ def _colliding_links(
 
 def _raised(surface: Surface) -> Surface:
     """The surface in the color of collisions, moved outwards by OFFSET."""
-    # vertices at one point share a mean normal: sharp edges have a vertex for each adjacent face
+    # move all vertices at one point alike, by their mean normal: sharp edges have a vertex for each face
     _, corner = np.unique(surface.vertices, axis=0, return_inverse=True)
     corner = corner.reshape(-1)
     normals = np.stack([np.bincount(corner, column) for column in surface.normals.T], axis=1)

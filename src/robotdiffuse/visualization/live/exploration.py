@@ -404,7 +404,7 @@ class ExplorationPage(LivePage):
 
     def _show_panel(self, state: ExplorationState) -> None:
         paused = state.mode == PAUSED
-        # only if they changed: else a visitor's change that has not arrived yet would be undone
+        # only if the state changed: otherwise, a visitor's change that has not arrived yet would be undone
         if self._changes.new("options", state.settings, state.noise, state.speed):
             set_value(self._policy, state.settings.policy)
             set_value(self._noise, state.noise)

@@ -150,7 +150,7 @@ class Page(LivePage):
         violation = None if state.validation is None else state.validation.report.violation
         if new("robot", robot):
             self._new_robot(robot)
-        self._drawn.frames(problem.start)  # compiles before the atomic block, in which nothing is sent
+        self._drawn.frames(problem.start)  # compiles, which would delay the messages of the atomic block
         with self.server.atomic():
             self._panel.show(state, validity(state), selected)
             if new("scene", problem.scene, selected):
@@ -692,8 +692,8 @@ def _appearance(shape: Shape) -> object:
 
 
 def draw_trace(server: viser.ViserServer, arm: DrawnArm, motion: Trajectory | None) -> None:
-    """Draw the trace of the tool along a motion, with colors from that of the start to that of the goal; None
-    removes it."""
+    """Draw the trace of the tool along a motion, in colors from START to GOAL; without a motion, remove
+    it."""
     if motion is None:
         server.scene.remove_by_name("/trace")
         return
