@@ -81,7 +81,7 @@ def save_network(name: str, network: Any, folder: str | FilePath, training: dict
 
 
 def _save(module: SavedModule, folder: FilePath, stem: str, about: dict[str, Any]) -> None:
-    """Write STEM.safetensors, the exported parts, and last STEM.json with the SHA-256 of all."""
+    """Write STEM.safetensors, the ONNX files, and last STEM.json with the SHA-256 of these files."""
     # weight matrices of layers in fp16, other tensors unchanged
     kinds = (nn.Linear, nn.Conv3d)
     half = {f"{name}.weight" for name, part in module.named_modules() if isinstance(part, kinds)}

@@ -99,7 +99,7 @@ FREE = 2
 SHADOW = 4
 OUT_OF_VIEW = 8
 BITS = (OCCUPIED, FREE, SHADOW, OUT_OF_VIEW)
-"""The bits of `Samples.seen`."""
+"""The bits of `Samples.seen`. SHADOW: the arm hides the voxel."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class CameraPlaces(Settings, name="cameras"):
     """Share of the cameras that stand opposite to the obstacles, as seen from the base. All other cameras may
     be in any direction from the base."""
     front: float = 2.0
-    """Largest angle, at the base, between such a camera and the direction exactly opposite to the
+    """Largest angle, at the base, between a camera of `front_share` and the direction exactly opposite to the
     obstacles."""
     target_spread: float = 0.2
     """Standard deviation, along each axis, of the point that a camera looks at. The mean of this point is

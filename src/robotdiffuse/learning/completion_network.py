@@ -59,7 +59,7 @@ def _shuffled(x: Float[Tensor, "n c i j k"]) -> Float[Tensor, "n c//8 2*i 2*j 2*
 
 
 class Block(nn.Module):
-    """A residual block; its initial output is small."""
+    """A residual block, initially close to the identity."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()

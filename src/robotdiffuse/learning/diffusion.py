@@ -90,8 +90,9 @@ def noise_factor(
     """The matrix L that turns white noise e into the noise L e of the forward process, which is zero at the
     first and the last waypoint and has a mean variance of 1 between them.
 
-    residuals: scaled to unit variance. smooth: whether L Lᵀ is the covariance of the residuals over the
-    waypoints, plus a little white noise so that it has full rank; otherwise L is `white_noise_factor`.
+    residuals: trajectories relative to their reference, scaled to unit variance. smooth: whether L Lᵀ is the
+    covariance of the residuals over the waypoints, plus a little white noise so that it has full rank;
+    otherwise L is `white_noise_factor`.
     """
     waypoints = residuals.shape[1]
     white = white_noise_factor(waypoints)
@@ -177,7 +178,7 @@ Samples = Float[ndarray, "count ..."]
 NoiseLevels = Int[ndarray, "steps"]
 Predict = Callable[[ndarray, int], ndarray]
 """A function from (x_t [count, ...], t) to the predicted clean x_0. It converts the network's output as the
-objective requires, holds the ends and applies guidance."""
+objective requires, sets the first and the last waypoint to start and goal, and applies guidance."""
 DrawNoise = Callable[[], ndarray]
 """A function that returns new standard noise in the shape of the samples."""
 MoveMean = Callable[[ndarray, int], ndarray]
@@ -203,8 +204,8 @@ def ddim(
 def ddpm(
     predict: Predict, schedule: NoiseSchedule, draw_noise: DrawNoise, steps: int, eta: float = 1.0
 ) -> Samples:
-    """Samples by DDPM, ancestral sampling (Ho et al. 2020): the sampler of the paper, with all T levels, of
-    MPD and of EDMP. All noise is drawn afresh, for any `eta`."""
+    """Samples by DDPM, ancestral sampling (Ho et al. 2020): the sampler of MPD, of EDMP and, with all T
+    levels, of the paper. All noise is drawn afresh, for any `eta`."""
     return ddim(predict, schedule, draw_noise, steps, eta=1.0)
 
 
@@ -217,14 +218,15 @@ def reverse_process(
     noise_scale: float = 1.0,
     eta: float = 1.0,
 ) -> Samples:
-    """Samples at any levels (Ho et al. 2020, algorithm 2); the means of the steps may be moved.
+    """Samples by denoising at the given levels (Ho et al. 2020, algorithm 2). The mean of each step may be
+    moved.
 
     Each x at a lower level is drawn about its mean given x_level and the predicted x_0 (Song et al. 2021, eq.
     12): the noise in x is kept, except for the share that is drawn afresh (eq. 16). With eta = 1, x_lower is
     drawn from q(x_lower | x_level, x_0), whose variance is beta tilde (Ho et al. 2020, eq. 7; between any two
     levels, Kingma et al. 2021, eq. 25).
 
-    levels: in descending order. Sampling begins with standard noise at the first level; the step after the
+    levels: in descending order. Sampling begins with standard noise at the first level; the step from the
         last level gives the clean x_0.
     move: replaces the mean of a step, for example by a mean with lower costs (MPD, algorithm 1).
     noise_scale: factor of the standard deviation of the noise that is added to the means (MPD: 0.5).

@@ -10,13 +10,14 @@ h = max(S - D, 0) of a safe distance S and a distance D:
 | self_collision | sum of h^2 / 2 over pairs of links; D: between the two links        | self_margin |
 | length         | sum of |q_(i+1) - q_i|^2 / 2: velocities                            | length      |
 
-The first two concern single waypoints. Each waypoint is pushed by the smallest motion that clears a contact
-(a Gauss-Newton step), and a kernel spreads the pushes over the neighboring waypoints, as the metric of CHOMP
-does (Zucker et al., IJRR 2013). Length is the smoothness of CHOMP; it moves one waypoint after the other
-towards its optimum between its neighbors.
+The first two costs depend on single waypoints. Each waypoint is pushed by the smallest motion that clears a
+contact (a Gauss-Newton step), and a kernel spreads the pushes over the neighboring waypoints, as the metric
+of CHOMP does (Zucker et al., IJRR 2013). Length is the smoothness of CHOMP; it moves one waypoint after the
+other towards its optimum between its neighbors.
 
-A problem's path constraints are one more cost: the sum of h^2 / 2 over their rows, where h is how far a row's
-value exceeds a share of its tolerance [m]; a radian counts as `projection_kernel.ANGLE_WEIGHT` meters.
+A problem's path constraints are one more cost: the sum of h^2 / 2 over their rows (scalar constraints), where
+h is how far a row's value exceeds a share of its tolerance [m]; a radian counts as
+`projection_kernel.ANGLE_WEIGHT` meters.
 """
 
 from dataclasses import dataclass
@@ -120,8 +121,8 @@ def _push_away(cost, gradient, push, out):
 
 @allocation_free(fastmath=True)
 def _spread(q, first, last, pushes, active, kernel, lower, upper):
-    """Moves each waypoint by a weighted mean of its neighbors' pushes; by less if only distant neighbors are
-    pushed."""
+    """Moves each of the waypoints `first` to `last` - 1 by a weighted mean of its neighbors' pushes; by less
+    if only distant neighbors are pushed."""
     dof = q.shape[1]
     for i in range(first, last):
         weight = _ZERO
@@ -143,7 +144,7 @@ def _spread(q, first, last, pushes, active, kernel, lower, upper):
 def _shorten(q, first, last, share):
     """Moves each waypoint by a fraction of the way to the middle of its neighbors. The whole way would be
     Newton's step of the length cost in this waypoint alone. Every second waypoint is moved first, then the
-    others, so that waypoints moved together share no segment."""
+    others, so that waypoints moved together share no segment. Waypoints: `first` to `last` - 1."""
     dof = q.shape[1]
     for parity in range(2):
         for i in range(first + parity, last, 2):

@@ -153,7 +153,8 @@ class ModelParts(Settings):
 
 
 def check_points(where: str, encoder: str | None, denoiser: str) -> None:
-    """Raises InputError if only one of encoder and denoiser works on points. where: the encoder's field."""
+    """Raises InputError if only one of encoder and denoiser works on points. where: name of the setting that
+    holds the encoder, for the message."""
     if (encoder == "points") != (denoiser == "cross_attention"):
         raise InputError(
             f"{where} is {encoder} and denoiser is {denoiser}; "
@@ -203,9 +204,9 @@ class MotionModel(ABC):
     """The diffusion model over trajectories.
 
     The diffused variable x is a trajectory: its waypoints, normalized, relative to a reference, and scaled.
-    With the targets `residual` and `absolute`, x is in units of the training data's standard
-    deviation, and relative to the straight line from start to goal (residual) or to the mean of the data
-    (absolute, the paper's). With the target `limits`, x is the joint values in units of their limits, the
+    With the targets `residual` and `absolute`, x is in units of the training data's standard deviation, and
+    relative to the straight line from start to goal (residual) or to the mean of the data (absolute, the
+    paper's). With the target `limits`, x is the joint values scaled so that their limits are -1 and 1, the
     noise is white, and nothing is taken from the data, as in MPD and EDMP. The first and the last waypoint
     are start and goal: they are written over the ends of x at every step (the paper's noise interpolation).
     """
@@ -467,8 +468,8 @@ def link_clearances(checker: CollisionChecker, settings: MotionModelSettings) ->
 
 
 def _carriers(checker: CollisionChecker) -> tuple[int, list[int]]:
-    """The number of the checker's links that belong to the bare arm, and the carrier of each attached body,
-    which follow these links.
+    """The number of the checker's links that belong to the bare arm, and the carrier of each attached body.
+    Attached bodies follow the arm's links in `checker.links`.
 
     The carrier is the index of the arm's link to which the body is fixed. If that link has no clearance, it
     is the index of the last link whose frame does not come after the body's frame in the kinematic tree.

@@ -13,11 +13,12 @@ for the configuration and 512, 256, 128 for the decoder.
 
 Differences from the paper:
 
-- *Size*, for training on one core: a cloud of 256 + 12 + 6 per link points (for a Panda 256 scene, 120 robot,
-  60 target; paper 4,096, 2,048 and 128); set abstraction with 96 and 24 centers of 16 neighbors each and
-  balls of 0.2 and 0.6 m for the sparser cloud (512 and 128 of 128; 0.05 and 0.3 m); narrower layers (the
-  paper's end in 1,024, then 4,096, 2,048, 2,048 features); batches of 128 at a rate of 2e-3 (10 at 1e-4);
-  losses on the robot's points of the cloud (1,024).
+- *Size*, for training on one core (the paper's numbers in brackets): a cloud of 256 points of the scene, and
+  for each link 12 points of the robot and 6 of the target, 120 and 60 for a Panda (4,096, 2,048 and 128);
+  two set abstractions with 96 and 24 centers (512 and 128), 16 neighbors (128), and balls of 0.2 and 0.6 m
+  (0.05 and 0.3 m), since the cloud is sparser; narrower layers (ending in 1,024, then 4,096, 2,048, 2,048
+  features); batches of 128 at a learning rate of 2e-3 (10 at 1e-4); losses on the robot's points of the
+  cloud (1,024 points).
 - *Target*: a configuration, to be reached within 1e-4 rad; the paper's target is a pose of the hand. So the
   target's points are those of the whole arm at the goal, the direction to the goal configuration is a further
   input of the configuration encoder, and points are labeled by link, not only as scene, robot or target.
@@ -25,9 +26,9 @@ Differences from the paper:
 - The collision loss is on the arm's covering spheres, which protrude a little, not on points.
 - The expert's motions come from our data and have 48 waypoints (paper: 50), forwards or backwards, with one
   step at rest at the end.
-- Displacements are output in units of the experts' mean step, and weights are initialized as in K. He et al.
-  (ICCV 2015): with PyTorch's defaults, activations fade over the many layers, and training takes many times
-  as long.
+- Displacements are output in units of the experts' root mean square step, and weights are initialized as in
+  K. He et al. (ICCV 2015): with PyTorch's defaults, activations fade over the many layers, and training takes
+  many times as long.
 """
 
 from dataclasses import dataclass, field
@@ -151,7 +152,7 @@ class SetAbstraction(nn.Module):
     def __init__(
         self, channels: int, widths: tuple[int, ...], centers: int, neighbors: int, radius: float
     ) -> None:
-        """`channels` of each point's features; `widths` of the layers; `radius` of the balls [m]."""
+        """channels: number of features of a point. widths: of the layers. radius: of the balls [m]."""
         super().__init__()
         self.centers = centers
         self.neighbors = neighbors

@@ -9,9 +9,10 @@ random. The planner that uses these networks is `baselines.mpnet`.
 Differences from the paper:
 
 - Enet and Pnet are smaller, so that they train in an hour of one core; the settings name the paper's sizes.
-- The paper trains Enet either as an auto-encoder or end to end with Pnet. Here a run begins with the first
-  and continues with the second: a code z that is trained only for reconstruction loses details that decide
-  whether the arm collides, and training end to end is cheap, as the waypoints of a trajectory share their z.
+- The paper trains Enet either as an auto-encoder or end to end with Pnet. Here a run begins with the
+  auto-encoder and continues end to end: a code z that is trained only for reconstruction loses details that
+  decide whether the arm collides, and training end to end is cheap, as the waypoints of a trajectory share
+  their z.
 - The paper's clouds list the obstacles in a fixed order, which a sensed cloud lacks. So points are sorted
   along a space-filling curve: neighbors in the list are neighbors in space, and a perceptron can average
   them.
@@ -20,7 +21,7 @@ Differences from the paper:
 - Pnet outputs the step to the next waypoint, in units of the data's steps, instead of the waypoint. So
   dropout disturbs only the step, not the arm's current configuration.
 - Dropout drops a quarter of the outputs of Pnet's hidden layers, not half, so that these narrower layers keep
-  about as many outputs as in the paper. With half, Pnet learns far less in this shorter training.
+  about as many outputs as in the paper. With half dropped, Pnet learns far less in this shorter training.
 - A training sample is a random row of one of our demonstrations and the row 0.7 rad further along the path
   (the paper: neighboring vertices of optimized RRT* paths). On average, 0.7 rad is a sixth of a path, and the
   straight steps are 0.3 % shorter than the path. The step has the same length everywhere but at
@@ -66,9 +67,9 @@ TRIVIAL_SHARE = 0.15
 @dataclass(frozen=True)
 class MPNetSettings(Settings, name="mpnet"):
     points: Count = 320
-    """Points of Enet's input cloud (paper: 1,400, for scenes in two dimensions)."""
+    """Number of points of Enet's input cloud (paper: 1,400, for scenes in two dimensions)."""
     encoder_layers: Sizes = (384, 256, 128)
-    """Layers of Enet between the cloud and z (paper: 512, 256, 128)."""
+    """Widths of Enet's layers between the cloud and z (paper: 512, 256, 128)."""
     decoder_layer: Count = 128
     """Size of the only layer between z and the reconstruction, used only in training (paper: the mirror image
     of Enet)."""
@@ -77,12 +78,12 @@ class MPNetSettings(Settings, name="mpnet"):
     contraction: NotNegative = 1e-3
     """lambda, the weight of the contractive penalty [m^2]."""
     layers: Sizes = (768, 640, 512, 384, 320, 256, 192, 128, 128, 64, 32)
-    """Layers of Pnet (paper: 1280, 1024, 896, 768, 512, 384, 256, 256, 128, 64, 32)."""
+    """Widths of Pnet's layers (paper: 1280, 1024, 896, 768, 512, 384, 256, 256, 128, 64, 32)."""
     dropout: Annotated[float, Bound(least=0.0, below=1.0)] = 0.25
     """Share of the outputs of Pnet's layers that is dropped, in planning and training (paper: 0.5, of wider
     layers)."""
     steady_layers: Natural = 2
-    """Number of Pnet's last layers without dropout (paper: nearly all have it)."""
+    """Number of Pnet's last layers without dropout (paper: nearly all layers have dropout)."""
     step: Positive = 0.7
     """Distance along the path from one waypoint to the next [rad, joint-space L2]."""
     waypoints: Count = 8

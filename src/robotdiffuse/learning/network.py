@@ -37,8 +37,8 @@ class SavedModule(nn.Module):
 
 
 class Network(SavedModule):
-    """A network for one robot, made from a `RobotIdentity` and settings, whose class is in the network's
-    entry of `weight_files.NETWORKS`."""
+    """A network for one robot, made from a `RobotIdentity` and settings. `weight_files.NETWORKS` names the
+    class of the settings."""
 
     robot: RobotIdentity
     settings: Any

@@ -128,17 +128,18 @@ NETWORKS = Registry(
     },
 )
 """The last value of an entry, its kind, is what follows `robotdiffuse train` in the command that trains the
-network; if it is missing, that is `baseline NAME`."""
+network. Entries without a kind are trained by `robotdiffuse train baseline NAME`."""
 
 
 FORMAT = 2
+"""Version of the format of NAME.json."""
 
 
 def stamp(folder: FilePath, name: str) -> tuple[int, int] | None:
-    """Modification time [ns] and inode of NAME.json, the file that training writes last; None if there is
-    none.
+    """Modification time [ns] and inode of NAME.json, the file that training writes last; None if it is
+    missing.
 
-    A cached network is reused as long as the stamp stays the same.
+    A cached network is reused as long as these two numbers stay the same.
     """
     try:
         status = (folder / f"{name}.json").stat()
@@ -254,7 +255,7 @@ def check_weights(name: str, folder: str | FilePath | None) -> None:
 def weights_folder(name: str, folder: str | FilePath | None, robot: Robot) -> FilePath:
     """The folder with weights of a network: the given folder, or the folder from `weights_for`.
 
-    Raises InputError if it holds none, naming the command that trains them.
+    Raises InputError if it holds no such weights, naming the command that trains them.
     """
     check_weights(name, folder)
     if folder is not None:
@@ -270,7 +271,7 @@ def weights_folder(name: str, folder: str | FilePath | None, robot: Robot) -> Fi
 def completion_folder(folder: str | FilePath | None) -> FilePath:
     """The folder with weights of the completion network: the given folder, or the package's.
 
-    Raises InputError if it holds none, naming the command that trains them.
+    Raises InputError if it holds no such weights, naming the command that trains them.
     """
     place = BUNDLED / "completion" if folder is None else FilePath(folder)
     if not (place / "completion.json").is_file():

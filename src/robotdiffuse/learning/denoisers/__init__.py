@@ -37,7 +37,7 @@ class DenoiserSettings(Settings):
 
 @dataclass(frozen=True)
 class AttentionSettings(DenoiserSettings):
-    """Settings of all transformers.
+    """Settings of all transformers. z_tk is the token that carries the condition and the noise level.
 
     The paper states neither the number of heads nor the size of the hidden layer: `paper_size` has the sizes
     of the network that the paper follows, the motion diffusion model of Tevet et al. 2023.
@@ -83,8 +83,8 @@ class AttentionSettings(DenoiserSettings):
 @dataclass(frozen=True)
 class TransformerSettings(AttentionSettings, name="transformer"):
     add_z_tk: bool = True
-    """Whether z_tk is also added to every other token, so that the first layer need not distribute it;
-    otherwise it is only a token (the paper's)."""
+    """Whether z_tk is also added to every other token, so that the first layer need not distribute it. If
+    not, z_tk is only a token, as in the paper."""
 
     @classmethod
     def paper_size(cls) -> "TransformerSettings":

@@ -102,7 +102,7 @@ def attend(
 
 
 def start_small(layer: nn.Linear, layers: int) -> None:
-    """Initialize the last layer of a residual branch, one of `layers` in a row."""
+    """Initialize the last layer of a residual branch; `layers`: number of residual blocks in a row."""
     nn.init.normal_(layer.weight, std=0.02 / (2 * layers) ** 0.5)
     nn.init.zeros_(layer.bias)
 
@@ -122,7 +122,7 @@ class Denoiser(nn.Module, ABC):
     def __init__(self, settings: Any, waypoints: int, dof: int, features: int, condition: int) -> None:
         """settings: of the class that DENOISERS names for the denoiser.
         features: inputs per waypoint.
-        condition: numbers in [z, start, goal]; start and goal are the last two times `dof`.
+        condition: size of [z, start, goal], in which start and goal have `dof` numbers each.
         """
         super().__init__()
         self.settings = settings
@@ -228,7 +228,7 @@ class TrajectoryTransformer(Denoiser):
         return nn.ModuleList(Block(*sizes, count, causal, cross) for _ in range(count))
 
     def set_positions(self, at: Float[ndarray, "tokens"]) -> None:
-        """Give the tokens other positions, in waypoints; their number may change."""
+        """Give the tokens other positions [waypoints]; the number of tokens may change."""
         self.positions = positions(at, self.settings.width).to(self.positions.device)
 
     def forward(
@@ -257,6 +257,7 @@ class TrajectoryTransformer(Denoiser):
         return self.out(self.norm(x[:, -count:])).float().reshape(batch, -1, self.dof)
 
     def _encoded(self, condition: Conditions, level: Levels) -> Float[Tensor, "batch 4 width"]:
+        """The encoder's output for the tokens z, start, goal and t."""
         parts = zip(self.condition, condition.split(self.sizes, -1), strict=True)
         memory = torch.stack([*(embed(part) for embed, part in parts), self.level(level)], 1).float()
         for block in self.encoder:
@@ -264,6 +265,7 @@ class TrajectoryTransformer(Denoiser):
         return self.norm_encoded(memory)
 
     def _points(self, points: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch points width"]:
+        """Tokens of the scene's points [m]."""
         angles = torch.cat(wave_angles(points), -1)
         return self.norm_points(self.points(torch.cat([points, angles.sin(), angles.cos()], -1)))
 
@@ -354,6 +356,7 @@ class UNet(Denoiser):
         for blocks, halve in zip(self.down, self.halving, strict=True):
             x = _through(blocks, x, token)
             skips.append(x)
+            # two neighboring waypoints become one with the features of both
             x = halve(x.reshape(x.shape[0], x.shape[1] // 2, -1)).float()
         x = _through(self.middle, x, token)
         for blocks, double, before in zip(

@@ -37,13 +37,15 @@ class EncoderSettings(Settings, name="encoder"):
         """Points within the region in the form that the exported encoder takes [m]."""
         if self.ordered:
             return in_order(points, self.cloud, self.along_curve)
-        # padding points of zeros have no effect; the exported network needs at least one point, or `cloud`
+        # padding points of zeros have no effect; the exported network needs at least one point, and without
+        # `any_size` it needs `cloud` points
         needed = 1 if self.any_size else self.cloud
         return np.pad(points, ((0, max(needed - len(points), 0)), (0, 0)))
 
 
 ORDER_STEPS = 2**20 - 1
-"""Coordinates are rounded to this many steps between zero and the cloud's largest one before sorting."""
+"""Coordinates are rounded to this many steps between zero and the cloud's largest coordinate before
+sorting."""
 
 
 CURVE_STEP = 2.0**-16
@@ -94,7 +96,7 @@ class PointAutoencoderSettings(EncoderSettings):
     points: Sizes = (64, 128, 256)
     """Widths of the layers of the perceptron on each point."""
     hidden: Count = 384
-    """Width of the layer between the pooled features and z, and of the decoder's."""
+    """Width of the layer between the pooled features and z, and of the decoder's hidden layers."""
     decoded: Count = 192
     """Number of points that the decoder reconstructs."""
 
@@ -160,7 +162,7 @@ class DGCNNSettings(EncoderSettings):
     edges: Sizes = (32, 32, 64)
     """Widths of the layers of edge convolution (64, 64, 128, 256)."""
     embedding: Count = 192
-    """Number of features of a point, computed from all these layers, that are pooled (1024)."""
+    """Number of pooled features of a point, computed from the outputs of all edge convolutions (1024)."""
     head: tuple[Count, ...] = (192,)
     """Widths of the layers between the pooled features and z (512, 256)."""
 

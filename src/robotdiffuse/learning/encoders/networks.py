@@ -1,8 +1,8 @@
 """The encoders: auto-encoders that are trained alone, and networks that are trained with the planner.
 
 Unlike the originals, PointNet and DGCNN normalize features over the channels of a point (layer norm), not
-over the batch: a code must not depend on the other clouds, clouds may hold points that do not count, and
-averaged weights have no averaged batch statistics.
+over the batch: z must not depend on the other clouds of a batch, clouds may contain ignored points, and the
+moving average of the weights has no matching batch statistics.
 """
 
 from abc import ABC, abstractmethod
@@ -114,8 +114,8 @@ def fp32(tensor: Tensor) -> torch.autocast:
 
 
 OCTAVES = 4
-"""Number of wavelengths (4 m, 2 m, ...) of the sines and cosines of a point's coordinates, which are also
-inputs."""
+"""A point's inputs are its coordinates, and their sines and cosines at this number of wavelengths (4 m,
+2 m, ...)."""
 
 
 def wave_angles(points: Float[Tensor, "*batch 3"], octaves: int = OCTAVES) -> list[Float[Tensor, "*batch 3"]]:
@@ -148,9 +148,9 @@ class CompressionAutoencoder(Autoencoder):
 
     A perceptron on 1,400 points in a fixed order, 4200 -> 786 -> 512 -> 256 -> 60, and its mirror image. The
     paper states neither the order nor the activation. Here the points are sorted along a space-filling curve,
-    so that an input belongs to a small part of the surfaces. If points were sorted by x, then y, then z, an
-    input's y and z could be those of any obstacle. The activation is PReLU, as in MPNet (Qureshi et al.
-    2019), whose encoder has this form and this loss.
+    so that each of the 4200 inputs belongs to a small part of the surfaces. If points were sorted by x, then
+    y, then z, an input's y and z could be those of any obstacle. The activation is PReLU, as in MPNet
+    (Qureshi et al. 2019), whose encoder has this form and this loss.
     """
 
     settings: CompressionAutoencoderSettings

@@ -45,12 +45,12 @@ def random_scenes(count: int, max_obstacles: int, rng: Generator, rop: bool = Fa
     kinds[np.arange(max_obstacles) >= number[:, None]] = NONE
     center = rng.uniform([-1.0, -1.0, 0.1], [1.0, 1.0, 1.0], (*shape, 3))
     center[family == 2] *= rng.uniform([0.5, 0.5, 0.3], [1.0, 1.0, 1.2], (int((family == 2).sum()), 1, 3))
-    third = (family == 2)[:, None, None]
+    any_size = (family == 2)[:, None, None]
     radius = np.where(family == 0, rng.uniform(0.18, 0.27, count), rng.uniform(0.06, 0.2, count))
-    radius = np.where(third[..., 0], rng.uniform(0.04, 0.3, shape), radius[:, None])
+    radius = np.where(any_size[..., 0], rng.uniform(0.04, 0.3, shape), radius[:, None])
     edge = np.where(family == 0, 0.2, rng.uniform(0.08, 0.3, count))[:, None, None]
-    size = np.where(third, np.exp(rng.uniform(np.log(0.03), np.log(0.9), (*shape, 3))), edge)
-    turned = third & (rng.random((*shape, 1)) < 0.5)
+    size = np.where(any_size, np.exp(rng.uniform(np.log(0.03), np.log(0.9), (*shape, 3))), edge)
+    turned = any_size & (rng.random((*shape, 1)) < 0.5)
     wxyz = np.where(turned, rng.standard_normal((*shape, 4)), np.array([1.0, 0.0, 0.0, 0.0]))
     wxyz /= np.linalg.norm(wxyz, axis=-1, keepdims=True)
     size = np.where((kinds == SPHERE)[..., None], radius[..., None], size)

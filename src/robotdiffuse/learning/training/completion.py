@@ -41,8 +41,8 @@ from robotdiffuse.processes.workers import Workers
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 
-Probabilities = Float32[ndarray, "m"]
-Truth = Bool[ndarray, "m"]
+Floats = Float32[ndarray, "m"]
+Flags = Bool[ndarray, "m"]
 NICENESS = 5
 """Niceness of the workers: the training process has priority."""
 BATCHES_AHEAD = 3
@@ -256,7 +256,7 @@ class CompletionTask(TrainingTask):
         logits, truth, _ = self._logits_and_truth(samples)
         return binary_cross_entropy_with_logits(logits, truth.float())
 
-    def _predictions(self, samples: Samples) -> tuple[Probabilities, Truth, Truth]:
+    def _predictions(self, samples: Samples) -> tuple[Floats, Flags, Flags]:
         """Logits and truth of the predicted fine voxels, and which of these are unknown and above the
         ground."""
         predictions: list[tuple[ndarray, ndarray, ndarray]] = []
@@ -275,7 +275,7 @@ def _split(samples: Samples) -> list[Samples]:
     return [Samples(*(array[i : i + 4] for array in samples)) for i in range(0, len(samples.seen), 4)]
 
 
-def fitted_temperature(logits: Probabilities, truth: Truth) -> float:
+def fitted_temperature(logits: Floats, truth: Flags) -> float:
     """The temperature by which logits are divided so that their cross-entropy is smallest (Guo et al.
     2017)."""
     from scipy.optimize import minimize_scalar
@@ -289,7 +289,7 @@ def fitted_temperature(logits: Probabilities, truth: Truth) -> float:
     return float(np.exp(optimum.x))
 
 
-def reliability(p: Probabilities, truth: Truth) -> list[list[float]]:
+def reliability(p: Floats, truth: Flags) -> list[list[float]]:
     """For each bin of predicted probabilities: their mean, the share of occupied voxels, and the count."""
     bin_indices = np.minimum((p * CALIBRATION_BINS).astype(int), CALIBRATION_BINS - 1)
     count = np.bincount(bin_indices, minlength=CALIBRATION_BINS)
@@ -300,14 +300,14 @@ def reliability(p: Probabilities, truth: Truth) -> list[list[float]]:
     return [[round(a, 4), round(b, 4), float(n)] for a, b, n in rows]
 
 
-def calibration_error(p: Probabilities, truth: Truth) -> float:
+def calibration_error(p: Floats, truth: Flags) -> float:
     """Expected calibration error: the mean over the voxels of |mean predicted probability - share of occupied
     voxels| of their bins."""
     rows = np.array(reliability(p, truth))
     return float((np.abs(rows[:, 0] - rows[:, 1]) * rows[:, 2]).sum() / max(1.0, rows[:, 2].sum()))
 
 
-def average_precision(p: Probabilities, truth: Truth) -> float:
+def average_precision(p: Floats, truth: Flags) -> float:
     """Mean precision over all thresholds, weighted by the gain in recall."""
     order = np.argsort(-p, kind="stable")
     hits = np.cumsum(truth[order])

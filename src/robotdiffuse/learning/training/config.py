@@ -51,7 +51,8 @@ class TrainingSettings(Settings):
     """Settings of every training run."""
 
     minutes: Positive | None = 40.0
-    """Length of the run in wall time [min]; the learning rate reaches 0 at its end. None: by `samples`."""
+    """Length of the run in wall time [min]; the learning rate reaches 0 at its end. None: `samples` sets the
+    length."""
     samples: Count | None = None
     """Length of the run in training samples. Such runs are reproducible; runs by `minutes` are not."""
     seed: Natural = 0
@@ -140,8 +141,9 @@ class PlannerTraining(MotionTraining, ModelParts):
 
     encoder: str | None
     """Folder with a trained encoder, which stays frozen; or the name of an encoder that is trained jointly,
-    by the planner's loss, on new clouds for every batch: pointnet or dgcnn, or points, which has nothing to
-    train, for the denoiser cross_attention. None for a prior, whose inputs do not include the scene."""
+    by the planner's loss, on new clouds for every batch: pointnet or dgcnn; or, for the denoiser
+    cross_attention, points, an encoder without weights. None for a prior, whose inputs do not include the
+    scene."""
     minutes: Positive | None = 70.0
     learning_rate: Positive = 6e-4
     """Peak learning rate of AdamW (paper: 3e-4)."""
@@ -152,7 +154,7 @@ class PlannerTraining(MotionTraining, ModelParts):
     losses: LossSettings = field(default_factory=LossSettings)
     """The paper's losses of joints, points and collision."""
     trivial_share: Share = 0.1
-    """Share of trivial trajectories in each batch, with a free straight line from start to goal: from these
+    """Share of trivial trajectories in each batch: the straight line from start to goal is free. From them
     the network learns to keep straight lines."""
     smooth_noise: bool = True
     """Whether the noise has the covariance of the trajectories over the waypoints; otherwise it is white (the

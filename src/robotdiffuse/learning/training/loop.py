@@ -87,8 +87,8 @@ class Processes:
     def average(self, parameters: Iterable[nn.Parameter], loss: float) -> float:
         """Replace the gradients by their means over the processes; returns the mean of the losses.
 
-        With a single process, nothing changes. A gradient or loss that is not finite in one process becomes
-        so in all processes.
+        With a single process, nothing changes. A gradient or loss that is not finite in one process makes
+        the mean in all processes not finite.
         """
         if self.count == 1:
             return loss
@@ -211,7 +211,7 @@ class TrainingRun:
 
     Several processes, started by torchrun, are one run: each draws its own batches of the size in the
     settings, and all step by their mean gradient. The first process validates, shows progress and writes all
-    files; all processes read the folder. They stop, skip and roll back together.
+    files; all processes read the folder. They stop, skip steps and return to checkpoints together.
     """
 
     def __init__(self, task: TrainingTask, out: str) -> None:

@@ -26,8 +26,8 @@ class ForwardKinematics:
     Configurations `q` [rad], or [m] for prismatic joints, have any batch shape. They are converted to `dtype`
     and `device`, and the results have these too.
 
-    The frame of joint j is T[j + 1] = T[parents[j]] @ (C + cos(q) A + sin(q) B) with constant A, B and C. It
-    takes one small matrix product and two multiply-adds over the batch.
+    The frame of joint j is T[j + 1] = T[parents[j]] @ (C + cos(q) A + sin(q) B) with constant A, B and C.
+    Each frame takes one small matrix product and two multiply-adds over the batch.
     """
 
     def __init__(
@@ -36,6 +36,7 @@ class ForwardKinematics:
         self.robot = robot
         self.dtype = dtype
         self.device = torch.device(device)
+        # C, A and B of a rotation about z; C and the slide of a translation along z
         turns = np.zeros((3, 4, 4))
         turns[0, 2, 2] = turns[0, 3, 3] = 1
         turns[1, 0, 0] = turns[1, 1, 1] = 1
@@ -95,8 +96,8 @@ class LossSettings(Settings, name="losses"):
     collision: NotNegative = 0.0
     """The paper's lambda_collision."""
     begin: Share = 0.0
-    """Share of the training after which L_collision begins; it rises over a tenth of the training. Earlier
-    predictions are too far off for a meaningful gradient."""
+    """Share of the training after which L_collision begins; its weight then rises over a tenth of the
+    training. Earlier predictions are too far off for a meaningful gradient."""
     points: Count = 6
     """Number of points of each link's surface in L_point."""
     waypoints: Count = 8
