@@ -212,7 +212,7 @@ def test_too_many_nodes_or_edges_other_robots_and_places_off_the_lattice_are_ref
     checker, start, goals, _ = arm_problem(0)
     search = LatticeSearch(checker, start, goals, DStarLiteSettings())
     for call, message in (
-        (lambda: AStar(AStarSettings(spacing=0.001)).plan(AROUND), r"spacing is 0.001.*a spacing of 0.0"),
+        (lambda: AStar(AStarSettings(spacing=0.001)).plan(AROUND), r"spacing is 0.001.*use at least 0.0"),
         (
             lambda: LatticeSearch(baxter, ends[0], ends[1:], AStarSettings(joints_per_move=14)),
             r"joints_per_move is 14; on baxter .* 4782968 edges.* at most 5",

@@ -70,7 +70,7 @@ def test_times_and_no_rows(tmp_path, arrays):
     shards.write_shard(tmp_path, 0, timed, {})
     shard = shards.check_shard(tmp_path, 0, manifest_of(ARM, WAYPOINTS, timing="time"))
     assert len(shard) == 0 and shard["trajectories"].shape == (0, WAYPOINTS, ARM.dof)
-    with pytest.raises(InputError, match="array times: it must be there only where timing is time"):
+    with pytest.raises(InputError, match="array times: it must exist if timing is time, and only then"):
         shards.check_shard(tmp_path, 0, manifest_of(ARM, WAYPOINTS))
 
 

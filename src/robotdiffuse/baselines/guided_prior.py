@@ -309,8 +309,8 @@ GUIDE_STEPS = 5
 LIMIT_MARGIN = 0.02
 """Joints closer than this to a limit are moved away from it to this distance [rad]."""
 COLLISION_WEIGHT = 0.1
-"""Weight of the collision cost [rad²/m]. A waypoint that violates a margin moves by about this times 0.5
-m/rad."""
+"""Weight of the collision cost [rad²/m]. A waypoint that violates a margin moves by about this times the
+cost's gradient, 0.5 m/rad."""
 PRIOR_WEIGHT = 2.0
 """Weight of the Gaussian process cost, for waypoints one unit of time apart and a power spectral density of 1
 rad²."""
@@ -368,8 +368,8 @@ class MPD(GuidedPrior[MPDSettings]):
                 checker, q, settings.margin, settings.self_margin, settings.between
             )
             limit_margin = np.minimum(LIMIT_MARGIN, (robot.upper - robot.lower) / 2)
-            inside = np.clip(q, robot.lower + limit_margin, robot.upper - limit_margin)
-            moves = limited(-COLLISION_WEIGHT * gradient, settings.push) + (inside - q)
+            within_limits = np.clip(q, robot.lower + limit_margin, robot.upper - limit_margin)
+            moves = limited(-COLLISION_WEIGHT * gradient, settings.push) + (within_limits - q)
             moves[:, [0, -1]] = 0.0
             q = implicit_step((q + moves).astype(np.float32), PRIOR_WEIGHT)
         return q
@@ -440,8 +440,8 @@ class GuideSettings(Settings, name="edmp.guides"):
     near_margin: NotNegative
     """Margin at the last guided step [m]. The margin falls linearly from `far_margin` to `near_margin`."""
     weight: NotNegative
-    """Weight of the cost [rad²/m]. A waypoint that violates the margin moves by about this times 0.5
-    m/rad."""
+    """Weight of the cost [rad²/m]. A waypoint that violates the margin moves by about this times the cost's
+    gradient, 0.5 m/rad."""
     guided_share: Share
     """Fraction of the denoising steps that are guided: the last ones."""
 
@@ -472,6 +472,7 @@ class EDMPSettings(PriorSettings, name="edmp"):
     push: Positive = 0.15
     """Longest move of a waypoint in one gradient step [rad, joint-space L2]."""
     guides: Annotated[tuple[GuideSettings, ...], Filled()] = ENSEMBLE
+    """The ensemble of guides. Each guide moves its own part of the batch."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

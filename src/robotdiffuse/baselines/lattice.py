@@ -49,14 +49,21 @@ Outcome = IntEnum("Outcome", "GOING FOUND EXHAUSTED FULL", start=0)  # result of
 # goals as of its last expansion [steps]. rhs: its cost from the goals by the neighbors' g [steps]. parent:
 # the neighbor that gives rhs.
 NODE = np.dtype([("at", "i8"), ("g", "f8"), ("rhs", "f8"), ("parent", "i8")])
-# The arrays of a search. origin[dof]: the node with the lowest coordinates [rad]. counts[dof]: number of
-# nodes along each joint; the first and the   last are outside the limits. strides[dof]: change of `at` per
-# step of each joint. moves, costs: what each edge adds to `at`, and its cost [steps]. goals: number of goals.
-# corners: `at` of the nodes   around the goals. inflation: factor on the heuristic; above 1, nodes are
-# expanded only once, as in ARA* (M. Likhachev et al., NIPS 2003). slots: hash table from `at` to the index of
-# a node. nodes, q: index 0 stands for no node, then the goals, then the nodes   of the lattice. queue:
-# priority queue as a binary tree of maxima; its leaves are 1 / (1 + key), or 0 if not queued. values:
-# counters, see below. offers: costs of one node by each of its moves and goals [steps].
+# The arrays of a search.
+# - origin[dof]: the node with the lowest coordinates [rad].
+# - counts[dof]: number of nodes along each joint; the first and the last are outside the limits.
+# - strides[dof]: change of `at` per step of each joint.
+# - moves, costs: what each edge adds to `at`, and its cost [steps].
+# - goals: number of goals.
+# - corners: `at` of the nodes around the goals.
+# - inflation: factor on the heuristic; above 1, nodes are expanded only once, as in ARA* (M. Likhachev et
+#   al., NIPS 2003).
+# - slots: hash table from `at` to the index of a node.
+# - nodes, q: the nodes and their configurations. Index 0 stands for no node; then come the goals, then the
+#   nodes of the lattice.
+# - queue: priority queue as a binary tree of maxima; its leaves are 1 / (1 + key), or 0 if not queued.
+# - values: counters, see below.
+# - offers: costs of one node through each of its neighbors and goals [steps].
 FIELDS = "origin spacing counts strides moves costs goals corners inflation slots nodes q queue "
 Search = namedtuple("Search", FIELDS + "values offers block space work", defaults=(None, ()))
 NODES, EXPANSIONS, START = range(3)  # in `values`: number of nodes, number of expansions, index of the start
@@ -100,8 +107,8 @@ def _distance(s, u, v):
 @allocation_free()
 def _update_vertex(s, v):
     """UpdateVertex of D* Lite: sets the key of a node in the queue. The heuristic is the larger of two lower
-    bounds on the cost to the start: the Euclidean distance, and the sum over the joints if every move changes
-    as many as possible."""
+    bounds on the cost to the start: the Euclidean distance, and the cost of covering the summed joint
+    differences by moves of as many joints as possible."""
     node = s.nodes[v]
     queue = s.queue
     i = len(queue) // 2 + v
@@ -235,6 +242,7 @@ class LatticeSearch:
     `DStarLiteSettings`."""
 
     expansions = 0
+    """Number of expanded nodes so far."""
     cost = np.inf
     """Length of the path that `run` found [rad]; infinite if it found none."""
 
@@ -262,14 +270,14 @@ class LatticeSearch:
         if nodes >= MAX_NODES:
             least = 1.1 * spacing * (nodes / MAX_NODES) ** (1 / robot.dof)
             raise InputError(
-                f"{name}.spacing is {spacing:g}, too fine for {robot.name}: a spacing of {least:.2g} does it"
+                f"{name}.spacing is {spacing:g}, too fine for {robot.name}: use at least {least:.2g}"
             )
         edges = np.cumsum([comb(robot.dof, k) * 2**k for k in range(1, robot.dof + 1)])
         most = edges[: settings.joints_per_move].max()
         if most > MAX_MOVES:
             raise InputError(
-                f"{name}.joints_per_move is {settings.joints_per_move}; on {robot.name} that makes {most} "
-                f"edges of a node; it must be at most {sum(edges <= MAX_MOVES)}"
+                f"{name}.joints_per_move is {settings.joints_per_move}; on {robot.name} a node then has "
+                f"{most} edges; use at most {sum(edges <= MAX_MOVES)}"
             )
         # edges: all combinations of joints and signs
         sizes = range(1, min(settings.joints_per_move, robot.dof) + 1)

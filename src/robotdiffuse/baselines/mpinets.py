@@ -142,6 +142,7 @@ class _Motion:
         return self.arrived and not self.collided
 
     def go(self, space: Space, q: Float32[ndarray, "dof"]) -> None:
+        """Adds the policy's next configuration."""
         step = np.stack([self.waypoints[-1], q])
         self.collided |= not motions_free(space, step)[0]
         self.moving = np.ptp(step, axis=0).max() >= STANDSTILL

@@ -163,13 +163,13 @@ class NeuralPlanning:
         return f"solved by {MPNet.name}: round {rounds}, after {self.replanned} neural replannings{methods}"
 
     def between(
-        self, starts: Configurations, goals: Configurations, one_will_do: bool = False
+        self, starts: Configurations, goals: Configurations, stop_at_free: bool = False
     ) -> list[Configurations]:
         """Bidirectional neural planning of many motions at once.
 
-        With `one_will_do`, planning stops as soon as one motion is free. A motion that was not connected
-        contains a segment in collision. Connected motions may also contain collisions, since their other
-        segments are not checked.
+        With `stop_at_free`, planning stops as soon as one motion is free. A motion whose two sides were not
+        connected contains a segment in collision. Connected motions may also contain collisions, since their
+        other segments are not checked.
         """
         start_sides = [[q] for q in starts]
         goal_sides = [[q] for q in goals]
@@ -183,7 +183,7 @@ class NeuralPlanning:
             for i, state in zip(unconnected, self.next_states(q, goal), strict=True):
                 near[i].append(state)
             connected = [i for i in unconnected if self.segments_free(np.stack([near[i][-1], far[i][-1]]))[0]]
-            if one_will_do and any(
+            if stop_at_free and any(
                 self.segments_free(_joined(start_sides[i], goal_sides[i])).all() for i in connected
             ):
                 break

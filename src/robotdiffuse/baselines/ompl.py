@@ -96,6 +96,7 @@ class Watch:
         yield from self._while(ob.PlannerTerminationCondition(self._is_over))
 
     def caught(self, error: BaseException) -> None:
+        """Stores the search's first exception, and ends the search."""
         self._error = self._error or error
         if self._condition is not None:
             self._condition.terminate()
@@ -171,8 +172,8 @@ class MotionChecks(ob.MotionValidator):
 
 
 class OmplPlanner(Planner[OmplSettings]):
-    """Base class of OMPL's planners. A subclass names a class of ompl.geometric; the table PLANNERS lists
-    it."""
+    """Base class of OMPL's planners. A subclass names a class of ompl.geometric; the table PLANNERS lists the
+    subclasses."""
 
     settings_class = OmplSettings
     algorithm: ClassVar[type[ob.Planner]]
@@ -265,8 +266,8 @@ class OmplPRM(OmplPlanner):
     name = "ompl_prm"
     algorithm = og.PRM
     # OMPL's second thread adds further goals to the roadmap. It would cause a deadlock: it holds the
-    # roadmap's lock while it waits for Python's lock, and the first thread does the reverse. Searching
-    # backwards, there is a single goal.
+    # roadmap's lock while it waits for Python's lock, and the first thread does the reverse. A backward
+    # search has a single goal.
     backwards = True
 
 
@@ -317,7 +318,7 @@ class _Search:
     ) -> None:
         # seeds all generators that OMPL creates from here on; 0 is not a valid seed
         ou.RNG.setSeed(int(np.random.SeedSequence([context.request.seed, attempt]).generate_state(1)[0]) or 1)
-        self._call = context
+        self._context = context
         self._robot = context.problem.robot
         self._watch = Watch(context)
         space = search_space(
@@ -364,7 +365,7 @@ class _Search:
     @property
     def gave_up(self) -> str:
         """The reason why there is no path, if OMPL ended before the time limit; else an empty string."""
-        return f"OMPL ended without a path: {self._status}" if self._call.remaining > 0 else ""
+        return f"OMPL ended without a path: {self._status}" if self._context.remaining > 0 else ""
 
     def run(self, shorter_than: float = np.inf) -> bool:
         """Search for a path until time runs out; an anytime planner searches for a path shorter than

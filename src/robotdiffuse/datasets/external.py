@@ -99,14 +99,14 @@ def write_dataset(
     motions = [_positions(arm, i, path) for i, path in enumerate(paths)]
     if not motions:
         raise InputError("paths is empty; a data set has at least one motion")
-    around = [scenes] * len(motions) if isinstance(scenes, Scene) else list(scenes)
-    if len(around) != len(motions) or not all(isinstance(scene, Scene) for scene in around):
+    per_path = [scenes] * len(motions) if isinstance(scenes, Scene) else list(scenes)
+    if len(per_path) != len(motions) or not all(isinstance(scene, Scene) for scene in per_path):
         raise InputError(
-            f"scenes are {len(around)}; they must be one rd.Scene, or one for each of {len(motions)} paths"
+            f"scenes are {len(per_path)}; they must be one rd.Scene, or one for each of {len(motions)} paths"
         )
-    floor = _shared_floor(around)
-    slots = max(len(scene.shapes) for scene in around) - (floor is not None)
-    packed = PackedScenes.pack(around, slots, floor is not None)
+    floor = _shared_floor(per_path)
+    slots = max(len(scene.shapes) for scene in per_path) - (floor is not None)
+    packed = PackedScenes.pack(per_path, slots, floor is not None)
     if not (split_of(packed) == SPLITS.index("train")).any():
         raise InputError(
             "no scene falls into the training split, to which a hash assigns 90 % of scenes; give more scenes"
@@ -114,7 +114,7 @@ def write_dataset(
     q = np.stack([resample(motion[None].astype(np.float32), waypoints)[0] for motion in motions])
     about = {"families": {FAMILY: {}}, "floors": {FAMILY: floor}, "slots": slots}
     about["settings"] = {"imported": "write_dataset"}
-    return _write(FilePath(folder), arm, arm.source or arm.name, around, q, about)
+    return _write(FilePath(folder), arm, arm.source or arm.name, per_path, q, about)
 
 
 def _write(

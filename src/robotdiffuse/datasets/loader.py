@@ -118,11 +118,11 @@ class RopDataset(Dataset[dict[str, Tensor]]):
         poses = []
         scenes = []
         for i, rows in enumerate(read_rows(folder, robot, waypoints)):
-            mine = np.flatnonzero(rows.split == SPLITS.index(split))
+            of_split = np.flatnonzero(rows.split == SPLITS.index(split))
             self._trajectories.append(rows.q)
-            places.append(np.stack([np.full(len(mine), i), mine], axis=1))
-            poses.append(rows.shard["target_pose"][mine])
-            scenes.append(rows.scenes[mine])
+            places.append(np.stack([np.full(len(of_split), i), of_split], axis=1))
+            poses.append(rows.shard["target_pose"][of_split])
+            scenes.append(rows.scenes[of_split])
         self._places = np.concatenate(places)
         """Shard and row of each item."""
         self._poses, self._scenes = np.concatenate(poses), PackedScenes.joined(scenes)
@@ -178,7 +178,7 @@ class RopDataset(Dataset[dict[str, Tensor]]):
 
     def _run(self, jobs: Iterator) -> Iterator[RopBatch]:
         threads = min(MAX_THREADS, torch.get_num_threads())
-        # one thread makes a batch: PyTorch's own threads would wait for each other at every step
+        # each batch is made by one thread: PyTorch's own threads would wait for each other at every step
         pool = ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
         waiting: deque = deque()
         try:
@@ -212,8 +212,8 @@ class RopDataset(Dataset[dict[str, Tensor]]):
         dof = self.manifest.dof
         q = np.empty((len(indices), waypoints, dof), np.float32)
         for s in np.unique(shard):
-            mine = np.flatnonzero(shard == s)
-            q[mine] = self._trajectories[s][row[mine]]
+            of_shard = np.flatnonzero(shard == s)
+            q[of_shard] = self._trajectories[s][row[of_shard]]
         raw = torch.from_numpy(q).to(self.device).view(-1, waypoints * dof)
         scaled = torch.addcmul(self._shift, raw, self._scale).view(-1, waypoints, dof)
         scenes = self._scenes[indices]

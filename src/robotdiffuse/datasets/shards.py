@@ -85,9 +85,9 @@ class Manifest(Settings):
 
     @classmethod
     def of(
-        cls, robot: Robot, source: str, *, floors: Mapping[str, Box | None], timing: str = "arc", **rest: Any
+        cls, robot: Robot, source: str, *, floors: Mapping[str, Box | None], timing: str = "arc", **more: Any
     ) -> "Manifest":
-        """The manifest of data of a robot. source: the field `robot`. floors: the floor of each family. rest:
+        """The manifest of data of a robot. source: the field `robot`. floors: the floor of each family. more:
         the other fields."""
         records = {
             name: None if floor is None else {"center": floor.center.tolist(), "size": floor.size.tolist()}
@@ -101,7 +101,7 @@ class Manifest(Settings):
             upper=tuple(robot.upper.tolist()),
             timing=timing,
             floors=records,
-            **rest,
+            **more,
         )
 
     @property
@@ -386,7 +386,7 @@ def check_shard(folder: str | FilePath, index: int, manifest: Manifest) -> Shard
     shard = read_shard(folder, index)
     path = shard_path(folder, index)
     if ("times" in shard.arrays) != (manifest.timing == "time"):
-        raise InputError(f"shard {path}, array times: it must be there only where timing is time")
+        raise InputError(f"shard {path}, array times: it must exist if timing is time, and only then")
     check_shapes(folder, shard, manifest)
     for name, array in shard.arrays.items():
         if name not in UNBOUNDED and not np.isfinite(array).all():

@@ -177,11 +177,13 @@ def _may_intersect(region, row, axes):
         half = _HALF * (abs(axes[r, 0]) + abs(axes[r, 1]) + abs(axes[r, 2]))
         away = max(abs(row[r] - region[r]) - half, _ZERO)
         gap += away * away
+    # `half` is now half the box's height
     return row[2] + half > region[4] and gap < region[3] * region[3]
 
 
 @kernel(inline="always")
 def _inside(region, point):
+    """Whether a point [m] is in the region."""
     x = point[0] - region[0]
     y = point[1] - region[1]
     z = point[2] - region[2]

@@ -276,7 +276,7 @@ def _evaluate(
     else:
         folder = out / which.folder
         encoder = load_model(str(folder), robot).encoder
-        assert encoder is not None  # every row has one
+        assert encoder is not None  # every row has an encoder
         steps = NETWORK_ALONE.guidance_steps if guided else 0
         planner = replace(
             NETWORK_ALONE,

@@ -133,8 +133,8 @@ GRACE = 20.0
 """A process that has not answered this long after the time limit is killed [s]. In this time, the motion is
 validated and timed."""
 RESTARTS_TIMEOUT_FACTOR = 20.0
-"""Timeout of planners that restart, as a multiple of the time limit. It is long because computing the
-trajectory of each path does not count for the limit."""
+"""Timeout for all repeated calls of a run together (`equal_time`), as a multiple of the time limit. It is
+long because computing the trajectory of each path does not count for the limit."""
 RUNS_PER_TASK = 20
 """Number of runs in a task of a cluster. Each task starts the planner's process again."""
 
@@ -271,9 +271,9 @@ def on_this_machine(settings: "BenchSettings", runs: Sequence[Run], session: str
             job.result()
         while todo or running:
             busy = {run.method for run in running.values()}
-            place = next((i for i, run in enumerate(todo) if run.method not in busy), None)
-            if place is not None and len(running) < workers:
-                run = todo.pop(place)
+            position = next((i for i, run in enumerate(todo) if run.method not in busy), None)
+            if position is not None and len(running) < workers:
+                run = todo.pop(position)
                 running[pool.submit(planners[run.method].plan, run, settings.equal_time)] = run
                 continue
             for job in wait(running, return_when=FIRST_COMPLETED).done:
@@ -395,8 +395,8 @@ def run_bench(settings: BenchSettings, report: Progress, done: Done) -> int:
     """Make the calls that have no record in the folder; returns how many were made.
 
     A call with a shorter time limit is not repeated if it ended before its limit, since more time would not
-    change it. Raises InputError, before any call, for bad settings or a planner that cannot be loaded, and
-    KeyboardInterrupt on Ctrl-C. Running again with the same settings then continues.
+    change its result. Raises InputError, before any call, for bad settings or a planner that cannot be
+    loaded, and KeyboardInterrupt on Ctrl-C. Running again with the same settings then continues.
     """
     with lock_folder(settings.out):
         specs = settings.specs
@@ -431,7 +431,9 @@ def open_runs(
             if is_answered:
                 answered.add((label, *record.case))
     runs = runs_of(cases, settings.specs, range(settings.seeds), settings.time_limit)
-    return [t for t in runs if (t.method, t.case.problem_set, t.case.name, t.seed) not in answered]
+    return [
+        run for run in runs if (run.method, run.case.problem_set, run.case.name, run.seed) not in answered
+    ]
 
 
 def _check_weights(settings: BenchSettings, sessions: Sequence[Mapping[str, Any]]) -> None:

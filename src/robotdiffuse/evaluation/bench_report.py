@@ -93,7 +93,8 @@ class Bench:
 
     @property
     def reference(self) -> str:
-        """The planner that all others are compared with; with restarts, if it has such records."""
+        """The planner that all others are compared with: the default planner, else the first planner; with
+        restarts, if it has records with restarts."""
         plain = DEFAULT_PLANNER if DEFAULT_PLANNER in self.records else next(iter(self.records))
         return plain + RESTARTED if plain + RESTARTED in self.records else plain
 
@@ -294,7 +295,7 @@ class Comparison:
     limit: float
     """Time limit [s]."""
     problems: int
-    """Number of these problems."""
+    """Number of problems on which the planners are compared."""
     section_problems: int
     """Number of all problems in the section."""
     seeds: int
@@ -341,7 +342,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Section:
-    """Results on a problem set, or on its non-trivial part."""
+    """Results on a problem set, or on its non-trivial problems that at least one planner solves."""
 
     name: str
     problem_set: str
@@ -357,8 +358,8 @@ class Section:
 
 
 def sections(bench: Bench, limits: Sequence[float] | None = None) -> list[Section]:
-    """The results on all problem sets. Sets of random problems get a second section without the trivial
-    problems.
+    """The results on all problem sets. Sets of random problems get a second section, with only the
+    non-trivial problems that at least one planner solves.
 
     `limits` are the time limits to report [s]; None: the limits of the records, and all LIMITS below the
     longest of them. Raises InputError if no planner has results for any of the limits.
@@ -380,7 +381,8 @@ def sections(bench: Bench, limits: Sequence[float] | None = None) -> list[Sectio
             parts[problem_set + NONTRIVIAL_LABEL] = {r.name for r in records if r.solved and not r.trivial}
         for name, problems in parts.items():
             part = {
-                planner: {key: of[key] for key in of if key[0] in problems} for planner, of in calls.items()
+                planner: {key: by_key[key] for key in by_key if key[0] in problems}
+                for planner, by_key in calls.items()
             }
             comparisons = (
                 _comparison(bench, problem_set, part, len(problems), places, limit)
@@ -401,10 +403,14 @@ def _counted(
 ) -> dict[Key, Record]:
     """The records of a planner that count for a limit.
 
-    If the planner was run with this limit on the first problems only, the other problems are left out. For
-    these, only calls that ended before a shorter limit have results, which would select easy problems.
+    If the planner was run with this limit on the first problems only, the other problems are left out. On the
+    other problems, only calls that ended before a shorter limit have results, which would select easy ones.
     """
-    counted = {key: record for key, of in calls.items() if (record := deciding_record(of, limit)) is not None}
+    counted = {
+        key: record
+        for key, records in calls.items()
+        if (record := deciding_record(records, limit)) is not None
+    }
     if len(counted) == len(calls):
         return counted
     counts = [
@@ -663,20 +669,19 @@ def main_table(section: Section, comparison: Comparison, reference: str) -> Tabl
     load = f"; load average {min(loads):.1f} to {max(loads):.1f}" if loads else ""
     note = f"All rows were timed alike: {comparison.rows[0].timed}{load}."
     if not comparison.alike:
-        alone = "their times cannot be compared as such"
-        note = f"Not all rows were timed alike, see the last column{load}; {alone}."
+        note = f"Not all rows were timed alike, see the last column{load}; their times cannot be compared."
     unequal = any(UNEQUAL in text for row in table.texts for text in row)
     return replace(table, notes=(note, UNEQUAL_NOTE) if unequal else (note,))
 
 
 def _table(heading: str, rows: Sequence[Row], spec: Spec) -> Table:
-    cells = [[named(row.planner), *(of(row) for _, of in spec)] for row in rows]
+    cells = [[named(row.planner), *(cell(row) for _, cell in spec)] for row in rows]
     return Table.of(heading, ["planner", *(column for column, _ in spec)], cells)
 
 
 def _ratio(comparison: Comparison, reference: str) -> PlannerColumn:
-    """A column with the ratio of path lengths to those of the reference planner, and its interval. It is
-    empty for a planner that ended early and also has a row with restarts, which shows the ratio."""
+    """A column with the ratio of path lengths to those of the reference planner, and its interval. The cell
+    is empty for a planner that ended early and also has a row with restarts, which shows the ratio."""
     full = {row.planner: row.full for row in comparison.rows}
 
     def ratio(row: Row) -> Cell:

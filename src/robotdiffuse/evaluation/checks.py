@@ -71,7 +71,7 @@ PYBULLET_STEP = 0.01
 """PyBullet checks the waypoints, and configurations between them that are at most this far apart [rad,
 joint-space L2]."""
 PYBULLET_TOLERANCE = 0.001
-"""Contacts of smaller depth count as rounding errors of Bullet [m]."""
+"""Contacts that are less deep than this count as rounding errors of Bullet [m]."""
 MOTIONS_PER_TASK = 100
 """Largest number of motions that a process checks in one task; all are of the same shard."""
 

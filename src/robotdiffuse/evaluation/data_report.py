@@ -155,16 +155,16 @@ def facts(data: DataFigures) -> list[tuple[str, str]]:
         (f"in {data.shards:,} shards", f"{data.bytes / 1e6:,.1f} MB"),
         ("splits", ", ".join(f"{count:,} {name}" for name, count in data.splits.items())),
         ("problems solved", f"{_share(solved)}; of {counts['tried']:,} tried {lost}"),
-        (f"come no closer than {distance} or than their ends", _share(keeps_distance)),
+        (f"keep {distance}, or the clearance of start or goal if smaller", _share(keeps_distance)),
         (
-            f"keep {distance} all along, where both ends have it",
+            f"keep {distance} all along, if start and goal do",
             _share(clearance_between >= data.safety_distance) if len(clearance_between) else NO_VALUE,
         ),
         (
             "goals reached per problem",
             f"{np.isfinite(data.sample['goal_costs']).sum(axis=1).mean():.1f}",
         ),
-        ("trivial: the line is free", _share(data.all["line_free"])),
+        ("trivial: the straight line is free", _share(data.all["line_free"])),
     ]
 
 
@@ -234,10 +234,11 @@ def data_report(data: DataFigures, name: str) -> Report:
     distance = f"{100 * data.safety_distance:.3g} cm"
     report.plot(
         "motions.svg",
-        f"Motions by family; the search keeps {distance} away from the ends. Detours: without trivial ones",
+        f"Motions by family; except near start and goal, the search keeps {distance} from obstacles. "
+        "Detours: without trivial motions",
         histograms(_motions(data), 3),
     )
-    caption = "Goals per problem, and the excess cost of the others over the best one"
+    caption = "Goals per problem, and the excess cost of all other goals over the best goal"
     report.plot("goals.svg", caption, histograms(_goals(data), 2))
     q = data.sample["trajectories"]
     joints: Histograms = {

@@ -1,7 +1,7 @@
 """Methods for `runs`: planners, and networks or controls that sample trajectories. Each method yields the
 fields of its records, including the validator's verdict.
 
-The time of a planner's call includes its validation; the time of sampling does not.
+The time of a planner's call includes its validation; the time of sampling does not include validation.
 """
 
 import hashlib

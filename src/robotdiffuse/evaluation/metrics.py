@@ -20,8 +20,8 @@ from robotdiffuse.validation.report import Report
 from robotdiffuse.validation.tolerances import sample_path
 
 STEP = 0.02
-"""Longest step along a path for measuring lengths of link paths [rad, joint-space L2]. Measured arcs are too
-short by at most 0.002 %."""
+"""Longest step along a path for measuring lengths of link paths [rad, joint-space L2]. Measured lengths are
+too short by at most 0.002 %."""
 SAMPLE_TIME = 0.01
 """Time between the states at which smoothness is measured [s]."""
 STANDSTILL = 1e-6

@@ -1,9 +1,9 @@
 """The paper's problems, its Table 1 and its figures, compared with results of this package.
 
-Start and goal points are drawn as the authors draw them: uniformly in a box. Inverse kinematics of the
-position only finds a start configuration and a goal configuration. The goal of a problem is either this
-configuration or the tip's pose at this configuration. For a goal pose, planners find up to ten
-configurations. A motion succeeds if it ends within 1 cm and 15 degrees of the pose.
+Start and goal points are drawn as the authors draw them: uniformly in a box. Inverse kinematics finds a start
+configuration and a goal configuration for these positions, with any orientation. The goal of a problem is
+either the goal configuration or the tip's pose at this configuration. For a goal pose, planners find up to
+ten configurations. A motion succeeds if it ends within 1 cm and 15 degrees of the pose.
 """
 
 import itertools

@@ -58,12 +58,12 @@ SEARCHES = Registry(
     {
         "shared_tree_rrt_star": Entry(
             "robotdiffuse.planning.search.shared_tree:SharedTreeSearch",
-            "the paper's: one tree towards all goals of a target, with the cost of each",
+            "the paper's: one tree towards all goals of a target; stores the cost of each goal",
             "SharedTreeSettings",
         ),
         "aorrtc": Entry(
             "robotdiffuse.generation.aorrtc_solver:AORRTCSearch",
-            "shorter paths in less time at the same safety distance, with the cost of one goal",
+            "shorter paths in less time at the same safety distance; stores the cost of one goal",
             "AORRTCSearchSettings",
         ),
     },
@@ -191,8 +191,8 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
     checker = CollisionChecker(robot, sample.scene)
     space = search_space(checker, settings.search.resolution)
     lines_free = [bool(motions_free(space, np.stack([sample.start, goal]))[0]) for goal in goals]
-    thinned = rng.random() >= settings.trivial_share
-    if thinned and all(lines_free):
+    thin_if_trivial = rng.random() >= settings.trivial_share
+    if thin_if_trivial and all(lines_free):
         return "thinned"  # trivial, whichever goal a search would choose
     search: SharedTreeSearch | AORRTCSearch = SEARCHES.load(settings.planner)(
         checker, sample.start, sample.goals, settings.search, random_state(settings.seed, number)
@@ -203,7 +203,7 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
         return "unsolved"
     goal = search.goals[search.best_goal]
     line_free = lines_free[search.best_goal]
-    if thinned and line_free:
+    if thin_if_trivial and line_free:
         return "thinned"
     validator = Verifier(sample.problem(robot), VerifySettings())
     motion = _resampled(settings, robot, path, validator)
