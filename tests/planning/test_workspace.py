@@ -249,7 +249,7 @@ def test_contacts_hold_for_their_step_only() -> None:
     steps = pick(GRASP @ rd.pose([0.0, 0.0, -0.12]))
     result = space.plan_steps([*steps[:3], rd.MoveRelative([0, 0, 0.15], "world", name="lift")], "ready")  # type: ignore[list-item]
     assert result.failed == "lift" and "can touches table" in result.reason
-    assert "if it stands there, allowed_contacts of table may name it" in result.reason
+    assert "if it stands there, name it in allowed_contacts of table" in result.reason
     assert space.scene.allowed_contacts == ()
 
 

@@ -20,8 +20,8 @@ _ONE, _NO_BOX_CORNER = np.float32(1.0), np.float32(EMPTY_BOX[0, 0])
 
 @inner_kernel()
 def _scene(empty, floors, floor, kinds, params, solids, around):
-    """Writes a packed scene to the buffers `solids` and `around` and returns its SceneArrays. The first solid
-    is row `floor` of `floors`; with `floor` = -1 there is none."""
+    """Writes a packed scene to the buffers `solids` and `around` and returns its SceneArrays. The floor,
+    row `floor` of `floors`, is the first solid; with `floor` = -1 there is no floor."""
     n = 0
     if floor >= 0:
         solids[0] = floors[floor]

@@ -55,7 +55,7 @@ class CollisionChecker:
     def clearances_and_gradients(
         self, q: Float[ndarray, "n dof"], limit: float, margin: float
     ) -> tuple[Float[ndarray, "n links"], Float[ndarray, "n dof"]]:
-        """`link_clearances`, and the gradient of the arm's margin violation by the joints [m/rad].
+        """`link_clearances`, and the gradient of the arm's margin violation by joint positions [m/rad].
 
         The violation is sqrt(sum of h²) over the covering spheres. A sphere at signed distance D from the
         scene contributes h = max(0, margin - D). Violation and gradient are 0 where no sphere is within
@@ -79,8 +79,8 @@ class CollisionChecker:
     ) -> tuple[Float[ndarray, "n"], Float[ndarray, "n dof"]]:
         """Collision cost of each configuration and its gradient: the paper's hinge loss, squared.
 
-        `margin` is the distance to obstacles and `self_margin` that between links below which the cost is
-        positive [m].
+        The cost is positive where the arm is nearer than `margin` [m] to an obstacle, or two links are nearer
+        than `self_margin` [m] to each other.
         """
         return collision_cost.cost_gradients(
             self.robot_arrays,

@@ -13,9 +13,8 @@ from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
-MAX_CONFIGURATIONS = 5000
-"""Largest number of times that `contacts` certifies the remaining motion; each time it resumes at one
-configuration."""
+MAX_SWEEPS = 5000
+"""Largest number of times that `contacts` certifies the remaining motion."""
 
 
 def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: float) -> list[Contact]:
@@ -31,7 +30,7 @@ def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: fl
     end = float(motion.travel[-1])
     at = 0.0
     contacts_in_order = list[Contact]()
-    for _ in range(MAX_CONFIGURATIONS):
+    for _ in range(MAX_SWEEPS):
         low = motion_pieces.segment_at(motion.travel, at)[0]
         contact_configuration = motion_pieces.configurations(motion, np.array([at]))
         remaining_q = np.concatenate([contact_configuration, q[low + 1 :]])
@@ -58,8 +57,8 @@ def _follow(
     first: Contact,
     contact_list: list[Contact],
 ) -> float:
-    """Appends to `contact_list` the contact `first` at travel `at`, and those that begin before the arm is
-    free again. Returns the travel at which it is free, or the end of the motion."""
+    """Appends to `contact_list` the contact `first` at travel `at`, and the contacts that begin before the
+    arm is free again. Returns the travel at which the arm is free, or the end of the motion."""
     checks = {(check.link, check.other): check for check in checks_of(exact.robot)}
     open_contacts: dict[tuple[str, str | None, str], int] = {}
     first_place = _place(motion, at)

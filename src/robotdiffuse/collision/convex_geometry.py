@@ -98,8 +98,8 @@ def checks_of(robot: Robot) -> tuple[Check, ...]:
 
 
 def surfaces_decide(robot: Robot, check: Check) -> bool:
-    """Whether the mesh surfaces of two links decide if they collide when their convex parts touch; see
-    `Robot.grazing`."""
+    """Whether two links are grazing (see `Robot.grazing`): where their convex parts touch, their mesh
+    surfaces decide whether the links collide."""
     return check.other is not None and frozenset(check) in robot.grazing
 
 
@@ -180,7 +180,7 @@ def _bounded(shape: Shape, points: Float[ndarray, "n 3"], inflation: float) -> S
 
 def describe_contact(link: str, other: str, depth: float, itself: bool) -> str:
     """A contact of penetration `depth` [m] in words: 'panda_link5 is 3.2 cm inside sphere_2'. With `itself`,
-    both bodies are links and 'overlap by 3.2 cm'."""
+    both bodies are links: 'a and b overlap by 3.2 cm'."""
     length = f"{depth * 100:.1f} cm" if depth >= 0.01 else f"{depth * 1000:.1f} mm"
     if depth < 5e-5:
         return f"{link} touches {other}"

@@ -52,8 +52,8 @@ MAX_CONTACTS = 200
 
 
 class Distance(NamedTuple):
-    """Signed distance [m] of a link to the nearest obstacle or to another link. `other` is its name, None in
-    an empty scene."""
+    """Signed distance [m] of a link to the nearest obstacle or to another link. `other` names this
+    obstacle or link; None in an empty scene."""
 
     link: str
     other: str | None
@@ -230,8 +230,8 @@ class ExactCollision:
     def _signed(
         self, piece: _Piece, other: _Piece | _Obstacle, frames: ndarray, cutoff: float, depth: bool
     ) -> float:
-        """Signed distance of two geometries [m]. For a surface farther than `cutoff` it is some value of at
-        least `cutoff`.
+        """Signed distance of two geometries [m]. For a surface farther away than `cutoff`, the result is some
+        value of at least `cutoff`.
 
         Without `depth`, the penetration of a surface may be too small, but the sign is right.
         """
@@ -300,10 +300,10 @@ class ExactCollision:
     ) -> float:
         """Signed distance of two grazing links [m], at most `cutoff`.
 
-        It is the distance of their convex parts. Where these overlap by at most MAX_OVERLAP or are nearer
-        than SURFACES_BELOW, the distance of the mesh surfaces is used if it is larger, unless the surfaces
-        touch or one encloses a piece of the other. Without `depth`, the penetration may be too small, but the
-        sign is right.
+        It is the distance of their convex parts, or the distance of their mesh surfaces if that is larger.
+        The surfaces count only if the parts overlap by at most MAX_OVERLAP or are nearer than SURFACES_BELOW,
+        and if the surfaces neither touch nor enclose a piece of each other. Without `depth`, the penetration
+        may be too small, but the sign is right.
         """
         assert candidates.surfaces is not None
         best = cutoff
@@ -360,7 +360,7 @@ class ExactCollision:
             undecided = np.flatnonzero(~hit)
             lower = candidates.lower(frames[undecided])
             rows, columns = np.nonzero(lower <= 0)
-            separated = np.zeros(len(q), bool)  # by their surfaces
+            separated = np.zeros(len(q), bool)  # grazing links with overlapping parts and separate surfaces
             for row, column in zip(undecided[rows].tolist(), columns.tolist(), strict=True):
                 if hit[row] or separated[row]:
                     continue
@@ -409,5 +409,5 @@ def contact_message(robot: Robot, contact: Distance) -> str:
     itself = partner in robot.link_names
     message = describe_contact(link, str(partner), -distance, itself)
     if not itself and -distance < RESTING_DEPTH and link in [body.name for body in robot.attached]:
-        message += f"; if it stands there, allowed_contacts of {partner} may name it"
+        message += f"; if it stands there, name it in allowed_contacts of {partner}"
     return message

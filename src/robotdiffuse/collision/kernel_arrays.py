@@ -94,7 +94,7 @@ class SceneArrays(NamedTuple):
     """[cells + 1] first point of each cell."""
     grid: ndarray
     """[nx * ny * nz] distance from each voxel's center to the nearest point's center [m]. Values beyond the
-    band are lower bounds."""
+    band (see `grid_frame`) are lower bounds."""
     nearest: ndarray
     """[nx * ny * nz] index of the point that is nearest to each voxel's center. Beyond the band it is a point
     near the nearest one; far beyond, it is -1."""
@@ -153,12 +153,12 @@ def _known_tables(
 ) -> dict[int, LinkPairTable]:
     """The tables of `Robot.tables` by index of the pair. Tables are left out if the joints between the pair's
     links are not exactly those of the table, as after locking a joint."""
-    number = {frozenset((groups[a], groups[b])): p for p, (a, b) in enumerate(pairs)}
+    pair_index = {frozenset((groups[a], groups[b])): p for p, (a, b) in enumerate(pairs)}
     tables_by_pair = {}
     for table in robot.tables:
         between = tuple(robot.joint_names[joint] for joint in robot.joints_between(*table.links))
-        if frozenset(table.links) in number and between == table.joints:
-            tables_by_pair[number[frozenset(table.links)]] = table
+        if frozenset(table.links) in pair_index and between == table.joints:
+            tables_by_pair[pair_index[frozenset(table.links)]] = table
     return tables_by_pair
 
 
@@ -250,7 +250,7 @@ GRID_SECONDS_PER_POINT = 7e-7
 @lru_cache(maxsize=8)
 def compile_scene_for(robot: Robot, scene: Scene) -> SceneArrays:
     """The arrays of the part of a scene that the robot can come near. They are cached, since a search and the
-    validator use the same ones."""
+    validator use the same arrays."""
     largest = float(compile_robot(robot).spheres[:, 3].max(initial=0.0))
     return compile_scene(scene, reach_bound(robot), largest, robot_groups(robot))
 
@@ -295,6 +295,7 @@ def _rows(solids: Sequence[Solid], reach: float) -> ndarray:
     sizes = np.array([[*solid.half, solid.disc, solid.rounding] for solid in solids]).reshape(-1, 5)
     R = T[:, :3, :3]
     half = sizes[:, :3]
+    # crop each box to coordinates within `far` of the base's origin
     far = 2 * reach + 1
     base = -np.einsum("nij,ni->nj", R, T[:, :3, 3])
     low = np.maximum(-half, base - far)

@@ -143,9 +143,9 @@ class ContinuousCollision:
         q = for_kernels(q)
         motion = Motion(q, motion_pieces.travel_along(q, self.checks.motion_radii))
         todo = motion_pieces.first_pieces(motion, self.checks, INITIAL_TRAVEL)
-        best = np.full(2, CLEARANCE_CAP)
-        certified = np.full(2, CLEARANCE_CAP)
-        hit: tuple[float, int] | None = None
+        best = np.full(2, CLEARANCE_CAP)  # smallest measured clearance of SCENE and of PAIR
+        certified = np.full(2, CLEARANCE_CAP)  # their smallest lower bounds along the motion
+        hit: tuple[float, int] | None = None  # place and check of the first contact
         while len(todo.start):
             bounds, rows, columns = kernel.rounds(
                 self.arm,
@@ -172,10 +172,10 @@ class ContinuousCollision:
     def _ask(
         self, motion: Motion, bounds: Round, rows: ndarray, columns: ndarray, best: ndarray
     ) -> tuple[tuple[float, int], Round] | None:
-        """Let Coal compute the distances that the other bounds left open.
+        """Let Coal compute the distances of checks that the bounds did not decide.
 
-        If there is a contact, returns its place and check, and the part of the round before the contact: an
-        earlier contact may still be found there, and later pieces no longer matter. Else returns None.
+        If there is a contact, returns its place and check, and the pieces before the contact with their
+        bounds: only there may an earlier contact be found. Else returns None.
         """
         todo = bounds.pieces
         clearance = bounds.clearance
@@ -196,12 +196,12 @@ class ContinuousCollision:
         if not touched:
             return None
         row = int(rows[computed])
-        kept_rows = row + int(todo.stop[row] - todo.start[row] > 2 * CONTACT_TRAVEL_TOLERANCE)
+        row_count = row + int(todo.stop[row] - todo.start[row] > 2 * CONTACT_TRAVEL_TOLERANCE)
         todo.stop[row] = middle[row]
         clearance[row:] = lower[row:] = -np.inf
         piece_arrays = (todo.start, todo.stop, todo.undecided)
         earlier = Round(
-            Pieces(*(part[:kept_rows] for part in piece_arrays)), *(part[:kept_rows] for part in bounds[1:])
+            Pieces(*(part[:row_count] for part in piece_arrays)), *(part[:row_count] for part in bounds[1:])
         )
         return (float(middle[row]), int(columns[computed])), earlier
 

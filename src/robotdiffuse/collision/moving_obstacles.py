@@ -87,7 +87,7 @@ class MovingCollision:
         all_pairs = np.ones((1, len(self.link_names), len(self.moving)), np.bool_)
         ends = times[[0, -1]]
         tasks = Tasks(ends[:1], ends[1:], all_pairs)
-        hit = None
+        hit = None  # time, link and obstacle of the first contact
         while len(tasks.start):
             bound, open_tasks = kernel.settle_tasks(
                 self.links, self.tracks, times, q, tasks, self.contact, self.tightness, best
@@ -99,7 +99,7 @@ class MovingCollision:
                     continue
                 time = (start + stop) / 2
                 distance = self._distance(link, o, times, q, time)
-                lost = self._lost(link, o, times, q, start, stop)
+                loss = self._clearance_loss(link, o, times, q, start, stop)
                 if distance <= self.contact or stop - start < MIN_INTERVAL:
                     if hit is None or time < hit[0]:
                         hit = time, link, o
@@ -107,8 +107,8 @@ class MovingCollision:
                         halves.append((start, time, link, o))
                     continue
                 best[0] = min(best[0], distance)
-                if distance - lost >= max(self.contact, self.tightness * best[0]):
-                    certified = min(certified, distance - lost)
+                if distance - loss >= max(self.contact, self.tightness * best[0]):
+                    certified = min(certified, distance - loss)
                 else:
                     halves += [(start, time, link, o), (time, stop, link, o)]
             tasks = self._tasks([half for half in halves if hit is None or half[0] < hit[0]])
@@ -149,13 +149,16 @@ class MovingCollision:
         """Signed distance of a link's meshes to obstacle o at a time [m], less the obstacle's growth until
         then."""
         obstacle = self.moving[o]
-        T_stands_moved = obstacle.shape.T_base_shape @ inverse(obstacle.pose(time))
+        # instead of the obstacle, the robot moves
+        T_base_moved = obstacle.shape.T_base_shape @ inverse(obstacle.pose(time))
         distance = self._exact[o].distance_from_moved_base(
-            self.link_names[link], interpolated(time, times, q), T_stands_moved
+            self.link_names[link], interpolated(time, times, q), T_base_moved
         )
         return distance - self.tracks.growth[o] * max(time, 0.0)
 
-    def _lost(self, link: int, o: int, times: ndarray, q: ndarray, start: float, stop: float) -> float:
+    def _clearance_loss(
+        self, link: int, o: int, times: ndarray, q: ndarray, start: float, stop: float
+    ) -> float:
         """Upper bound on how much clearance is lost from the middle of an interval to either end [m]: how far
         points of the link move, plus how far points of the obstacle move."""
         travel = kernel.cumulative_motion(q)

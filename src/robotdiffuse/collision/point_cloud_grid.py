@@ -20,13 +20,13 @@ MAX_POINTS = 400_000
 pieces merged."""
 MAX_SOLIDS = 1000
 """Largest number of spheres of a surface that links may touch. These spheres are not in the grid but checked
-one by one; more are merged by `join_to_few`."""
+one by one; `join_to_few` merges them until few enough are left."""
 JOIN_VOXEL = 0.004
-"""Edge of the voxels by which `join_to_few` first merges spheres [m]; it grows until few enough are left."""
+"""Edge of the voxels by which `join_to_few` first merges spheres [m]; it grows from round to round."""
 EXACT_RANGE = 0.1
 """Clearances to points are exact up to this [m], and lower bounds beyond."""
 VOXELS_PER_RANGE = 10
-"""Number of voxels per distance up to which the grid stores a nearest point, unless MAX_VOXELS needs larger
+"""The grid stores nearest points up to a distance of this many voxels, or fewer if MAX_VOXELS requires larger
 voxels."""
 MAX_VOXELS = 1e6
 """Approximate largest number of voxels of a grid: 4 MB, which fits a processor's cache."""
@@ -91,7 +91,7 @@ def join_to_few(spheres: Float[ndarray, "n 4"]) -> Float[ndarray, "m 4"]:
 def cover_triangles(triangles: Float[ndarray, "n 3 3"], reach: float) -> Float[ndarray, "m 4"]:
     """Spheres around pieces of the triangles that together cover the surface within `reach` [m]."""
     near = _divide(triangles, reach / 4 if np.isfinite(reach) else np.inf, reach)
-    # bisection ends with pieces of about a quarter of the squared spacing
+    # bisected triangles have an area of about spacing² / 4
     spacing = max(MESH_SPACING, float(np.sqrt(4 * _area(near) / MAX_POINTS)))
     triangle_parts = _divide(near, spacing, reach)
     centers = triangle_parts.mean(axis=1)
@@ -158,7 +158,7 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
     index = index[order]
     cell = cell[order]
     first = np.asarray(np.searchsorted(cell, np.arange(int(np.prod(cells)) + 1)), np.int32)
-    # The band is wide enough to decide about the robot's largest sphere.
+    # wide enough to decide whether the robot's largest sphere touches a point
     band = np.float32(max(radius + float(radii.max()) + 1e-3, 2 * float(voxel)))
     # runs of points in the same voxel
     voxels = _flat(index, shape)

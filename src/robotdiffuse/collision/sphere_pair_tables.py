@@ -4,7 +4,7 @@ The relative pose of two links depends only on the joints between them. For link
 between them, such as forearm and hand, bounding spheres overlap almost always. A table over these joints says
 at which joint values the links may touch: one look-up replaces hundreds of distances. Tables are computed
 from the spheres. If the robot has a table of the links' convex parts (`robots/fitting/sampled_links.py`),
-cells that it proves free are free here too.
+cells that are proved free there are free here too.
 """
 
 from collections.abc import Mapping
@@ -39,8 +39,8 @@ def build_pair_tables(
     radii: Float[ndarray, "groups dof"],
     known: Mapping[int, LinkPairTable],
 ) -> tuple[Int32[ndarray, "pairs 4"], Float32[ndarray, "tables width"]]:
-    """The tables, and the rows of `RobotArrays.pairs` with table and bit filled in for pairs that depend on
-    one or two joints.
+    """The rows of `RobotArrays.pairs`, with table and bit filled in for pairs that depend on one or two
+    joints, and the tables.
 
     A table is a row of numbers: index, lower end and cells per unit of the first joint, then of the second
     joint, then the cells. A cell is the sum of the bits of the pairs that may touch there.
@@ -65,7 +65,7 @@ def build_pair_tables(
         before = int(parents[far - 1])
         if near in (before, parents[before - 1] if before else 0) and len(pairs) < MAX_PAIRS:
             pairs.append(p)
-    # one table per last joint of a pair; the other axis is the joint before it
+    # one table for all pairs with the same last joint; the table's other axis is the joint before
     for last, pairs in pairs_by_joint.items():
         before = int(parents[last]) - 1
         joints = np.array([before if before >= 0 else last, last])

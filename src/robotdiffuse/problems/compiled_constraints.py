@@ -151,7 +151,7 @@ class PathConstraints:
 
     def projected(self, q: Configurations, tolerance_fraction: float, most: int = -1) -> Configurations:
         """The configurations, projected so that they use at most a fraction of the tolerances. Failed
-        projections are left out. most: the largest number of configurations; -1: all."""
+        projections are left out. most: stop after this many successful projections; -1: project all."""
         rows, satisfied = self.project(q, tolerance_fraction, most)
         return rows[satisfied]
 
@@ -163,7 +163,8 @@ class PathConstraints:
         return rows, project_each(self.rows, self.limits(tolerance_fraction), rows, most)
 
     def worst_violation(self, q: Configuration) -> ConstraintViolation | None:
-        """The violation of a configuration that is largest relative to the tolerance; None without one."""
+        """The violation of a configuration that is largest relative to the tolerance; None if there is
+        none."""
         [values] = self.values(q[None])
         over = (values - self.rows.limit) / self.rows.tolerance
         row = int(over.argmax())
@@ -180,8 +181,8 @@ class PathConstraints:
         """
         q = for_kernels(q)
         rows = self.rows
-        # how much a row's value can change if each joint deviates by `chord`; the reference of a TURN turns
-        # with the position along its segment
+        # how much a row's value can change if each joint deviates by `chord`; the interpolated orientation of
+        # a TURN changes with the position along its segment
         own_change = np.where(rows.row_kind == DISTANCE, rows.lever_bounds.sum(axis=1), rows.chain_length)
         turning = (rows.row_kind == TURN) * np.linalg.norm(rows.a, axis=1) * np.linalg.norm(rows.b, axis=1)
         slack = chord * (own_change + turning * rows.lever_bounds.sum(axis=1))
@@ -373,7 +374,7 @@ def _arrays(robot: Robot, frames: list[str], rows: list[_Row]) -> Rows:
     for row, chain in zip(joints, chains, strict=True):
         row[: len(chain)] = chain
     kinds = np.array([KINDS[joint.kind] for joint in robot.planned_joints])
-    of_rows: dict[str, ndarray] = {
+    row_fields: dict[str, ndarray] = {
         name: np.array([getattr(row, name) for row in rows]) for name in _Row._fields
     }
     return Rows(
@@ -386,9 +387,9 @@ def _arrays(robot: Robot, frames: list[str], rows: list[_Row]) -> Rows:
         chain_length=np.array([len(chain) for chain in chains]),
         same_frame=np.array([False, *(a == b for a, b in pairwise(frames))]),
         T_joint_frame=np.stack([robot.T_frame_link(frame) for frame in frames]),
-        inner_limit=PROJECTION_FRACTION * of_rows["limit"],
+        inner_limit=PROJECTION_FRACTION * row_fields["limit"],
         lever_bounds=np.stack([levers[frame] for frame in frames]),
-        **of_rows,
+        **row_fields,
     )
 
 

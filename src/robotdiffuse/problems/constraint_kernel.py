@@ -7,10 +7,10 @@ the value of each must not exceed a limit:
 - DISTANCE: from the frame's origin to a box [m], negative inside. Lines, planes and segments are boxes of
   zero or infinite size along some of their axes.
 - CONE: the angle between an axis of the frame and a direction [rad].
-- TURN: the angle from the frame's orientation to the orientation interpolated at its position on a segment
-  [rad].
-- ROLL_PITCH_YAW: for tolerances of goals, never along a motion: the most that roll, pitch or yaw of the
-  frame's orientation relative to a reference exceeds its tolerance [rad].
+- TURN: the angle from the frame's orientation to the orientation that is interpolated along a segment, at the
+  frame's position [rad].
+- ROLL_PITCH_YAW: the largest excess of roll, pitch or yaw, relative to a reference, over its tolerance [rad].
+  Only goals have such rows, not motions.
 
 A piece of a motion is proved to satisfy a row from the poses at its two ends. Along the piece, the joints
 move by dq at constant rates.
@@ -19,8 +19,9 @@ move by dq at constant rates.
   eighth of its second derivative. This derivative is at most sum_jk |dq_j dq_k| r_max(j,k), where r_k, the
   lever of joint k, is the distance from its axis to p. Distance to a box is convex with slope 1, so it is at
   most this deviation plus the larger value at the two ends.
-- CONE: its cosine is linear in the axis, whose second derivative is at most (sum_j |dq_j|)².
-- TURN: it grows no faster than the frame and its reference rotate.
+- CONE: the cosine of the angle is linear in the axis; the axis has a second derivative of at most
+  (sum_j |dq_j|)².
+- TURN: the angle grows no faster than the frame and the interpolated orientation rotate.
 """
 
 from typing import NamedTuple
@@ -105,6 +106,7 @@ class Work(NamedTuple):
     A: np.ndarray
     """[3 m, 3 m] matrix of the linear system of a step."""
     y: np.ndarray
+    """[3 m] intermediate solution of this system; also scratch memory."""
     step: np.ndarray
     """[dof] the step of a projection."""
     held: np.ndarray

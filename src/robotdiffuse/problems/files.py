@@ -64,8 +64,8 @@ def load_problem(file: str | Path, index: int = 0, ignore_joints: bool = False) 
         file: A .yaml, .yml, .json or .jsonl file. File names in it are relative to its folder. `scene` may
             name a MoveIt planning scene, and `request` a motion plan request, which replaces start and goal.
         index: The problem of a .jsonl file, from 0.
-        ignore_joints: Whether joints of MoveIt files that the robot does not have are noted, instead of
-            refused.
+        ignore_joints: Whether joints of MoveIt files that the robot lacks are ignored, with a note, instead
+            of refused.
 
     Raises:
         InputError: One line that names the file and the field, for unknown or missing fields and shapes,

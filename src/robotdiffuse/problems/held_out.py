@@ -54,7 +54,7 @@ class Case:
     """Whether the straight line to a goal configuration passes the validator."""
     reference: float | None = None
     """Length of the shortest known path [rad]: of the straight line if trivial, else of a search's path; None
-    if no search ran, or none found a path."""
+    if no search ran, or if it found no path."""
     problem_set: str = ""
     """Name of the problem set: the name of a family, or of a file or folder without its ending."""
 
@@ -75,7 +75,7 @@ def held_out_problem(family: str, number: int) -> Problem:
     index = list(FAMILIES).index(family)
     rng = np.random.default_rng([SEED, number] if index == 0 else [SEED, 10 + index, number])
     if index > 1:
-        rng.random()  # keeps the published problems, whose generator drew one number more
+        rng.random()  # the generator of the published problems drew one number more
     robot = load_robot("panda")
     return load_family(family).draw(robot, rng).problem(robot)
 
@@ -119,7 +119,7 @@ class CaseFile:
         """Replaces all cases atomically. Raises InputError if two have the same name."""
         twice = repeated(case.name for case in cases)
         if twice:
-            raise InputError(f"two problems are called {twice[0]}; rename the file of one")
+            raise InputError(f"two problems are called {twice[0]}; rename one of their files")
         self._lines.replace([_row(case) for case in cases])
         self._rows = {row["name"]: row for row in self._lines.rows}
 

@@ -82,10 +82,11 @@ def xyz_of(where: str, value: object) -> Vector:
 
 
 def pose_of(where: str, value: object, position: str = "position", orientation: str = "orientation") -> Pose:
-    """The transform of a geometry_msgs/Pose, or of a Transform, whose two fields have other names."""
+    """The transform of a geometry_msgs/Pose, or of a geometry_msgs/Transform, given the names of its
+    fields."""
     value = mapping_of(where, value)
-    turn = value.get(orientation)
-    xyzw = [turn.get(axis) for axis in "xyzw"] if isinstance(turn, dict) else turn
+    xyzw = value.get(orientation)
+    xyzw = [xyzw.get(axis) for axis in "xyzw"] if isinstance(xyzw, dict) else xyzw
     wxyz = np.roll(unit_quaternion(where, xyzw, orientation), 1)
     return transform(xyz_of(f"{where}.{position}", value.get(position)), rotation_from_quaternion(wxyz))
 
@@ -145,7 +146,7 @@ class MoveItFrames(dict[str, ndarray]):
             T_base_own = T_base_root @ inverse(T_own_root)
             self.update({name: T_base_own for name in own if name not in self.links})
         elif robot is not None:
-            self.unknown_reason = f"a joint moves {robot.base} in {robot.root}"
+            self.unknown_reason = f"a joint moves {robot.base} relative to {robot.root}"
 
     def of_header(self, where: str, entry: dict[str, Any]) -> Pose:
         """T_base_frame of the frame that the header of an entry names.
@@ -159,7 +160,7 @@ class MoveItFrames(dict[str, ndarray]):
         frame_names = [frame for frame in self if frame]
         if self.unknown_reason:
             raise InputError(
-                f"frame_id of {where} is {shown(name)}, and the pose of the robot's base in it is unknown: "
+                f"frame_id of {where} is {shown(name)}, and the robot's pose in this frame is unknown: "
                 f"{self.unknown_reason}; known frames: {', '.join(frame_names)}"
             )
         raise unknown_name(f"frame_id of {where}:", name, frame_names)
@@ -210,8 +211,8 @@ def moveit_scene(
             shapes.extend(object_shapes(object_entry, frames, folder))
     names = dict.fromkeys(shape.name for shape in shapes)
     allowed = matrix_contacts(mapping_of(SCENE, data, MATRIX), names, links)
-    object_entry = Scene(shapes, contacts).allowed_contacts  # type: ignore[arg-type]
-    return Scene(shapes, (*allowed.items(), *object_entry))
+    additional = Scene(shapes, contacts).allowed_contacts  # type: ignore[arg-type]
+    return Scene(shapes, (*allowed.items(), *additional))
 
 
 def matrix_contacts(
@@ -290,7 +291,7 @@ def object_shapes(entry: dict[str, Any], frames: MoveItFrames, folder: Path) -> 
             poses = [NO_POSE] * len(parts)
         if len(poses) != len(parts):
             raise InputError(
-                f"has {len(parts)} {plural} and {len(poses)} {key}_poses; it must be one for each"
+                f"has {len(parts)} {plural} and {len(poses)} {key}_poses; it must have a pose for each"
             )
         for i, ((location, part), pose) in enumerate(zip(parts, poses, strict=True)):
             T = T_base_object @ pose_of(f"{key}_poses[{i}]", pose)
@@ -391,7 +392,7 @@ def scene_robot_notes(data: object, robot: Robot, ignore_joints: bool = False) -
 def joint_notes(
     where: str, values: dict[str, float], robot: Robot, model: str, ignore_joints: bool
 ) -> tuple[str, ...]:
-    """A note on joints of `values` that the robot lacks. Raises InputError for them unless `ignore_joints`.
+    """A note on joints of `values` that the robot lacks. Unless `ignore_joints`, raises InputError instead.
 
     A joint that is fixed in the robot counts as lacking if its value is not zero. model: name of the scene's
     robot, for the message.
@@ -409,8 +410,8 @@ def joint_notes(
     of_model = f" (robot_model_name is {shortened(model)})" if model not in ("", robot.name) else ""
     movable = joined(name for name, kind in kinds.items() if kind in MOVING_KINDS)
     raise InputError(
-        f"{where} has values of {joined(lacking)}, movable joints that {robot.name} lacks{of_model}; its own "
-        f"are {movable}: give the robot that is meant, or ignore these joints (--ignore-joints, "
+        f"{where} has values of {joined(lacking)}, movable joints that {robot.name} lacks{of_model}; its "
+        f"movable joints are {movable}. Give another robot, or ignore these joints (--ignore-joints, "
         f"ignore_joints=True)"
     )
 
@@ -428,8 +429,8 @@ class MoveItAttached:
     touch_links: tuple[str, ...] = ()
 
     def held_by(self, robot: Robot, start: list[float]) -> Robot:
-        """The robot, holding this object as at the configuration `start`; touch_links that it lacks are
-        ignored."""
+        """The robot, holding this object as at the configuration `start`; touch_links that the robot
+        lacks are ignored."""
         shapes = self.shapes
         if not self.in_link and self.link in robot.link_names:
             T_link_base = inverse(link_pose(robot, np.array(start), self.link))
@@ -468,8 +469,8 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
     frames: the frames of the request's scene. folder: names of mesh files are relative to it.
 
     Several joint goal constraints are alternative goals. A position and an orientation constraint of one link
-    are a pose goal at the center of the region, whose size and tolerances are ignored. Raises InputError for
-    anything else, and for path constraints, because ignoring them would change the problem.
+    are a pose goal at the center of the position's region; sizes and tolerances are ignored. Raises
+    InputError for anything else, and for path constraints, because ignoring them would change the problem.
     """
     data = mapping_of(REQUEST, data)
     for name in ("path_constraints", "trajectory_constraints"):
@@ -525,7 +526,7 @@ def _attached(location: str, entry: dict[str, Any], frames: MoveItFrames, folder
 
 def _joint_goal(where: str, goal: dict[str, Any]) -> dict[str, float]:
     if any(goal.get(f"{kind}_constraints") for kind in ("position", "orientation", "visibility")):
-        raise InputError(f"{where} must have joint_constraints alone, or be the only goal and a pose")
+        raise InputError(f"{where} must have joint_constraints alone; only a single goal may be a pose")
     return {
         str(entry.get("joint_name")): float(vector(at, "position", [entry.get("position")], 1)[0])
         for at, entry in mappings_of(f"{where}.", goal, "joint_constraints")

@@ -22,7 +22,7 @@ from robotdiffuse.robots.ik_kernel import PRISMATIC, damped_step
 ANGLE_WEIGHT = 0.3
 """An error of 1 rad counts as this many meters in projection [m/rad]."""
 MIN_COSINE = 0.05
-"""The rates of roll and yaw diverge at a pitch of 90°: the cosine of the pitch is at least this in them."""
+"""Lower bound of |cos(pitch)| in the rates of roll and yaw, which diverge at a pitch of 90°."""
 DAMPING = 1e-5
 """Damping of the steps; only squared singular values well above it are inverted."""
 MAX_STEP = 1.0
@@ -64,7 +64,7 @@ def _residuals(rows, limits, q, work):
         if value <= limits[m]:
             continue
         residuals = 1 if rows.row_kind[m] == CONE else 3
-        # the part of the error to remove: it leaves an error of inner_limit
+        # the fraction of the error to remove, so that inner_limit is left
         share = 1.0 - rows.inner_limit[m] / value if value > 0 else 1.0
         sine = np.sqrt(work.error[0] ** 2 + work.error[1] ** 2 + work.error[2] ** 2)  # of a CONE's angle
         for r in range(residuals):
@@ -102,9 +102,8 @@ def _residuals(rows, limits, q, work):
                 elif rows.joint_kinds[m, k] != PRISMATIC and sine > 1e-9:
                     for i in range(3):
                         entry += ANGLE_WEIGHT * work.axes[k, i] * work.error[i] / sine
-                elif (
-                    rows.joint_kinds[m, k] != PRISMATIC
-                ):  # axis and direction are opposite: any rotation axis serves
+                elif rows.joint_kinds[m, k] != PRISMATIC:
+                    # the axis of the CONE is opposite to its direction: any rotation axis reduces the angle
                     entry = ANGLE_WEIGHT * work.axes[k, 0]
                 work.J[count, rows.chain[m, k]] = entry
             count += 1
@@ -160,7 +159,7 @@ def project(rows, limits, q, work):
 @kernel(nogil=True)
 def project_each(rows, limits, q, most):
     """Projects configurations q[n, dof] in place, in order, until `most` of them satisfy the limits; -1: all.
-    Returns which of them satisfy the limits [n]."""
+    Returns which rows satisfy the limits [n]."""
     work = make_work(rows)
     satisfied = np.zeros(len(q), np.bool_)
     count = 0

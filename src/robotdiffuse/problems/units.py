@@ -14,9 +14,9 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape
 
 MAX_EXTENT = 10.0
-"""A mesh or a cloud gets a note if the longest edge of its bounding box exceeds this; a view, if half of its
-depths do [m]. Other shapes get a note only if the shortest edge exceeds it: a floor may be wide, but is flat.
-"""
+"""A mesh or a cloud gets a note if the longest edge of its bounding box exceeds this [m]; a view, if half of
+its depths exceed it. Other shapes get a note only if the shortest edge exceeds it: a floor is wide, but
+flat."""
 VIEW_STRIDE = 4
 """Only every fourth row and column of a depth image is checked."""
 MIN_POINTS_IN_ARM = 10
@@ -25,7 +25,8 @@ ADVICE = "lengths are in meters: divide millimeters by 1000"
 
 
 def unit_notes(problem: Problem) -> tuple[str, ...]:
-    """Notes on obstacles that may be in millimeters: each that is too large, or all if none is in reach."""
+    """Notes on obstacles that may be in millimeters: on each that is too large, or on all if none is in
+    reach."""
     reach = reach_bound(problem.robot)
     shapes = [shape for shape in problem.scene.shapes if not isinstance(shape, (SeenPoints, AssumedPoints))]
     has_seen_points = len(shapes) < len(problem.scene.shapes)

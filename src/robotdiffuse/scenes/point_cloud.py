@@ -57,8 +57,8 @@ def cover_radius(edge: float) -> float:
 
 
 def occupied_voxels(data: bytes, edge: float) -> Points:
-    """The centers of the occupied voxels of a tree in OctoMap's binary format [m]; as in `read_octomap`, of
-    larger cubes only the voxels at the surface.
+    """The centers of the occupied voxels of a tree in OctoMap's binary format [m]. Of larger cubes, only
+    the voxels at the surface are returned, as in `read_octomap`.
 
     Raises InputError for data that end too soon, a tree that is too deep or has too many voxels, and an edge
     that is not positive.
@@ -292,7 +292,7 @@ def lzf_unpacked(packed: bytes, size: int) -> bytes:
         at += 1
         repeated = out[max(start, 0) : start + length]
         if start < 0:
-            raise ValueError("the packed data refer to what is before their beginning")
+            raise ValueError("the packed data repeat bytes from before the beginning")
         out += (repeated * -(-length // len(repeated)))[:length]
     if len(out) != size:
         raise ValueError(f"the packed data do not unpack to {size:,} bytes")
@@ -312,5 +312,5 @@ READERS: dict[str, Callable[[Path], ndarray]] = {
 
 def default_radius(file: str | Path, scale: float = 1.0) -> float:
     """Default radius of the points of a file [m]: POINT_RADIUS, or for an octomap the radius of the sphere
-    around a voxel, in units of the file times `scale`."""
+    around a voxel. `scale`: meters for each unit of the octomap."""
     return scale * cover_radius(read_octomap(file)[1]) if Path(file).suffix.lower() == ".bt" else POINT_RADIUS

@@ -198,10 +198,10 @@ def contact_notes(scene: Scene) -> tuple[str, ...]:
 
 
 def _contacts(
-    allowed: object, given: dict[str, list[str]], names: set[str]
+    allowed: object, names_of: dict[str, list[str]], names: set[str]
 ) -> tuple[tuple[str, tuple[str, ...] | str], ...]:
-    """Checks allowed contacts and returns `Scene.allowed_contacts`. `given` maps each name that was given to
-    shapes to the unique names of these shapes."""
+    """Checks allowed contacts and returns `Scene.allowed_contacts`. `names_of`: for each name
+    that shapes were given, the unique names of these shapes."""
     try:
         entries = allowed.items() if isinstance(allowed, Mapping) else [(a, b) for a, b in allowed]  # type: ignore
     except (TypeError, ValueError):
@@ -210,7 +210,7 @@ def _contacts(
         ) from None
     allowed_links: dict[str, dict[str | None, None]] = {}  # None stands for all links
     for obstacle, links in entries:
-        if not isinstance(obstacle, str) or (obstacle not in given and obstacle not in names):
+        if not isinstance(obstacle, str) or (obstacle not in names_of and obstacle not in names):
             raise unknown_name("obstacle in allowed_contacts:", obstacle, names)
         named = isinstance(links, list | tuple) and all(isinstance(link, str) for link in links)
         if links != ALL_LINKS and not named:
@@ -225,7 +225,7 @@ def _contacts(
             )
     by_name: dict[str, dict[str | None, None]] = {}
     for obstacle, touching in allowed_links.items():
-        for name in given.get(obstacle, [obstacle]):
+        for name in names_of.get(obstacle, [obstacle]):
             by_name[name] = by_name[name] | touching if name in by_name else touching
     return tuple(
         (name, ALL_LINKS if None in touching else tuple(touching))  # type: ignore[arg-type]
@@ -252,12 +252,12 @@ def _mujoco_shapes(model: Any, data: Any, base: str) -> list[Shape]:
     if body < 0:
         raise unknown_name("body", base, [model.body(k).name for k in range(model.nbody)])
     T_base_world = inverse(transform(placed.xpos[body], placed.xmat[body].reshape(3, 3)))
-    robot = set(mjcf.robot_bodies(model))
+    robot_bodies = set(mjcf.robot_bodies(model))
     colliding = model.geom_contype | model.geom_conaffinity
     shapes: list[Shape] = []
     for geom in range(model.ngeom):
         body = int(model.geom_bodyid[geom])
-        if body in robot or not colliding[geom]:
+        if body in robot_bodies or not colliding[geom]:
             continue
         name = model.geom(geom).name or model.body(body).name or f"geom{geom}"
         T = T_base_world @ transform(placed.geom_xpos[geom], placed.geom_xmat[geom].reshape(3, 3))

@@ -56,8 +56,8 @@ def draw(shape: Any, n: int, rng: Generator) -> ndarray:
     """n points on a shape, uniform by area, in the base frame [m]. This default samples the triangles of the
     shape's mesh; other kinds of shapes register their own functions."""
     mesh = shape.mesh
-    edges = np.cumsum(mesh.face_areas)
-    face = np.searchsorted(edges[:-1], rng.random(n) * edges[-1], side="right")
+    areas = np.cumsum(mesh.face_areas)
+    face = np.searchsorted(areas[:-1], rng.random(n) * areas[-1], side="right")
     u, v = rng.random((2, n, 1))
     outside = u + v > 1
     u = np.where(outside, 1 - u, u)
@@ -117,7 +117,7 @@ def sample_surface(
     """`count` points on the shapes, in random order, uniform by area within the region [m].
 
     Points repeat if only a small part of the surface is in the region. The array has shape (0, 3) if no part
-    of the surface is.
+    of the surface is in it.
     """
     shapes = [shape for shape in scene.shapes if shape.area > 0 and _may_intersect(shape, region)]
     if not shapes or count == 0:

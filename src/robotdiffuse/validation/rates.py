@@ -6,11 +6,11 @@ Limits must hold all along the cubics through the rows' positions and velocities
 cubics. A trajectory whose cubics exceed the limits needs rows at shorter intervals. The arm is assumed to
 rest before the first row (or to move at the problem's start velocity) and after the last row.
 
-Rates agree with the positions if some motion within the limits has them. If a joint's velocity changes from
-v0 to v1 in a step of h seconds with accelerations up to A, it moves by h (v0 + v1) / 2 ± (A h² - (v1 - v0)² /
-A) / 4. The extremes are full acceleration followed by full braking, and the reverse. A is twice the greatest
-acceleration in the motion, by rows or by positions, but at most the limit. The acceleration of a row must be
-near those of the cubics before and after the row.
+Rates agree with the positions if some motion within the limits has these rates and positions. If a joint's
+velocity changes from v0 to v1 in a step of h seconds with accelerations up to A, it moves by h (v0 + v1) / 2
+± (A h² - (v1 - v0)² / A) / 4. The extremes are full acceleration followed by full braking, and the reverse. A
+is twice the greatest acceleration in the motion, by rows or by positions, but at most the limit. The
+acceleration of a row must be near those of the cubics before and after the row.
 
 Positions have a limited resolution, which hides any velocity over a step of nanoseconds. If rows are closer
 than a millisecond, the tests are therefore repeated between rows that are further apart.
@@ -47,13 +47,13 @@ def rate_violations(
     must increase.
 
     The motion must begin with `start_velocity` [dof] (None: at rest) and end at rest. A limit of 0 means that
-    the robot states none; the rates must then only agree with the positions. cubics: those of the trajectory,
-    if they are known.
+    the robot states none; the rates must then only agree with the positions. cubics: the trajectory's cubics,
+    if they have been computed.
     """
     first_violations: dict[str, Violation] = {}
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        begins = np.zeros(robot.dof) if start_velocity is None else start_velocity
-        for check in _checks(robot, cubics or Cubics(trajectory), settings, begins):
+        initial_velocity = np.zeros(robot.dof) if start_velocity is None else start_velocity
+        for check in _checks(robot, cubics or Cubics(trajectory), settings, initial_velocity):
             within = check.deviation <= check.allowed
             if within.all():
                 continue
@@ -87,8 +87,10 @@ class _Check(NamedTuple):
     """The end of a message: the expected value, by row and joint."""
 
 
-def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: JointValues) -> Iterator[_Check]:
-    """All tests of the rates; `begins` is the velocity before the motion."""
+def _checks(
+    robot: Robot, cubics: Cubics, settings: VerifySettings, initial_velocity: JointValues
+) -> Iterator[_Check]:
+    """All tests of the rates; `initial_velocity` is the velocity before the motion."""
     trajectory = cubics.trajectory
     q = trajectory.positions
     v = trajectory.velocities
@@ -110,26 +112,26 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
         )
 
     at_ends = np.zeros_like(v)
-    at_ends[0], at_ends[-1] = np.abs(v[0] - begins), np.abs(v[-1])
+    at_ends[0], at_ends[-1] = np.abs(v[0] - initial_velocity), np.abs(v[-1])
     rule = "but motions begin and end at rest"
-    if begins.any():
+    if initial_velocity.any():
         rule = "but the motion is to begin at the problem's start_velocity and end at rest"
     yield _Check("rest", "velocity", v, at_ends, rest_tolerance, lambda *_: rule)
 
     limits = robot.velocity
     rate_name = "mean velocity from here to the next row"
     yield limited("jump", rate_name, mean, limits, settings.jump * limits + mean_error)
-    # An error of a step's mean velocity m changes the cubic's velocities by up to 3/2 of it, and its
-    # accelerations by 6 times it divided by the step's duration (see trajectories/cubics.py).
+    # An error e of the mean velocity of a step of h seconds changes the cubic's velocities by up to 3/2 e,
+    # and its accelerations by up to 6 e / h (see trajectories/cubics.py).
     rate_name = "greatest velocity of the cubic to the next row"
     yield limited(
         "velocity", rate_name, cubics.extremes.velocity, limits, limit_factor * limits + 1.5 * mean_error
     )
     yield limited("velocity", "velocity", v, limits, limit_factor * limits)
 
-    # Second differences of positions. Mirrored steps before the first and after the last row let the mean
-    # velocity over both steps be the velocity at the end: `begins`, and 0.
-    means = _padded(2 * begins - mean[:1], mean, -mean[-1:])
+    # Second differences of positions. The first step is mirrored before the first row, and the last step
+    # after the last row, so that the mean velocity of a step and its mirror image is `initial_velocity` or 0.
+    means = _padded(2 * initial_velocity - mean[:1], mean, -mean[-1:])
     durations = _padded(step[:1], step, step[-1:])
     uncertainty = _padded(mean_error[:1], mean_error, mean_error[-1:])
     spacing = (durations[1:] + durations[:-1]) / 2
@@ -183,7 +185,7 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
         low = np.minimum(before, after)
         high = np.maximum(before, after)
         outside = np.maximum(low - a, a - high)
-        if begins.any():
+        if initial_velocity.any():
             outside[0] = 0.0  # the unknown motion before the start may have had any acceleration
         agreement = settings.rate_agreement * np.where(limits > 0, np.minimum(limits, measured), measured)
         yield _Check(
@@ -198,7 +200,7 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
 
     if step.min(initial=np.inf) >= AVERAGING_WINDOWS[0]:
         return
-    # The tests between rows that are further apart: from an earlier row, at which the excess is largest.
+    # tests over longer times: to each row from the earlier row with the largest excess
     times = trajectory.times
     resolution = settings.limit_slack
     rate_name = "mean velocity from an earlier row to here"
@@ -223,7 +225,9 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
 
     limits = robot.acceleration
     for window in AVERAGING_WINDOWS:
-        second, uncertainty = _second_differences(trajectory, begins, window, resolution, rest_tolerance)
+        second, uncertainty = _second_differences(
+            trajectory, initial_velocity, window, resolution, rest_tolerance
+        )
         description = f"mean acceleration by its positions over {1e3 * window:g} ms and more"
         yield limited("acceleration", description, second, limits, limit_factor * limits + uncertainty)
 
@@ -234,17 +238,17 @@ def _cumulative(steps: JointRows) -> JointRows:
 
 
 def _worst_earlier_row(
-    times: Values, way: JointRows, allowed: JointRows
+    times: Values, values: JointRows, allowed: JointRows
 ) -> tuple[Int[ndarray, "n dof"], JointRows]:
     """For each row and joint, the earlier row with the largest excess, and the time since that row [s].
 
-    The excess is the absolute change of `way` since the earlier row, minus the growth of `allowed`. For the
-    first row, the row itself is returned.
+    The excess is the absolute change of `values` since the earlier row, minus the growth of `allowed`. For
+    the first row, the row itself is returned.
     """
-    rows = np.arange(len(way))[:, None]
-    beyond = np.full(way.shape, -np.inf)
-    first = np.broadcast_to(rows, way.shape)
-    for signed in (way, -way):
+    rows = np.arange(len(values))[:, None]
+    beyond = np.full(values.shape, -np.inf)
+    first = np.broadcast_to(rows, values.shape)
+    for signed in (values, -values):
         excess = signed - allowed
         min_excess = np.minimum.accumulate(excess, axis=0)
         at = np.maximum.accumulate(np.where(excess <= min_excess, rows, 0), axis=0)
@@ -263,18 +267,18 @@ def _change_since(rows: JointRows, first: Int[ndarray, "n dof"]) -> JointRows:
 
 def _second_differences(
     trajectory: Trajectory,
-    begins: JointValues,
+    initial_velocity: JointValues,
     window: float,
     resolution: float,
     rest_tolerance: JointValues,
 ) -> tuple[JointRows, JointRows]:
     """Mean accelerations about each row and their uncertainty, from the positions at the row and at the
     nearest rows at least `window` [s] before and after it. Before the motion, the arm moves with the velocity
-    `begins`; after it, the arm rests."""
+    `initial_velocity`; after it, the arm rests."""
     times = trajectory.times
     q = trajectory.positions
     clock = _padded(times[:1] - window, times, times[-1:] + window)
-    rows = _padded(q[:1] - window * begins, q, q[-1:])
+    rows = _padded(q[:1] - window * initial_velocity, q, q[-1:])
     low = np.searchsorted(clock, times - window, side="right") - 1
     high = np.searchsorted(clock, times + window)
     before = (times - clock[low])[:, None]

@@ -21,8 +21,9 @@ class Violation:
     other: str | None = None
     """The obstacle, the other link or the kind of constraint."""
     excess: float | None = None
-    """Amount of the violation. For a contact, its greatest depth [m]; for a constraint, its greatest value
-    until it is met again; otherwise the excess over a limit or the error at the goal, in its own unit."""
+    """Amount of the violation, in its own unit. For a contact, its greatest depth [m]; for a constraint, the
+    greatest excess over its limit until it is met again; otherwise the excess over a limit, or the error at
+    start or goal."""
 
     @property
     def line(self) -> str:

@@ -38,8 +38,8 @@ class VerifySettings(Settings, name="verify"):
     """At a waypoint where the motion must stop, no joint may be faster than this [rad/s] or [m/s]."""
     rate_slack: NotNegative = 0.01
     """Fraction by which a trajectory may exceed velocity, acceleration, effort and speed limits. A velocity
-    may also differ by this fraction of its limit from that of the positions, and from zero at the start and
-    the end."""
+    may also differ by this fraction of its limit from the velocity that the positions give, and from zero at
+    the start and the end."""
     rate_agreement: NotNegative = 0.5
     """How far the acceleration of a row may be outside of the range of accelerations of the cubics before and
     after the row, as a fraction of the joint's greatest acceleration."""
@@ -50,8 +50,8 @@ class VerifySettings(Settings, name="verify"):
     are added until it leaves the lines by at most this [rad] or [m]; more are added if the clearance is
     small."""
     constraint_chord: Positive = 1e-6
-    """`chord` for validating path constraints. The tolerances of constraints are reduced by what a cubic may
-    differ from the lines."""
+    """`chord` for validating path constraints. The tolerances of constraints are reduced to cover the
+    deviation of the cubics from the lines."""
     reversal_angle: NotNegative = float(np.radians(150))
     """A change of direction in joint space by more than this [rad] is a sharp reversal."""
     reversal_step: NotNegative = 0.05
@@ -133,8 +133,8 @@ def goal_error(
     else:
         beyond = np.maximum(np.abs(T_goal_end[:3, 3]) - xyz - slack, 0.0)
         at_goal = bool(np.linalg.norm(beyond) <= blend)
-    turned = angle <= settings.goal_angle if rpy is None else _turned(T_goal_end[:3, :3], rpy, slack)
-    if at_goal and turned:
+    oriented = angle <= settings.goal_angle if rpy is None else _turned(T_goal_end[:3, :3], rpy, slack)
+    if at_goal and oriented:
         return None
     more = "" if xyz is None and rpy is None else ", which is beyond its tolerances"
     message = (
@@ -145,8 +145,8 @@ def goal_error(
 
 
 def goal_index(robot: Robot, goal: Goal, q: Configuration) -> int | None:
-    """Index of the goal at which a configuration is, among the goals of an `AnyGoal` or the rows of several
-    goal configurations; None if it is at no goal. Goals that are reached exactly come before others."""
+    """Index of the goal that a configuration reaches, among the goals of an `AnyGoal` or the rows of several
+    goal configurations; None if it reaches no goal. Goals that are reached exactly come before others."""
     goals: Sequence[Goal] = goal.goals if isinstance(goal, AnyGoal) else (goal,)
     if isinstance(goal, JointGoal):
         goals = [JointGoal(row) for row in goal.positions]
@@ -171,9 +171,9 @@ def first_place_within(
     A place is the index of a row plus the traveled fraction of the segment after it. None if no sample of the
     path is that near; samples are at most BLEND_SAMPLE_SHARE of the blend apart.
     """
-    places, way = sample_path(q, BLEND_SAMPLE_SHARE * blend, after)
-    for i in np.flatnonzero(_near(robot, goal, way, blend, settings)):
-        if goal_error(robot, goal, way[i], settings, blend) is None:
+    places, samples = sample_path(q, BLEND_SAMPLE_SHARE * blend, after)
+    for i in np.flatnonzero(_near(robot, goal, samples, blend, settings)):
+        if goal_error(robot, goal, samples[i], settings, blend) is None:
             return float(places[i])
     return None
 
@@ -204,9 +204,9 @@ def _near(
         reach = blend + settings.goal_tolerance * np.sqrt(robot.dof)
         return (np.linalg.norm(differences, axis=2) <= reach).any(axis=0)
     xyz = goal.xyz_tolerance
-    room = settings.goal_distance if xyz is None else float(np.linalg.norm(xyz + settings.goal_slack))
+    tolerance = settings.goal_distance if xyz is None else float(np.linalg.norm(xyz + settings.goal_slack))
     offsets = link_origins(robot, q, goal.frame) - goal.T_base_frame[:3, 3]
-    return np.linalg.norm(offsets, axis=1) <= room + blend
+    return np.linalg.norm(offsets, axis=1) <= tolerance + blend
 
 
 def _turned(rotation: ndarray, tolerance: ndarray, slack: float) -> bool:

@@ -33,16 +33,17 @@ class Pieces(NamedTuple):
     """The pieces of a motion, from each row to the next."""
 
     states: Callable[[Int[ndarray, "n"], Values], States]
-    """States at places, given by the index of the piece and the fraction of it that has passed, its share."""
+    """States at places. A place is the index of a piece, and its share: the traveled fraction of the
+    piece."""
     along: Stretches
-    """Bounds on positions and derivatives along each piece; derivatives are by the share."""
+    """Bounds on positions and derivatives along each piece; derivatives are with respect to the share."""
 
 
 class Excess(NamedTuple):
     """The first value that exceeds its limit, or is not proved to be within its limit."""
 
     place: float
-    """Row, plus the share of the piece after it that has passed."""
+    """Row, plus the traveled share of the piece after it."""
     joint: int
     """Index of the joint, or of the frame."""
     torque: float
@@ -106,7 +107,7 @@ def first_beyond(
     Args:
         limits: Limits of k values [k].
         values: Computes the k values [n, k] from n positions, velocities and accelerations.
-        bends: Bounds on the second derivatives of the values along each of m pieces, by the share.
+        bends: Bounds on the second derivatives of the values with respect to the share, for each of m pieces.
         states: `Pieces.states`.
         slack: Allowed excess, as a fraction of a limit.
     """
@@ -137,7 +138,7 @@ def first_beyond(
         wrong = np.flatnonzero(exceeds | unproved)
         places.append(piece[wrong] + np.where(exceeds & ~low_exceeds, high, low)[wrong])
         beyond.append((np.where(bound > allowed, bound, bound + unsure) - allowed)[wrong])
-        # halve what is undecided, and what exceeds at one end only, to locate the place
+        # halve undecided intervals, and intervals with an excess at one end only, to locate the excess
         unlocated = exceeds & (low_exceeds != high_exceeds) & (high - low > PLACE_RESOLUTION)
         halved = undecided.any(axis=1) & (unlocated | ~(exceeds | unproved))
         piece = piece[halved]

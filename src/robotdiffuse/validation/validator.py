@@ -41,7 +41,7 @@ MAX_DURATION = 1e5
 """Longest motion that is validated, about a day [s]."""
 CHORD_SHARE = 0.1
 """Collision is checked on straight lines, and certified clearances are reduced by how far the cubics leave
-them. Rows are added until the reduction is at most this fraction of the clearance."""
+these lines. Rows are added until the reduction is at most this fraction of the clearance."""
 CHORD_MARGIN = 0.9
 """Safety factor on the `chord` that is computed for the next try, so that a single retry suffices."""
 
@@ -188,12 +188,12 @@ class Verifier:
             clearance = report.min_clearance
             if clearance is None:
                 return report
-            lost = float((radii @ off).max(initial=0.0))
+            reduction = float((radii @ off).max(initial=0.0))
             allowed = max(CHORD_SHARE * clearance, settings.tightness * settings.contact / 2)
-            if lost <= allowed:
-                scene, itself = np.array([report.scene_clearance, report.self_clearance]) - lost
+            if reduction <= allowed:
+                scene, itself = np.array([report.scene_clearance, report.self_clearance]) - reduction
                 return replace(report, scene_clearance=float(scene), self_clearance=float(itself))
-            chord = CHORD_MARGIN * float(off.max()) * allowed / lost
+            chord = CHORD_MARGIN * float(off.max()) * allowed / reduction
 
     def collision_free(self, path: Path) -> bool:
         """Whether a path is certified free of collision and proved to keep the path constraints. Start, goal
@@ -232,7 +232,7 @@ class Verifier:
 
         q: configurations [n, dof]. times: their times; None for a path. found: violations that are already
         known. at_rest: whether the motion rests at each row; None: it may stop at any row. along: times and
-        configurations between which path constraints are proved; None: `times` and `q`.
+        configurations of a finer path, on which path constraints are proved; None: `times` and `q`.
         """
         bad = np.flatnonzero(~(np.abs(q) <= MAX_COORDINATE).all(axis=1))
         if len(bad):
@@ -403,8 +403,8 @@ class Verifier:
         return Violation("goal", time, f"the motion ends {off.message}", off.subject, None, off.excess)
 
     def _waypoints(self, q: ndarray, clock: ndarray, at_rest: ndarray | None) -> Violation | None:
-        """A violation for the first of the problem's waypoints that the motion misses: it must stop there, or
-        pass within the waypoint's blend, after it has reached the waypoints before."""
+        """A violation for the first of the problem's waypoints that the motion misses. The motion must stop
+        at a waypoint, or pass within the waypoint's blend, after it has reached the waypoints before."""
         problem = self.problem
         after = 0.0
         for k, (goal, blend) in enumerate(zip(problem.waypoints, problem.blend, strict=True)):
@@ -412,12 +412,15 @@ class Verifier:
                 place = first_place_within(self.robot, goal, q, blend, self.settings, after)
             else:
                 stops = np.arange(len(q)) if at_rest is None else np.flatnonzero(at_rest)
-                late = stops[stops >= after]
-                reaching = (i for i in late if goal_error(self.robot, goal, q[i], self.settings) is None)
+                later_stops = stops[stops >= after]
+                reaching = (
+                    i for i in later_stops if goal_error(self.robot, goal, q[i], self.settings) is None
+                )
                 place = next(reaching, None)
             if place is None:
                 requirement = f"pass within {blend:g} of" if blend else "stop at"
-                message = f"the motion does not {requirement} waypoints[{k}] after those before it"
+                order = f" after waypoints[{k - 1}]" if k else ""
+                message = f"the motion does not {requirement} waypoints[{k}]{order}"
                 return Violation("waypoint", float(clock[-1]), message, f"waypoints[{k}]", None, None)
             after = float(place)
         return None
@@ -503,7 +506,7 @@ def violations(
     report = verify(problem, motion, settings)
     if report.valid or (report.violation is not None and report.violation.kind in ("not_finite", "time")):
         return () if report.violation is None else (report.violation,)
-    # contacts with static obstacles and links, and joint limits, are found again below, all of them
+    # contacts with static obstacles and links, and joint limits, are left to the complete searches below
     static = {*(shape.name for shape in problem.scene.shapes), *problem.robot.link_names}
     all_violations = [
         w for w in report.found if w.kind != "limits" and not (w.kind in CONTACT_KINDS and w.other in static)

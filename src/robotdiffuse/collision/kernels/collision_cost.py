@@ -81,7 +81,8 @@ def solid_distance(solid, x, y, z):
     a = abs(u) - solid[12]
     b = abs(v) - solid[13]
     c = abs(w) - solid[14]
-    # outward directions along the first two axes; a cylinder has a single radial one
+    # outward normals (ou, ov) and (pu, pv) of the faces along the first two axes; a cylinder has only one,
+    # which is radial
     ou = np.copysign(_ONE, u)
     ov = _ZERO
     pu = _ZERO
@@ -189,7 +190,7 @@ def _subtract_torques(robot, frames, frame, wrench, grad):
 
 @allocation_free(forceinline=True)
 def _close(around, part, x, y, z, reach):
-    """Mask of the obstacles, in row `part` of 16, with bounding boxes within `reach` [m] of a point."""
+    """Mask of the obstacles in row `part` of `around` with bounding boxes within `reach` [m] of a point."""
     dx = maximum(maximum(load(around, part, 0) - x, x - load(around, part, 3)), _ZERO)
     dy = maximum(maximum(load(around, part, 1) - y, y - load(around, part, 4)), _ZERO)
     dz = maximum(maximum(load(around, part, 2) - z, z - load(around, part, 5)), _ZERO)
@@ -238,7 +239,7 @@ def _row_cost(robot, scene, g, row, frame, margin, nearest, wrench):
             while nearer:
                 nearest[first_lane(nearer)] = k
                 nearer &= nearer - 1
-    # spheres that are nearest to a point of the clouds, then the others
+    # cost of spheres that are nearest to a point of a cloud, then of spheres that are nearest to a solid
     if near_cloud:
         for i in range(robot.row_sizes[row]):
             px = lane(x, i)
@@ -369,7 +370,7 @@ def clearances_and_gradients_into(robot, scene, q, limit, margin, work, clearanc
     """
     clearances_into(robot, scene, q, limit, work, clearances)
     scratch = make_cost_workspace(q.shape[1])
-    pairs = np.zeros(len(robot.pairs), np.float32)  # clearances of 0, which a self margin of 0 does not count
+    pairs = np.zeros(len(robot.pairs), np.float32)  # no cost at a self margin of 0
     gradients[:] = np.float32(0.0)
     for i in range(len(q)):
         if clearances[i].min() < margin:

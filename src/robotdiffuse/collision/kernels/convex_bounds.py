@@ -2,7 +2,7 @@
 
 A plane that separates two convex bodies proves that they do not touch, no matter how the plane was found.
 The algorithm of Gilbert, Johnson and Keerthi (GJK, 1988) finds the best plane for the poses in the middle of
-the motion, starting from the plane of the previous motion. The bound needs only this plane: it is the
+the motion, starting from the plane of the previous motion. The bound needs only this plane: the bound is the
 smallest gap, along the plane's normal, between the vertices of one body and the other body during the motion.
 Each vertex moves from its position in the middle by t v + r with t in [-1, 1], where v is the vertex's
 velocity and r a small remainder of second order (see `lane_clearance.py`). All computations are in float64.
@@ -53,8 +53,8 @@ class Solids(NamedTuple):
     rounding: np.ndarray
     """[n] radius of the ball."""
     is_bound: np.ndarray
-    """[n] whether the solid is only the bounding box of a surface or a point cloud. Only Coal computes the
-    exact distances of these."""
+    """[n] whether the solid is only the bounding box of a surface or a point cloud. Only Coal computes
+    exact distances to such obstacles."""
     may_touch: np.ndarray
     """[checks, n] whether the link of a check may touch the obstacle; shape [0, 0] without allowed
     contacts."""
@@ -75,7 +75,7 @@ class Posture(NamedTuple):
     simplex: np.ndarray
     """[4, 3] vertices of GJK's simplex."""
     edges: np.ndarray
-    """[3, 3] its edges from the newest vertex."""
+    """[3, 3] edges of the simplex from its newest vertex."""
     points: np.ndarray
     """[3, 3] the current normal, and the support points of the two bodies along it."""
 

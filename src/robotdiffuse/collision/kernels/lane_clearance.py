@@ -57,7 +57,7 @@ class ClearanceWorkspace(NamedTuple):
     """[obstacles] whether the obstacle may be the nearest one of a group in any lane; the last entry stands
     for all points."""
     bounds: np.ndarray
-    """[obstacles, W] distances of the center of a group's bounding sphere [m]."""
+    """[obstacles, W] distances of the obstacles from the center of a group's bounding sphere [m]."""
     need: np.ndarray
     """[1, W] clearances are computed up to this value [m]; a lane with a negative value is skipped."""
     clearance: np.ndarray

@@ -5,7 +5,7 @@ The check goes from coarse to fine. What a SIMD lane stands for changes with the
 1. Frames and bounding spheres of the links: a lane is a configuration.
 2. Obstacles that a link may touch in any configuration, from their bounding boxes: a lane is an obstacle.
 3. Configurations in which the link's bounding sphere touches such an obstacle: a lane is a configuration.
-4. Whether the link's spheres touch it, one configuration after the other: a lane is a sphere.
+4. Whether the link's spheres touch the obstacle, one configuration after the other: a lane is a sphere.
 """
 
 from typing import NamedTuple

@@ -66,18 +66,18 @@ class Arm(NamedTuple):
 
 
 class Checks(NamedTuple):
-    """The checks, those against the scene first."""
+    """The checks; checks against the scene come first."""
 
     kind: np.ndarray
     """[checks] SCENE or PAIR."""
-    where: np.ndarray
+    sphere_index: np.ndarray
     """[checks] index in RobotArrays of the link's group of spheres, or of the pair of groups; -1 without
     spheres."""
     parts: np.ndarray
     """[checks, 4] index range of the link's convex parts, then of the other link's parts. In a pair, the link
     further from the base comes first."""
     base: np.ndarray
-    """[checks] the frame of what the link is checked against: frame 0, or that of the link nearer to the
+    """[checks] the frame of the other body: frame 0 for the scene, else the frame of the link nearer to the
     base."""
     common: np.ndarray
     """[checks] the frame relative to which motion is measured: `base`, or the frame where two arms part."""
@@ -86,9 +86,9 @@ class Checks(NamedTuple):
     motion_radii: np.ndarray
     """[checks, dof] bound on the motion of any point of the link, or of either link of a pair, per unit of
     joint motion, relative to `common`."""
-    undecided: np.ndarray
-    """[checks] for grazing links, distance of the convex parts up to which their mesh surfaces decide,
-    computed by Coal [m]; else 0."""
+    surfaces_below: np.ndarray
+    """[checks] for grazing links, distance of the convex parts up to which their mesh surfaces decide [m];
+    Coal computes it. Else 0."""
 
 
 class Round(NamedTuple):
@@ -110,7 +110,7 @@ class Round(NamedTuple):
 def _spread(motion, start, stop, q, dq, e, max_offset, scratch):
     """Writes q, dq, e and D (`max_offset`), as defined at the top of this file, for the piece from start to
     stop."""
-    # the ends of the piece, then the waypoints between them
+    # from the ends of the piece (the start in `dq`, the end in `scratch`), then from the waypoints between
     dof = len(q)
     configuration(motion, 0.5 * (start + stop), q)
     configuration(motion, start, dq)
@@ -190,15 +190,15 @@ def bound_by_spheres(arm, scene, motion, checks, pieces, best, work):
                     work.need[0, i] = best[kind] + rest[row, c] + FLOAT32_SLACK
             if undecided_count == 0:
                 continue
-            if checks.where[c] >= 0:
+            if checks.sphere_index[c] >= 0:
                 if kind == SCENE:
-                    group_along(arm.spheres, scene, checks.where[c], True, work)
+                    group_along(arm.spheres, scene, checks.sphere_index[c], True, work)
                 else:
-                    pair_along(arm.spheres, checks.where[c], True, work)
+                    pair_along(arm.spheres, checks.sphere_index[c], True, work)
             for row in range(first, last):
                 if not pieces.undecided[row, c]:
                     continue
-                if checks.where[c] < 0:
+                if checks.sphere_index[c] < 0:
                     clearance[row, c] = lower[row, c] = -np.inf
                     continue
                 clearance[row, c] = work.clearance[0, row - first] - FLOAT32_SLACK
@@ -244,15 +244,15 @@ def bound_by_convex_parts(arm, solids, motion, checks, bounds, best, tightness, 
                 is_posed = True
             rest = bounds.rest[row, c]
             kind = checks.kind[c]
-            coarser = bounds.clearance[row, c]
+            sphere_clearance = bounds.clearance[row, c]
             clearance, lower, best[kind], unresolved, touching = _bound_by_planes(
                 arm.hulls, solids, checks, c, rest, best[kind], tightness, contact, posture
             )
             if not unresolved:
-                bounds.clearance[row, c] = max(clearance, coarser)
+                bounds.clearance[row, c] = max(clearance, sphere_clearance)
                 bounds.lower[row, c] = max(lower, bounds.lower[row, c])
-            if unresolved and not touching and coarser > COAL_BELOW:
-                best[kind] = min(best[kind], coarser)
+            if unresolved and not touching and sphere_clearance > COAL_BELOW:
+                best[kind] = min(best[kind], sphere_clearance)
             elif touching or unresolved:
                 part_travel = 0.0
                 for p in range(checks.parts[c, 0], checks.parts[c, 1]):
@@ -301,7 +301,7 @@ def _bound_by_planes(hulls, solids, checks, c, rest, best, tightness, contact, p
                 middle, along, measured = meshes.best_plane(
                     hulls, p, solids, solid, common, tightness * best + rest, posture.planes[p, slot], posture
                 )
-                if measured and middle <= max(contact, checks.undecided[c]):
+                if measured and middle <= max(contact, checks.surfaces_below[c]):
                     touching = True
                 elif measured:
                     best = min(best, middle)
@@ -312,7 +312,7 @@ def _bound_by_planes(hulls, solids, checks, c, rest, best, tightness, contact, p
 
 @kernel()
 def settle(checks, bounds, best, certified, tightness):
-    """Settles the checks with sufficient bounds and splits pieces with other checks. Lowers
+    """Settles the checks with sufficient bounds, and splits the pieces that have undecided checks. Lowers
     certified[kind]."""
     pieces = bounds.pieces
     n, count = bounds.clearance.shape
@@ -330,7 +330,8 @@ def settle(checks, bounds, best, certified, tightness):
                 certified[kind] = min(certified[kind], lower)
                 continue
             # the loss of clearance along a piece is proportional to its length, the remainder to its square;
-            # the piece is split into the fewest parts for which their sum is likely to be small enough
+            # the piece is split into the fewest parts for which loss plus remainder is probably at most
+            # `spare`
             rest = bounds.rest[row, c]
             spare = bounds.clearance[row, c] - required
             lost = bounds.clearance[row, c] - lower - rest

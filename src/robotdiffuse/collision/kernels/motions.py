@@ -116,6 +116,7 @@ def _stretch_free(space, a, b, s, t, padding, block, work):
     blocks = max(int(np.ceil(travel / space.resolution / np.float32(W))), 1)
     step = (t - s) / np.float32(blocks * W)
     for k in range(blocks):
+        # the lanes of each block are spread evenly over the motion
         shares = (lane_numbers() * np.float32(blocks) + np.float32(blocks - k)) * step
         for j in range(dof):
             far = np.float32(b[j] - a[j])

@@ -1,8 +1,8 @@
 """The compiled part of the motion certificate among moving obstacles; see `collision/moving_obstacles.py`.
 
 A task is an interval of a timed motion, with the pairs of a link and an obstacle that are undecided there.
-The clearance of a pair is computed in the middle of the interval, from the covering spheres. From it is
-subtracted how far points of the link and of the obstacle can move from the middle to either end. The pair is
+The clearance of a pair is computed in the middle of the interval, from the covering spheres, less the
+distances that points of the link and of the obstacle can move from the middle to either end. The pair is
 settled if the result is at least the required clearance; otherwise the interval is halved. If the spheres
 touch, the pair is left to the exact meshes.
 """
@@ -307,8 +307,8 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
 
 @kernel(nogil=True)
 def free_at_times(links, tracks, q, times, least):
-    """Whether the covering spheres keep `least` [m] from all obstacles, [n, k], for each configuration of
-    q[n, dof] at each of the increasing times[k]."""
+    """For each configuration of q[n, dof] and each of the increasing times[k], whether the covering spheres
+    keep `least` [m] from all obstacles: bool[n, k]."""
     dof = q.shape[1]
     count = len(links.frame)
     obstacles = len(tracks.growth)

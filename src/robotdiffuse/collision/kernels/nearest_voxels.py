@@ -7,7 +7,7 @@ from robotdiffuse.core.kernels import allocation_free, kernel
 
 _NO_POINTS = np.int32(1 << 30)
 """Squared distance that stands for infinity, in lines without any points [voxels²]."""
-_ROUNDED = 1e-6
+_ROUNDING_SLACK = 1e-6
 """Added before a position along a line is rounded down [voxels]: more than its rounding error, less than the
 distance of a fractional position from the next integer."""
 
@@ -18,8 +18,7 @@ def nearest_voxels(run):
     at this nearest voxel.
 
     run int32[nx, ny, nz] is the number of the voxel's group of points, -1 without points; at least one voxel
-    has points. The transform goes
-    axis by axis (A. Meijster, J. Roerdink, W. Hesselink, 2000).
+    has points. The transform goes axis by axis (A. Meijster, J. Roerdink, W. Hesselink, 2000).
     """
     nx, ny, nz = run.shape
     # along z: a scan in both directions; then along y and x: lower envelopes of parabolas
@@ -50,38 +49,39 @@ def nearest_voxels(run):
 
 
 @allocation_free(fastmath=True)
-def _nearest_in_line(squares, holders, kept, since, before, whose):
+def _nearest_in_line(squares, holders, envelope, since, before, owners):
     """Updates the squared distances and nearest values of a line from the other voxels of the line.
 
     Voxel s contributes the parabola before[s] + (u - s)² at position u; the new squared distance is the lower
-    envelope of all parabolas. The first `top` + 1 entries of `kept` are the voxels on the envelope in order;
-    kept[i] is lowest from position since[i] on. `before` and `whose` are copies of the input.
+    envelope of all parabolas. The first `top` + 1 entries of `envelope` are the voxels on the envelope in
+    order; envelope[i] is lowest from position since[i] on. `before` and `owners` are copies of the input.
     """
     n = len(squares)
     top = -1
     for u in range(n):
         before[u] = squares[u]
-        whose[u] = holders[u]
+        owners[u] = holders[u]
         if before[u] == _NO_POINTS:
             continue
         while (
-            top >= 0 and before[kept[top]] + (since[top] - kept[top]) ** 2 > before[u] + (since[top] - u) ** 2
+            top >= 0
+            and before[envelope[top]] + (since[top] - envelope[top]) ** 2 > before[u] + (since[top] - u) ** 2
         ):
             top -= 1
         from_here = 0
         if top >= 0:
-            s = kept[top]
+            s = envelope[top]
             offset = np.float64(u * u - s * s + before[u] - before[s])
-            from_here = 1 + int(offset / np.float64(2 * (u - s)) + _ROUNDED)
+            from_here = 1 + int(offset / np.float64(2 * (u - s)) + _ROUNDING_SLACK)
         if from_here < n:
             top += 1
-            kept[top] = u
+            envelope[top] = u
             since[top] = from_here
     if top < 0:
         return
     for u in range(n - 1, -1, -1):
-        s = kept[top]
+        s = envelope[top]
         squares[u] = before[s] + (u - s) ** 2
-        holders[u] = whose[s]
+        holders[u] = owners[s]
         if u == since[top]:
             top -= 1

@@ -8,7 +8,7 @@ distance e from the center of its voxel, a query knows the distance to within e.
 enough, it computes the distances to the points in the cells around. `point_cloud_grid.py` builds the arrays,
 which are fields of SceneArrays.
 
-Coordinates called f are in voxels from the grid's origin, and c are the same clamped to the grid. i is the
+Coordinates called f are in voxels from the grid's origin; c is f clamped to the grid. i is the
 voxel, e the offset from the voxel's center, and o = f - c the offset of a query outside the grid. Entries of
 `scene.grid_frame`: 0 to 2 origin, 3 voxel, 4 cell, 5 and 6 largest and smallest radius of a point, 7 band, 8
 to 10 numbers of voxels, 11 to 13 numbers of cells.
@@ -288,7 +288,7 @@ def _columns(frame, rx, ry, reach):
 
 @allocation_free(forceinline=True)
 def _in_column(scene, i, j, rx, ry, rz, reach):
-    """Index range of the points in a column's cells within `reach` [m]; empty if no cell is."""
+    """Index range of the points in a column's cells within `reach` [m]; empty if there are none."""
     frame = scene.grid_frame
     cell = frame[4]
     my = int(frame[12])

@@ -12,7 +12,7 @@ FAMILIES = Registry(
     "family",
     {
         "rop": Entry(f"{HERE}.rop:ROP", "the paper's: two spheres or cubes around the arm, and a floor"),
-        "rop_dense": Entry(f"{HERE}.rop:ROP_DENSE", "3 to 12 smaller spheres or cubes of varied size"),
+        "rop_dense": Entry(f"{HERE}.rop:ROP_DENSE", "3 to 12 spheres or cubes of varied size"),
         "shelf": Entry(f"{HERE}.furniture:SHELF", "from one compartment of a bookcase to another"),
         "crate": Entry(f"{HERE}.furniture:CRATE", "in and out of open-topped boxes on the ground"),
         "table": Entry(f"{HERE}.furniture:TABLE", "between the objects on a table, and beneath it"),

@@ -74,7 +74,8 @@ class SampledProblem:
     """Target pose of the tip. If the target is only a position, the first goal gives the orientation."""
 
     def problem(self, robot: Robot) -> Problem:
-        """The problem of reaching any goal, or a configuration that full turns of joints make from a goal."""
+        """The problem of reaching any of the goals, or a configuration full turns of joints away from a
+        goal."""
         goals = np.concatenate([robot.equivalent_configurations(goal, self.start) for goal in self.goals])
         return Problem(robot, self.scene, self.start, JointGoal(goals))
 

@@ -43,7 +43,7 @@ FLOOR = Box((0.0, 0.0, -0.05), (3.0, 3.0, 0.1), name="floor")
 SHOULDER = np.array([0.0, 0.0, 0.33])
 """Point from which reaches are measured: a Panda's shoulder, in the base frame [m]."""
 REGION_MARGIN = 0.03
-"""Distance of targets from the sides of their region, if it is wide enough [m]."""
+"""Distance of targets from the sides of their region, if the region is wide enough [m]."""
 FINGER_LENGTH = 0.1
 """Approximate distance from the origin of a Panda's tip link, along its z axis, to its fingertips [m]."""
 HAND_LENGTH = 0.3
@@ -141,7 +141,7 @@ class Furniture(Ranges, ABC):
 
     @abstractmethod
     def build(self, rng: Generator) -> "Sequence[FurnitureFrame]":
-        """The pieces of furniture with all their regions, also those out of reach. Raises NoRoomError if
+        """The pieces of furniture with all their regions, also regions out of reach. Raises NoRoomError if
         objects do not fit."""
 
     @property
@@ -175,8 +175,8 @@ class Furniture(Ranges, ABC):
             if len(regions) >= 2 and all(is_clear_of(shape, keep_out) for shape in shapes):
                 return FurnishedScene(Scene([self.floor, *shapes]), tuple(regions))
         raise InputError(
-            f"no scene of {type(self).__name__} with two regions in reach and nothing in the robot's base in "
-            f"{MAX_TRIES} samples; change distance or reach"
+            f"none of {MAX_TRIES} scenes of {type(self).__name__} has two regions in reach and no obstacle "
+            "in the robot's base; change distance or reach"
         )
 
     def scene(self, rng: Generator, keep_out: Spheres | None = None) -> Scene:
@@ -784,14 +784,14 @@ class Cabinet(Furniture):
         ]
         kinds = rng.random(len(cells))
         drawers = np.flatnonzero(kinds < self.drawer_share)[: self.max_drawers]
-        widest = min(self.door_angle[1], np.pi / 2) if len(drawers) else self.door_angle[1]
+        max_angle = min(self.door_angle[1], np.pi / 2) if len(drawers) else self.door_angle[1]
         free = []
         for i, cell in enumerate(cells):
             if i in drawers:
                 regions.append((*self._drawer(frame, cell, depth, t, rng), DOWN))
             elif kinds[i] > 1 - self.door_share:
                 shut = rng.random() < self.shut_share
-                angle = 0.0 if shut else rng.uniform(self.door_angle[0], widest)
+                angle = 0.0 if shut else rng.uniform(self.door_angle[0], max_angle)
                 _door(frame, cell, t, angle, rng.random() < 0.5)
                 free += [] if shut else [[*cell]]
             else:

@@ -270,7 +270,7 @@ def test_files_of_another_robot_are_refused_by_its_joints(tmp_path: Path) -> Non
         rd.load_problem(file)
     text = str(raised.value)
     assert "robot_state.joint_state has values of gripper_finger1_joint, movable joints that ur5 lacks" in text
-    assert "robot_model_name is ur5_robotiq85" in text and "its own are shoulder_pan_joint, " in text
+    assert "robot_model_name is ur5_robotiq85" in text and "its movable joints are shoulder_pan_joint, " in text
     refuses(r"scene0001.yaml: .* gripper_finger1_joint", read_moveit_scene, tmp_path / "scene0001.yaml", rd.load_robot("ur5"))
     [entry] = load_motion_bench_maker(tmp_path, rd.load_robot("ur5"))
     assert "gripper_finger1_joint" in entry.error
@@ -411,7 +411,7 @@ WRONG_REQUESTS: dict[str, tuple[object, str]] = {
     ),
     "two poses": (
         request_data() | {"goal_constraints": [pose_constraint(), pose_constraint()]},
-        "joint_constraints alone, or be the only goal",
+        "joint_constraints alone; only a single goal may be a pose",
     ),
     "position alone": (pose_request(["orientation_constraints"], []), "one position and one orientation"),
     "offset": (pose_request(["position_constraints", 0, "target_point_offset"], [0, 0, 1]), "must be zero"),
@@ -497,7 +497,7 @@ def test_poses_compose_from_the_base_outwards() -> None:
 def test_scene_in_the_world_of_a_robot_whose_base_moves_there_is_refused(tmp_path: Path) -> None:
     robot = mounted(tmp_path, "prismatic")
     fixed = {"transform": {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1]}, "child_frame_id": "world"}
-    refuses("a joint moves base in world", place, at("world", fixed_frame_transforms=[fixed]), robot)
+    refuses("a joint moves base relative to world", place, at("world", fixed_frame_transforms=[fixed]), robot)
     assert place(at("base"), robot) == [0, 0, 0]
 
 
