@@ -118,7 +118,7 @@ class MovingCollision:
 
     def inflated(self, by: Float[ndarray, "obstacles"]) -> "MovingCollision":
         """A copy for `first_unproved_time` in which each obstacle is inflated by a distance [m]. Only the
-        covering spheres' bounds use it, not the exact meshes."""
+        covering spheres' bounds use the inflation, not the exact meshes."""
         inflated = copy(self)
         inflated.tracks = self.tracks._replace(rounding=self.tracks.rounding + by)
         return inflated

@@ -12,12 +12,12 @@ the value of each must not exceed a limit:
 - ROLL_PITCH_YAW: the largest excess of roll, pitch or yaw, relative to a reference, over its tolerance [rad].
   Only goals have such rows, not motions.
 
-A piece of a motion is proved to satisfy a row from the poses at its two ends. Along the piece, the joints
-move by dq at constant rates.
+The poses at the two ends of a piece of a motion prove that the piece satisfies a row. Along the piece, the
+joints move by dq at constant rates.
 
-- DISTANCE: the frame's origin p leaves the straight line between its positions at the two ends by at most an
-  eighth of its second derivative. This derivative is at most sum_jk |dq_j dq_k| r_max(j,k), where r_k, the
-  lever of joint k, is the distance from its axis to p. Distance to a box is convex with slope 1, so it is at
+- DISTANCE: the frame's origin p leaves the straight line between the two ends by at most an eighth of the
+  second derivative of p. This derivative is at most sum_jk |dq_j dq_k| r_max(j,k), where r_k, the lever of
+  joint k, is the distance from the joint's axis to p. Distance to a box is convex with slope 1, so it is at
   most this deviation plus the larger value at the two ends.
 - CONE: the cosine of the angle is linear in the axis; the axis has a second derivative of at most
   (sum_j |dq_j|)².

@@ -241,13 +241,13 @@ def _moveit_problem(scene_file: Path, robot: Robot | None, ignore_joints: bool) 
     with located(request_file):
         request = moveit_request(read_yaml(request_file), frames, scene_file.parent)
     with located(scene_file):
-        scene = moveit_scene(data, frames, scene_file.parent, _linkable(robot, request))
+        scene = moveit_scene(data, frames, scene_file.parent, _link_and_object_names(robot, request))
     with located(request_file):
         notes += request.robot_notes(robot, moveit_model(data), ignore_joints)
         return _requested(robot, scene, request, notes, {})
 
 
-def _linkable(robot: Robot, request: MoveItRequest | None) -> tuple[str, ...]:
+def _link_and_object_names(robot: Robot, request: MoveItRequest | None) -> tuple[str, ...]:
     """Names of the robot's links and of the objects that it holds at the start."""
     return (*robot.link_names, *(attached.name for attached in (request.attached if request else ())))
 
@@ -270,8 +270,8 @@ def _requested(
             or abs(locked - start_value) <= MIMIC_SLACK
         ):
             continue
-        implied = f"planned at {locked:g}, which {joint.mimic.joint} implies"
-        notes.append(f"start_state: {joint.name} is {start_value:g}; {implied}")
+        implied = f"it mimics {joint.mimic.joint}: planned at {locked:g}"
+        notes.append(f"start_state: {joint.name} is {start_value:g}, but {implied}")
 
     start = robot.planned_values("start_state", request.start)
     for attached in request.attached:
@@ -323,7 +323,9 @@ def _problem(
             request = moveit_request(read_yaml(folder / str(values["request"])), frames, folder)
         if from_moveit:
             scene_folder = (folder / values["scene"]).parent
-            scene = moveit_scene(content, frames, scene_folder, _linkable(robot, request), contacts)
+            scene = moveit_scene(
+                content, frames, scene_folder, _link_and_object_names(robot, request), contacts
+            )
         else:
             scene, scene_notes = read_scene(values["scene"], folder, contacts)
             notes += scene_notes

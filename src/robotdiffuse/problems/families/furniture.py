@@ -84,7 +84,7 @@ class Region:
     yaw: float
     """Rotation of the box about the vertical axis [rad]."""
     approach: Vector
-    """Unit vector, in the base frame, in which the hand points: into a compartment, or down into a crate."""
+    """Unit vector of the hand's direction, in the base frame: into a compartment, or down into a crate."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -318,7 +318,7 @@ def test_a_mimic_joint_elsewhere_than_its_master_puts_it_is_a_note(tmp_path: Pat
     request = {"start_state": here, "goal_constraints": [goal]}
     (tmp_path / "request0001.yaml").write_text(yaml.safe_dump(request))
     [entry] = load_motion_bench_maker(tmp_path, robot)
-    assert entry.load().notes == ("start_state: follow is 0.01; planned at 0.03, which grip implies",)
+    assert entry.load().notes == ("start_state: follow is 0.01, but it mimics grip: planned at 0.03",)
 
 
 def pose_constraint() -> dict[str, Any]:
