@@ -168,9 +168,9 @@ def library(data: str, robot: Robot) -> Trajectories:
 def bent(
     motions: Float[ndarray, "n waypoints dof"], start: Configuration, goal: Configuration, count: int
 ) -> Trajectories:
-    """The motions, forwards or backwards, with first and last waypoints nearest to start and goal; the
-    nearest first. They are bent to begin at the start and end at the goal: the differences there are
-    interpolated linearly along the motion and added."""
+    """The `count` motions, forwards or backwards, that begin and end nearest to start and goal; the nearest
+    first. Each motion is bent to begin at the start and end at the goal: the offsets of its two ends from
+    them are interpolated linearly along the motion and subtracted."""
     both_directions = np.concatenate([motions, motions[:, ::-1]])
     ends = np.stack([start, goal])
     distance = np.square(both_directions[:, [0, -1]] - ends).sum(axis=(1, 2))

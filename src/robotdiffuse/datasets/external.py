@@ -305,11 +305,11 @@ def _read(file: str | FilePath) -> tuple[Float32[ndarray, "n 254 7"], Float32[nd
         if not np.isfinite(array).all():
             raise InputError(f"{file}: {name} holds numbers that are not finite")
     for name, stated, actual in (("start", y[:, :DOF], x[:, 0]), ("goal", y[:, DOF : 2 * DOF], x[:, -1])):
-        off = np.abs(stated - actual).max(axis=1)
-        if off.max() > END_TOLERANCE:
+        difference = np.abs(stated - actual).max(axis=1)
+        if difference.max() > END_TOLERANCE:
             end = "first" if name == "start" else "last"
             raise InputError(
-                f"{file}: row {off.argmax()} has a {name} that differs from its {end} waypoint by "
-                f"{off.max():.3g} rad; they must be the same"
+                f"{file}: row {difference.argmax()} has a {name} that differs from its {end} waypoint by "
+                f"{difference.max():.3g} rad; they must be the same"
             )
     return x, y[:, 2 * DOF : 2 * DOF + 6].reshape(-1, 2, 3)

@@ -59,8 +59,8 @@ EXAMPLES_PER_KIND = 5
 LIMIT_SLACK = 1e-6
 """Tolerance of joint limits [rad], since waypoints have single precision."""
 CLEARANCE_TOLERANCE = 1e-4
-"""Largest difference between the recorded clearance and the measured one: the smallest clearance of the
-covering spheres over the waypoints [m]."""
+"""Largest difference between the recorded and the measured clearance of a motion [m]. This clearance is the
+smallest one of the covering spheres over the waypoints."""
 COST_TOLERANCE = 0.05
 """Largest fraction by which the path through the stored waypoints, which cuts corners, may be shorter than
 the recorded length."""
@@ -298,15 +298,15 @@ def _ends(shard: Shard, row: int) -> Defects:
     q = shard["trajectories"][row]
     goals = shard["goals"][row]
     goal = int(shard["goal_index"][row])
-    off = np.abs(q[0] - shard["start"][row]).max()
-    if off:
-        yield "ends", f"the first waypoint differs from the start by {off:.3g}"
+    difference = np.abs(q[0] - shard["start"][row]).max()
+    if difference:
+        yield "ends", f"the first waypoint differs from the start by {difference:.3g}"
     if not 0 <= goal < len(goals) or np.isnan(goals[goal]).any():
         yield "ends", f"goal_index is {goal}; there is no such goal"
         return
-    off = np.abs(q[-1] - goals[goal]).max()
-    if off:
-        yield "ends", f"the last waypoint differs from goal {goal} by {off:.3g}"
+    difference = np.abs(q[-1] - goals[goal]).max()
+    if difference:
+        yield "ends", f"the last waypoint differs from goal {goal} by {difference:.3g}"
 
 
 def _limits(robot: Robot, q: Configurations) -> Defects:

@@ -12,8 +12,8 @@ h = max(S - D, 0) of a safe distance S and a distance D:
 
 The first two costs depend on single waypoints. Each waypoint is pushed by the smallest motion that clears a
 contact (a Gauss-Newton step), and a kernel spreads the pushes over the neighboring waypoints, as the metric
-of CHOMP does (Zucker et al., IJRR 2013). Length is the smoothness of CHOMP; it moves one waypoint after the
-other towards its optimum between its neighbors.
+of CHOMP does (Zucker et al., IJRR 2013). The cost of length is CHOMP's smoothness; its
+step moves each waypoint towards the middle of its two neighbors.
 
 A problem's path constraints are one more cost: the sum of h^2 / 2 over their rows (scalar constraints), where
 h is how far a row's value exceeds a share of its tolerance [m]; a radian counts as
