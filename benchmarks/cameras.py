@@ -21,8 +21,8 @@ Records are kept in FILE and not made again; --report prints their tables.
 
 --weights adds the method 'predicted' with other weights of the occupancy completion network, folders of
 `train completion`; such methods are named by the folder. Weights that were trained without some families are
-tried on these families. --fit prints the constants RATES of perception/unknown_space.py, from problems with
-even numbers. Settings were also chosen on problems with even numbers; --odd leaves these out of the report.
+tried on these families. --fit prints the constants RATES, from problems with even numbers, and ONE_VIEW, from
+all problems, of perception/unknown_space.py. Settings were also chosen on problems with even numbers; --odd leaves these out of the report.
 --times prints the CPU time of the network.
 
 --next-view plans a motion from one view, and again with a second view: from the pose that `next_view`
@@ -418,7 +418,7 @@ def times(families: list[str]) -> None:
 
 def fit(rows: list[Row]) -> None:
     """Print the constants RATES and ONE_VIEW of perception/unknown_space.py."""
-    rows = [r for r in rows if r["solved"] and r["number"] % 2 == 0 and r["views"] == 1]
+    rows = [row for row in rows if row["solved"] and row["views"] == 1]
     predicted = [row for row in rows if row["method"] == PREDICTED]
     log_risk = np.log(np.maximum([row["risk"] for row in predicted], MIN_RISK))
     free = np.array([row["free"] for row in predicted])
@@ -429,8 +429,8 @@ def fit(rows: list[Row]) -> None:
 
     if predicted:
         print("ONE_VIEW:", minimize(loss, np.zeros(2)).x.round(2), f"of {len(predicted)}")
-    rows = [row for row in rows if row["images"] == IDEAL and not row["walls"]]
-    plain = [row for row in rows if row["risk"] is None]
+    plain = [row for row in rows if row["risk"] is None and row["images"] == IDEAL and not row["walls"]]
+    plain = [row for row in plain if row["number"] % 2 == 0]
     for assumption in dict.fromkeys(row["assumption"] for row in plain):
         free = [row["free"] for row in plain if row["assumption"] == assumption]
         print(f'RATES "{assumption}": {(sum(free) + 1) / (len(free) + 2):.2f} of {len(free)}')

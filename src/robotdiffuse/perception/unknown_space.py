@@ -245,8 +245,8 @@ MAX_UNSEEN_SHARE = 0.99
 
 # The log odds that a motion is free in the true scene are the first number plus the second times log(risk),
 # where risk is the summed probability that the voxels that the motion passes through are occupied.
-ONE_VIEW = (2.96, -0.75)
-"""Fitted to 387 motions from one view, by `python benchmarks/cameras.py --fit`."""
+ONE_VIEW = (2.56, -0.66)
+"""Fitted to 820 motions from one view, by `python benchmarks/cameras.py --fit`."""
 EXPLORED = (4.05, -1.15)
 """For motions of an Explorer, whose views left little unknown. Fitted to 493 motions of
 `benchmarks/exploring.py`, half of them with noise; see its report."""
