@@ -22,7 +22,8 @@ Records are kept in FILE and not made again; --report prints their tables.
 --weights adds the method 'predicted' with other weights of the occupancy completion network, folders of
 `train completion`; such methods are named by the folder. Weights that were trained without some families are
 tried on these families. --fit prints the constants RATES, from problems with even numbers, and ONE_VIEW, from
-all problems, of perception/unknown_space.py. Settings were also chosen on problems with even numbers; --odd leaves these out of the report.
+all problems, of perception/unknown_space.py. Settings were also chosen on problems with even numbers; --odd
+leaves these out of the report.
 --times prints the CPU time of the network.
 
 --next-view plans a motion from one view, and again with a second view: from the pose that `next_view`
