@@ -98,7 +98,7 @@ def test_problem_of_a_jsonl_file(tmp_path: Path, said: Said) -> None:
     file = tmp_path / "problems.jsonl"
     blocked = PROBLEM | melon(-0.45)
     file.write_text(f"{json.dumps(PROBLEM)}\n{json.dumps(blocked)}\n")
-    assert run("plan", file, "--planner", "rrt_connect", "--time-limit", 5) == 0
+    assert run("plan", file, "--planner", "rrt_connect", "--time-limit", 5, "--until", "first") == 0
     assert "invalid_start" in said(1, "plan", file, "--planner", "rrt_connect", "--index", 1)
 
 
@@ -134,7 +134,7 @@ def test_demo(tmp_path: Path, said: Said) -> None:
 
 @pytest.mark.parametrize("file", EXAMPLES, ids=lambda file: file.name)
 def test_examples_are_solved(file: Path) -> None:
-    assert run("plan", file, "--planner", "rrt_connect", "--time-limit", 5) == 0
+    assert run("plan", file, "--planner", "rrt_connect", "--time-limit", 5, "--until", "first") == 0
 
 
 def test_the_clearance_is_printed_beside_the_requested_one(tmp_path: Path, said: Said) -> None:

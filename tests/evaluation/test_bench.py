@@ -81,7 +81,8 @@ def faulty(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("faulty")
-def test_failures_of_every_kind_are_records_and_the_run_goes_on(tmp_path: Path) -> None:
+def test_failures_of_every_kind_are_records_and_the_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench, "GRACE", 8.0)
     asked = replace(settings(tmp_path, "faulty", count=1), seeds=7, time_limit=0.5)
     assert bench.run_bench(asked, quiet, quiet) == 7
     found = {record.seed: record for record in read_records(tmp_path)["faulty"]}

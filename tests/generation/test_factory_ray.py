@@ -103,6 +103,7 @@ def test_bench_on_a_cluster_is_as_on_this_machine(cluster: Any, tmp_path: Path) 
     assert [record.positions for record in sorted(there, key=lambda r: r.name)] == [r.positions for r in here]
 
 
+@pytest.mark.slow
 def test_many_problems_with_a_node_killed_are_as_on_this_machine(cluster, monkeypatch):
     monkeypatch.setattr(plan_many, "PROBLEMS_PER_TASK", 1)
     node = cluster.add_node(num_cpus=1, object_store_memory=STORE)

@@ -44,6 +44,8 @@ if __name__ == "__main__":
     from helpers.faulty_planner import ENTRY
     from robotdiffuse.cli import main
     from robotdiffuse.planning import PLANNERS
+    from robotdiffuse.server import connection
 
     PLANNERS["faulty"] = ENTRY
+    connection.READ_TIMEOUT = 3.0
     sys.exit(main())

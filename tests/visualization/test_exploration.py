@@ -38,6 +38,7 @@ def test_a_cube_has_six_faces_around_it() -> None:
 SMALL = PictureSettings(width=240, height=150, ghosts=1)
 
 
+@pytest.mark.usefixtures("small_pictures")
 def test_each_moment_has_a_picture(tmp_path: Path) -> None:
     problem, explorer = recorded()
     exploration.write_exploration_picture(explorer, problem.scene, tmp_path / "explore.png", SMALL)
