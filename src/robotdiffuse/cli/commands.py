@@ -625,7 +625,11 @@ TRAINING = (
     ("--batch N", "batch size", count),
     ("--learning-rate X", "peak learning rate", positive),
     ("--threads N", "number of PyTorch threads", count),
-    ("--checkpoint-seconds S", "time between checkpoints [s] (default: 120)", positive),
+    (
+        "--checkpoint-seconds S",
+        "time between checkpoints [s] (default: 120; encoder: 60; config paper: 1800)",
+        positive,
+    ),
 )
 DEVICE = ("--device NAME", "cpu or cuda (default: cuda if there is one)")
 TRAIN = Command(

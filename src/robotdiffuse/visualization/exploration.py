@@ -28,6 +28,7 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.visualization.arm import DrawnArm
 from robotdiffuse.visualization.picture import (
     MARGINS,
+    WHITE,
     Camera,
     ClearSurface,
     PictureSettings,
@@ -56,8 +57,7 @@ MAX_MOMENTS = 6
 TILE = PictureSettings(width=720, height=450, ghosts=2)
 """Size and contents of the picture of one moment."""
 GAP = 6
-"""Space between the pictures of two moments [pixels]."""
-GAP_COLOR = (0xFF, 0xFF, 0xFF)
+"""White space between the pictures of two moments [pixels]."""
 UNKNOWN_ALPHA = 0.27
 PREDICTED_ALPHA = 0.55
 SHARE_COLORS = ((0x8A, 0x93, 0xA0), UNKNOWN)
@@ -66,7 +66,6 @@ CAPTION_SIZE = 1.7
 """Factor on the size of a caption's letters."""
 FADE = (0.7, 0.95)
 """Where pictures of moments fade behind their caption, and how much; arguments of `faded_below`."""
-WHITE = (0xFF, 0xFF, 0xFF)
 LAYERS = (
     {"name": "Occupied", "color": OBSERVED, "opacity": 1.0, "order": 0},
     {"name": "Predicted", "color": ASSUMED, "opacity": 0.6, "order": 1},
@@ -269,7 +268,7 @@ def _joined(tiles: list[Image.Image]) -> Image.Image:
     rows = -(-len(tiles) // columns)
     width = tiles[0].width + GAP
     height = tiles[0].height + GAP
-    sheet = Image.new("RGB", (columns * width - GAP, rows * height - GAP), GAP_COLOR)
+    sheet = Image.new("RGB", (columns * width - GAP, rows * height - GAP), WHITE)
     for i, tile in enumerate(tiles):
         sheet.paste(tile, (i % columns * width, i // columns * height))
     return sheet

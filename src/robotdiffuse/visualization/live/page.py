@@ -653,12 +653,13 @@ class Obstacles:
         for name in [name for name in self._nodes if name not in names]:
             self._nodes.pop(name)[1].remove()
         for obstacle in obstacles:
-            key = _appearance(obstacle.shape), obstacle.color, obstacle.name == selected
+            is_selected = obstacle.name == selected
+            key = _appearance(obstacle.shape), obstacle.color, is_selected
             drawn_node = self._nodes.get(obstacle.name)
             if drawn_node is None or drawn_node[0] != key:
                 if drawn_node is not None:
                     drawn_node[1].remove()
-                self._nodes[obstacle.name] = key, self._draw(obstacle, obstacle.name == selected)
+                self._nodes[obstacle.name] = key, self._draw(obstacle, is_selected)
             place(self._nodes[obstacle.name][1], obstacle.frame(time))
 
     def _draw(self, obstacle: Drawable, selected: bool) -> Any:
