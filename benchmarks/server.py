@@ -183,7 +183,7 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=5, help="number of workers that are killed (5)")
     parser.add_argument("--problems", type=int, default=10, help="number of problems of each family (10)")
     parser.add_argument("--planner", default="robotdiffuse", help="planner to use (robotdiffuse)")
-    small = {"seconds": 4.0, "clients": 2, "workers": 1, "kills": 1, "problems": 1, "planner": "rrt_connect"}
+    small = {"seconds": 2.0, "clients": 2, "workers": 1, "kills": 1, "problems": 1, "planner": "aorrtc"}
     arguments = parse(parser, **small)
     print(header("numpy", "numba", "fastapi", "uvicorn"), "\n")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
