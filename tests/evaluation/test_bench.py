@@ -20,7 +20,7 @@ from robotdiffuse.cli import main
 from robotdiffuse.core import registry
 from robotdiffuse.core.registry import Entry
 from robotdiffuse.evaluation import bench
-from robotdiffuse.evaluation.bench_report import LATE_SECONDS
+from robotdiffuse.evaluation.bench_comparisons import LATE_SECONDS
 from robotdiffuse.evaluation.metrics import METRICS
 from robotdiffuse.evaluation.problem_sets import gather_cases, problem_set_name, validator
 from robotdiffuse.evaluation.runs import Record, RecordFile, Run, read_records

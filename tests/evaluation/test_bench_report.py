@@ -13,7 +13,7 @@ import robotdiffuse as rd
 from helpers.refusals import refuses
 from robotdiffuse.cli import main
 from robotdiffuse.core.tables import Table
-from robotdiffuse.evaluation import bench_report
+from robotdiffuse.evaluation import bench_comparisons, bench_report
 from robotdiffuse.evaluation.metrics import METRICS, Metric, measured
 from robotdiffuse.evaluation.problem_sets import case_file
 from robotdiffuse.evaluation.report import draw_plot
@@ -93,7 +93,7 @@ def small(tmp_path: Path) -> Path:
     return write(tmp_path / "small_run", records)
 
 
-def rows(section: bench_report.Section, limit: float) -> dict[str, bench_report.Row]:
+def rows(section: bench_comparisons.Section, limit: float) -> dict[str, bench_comparisons.Row]:
     (found,) = (c for c in section.comparisons if c.limit == limit)
     return {row.planner: row for row in found.rows}
 
@@ -102,33 +102,33 @@ def test_a_call_counts_for_shorter_limits_and_for_longer_ones_if_it_ended_by_its
     short = failed("mpnet", "a", 0.1, 0.1)
     middle = failed("mpnet", "a", 1.0, 0.5)
     long = failed("mpnet", "a", 10.0, 10.0)
-    assert bench_report.deciding_record([short, middle, long], 0.05) is short
-    assert bench_report.deciding_record([short, middle, long], 0.5) is middle
-    assert bench_report.deciding_record([short, middle, long], 5.0) is long
-    assert bench_report.deciding_record([short, middle, long], 60.0) is middle
-    assert bench_report.deciding_record([short], 1.0) is None
-    assert bench_report.deciding_record([failed("mpnet", "a", 1.0, 0.0, status="crashed")], 2.0) is None
+    assert bench_comparisons.deciding_record([short, middle, long], 0.05) is short
+    assert bench_comparisons.deciding_record([short, middle, long], 0.5) is middle
+    assert bench_comparisons.deciding_record([short, middle, long], 5.0) is long
+    assert bench_comparisons.deciding_record([short, middle, long], 60.0) is middle
+    assert bench_comparisons.deciding_record([short], 1.0) is None
+    assert bench_comparisons.deciding_record([failed("mpnet", "a", 1.0, 0.0, status="crashed")], 2.0) is None
 
 
 def test_an_outcome_is_what_was_found_by_then() -> None:
     record = solved("ompl_rrt_star", "a", 10.0, [(0.5, 4.0), (2.0, 3.0)], time=10.0)
-    before, between, after = (bench_report.outcome(record, t) for t in (0.4, 1.0, 10.0))
+    before, between, after = (bench_comparisons.outcome(record, t) for t in (0.4, 1.0, 10.0))
     assert not before.solved and np.isnan(before.joint_length)
-    assert before.returned == 0.4 and before.failure == bench_report.LATER
+    assert before.returned == 0.4 and before.failure == bench_comparisons.LATER
     assert (between.found, between.returned) == (0.5, 1.0)
     assert (between.joint_length, between.link_length) == (4.0, pytest.approx(12.0))  # 9 x 4 / 3
     assert (after.joint_length, after.link_length) == (3.0, 9.0)
     # the validator may end after the limit of the call alone
-    assert bench_report.outcome(solved("mpd", "a", 1.0, [(1.08, 4.0)]), 1.0).found == 1.0
-    assert not bench_report.outcome(solved("mpd", "a", 1.0, [(1.2, 4.0)]), 1.0).solved
-    assert not bench_report.outcome(solved("mpd", "a", 2.0, [(1.08, 4.0)]), 1.0).solved
+    assert bench_comparisons.outcome(solved("mpd", "a", 1.0, [(1.08, 4.0)]), 1.0).found == 1.0
+    assert not bench_comparisons.outcome(solved("mpd", "a", 1.0, [(1.2, 4.0)]), 1.0).solved
+    assert not bench_comparisons.outcome(solved("mpd", "a", 2.0, [(1.08, 4.0)]), 1.0).solved
 
 
 def test_figures_of_a_small_run(small: Path) -> None:
-    bench = bench_report.read_bench(small)
+    bench = bench_comparisons.read_bench(small)
     assert next(iter(bench.records)) == bench.reference == "robotdiffuse"
     assert set(bench.records) == {"robotdiffuse", "mpnet", "ompl_rrt_star"}
-    whole, apart = bench_report.sections(bench)
+    whole, apart = bench_comparisons.sections(bench)
     assert (whole.name, apart.name) == ("rop", "rop, non-trivial")
     assert [c.limit for c in whole.comparisons] == [0.1, 1.0, 10.0]
     assert [c.problems for c in whole.comparisons] == [4, 4, 4]
@@ -137,11 +137,11 @@ def test_figures_of_a_small_run(small: Path) -> None:
     assert [row.figures.success for row in star] == [25, 50, 75]
     assert star[0].figures.length == 9.0  # improved by 0.075 s
     assert [o.found for o in star[1].solved] == [0.05, 0.5]
-    assert star[1].figures.time == 1.0 and star[2].failures == {bench_report.RAN_OUT: 1}
+    assert star[1].figures.time == 1.0 and star[2].failures == {bench_comparisons.RAN_OUT: 1}
     net = rows(whole, 1.0)["mpnet"]
     assert (net.figures.success, net.figures.collision) == (50, 25)
     assert net.interval == pytest.approx((0.150, 0.850), abs=1e-3)
-    assert net.failures == {"scene collision": 1, bench_report.GAVE_UP: 1}
+    assert net.failures == {"scene collision": 1, bench_comparisons.GAVE_UP: 1}
     assert net.figures.time == pytest.approx((0.02 + 1 + 1 + 0.02) / 4)
     assert net.paired is not None
     assert (net.paired.a_only, net.paired.b_only, net.paired.both) == (0, 2, 2)
@@ -167,7 +167,7 @@ def test_compared_are_problems_that_all_planners_were_given_this_time_for(tmp_pa
     records += [failed("edmp", name, 1.0, 1.0) for name in names]
     folder = write(tmp_path / "run", records, {10.0: 2})
     keep_problems(folder, names)
-    (section,) = bench_report.sections(bench_report.read_bench(folder))
+    (section,) = bench_comparisons.sections(bench_comparisons.read_bench(folder))
     whole = {c.limit: c for c in section.comparisons}
     assert whole[1.0].problems == 6 and whole[1.0].missing == ()
     assert (whole[10.0].problems, whole[10.0].section_problems) == (2, 6)
@@ -183,7 +183,7 @@ def test_seeds_of_a_problem_are_one_row_of_the_comparison(tmp_path: Path) -> Non
         records.append(solved("robotdiffuse", "b", 1.0, [(0.1, 2.0)], seed=seed))
         one = solved("mpd", "b", 1.0, [(0.1, 2.0)], seed=seed)
         records.append(one if seed == 0 else failed("mpd", "b", 1.0, 1.0, seed=seed))
-    (section,) = bench_report.sections(bench_report.read_bench(write(tmp_path / "run", records)), [1.0])
+    (section,) = bench_comparisons.sections(bench_comparisons.read_bench(write(tmp_path / "run", records)), [1.0])
     row = rows(section, 1.0)["mpd"]
     assert section.main.seeds == 3 and row.figures.success == pytest.approx(400 / 6)
     assert row.paired is not None and (row.paired.both, row.paired.b_only) == (1, 1)
@@ -191,7 +191,7 @@ def test_seeds_of_a_problem_are_one_row_of_the_comparison(tmp_path: Path) -> Non
 
 
 def test_curves_end_where_they_are_no_longer_known_of_all_problems(small: Path) -> None:
-    whole, _ = bench_report.sections(bench_report.read_bench(small))
+    whole, _ = bench_comparisons.sections(bench_comparisons.read_bench(small))
     curves = {curve.planner: curve for curve in whole.curves}
     assert curves["mpnet"].end == 10.0
     assert curves["ompl_rrt_star"].found.tolist() == [0.05, 0.5, 5.0]
@@ -219,12 +219,12 @@ def test_lengths_are_compared_at_equal_time(tmp_path: Path) -> None:
             solved("ompl_aorrtc", name, 1.0, [(0.01, 2.4), (0.3, 1.6)], 0.99),
         ]
     records.append(failed("rrt_connect", "rop/3", 1.0, 1.0))  # which stands for its restarts
-    bench = bench_report.read_bench(write(tmp_path / "run", records))
+    bench = bench_comparisons.read_bench(write(tmp_path / "run", records))
     assert list(bench.records)[:2] == ["robotdiffuse", "robotdiffuse+restarts"]
     again = bench.records["rrt_connect" + RESTARTED]
     assert [record.name for record in again] == [f"rop/{i}" for i in range(4)]
     assert {record.planner for record in again} == {"rrt_connect+restarts"}
-    section = bench_report.sections(bench)[-1]
+    section = bench_comparisons.sections(bench)[-1]
     table = bench_report.main_table(section, section.main, bench.reference)
     assert cells(table, "joint length / robotdiffuse, restarted") == {
         "robotdiffuse": "–",
@@ -237,10 +237,10 @@ def test_lengths_are_compared_at_equal_time(tmp_path: Path) -> None:
     tenth = bench_report.main_table(section, section.comparisons[0], bench.reference)
     lengths = cells(tenth, "joint length / robotdiffuse, restarted")
     assert lengths["rrt_connect, restarted"].startswith("1.200 ")
-    plain = bench_report.read_bench(bench.folder, ["robotdiffuse", "rrt_connect"])
+    plain = bench_comparisons.read_bench(bench.folder, ["robotdiffuse", "rrt_connect"])
     assert len(plain.records) == 4
     alone = replace(plain, records={n: r for n, r in plain.records.items() if RESTARTED not in n})
-    section = bench_report.sections(alone)[-1]
+    section = bench_comparisons.sections(alone)[-1]
     table = bench_report.main_table(section, section.main, alone.reference)
     assert cells(table, "joint length / robotdiffuse") == {"robotdiffuse": "1", "rrt_connect": "1.200 (1.200 to 1.200) †"}
     assert bench_report.UNEQUAL_NOTE in table.notes
@@ -255,8 +255,8 @@ def test_rows_that_were_timed_under_other_loads_are_told_in_the_table(tmp_path: 
     every = RUN | {"planners": [], "time_limit": 1.0, "count": 3}
     runs = [every | {"run": run, "workers": workers} for run, workers in (("a", 2), ("b", 1))]
     (folder / "runs.jsonl").write_text("".join(json.dumps(run) + "\n" for run in runs))
-    bench = bench_report.read_bench(folder)
-    (section,) = bench_report.sections(bench, [1.0])
+    bench = bench_comparisons.read_bench(folder)
+    (section,) = bench_comparisons.sections(bench, [1.0])
     table = bench_report.main_table(section, section.main, bench.reference)
     assert cells(table, "timed") == {
         "robotdiffuse": "run a, 2 at once",
@@ -264,8 +264,8 @@ def test_rows_that_were_timed_under_other_loads_are_told_in_the_table(tmp_path: 
         "mpd": "run b, 1 at once",
     }
     assert "Not all rows were timed alike" in table.notes[0]
-    bench = bench_report.read_bench(folder, ["robotdiffuse", "rrt_connect"])
-    (section,) = bench_report.sections(bench, [1.0])
+    bench = bench_comparisons.read_bench(folder, ["robotdiffuse", "rrt_connect"])
+    (section,) = bench_comparisons.sections(bench, [1.0])
     table = bench_report.main_table(section, section.main, bench.reference)
     assert table.columns[-1].heading == "ComScore"
     assert table.notes[0] == "All rows were timed alike: run a, 2 at once; load average 1.5 to 2.2."
@@ -281,8 +281,8 @@ def test_a_metric_is_declared_in_one_place(small, tmp_path, monkeypatch):
     record = solved("robotdiffuse", "rop/9", 1.0, [(0.1, 0.5)], measures=figures)
     assert record.row()["waypoint_count"] == 3
     assert record_of_row(json.loads(json.dumps(record.row()))) == record
-    bench = bench_report.read_bench(write(tmp_path / "run", [record]))
-    parts = bench_report.sections(bench, [1.0])
+    bench = bench_comparisons.read_bench(write(tmp_path / "run", [record]))
+    parts = bench_comparisons.sections(bench, [1.0])
     report = bench_report.bench_report(bench, parts)
     assert re.search(r"waypoint count kilo .*\n.*\n.* 0.0030 ", report.markdown)
     page = report.page
@@ -322,8 +322,8 @@ def test_no_legend_or_name_is_clipped() -> None:
 
 def test_what_is_shown_is_hard_or_failed(small: Path) -> None:
     keep_problems(small, [f"rop/{i}" for i in range(4)])
-    bench = bench_report.read_bench(small)
-    shown = bench_report.motions_to_replay(bench, bench_report.sections(bench, [1.0]))
+    bench = bench_comparisons.read_bench(small)
+    shown = bench_report.motions_to_replay(bench, bench_comparisons.sections(bench, [1.0]))
     titles = [motion.title for motion in shown]
     assert titles[0] == "robotdiffuse · rop/0"  # solved by all; made up as one and the same
     assert "ompl_rrt_star · rop/0" in titles
@@ -338,11 +338,16 @@ def test_what_is_shown_is_hard_or_failed(small: Path) -> None:
 def test_bad_input_is_one_clear_line(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (small / "new" / "records").mkdir(parents=True)
     (small / "new" / "records" / "mpnet.jsonl").touch()
-    refuses("no records yet", bench_report.read_bench, small / "new")
-    refuses(r"no records of foo; it has .*mpnet, ", bench_report.read_bench, small, ["foo"])
-    refuses("no planner was run that long", bench_report.sections, bench_report.read_bench(small, ["ompl_rrt_star"]), [60.0])
+    refuses("no records yet", bench_comparisons.read_bench, small / "new")
+    refuses(r"no records of foo; it has .*mpnet, ", bench_comparisons.read_bench, small, ["foo"])
+    refuses(
+        "no planner was run that long",
+        bench_comparisons.sections,
+        bench_comparisons.read_bench(small, ["ompl_rrt_star"]),
+        [60.0],
+    )
     (small / "runs.jsonl").write_text('{"date": 1}\n')
-    refuses(r"runs\.jsonl is damaged", bench_report.read_bench, small)
+    refuses(r"runs\.jsonl is damaged", bench_comparisons.read_bench, small)
     with (small / "records" / "mpnet.jsonl").open("a") as stream:
         stream.write("{broken\n")
     assert main(["bench", "report", str(small)]) == 2

@@ -13,16 +13,13 @@ from robotdiffuse.core.tables import Table, show
 from robotdiffuse.core.types import Path as Waypoints
 from robotdiffuse.evaluation import paper
 from robotdiffuse.evaluation.bench import BenchSettings, preset_settings, run_bench
+from robotdiffuse.evaluation.bench_comparisons import Bench, Section, read_bench, sections
 from robotdiffuse.evaluation.bench_report import (
-    Bench,
-    Section,
     about,
     bench_report,
     main_table,
     missing_line,
     motions_to_replay,
-    read_bench,
-    sections,
 )
 from robotdiffuse.evaluation.checks import confirm
 from robotdiffuse.evaluation.problem_sets import hard_cases

@@ -27,7 +27,7 @@ from robotdiffuse.core.settings import Count, OneOf, Settings
 from robotdiffuse.core.tables import Column, Figure, Table
 from robotdiffuse.core.types import Values
 from robotdiffuse.datasets.shards import read_manifest
-from robotdiffuse.evaluation.bench_report import Mean
+from robotdiffuse.evaluation.bench_comparisons import Mean
 from robotdiffuse.evaluation.methods import (
     NETWORK_ALONE,
     from_control,

@@ -22,16 +22,8 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.tables import Column, Table, plain
 from robotdiffuse.core.types import Configurations, Path
 from robotdiffuse.evaluation.bench import BenchSettings, Done, run_bench
-from robotdiffuse.evaluation.bench_report import (
-    Bench,
-    Mean,
-    Section,
-    about,
-    crashes,
-    read_bench,
-    sections,
-    success_over_time,
-)
+from robotdiffuse.evaluation.bench_comparisons import Bench, Mean, Section, read_bench, sections
+from robotdiffuse.evaluation.bench_report import about, crashes, success_over_time
 from robotdiffuse.evaluation.methods import NETWORK_ALONE, from_network, sampled, sampling_digest
 from robotdiffuse.evaluation.metrics import METRICS
 from robotdiffuse.evaluation.problem_sets import hard_cases, read_cases, validator
