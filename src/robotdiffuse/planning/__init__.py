@@ -69,7 +69,7 @@ PLANNERS = Registry(
             "planning.search.shared_tree:SharedTreeRRTStar",
             "SharedTreeSettings",
             SEARCH,
-            "the paper's planner for data: one tree, all goals, near-optimal, 5 cm away from obstacles",
+            "the paper's planner for training data: one tree, all goals, near-optimal, 5 cm of clearance",
         ),
         "mpnet": _entry(
             "baselines.mpnet:MPNet",
@@ -244,5 +244,6 @@ def plan(
         while len(_planners) >= MAX_LOADED:  # drop the planner that was loaded first
             _planners.pop(next(iter(tuple(_planners))), None)
         loaded = _planners[key] = load_planner(planner, settings)
-    limits = velocity_scaling, acceleration_scaling, jerk
-    return loaded.plan(problem, time_limit, seed, until, clearance, *limits, objective)
+    return loaded.plan(
+        problem, time_limit, seed, until, clearance, velocity_scaling, acceleration_scaling, jerk, objective
+    )

@@ -80,7 +80,7 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
     configuration.
     """
     problem = context.problem
-    robot = context.problem.robot
+    robot = problem.robot
     if not isinstance(problem.goal, PoseGoal | JointGoal):
         return None
     line = next(entry for entry in problem.constraints if isinstance(entry, CartesianLine))
@@ -184,8 +184,8 @@ def faster_ends(
 ) -> list[tuple[float, Float[ndarray, "k dof"]]]:
     """Costs and motions along the line that end in other configurations of the end pose than `rows`.
 
-    Each returned motion has a lower cost than `best_cost` and than the motions before it, and is at most
-    LONGER times as long as `rows`.
+    arm, joints: from `ik_chain`. Each returned motion has a lower cost than `best_cost` and than the motions
+    before it, and is at most LONGER times as long as `rows`.
     """
     end = rows[-1]
     max_length = LONGER * path_length(rows)

@@ -157,10 +157,10 @@ def _within(pose: PoseGoal, fraction: float) -> PoseGoal:
 def _combined(
     problem: Problem, poses: Sequence[PoseGoal], solutions: Sequence[ndarray], rng: np.random.Generator
 ) -> Configurations:
-    """Seeds for several poses: random combinations of the configurations in `solutions` that each pose alone
-    has. A joint that moves several links takes its value from one pose's configuration, chosen at random. No
-    rows if a pose has no configuration."""
-    seeds = np.tile(problem.start, (SEEDS if all(len(alone) for alone in solutions) else 0, 1))
+    """Seeds for several poses: random combinations of `solutions`, which are, for each pose, configurations
+    that reach this pose alone. A joint that moves several links takes its value from one pose's
+    configuration, chosen at random. No rows if there is no configuration for some pose."""
+    seeds = np.tile(problem.start, (SEEDS if all(len(rows) for rows in solutions) else 0, 1))
     for k in rng.permutation(len(poses)):
         moving = ~on_other_arm(problem.robot, poses[k].frame)
         if len(seeds):

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from robotdiffuse.problems.compiled_constraints import PathConstraints
 
 GOAL_TIME_FRACTION = 0.5
-"""Of several goals, no more goals are tried after this fraction of the time limit: in the first pass over the
-goals if one was free, in the second pass in any case."""
+"""Fraction of the time limit after which no more of several goals are tried. The first pass over the goals
+ends then only if a free goal was found."""
 NEAR_POSE_FRACTIONS = (0.1, 0.3, 0.9)
 """If a pose cannot be reached exactly, inverse kinematics tries these fractions of the validator's goal
 tolerances, in this order."""
@@ -146,10 +146,10 @@ def padded_space(
 
 
 def falling_clearances(most: float, checker: CollisionChecker, states: Configurations) -> list[float]:
-    """Clearances for a search to try, from `most` to zero [m].
+    """Clearances for a search to try, from `most` to zero in CLEARANCE_STEPS equal steps [m].
 
-    These are CLEARANCE_STEPS equal steps, and, if below `most`, the clearance of the start, states[0], and of
-    the goal that is farthest from obstacles, each minus END_MARGIN.
+    In addition, if below `most`: the clearance of the start, states[0], and the clearance of the goal that is
+    farthest from obstacles, each minus END_MARGIN.
     """
     own = checker.link_clearances(states).min(axis=1, initial=1.0)
     at_ends = {max(float(end) - END_MARGIN, 0.0) for end in (own[0], own[1:].max()) if end < most}
@@ -411,8 +411,8 @@ def _pose_goals(
             context.note(note)
         return _with_turns(context, configurations)
     places = [", ".join(f"{value:.3f}" for value in pose.T_base_frame[:3, 3]) for pose in poses_of(goal)]
-    named = {pose.frame: f"({xyz}) m" for pose, xyz in zip(poses_of(goal), places, strict=True)}
-    of_poses = "the pose of " + " and of ".join(f"{frame} at {place}" for frame, place in named.items())
+    place_of = {pose.frame: f"({xyz}) m" for pose, xyz in zip(poses_of(goal), places, strict=True)}
+    of_poses = "the pose of " + " and of ".join(f"{frame} at {place}" for frame, place in place_of.items())
     unconstrained = replace(problem, constraints=())
     if not len(rejected) and context.validator.constraints is not None:
         reached = pose_configurations(unconstrained, goal, rng)
@@ -421,11 +421,12 @@ def _pose_goals(
             prefix = f"no configuration was found for {of_poses} that keeps the"
             return context.fail(Status.INVALID_GOAL, f"{prefix} constraints, e.g. {wrong.message}")
     if not len(rejected):
-        several = poses_of(goal) if len(named) > 1 else ()
+        # of several poses, name those that cannot be reached even alone, or all
+        several = poses_of(goal) if len(place_of) > 1 else ()
         alone = [pose.frame for pose in several if not len(pose_configurations(unconstrained, pose, rng))]
-        brought = " and ".join(f"{frame} to the pose at {named[frame]}" for frame in alone or named)
+        unreached = " and ".join(f"{frame} to the pose at {place_of[frame]}" for frame in alone or place_of)
         return context.fail(
-            Status.UNREACHABLE_GOAL, f"no configuration within the joint limits brings {brought}"
+            Status.UNREACHABLE_GOAL, f"no configuration within the joint limits brings {unreached}"
         )
     collision = _explained(robot, scene, rejected[0])
     return context.fail(

@@ -199,6 +199,7 @@ def plan_steps(
             indices = [result.goal_index]
         while result.solved:
             ends = [(i, end) for i, end in ends if np.abs(end - result.path.positions[-1]).max() > SAME_END]
+            # ends at goals that no earlier motion reached come first
             untried = [(i, end) for i, end in ends if i not in indices] or ends
             if not untried:
                 return
@@ -212,7 +213,7 @@ def plan_steps(
         k: int, space: Any, q: Configuration, results: tuple[PlanResult | None, ...]
     ) -> StepsResult | None:
         """A result for all steps. The first k steps are planned already, with these `results`, and end at q.
-        None if a later step fails; `furthest` then tells about the failure after the most steps."""
+        None if a later step fails; `furthest` then holds the failure that came after the most steps."""
         nonlocal furthest, retried_ends
         if k == len(steps):
             return StepsResult(tuple(steps), results, space, f"solved in {k} steps", clock() - began)

@@ -239,7 +239,7 @@ class Workspace:
         """Plan steps such as approach, grasp, lift, carry and place. The workspace is not changed.
 
         If a step fails, an earlier `MoveTo` step is planned again to another goal or goal configuration: the
-        last such step for which one is left.
+        last step before it that has untried ones.
 
         Args:
             steps: `rd.MoveTo`, `rd.MoveRelative`, `rd.Attach` and `rd.Detach`, in their order.

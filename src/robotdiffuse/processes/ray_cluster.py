@@ -21,7 +21,7 @@ MAX_RETRIES = 20
 def on_ray(call: Callable[..., Any], calls: Sequence[tuple]) -> Results:
     """Run the calls on a Ray cluster, one core each; calls of a lost node are repeated on another node.
 
-    See `ray_cluster`. Each node needs this package, and the files that the calls read under the same paths.
+    See `ray_cluster`. Each node needs this package and, under the same paths, the files that the calls read.
     """
     pending = list(enumerate(calls))[::-1]
     running = {}
@@ -75,7 +75,7 @@ def ray_cluster() -> Iterator[Any]:
             raise type(error.cause)(str(error.cause)) from None
         if "No module named 'robotdiffuse'" in str(error):
             raise InputError(
-                f"a node of the Ray cluster cannot import robotdiffuse; install {__version__} on all"
+                f"a node of the Ray cluster cannot import robotdiffuse; install {__version__} on every node"
             ) from None
         raise
     except RayError as error:
@@ -101,4 +101,5 @@ def _check_reachable(address: str) -> None:
 
 
 def _line(error: Exception) -> str:
+    """The message of an error on one line."""
     return " ".join(str(error).split())

@@ -184,6 +184,7 @@ class Worker:
                     answer, renew = connection.recv()
                     if not isinstance(answer, float):
                         break
+                    # not a result, but the time that the call may still take, from `allow`
                     due = time.monotonic() + answer
         except (EOFError, OSError):
             process.join(TERMINATE_TIMEOUT)
@@ -465,7 +466,7 @@ def _main(connection: Connection) -> None:
     _exit_by_signal_with_parent()
     _this = _Process(connection)
     threading.Thread(target=_this.receive, daemon=True).start()
-    _this.send(0.0)
+    _this.send(0.0)  # the message for which `Worker._start` waits
     try:
         _, message = _this.calls.get()
         entries, prepare, arguments = pickle.loads(message)

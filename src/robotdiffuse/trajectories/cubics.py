@@ -77,7 +77,8 @@ class Cubics:
     def turns(self) -> tuple[Values, Configurations]:
         """Times [s] within steps at which a joint reverses its direction, so that its position is extreme,
         and the positions of all joints at these times."""
-        # roots u in (0, 1) of the velocity v + h (start u + curve u² / 2), in a form without cancellation
+        # roots u in (0, 1) of the velocity divided by h, v + start u + curve u² / 2, in a form without
+        # cancellation
         start = self.extremes.start
         v = self.trajectory.velocities[:-1] / self.steps
         curve = self.extremes.end - start
@@ -135,12 +136,12 @@ def _extremes(times, q, v):
     upper = q[0].copy()
     for i in range(rows - 1):
         h = times[i + 1] - times[i]
-        per = 1 / h
+        inverse_h = 1 / h
         for j in range(dof):
             speed = v[i, j]
-            m = (q[i + 1, j] - q[i, j]) * per
-            a = (6 * m - 4 * speed - 2 * v[i + 1, j]) * per
-            b = (2 * speed + 4 * v[i + 1, j] - 6 * m) * per
+            m = (q[i + 1, j] - q[i, j]) * inverse_h
+            a = (6 * m - 4 * speed - 2 * v[i + 1, j]) * inverse_h
+            b = (2 * speed + 4 * v[i + 1, j] - 6 * m) * inverse_h
             peak_speed = max(abs(speed), abs(v[i + 1, j]))
             if a * b < 0:  # the speed is also extreme where the acceleration is 0
                 peak_speed = max(peak_speed, abs(speed + h * a * a / (2 * (a - b))))
@@ -148,7 +149,7 @@ def _extremes(times, q, v):
             start[i, j] = a
             end[i, j] = b
             velocity[i, j], acceleration[i, j] = peak_speed, max(abs(a), abs(b))
-            jerk[j] = max(jerk[j], abs(b - a) * per)
+            jerk[j] = max(jerk[j], abs(b - a) * inverse_h)
             bend = acceleration[i, j] * h * h / 8  # bound of the distance to the straight line
             chord[i], chords[j] = max(chord[i], bend), max(chords[j], bend)
             low = min(q[i, j], q[i + 1, j])

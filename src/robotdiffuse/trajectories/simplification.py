@@ -30,7 +30,7 @@ the largest to the smallest scale."""
 
 @kernel(nogil=True)
 def simplify(space, path, rounds):
-    """A free path [n, dof] with the start and goal of `path`, a free path, that is not longer.
+    """A free path [n, dof] that is not longer than the free path `path` and has its start and goal.
 
     Waypoints that a straight line can skip are removed. Each of at most `rounds` rounds then smooths corners
     and removes such waypoints again.
@@ -56,7 +56,7 @@ def simplify(space, path, rounds):
 
 @kernel(nogil=True)
 def shortcut(space, path, tries, state):
-    """A free path [n, dof] with the start and goal of `path`, a free path, that is not longer.
+    """A free path [n, dof] that is not longer than the free path `path` and has its start and goal.
 
     Waypoints that a straight line can skip are removed. Then `tries` attempts alternate between a random
     shortcut from one segment to another and a move of a waypoint towards the chord of its neighbors. state:
@@ -71,7 +71,7 @@ def shortcut(space, path, tries, state):
 
 @kernel(nogil=True)
 def tighten(space, path, tries, state):
-    """A free path [n, dof] with the start and goal of `path`, a free path, that is not longer and near it.
+    """A free path [n, dof] near the free path `path` that is not longer and has its start and goal.
 
     Each of `tries` attempts removes or moves a random waypoint. Shortcuts and smoothing end with paths a
     little longer than the shortest path of the homotopy class. Tightening comes closer without new corners,
@@ -113,8 +113,8 @@ def _free(space, path, block, work):
 
 @inner_kernel()
 def _skipped(space, path, block, work):
-    """The path without waypoints that straight lines can skip. After each waypoint comes the farthest one
-    that a free straight line reaches."""
+    """The path without waypoints that straight lines can skip. After each waypoint comes the last waypoint of
+    the path that a free straight line reaches."""
     out = np.empty(path.shape, np.float32)
     n = 0
     i = 0

@@ -17,8 +17,8 @@ from robotdiffuse.trajectories.corner_rounding import BlendedPolyline
 from robotdiffuse.trajectories.timing_kernel import fastest_speeds, sample_positions, slowdown
 
 MAX_ROWS = 200_000
-"""Largest number of rows of a motion between two stops before it is averaged to keep jerk limits, which adds
-rows. Longer motions have larger time steps."""
+"""Largest number of rows of a motion between two stops; averaging for jerk limits adds further rows. Longer
+motions have larger time steps."""
 SECONDS_PER_ROW = 5e-6
 """Estimated time to sample and validate a row [s]."""
 MIN_STEPS = 4
@@ -40,7 +40,7 @@ rest."""
 Scaling = Annotated[float, Bound(least=MIN_SCALING, most=1.0)]
 Jerk = Annotated[float, Bound(least=MIN_JERK, infinite=True)]
 CHECKS_PER_INTERVAL = 8
-"""Number of equal parts of a grid interval at the ends of which frame speeds and torques are checked."""
+"""Frame speeds and torques are checked at the ends of this many equal parts of each grid interval."""
 MIN_TORQUE_SHARE = 2e-3
 """Smallest fraction of a torque limit that is available to motion, where gravity needs nearly all of it."""
 LIMIT_TOLERANCE = 1e-6
@@ -58,7 +58,7 @@ MIN_STOPPING_DISTANCE = 0.01
 
 
 class TooFastError(RuntimeError):
-    """The start speed of a motion is too high for the first corners, or to stop."""
+    """The start speed of a motion is too high for the first corners, or for a stop on the path."""
 
 
 @dataclass(frozen=True)
@@ -136,6 +136,7 @@ def time_line(
     jerk = jerk_limits(robot, settings)
     best = None
     share = 1.0
+    # lower the accelerations step by step, until the motion with jerk limits becomes longer again
     while True:
         limits = velocity, share * acceleration
         speeds = _fastest_speeds(line, grid, *limits, extra=extra)
@@ -192,16 +193,16 @@ def _moving_start(robot: Robot, line: BlendedPolyline, settings: TimingSettings,
                 break
             widths = line.half_widths.copy()
             widths[:1] = np.minimum(widths[:1], first - lead)
-            led_waypoints = np.concatenate([line.waypoints[:1] + lead * direction, line.waypoints[1:]])
-            rest = BlendedPolyline(led_waypoints, widths)
-            grid = timing_grid(rest, settings)
+            waypoints = np.concatenate([line.waypoints[:1] + lead * direction, line.waypoints[1:]])
+            after_lead = BlendedPolyline(waypoints, widths)
+            grid = timing_grid(after_lead, settings)
             try:
-                speeds = _fastest_speeds(rest, grid, velocity, share * acceleration, start_speed)
+                speeds = _fastest_speeds(after_lead, grid, velocity, share * acceleration, start_speed)
             except TooFastError:
                 break
             count = int(np.ceil(_duration(grid, speeds) / step))
             check_timing(f"the {count} rows of a motion", SECONDS_PER_ROW * count)
-            controls = sample_positions(rest.arrays, grid, speeds, step * np.arange(count + 1))
+            controls = sample_positions(after_lead.arrays, grid, speeds, step * np.arange(count + 1))
             rows = spline_rows(controls, step, window, start_speed * direction)
             if window == windows[-1] or _keeps_jerk(rows, step, jerk):
                 rows[1][0] = line.waypoints[0]
@@ -271,8 +272,8 @@ def _fastest_speeds(
     extra: ExtraLimits = NO_EXTRA_LIMITS,
 ) -> Values:
     """ṡ at each grid point of the fastest motion that keeps the limits between grid points as well. A motion
-    from rest is slowed down as a whole; with a start speed, the limits at the grid points are lowered by
-    `share` until it does."""
+    from rest is slowed down as a whole. For a motion with a start speed, the limits at the grid points are
+    lowered by the factor `share` until the motion keeps the real limits everywhere."""
     share = 1.0
     at_start = start_speed * np.abs(line(grid[:1], 1)[0])
     for _ in range(MAX_SHARES):
@@ -301,10 +302,10 @@ def derivatives_and_limits(
     """The arguments of `fastest_speeds`: q' and q'' at the grid points, the grid, velocity limits, and lowest
     and highest accelerations.
 
-    Extra limits are further columns of the same form, as if they were joints. A frame speed is a multiple of
-    ṡ, which is its q'; it has no acceleration limits. A torque is a s̈ + b ṡ² + gravity; divided by its
-    limit, a is its q', b is its q'', and its acceleration limits are ±1 minus gravity. It has no velocity
-    limit.
+    Extra limits are further columns of the same form, as if they were joints. A frame speed is proportional
+    to ṡ; the factor is its q', and it has no acceleration limits. A torque is a s̈ + b ṡ² + gravity, all
+    divided by the torque limit: a is its q', b is its q'', and its acceleration limits are ±1 minus gravity.
+    It has no velocity limit.
     """
     first = line(grid, 1)
     second = line(grid, 2)

@@ -35,11 +35,10 @@ def straight_line_time(
     else:
         j = np.divide(distance, jerk, out=np.zeros_like(distance), where=jerk > 0).max(axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # time to reach the velocity limit; at the left, the acceleration limit is reached on the way
+        # time to reach the velocity limit; first case: the acceleration limit is reached on the way
         speed_up = np.where(a * a >= j * v, a / v + j / a, 2 * np.sqrt(j / v))
         speed_up = np.where((a == 0) & (j == 0), 0.0, speed_up)
-        # without reaching the velocity limit: the whole time, with and without reaching the acceleration
-        # limit
+        # the whole time if the velocity limit is not reached; first case: the acceleration limit is reached
         ramp = j / a
         triangular_time = np.where(2 * j * j <= a**3, ramp + np.sqrt(ramp * ramp + 4 * a), 4 * np.cbrt(j / 2))
         return np.where(

@@ -35,8 +35,8 @@ MAX_TIMINGS = 8
 """Largest number of times that a motion with rounded corners is timed and validated; if the last is refused,
 the motion stops at every corner."""
 MAX_SLOWER_TIMINGS = 4
-"""In this many first timings, accelerations are lowered if each corner is free but the motion is refused; in
-later timings, all corners are rounded less."""
+"""If each corner is free but the motion is refused, the next timing has lower accelerations; after this many
+timings, all corners are rounded less instead."""
 CORNER_SAMPLES = 17
 """Number of configurations that are checked along a rounded corner."""
 CORNER_PLACES = np.linspace(-1, 1, CORNER_SAMPLES)
@@ -74,8 +74,8 @@ def time_parameterize(
         free: Whether a path is free of collision.
         settings: Settings of timing.
         keeps: Whether the configurations [n, dof] along a rounded corner meet a requirement that the path
-            meets, such as a clearance. Other corners are rounded less from the beginning, but by at least
-            MIN_DEVIATION.
+            meets, such as a clearance. Corners that do not meet it are rounded less from the beginning,
+            but by at least MIN_DEVIATION.
         start_speed: Speed at the beginning [rad/s, joint-space L2], along the first straight line, which must
             be long enough to stop on.
         extra: Limits on frame speeds and torques, applied only if the motion begins at rest.
@@ -226,12 +226,13 @@ def _time_segments(
 
 
 def _joined(pieces: Sequence[tuple[ndarray, ...]]) -> tuple[ndarray, ...]:
-    """Joins motions (times, then columns). Each motion begins with the last row of the motion before it."""
+    """Joins motions, which are tuples of times and further columns. Each motion begins with the last row of
+    the motion before it."""
     start = 0.0
     parts = []
-    for times, *more in pieces:
+    for times, *columns in pieces:
         first = min(len(parts), 1)
-        parts.append((start + times[first:], *(column[first:] for column in more)))
+        parts.append((start + times[first:], *(column[first:] for column in columns)))
         start += times[-1]
     return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
 
@@ -347,6 +348,7 @@ class StopGraph:
         times, q = motion.rows[:2]
         ticks = self.step * np.arange(motion.ticks + 1)
         at = interpolated(ticks, times, q)
+        # squared distances, without the term that is the same for all configurations
         return ((configurations**2).sum(axis=1) - 2 * at @ configurations.T).argmin(axis=1)
 
     def trajectory(self, motions: list[Motion | int]) -> Trajectory:

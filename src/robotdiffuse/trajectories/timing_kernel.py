@@ -34,8 +34,9 @@ width times the norm of the change of direction."""
 CORNER_INTERVALS = 8
 LINE_INTERVALS = 32
 MIN_SPEED_RATIO = 0.01
-"""At each grid point, ṡ² is at least this fraction of the previous ṡ² or of the greatest ṡ² there. Where a
-joint's q' changes sign, the limits would otherwise allow a speed after which the motion must stop."""
+"""At each grid point, ṡ² is at least this fraction of the previous ṡ² or, if that is less, of the greatest ṡ²
+there. Where a joint's q' changes sign, the limits would otherwise allow a speed after which the motion must
+stop."""
 
 
 @inner_kernel()
@@ -178,8 +179,8 @@ def least_time(line, velocity, acceleration, corner_intervals, line_intervals):
 
 @kernel()
 def estimated_time(line, velocity, acceleration):
-    """Estimate of `least_time` by a tenth of its work [s]. On random lines, the estimate is 0.7 % too long on
-    average, with a standard deviation of 0.5 %.
+    """Estimate of `least_time` with a tenth of its work [s]. On random lines, the estimate is 0.7 % too long
+    on average, with a standard deviation of 0.5 %.
 
     A backward pass and a forward pass limit s̈ in each interval by the acceleration limits at one end only,
     the end from which the pass comes. If the limits at either end are exceeded then, the interval's duration

@@ -158,10 +158,10 @@ def best_looks(
     a prediction.
     taken: configurations of earlier images that did not show the wanted voxels. Each of them lowers the score
     of viewpoints nearby.
-    hemmed_in: whether the arm cannot go back. The last path is then to the configuration in which the arm is
-    farthest from where it was in all images; for a CONFINED arm it is also the first path.
-    beside: the latest image of a fixed camera. With the arm at a viewpoint, this camera may see wanted voxels
-    that the arm hides now.
+    hemmed_in: whether the arm cannot go back. If so, the last path leads to the configuration in which the
+    arm is farthest from where it was in all images; for a CONFINED arm, this is also the first path. beside:
+    the latest image of a fixed camera. With the arm at a viewpoint, this camera may see wanted voxels that
+    the arm hides now.
     """
     robot = known.robot
     at = np.argwhere(wanted)

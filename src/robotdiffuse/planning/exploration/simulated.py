@@ -282,9 +282,8 @@ def explore(
         q = path.positions[-1]
         if beside is not None:
             height, width = beside.depth.shape
-            T = beside.T_base_camera
-            size = (width, height)
-            view = ray_cast(problem.scene, T, beside.intrinsics, size, problem.robot, q)
+            fixed_camera = beside.T_base_camera, beside.intrinsics, (width, height)
+            view = ray_cast(problem.scene, *fixed_camera, problem.robot, q)
             explorer.observe(measured(view, np.inf, noise, rng))
         yield Event(step, q, "" if violation is None else violation.message)
         if violation is not None:

@@ -1,13 +1,14 @@
 """Motions among moving obstacles: a planner finds a path in the static scene, which is then timed so that the
 arm does not meet the moving obstacles.
 
-The path has places where the arm may stop. Motions between any two places, forwards and backwards, at full or
-half speed, are timed within the robot's limits. A search over a grid of times finds the sequence of motions
-and waits that reaches the end first. A place is reached at a time if the arm was there one step before and
-can wait, or if a collision-free motion ends there. This is SIPP on a grid (M. Phillips and M. Likhachev,
-"SIPP: Safe interval path planning for dynamic environments", ICRA 2011). The validator then checks the whole
-motion in continuous time. If it refuses the motion, other paths are tried: with other seeds, and around the
-obstacles at their places at a random time.
+The path has places where the arm may stop. Motions between any two places without a sharp corner between
+them, forwards and backwards, at full or half speed, are timed within the robot's limits. A search over a grid
+of times finds the sequence of motions and waits that reaches the end as early as possible. A place is reached
+at a time if the arm was there one step before and can wait, or if a collision-free motion ends there. This is
+SIPP on a grid (M. Phillips and M. Likhachev, "SIPP: Safe interval path planning for dynamic environments",
+ICRA 2011). The validator then checks the whole motion in continuous time. If it refuses the motion, other
+paths are tried: paths found with other seeds, and paths around the moving obstacles as they stand at a random
+time.
 
 With waypoints, the motion stops at each waypoint in their order. It may wait there or go back to an earlier
 waypoint.
@@ -48,7 +49,8 @@ def earliest(
     first: Int[ndarray, "n"],
     cells: Int[ndarray, "k"],
 ) -> tuple[list[int], bool]:
-    """The schedule that takes the arm from rest at the first place, at tick 0, to the last place first.
+    """The schedule that takes the arm from the first place, where it rests at tick 0, to the last place as
+    early as possible.
 
     clear: whether each configuration is free at each tick.
     cell: index of the configuration at each place.
@@ -88,6 +90,7 @@ def _reached(came, clear, cell, source, target, first, cells, begin, count):
             arrival = now + first[m + 1] - first[m] - 1
             if came[now, source[m]] == UNREACHED or arrival >= ticks or came[arrival, target[m]] != UNREACHED:
                 continue
+            # both configurations of each step must be free at both of its ticks
             free = True
             for k in range(first[m + 1] - first[m] - 1):
                 a = cells[first[m] + k]
@@ -123,7 +126,8 @@ CELL_SECONDS = 1e-8
 """Smallest computing time per cell of the grid (a configuration at a time) [s]."""
 GRID_TRAVEL = 0.02
 """Largest travel of any point of the arm between two neighboring configurations of the grid [m]."""
-# The grid of times ends at DURATION_FACTOR times the duration without moving obstacles, plus EXTRA_TIME [s].
+# The grid of times ends at DURATION_FACTOR times the duration of a motion that stops at every place (the mean
+# over SPEED_FACTORS), plus EXTRA_TIME [s].
 EXTRA_TIME = 5.0
 DURATION_FACTOR = 3.0
 PATH_TIME_FRACTION = 0.5
@@ -131,7 +135,7 @@ PATH_TIME_FRACTION = 0.5
 
 
 def plan_among_moving_obstacles(solver: Solver, problem: Problem, request: PlanRequest) -> PlanResult:
-    """A motion among the problem's moving obstacles, certified in time until it ends."""
+    """A motion among the problem's moving obstacles, certified at every time until it ends."""
     context = PlanningContext(solver.name, problem, request)
     robot = problem.robot
     still = replace(problem, moving=())
@@ -156,8 +160,8 @@ def plan_among_moving_obstacles(solver: Solver, problem: Problem, request: PlanR
             standing = (obstacle.at(time) for obstacle in problem.moving if obstacle.known)
             scene = scene.with_shapes([*scene.shapes, *standing])
         limit = max(PATH_TIME_FRACTION * (request.time_limit - context.elapsed), 1e-3)
-        of_path = replace(request, time_limit=limit, seed=request.seed + attempts // 2)
-        result = plan_path(solver, replace(still, scene=scene), of_path)
+        path_request = replace(request, time_limit=limit, seed=request.seed + attempts // 2)
+        result = plan_path(solver, replace(still, scene=scene), path_request)
         attempts += 1
         if result.path is None or result.trajectory is None:
             if attempted_paths == 0 and scene is problem.scene:
@@ -188,28 +192,30 @@ def plan_among_moving_obstacles(solver: Solver, problem: Problem, request: PlanR
 
 
 def _solved(
-    context: PlanningContext, found: PlanResult, timed: Trajectory, scene: float | None, itself: float | None
+    context: PlanningContext, static: PlanResult, timed: Trajectory, scene: float | None, itself: float | None
 ) -> PlanResult:
-    assert found.scene_clearance is not None and found.self_clearance is not None
+    """The result of the static scene with the trajectory `timed`; scene, itself: its clearances to obstacles
+    and between links [m]."""
+    assert static.scene_clearance is not None and static.self_clearance is not None
     assert scene is not None and itself is not None
-    scene = min(scene, found.scene_clearance)
-    itself = min(itself, found.self_clearance)
+    scene = min(scene, static.scene_clearance)
+    itself = min(itself, static.self_clearance)
     return replace(
-        found,
-        reason=f"{found.reason}, timed among moving obstacles",
+        static,
+        reason=f"{static.reason}, timed among moving obstacles",
         planning_time=context.elapsed,
         seed=context.request.seed,
         trajectory=timed,
         scene_clearance=scene,
         self_clearance=itself,
         min_clearance=min(scene, itself),
-        notes=(*context.notes, *(note for note in found.notes if note not in context.notes)),
+        notes=(*context.notes, *(note for note in static.notes if note not in context.notes)),
     )
 
 
 def _stops(problem: Problem, path: Path) -> list[int]:
-    """The row of a path at each waypoint: the first one that reaches it, from the row of the waypoint before
-    on."""
+    """The row of a path at each waypoint: the first row that reaches it, not before the row of the previous
+    waypoint."""
     rows = range(len(path.positions))
     stops = [0]
     for goal in problem.waypoints:
@@ -224,12 +230,13 @@ def _timed(
     context: PlanningContext,
     problem: Problem,
     collision: MovingCollision,
-    found: PlanResult,
+    static: PlanResult,
     clearance: float,
 ) -> Trajectory | None:
-    """The motion along the path of `found` that reaches the end first, by the grid of times; None if there is
-    none. Corners are rounded as in `found`. clearance: to moving obstacles [m]."""
-    path = found.path
+    """The motion along the path of `static`, a result for the static scene, that reaches the end as early as
+    possible on the grid of times; None if there is none. Corners are rounded as in `static`. clearance: to
+    moving obstacles [m]."""
+    path = static.path
     assert path is not None
     robot = problem.robot
     validator = verifier(replace(problem, moving=()))
@@ -244,15 +251,16 @@ def _timed(
         GRID_STEP,
         context.keeps_constraints,
         context.beside,
-        None if found.corner_deviations is None else np.array(found.corner_deviations),
+        None if static.corner_deviations is None else np.array(static.corner_deviations),
         _stops(problem, path),
     )
     links = compile_links(robot)[1]
     s, configurations = graph.sample(links.motion_radii.max(axis=0), GRID_TRAVEL)
-    longest = sum(motion.ticks for motion in graph.motions if motion.target == motion.source + 1) // len(
+    # ticks of a motion that stops at every place: the mean over the speed factors
+    ticks = sum(motion.ticks for motion in graph.motions if motion.target == motion.source + 1) // len(
         SPEED_FACTORS
     )
-    count = int(DURATION_FACTOR * longest + EXTRA_TIME / GRID_STEP)
+    count = int(DURATION_FACTOR * ticks + EXTRA_TIME / GRID_STEP)
     check_timing(f"a grid of {count} times", CELL_SECONDS * count * len(configurations))
     times = GRID_STEP * np.arange(count)
     speed = max(obstacle.top_speed for obstacle in problem.moving)

@@ -49,9 +49,9 @@ from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.problem import OCCUPIED, OPTIMISTIC, PADDED, PREDICTED, JointGoal, Problem
 from robotdiffuse.robots.kinematics import placed_spheres
 
-# Under an assumption, at most MAX_FIRST_MOTIONS motions are planned, of which one is chosen. The risk of a
-# motion is the sum of the predicted probabilities of all unknown voxels that it sweeps. Planning ends early
-# if a motion's risk is at most NEGLIGIBLE_RISK, or, after MIN_FIRST_MOTIONS motions, at most ACCEPTABLE_RISK.
+# Under an assumption, at most MAX_FIRST_MOTIONS first motions are planned. The risk of a motion is the sum of
+# the predicted probabilities of all unknown voxels that it sweeps. No more first motions are planned once the
+# lowest risk is at most NEGLIGIBLE_RISK, or, after MIN_FIRST_MOTIONS motions, at most ACCEPTABLE_RISK.
 MAX_FIRST_MOTIONS = 8
 MIN_FIRST_MOTIONS = 4
 ACCEPTABLE_RISK = 2.0
@@ -144,7 +144,7 @@ def plan_with_unknown_space(
                 why = "no motion keeps out of all space that no view saw"
                 return _with_notes(context, replace(result, reason=f"{why}: {result.reason}"))
             if occupied_only or result.solved:
-                return _with_notes(context, result, policy_note, _lesser(failed, assumption.name))
+                return _with_notes(context, result, policy_note, _failed_note(failed, assumption.name))
             failed.append(assumption.name)
     result = attempts.best(as_seen, AS_SEEN, limit)
     took = f"preparing it took {prepared:.2g} s of the time limit of {limit:g} s"
@@ -152,7 +152,7 @@ def plan_with_unknown_space(
     if policy == OPTIMISTIC or not result.solved:
         return _with_notes(context, result, "" if policy == OPTIMISTIC or failed else late)
     if failed:
-        return _with_notes(context, result, policy_note, _lesser(failed, FREE_UNKNOWN_SPACE))
+        return _with_notes(context, result, policy_note, _failed_note(failed, FREE_UNKNOWN_SPACE))
     return _with_notes(context, result, policy_note, f"{late}; planned with {FREE_UNKNOWN_SPACE}")
 
 
@@ -169,7 +169,7 @@ def policy_for(problem: Problem) -> tuple[str, str]:
     return PADDED, f"unknown space: {PADDED}, since the network {limitation}"
 
 
-def _lesser(failed: list[str], used: str) -> str:
+def _failed_note(failed: list[str], used: str) -> str:
     """A note on the assumptions under which no motion was found; "" if there are none."""
     if not failed:
         return ""
@@ -237,8 +237,8 @@ def with_assumption(problem: Problem, assumption: Assumption, goals: Configurati
     """The problem with an assumption's obstacles added to the observed scene, except those at the start or at
     the goals. Only the goals at which the fewest obstacles have to be removed are kept."""
     start, *at_goals = (placed_spheres(problem.robot, q).astype(np.float32) for q in (problem.start, *goals))
-    needed = np.array([assumption.touched(spheres) for spheres in at_goals] if len(at_goals) > 1 else [0])
-    easiest = np.flatnonzero(needed == needed.min())
+    touched = np.array([assumption.touched(spheres) for spheres in at_goals] if len(at_goals) > 1 else [0])
+    easiest = np.flatnonzero(touched == touched.min())
     obstacles = assumption.obstacles(np.concatenate([start, *(at_goals[i] for i in easiest)]))
     scene = problem.scene.with_shapes([*problem.scene.shapes, obstacles])
     return replace(problem, scene=scene, goal=JointGoal(goals[easiest]), views=())

@@ -6,7 +6,7 @@ configurations, the planner chooses one, from which the next waypoint may be out
 segment has no path, all segments are planned again with another seed, as long as there is time.
 
 A waypoint with a blend is a corner between two segments. It is rounded like the corners of paths, as widely
-as its blend allows and as the corner is free. The motion stops at the waypoint if no rounding is free, or if
+as its blend and the obstacles allow. The motion stops at the waypoint if no rounding is free, or if
 stopping is faster, as it may be where the path turns back.
 
 A motion from a start velocity begins while the arm is moving, without acceleration. It starts with a straight
@@ -56,7 +56,7 @@ def plan_through_waypoints(solver: Solver, problem: Problem, request: PlanReques
     """
     context = PlanningContext(solver.name, problem, request)
     goals = (*problem.waypoints, problem.goal)
-    several = [not (isinstance(goal, JointGoal) and len(goal.positions) == 1) for goal in goals]
+    has_choice = [not (isinstance(goal, JointGoal) and len(goal.positions) == 1) for goal in goals]
     attempts = 0
     while True:
         segments: list[PlanResult] = []
@@ -64,8 +64,8 @@ def plan_through_waypoints(solver: Solver, problem: Problem, request: PlanReques
         for k, goal in enumerate(goals):
             segment_limit = max(request.time_limit - context.elapsed, MIN_TIME_LIMIT) / (len(goals) - k)
             segment = replace(problem, start=start, goal=goal, waypoints=(), blend=(), notes=())
-            of_segment = replace(request, time_limit=segment_limit, seed=request.seed + attempts)
-            segments.append(attempt(solver, segment, of_segment))
+            segment_request = replace(request, time_limit=segment_limit, seed=request.seed + attempts)
+            segments.append(attempt(solver, segment, segment_request))
             path = segments[-1].path
             if path is None:
                 break
@@ -73,7 +73,7 @@ def plan_through_waypoints(solver: Solver, problem: Problem, request: PlanReques
         else:
             return _joined(context, segments, _motions(context, segments))
         attempts += 1
-        if not any(several[: len(segments) - 1]) or context.remaining <= 0:
+        if not any(has_choice[: len(segments) - 1]) or context.remaining <= 0:
             failed = segments[-1]
             reason = f"segment {len(segments)} of {len(goals)}: {failed.reason}"
             # INVALID_START would blame the problem's start, but a later segment begins at a planned
@@ -123,11 +123,11 @@ def _without_stops(context: PlanningContext, segments: Sequence[PlanResult], fir
         deviations[row] = _deviation(part, path, int(row), goal, radius)
     clearances = [s.min_clearance for s in segments if s.min_clearance is not None]
     clearance = min(combined.clearance, *clearances)
-    closer = verifier(part, replace(DEFAULT, contact=max(clearance, DEFAULT.contact)))
+    distant = verifier(part, replace(DEFAULT, contact=max(clearance, DEFAULT.contact)))
     result = combined.finish(
         path.positions,
         context.planner_name,
-        keeps=lambda q: closer.collision_free(replace(path, positions=q)),
+        keeps=lambda q: distant.collision_free(replace(path, positions=q)),
         deviations=deviations,
     )
     return None if result is None else result.trajectory
@@ -136,8 +136,8 @@ def _without_stops(context: PlanningContext, segments: Sequence[PlanResult], fir
 def _corners(
     segments: Sequence[PlanResult], default: float
 ) -> tuple[Int[ndarray, "waypoints"], Float[ndarray, "n"]]:
-    """For the joined path of segments: the rows at which the waypoints are, and how far the motion may pass
-    each row [rad, joint-space L2], which is 0 at the waypoints."""
+    """For the joined path of segments: the rows at which the waypoints are, and how far from each row the
+    motion may pass [rad, joint-space L2], which is 0 at the waypoints."""
     lengths = [len(segment.path.positions) - 1 for segment in segments if segment.path is not None]
     ends = np.cumsum(lengths)
     deviations = np.full(ends[-1] + 1, default)
@@ -149,8 +149,8 @@ def _corners(
 
 
 def _deviation(problem: Problem, path: Path, row: int, goal: Goal, blend: float) -> float:
-    """How far the motion may pass the path's corner at a row and still come within the blend of a goal [rad,
-    joint-space L2]; 0 if no tried deviation is small enough."""
+    """How far from the path's corner at a row the motion may pass, so that it still comes within the blend of
+    a goal [rad, joint-space L2]; 0 if no tried deviation is small enough."""
     q = path.positions
     deviation = MAX_DEVIATION_PER_BLEND * blend
     for _ in range(MAX_DEVIATIONS):

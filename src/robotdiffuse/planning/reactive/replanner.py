@@ -104,8 +104,8 @@ class ObservedObstacle:
 
 
 class PredictedObstacles:
-    """Moving obstacles from the time `since` [s] on, for checks of motions in time. They are predicted
-    (`straight_on`), or grown: each is everywhere where it can be (`anywhere`)."""
+    """Moving obstacles from the time `since` [s] on, for checks of timed motions. They are predicted
+    (`straight_on`), or grown: each fills all space that it can have reached (`anywhere`)."""
 
     def __init__(self, robot: Robot, moving: list[MovingObstacle], since: float) -> None:
         self._moving = moving
@@ -150,8 +150,8 @@ class PredictedObstacles:
         begins: float,
     ) -> bool:
         """Whether no obstacle touches the arm during a motion: within HORIZON, or until it has rested at the
-        end for REST_TIME if the motion is shorter. times: from the beginning of the motion, which is at
-        `begins` [s]."""
+        end for REST_TIME if the motion is shorter. times: since the beginning of the motion [s]. begins: time
+        of this beginning [s]."""
         soon = max(int(np.searchsorted(times, HORIZON)), 1)
         rest_time = REST_TIME if soon == len(times) else 0.0
         return self.comes_to(q[:soon], times[:soon] + begins, rest_time + 1e-3) is None
@@ -168,8 +168,8 @@ DRIVING_PERIODS = 1, 6
 """Numbers of periods for which the arm accelerates before it brakes, tried in turn. The larger number lets it
 leave the neighborhood of an obstacle."""
 PREDICTION_DELAYS = 0.3, 0.0, 0.8
-"""Successive searches for a path use the obstacles as predicted this long after the arm rests, in turn
-[s]."""
+"""Successive searches for a path use, in turn, the obstacles as predicted this long after the arm comes to
+rest [s]."""
 EVASION_OVERHEAD = 0.2
 """Time that an evasion takes in addition to its duration at full speed [s]."""
 HORIZON = 2.5
@@ -222,8 +222,7 @@ class Replanner:
     """Takes an arm to a goal among obstacles that move freely up to a maximum speed.
 
     The obstacles are `problem.moving`; the maximum speed of each is its `max_speed`, or the largest speed of
-    its known motion. The rest of the scene is static, and the arm is at rest at the start. Threads may share
-    a
+    its known motion. The other obstacles are static, and the arm is at rest at the start. Threads may share a
     Replanner: calls wait for each other.
     """
 
@@ -254,14 +253,14 @@ class Replanner:
         self._now = -np.inf
         self._searches = 0
         self._next: TimedPath | None = None
-        stated = np.where(problem.robot.jerk > 0, problem.robot.jerk, np.inf)
-        jerk = stated if settings.jerk is None else np.full(problem.robot.dof, settings.jerk)
+        own_jerk = np.where(problem.robot.jerk > 0, problem.robot.jerk, np.inf)
+        jerk = own_jerk if settings.jerk is None else np.full(problem.robot.dof, settings.jerk)
         self._filter = JerkFilter(problem.robot, jerk, settings.sample_time, problem.start)
         self._path, self._goals, self._space = self._first_path()
         # The current motion along the path, before the filter, and the time when it begins [s].
         self._since = -np.inf
         self._motion = AT_REST
-        self._left = False
+        self._must_leave = False
         """Whether the path must be left where the current motion ends, because the goal has changed."""
         self._rehearse()
 
@@ -294,7 +293,7 @@ class Replanner:
             raise InputError(f"the replanner cannot take this goal: {start_goal.reason}")
         self.problem, self._goals = problem, np.array(start_goal.goals)
         self._next = None
-        self._left = True
+        self._must_leave = True
 
     @locked
     def step(self, observation: Mapping[str, ArrayLike], now: float) -> Command:
@@ -348,7 +347,7 @@ class Replanner:
         """Whether the arm, at rest, is at a goal."""
         path = self._path
         s = float(self._motion.s[0])
-        if self._left:
+        if self._must_leave:
             return bool(np.linalg.norm(self._goals - path.at(s), axis=1).min() < MIN_LENGTH)
         return bool(path.to_goal and path.then is None and s >= path.end)
 
@@ -401,7 +400,7 @@ class Replanner:
         next_path = self._path if self._next is None else self._next
         clear = self._path_clear(predicted, next_path, self._next is None)
         moving = not self._rests or self._motion.duration > 0
-        leaves = self._left and self._next is None
+        leaves = self._must_leave and self._next is None
         if clear and (next_path.to_goal or moving) and not leaves:
             return clear
         candidate = self._search(predicted, rest, rest_time)
@@ -420,16 +419,18 @@ class Replanner:
         return predicted.free(*motion, begins)
 
     def _search(self, predicted: PredictedObstacles, start: Configuration, time: float) -> TimedPath | None:
-        """A path from `start`, where the arm rests at `time`, to a goal, around the predicted obstacles; it
-        may lead back to the current path where this is free to its end. None if none was found."""
+        """A path from `start`, where the arm rests at `time`, to a goal, around the predicted obstacles. It
+        may lead back to a waypoint of the current path from which that path is free to its end. None if no
+        path was found."""
         self._searches += 1
         later = time + PREDICTION_DELAYS[self._searches % len(PREDICTION_DELAYS)]
         still = self._still.scene
         scene = still.with_shapes([*still.shapes, *predicted.shapes(later)])
         checker = CollisionChecker(self._robot, scene)
+        # the goals of the search, and for each the waypoints that follow it on the current path
         roots = list(self._goals)
         after = [np.zeros((0, self._robot.dof))] * len(self._goals)
-        if self._path.to_goal and not self._left:
+        if self._path.to_goal and not self._must_leave:
             old = self._path.remaining(float(self._motion.s[-1]))
             free = motions_free(search_space(checker, COARSE_RESOLUTION), old.astype(np.float32))
             first = len(free) - int(np.argmin(free[::-1])) if not free.all() else 1
@@ -452,8 +453,8 @@ class Replanner:
         return self._certified(np.concatenate([path, after[end]]), True)
 
     def _evasion(self, predicted: PredictedObstacles, rest: Configuration, time: float) -> TimedPath | None:
-        """A straight path from `rest` to the tried place where an obstacle is predicted to come last; None if
-        the arm should stay."""
+        """A straight path from `rest` to the random configuration at which an obstacle is predicted to arrive
+        latest; None if the arm should stay."""
         robot = self._robot
         directions = self._rng.normal(size=(EVASIONS, robot.dof))
         directions *= EVASION_RADIUS / np.linalg.norm(directions, axis=1, keepdims=True)
@@ -488,8 +489,8 @@ class Replanner:
             self._path = self._next
             self._next = None
             self._motion = AT_REST
-            self._left = False
-        elif not self._left and self._path.then is not None and self._motion.s[0] >= self._path.end:
+            self._must_leave = False
+        elif not self._must_leave and self._path.then is not None and self._motion.s[0] >= self._path.end:
             self._path = self._path.then
             self._motion = AT_REST
 
@@ -500,7 +501,7 @@ class Replanner:
         path = self._path
         s = float(self._motion.s[0])
         speed = float(self._motion.speeds[0])
-        if s >= path.end or self._left:
+        if s >= path.end or self._must_leave:
             return False
         for periods in DRIVING_PERIODS:
             extended = path.on_then_rest(s, speed, periods * settings.period)

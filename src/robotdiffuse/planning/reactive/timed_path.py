@@ -61,8 +61,8 @@ class SpeedProfile(NamedTuple):
     @property
     def duration(self) -> float:
         """Time until the arm rests [s]."""
-        both = self.speeds[1:] + self.speeds[:-1]
-        return float((2 * np.diff(self.s)[both > 0] / both[both > 0]).sum())
+        speed_sums = self.speeds[1:] + self.speeds[:-1]
+        return float((2 * np.diff(self.s)[speed_sums > 0] / speed_sums[speed_sums > 0]).sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,6 +194,8 @@ class JerkFilter:
         self.joint_names = robot.joint_names
         self.step = step
         share = ACCELERATION_FRACTION
+        # The window of the averages, in samples, follows from the jerk limits. It moves the arm off the path
+        # by half its variance times the acceleration; lower accelerations need a shorter window.
         while True:
             window = max(int(np.ceil(2 * share * (robot.acceleration / jerk).max() / step)), 1)
             variance = step**2 * ((window**2 - 1) / 12 + 1 / 3)

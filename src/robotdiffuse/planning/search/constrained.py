@@ -54,11 +54,11 @@ class Limits(NamedTuple):
 
     rows: tuple
     """`problems.constraint_kernel.Rows`"""
-    kept: np.ndarray
-    """[m] limits of the values of the m rows, slightly smaller than the validator's limits."""
+    row_limits: np.ndarray
+    """[rows] greatest values of the constraint rows, slightly smaller than the validator's limits."""
     work: tuple
     growing: np.ndarray
-    """[m] limits along the piece that is being proved."""
+    """[rows] greatest values along the piece that is being proved."""
     stack: np.ndarray
     """[MAX_DEPTH, dof] ends of the pieces that `between` has yet to reach."""
     out: np.ndarray
@@ -68,13 +68,13 @@ class Limits(NamedTuple):
 
 
 @kernel()
-def make_limits(rows, kept):
+def make_limits(rows, row_limits):
     dof = len(rows.lower)
     return Limits(
         rows,
-        kept,
+        row_limits,
         make_work(rows),
-        np.empty(len(kept)),
+        np.empty(len(row_limits)),
         np.empty((MAX_DEPTH, dof)),
         np.empty((MAX_PIECES, dof)),
         np.empty(dof),
@@ -83,7 +83,7 @@ def make_limits(rows, kept):
 
 @overload(rrt_kernel.keep)
 def _keep(limits, q):
-    return lambda limits, q: project(limits.rows, limits.kept, q, limits.work)
+    return lambda limits, q: project(limits.rows, limits.row_limits, q, limits.work)
 
 
 @overload(rrt_kernel.extended)
@@ -96,7 +96,7 @@ def _extended(space, limits, trees, tree, near, q, longest, scratch):
             end[:] = q
         else:
             end[:] = origin + longest / gap * (q - origin)
-            if not project(limits.rows, limits.kept, end, limits.work):
+            if not project(limits.rows, limits.row_limits, end, limits.work):
                 return -1
             if distance(end, q) > max(MIN_APPROACH * gap, gap - 0.5 * longest):
                 return -1
@@ -120,9 +120,9 @@ def _straight(limits, a, b):
     work = limits.work
     evaluate(rows, a, 0, work)
     evaluate(rows, b, 1, work)
-    for m in range(len(limits.kept)):
+    for m in range(len(limits.row_limits)):
         limit = max(work.values[0, m], work.values[1, m]) + MAX_GROWTH * rows.tolerance[m]
-        limits.growing[m] = min(limits.kept[m], limit)
+        limits.growing[m] = min(limits.row_limits[m], limit)
     return proved(rows, limits.growing, a, b, MIN_PROOF_PIECE, work)[1] < 0
 
 
@@ -133,7 +133,7 @@ def _usable(space, limits, a, b, scratch):
 
 @inner_kernel()
 def between(space, limits, a, b, most, scratch):
-    """Find a free motion in straight pieces between two configurations a and b that keep the constraints;
+    """Find a free motion in straight pieces that keep the constraints, between two configurations a and b;
     write the ends of the pieces to limits.out.
 
     Returns the number of pieces; 0 if no motion was found or if it is longer than `most` [rad].
@@ -163,7 +163,7 @@ def between(space, limits, a, b, most, scratch):
             return 0
         middle = stack[top]
         middle[:] = 0.5 * (current + target)
-        if not project(limits.rows, limits.kept, middle, limits.work):
+        if not project(limits.rows, limits.row_limits, middle, limits.work):
             return 0
         if max(distance(current, middle), distance(middle, target)) > MAX_DRIFT * gap:
             return 0
@@ -182,9 +182,9 @@ def line(space, limits, a, b):
 
 @kernel(nogil=True)
 def simplify(space, limits, path, rounds, tries, state):
-    """A path with the start and goal of `path` that is not longer. First `tries` shortcuts between random
-    waypoints are tried, and waypoints that a straight piece can skip are removed. Then each of `rounds`
-    rounds smooths the corners, and such waypoints are removed again."""
+    """A path that is not longer than `path` and has its start and goal. First `tries` shortcuts between
+    random waypoints are tried, and waypoints that a straight piece can skip are removed. Then each of
+    `rounds` rounds smooths the corners. At the end, waypoints that can be skipped are removed again."""
     scratch = rrt_kernel.make_scratch(space, path)
     points = _finer(path)
     failed = 0
@@ -262,7 +262,7 @@ def _smoothed(space, limits, path, scratch):
         if distance(trial, finer[i]) < MIN_CORNER_MOVE:
             continue
         if (
-            project(limits.rows, limits.kept, trial, limits.work)
+            project(limits.rows, limits.row_limits, trial, limits.work)
             and _usable(space, limits, finer[i - 1], trial, scratch)
             and _usable(space, limits, trial, finer[i + 1], scratch)
         ):

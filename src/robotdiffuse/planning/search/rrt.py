@@ -43,8 +43,8 @@ from robotdiffuse.trajectories.simplification import simplify, tighten
 from robotdiffuse.trajectories.speed_limits import scaled_limits
 
 MIN_CLEARANCE = 0.002
-"""Clearance that is tried before 0, even if none is requested [m]. Without a clearance, collision checks are
-expensive near contact; with this one, paths are hardly longer."""
+"""Clearance that is tried before 0, even if no clearance is requested [m]. It makes paths hardly longer, and
+avoids collision checks near contact, which are expensive."""
 FALLING_FRACTIONS = (1.0, 0.5, 0.25)
 """Fractions of the requested clearance that are tried in turn; see `usual_clearances`."""
 ITERATIONS_PER_CLEARANCE = 400
@@ -308,6 +308,7 @@ class AnytimeSearch:
         self._set_level(self._level)
 
     def _set_level(self, level: int) -> None:
+        """Use the clearance with the index `level` from now on."""
         self._level = level
         self._tried = 0
         self.space = self.start_goal.space(self.settings.resolution, self.clearance)
@@ -474,7 +475,7 @@ class _Validation:
         Returns whether there is a valid path to return.
         """
         search = self.search
-        motions = self.search.motions
+        motions = search.motions
         assert search.best is not None
         self._validated_at = search.work
         self._late = self.context.remaining <= 0
@@ -498,7 +499,7 @@ class _Validation:
         and the same seed must give the same result.
         """
         search = self.search
-        motions = self.search.motions
+        motions = search.motions
         before = self.best
         if before is None or self.context.ended or self._late:
             return
@@ -591,8 +592,8 @@ def anytime(
     problem = context.problem
     if request.objective == TIME and request.until != FIRST and not problem.constraints:
         straight = float(np.linalg.norm(search.goals - search.start, axis=1).min())
-        several = problem.goal.goals if isinstance(problem.goal, AnyGoal) else (problem.goal,)
-        joint_goals_only = all(isinstance(goal, JointGoal) for goal in several)
+        goals = problem.goal.goals if isinstance(problem.goal, AnyGoal) else (problem.goal,)
+        joint_goals_only = all(isinstance(goal, JointGoal) for goal in goals)
         longest = np.inf if joint_goals_only else MAX_DETOUR * straight
         search.motions = TimeOptimization(
             problem.robot, context.timing, search.start, search.goals, request.seed, longest
@@ -627,9 +628,9 @@ def anytime(
             if searching:
                 improve()
             if motions is not None:
-                share = ATTEMPTS_PER_ITERATION * search.work
-                attempts = share if searching else motions.attempts + ATTEMPTS_AFTER_SEARCH
-                while motions.attempts < attempts and context.remaining > 0 and motions.candidates:
+                after_search = motions.attempts + ATTEMPTS_AFTER_SEARCH
+                target = ATTEMPTS_PER_ITERATION * search.work if searching else after_search
+                while motions.attempts < target and context.remaining > 0 and motions.candidates:
                     motions.improve(search.space)
     validation.run_last()
     return replace(validation.best or context.unsolved(), trees=search.trees)

@@ -27,7 +27,7 @@ INFINITE = np.float32(np.inf)
 _NOWHERE = np.float32(1e15)
 """Coordinate of unused node places, far from all nodes; its square is finite [rad]."""
 _FAR = np.float32(1e29)
-"""A squared distance between those of nodes (smaller) and those of unused places (larger) [rad²]."""
+"""A squared distance that is larger than those of nodes and smaller than those of unused places [rad²]."""
 LINE_SHARE = np.float32(0.5)
 """While there is no path: fraction of the samples that are drawn around the straight line from start to goal;
 the other samples are uniform."""
@@ -63,6 +63,7 @@ class Scratch(NamedTuple):
 
     work: tuple
     block: np.ndarray
+    """[dof, W] configurations that are checked at once."""
     end: np.ndarray
     """[dof] where a motion ends."""
 
@@ -98,7 +99,7 @@ def make_scratch(space, q):
 
 
 def keep(limits, q):
-    """Project q onto the path constraints, in place; returns whether it keeps them then. Only compiled code
+    """Project q onto the path constraints, in place; returns whether q then keeps them. Only compiled code
     can call this function."""
 
 
@@ -484,8 +485,8 @@ def branch(trees, tree, node):
 
 @inner_kernel()
 def _joined(trees, tree, x_new, x_connect):
-    """The path from the start to a goal where the trees meet: x_new in `tree` and x_connect in the other tree
-    are nodes at the same configuration."""
+    """The path from the start to a goal through the configuration where the trees meet. This is the node
+    x_new of `tree` and the node x_connect of the other tree."""
     first, second = (x_new, x_connect) if tree == 0 else (x_connect, x_new)
     forth = branch(trees, 0, first)
     back = branch(trees, 1, trees.parents[1, second])

@@ -1,4 +1,4 @@
-"""Shared-Tree Informed RRT*, the paper's planner for data: one tree, many goals, a safety distance.
+"""Shared-Tree Informed RRT*, the paper's planner for training data: one tree, many goals, a safety distance.
 
 The parts of the paper's section on data sets, their implementation here, and how the authors' code differs:
 
@@ -443,5 +443,5 @@ def _reason(search: SharedTreeSearch) -> str:
     reached = int(np.isfinite(search.goal_costs).sum())
     return (
         f"solved by {SharedTreeRRTStar.name}: {len(search.costs)} rounds, {reached} of {len(search.goals)} "
-        f"goals reached, {100 * search.safety_distance:.0f} cm of safety distance kept away from the ends"
+        f"goals reached, {100 * search.safety_distance:.0f} cm of safety distance, except near start and goal"
     )

@@ -67,11 +67,11 @@ def reduce_time(space, path, deviations, time, velocity, acceleration, longest, 
     step = np.zeros(dof)
     moved = np.int64(0)
     for _ in range(tries):
-        new, wider, first, last = _candidate(space, path, deviations, step, moved, state)
+        new, new_deviations, first, last = _candidate(space, path, deviations, step, moved, state)
         moved = 0
         if len(new) == 0:
             continue
-        line = rounded_line(new, wider)
+        line = rounded_line(new, new_deviations)
         if line[1][-1] > longest:
             continue
         new_time = estimated_time(line, velocity, acceleration)
@@ -80,7 +80,7 @@ def reduce_time(space, path, deviations, time, velocity, acceleration, longest, 
                 step[:] = new[last] - path[last]
                 moved = last if np.abs(step).max() > 0 else 0
             path = new
-            deviations = wider
+            deviations = new_deviations
             time = new_time
     return path, deviations, time
 
@@ -93,27 +93,28 @@ def _candidate(space, path, deviations, step, again, state):
     n, dof = path.shape
     kind = np.float32(1.0) if again else random(state)
     i = again if again else 1 + min(int(random(state) * (n - 2)), n - 3)
-    if kind < REMOVE_SHARE and n > 3:
+    if kind < REMOVE_SHARE and n > 3:  # remove waypoint i
         new = np.empty((n - 1, dof))
-        wider = np.empty(n - 3)
+        new_deviations = np.empty(n - 3)
         new[:i] = path[:i]
         new[i:] = path[i + 1 :]
-        wider[: i - 1] = deviations[: i - 1]
-        wider[i - 1 :] = deviations[i:]
-        return new, wider, i - 1, i - 1
-    if kind < ADD_SHARE:
+        new_deviations[: i - 1] = deviations[: i - 1]
+        new_deviations[i - 1 :] = deviations[i:]
+        return new, new_deviations, i - 1, i - 1
+    if kind < ADD_SHARE:  # add waypoint i in the middle of a segment
         i = 1 + min(int(random(state) * (n - 1)), n - 2)
         new = np.empty((n + 1, dof))
-        wider = np.empty(n - 1)
+        new_deviations = np.empty(n - 1)
         new[:i] = path[:i]
         new[i + 1 :] = path[i:]
         new[i] = 0.5 * (path[i - 1] + path[i])
-        wider[: i - 1] = deviations[: i - 1]
-        wider[i:] = deviations[i - 1 :]
-        wider[i - 1] = deviations[min(i - 1, n - 3)]
+        new_deviations[: i - 1] = deviations[: i - 1]
+        new_deviations[i:] = deviations[i - 1 :]
+        new_deviations[i - 1] = deviations[min(i - 1, n - 3)]
     else:
         new = path.copy()
-        wider = deviations.copy()
+        new_deviations = deviations.copy()
+    # move waypoint i, with a random scale and in a random part of the joints, within the joint limits
     if again:
         new[i] += REPEAT_FACTOR * step
     elif kind < ADD_SHARE or kind >= WIDEN_SHARE:
@@ -124,13 +125,14 @@ def _candidate(space, path, deviations, step, again, state):
                 new[i, j] += size * (2.0 * random(state) - 1.0)
     for j in range(dof):
         new[i, j] = min(max(new[i, j], space.lower[j]), space.upper[j])
+    # change the deviation of its corner
     if not again and kind >= ADD_SHARE and (kind < WIDEN_SHARE or random(state) < 0.5):
         change = WIDENING if random(state) < 0.75 else 1.0 / WIDENING
-        wider[i - 1] = min(change * wider[i - 1], MAX_DEVIATION)
+        new_deviations[i - 1] = min(change * new_deviations[i - 1], MAX_DEVIATION)
     for k in range(i - 1, i + 1):
         if ((new[k + 1] - new[k]) ** 2).sum() < MIN_SEGMENT**2:
-            return np.empty((0, dof)), wider, 0, 0
-    return new, wider, i - 1, i
+            return np.empty((0, dof)), new_deviations, 0, 0
+    return new, new_deviations, i - 1, i
 
 
 @inner_kernel(inline="always")
