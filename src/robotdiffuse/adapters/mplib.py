@@ -39,13 +39,13 @@ HELD = "attached"
 RAMP_TIME = 0.01
 # The last row is repeated for this time [s], in which position controllers reach it.
 SETTLING_TIME = 0.24
-# Distance that lines with uneven rotation may have from the straight line [m].
+# Largest distance from the straight line for motions that turn unevenly along it [m].
 LOOSE_TOLERANCE = 0.002
 # Weight of the rotation error against the position error, for poses that are out of reach [m/rad].
 TILT_WEIGHT = 0.01
-# The tilt is this factor larger than the smallest one that reaches the position, where the arm is stretched.
+# Factor from the smallest tilt that reaches the position, with the arm stretched, to the tilt that is used.
 TILT_MARGIN = 1.25
-# Grippers are held at multiples of this [rad] or [m].
+# Locked joints, such as fingers, are held at multiples of this [rad] or [m].
 HELD_JOINT_STEP = 0.002
 
 
@@ -93,7 +93,7 @@ class Planner:
             acceleration if len(acceleration) else robot.acceleration,
         )
         self.workspace = Workspace(self.robot, move_group)
-        """The robot and its obstacles; obstacles that are no point clouds are added to it."""
+        """The robot and its obstacles. Obstacles other than point clouds are added by its method `add`."""
 
     @property
     def joint_vel_limits(self) -> ndarray:
@@ -218,7 +218,7 @@ class Planner:
         """Move along a straight line while turning at a constant rate; see `plan_pose`.
 
         If there is no such motion, a motion along the line that turns unevenly is tried. If the pose is out
-        of reach, but the arm can reach its position when tilted by less than 15 degrees, the motion ends
+        of reach, but the arm can reach its position when tilted by at most 15 degrees, the motion ends
         there, tilted. In both cases `note` says so.
         """
         T = self._in_world(target_pose, options)
@@ -246,7 +246,8 @@ class Planner:
     plan_qpos_to_qpos = plan_qpos
 
     def check_for_self_collision(self, qpos: ArrayLike) -> list[str]:
-        """A list with the reason why a configuration is not free without obstacles; empty if it is free."""
+        """A list with the reason why a configuration is not free if obstacles are ignored; empty if it is
+        free."""
         start = self._start(qpos)
         state = Workspace(self.workspace.robot, self.workspace.tip).is_free(start)
         return [] if state else [state.reason]

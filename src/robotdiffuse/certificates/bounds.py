@@ -4,7 +4,7 @@ A claim is that a link is free of the scene or of another link. A stretch is fre
 of the link in the middle of the stretch exceeds its displacement: the largest distance of any point of the
 link, anywhere on the stretch, from its place in the middle. Clearances are those of the robot's covering
 spheres, or those of its convex meshes by separating planes. For two links, only joints that move exactly one
-of them count: those after the last joint that moves both.
+of the links count: the joints after the last joint that moves both links.
 
 The geometry is the checker's own: distances of points to obstacles, and support functions of obstacles.
 """
@@ -30,8 +30,8 @@ from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape
 CLEARANCE_CAP = 1.0
 """Larger clearances count as this [m]."""
 PLANE_RANGE = 0.2
-"""Triangles and points further than this from the ball around a part count as this far away and need no
-planes [m]."""
+"""Triangles and points further than this from the ball around a part need no planes, and count as this far
+away [m]."""
 EXACT_TRIANGLE_RANGE = 4.0
 """A triangle is replaced by the ball around it at distances of more than this many radii of the ball."""
 MAX_ARRAY_SIZE = 1_000_000
@@ -220,7 +220,8 @@ class Claim(NamedTuple):
 
     link: str
     against: str
-    """SCENE, the name of a moving obstacle, or the name of the other link, which no more joints move."""
+    """SCENE, the name of a moving obstacle, or the name of the other link, which is moved by at most as many
+    joints as `link`."""
 
 
 class Stretches(NamedTuple):
@@ -289,8 +290,7 @@ class Prover:
         off: JointRows | None = None,
     ) -> None:
         """off: how far each joint may leave the straight line from each configuration to the next [rad] or
-        [m];
-        None: 0."""
+        [m]; None: 0."""
         self.robot = robot
         self.q = q
         self.off = np.zeros_like(q[1:]) if off is None else off
@@ -300,7 +300,7 @@ class Prover:
             raise InputError(
                 f"the robot has a link called {SCENE!r}; rename it: certificates use this name for the scene"
             )
-        self._of = {link: k for k, link in enumerate(self.linkage.links)}
+        self._link_index = {link: k for k, link in enumerate(self.linkage.links)}
         self._moved = self.linkage.moved
         self.may_touch = np.array(
             [[scene.may_touch(link, name) for name in self.obstacles.names] for link in self.linkage.links],
@@ -317,7 +317,7 @@ class Prover:
     def claims(self) -> tuple[Claim, ...]:
         """All claims: each moving link against the scene, and each pair of links that move relative to each
         other and may not touch."""
-        moved = {link: self._moved[self._of[link]] for link in self.links}
+        moved = {link: self._moved[self._link_index[link]] for link in self.links}
         level = {link: int(joints.sum()) for link, joints in moved.items()}
         moving = [Claim(link, SCENE) for link in self.links if level[link] > 0]
         pairs = []
@@ -409,9 +409,9 @@ class Prover:
     ) -> tuple[ndarray, ndarray]:
         """For each link, the clearance of its balls and an upper bound on their displacement [m].
 
-        links: indices of links. moved: for each, the joints that count. posture: for each, the row in
-        `postures` and `spans`. distances: computes the distance of each ball's center to the other body, from
-        the ball's row in `links`, its posture and its center; None: clearances are not computed.
+        links: indices of links. moved: for each link, the joints that count. posture: for each link, the row
+        in `postures` and `spans`. distances: computes the distance of each ball's center to the other body,
+        from the ball's row in `links`, its posture and its center; None: clearances are not computed.
         """
         row, ball, begin = self._expand(links)
         at = posture[row]
@@ -428,34 +428,36 @@ class Prover:
     def _by_spheres(
         self, claim: ndarray, posture: ndarray, postures: Postures, spans: ndarray, pairs: bool
     ) -> tuple[ndarray, ndarray]:
-        farther = np.array([self._of[c.link] for c in self.claims])[claim]
-        moved = self._moved[farther]
+        """Clearances and displacements by the covering spheres, for claims against the scene, or between
+        links if `pairs` is true."""
+        links = np.array([self._link_index[c.link] for c in self.claims])[claim]
+        moved = self._moved[links]
         if not pairs:
 
             def to_scene(row: ndarray, at: ndarray, centers: ndarray) -> ndarray:
                 gaps = self.obstacles.distances(centers)
                 if self.may_touch.any():
-                    gaps[self.may_touch[farther[row]]] = CLEARANCE_CAP
+                    gaps[self.may_touch[links[row]]] = CLEARANCE_CAP
                 return gaps.min(axis=1, initial=CLEARANCE_CAP)
 
-            return self._ball_bounds(farther, moved, posture, postures, spans, to_scene)
-        nearer = np.array([self._of.get(c.against, 0) for c in self.claims])[claim]
-        alone = self._moved[nearer] & ~moved
-        near_displacement = np.zeros(len(claim))
-        some = np.flatnonzero(alone.any(axis=1))
+            return self._ball_bounds(links, moved, posture, postures, spans, to_scene)
+        others = np.array([self._link_index.get(c.against, 0) for c in self.claims])[claim]
+        moves_other_only = self._moved[others] & ~moved
+        other_displacement = np.zeros(len(claim))
+        some = np.flatnonzero(moves_other_only.any(axis=1))
         if len(some):
-            near_displacement[some] = self._ball_bounds(
-                nearer[some], alone[some], posture[some], postures, spans
+            other_displacement[some] = self._ball_bounds(
+                others[some], moves_other_only[some], posture[some], postures, spans
             )[1]
-        clearance, went = self._ball_bounds(
-            farther,
-            moved & ~self._moved[nearer],
+        clearance, link_displacement = self._ball_bounds(
+            links,
+            moved & ~self._moved[others],
             posture,
             postures,
             spans,
-            lambda row, at, centers: self._to_links(postures, at, centers, nearer[row]),
+            lambda row, at, centers: self._to_links(postures, at, centers, others[row]),
         )
-        return clearance, went + near_displacement
+        return clearance, link_displacement + other_displacement
 
     def _to_links(self, postures: Postures, at: ndarray, centers: ndarray, link: ndarray) -> ndarray:
         """The distance of each point to the spheres of its link [m]. at: the posture; link: the link's
@@ -486,6 +488,9 @@ class Prover:
         clearance of a pair is the greater of the gap between the balls around them and the widest gap that a
         plane shows. The margin of a pair is a lower bound of its gap anywhere on the stretch, computed in the
         same way. The results are the smallest clearance, and its difference from the smallest margin.
+
+        which: for each stretch, its row in `postures`. ways: for each marked stretch, the `_steps` of its
+        joints and their `deviations`.
         """
         normals: dict[tuple[int, int, int], list[tuple[float, float, float]]] = {}
         for plane in planes:
@@ -493,16 +498,16 @@ class Prover:
         clearance = np.full(len(marked), CLEARANCE_CAP)
         margin = np.full(len(marked), CLEARANCE_CAP)
         places = [(self.claims[stretches.claim[i]], postures.T[which[i]]) for i in marked]
-        standing = [placed(self.parts[claim.link], T[self._of[claim.link]]) for claim, T in places]
+        standing = [placed(self.parts[claim.link], T[self._link_index[claim.link]]) for claim, T in places]
         in_scene = [k for k, (claim, _) in enumerate(places) if claim.against == SCENE]
         centers = [part.center for k in in_scene for part in standing[k]]
         to_scene = iter(self.obstacles.distances(np.array(centers).reshape(-1, 3)))
         for k, (claim, T) in enumerate(places):
             # joints that move only the link, and joints that move only the other link
-            mine = self._moved[self._of[claim.link]]
+            mine = self._moved[self._link_index[claim.link]]
             theirs = np.zeros(len(self.linkage.slides), bool)
             if claim.against != SCENE:
-                moved_other = self._moved[self._of[claim.against]]
+                moved_other = self._moved[self._link_index[claim.against]]
                 mine, theirs = mine & ~moved_other, moved_other & ~mine
             mine = np.flatnonzero(mine)
             theirs = np.flatnonzero(theirs)
@@ -511,32 +516,32 @@ class Prover:
                 bodies = self.others(claim, T, part)
                 if claim.against == SCENE:
                     ball_gaps = next(to_scene) - part.radius
-                    ball_gaps[self.may_touch[self._of[claim.link]]] = CLEARANCE_CAP
+                    ball_gaps[self.may_touch[self._link_index[claim.link]]] = CLEARANCE_CAP
                 else:
                     ball_gaps = self.balls_apart(part, bodies)
-                ball_gaps, along = ball_gaps.copy(), ball_gaps - displacement[k]
+                ball_gaps, margins = ball_gaps.copy(), ball_gaps - displacement[k]
                 for o, body in enumerate(bodies):
                     known_normal = normals.get((int(marked[k]), p, o))
                     if known_normal is not None:
                         n = np.array(known_normal)
                         n /= np.sqrt((n**2).sum(axis=1, keepdims=True))
                         axes = postures.origins[at], postures.axes[at]
-                        nearer = self.linkage.approach(*axes, part.vertices, mine, way, n, off)
-                        against = np.zeros(len(n))
+                        approach = self.linkage.approach(*axes, part.vertices, mine, way, n, off)
+                        other_rise = np.zeros(len(n))
                         if len(theirs):
                             assert isinstance(body, Part)
-                            comes = self.linkage.approach(*axes, body.vertices, theirs, way, -n, off)
+                            other_approach = self.linkage.approach(*axes, body.vertices, theirs, way, -n, off)
                             heights = n @ body.vertices.T
-                            against = (heights + comes).max(axis=1) - heights.max(axis=1)
+                            other_rise = (heights + other_approach).max(axis=1) - heights.max(axis=1)
                         widest = gaps(part, body, n).max(axis=-1)
-                        remaining = (gaps(part, body, n, nearer) - against).max(axis=-1)
-                        least_of = np.maximum(ball_gaps[o], widest)
-                        left_of = np.maximum(along[o], remaining)
+                        remaining = (gaps(part, body, n, approach) - other_rise).max(axis=-1)
+                        element_gaps = np.maximum(ball_gaps[o], widest)
+                        element_margins = np.maximum(margins[o], remaining)
                         beyond = PLANE_RANGE if isinstance(body, Surface) else CLEARANCE_CAP
-                        ball_gaps[o] = max(ball_gaps[o], least_of.min(initial=beyond))
-                        along[o] = max(along[o], left_of.min(initial=beyond - displacement[k]))
+                        ball_gaps[o] = max(ball_gaps[o], element_gaps.min(initial=beyond))
+                        margins[o] = max(margins[o], element_margins.min(initial=beyond - displacement[k]))
                 clearance[k] = min(clearance[k], ball_gaps.min(initial=CLEARANCE_CAP))
-                margin[k] = min(margin[k], along.min(initial=CLEARANCE_CAP))
+                margin[k] = min(margin[k], margins.min(initial=CLEARANCE_CAP))
         return clearance, clearance - margin
 
     def others(self, claim: Claim, T: ndarray, part: Part) -> Sequence[Rounded | Surface | Part]:
@@ -544,7 +549,7 @@ class Prover:
         elements."""
         if claim.against == SCENE:
             return self.obstacles.near(part.center, part.radius)
-        return placed(self.parts[claim.against], T[self._of[claim.against]])
+        return placed(self.parts[claim.against], T[self._link_index[claim.against]])
 
     def balls_apart(self, part: Part, bodies: Sequence[Rounded | Surface | Part]) -> Float[ndarray, "bodies"]:
         """Distances of the ball around a part to each obstacle, or to the balls around the parts of another
@@ -627,8 +632,9 @@ class MovingProver(Prover):
     given times or within a known distance of the lines.
 
     The clearance of a stretch is that of the link's spheres at its middle, with the obstacle where it is at
-    that time. The displacement is the sum of those of the link and of the obstacle, from the middle until
-    either end.
+    that time. The displacement is the sum of the displacements of the link and of the obstacle from the
+    middle to either end. An obstacle with unknown motion is placed where it is at time 0, and its
+    displacement counts from then.
     """
 
     def __init__(
@@ -646,7 +652,7 @@ class MovingProver(Prover):
     @cached_property
     def claims(self) -> tuple[Claim, ...]:
         """Each moving link against each obstacle."""
-        links = [link for link in self.links if self._moved[self._of[link]].any()]
+        links = [link for link in self.links if self._moved[self._link_index[link]].any()]
         return tuple(Claim(link, obstacle.name) for link in links for obstacle in self.moving)
 
     def bounds(self, stretches: Stretches, by_planes: ndarray, planes: list[Plane]) -> Bounds:
@@ -656,7 +662,7 @@ class MovingProver(Prover):
         postures = self.linkage.place(self.at(middle))
         rows = np.arange(len(self.times))
         begin, at, end = (np.interp(s, rows, self.times) for s in (stretches.start, middle, stretches.stop))
-        links = np.array([self._of[claim.link] for claim in self.claims])[stretches.claim]
+        links = np.array([self._link_index[claim.link] for claim in self.claims])[stretches.claim]
         number = {moving_obstacle.name: i for i, moving_obstacle in enumerate(self.moving)}
         obstacle_indices = np.array([number[claim.against] for claim in self.claims])[stretches.claim]
         speed, bounded, reference_pose = (

@@ -1,4 +1,4 @@
-"""The checker of proofs. It needs no search and shares no code with the validator but the data types.
+"""The checker of proofs. It needs no search, and shares only data types with the validator.
 
 A claim says that a link stays clear of the scene, or of another link. It is proved for stretches of the
 motion, intervals between rows: the clearance in the middle of a stretch exceeds the displacement, which is
@@ -104,7 +104,7 @@ def check(
 
 def _cover_errors(robot: Robot) -> Iterator[str]:
     """A message for each link with corners of meshes outside its spheres, since spheres prove most stretches.
-    That spheres cover all of the meshes is proved when a robot is prepared."""
+    The preparation of a robot proves that the spheres cover all of the meshes."""
     for link, meshes in robot.meshes.items():
         if link not in robot.spheres or not len(robot.spheres[link]) or not meshes:
             continue
@@ -124,8 +124,8 @@ def _proof_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
     prover = Prover(problem.robot, problem.scene, *along)
     proof = certificate.proof
     stated = {"scene": certificate.scene_clearance, "self": certificate.self_clearance}
-    of_pairs = np.array([claim.against != SCENE for claim in proof.claims], bool)[proof.stretches.claim]
-    yield from _bound_errors(prover, proof, {"scene": ~of_pairs, "self": of_pairs}, stated)
+    is_pair = np.array([claim.against != SCENE for claim in proof.claims], bool)[proof.stretches.claim]
+    yield from _bound_errors(prover, proof, {"scene": ~is_pair, "self": is_pair}, stated)
     moving = certificate.moving
     if moving is not None and not problem.moving:
         yield "proof: it has a part on moving obstacles, which the problem does not have"
@@ -194,9 +194,9 @@ def _bound_errors(
         if len(unproved):
             i = int(unproved[0])
             yield f"proof: {_place(proof, i)} is clear by {margin[i]:.6f} m, not by {stated_clearance:.6f} m"
-        nothing = np.flatnonzero(marked & ~(margin > 0))
-        if len(nothing):
-            i = int(nothing[0])
+        without_margin = np.flatnonzero(marked & ~(margin > 0))
+        if len(without_margin):
+            i = int(without_margin[0])
             yield f"proof: {_place(proof, i)} is not shown to be free: {margin[i]:.6f} m are left"
 
 
@@ -208,7 +208,7 @@ def _gaps(proof: StretchProof, last: float) -> Iterator[str]:
         start = stretches.start[rows]
         stop = stretches.stop[rows]
         edges = np.concatenate([[0.0], stop]), np.concatenate([start, [last]])
-        # A motion of one row has no gap without stretches, but its row must be proved by one.
+        # A motion of one row has no gap without stretches, but a stretch must prove its row.
         empty = not len(rows)
         broken = np.flatnonzero((edges[0] != edges[1]) | np.append(stop < start, empty))
         if len(broken):

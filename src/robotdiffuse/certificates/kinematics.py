@@ -102,7 +102,7 @@ class Linkage:
 
     def levers(self, link: str, q: Configurations) -> Float[ndarray, "joints"]:
         """Upper bounds on the distance of a link's origin from the axis of each planned joint that moves it,
-        base first [m]; 1 for a prismatic joint. q: the extreme positions of a motion, in rows."""
+        base first [m]; 1 for a prismatic joint. q: rows that contain the extreme position of each joint."""
         bounds = list[float]()
         length = 0.0
         for joint in reversed(self._up_to(link)):
@@ -167,8 +167,8 @@ class Linkage:
         """Upper bound on the movement of each point against each unit normal [m].
 
         origins, axes: of the joints in a posture. moved_by: the joints that move the points, base first.
-        steps: differences from the posture; the joints move anywhere on the straight lines between these, or
-        within `off` of the lines.
+        steps: configurations minus that of the posture; the joints move anywhere on the straight lines
+        between these configurations, or within `off` of the lines.
 
         To first order, a point's movement along a normal is linear in the joints, so its minimum is at one of
         the steps, less what `off` adds. With spans D and the greatest distance L_k of the point from axis k,
@@ -205,8 +205,8 @@ def cross_matrix(axis: Vector) -> Rotation:
 
 
 class Cubics(NamedTuple):
-    """The cubics from each row of a motion to the next. Their accelerations are linear in time, and 0 for a
-    path."""
+    """The cubics from each row of a motion to the next. Their accelerations are linear in time; for a path,
+    they are 0."""
 
     times: Values
     """Time at which each cubic begins [s]."""
@@ -240,7 +240,7 @@ class Cubics(NamedTuple):
         return np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 1)
 
     @property
-    def pulls(self) -> JointRows:
+    def peak_accelerations(self) -> JointRows:
         """The greatest absolute acceleration of each cubic and joint."""
         return np.maximum(np.abs(self.start), np.abs(self.end))
 
@@ -260,7 +260,7 @@ class Cubics(NamedTuple):
         return np.maximum(np.abs(extremal), np.maximum(np.abs(self.velocities), np.abs(last)))
 
     @property
-    def turns(self) -> Configurations:
+    def turning_points(self) -> Configurations:
         """Positions that include the extremes of each joint inside each cubic: two rows per cubic, at the
         roots of the velocity, or at an end of the cubic where there is no root inside."""
         v = self.velocities / self.steps
@@ -271,11 +271,11 @@ class Cubics(NamedTuple):
             np.divide(above, below, out=np.zeros_like(above), where=below != 0)
             for above, below in ((2 * v, far), (far, curve))
         ]
-        turns = []
+        points = []
         for share in np.clip(shares, 0.0, 1.0):
             t = share * self.steps
-            turns.append(self.positions + t * (self.velocities + t * (self.start / 2 + share * curve / 6)))
-        return np.concatenate(turns)
+            points.append(self.positions + t * (self.velocities + t * (self.start / 2 + share * curve / 6)))
+        return np.concatenate(points)
 
     def deviations(self, times: Values) -> JointRows:
         """Upper bounds on how far each joint leaves the straight lines between its positions at these times,

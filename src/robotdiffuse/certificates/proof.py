@@ -20,7 +20,8 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud, Shape, Triangulated
 
 BOUND_TOLERANCE = 1e-6
-"""A recomputed bound may differ from the bound in the proof by this [m] or [rad], because files round."""
+"""A recomputed bound may differ from the bound in the proof by this [m] or [rad], since files round
+bounds."""
 DECIMALS = 7
 """Number of decimals of bounds [m] in files."""
 
@@ -52,7 +53,7 @@ class Tolerances:
 @dataclass(frozen=True, eq=False)
 class StretchProof:
     """Stretches (intervals) of the motion for each claim, with the bounds that prove each stretch free. A
-    claim is that a link is free of the scene or of another link."""
+    claim is that a link is free of the scene, of a moving obstacle or of another link."""
 
     claims: tuple[Claim, ...]
     stretches: Stretches

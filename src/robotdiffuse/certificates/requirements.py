@@ -3,11 +3,11 @@ path constraints and torques.
 
 Path constraints: from one configuration to the next, each joint j moves by dq_j at a constant rate. The
 origin p of a frame then deviates from the chord (the straight line between its two positions) by at most an
-eighth of its second derivative. This derivative is at most sum_jk |dq_j dq_k| L_max(j,k), where L_k is an
-upper bound on the distance of p from the axis of joint k during the motion. The distance of a point to a
-convex body is a convex function. So along the chord, it is at most the larger of its values at the two ends;
-the deviation is added. An axis of the frame deviates from its own chord by at most (sum_j |dq_j|)² / 8. The
-angle between two rotating frames changes at most at the sum of their speeds of rotation.
+eighth of its largest second derivative. This derivative is at most sum_jk |dq_j dq_k| L_max(j,k), where L_k
+is an upper bound on the distance of p from the axis of joint k during the motion. The distance of a point to
+a convex body is a convex function. So along the chord, it is at most the larger of its values at the two
+ends; the deviation is added. An axis of the frame deviates from its own chord by at most (sum_j |dq_j|)² / 8.
+The angle between two rotating frames changes at most at the sum of their speeds of rotation.
 
 Torques are computed at samples: the rows of the motion and places between them. Between two samples,
 positions follow a cubic or a straight line, and velocities and accelerations are its derivatives.
@@ -142,13 +142,13 @@ def frame_speed_errors(problem: Problem, motion: Trajectory, slack: float) -> li
     linkage = Linkage(problem.robot)
     lines = []
     cubics = cubics_of(motion)
-    extreme_positions = np.concatenate([motion.positions, cubics.turns])
+    extreme_positions = np.concatenate([motion.positions, cubics.turning_points])
     for constraint in problem.constraints:
         if not isinstance(constraint, CartesianLine) or constraint.speed is None:
             continue
         joints = np.flatnonzero(linkage.moved[linkage.links.index(constraint.frame)])
         speed = np.cumsum(cubics.speeds[:, joints], axis=1)
-        acceleration = np.cumsum(cubics.pulls[:, joints], axis=1)
+        acceleration = np.cumsum(cubics.peak_accelerations[:, joints], axis=1)
         products = np.diff(3 * acceleration * speed + speed**3, axis=1, prepend=0.0)
         second_derivatives = (cubics.jerks[:, joints] + products) @ linkage.levers(
             constraint.frame, extreme_positions
@@ -274,7 +274,7 @@ def _angle_bounds(along: _FrameMotion, chord: float, *ends: Pose) -> Values:
 
 
 def _angles(first: ndarray, second: ndarray) -> Values:
-    """Angles between rotations [rad], from the norm of their difference, which is accurate near 0 as well."""
+    """Angles between rotations [rad], from the norm of their difference, which is accurate near 0 too."""
     return 2 * np.arcsin(np.clip(np.linalg.norm(first - second, axis=(1, 2)) / np.sqrt(8), 0.0, 1.0))
 
 
@@ -311,8 +311,8 @@ def _intervals(motion: Path | Trajectory, samples: Values) -> tuple[ndarray, Val
     """The m intervals between consecutive samples of a motion.
 
     Returns positions, velocities and accelerations at the start and the end of each interval [2, 3, m, dof];
-    durations [s], 1 for a path; and the `Bound` of each of the three [3, 3, m, dof]. Derivatives are by time;
-    those of a path, which is at rest, by the fraction of the interval.
+    durations [s], 1 for a path; and the `Bound` of the positions, velocities and accelerations
+    [3, 3, m, dof]. Derivatives are by time; for a path, which is at rest, by the fraction of the interval.
     """
     cubics = cubics_of(motion)
     if isinstance(motion, Path) or not len(cubics.times):
@@ -327,7 +327,7 @@ def _intervals(motion: Path | Trajectory, samples: Values) -> tuple[ndarray, Val
     row = cubics.rows(at[:-1])
     ends = np.array([cubics.at(row, time - cubics.times[row]) for time in (at[:-1], at[1:])])
     far = np.abs(cubics.positions) + cubics.speeds * cubics.steps
-    rates = [far, cubics.speeds, cubics.pulls, cubics.jerks, 0 * far]
+    rates = [far, cubics.speeds, cubics.peak_accelerations, cubics.jerks, 0 * far]
     return ends, np.diff(at), np.array([rates[k : k + 3] for k in range(3)])[:, :, row]
 
 
@@ -412,8 +412,8 @@ def _newton_euler(
 
 def _second_derivative_bounds(problem: Problem, bounds: ndarray) -> JointRows:
     """Upper bounds on the second derivatives of torques from each sample to the next, by the Newton-Euler
-    equations with a `Bound` in place of each vector. In place of a link's rotation is the `Bound` of its
-    angular velocity."""
+    equations with a `Bound` in place of each vector, and the `Bound` of a link's angular velocity in place
+    of its rotation."""
     robot = problem.robot
     still = np.zeros((3, bounds.shape[2]))
     slides = Linkage(robot).slides
@@ -461,13 +461,13 @@ def _link_inertias(problem: Problem) -> dict[str, list[Inertia]]:
 
 
 AVERAGING_WINDOWS = (1e-3, 4e-3, 16e-3)
-"""Windows over which mean accelerations are tested [s]. If any rows are closer than the first window, the
-longer windows are used as well, because the tolerance of positions hides accelerations between such rows."""
+"""Windows over which mean accelerations are tested [s]. The longer windows are used only if any rows are
+closer than the first window, because the tolerance of positions hides accelerations between such rows."""
 AGREEMENT = 0.5
 """Largest difference between the acceleration of a row and those of the cubics before and after it, as a
 fraction of the joint's largest acceleration."""
 REST_SHARE = 0.01
-"""Smallest value of this largest acceleration, as a fraction of the joint's limit."""
+"""Lower bound of the joint's largest acceleration in AGREEMENT, as a fraction of the joint's limit."""
 JUMP = 1e-6
 """Largest jump of an acceleration in a motion for which jerks are stated, as a fraction of the joint's
 limit."""
@@ -524,7 +524,7 @@ def requirement_errors(problem: Problem, certificate: MotionProof) -> Iterator[s
     name = not_covered(problem, motion)
     if name:
         yield f"problem: certificates do not prove anything about {name}"
-    extreme_positions = np.concatenate([motion.positions, cubics_of(motion).turns])
+    extreme_positions = np.concatenate([motion.positions, cubics_of(motion).turning_points])
     beyond = np.maximum(robot.lower - extreme_positions, extreme_positions - robot.upper)
     beyond[:, robot.continuous] = 0.0
     for j in np.flatnonzero(~(beyond <= tolerances.limit_slack).all(axis=0)):
@@ -570,7 +570,7 @@ def cubic_jerks(robot: Robot, motion: Path | Trajectory) -> JointValues | None:
     if isinstance(motion, Path) or len(motion.times) < 2:
         return None
     cubics = cubics_of(motion)
-    limits = np.where(robot.acceleration > 0, robot.acceleration, cubics.pulls.max(axis=0))
+    limits = np.where(robot.acceleration > 0, robot.acceleration, cubics.peak_accelerations.max(axis=0))
     written = motion.accelerations
     off = np.maximum(np.abs(written[:-1] - cubics.start), np.abs(written[1:] - cubics.end))
     if not (cubics.jumps() <= JUMP * limits).all() or not (off <= JUMP * limits).all():
@@ -579,7 +579,7 @@ def cubic_jerks(robot: Robot, motion: Path | Trajectory) -> JointValues | None:
 
 
 def _jerk_errors(robot: Robot, motion: Trajectory, certificate: MotionProof) -> Iterator[str]:
-    """A message for each joint with a larger jerk than the proof states, if it states jerks."""
+    """A message for each joint with a larger jerk than the proof states, if the proof states jerks."""
     stated = dict(certificate.jerks)
     if not stated:
         return
@@ -624,8 +624,8 @@ def _waypoint_errors(problem: Problem, motion: Path | Trajectory, tolerances: To
 
 
 def _torque_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
-    """A message for each torque bound that differs from the proof, and for each torque that is not proved to
-    be within its limit with the payload."""
+    """A message for each torque bound that differs from the bound in the proof, and for each torque that is
+    not proved to be within its limit with the payload."""
     motion = certificate.motion
     stated = certificate.torques
     if problem.payload is None:
@@ -641,8 +641,8 @@ def _torque_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
 
 
 def _constraint_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
-    """A message for each bound that differs from the proof, and for each path constraint that is not proved
-    to be kept."""
+    """A message for each bound that differs from the bound in the proof, and for each path constraint that is
+    not proved to be kept."""
     if not problem.constraints and not certificate.constraints:
         return
     q = configurations(certificate.motion, certificate.between)
@@ -688,8 +688,8 @@ def _rate_errors(
     speed = robot.velocity
     acceleration = robot.acceleration
     change = np.diff(v, axis=0) / step
-    # an error of the mean velocity changes the cubic's velocities by up to 3/2 of it, and its accelerations
-    # by 6 / step times it
+    # an error e of the mean velocity changes the cubic's velocities by up to 1.5 e, and its accelerations by
+    # up to 6 e / step
     acceleration_slack = 6 * position_slack / step**2
     yield from _agreement_errors(robot, motion, cubics, start_velocity, acceleration_slack)
     for quantity, values, limit, slack in (
@@ -703,7 +703,7 @@ def _rate_errors(
         ("acceleration", a, acceleration, 0.0),
         ("mean acceleration between rows", change, acceleration, 0.0),
         ("velocity along its cubics", cubics.speeds, speed, 1.5 * position_slack / step),
-        ("acceleration along its cubics", cubics.pulls, acceleration, acceleration_slack),
+        ("acceleration along its cubics", cubics.peak_accelerations, acceleration, acceleration_slack),
     ):
         yield from _exceeded(robot, quantity, np.abs(values), limit, rate_factor * limit + slack)
     beyond = _excess_displacement(motion, rate_factor, position_slack, speed)
@@ -762,8 +762,9 @@ def _excess_displacement(
     """For each joint, the largest excess of its displacement between two rows over what its velocity limit
     allows in the time between them, over all pairs of rows [1, dof].
 
-    For each step between the two rows, a tolerance of `position_slack` is allowed; less for a step shorter
-    than the first averaging window. The caller allows this tolerance once more, for the two rows themselves.
+    For each step between the two rows, a tolerance of `position_slack` is allowed; proportionally less for a
+    step shorter than the first averaging window. The caller allows this tolerance once more, for the two rows
+    themselves.
     """
     step = np.diff(motion.times)[:, None]
     q = motion.positions
@@ -786,7 +787,7 @@ def _agreement_errors(
     off = np.maximum(np.minimum(before, after) - a, a - np.maximum(before, after)).clip(0.0)
     if start_velocity.any():
         off[:1] = 0.0  # the acceleration of the motion before this one is not known
-    peak = np.abs(np.concatenate([cubics.pulls, a])).max(axis=0)
+    peak = np.abs(np.concatenate([cubics.peak_accelerations, a])).max(axis=0)
     peak = np.maximum(peak, REST_SHARE * robot.acceleration)
     slack = np.maximum(
         np.concatenate([acceleration_slack[:1], acceleration_slack]),

@@ -89,8 +89,8 @@ class PlaneFinder:
     def planes(self, todo: Stretches, rows: ndarray, needed: Values) -> list[Plane]:
         """Separating planes for some of the stretches in `todo`, by their indices `rows`.
 
-        needed: for each of these stretches, the clearance that it needs [m]. Pairs of bodies with balls
-        further apart get no plane. Bodies that touch have no separating plane.
+        needed: for each of these stretches, the clearance that it needs [m]. No plane is made for bodies with
+        balls further apart, or for bodies that touch, which have no separating plane.
         """
         prover = self.prover
         middle = (todo.start[rows] + todo.stop[rows]) / 2
@@ -318,7 +318,7 @@ def _between(motion: Path | Trajectory, chord: float) -> Values:
     """Times between the rows at which configurations are added, so that no joint leaves the straight lines
     between configurations by more than `chord` [rad] or [m]."""
     cubics = cubics_of(motion)
-    off = (cubics.pulls * cubics.steps**2 / 8).max(axis=1)
+    off = (cubics.peak_accelerations * cubics.steps**2 / 8).max(axis=1)
     parts = np.maximum(np.ceil(np.sqrt(off / chord)), 1).astype(int)
     if parts.sum() > MAX_STRETCHES:
         raise InputError("the motion bends too much between its rows to be certified; give more rows")
@@ -336,8 +336,7 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[
     todo = Stretches(np.arange(count), np.zeros(count), np.full(count, last))
     against_scene = np.array([claim.against == SCENE for claim in prover.claims], bool)
     targets = np.where(against_scene, least.get(SCENE, 0.0), least[""]) + ROUNDING_RESERVE
-    in_time = isinstance(prover, MovingProver)
-    tools = None if in_time else PlaneFinder(prover)
+    plane_finder = None if isinstance(prover, MovingProver) else PlaneFinder(prover)
     proofs = list[StretchProof]()
     total = 0
     while len(todo.claim) or not proofs:  # robots without bodies have nothing to prove
@@ -353,23 +352,23 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[
             & (clearance < PLANES_BELOW)
             & (displacement < PLANES_DISPLACEMENT)
         )
-        if tools is not None and close.any():
+        if plane_finder is not None and close.any():
             rows = np.flatnonzero(close)
-            planes = tools.planes(todo, rows, displacement[rows] + target[rows])
-            number = {row: k for k, row in enumerate(rows.tolist())}
-            numbered_planes = [plane._replace(stretch=number[plane.stretch]) for plane in planes]
+            planes = plane_finder.planes(todo, rows, displacement[rows] + target[rows])
+            index_of = {row: k for k, row in enumerate(rows.tolist())}
+            numbered_planes = [plane._replace(stretch=index_of[plane.stretch]) for plane in planes]
             tighter = prover.bounds(todo.some(rows), np.ones(len(rows), bool), numbered_planes)
-            better = _down(tighter.clearance)
-            less = _up(tighter.displacement)
-            by_planes[rows] = better - less > clearance[rows] - displacement[rows]
+            plane_clearance = _down(tighter.clearance)
+            plane_displacement = _up(tighter.displacement)
+            by_planes[rows] = plane_clearance - plane_displacement > clearance[rows] - displacement[rows]
             chosen = by_planes[rows]
-            clearance[rows[chosen]] = better[chosen]
-            displacement[rows[chosen]] = less[chosen]
-            _check_parts_are_apart(prover, todo.some(rows[better <= 0]))
+            clearance[rows[chosen]] = plane_clearance[chosen]
+            displacement[rows[chosen]] = plane_displacement[chosen]
+            _check_parts_are_apart(prover, todo.some(rows[plane_clearance <= 0]))
         proved = clearance - displacement >= target
-        number = np.cumsum(proved) - 1
+        proved_index = np.cumsum(proved) - 1
         kept_planes = tuple(
-            plane._replace(stretch=int(number[plane.stretch]))
+            plane._replace(stretch=int(proved_index[plane.stretch]))
             for plane in planes
             if proved[plane.stretch] and by_planes[plane.stretch]
         )
@@ -383,8 +382,8 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[
 
 
 def _check_parts_are_apart(prover: Prover, stretches: Stretches) -> None:
-    """Raise InputError if one of these stretches is for two links that are free only by their exact surfaces
-    (`Robot.grazing`), so that no separating planes exist."""
+    """Raise InputError if one of these stretches is for two links that only their exact surfaces show to be
+    free (`Robot.grazing`), so that no separating planes exist."""
     for k in stretches.claim.tolist():
         claim = prover.claims[k]
         if frozenset((claim.link, claim.against)) in prover.robot.grazing:

@@ -13,7 +13,7 @@ MAX_COORDINATE = 1e4
 """Largest absolute coordinate, size or joint value [m] or [rad]. At 10 km, adjacent float32 numbers are about
 1 mm apart; compiled code adds a margin for this error."""
 MIN_SIZE = 1e-9
-"""Smallest size [m]: what is smaller is an error in units; float32 numbers near 1 m are 1e-7 m apart."""
+"""Smallest size [m]. A smaller size must be an error in units: float32 numbers near 1 m are 1e-7 m apart."""
 # Smallest limit of a joint's velocity, acceleration or jerk, and largest value of these rates, in SI units.
 MIN_RATE = 1e-6
 MAX_RATE = 1e6
@@ -61,8 +61,8 @@ class Value:
 
 
 def read_only(value: T) -> T:
-    """Returns the value unchanged if all its arrays are read-only, else a copy in which they are. Arrays are
-    looked for in tuples and dictionaries too."""
+    """Returns the value unchanged if all its arrays are read-only, else a copy with read-only arrays. Arrays
+    in tuples and dictionaries count too."""
     if isinstance(value, ndarray):
         if not _writable(value):
             return value
@@ -81,15 +81,15 @@ def read_only(value: T) -> T:
 
 
 def for_kernels(array: ndarray, dtype: type = np.float64) -> ndarray:
-    """The array as compiled code takes it: contiguous and writable. A read-only array has another type in
-    Numba, so Numba would compile all functions again for it."""
+    """The array as compiled code takes it: contiguous and writable. Numba gives read-only arrays another
+    type, so it would compile all functions again for them."""
     array = np.ascontiguousarray(array, dtype)
     return array if array.flags.writeable else array.copy()
 
 
 def _writable(array: ndarray) -> bool:
-    """Whether the array's memory may be written to, through this array or one that it is a view of. Memory of
-    an owner outside NumPy counts as writable unless the owner is `bytes`."""
+    """Whether the array's memory may be written to, through this array or an array that it is a view of.
+    Memory of an owner outside NumPy counts as writable unless the owner is `bytes`."""
     owner: Any = array
     while isinstance(owner, ndarray):
         if owner.flags.writeable:

@@ -6,8 +6,8 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 
 LONG = 0.2
-"""A step that takes less than this [s] begins if any time is left, even if less than the step takes. Timing
-may exceed the time limit by it."""
+"""A step shorter than this [s] begins as long as any time is left. Timing (the time parameterization) may
+exceed the time limit by this."""
 _remaining: ContextVar[Callable[[], float] | None] = ContextVar("remaining", default=None)
 _cancel_check: ContextVar[Callable[[], None] | None] = ContextVar("cancel_check", default=None)
 # Work for which too little time is left; the words end the message "the time limit is too short ...".
@@ -38,8 +38,8 @@ def deadline(remaining: Callable[[], float]) -> Iterator[None]:
 def cancel_check(check: Callable[[], None]) -> Iterator[None]:
     """Within the block, each `check_cancelled` calls `check`, which may raise to cancel the work.
 
-    A signal handler must not raise it instead: compiled code that returns its results runs Python, where an
-    unexpected exception ends the process.
+    A signal handler must not raise instead: compiled code runs Python while it returns its results, and an
+    exception there ends the process.
     """
     before = _cancel_check.set(check)
     try:

@@ -30,7 +30,8 @@ class InputError(ValueError):
         super().__init__("\n  ".join([line, *listed]))
 
     def __reduce__(self) -> tuple[type, tuple[str, list[str]]]:
-        """For pickle and copies, which would otherwise join the listed lines into one."""
+        """For pickle and copies, which would otherwise join the message and its `listed` lines into one
+        line."""
         line, *listed = str(self).split("\n  ")
         return type(self), (line, listed)
 
@@ -93,8 +94,8 @@ def check_list(
 
 
 def distinct(*values: float | int, digits: int = 6) -> list[str]:
-    """The numbers as texts of `digits` digits, for messages that compare numbers. Where different numbers
-    would have equal texts, all texts have more digits."""
+    """The numbers as texts of `digits` digits, for messages that compare numbers. If different numbers would
+    have equal texts, all texts have more digits."""
     texts = [f"{value:.{digits}g}" for value in values]
     if len({*texts}) < len({*values}) and digits < 17:
         return distinct(*values, digits=digits + 1)

@@ -27,7 +27,7 @@ from robotdiffuse.core.errors import InputError, reading, repeated, shortened, s
 MEGABYTE = 2**20
 MAX_FILE_SIZE = 256 * MEGABYTE
 MAX_YAML_SIZE = 16 * MEGABYTE
-"""Parsing this much YAML takes ten seconds; the same JSON takes less than one [bytes]."""
+"""Largest size of a YAML file [bytes]. Parsing it takes ten seconds, JSON of this size less than one."""
 MAX_DEPTH = 64
 """Deepest nesting of lists and mappings."""
 MAX_SHOWN_NAME = 300

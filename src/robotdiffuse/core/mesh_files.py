@@ -41,7 +41,7 @@ NO_GEOMETRY = frozenset(
 """Elements of Collada that contain no geometry. They are removed before reading, since trimesh also drops
 geometry if one of them is damaged."""
 BYTES_PER_USE = 30_000
-"""Estimated memory of each use of a geometry's part in a Collada scene, without the part's indices
+"""Estimated memory for each use of a list of polygons (<p>) in a Collada scene, without the list's indices
 [bytes]."""
 MAX_ACCESSED = 20_000_000
 """Maximum number of elements of all accessors of a glTF file. The file's size does not bound this number,
@@ -63,7 +63,7 @@ def read_triangles(
     Args:
         file: A file with an ending in MESH_FORMATS. Materials and images are not read.
         merge: Whether vertices with equal coordinates are merged.
-        notes: Receives a note if the file is turned or scaled.
+        notes: Receives a note if the mesh is rotated or scaled.
 
     Raises:
         InputError: For files that `input_file` refuses, other formats, and empty or damaged files.

@@ -29,7 +29,7 @@ def write_atomically(
 ) -> None:
     """Write a temporary file and rename it to `file`, so that no reader sees `file` half written.
 
-    content: text, bytes, or a function that writes to a stream.
+    content: text, bytes, or a function that writes to the stream that it is given.
     make_folder: whether to make the folder of `file` if it does not exist.
 
     If writing fails or is interrupted, an existing `file` keeps its content. Raises InputError if the file
@@ -109,7 +109,7 @@ class JsonLines:
 
     def _write(self, file: Path, line: str) -> None:
         if self._without_cut_line is not None:
-            # The cut line is removed here and not on reading, when another process could still be writing it.
+            # The incomplete line is removed only now: at reading, another process could still be writing it.
             write_atomically(file, self._without_cut_line)
             self._without_cut_line = None
         file.parent.mkdir(parents=True, exist_ok=True)

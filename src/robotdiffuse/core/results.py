@@ -41,8 +41,8 @@ class PlanResult:
 
     status: Status
     reason: str
-    """A sentence. SOLVED: which part of the planner found the path; otherwise why there is no motion and what
-    to do."""
+    """A sentence: if SOLVED, which part of the planner found the path; otherwise why there is no motion, and
+    what to do."""
     planner: str
     robot: str
     planning_time: float
@@ -86,8 +86,8 @@ class PlanResult:
     """Problems with a Cartesian line: the fraction of the line that the arm can follow from the start, 1 if
     there is a motion. If it is below 1, `reason` says what stops the arm."""
     corner_deviations: tuple[float, ...] | None = field(default=None, repr=False)
-    """How far the motion may pass each waypoint of the path, where it rounds the corner [rad, joint-space
-    L2]; None: `TimingSettings.corner_deviation`. Result files omit this field."""
+    """For each waypoint of the path, the largest distance at which the motion may pass it, rounding the
+    corner [rad, joint-space L2]; None: `TimingSettings.corner_deviation`. Result files omit this field."""
     trees: tuple[Tree, ...] = field(default=(), repr=False)
     """Search trees from the start and from the goals, when the shortest path was found or time ran out. Empty
     unless the planner's setting `keep_trees` is true; result files omit them."""

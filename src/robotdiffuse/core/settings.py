@@ -92,10 +92,10 @@ class Filled:
 
 @dataclass(frozen=True)
 class SettingsOf:
-    """Marks a field with the settings of the registry entry that another field names: `denoiser_settings` has
-    the settings of the entry `denoiser`.
+    """Marks a field with the settings of the registry entry that another field names: `denoiser_settings`
+    holds the settings of the entry whose name is in the field `denoiser`.
 
-    The value is None if the other field holds no name of the registry but, for example, a folder.
+    The value is None if the other field holds not a name of the registry but, for example, a folder.
     """
 
     field: str
@@ -179,8 +179,7 @@ class Settings:
         for name, field in fields.items():
             if name in values:
                 at = f"{where}.{name}"
-                # without settings, the name in the other field may be no entry of the registry, so it is not
-                # looked up
+                # if the value is None, the other field may hold a folder, which must not be looked up
                 kind = None if values[name] is None else _settings_class(hints[name], values, fields)
                 if kind is not None:
                     converted[name] = kind.from_json(values[name], at)
@@ -295,8 +294,8 @@ def _fits(hint: Any, value: Any) -> bool:
 def _converted(where: str, hint: Any, value: Any, owner: object = None) -> Any:
     """The value as its field stores it: a list as a tuple, a number of NumPy as Python's int or float.
 
-    owner: the settings object, for marks that compare the field with another; None before it exists. Raises
-    InputError for a value of the wrong type or out of bounds.
+    owner: the settings object, for marks that compare the field with another field; None before it exists.
+    Raises InputError for a value of the wrong type or out of bounds.
     """
     if not _fits(hint, value):
         raise InputError(f"{where} is {shown(value)}; it takes {_rule(hint)}")

@@ -28,7 +28,7 @@ class Column:
     better: Literal["more", "less", ""] = ""
     """Whether the largest or the smallest value is the best, which is marked; "": no value is marked."""
     left: bool = False
-    """Whether texts are aligned left; those of the first column always are."""
+    """Whether texts are aligned left. Texts of the first column always are."""
     scale: float = 1.0
     """Factor from a cell's number to the shown number, such as 1000 from s to ms."""
 
@@ -87,8 +87,8 @@ class Table:
 
     @property
     def best(self) -> set[tuple[int, int]]:
-        """Row and column of each best figure. Figures that are shown alike are equally good. A column has no
-        best figure if more than half of the rows share it."""
+        """Row and column of each best figure. Figures with the same text are equally good. A column has no
+        best figure if more than half of the rows have it."""
         places: set[tuple[int, int]] = set()
         for j, column in enumerate(self.columns):
             values = {i: _value(row[j]) for i, row in enumerate(self.rows)}

@@ -142,7 +142,7 @@ def moved_spheres(T: Pose, spheres: Spheres) -> Spheres:
 
 
 def ball_around(points: Points) -> tuple[Vector, float]:
-    """Center and radius [m] of a ball that contains the points; its center is that of their bounding box."""
+    """Center and radius [m] of a ball around the points; its center is the center of their bounding box."""
     center = (points.min(axis=0) + points.max(axis=0)) / 2
     return center, float(np.linalg.norm(points - center, axis=1).max())
 

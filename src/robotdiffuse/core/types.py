@@ -43,7 +43,7 @@ Poses = Float[ndarray, "_ 4 4"]
 Spheres = Float[ndarray, "_ 4"]
 """Rows of center x y z and radius [m]."""
 Mask = Bool[ndarray, "_"]
-if TYPE_CHECKING:  # types of fields that hold arrays and can be set from anything that NumPy converts to one
+if TYPE_CHECKING:  # types of fields that hold arrays and can be set to anything that NumPy converts to them
 
     class _Given:
         def __get__(self, owner: Any, kind: Any = None) -> ndarray: ...
@@ -75,13 +75,13 @@ REST = 1e-3
 MAX_SAMPLE_RATE = 1e5
 """Largest rate at which trajectories are resampled [Hz]."""
 ACCELERATION_GAIN = 1.005
-"""`resample` averages the rows if a joint's greatest acceleration grows by more than this factor..."""
+"""`resample` averages the rows if a joint's greatest acceleration grows by more than this factor, ..."""
 ACCELERATION_SHARE = 0.25
 """... or if the acceleration of a row and that of the cubic that begins or ends there differ by more than
 this fraction of the joint's greatest acceleration."""
 TIME_TOLERANCE = 1e-9
-"""A time at most this long before the start or after the end of a trajectory counts as that end; resampled
-rows are at least this far apart [s]."""
+"""A time at most this long before the start, or after the end, of a trajectory counts as the start or the
+end; resampled rows are at least this far apart [s]."""
 
 
 class Status(Enum):
@@ -197,7 +197,7 @@ class Trajectory(Value):
     def stops(self) -> Float[ndarray, "k"]:
         """Times [s] at which the whole arm rests between start and end. A wait is one stop, at its middle.
 
-        Only rows are checked, and the rows after `resample` may miss a stop: read `stops` before.
+        Only rows are checked, and the rows after `resample` may miss a stop: read `stops` before resampling.
         """
         speed = np.linalg.norm(self.velocities, axis=1)
         edges = np.diff((speed <= REST * speed.max()).astype(int), prepend=0, append=0)
@@ -265,11 +265,11 @@ class Trajectory(Value):
     def resample(self, rate: float | int) -> "Trajectory":
         """The motion with rows 1 / rate apart, and a last row at its end.
 
-        With fewer rows, the cubics between them may need larger accelerations where the acceleration changes
-        quickly. A motion from rest to rest is then averaged: its rows lie on the uniform cubic B-spline that
-        has the resampled positions as control points. An averaged motion leaves the path by up to a sixth of
-        the acceleration divided by rate², and lasts up to three steps longer. Validate the returned motion:
-        between its rows it may differ from this one.
+        With fewer rows, the cubics between the rows may need larger accelerations where the acceleration
+        changes quickly. A motion from rest to rest is then averaged: its rows lie on the uniform cubic
+        B-spline that has the resampled positions as control points. An averaged motion leaves the path by up
+        to a sixth of the acceleration divided by rate², and lasts up to three steps longer. Validate the
+        returned motion: between its rows it may differ from this one.
 
         Args:
             rate: Rows in a second [Hz], above 0 and at most 100,000.
@@ -355,9 +355,9 @@ def spline_rows(
     Its control points are moving averages over `window` configurations in `controls`, which are `step` [s]
     apart. Before the first configuration, the arm moved with the constant `velocity`.
 
-    Velocities and accelerations are weighted means of the motion's, so they obey the same limits at every
-    time; jerks are constant between rows. With a window of 1, the spline leaves the motion's path by at most
-    about a sixth of the acceleration times `step` squared; straight lines stay straight.
+    Velocities and accelerations are weighted means of those of the motion, so they obey the same limits at
+    every time; jerks are constant between rows. With a window of 1, the spline leaves the motion's path by at
+    most about a sixth of the acceleration times `step` squared; straight lines stay straight.
     """
     before = np.arange(-window - 2, 0)[:, None] * step * np.broadcast_to(velocity, controls.shape[1])
     moved = np.concatenate(

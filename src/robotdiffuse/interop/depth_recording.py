@@ -56,7 +56,7 @@ class StampedView(NamedTuple):
 
 
 def write_depth_views(robot: Robot, views: Mapping[str, Sequence[StampedView]], file: str | Path) -> None:
-    """Write views as .mcap. views: for each camera name, its views, which need the arm's configuration.
+    """Write views as .mcap. views: the views of each camera, by its name; each must have a configuration.
 
     Joint states and transforms are written only at the stamps of the images.
     """
@@ -282,7 +282,8 @@ def insert_by_time(history: list[Stamped], stamped: Stamped) -> None:
 
 def around(history: list[Stamped], stamp: float, gap: float) -> tuple[Any, Any, float] | None:
     """The entries before and after a time, and the fraction of the interval between them that has passed at
-    the time. If only one entry is within `gap` [s] of the time, this entry twice; None if there is none."""
+    the time. If only one entry is within `gap` [s] of the time, it is returned twice; None if there is
+    none."""
     i = bisect_left(history, stamp, key=itemgetter(0))
     near = [history[k] for k in (i - 1, i) if 0 <= k < len(history) and abs(history[k][0] - stamp) <= gap]
     if not near:
@@ -326,12 +327,12 @@ class TransformHistory:
         """
         T = np.eye(4)
         at = frame.lstrip("/")
-        passed = [at]  # the frames on the way from `frame` to its ancestors
+        passed = [at]  # `frame` and its ancestors up to `at`
         while at != base.lstrip("/"):
             if at not in self._parent or len(passed) > len(self._parent) + 1:  # no parent, or a cycle
                 raise InputError(
-                    f"no transforms lead from {base} to {frame}, the frame of {where}; from there they lead"
-                    f" to {', '.join(passed[1:]) or 'nothing'}"
+                    f"no transforms lead from {base} to {frame}, the frame of {where}; from {frame} they"
+                    f" lead to {', '.join(passed[1:]) or 'nothing'}"
                 )
             T = self._pose_in_parent(at, stamp, gap, where) @ T
             at = self._parent[at]
@@ -360,7 +361,7 @@ class _States:
 
     def add(self, stamp: float, state: Mapping[str, Any]) -> None:
         """Add a message, if it has positions of all joints of the arm."""
-        positions = dict(zip(state["name"], state["position"], strict=False))  # may have velocities alone
+        positions = dict(zip(state["name"], state["position"], strict=False))  # positions may be empty
         if all(name in positions for name in self._robot.joint_names):
             insert_by_time(
                 self._states, (stamp, np.array([positions[name] for name in self._robot.joint_names]))

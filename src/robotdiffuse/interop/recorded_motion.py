@@ -34,8 +34,8 @@ from robotdiffuse.robots.robot import MOVING_KINDS, Robot
 from robotdiffuse.scenes.scene import Scene
 
 STATIONARY_TOLERANCE = 1e-6
-"""Allowance for the rounding of recorded values: a locked joint may move by this and LOCKED_TOLERANCE
-together [rad] or [m]."""
+"""Allowance for the rounding of recorded values: a locked joint may move by the sum of this and
+LOCKED_TOLERANCE [rad] or [m]."""
 LOCKED_TOLERANCE = 1e-4
 """Largest distance of a joint from the value that the problem locks it at [rad] or [m]."""
 MAX_NAMES = 6
@@ -63,7 +63,7 @@ def checked_motion(
     velocities: object = None,
     accelerations: object = None,
 ) -> RecordedMotion:
-    """Check the parts of a motion and return it.
+    """The motion with these parts, after checking them.
 
     Empty times, velocities and accelerations count as absent. Times are shifted to begin at 0; times that are
     all 0 count as absent. Raises InputError as `check_motion_arrays` does, and for times that do not

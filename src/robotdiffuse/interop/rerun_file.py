@@ -28,7 +28,7 @@ def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
     problem has a `base`, else in the base's frame."""
     robot = problem.robot
     recording = rr.RecordingStream("robotdiffuse", recording_id=file.stem)
-    # recorded in memory: if Rerun itself failed to write a file, its thread would print a long message
+    # Recorded in memory, since Rerun's thread prints a long message if it cannot write a file.
     content = recording.memory_recording()
     recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     if problem.T_world_base is not None:

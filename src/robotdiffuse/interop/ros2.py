@@ -1,9 +1,10 @@
 """ROS 2 without ROS: messages, MCAP files and bags (folders with metadata.yaml and a database); ROS 1 bags.
 
-In MCAP files, /scene, /tf and /points/NAME hold Foxglove messages: the obstacles and the arm as triangles
-fixed to its links; the poses of the links and of moving obstacles; point clouds. /joint_trajectory,
-/display_planned_path, /joint_states and /robot_description hold ROS 2 messages. /robot_description is the
-URDF, if the robot was read from one. The URDF and the problem are also attached as files.
+In MCAP files, three kinds of topics hold Foxglove messages: /scene has the obstacles, and the arm as
+triangles that are fixed to its links; /tf has the poses of links and of moving obstacles; /points/NAME has a
+point cloud. /joint_trajectory, /display_planned_path, /joint_states and /robot_description hold ROS 2
+messages. /robot_description is the URDF, if the robot was read from one. The URDF and the problem are also
+attached as files.
 """
 
 import bz2
@@ -383,8 +384,8 @@ def _cloud(cloud: PointCloud, frame: str) -> PointCloudMessage:
 
 
 def _transforms(problem: Problem, poses: dict[str, Pose], at: int) -> FrameTransforms:
-    """A message with the poses of frames. poses: pose in the base frame of each moving obstacle and
-    of each link but the base. at: time [ns]."""
+    """A message with the poses of frames. poses: the pose, in the base frame, of each moving obstacle
+    and of each link other than the base. at: time [ns]."""
     update = FrameTransforms()
     robot = problem.robot
     frames = {frame: (robot.base, T) for frame, T in poses.items()}
@@ -443,10 +444,11 @@ DECOMPRESSORS: dict[Any, Any] = {
     bz2.decompress: bz2.BZ2Decompressor,
     lz4.frame.decompress: lz4.frame.LZ4FrameDecompressor,
 }
-"""Decompressors that can stop before the end of a chunk of a ROS 1 bag, by the function that rosbags
-calls in their place."""
+"""For each function by which rosbags unpacks a chunk of a ROS 1 bag, a decompressor that can stop before the
+end of the chunk."""
 VERSION = 9
-"""Version of the bag's metadata. ROS 2 Humble, which is older, ignores fields that it does not know."""
+"""Version of the bag's metadata. ROS 2 Humble writes an older version, and ignores fields that it does not
+know."""
 
 
 def write_bag(problem: Problem, trajectory: Trajectory, file: Path) -> None:

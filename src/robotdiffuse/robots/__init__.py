@@ -31,8 +31,8 @@ def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robo
     """Load a robot by its bundled name, a name given to `robotdiffuse robot add`, its folder, or its URDF.
 
     A URDF is looked up by content among the added robots. If none was made from it, the robot is prepared,
-    which takes about a minute, and stored. If several different ones were made from it, an InputError asks
-    for a name. Calls return the same object as long as the robot's files are unchanged.
+    which takes about a minute, and stored. If several robots that differ were made from it, an InputError
+    asks for a name. Calls return the same object as long as the robot's files are unchanged.
 
     Args:
         name: Name, robot folder, or URDF. Only `robot add` reads xacro files, since compiling a file runs the
@@ -126,7 +126,7 @@ def _from_urdf(urdf: Path) -> Robot:
     if len({(robot_fingerprint(robot), json.dumps(robot.poses)) for robot in robots.values()}) > 1:
         raise InputError(
             f"{urdf} was added as {', '.join(robots)}, which differ in joints, limits, spheres, allowed "
-            f"pairs or poses; use one of these names instead, or delete the others in {user_robots()}"
+            f"pairs or poses; use one of these names instead, or delete the other robots in {user_robots()}"
         )
     if robots:
         return next(iter(robots.values()))

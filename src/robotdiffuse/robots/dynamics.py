@@ -21,12 +21,12 @@ from robotdiffuse.robots.robot import Robot
 
 Jet = Float[ndarray, "3 n"]
 """Upper bounds on the length of a vector (or the absolute value of a number) and of its first two
-derivatives, on n pieces of a motion."""
+derivatives, on n stretches of a motion."""
 
 
 class Stretches(NamedTuple):
-    """Bounds for n stretches of a motion, on each of which the motion is smooth. Derivatives are by the share
-    of the stretch, which goes from 0 to 1; velocities and accelerations are by time."""
+    """Bounds for n stretches (intervals) of a motion, on each of which the motion is smooth. Derivatives are
+    by the fraction of the stretch that has passed, from 0 to 1; velocities and accelerations are by time."""
 
     q: Configurations
     """Largest absolute values of the joint positions [rad] or [m]."""
@@ -35,7 +35,7 @@ class Stretches(NamedTuple):
     speed: Float[ndarray, "3 n dof"]
     """Largest absolute values of the joint velocities and of the velocities' first two derivatives. For a
     path without times they are zero."""
-    pull: Float[ndarray, "3 n dof"]
+    acceleration: Float[ndarray, "3 n dof"]
     """Largest absolute values of the joint accelerations and of the accelerations' first two derivatives;
     zero for a path without times."""
 
@@ -65,50 +65,53 @@ def product(a: Jet, b: Jet) -> Jet:
 
 
 def second_derivative_bounds(bodies: list[Body], gravity: float, along: Stretches) -> Configurations:
-    """Upper bounds on the second derivatives of joint torques by the share of the stretch, in each
-    stretch."""
+    """Upper bounds on the second derivatives of joint torques by the fraction of the stretch, for each
+    stretch and joint."""
     still = np.zeros((3, len(along.q)))
     weight = still.copy()
     weight[0] = gravity
-    # from the base to the tips, for each frame: rotation per share of the stretch, angular velocity, angular
-    # acceleration, linear acceleration
+    # From the base to the tips, for each frame: its rate of rotation (by the fraction of the stretch), its
+    # angular velocity omega and angular acceleration alpha (by time), and the acceleration of its origin.
+    # The base accelerates upwards in place of gravity.
     frames: list[tuple[Jet, Jet, Jet, Jet]] = []
     axes: list[Jet] = []
     arms: list[Jet] = []
     for j, body in enumerate(bodies):
-        turn, spin, angular, linear = (
+        rotation, omega, alpha, linear = (
             frames[body.parent] if body.parent >= 0 else (still, still, still, weight)
         )
-        axis = _fixed(1.0, turn)
-        arm = _fixed(body.offset, turn)
+        axis = _fixed(1.0, rotation)
+        arm = _fixed(body.offset, rotation)
         v = along.v[:, :, j]
         speed = along.speed[:, :, j]
-        pull = along.pull[:, :, j]
+        joint_acceleration = along.acceleration[:, :, j]
         along_axis = product(speed, axis)
         if body.slides:
             arm = arm + product(np.stack([along.q[:, j], v[0], v[1]]), axis)
-        linear = linear + product(angular, arm) + product(spin, product(spin, arm))
+        linear = linear + product(alpha, arm) + product(omega, product(omega, arm))
         if body.slides:
-            linear = linear + product(pull, axis) + 2 * product(spin, along_axis)
+            linear = linear + product(joint_acceleration, axis) + 2 * product(omega, along_axis)
         else:
-            angular = angular + product(pull, axis) + product(spin, along_axis)
-            spin = spin + along_axis
-            turn = turn + product(np.stack([v[0], v[1], v[2]]), axis)
-        frames.append((turn, spin, angular, linear))
+            alpha = alpha + product(joint_acceleration, axis) + product(omega, along_axis)
+            omega = omega + along_axis
+            rotation = rotation + product(np.stack([v[0], v[1], v[2]]), axis)
+        frames.append((rotation, omega, alpha, linear))
         axes.append(axis)
         arms.append(arm)
-    # from the tips to the base: forces and moments that each body needs, and their components along the
-    # joints
+    # from the tips to the base: the force and moment that move each body and all bodies after it, and their
+    # components along the joints
     forces = [still] * len(bodies)
     moments = [still] * len(bodies)
     bounds = np.empty(along.q.shape)
     for j in reversed(range(len(bodies))):
-        body, (turn, spin, angular, linear) = bodies[j], frames[j]
-        lever = _fixed(body.lever, turn)
-        body_force = body.mass * (linear + product(angular, lever) + product(spin, product(spin, lever)))
-        inertia = body.moment * np.stack([np.ones_like(turn[0]), 2 * turn[0], 2 * turn[1] + 4 * turn[0] ** 2])
+        body, (rotation, omega, alpha, linear) = bodies[j], frames[j]
+        lever = _fixed(body.lever, rotation)
+        body_force = body.mass * (linear + product(alpha, lever) + product(omega, product(omega, lever)))
+        inertia = body.moment * np.stack(
+            [np.ones_like(rotation[0]), 2 * rotation[0], 2 * rotation[1] + 4 * rotation[0] ** 2]
+        )
         moment = (
-            product(inertia, angular) + product(spin, product(inertia, spin)) + product(lever, body_force)
+            product(inertia, alpha) + product(omega, product(inertia, omega)) + product(lever, body_force)
         )
         forces[j] = forces[j] + body_force
         moments[j] = moments[j] + moment
@@ -120,7 +123,7 @@ def second_derivative_bounds(bodies: list[Body], gravity: float, along: Stretche
 
 
 def _fixed(length: float, turn: Jet) -> Jet:
-    """Bounds for a vector of constant length that rotates with its body."""
+    """Bounds for a vector of constant length that is fixed in a body with the rate of rotation `turn`."""
     return length * np.stack([np.ones_like(turn[0]), turn[0], turn[1] + turn[0] ** 2])
 
 
@@ -186,7 +189,7 @@ class Dynamics:
         return out
 
     def second_derivatives(self, along: Stretches) -> Configurations:
-        """Bounds on the second derivatives of torques by the share of the stretch, for each stretch and
+        """Bounds on the second derivatives of torques by the fraction of the stretch, for each stretch and
         joint."""
         return second_derivative_bounds(self._bodies, GRAVITY, along)
 

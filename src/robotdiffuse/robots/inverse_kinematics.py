@@ -73,7 +73,7 @@ def inverse_kinematics(
         count: Largest number of configurations.
         rng: Source of the seeds.
         accept: Called with batches of solutions; returns a mask of the solutions to keep, e.g. those free of
-            collision. Rejected solutions do not count for the distance between solutions.
+            collision. Further solutions need not differ from rejected ones.
         settings: Whether the orientation of the pose must be reached, and the effort.
         near: A configuration that is the first seed, so that a slightly moved pose has a slightly moved first
             solution. Results are sorted by their distance from it. Joints that can turn more than once are

@@ -53,7 +53,8 @@ class Joint(Value):
     acceleration: float = 0.0
     jerk: float = 0.0
     mimic: Mimic | None = None
-    """The rule by which this joint follows another joint, if any. If that joint is locked, so is this one."""
+    """The rule by which this joint follows another joint, if any. If the other joint is locked, this joint is
+    locked too."""
     effort: float = 0.0
     """Largest torque [N m] or force [N]; 0 if the URDF gives none."""
 
@@ -220,8 +221,8 @@ class KinematicTree(Value):
         """Configurations within the limits that differ from `q` by whole turns of joints that have limits and
         a range above one turn.
 
-        In the first row, all of these joints are as close to `start` as possible. In each further row, one of
-        these joints reaches `q` by turning in the other direction, since obstacles may block the short way.
+        In the first row, each such joint is as close to `start` as possible. In each further row, one such
+        joint reaches `q` by turning in the other direction, since obstacles may block the short way.
         """
         several_turns = self._more_than_a_turn & ~self.continuous
         nearest = self._turned(q, start, several_turns)

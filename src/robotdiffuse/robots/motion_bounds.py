@@ -12,8 +12,8 @@ from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot
 
 COLUMNS = 180
-"""Number of directions around a joint's axis in the grid. Per joint between axis and link, bounds exceed the
-true maxima by about 0.1 %."""
+"""Number of directions around a joint's axis in the grid. With this number, bounds exceed the true maxima by
+about 0.1 % for each joint between axis and link."""
 LIMIT_SLACK = 1e-3
 """Joint limits are widened by this [rad] or [m], so that rounding errors of configurations at the limits do
 not matter."""
@@ -23,7 +23,7 @@ STEP = 2 * np.pi / COLUMNS
 ROWS = COLUMNS // 2 + 1
 """Number of latitudes of the grid, from pole to pole."""
 ARC_SAGITTA = 1 - np.cos(STEP / 2)
-"""Height of a circular arc of this angle over its chord, for radius 1."""
+"""Height of a circular arc of angle STEP above its chord, for radius 1."""
 
 
 @once_per_robot

@@ -255,7 +255,7 @@ class Robot(KinematicTree):
     def with_locked(self, locked: dict[str, float]) -> "Robot":
         """The robot with some joints locked at values. Joints that mimic them follow.
 
-        Values beyond the URDF's limits are accepted, since some published problems open grippers further.
+        Values beyond the URDF's limits are accepted, since some published problems open grippers that far.
         Calls with equal values return the same object.
 
         Args:
@@ -355,8 +355,8 @@ class Robot(KinematicTree):
             body: The held object or tool.
 
         Raises:
-            InputError: For unknown links, a link that no planned joint moves, a name that is already a
-            link's, and shapes that cannot be attached.
+            InputError: For unknown links, a link that no planned joint moves, a name that a link
+            already has, and shapes that cannot be attached.
         """
         field = TOOL if body.tool else "attached"
         self.check_moved(f"{field}.link", body.link)
@@ -482,9 +482,9 @@ def _with_body(robot: Robot, content: BodyContent) -> Robot:
 
 
 def scaled(robot: Robot, scale: float) -> Robot:
-    """The arm without attached bodies, with the offsets of its joints, the position limits of prismatic ones,
-    its spheres and its convex meshes scaled by a factor. All else is unchanged, also inertias and
-    surfaces."""
+    """The arm without attached bodies, scaled by a factor: joint offsets, limits and locked values of
+    prismatic joints, spheres, convex meshes and `above`. All else is unchanged, including inertias, named
+    poses and surfaces."""
     arm = robot.arm
     prismatic = {joint.name for joint in arm.joints if joint.kind == "prismatic"}
 

@@ -2,8 +2,8 @@
 if links graze each other, surfaces.npz.
 
 surfaces.npz contains the mesh surfaces of grazing links (`Robot.grazing`). The file is optional and not part
-of a robot's identity. Surfaces only make more configurations count as free: some in which convex parts
-overlap. So data, weights and proofs that were made without the file stay valid.
+of a robot's identity. Surfaces only make more configurations count as free: some of those in which convex
+parts overlap. So data, weights and proofs that were made without the file stay valid.
 """
 
 import hashlib
@@ -63,13 +63,13 @@ def write_robot_folder(robot: Robot, folder: str | Path, source: dict[str, Any])
     arrays = _packed([(link, mesh) for link, meshes in robot.meshes.items() for mesh in meshes])
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / SURFACE_FILE).unlink(missing_ok=True)  # it may belong to other meshes
+        (folder / SURFACE_FILE).unlink(missing_ok=True)  # an existing file may belong to other meshes
         write_atomically(folder / MESH_FILE, _npz(arrays))
         write_atomically(folder / ROBOT_FILE, _dump(_to_json(robot, source)) + "\n")
         if robot.grazing:
             arrays = _packed([*robot.surfaces.items()])
             arrays |= {
-                "vertices": arrays["vertices"].astype(np.float32),  # rounded by 6e-8 of their size at most
+                "vertices": arrays["vertices"].astype(np.float32),  # relative rounding error of at most 6e-8
                 "faces": arrays["faces"].astype(np.int32),
                 "grazing": np.array(sorted(sorted(pair) for pair in robot.grazing), np.str_),
                 "of": np.array(_digest(robot)),
@@ -202,9 +202,9 @@ def _table_from_json(data: dict) -> LinkPairTable:
     separated = np.array([np.frombuffer(bytes.fromhex(row), np.uint8) for row in data["apart"]])
     separated = np.unpackbits(separated, axis=1).astype(bool)
     lower, upper = (tuple(map(float, data[end])) for end in ("lower", "upper"))
-    ends = (len(lower), len(upper), 1 if len(separated) == 1 else 2)
+    dimensions = (len(lower), len(upper), 1 if len(separated) == 1 else 2)
     spans = [0 < high - low <= MAX_COORDINATE for low, high in zip(lower, upper, strict=False)]
-    if ends != (len(joints),) * 3 or not all(spans):
+    if dimensions != (len(joints),) * 3 or not all(spans):
         raise ValueError("a table over one or two joints expected, lower below upper")
     a, b = map(str, data["links"])
     return LinkPairTable((a, b), joints, lower, upper, separated[0] if len(joints) == 1 else separated)

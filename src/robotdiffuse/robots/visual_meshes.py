@@ -67,6 +67,7 @@ def _plain(vertices: ndarray, faces: ndarray, color: tuple[int, int, int]) -> Vi
 
 
 def _agree(visual: VisualMesh, collision: tuple[VisualMesh, ...], both_ways: bool) -> bool:
+    """Whether the bounding boxes agree. Unless `both_ways`, the visual mesh may be smaller."""
     points = np.concatenate([mesh.vertices for mesh in collision])
     beyond = np.array([points.min(0) - visual.vertices.min(0), visual.vertices.max(0) - points.max(0)])
     return bool((np.abs(beyond) if both_ways else beyond).max() < MAX_BOX_DIFFERENCE)

@@ -42,8 +42,8 @@ def convex_hull(points: Points) -> ConvexMesh:
 
 
 def thickened(points: Points) -> Points:
-    """The points; along each principal axis in which the set is thinner than `MIN_THICKNESS`, two copies
-    shifted by plus and minus `MIN_THICKNESS / 2` replace them."""
+    """The points. Along each principal axis in which they span less than `MIN_THICKNESS`, they are replaced
+    by two copies, shifted by plus and minus `MIN_THICKNESS / 2`."""
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     for axis in axes[np.ptp(points @ axes.T, axis=0) < MIN_THICKNESS]:
         points = np.concatenate([points - axis * MIN_THICKNESS / 2, points + axis * MIN_THICKNESS / 2])
@@ -59,8 +59,8 @@ def face_normals(mesh: ConvexMesh) -> Points:
 
 
 def planes_of(mesh: ConvexMesh) -> tuple[Points, Values]:
-    """Unit normals n and offsets d [m] of the distinct face planes of a convex mesh, which is inside n . x <=
-    d."""
+    """Unit normals n and offsets d [m] of the distinct face planes of a convex mesh; points x of the mesh
+    have n . x <= d."""
     normals = face_normals(mesh)
     normals = np.unique(np.round(normals[np.linalg.norm(normals, axis=1) > 0.5], 9), axis=0)
     # offsets from the farthest vertex, so that rounding does not put a plane inside the mesh
@@ -80,7 +80,7 @@ TIGHT_FRACTION = 0.125
 """Parts may stick out by this fraction of `concavity` at tight places: points where two links pass close to
 each other."""
 TIGHT_SLOPE = 0.3
-"""Farther than 2 `concavity` from a tight place, parts may stick out by this much more per meter of distance
+"""Beyond a distance of 2 `concavity` from a tight place, parts may stick out by this much more per meter
 [m/m]."""
 
 
@@ -139,13 +139,13 @@ class DistanceGrid:
 @kernel()
 def _farthest_inside(distance, origin, pitch, low, high, normals, offsets):
     """Largest value of `distance` among voxels whose centers are within the planes."""
-    best = 0.0
+    farthest = 0.0
     for i in range(max(low[0], 0), min(high[0], distance.shape[0])):
         x = origin[0] + (i + 0.5) * pitch
         for j in range(max(low[1], 0), min(high[1], distance.shape[1])):
             y = origin[1] + (j + 0.5) * pitch
             for k in range(max(low[2], 0), min(high[2], distance.shape[2])):
-                if distance[i, j, k] <= best:
+                if distance[i, j, k] <= farthest:
                     continue
                 z = origin[2] + (k + 0.5) * pitch
                 inside = True
@@ -154,12 +154,13 @@ def _farthest_inside(distance, origin, pitch, low, high, normals, offsets):
                         inside = False
                         break
                 if inside:
-                    best = distance[i, j, k]
-    return best
+                    farthest = distance[i, j, k]
+    return farthest
 
 
 def split(triangles: Triangles, size: "float | Float[ndarray, 'n']") -> Triangles:
-    """Halve triangles at their longest edge until no edge is longer than `size` [m]."""
+    """Halve triangles at their longest edge until no edge is longer than `size` [m], a number or one per
+    triangle."""
     sizes = np.broadcast_to(np.asarray(size, np.float64), len(triangles))
     return _split(np.ascontiguousarray(triangles, np.float64), sizes**2)
 
@@ -233,8 +234,8 @@ class PartSettings(Settings, name="convex parts"):
     concavity: Positive = 0.007
     """How far the hull of a part may stick out of the mesh [m]."""
     most: Count = 16
-    """Largest number of parts of a link; more for links of many surfaces (two parts for each), and
-    TIGHT_PART_FACTOR times as many with tight places."""
+    """Largest number of parts of a link; at least two for each surface of the link, and TIGHT_PART_FACTOR
+    times as many for a link with tight places."""
     voxels: Count = 400_000
     """Approximate number of voxels of the grid that measures concavity."""
     finest: Positive = 0.0015
@@ -242,8 +243,8 @@ class PartSettings(Settings, name="convex parts"):
     faces: int = 400
     """Hulls with more triangles are simplified. A simplified hull contains the original one."""
     rounding: float = 5e-4
-    """How far a simplified hull may stick out of the original hull [m], unless it already has MAX_PLANES
-    planes."""
+    """How far a simplified hull may stick out of the original hull [m]. A hull with MAX_PLANES planes may
+    stick out further."""
 
 
 def convex_parts(
@@ -396,7 +397,7 @@ def _sides(
     above = (height >= 0).all(1)
     crossing = triangles[~below & ~above]
     height = height[~below & ~above]
-    # reorder corners so that the corner that is alone on its side comes first
+    # reorder the corners of each crossing triangle: first the one that is alone on its side of the plane
     negative = height < 0
     alone = np.where(negative.sum(1) == 1, negative.argmax(1), (~negative).argmax(1))
     turn = (alone[:, None] + np.arange(3)) % 3
@@ -422,17 +423,17 @@ def _merged(hulls: list[ConvexMesh], space: DistanceGrid, settings: PartSettings
         for i, a in enumerate(hulls):
             for b in hulls[i + 1 :]:
                 if (id(a), id(b)) not in merged:
-                    both = convex_hull(np.concatenate([a.vertices, b.vertices]))
-                    both = simplified(both, settings)
-                    merged[id(a), id(b)] = (space.concavity(both), both)
+                    common_hull = convex_hull(np.concatenate([a.vertices, b.vertices]))
+                    common_hull = simplified(common_hull, settings)
+                    merged[id(a), id(b)] = (space.concavity(common_hull), common_hull)
         pairs = [
             (merged[id(a), id(b)][0], i, j) for i, a in enumerate(hulls) for j, b in enumerate(hulls) if i < j
         ]
         min_concavity, i, j = min(pairs)
         if min_concavity > settings.concavity:
             break
-        both = merged[id(hulls[i]), id(hulls[j])][1]
-        hulls = [hull for k, hull in enumerate(hulls) if k not in (i, j)] + [both]
+        common_hull = merged[id(hulls[i]), id(hulls[j])][1]
+        hulls = [hull for k, hull in enumerate(hulls) if k not in (i, j)] + [common_hull]
     return hulls
 
 

@@ -29,7 +29,8 @@ MAX_PIECES_PER_AXIS = 40
 BOUNDING_STEPS = 15
 """Number of centers that the search for a small sphere around points tries, plus one."""
 EQUIDISTANT = 0.999
-"""This search ends when the nearest point is at least this fraction of the radius away from the center."""
+"""The search for a small sphere ends when the nearest point is at least this fraction of the radius away from
+the center."""
 
 
 def cover(mesh: ConvexMesh) -> Spheres:
@@ -44,11 +45,11 @@ def cover(mesh: ConvexMesh) -> Spheres:
     ):
         spheres = bounding[None]
     else:
-        slabs = [vertices]
+        pieces = [vertices]
         for axis, count in enumerate(_lattice(high - low)):
             cuts = np.linspace(low[axis], high[axis], count + 1)[1:-1]
-            slabs = [slab for bounding in slabs for slab in _slices(bounding, axis, cuts)]
-        spheres = np.stack([_around(slab) for slab in slabs if len(slab)])
+            pieces = [slab for piece in pieces for slab in _slices(piece, axis, cuts)]
+        spheres = np.stack([_around(piece) for piece in pieces if len(piece)])
     return np.column_stack([spheres[:, :3] @ axes, spheres[:, 3] + MARGIN])
 
 
@@ -62,16 +63,16 @@ def _axes(vertices: Points) -> Rotation:
 
 
 def _lattice(size: Vector) -> tuple[int, ...]:
-    """Number of pieces along each axis: the fewest pieces within the tolerance. If MAX_SPHERES do not
-    suffice, the pieces with the smallest excess are returned."""
+    """Number of pieces along each axis: the fewest pieces with spheres within the tolerance. If MAX_SPHERES
+    pieces do not suffice, the numbers with the least excess."""
     counts = np.stack(
         np.meshgrid(*3 * [np.arange(1, MAX_PIECES_PER_AXIS + 1)], indexing="ij"), axis=-1
     ).reshape(-1, 3)
     counts = counts[counts.prod(axis=1) <= MAX_SPHERES]
     half = size / counts / 2
-    out = np.linalg.norm(half, axis=1) - half.min(axis=1)
-    close = np.flatnonzero(out <= LINK_TOLERANCES.tolerance(*HAND, float(size.min()) / 2))
-    best = close[counts[close].prod(axis=1).argmin()] if len(close) else out.argmin()
+    stick_out = np.linalg.norm(half, axis=1) - half.min(axis=1)
+    close = np.flatnonzero(stick_out <= LINK_TOLERANCES.tolerance(*HAND, float(size.min()) / 2))
+    best = close[counts[close].prod(axis=1).argmin()] if len(close) else stick_out.argmin()
     return tuple(counts[best].tolist())
 
 

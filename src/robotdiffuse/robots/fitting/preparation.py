@@ -75,13 +75,13 @@ class Neighbor(NamedTuple):
     link: str
     """Name of the neighbor."""
     T_link_neighbor: Poses
-    """Poses of the neighbor in the frame of the given link, at values over the range of the joint between
-    both; one pose if the joint is fixed."""
+    """Poses of the neighbor in the frame of the given link, at values over the range of the joint between the
+    two links; one pose if the joint is fixed."""
 
 
 def neighbors(robot: Robot, link: str) -> tuple[Neighbor, ...]:
-    """Links with geometry that a joint connects to the given link. Links without geometry that are rigidly
-    fixed between both are skipped."""
+    """Links with geometry that a joint connects to the given link. Links without geometry that fixed
+    joints connect between the two are skipped."""
     adjacent = []
     for joint in robot.joints:
         above = joint.parent
@@ -104,8 +104,8 @@ def neighbors(robot: Robot, link: str) -> tuple[Neighbor, ...]:
 
 
 def hidden_by_neighbors(robot: Robot, link: str) -> Callable[[Points], Mask]:
-    """A function that tells which points, in the link's frame [m], are inside the same neighbor at all joint
-    values."""
+    """A function that tells which points, in the link's frame [m], are inside a neighbor at all values of the
+    joint between the link and this neighbor."""
     neighbor_planes: list[tuple[Neighbor, tuple[ndarray, ndarray], Planes]] = []
     for near_link in neighbors(robot, link):
         corners = np.concatenate([mesh.vertices for mesh in robot.meshes[near_link.link]])
@@ -131,8 +131,8 @@ def hidden_by_neighbors(robot: Robot, link: str) -> Callable[[Points], Mask]:
 def with_grazing_links(
     robot: Robot, surfaces: Mapping[str, tuple[Surface, ...]], measured: Iterable[FalseCollisions]
 ) -> Robot:
-    """The robot with `grazing` pairs, and the surfaces of their links: all pairs of links with a false
-    collision of convex parts in any of the measurements."""
+    """The robot with its `grazing` pairs: all pairs of links with a false collision of convex parts in any of
+    the measurements. The robot also gets the surfaces of these links."""
     grazing = frozenset(
         frozenset(pair.links) for measurement in measured for pair in measurement.pairs if pair.by_parts > 0
     )
@@ -166,8 +166,8 @@ collisions."""
 GAP_SHRINKAGE = 0.6
 """Factor per round on `GAP_FRACTION`."""
 GAP_FRACTION = 1.2
-"""Where spheres of two links touch across a gap, how far spheres of each link may then stick out into the
-gap, as a fraction of the gap, on average over both links."""
+"""Refinement limits how far spheres that touch across a gap between two links stick out into it: to this
+fraction of the gap, on average over the two links."""
 
 
 @dataclass(frozen=True)
@@ -275,7 +275,7 @@ def prepare(
         progress: Called at each step.
         allowed: Pairs of links, with reasons, that are not checked even if sampling finds collisions.
     """
-    # measured with prismatic joints locked, since a long rail does not make an arm larger
+    # the reach is measured with prismatic joints locked, since a long rail does not make an arm larger
     slides = {j.name: (j.lower + j.upper) / 2 for j in robot.planned_joints if j.kind == "prismatic"}
     size = 0.0 if len(slides) == robot.dof else reach(robot.with_locked(slides))
     settings = settings.for_reach(size)
@@ -311,12 +311,12 @@ def prepare(
     _, _, robot, false_collisions = min(
         attempts, key=lambda attempt: attempt[:2]
     )  # the best attempt: refinement can also add false collisions
-    closer = with_finer_parts(robot, links, false_collisions, settings, seed)
-    if closer is not None:
-        remeasured = measure_false_collisions(closer, surfaces, settings.samples, np.random.default_rng(seed))
+    finer = with_finer_parts(robot, links, false_collisions, settings, seed)
+    if finer is not None:
+        remeasured = measure_false_collisions(finer, surfaces, settings.samples, np.random.default_rng(seed))
         max_by_spheres = max(false_collisions.by_spheres, settings.max_false_collisions)
         if remeasured.by_parts < false_collisions.by_parts and remeasured.by_spheres <= max_by_spheres:
-            robot = closer
+            robot = finer
             false_collisions = remeasured
     measured = (
         measure_false_collisions(robot, surfaces, settings.samples, np.random.default_rng((seed, k)))
@@ -341,19 +341,22 @@ def _refined(
     settings: PreparationSettings,
     seed: int,
 ) -> Robot:
-    """The robot with finer parts and spheres for pairs of links with many false collisions."""
+    """The robot with finer parts and spheres, or with tables, for pairs of links with many false collisions;
+    `k` is the number of refinements before."""
     worst_pairs = _worst(false_collisions, settings.max_false_collisions)
-    close = {pair.links for pair in worst_pairs if _beyond_spheres(robot, pair, settings)}
+    table_pairs = {pair.links for pair in worst_pairs if _beyond_spheres(robot, pair, settings)}
     coarse_links = {
         name
         for pair in worst_pairs
         if pair.by_parts > settings.max_false_collisions / 5
         for name in pair.links
-        if pair.links not in close or len(pair.coarse[name])
+        if pair.links not in table_pairs or len(pair.coarse[name])
     }
     for name in sorted(coarse_links):
         link = links[name]
-        places = [pair.coarse[name] for pair in worst_pairs if pair.links in close and name in pair.links]
+        places = [
+            pair.coarse[name] for pair in worst_pairs if pair.links in table_pairs and name in pair.links
+        ]
         tight = np.concatenate([*places, np.zeros((0, 3))])
         if len(tight):
             link.tight = np.concatenate([link.tight, tight])
@@ -362,11 +365,15 @@ def _refined(
                 link.parts, concavity=link.parts.concavity * CONCAVITY_SHRINKAGE, most=2 * link.parts.most
             )
         robot = link.decompose(robot)
-    affected = coarse_links | {name for pair in worst_pairs if pair.links not in close for name in pair.links}
+    affected = coarse_links | {
+        name for pair in worst_pairs if pair.links not in table_pairs for name in pair.links
+    }
     for name in sorted(affected):
         link = links[name]
         tight = [
-            _shared(pair, name) for pair in worst_pairs if name in pair.links and pair.links not in close
+            _shared(pair, name)
+            for pair in worst_pairs
+            if name in pair.links and pair.links not in table_pairs
         ]
         if tight:
             places = np.concatenate(tight)
@@ -374,7 +381,7 @@ def _refined(
             places[:, 3] = np.clip(gaps, settings.finest, link.bounds.tolerance)
             link.bounds = replace(link.bounds, tight=np.concatenate([link.bounds.tight, places]))
         robot = link.fit(robot, settings.spheres, seed)
-    return _with_tables(robot, close, coarse_links, settings)
+    return _with_tables(robot, table_pairs, coarse_links, settings)
 
 
 def with_finer_parts(
@@ -424,7 +431,7 @@ def _beyond_spheres(robot: Robot, pair: PairFalseCollisions, settings: Preparati
 
 
 def _shared(pair: PairFalseCollisions, link: str) -> Spheres:
-    """Places x, y, z on one of two links, and twice the part of the gap that the link's spheres may fill [m].
+    """Places x, y, z on one of two links, and twice the link's share of the gap there [m].
 
     Covering an area A takes about A / t spheres that stick out by t. Together the two links need the fewest
     spheres if they share the gap in proportion to the square roots of their areas.
@@ -434,8 +441,8 @@ def _shared(pair: PairFalseCollisions, link: str) -> Spheres:
 
 
 def _worst(false_collisions: FalseCollisions, allowed: float) -> list[PairFalseCollisions]:
-    """The pairs with the most false collisions, as few as possible: all other pairs together must be at most
-    UNREFINED_FRACTION of the allowed fraction."""
+    """The pairs with the most false collisions, as few as possible: all other pairs together have at most
+    UNREFINED_FRACTION of the `allowed` fraction of false collisions."""
     remaining = sum(pair.by_spheres for pair in false_collisions.pairs)
     worst_pairs = []
     for pair in false_collisions.pairs:
@@ -466,9 +473,9 @@ def _floor(robot: Robot, link: str) -> tuple[ndarray, float] | None:
 
 
 MIN_FREE = 0.2
-"""Fraction of free configurations below which a warning is given."""
+"""A warning is given if a smaller fraction of the configurations is free."""
 MAX_FALSE_COLLISIONS = 0.08
-"""Fraction of free configurations with false collisions above which a warning is given."""
+"""A warning is given if spheres collide falsely in a larger fraction of the free configurations."""
 MAX_PROPOSED = 3
 """Largest number of pairs that the error message proposes for a robot that always collides with itself
 although no single pair always collides."""

@@ -96,8 +96,8 @@ class Links:
         )
 
     def poses(self, q: Configurations, wanted: frozenset[str] | None = None) -> dict[str, Poses]:
-        """T_base_link [n, 4, 4] by link. With `wanted` links, only the poses of these links and of those on
-        the way to them, in the frame of their last common ancestor."""
+        """T_base_link [n, 4, 4] by link. With `wanted` links, only the poses of these links and of the links
+        on the way to them, in the frame of their last common ancestor."""
         start, joints = (self.robot.base, self.robot.joints) if wanted is None else self._between(wanted)
         poses = {start: np.broadcast_to(np.eye(4), (len(q), 4, 4))}
         values = with_mimics(self.robot.joints, {joint.name: q[:, i] for i, joint in enumerate(self.joints)})
@@ -223,9 +223,9 @@ def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float
     columns = [[j.name for j in links.joints].index(robot.joint_names[joint]) for joint in joints]
     nominal = links.named({})
     edge = (upper - lower) / CELLS
-    # boxes of joint values, in units of the table's cells: all have the same `size`, which is halved along
-    # one joint per iteration; `low` is their lower corner, with a row per pair of parts that may touch in the
-    # box
+    # Boxes of joint values, in units of the table's cells. All boxes have the same `size`, which is halved
+    # along one joint per iteration. Each row of `low` is the lower corner of a box, and the column of `parts`
+    # with the same index is a pair of parts that may touch in the box.
     separated = np.ones((CELLS,) * len(joints), dtype=bool)
     size = np.full(len(joints), float(CELLS))
     parts = np.indices([len(robot.meshes[link]) for link in pair]).reshape(2, -1)
@@ -238,6 +238,7 @@ def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float
         poses = links.poses(q, frozenset(pair))
         distance = links.part_distances(poses, *pair, cell_of_row.ravel(), parts, travel)
         touch = distance <= travel
+        # boxes that count as colliding: a cell or box that collides, or one with very little motion
         given_up = touch & ((size <= 1).all() & (distance <= 0) | (distance < -travel) | (travel < finest))
         for first, last in zip(*_cells(np.unique(low[given_up], axis=0), size), strict=True):
             separated[tuple(slice(*ends) for ends in zip(first, last, strict=True))] = False

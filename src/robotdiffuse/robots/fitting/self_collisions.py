@@ -36,13 +36,12 @@ LIMITS = "limits"
 NAMED = "named"
 BY_SRDF = "srdf"
 ADJACENT_STRIDE = 10
-"""Adjacent links, which are allowed to touch in any case, are tested in only one of this number of
-samples."""
+"""Adjacent links, which may touch in any case, are tested in only 1 / ADJACENT_STRIDE of the samples."""
 MIN_LIMITS_COLLIDING = 0.2
 """Smallest fraction of colliding samples for the reason `limits`."""
-MAX_HELD_JOINTS = 1
-"""A link belongs to the arm if at most this many held joints connect it to the arm, such as the bellows of a
-lift. Links after more held joints belong to a head or another arm."""
+MAX_LOCKED_JOINTS = 1
+"""A link belongs to the arm if at most this many locked joints connect it to the arm, such as the bellows of
+a lift. Links after more locked joints belong to a head or another arm."""
 MAX_POSE_OVERLAP = 0.03
 """If links overlap in a named pose by less than this [m], the pair is allowed for the reason `pose`."""
 
@@ -91,11 +90,11 @@ def find_allowed_collisions(
     - default: the links collide in the default pose, with the joints between them at zero. If the limits
       include this pose, the manufacturer considers it safe, so the meshes are taken to be too coarse there.
       Both links must belong to the arm, since the limits do not account for a tool on the last link or for
-      another arm. A link after one held joint also counts as part of the arm. The pair must then also collide
-      at the joint's held value, which planning does not change.
-    - limits: the links collide in at least a fifth of the samples. The value of one joint between them
-      determines when, and they collide at a stop of this joint: joints often have their stops where the links
-      on both sides meet.
+      another arm. A link after one locked joint also counts as part of the arm. The pair must then also
+      collide at the joint's locked value, which planning does not change.
+    - limits: the links collide in at least a fifth of the samples. The value of one joint between the links
+      determines whether they collide, and they collide at a stop of this joint: joints often have their stops
+      where the links on both sides meet.
     - pose: the links overlap slightly in a named pose of the SRDF, such as a tucked one.
 
     Coal tests the meshes unless the covering spheres show that they are apart. For pairs without collisions
@@ -107,21 +106,21 @@ def find_allowed_collisions(
     q = links.random(settings.samples, rng)
     poses = links.poses(q)
     default_poses = links.poses(default)
-    held_poses = links.poses(links.named({})[None])
+    locked_poses = links.poses(links.named({})[None])
     named: list[dict[str, ndarray]] = []
     adjacent = set[frozenset[str]]()
     if settings.assumptions:
         named = [links.poses(links.named(pose)[None]) for pose in robot.poses.values()]
         adjacent = _adjacent(robot)
 
-    def reason(a: str, b: str, near: ndarray, colliding: ndarray) -> str:
+    def reason(a: str, b: str, distances: ndarray, colliding: ndarray) -> str:
         if frozenset((a, b)) in adjacent:
             return ADJACENT
         if colliding.mean() >= ALWAYS_FRACTION:
             return ALWAYS
-        by_default = _own_between(robot, a, b, MAX_HELD_JOINTS) if settings.assumptions else None
-        zero = by_default is not None and all(joint.lower <= 0 <= joint.upper for joint in by_default)
-        if zero and links.collide(default_poses, a, b, 0) and links.collide(held_poses, a, b, 0):
+        between = _own_between(robot, a, b, MAX_LOCKED_JOINTS) if settings.assumptions else None
+        zero_allowed = between is not None and all(joint.lower <= 0 <= joint.upper for joint in between)
+        if zero_allowed and links.collide(default_poses, a, b, 0) and links.collide(locked_poses, a, b, 0):
             return DEFAULT
         if any(-MAX_POSE_OVERLAP < links.mesh_distance(pose, a, b) <= 0 for pose in named):
             return POSE
@@ -130,8 +129,8 @@ def find_allowed_collisions(
             links.stop_explains(joint, q, colliding) for joint in between or ()
         ):
             return LIMITS
-        descents = settings.descents if near.min() < NEAR_DISTANCE else settings.descents // 5
-        if not colliding.any() and not _descend(links, a, b, q[np.argsort(near)[:descents]], rng):
+        descents = settings.descents if distances.min() < NEAR_DISTANCE else settings.descents // 5
+        if not colliding.any() and not _descend(links, a, b, q[np.argsort(distances)[:descents]], rng):
             return NEVER
         return CHECKED
 
@@ -169,11 +168,11 @@ def _descend(links: "Links", a: str, b: str, starts: Float[ndarray, "n d"], rng:
     return False
 
 
-def _own_between(robot: Robot, a: str, b: str, max_held: int = 0) -> list[Joint] | None:
+def _own_between(robot: Robot, a: str, b: str, max_locked: int = 0) -> list[Joint] | None:
     """The movable joints between two links of the arm; None if one of the links does not belong to the arm.
 
-    A link belongs to the arm if at most `max_held` held joints connect it to a link that planned joints move,
-    and if it is not a tool.
+    A link belongs to the arm if at most `max_locked` locked joints connect it to a link that planned joints
+    move, and if it is not a tool.
     """
 
     def own(link: str) -> bool:
@@ -183,7 +182,7 @@ def _own_between(robot: Robot, a: str, b: str, max_held: int = 0) -> list[Joint]
         carried = above[link][: above[link].index(planned[0])] if planned else above[link]
         moving = [joint for joint in carried if joint.kind in MOVING_KINDS]
         tool = robot.at_end(link) and above[link][:1] != planned
-        return not tool and len(moving) <= max_held
+        return not tool and len(moving) <= max_locked
 
     above = {link: robot.joints_above(link)[::-1] for link in (a, b)}
     if not own(a) or not own(b):
@@ -234,7 +233,7 @@ class PairFalseCollisions:
     apart, and the smallest distance of the parts there [m]."""
     coarse: dict[str, Points]
     """By link and in the link's frame: places where parts overlap although the true meshes are apart [m].
-    Each place is listed only for the link with the parts that stick out further there."""
+    A place is listed only for the link with parts that stick out further there."""
 
 
 @dataclass(frozen=True)
@@ -285,10 +284,10 @@ def measure_false_collisions(
         for i in np.flatnonzero(spheres):
             parts[i] = links.collide(poses, a, b, int(i))
             if parts[i]:
-                places = coal_pose(poses[a][i]), coal_pose(poses[b][i])
+                T_a, T_b = coal_pose(poses[a][i]), coal_pose(poses[b][i])
                 result.clear()
                 meshes[i] = any(  # surfaces: a mesh inside another one is not detected
-                    coal.collide(first_mesh, places[0], second_mesh, places[1], request, result)
+                    coal.collide(first_mesh, T_a, second_mesh, T_b, request, result)
                     for first_mesh in trees[a]
                     for second_mesh in trees[b]
                 )
@@ -336,7 +335,7 @@ def _sticking_out(
     rows: Int[ndarray, "n"],
 ) -> dict[str, Points]:
     """Places where parts of two links overlap in the configurations `rows`, by link and in the link's frame
-    [m]. Each place is listed for the link with the true meshes that are further away from it."""
+    [m]. A place is listed only for the link with the true meshes that are further away from the place."""
     places_by_link: dict[str, list[ndarray]] = {link: [] for link in pair}
     request = coal.DistanceRequest()
     point = coal.Sphere(1e-6)

@@ -11,8 +11,8 @@ least excess, and moving each sphere to its best center. It starts from a greedy
 spheres as long as the others stay within their allowed radii.
 
 A sphere may contain points up to a tolerance away from the link; the tolerance may be smaller near some
-places. It may also contain points that are inside a neighboring link at all angles of the joint between both.
-It may not contain points below the plane that the robot stands on.
+places. It may also contain points that are inside a neighboring link at all values of the joint between the
+two links. It may not contain points below the plane that the robot stands on.
 """
 
 from collections.abc import Callable
@@ -51,7 +51,7 @@ MIN_PADDING = 0.03
 TIGHT_RADIUS = 0.015
 """The smaller tolerance of a tight place applies within this distance from it [m]."""
 TIGHT_SLOPE = 0.3
-"""Farther away, the tolerance grows by this much per meter [m/m]."""
+"""Beyond TIGHT_RADIUS from a tight place, the tolerance grows by this much per meter [m/m]."""
 
 MIN_DEPTH = 5e-4
 """Lower bound on the inscribed radius of a link, for thin plates [m]."""
@@ -235,13 +235,13 @@ BURIED_DEPTH = 1e-9
 """Points deeper than this in another part are not on the surface of the union [m]."""
 EXCESS_TOLERANCE = 0.1
 """Largest excess radius that is accepted, as a fraction of the grid spacing."""
-# cells for choosing spheres, and for the final fit: how many edges of a cell fit into the radius of the disc
-# that a sphere covers, and the largest number of cells
+# Cells for choosing spheres, and for the final fit: number of cell edges per radius of the disc that a sphere
+# covers, and largest number of cells.
 COARSE_CELLS = (5.0, 60_000)
 FINE_CELLS = (8.0, 150_000)
 MAX_CROWD = 10
-"""If the surface would have more than this many times the allowed number of cells, larger cells are computed
-at once, since the small ones may not fit into memory."""
+"""If the surface would have more than this many times the allowed number of cells, larger cells are chosen
+before the small ones are computed, since these may not fit into memory."""
 SMALLEST_TRIANGLE = 2e-6
 """A triangle of the surface that no single sphere contains is split down to this size [m]; a smaller one
 counts as uncovered."""
@@ -358,8 +358,8 @@ class Cells:
     corners: Int[ndarray, "c 3"]
     """Indices in `points` of the corners of each cell."""
     sharp: Mask
-    """Whether a point is a vertex of a mesh. All other points lie on a face or an edge between other points
-    of the cells, so a sphere that covers these covers them."""
+    """Whether a point is a vertex of a mesh. Every other point lies on a face or an edge between neighboring
+    points, so a sphere that covers the neighbors covers the point."""
 
     @staticmethod
     def of(solid: Solid, bounds: Bounds, cut: float, most: int) -> "Cells":
@@ -418,8 +418,8 @@ class Cells:
         return _Assignment(*assign(self.points, self.corners, centers, sizes.at(centers)))
 
     def part(self, mine: Mask) -> "Cells":
-        """The cells in the mask `mine`. Points on the border to other cells count as sharp, since cells on
-        one side only do not imply that they are covered."""
+        """The cells in the mask `mine`. Points on the border to other cells count as sharp, since their
+        neighbors on one side of the border do not imply that they are covered."""
         outside = np.zeros(len(self.points), dtype=bool)
         outside[self.corners[~mine]] = True
         used, index = np.unique(self.corners[mine], return_inverse=True)
@@ -427,7 +427,7 @@ class Cells:
 
 
 class _Assignment(NamedTuple):
-    """The sphere that each cell is assigned to, and the second best sphere."""
+    """For each cell, the sphere that it is assigned to, and the second best sphere."""
 
     owner: Int[ndarray, "c"]
     """The sphere that covers the cell with the least excess."""
@@ -442,7 +442,8 @@ class _Assignment(NamedTuple):
 def _relax(
     sizes: SphereSizeGrid, cells: Cells, centers: Points, rounds: int, enough: float
 ) -> tuple[Points, float]:
-    """Improved centers, and their largest excess radius [m]. Ends early when this is at most `enough`."""
+    """Improved centers, and their largest excess radius [m]. Ends early when the excess is at most
+    `enough`."""
     return relax(cells.points, cells.corners, cells.sharp, centers, rounds, enough, *sizes.arrays, DIRECTIONS)
 
 

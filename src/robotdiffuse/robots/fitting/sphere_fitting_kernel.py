@@ -1,8 +1,8 @@
 """Compiled inner loops of the sphere fit, and of tests between sets of spheres.
 
 A surface consists of cells: triangles, given by indices of points. A grid stores the largest allowed radius
-of a sphere at each center. Excess is how far a radius exceeds it. There are no jaxtyping annotations because
-Numba compiles these functions. Lengths are in meters.
+of a sphere at each center. The excess of a sphere is how far its radius exceeds this allowed radius. There
+are no jaxtyping annotations because Numba compiles these functions. Lengths are in meters.
 """
 
 import math
@@ -23,7 +23,7 @@ OUTSIDE_GRID = -1.0
 MIN_GAIN = 1e-7
 """Steps that reduce the excess by less than this are not taken [m]."""
 
-# unit vectors to the 26 neighbors of a voxel, in which the search for a center steps
+# Unit vectors to the 26 neighbors of a voxel: the directions of the steps in the search for a center.
 DIRECTIONS = np.array(
     [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], dtype=np.float64
 )
@@ -108,33 +108,33 @@ def assign(points, corners, centers, depths):
     """
     owner = np.empty(len(corners), np.int64)
     min_excess = np.empty(len(corners))
-    heir = np.empty(len(corners), np.int64)
-    second = np.empty(len(corners))
+    second_owner = np.empty(len(corners), np.int64)
+    second_min_excess = np.empty(len(corners))
     for c in range(len(corners)):
-        best = 1e9
-        runner = 1e9
-        mine = -1
-        next_best = -1
+        best_excess = 1e9
+        second_excess = 1e9
+        best_sphere = -1
+        second_sphere = -1
         for i in range(len(centers)):
             # most spheres can be excluded by their distance from the first corner
-            reach = runner + depths[i]
+            reach = second_excess + depths[i]
             near = squared_distance(points[corners[c, 0]], centers[i])
             if reach <= 0.0 or near >= reach * reach:
                 continue
             needed = math.sqrt(farthest_corner(points, corners, c, centers[i])) - depths[i]
-            if needed < best:
-                runner = best
-                best = needed
-                next_best = mine
-                mine = i
-            elif needed < runner:
-                runner = needed
-                next_best = i
-        owner[c] = mine
-        min_excess[c] = best
-        heir[c] = next_best
-        second[c] = runner
-    return owner, min_excess, heir, second
+            if needed < best_excess:
+                second_excess = best_excess
+                best_excess = needed
+                second_sphere = best_sphere
+                best_sphere = i
+            elif needed < second_excess:
+                second_excess = needed
+                second_sphere = i
+        owner[c] = best_sphere
+        min_excess[c] = best_excess
+        second_owner[c] = second_sphere
+        second_min_excess[c] = second_excess
+    return owner, min_excess, second_owner, second_min_excess
 
 
 @kernel(fastmath=True)
@@ -142,7 +142,8 @@ def greedy_cover(points, corners, places, depths):
     """Indices of places at which spheres cover all cells, chosen greedily: next is the sphere that covers the
     most uncovered cells.
 
-    A cell that no sphere of an allowed radius covers counts as covered by the spheres with the least excess.
+    `depths` are the largest allowed radii of spheres at `places`. A cell that no sphere of an allowed radius
+    covers counts as covered by the spheres with the least excess.
     """
     covers = np.zeros((len(corners), len(places)), np.bool_)
     counts = np.zeros(len(places), np.int64)
@@ -151,11 +152,11 @@ def greedy_cover(points, corners, places, depths):
         for i in range(len(places)):
             if depths[i] + max(min_excess, 0.0) <= 0.0:
                 continue
-            lacks = math.sqrt(farthest_corner(points, corners, c, places[i])) - depths[i]
-            if min_excess > 0.0 and lacks < min_excess:
-                min_excess = max(lacks, 0.0)
+            excess = math.sqrt(farthest_corner(points, corners, c, places[i])) - depths[i]
+            if min_excess > 0.0 and excess < min_excess:
+                min_excess = max(excess, 0.0)
                 covers[c, :i] = False
-            covers[c, i] = lacks <= min_excess
+            covers[c, i] = excess <= min_excess
         for i in range(len(places)):
             counts[i] += covers[c, i]
     is_open = np.ones(len(corners), np.bool_)
@@ -293,9 +294,9 @@ def excess_radius(center, own, count, grid, origin, spacing):
 @kernel(fastmath=True)
 def move_center(center, own, count, step, grid, origin, spacing, directions):
     """Moves `center` in place to the least excess radius, by pattern search with an initial `step`."""
-    min_radius = excess_radius(center, own, count, grid, origin, spacing)
+    min_excess = excess_radius(center, own, count, grid, origin, spacing)
     while step > MIN_STEP:
-        best = min_radius - MIN_GAIN
+        best = min_excess - MIN_GAIN
         direction = -1
         for k in range(len(directions)):
             trial = center + step * directions[k]
@@ -306,7 +307,7 @@ def move_center(center, own, count, step, grid, origin, spacing, directions):
         if direction < 0:
             step /= 2
         else:
-            min_radius = best
+            min_excess = best
             center += step * directions[direction]
 
 
@@ -314,13 +315,14 @@ def move_center(center, own, count, step, grid, origin, spacing, directions):
 def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing, directions):
     """Alternate between assigning cells to spheres and moving the spheres.
 
-    Returns the best centers found and their largest excess radius. Ends early when this is at most `enough`.
+    Returns the best centers found and their largest excess radius. Ends early when the excess is at most
+    `enough`.
     """
     cells = len(corners)
     count = len(centers)
     first = np.empty(len(points), np.int64)
-    stamp = np.empty(len(points), np.int64)
-    rim = np.empty(len(points), np.bool_)
+    collected_by = np.empty(len(points), np.int64)
+    on_rim = np.empty(len(points), np.bool_)
     assigned_points = np.empty((len(points), 3))
     order = np.empty(cells, np.int64)
     ends = np.empty(count + 1, np.int64)
@@ -338,9 +340,10 @@ def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing
             best_value = value
         if value <= enough or r == rounds:
             break
-        # a point between cells of one owner matters only if it is a vertex of the mesh
+        # `on_rim`: points that the owners of their cells must contain. A point between cells of one owner is
+        # such a point only if it is a vertex of the mesh. `first`: the owner of a point's first cell.
         first[:] = -1
-        rim[:] = sharp
+        on_rim[:] = sharp
         ends[:] = 0
         for c in range(cells):
             ends[owner[c] + 1] += 1
@@ -349,7 +352,7 @@ def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing
                 if first[p] < 0:
                     first[p] = owner[c]
                 elif first[p] != owner[c]:
-                    rim[p] = True
+                    on_rim[p] = True
         # `order` lists the cells by owner; those of sphere i are order[ends[i] : ends[i + 1]]
         for i in range(count):
             ends[i + 1] += ends[i]
@@ -357,14 +360,15 @@ def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing
         for c in range(cells):
             order[fill[owner[c]]] = c
             fill[owner[c]] += 1
-        stamp[:] = -1
+        # move each sphere; `collected_by`: the last sphere for which a point was collected
+        collected_by[:] = -1
         for i in range(count):
             assigned_count = 0
             for j in range(ends[i], ends[i + 1]):
                 for k in range(3):
                     p = corners[order[j], k]
-                    if rim[p] and stamp[p] != i:
-                        stamp[p] = i
+                    if on_rim[p] and collected_by[p] != i:
+                        collected_by[p] = i
                         assigned_points[assigned_count] = points[p]
                         assigned_count += 1
             if assigned_count > 0:

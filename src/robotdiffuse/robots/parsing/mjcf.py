@@ -34,7 +34,7 @@ DRAWN = ("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
 WORLD = 0
 """Index of the world body, which does not move."""
 EXCLUDED = "excluded by the model"
-"""Reason that is given for pairs of links that are not checked."""
+"""Reason for not checking a pair of links (`Srdf.allowed`)."""
 MIN_SHIFT = 1e-9
 """A joint closer than this to the origin of its body counts as being at the origin [m]."""
 
@@ -69,7 +69,7 @@ def compiled_model(path: Path) -> Any:
 
 def robot_bodies(model: Any) -> list[int]:
     """The bodies of the robot, parents before children: the bodies of all kinematic trees that actuators
-    move. If actuators move none, the trees with hinges or slides and without a free joint are taken."""
+    move. If actuators move no tree, the robot is all trees with hinges or slides and without a free joint."""
     trees: dict[int, list[int]] = {}
     for body in range(1, model.nbody):
         trees.setdefault(int(model.body_rootid[body]), []).append(body)
@@ -403,8 +403,9 @@ def _geoms_of(model: Any, body: int) -> range:
 
 
 def _related(model: Any, first: int, second: int, unfiltered: bool) -> bool:
-    """Whether two bodies are rigidly connected, or connected by joints of only one of them. Neither body is
-    the world. `unfiltered`: whether the model lets a body collide with its parent."""
+    """Whether two bodies are rigidly connected, or one is the parent of the other. Rigidly connected bodies
+    count as one body, and bodies fixed to the world are no parents. `unfiltered`: whether the model lets a
+    body collide with its parent."""
     welded = [int(model.body_weldid[body]) for body in (first, second)]
     above = [int(model.body_weldid[model.body_parentid[body]]) for body in welded]
     carried = welded[0] == above[1] or welded[1] == above[0]

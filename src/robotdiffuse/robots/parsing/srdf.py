@@ -257,13 +257,13 @@ class JointTree:
     def _begins_gripper(self, branches: list[Joint], own_joints: int) -> bool:
         """Whether a gripper or a hand begins where these joints branch off, `own_joints` joints after the
         last branching."""
-        rows = [self._chain_length(joint) for joint in branches]
+        lengths = [self._chain_length(joint) for joint in branches]
         if len(branches) == 1:
             jaw = branches[0].kind in MOVING_KINDS and GRIPPER.search(branches[0].name)
-            return bool(jaw) and rows[0] <= MAX_HAND_FINGER_JOINTS
+            return bool(jaw) and lengths[0] <= MAX_HAND_FINGER_JOINTS
         if len(branches) == 2:
-            return max(rows) <= MAX_FINGER_JOINTS
-        return len(branches) > 2 and (max(rows) <= MAX_HAND_FINGER_JOINTS or own_joints >= MIN_ARM_JOINTS)
+            return max(lengths) <= MAX_FINGER_JOINTS
+        return len(branches) > 2 and (max(lengths) <= MAX_HAND_FINGER_JOINTS or own_joints >= MIN_ARM_JOINTS)
 
     def _deepest(self, link: str) -> str:
         """The deepest link below a link."""
@@ -361,7 +361,7 @@ def _chosen_arms(file: Path, arms: list[Arm], group: str | None, groups: list[st
     if group is None:
         return arms
     chosen = [arm for arm, name in zip(arms, names, strict=True) if group in (name, arm.tip)]
-    words = sorted({ALL, all_name}) if len(arms) > 1 else []
-    if not chosen and group not in words:
-        raise unknown_name(f"group of {file}", group, [*names, *words, *groups])
+    all_names = sorted({ALL, all_name}) if len(arms) > 1 else []
+    if not chosen and group not in all_names:
+        raise unknown_name(f"group of {file}", group, [*names, *all_names, *groups])
     return chosen[:1] or arms

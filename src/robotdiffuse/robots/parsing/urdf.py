@@ -282,8 +282,8 @@ class UrdfTree:
                 file = self.packages.file(mesh.get("filename", ""))
                 digest.update(read_bytes(file, "mesh file"))
                 if file.suffix.lower() in (".dae", ".glb", ".gltf"):
-                    # these formats were once read without conversion to meters and z up; robots prepared then
-                    # must have another digest
+                    # earlier versions read these formats without conversion to meters and z up; robots that
+                    # they prepared must have another digest
                     digest.update(b"in metres, z up")
         return digest.hexdigest()
 
@@ -331,26 +331,25 @@ class UrdfTree:
         return transforms
 
     def pose_link(self, link: str) -> str:
-        """The link that stands for the robot in scene files: where a scene gives the robot's pose, it is this
-        link's.
+        """The link that a scene file places where it gives the robot's pose.
 
         It is the root, unless the URDF begins with a mobile base without geometry: a planar or floating
         joint, or three joints that move in a plane. Then it is the link after these joints. Only joints from
         the root to `link` are considered.
         """
-        way: list[str] = []
+        joints: list[str] = []  # from the root to `link`
         end = link
         while end in self.parents:
-            way.insert(0, self.parents[end])
-            end = self.ends[way[0]][0]
+            joints.insert(0, self.parents[end])
+            end = self.ends[joints[0]][0]
         bare = [self.links[self.root].find(kind) is None for kind in ("collision", "visual")]
-        for k, name in enumerate(way, 1):
+        for k, name in enumerate(joints, 1):
             if not all(bare):
                 break
             child = self.ends[name][1]
             if self.elements[name].get("type") in ("planar", "floating"):
                 return child
-            if moves_in_a_plane([self._joint(above) for above in way[:k]]):
+            if moves_in_a_plane([self._joint(above) for above in joints[:k]]):
                 return child
             bare += [self.links[child].find(kind) is None for kind in ("collision", "visual")]
         return self.root
@@ -441,7 +440,7 @@ class UrdfTree:
             velocity = DEFAULT_VELOCITY
             self.unlimited.add(joint.name)
         effort = 0.0
-        with suppress(InputError):  # most planning needs none
+        with suppress(InputError):  # only planning with a payload needs effort limits
             effort = max(float(self._numbers(attributes.get("effort", ""), 1, "effort")[0]), 0.0)
         acceleration = ACCELERATION_PER_VELOCITY * velocity
         jerk = JERK_PER_ACCELERATION * acceleration
@@ -599,8 +598,8 @@ class UrdfTree:
         return transform(xyz, rotation_from_quaternion(np.array([w, x, y, z])))
 
 
-# fields of MoveIt's joint_limits.yaml and of `Joint`; then MoveIt's fields that get a note, or switch a limit
-# off
+# FIELDS: MoveIt's fields of joint_limits.yaml, and those of `Joint`. FACTORS: MoveIt's fields that are
+# ignored with a note. FLAGS: MoveIt's fields that switch limits off.
 FIELDS = {
     "min_position": "lower",
     "max_position": "upper",
