@@ -167,7 +167,16 @@ def cpu_clock(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.fixture
-def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+def few_lights(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures are drawn with few lights, from the best of few directions."""
+    from robotdiffuse.visualization import picture
+
+    for number, fewer in (("SKY_LIGHTS", 6), ("KEY_LIGHTS", 4), ("AZIMUTHS", 6)):
+        monkeypatch.setattr(picture, number, fewer)
+
+
+@pytest.fixture
+def small_pictures(monkeypatch: pytest.MonkeyPatch, few_lights: None) -> None:
     """Light and ghosts take seconds to draw, and a small picture suffices for a test."""
     import robotdiffuse.visualization.exploration  # noqa: F401  with the settings' class in its annotations
     from robotdiffuse.visualization import picture, replay_page
@@ -176,5 +185,3 @@ def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (picture, replay_page):
         monkeypatch.setattr(module, "PictureSettings", lambda **_: small)
     monkeypatch.setattr(replay_page, "THUMBNAIL", small)
-    for number, fewer in (("SKY_LIGHTS", 6), ("KEY_LIGHTS", 4), ("AZIMUTHS", 6)):
-        monkeypatch.setattr(picture, number, fewer)

@@ -13,6 +13,7 @@ from robotdiffuse.drawables import decimated
 from robotdiffuse.visualization import PictureSettings, write_picture, write_replay
 from robotdiffuse.visualization.arm import DrawnArm
 
+pytestmark = pytest.mark.usefixtures("few_lights")
 SMALL = PictureSettings(width=320, height=200, ghosts=2)
 
 
