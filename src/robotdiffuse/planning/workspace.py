@@ -310,7 +310,7 @@ class Workspace:
                     return replace(result, reason=reason, fraction=(k + (result.fraction or 0.0)) / len(ends))
                 q = result.path.positions[-1]
                 lines.append(result)
-            joined = join(lines, time_limit=time_limit)
+            joined = join(lines, time_limit=time_left(time_limit, began))
             return replace(joined, fraction=1.0, goal_index=lines[-1].goal_index) if joined.solved else joined
         several = isinstance(pose, AnyGoal)
         matrices = numbers(pose)

@@ -277,9 +277,11 @@ def join(
             )
         gap = np.abs(after.path.positions[0] - before.path.positions[-1])
         if gap.max() > DEFAULT.start_tolerance:
-            name = first.robot.joint_names[int(gap.argmax())]
+            j = int(gap.argmax())
+            unit = "m" if first.robot.prismatic[j] else "rad"
             raise InputError(
-                f"results[{i}] begins {gap.max():.3g} rad from the end of results[{i - 1}] in {name}: plan "
+                f"results[{i}] begins {gap[j]:.3g} {unit} from the end of results[{i - 1}] in "
+                f"{first.robot.joint_names[j]}: plan "
                 f"it from results[{i - 1}].path.positions[-1]"
             )
     if blend and any(len(problem.constraints) > len(shared) for problem in problems):
