@@ -39,11 +39,11 @@ HELD = "attached"
 RAMP_TIME = 0.01
 # The last row is repeated for this time [s], in which position controllers reach it.
 SETTLING_TIME = 0.24
-# Largest distance from the straight line for motions that turn unevenly along it [m].
+# How far a motion that rotates unevenly may leave the straight line [m].
 LOOSE_TOLERANCE = 0.002
 # Weight of the rotation error against the position error, for poses that are out of reach [m/rad].
 TILT_WEIGHT = 0.01
-# Factor from the smallest tilt that reaches the position, with the arm stretched, to the tilt that is used.
+# The tilt is the smallest one that reaches the position, with the arm fully stretched, times this factor.
 TILT_MARGIN = 1.25
 # Locked joints, such as fingers, are held at multiples of this [rad] or [m].
 HELD_JOINT_STEP = 0.002
@@ -93,7 +93,7 @@ class Planner:
             acceleration if len(acceleration) else robot.acceleration,
         )
         self.workspace = Workspace(self.robot, move_group)
-        """The robot and its obstacles. Obstacles other than point clouds are added by its method `add`."""
+        """The robot and its obstacles. Add obstacles other than point clouds by `planner.workspace.add`."""
 
     @property
     def joint_vel_limits(self) -> ndarray:
@@ -246,14 +246,14 @@ class Planner:
     plan_qpos_to_qpos = plan_qpos
 
     def check_for_self_collision(self, qpos: ArrayLike) -> list[str]:
-        """A list with the reason why a configuration is not free if obstacles are ignored; empty if it is
-        free."""
+        """A list with the reason why a configuration is refused even if all obstacles are ignored; empty if
+        it is free."""
         start = self._start(qpos)
         state = Workspace(self.workspace.robot, self.workspace.tip).is_free(start)
         return [] if state else [state.reason]
 
     def check_for_env_collision(self, qpos: ArrayLike, *_: Any, **_options: Any) -> list[str]:
-        """A list with the reason why a configuration is not free among the obstacles; empty if it is free."""
+        """A list with the reason why a configuration is refused among the obstacles; empty if it is free."""
         start = self._start(qpos)
         state = self.workspace.is_free(start)
         return [] if state else [state.reason]

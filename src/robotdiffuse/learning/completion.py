@@ -165,7 +165,7 @@ class Samples(NamedTuple):
     seen: UInt8[ndarray, "n 56 56 32"]
     """The bits of `BITS`."""
     behind: UInt8[ndarray, "n 56 56 32"]
-    """Depth behind the nearest surface, in units of DEPTH_STEP."""
+    """How far each voxel lies behind the surface that hides it from the camera, in units of DEPTH_STEP."""
     truth: UInt8[ndarray, "n 56 56 32"]
     """Whether each of a voxel's eight fine voxels holds an obstacle: bit 4 x + 2 y + z, with x, y and z the
     index of the fine voxel, 0 or 1."""
@@ -269,6 +269,9 @@ def _exported(name: str, folder: FilePath) -> Completion:
 
     parts = exported_files(folder, name, read_description(folder, name))
     if parts.keys() != {".onnx"}:
-        raise InputError(f"{folder / name}.json names the ONNX files {sorted(parts)}; it must name .onnx")
+        raise InputError(
+            f"{folder / name}.json lists ONNX files with the endings {sorted(parts)}; it must list "
+            "exactly one, with the ending .onnx"
+        )
     network = OnnxNetwork(parts[".onnx"], f"{folder / name}.onnx")
     return lambda seen, behind: network(seen=seen, behind=behind)

@@ -8,7 +8,7 @@ h = max(S - D, 0) of a safe distance S and a distance D:
 |----------------|---------------------------------------------------------------------|-------------|
 | collision      | sum of h^2 / 2 over covering spheres; D: from sphere to scene       | margin (S)  |
 | self_collision | sum of h^2 / 2 over pairs of links; D: between the two links        | self_margin |
-| length         | sum of |q_(i+1) - q_i|^2 / 2: velocities                            | length      |
+| length         | sum of |q_(i+1) - q_i|^2 / 2                                        | length      |
 
 The first two costs depend on single waypoints. Each waypoint is pushed by the smallest motion that clears a
 contact (a Gauss-Newton step), and a kernel spreads the pushes over the neighboring waypoints, as the metric
@@ -16,8 +16,8 @@ of CHOMP does (Zucker et al., IJRR 2013). The cost of length is CHOMP's smoothne
 step moves each waypoint towards the middle of its two neighbors.
 
 A problem's path constraints are one more cost: the sum of h^2 / 2 over their rows (scalar constraints), where
-h is how far a row's value exceeds a share of its tolerance [m]; a radian counts as
-`projection_kernel.ANGLE_WEIGHT` meters.
+h is how far the value of a row exceeds `tolerance_share` times the row's tolerance, see `CollisionGuidance`
+[m]; a radian counts as `projection_kernel.ANGLE_WEIGHT` meters.
 """
 
 from dataclasses import dataclass
@@ -158,8 +158,9 @@ Trajectories = Float[ndarray, "count waypoints dof"]
 @dataclass(frozen=True)
 class GuidanceSettings(Settings, name="guidance"):
     margin: NotNegative | None = 0.04
-    """Distance to obstacles below which waypoints are pushed away [m]: the paper's safe distance S. It also
-    covers the motion between two waypoints. None: obstacles have no cost."""
+    """Distance to obstacles below which waypoints are pushed away [m]: the paper's safe distance S. Only
+    waypoints are checked; with this distance, the motion between them is mostly free too. None: obstacles
+    have no cost."""
     self_margin: NotNegative | None = 0.01
     """Distance between links below which they are pushed apart [m]; None: no cost."""
     push: Positive = 0.15
@@ -193,8 +194,8 @@ class CollisionGuidance:
         """The trajectories [rad] after `steps` steps, and their margin costs before the last step.
 
         The first and the last waypoint are not moved and have no cost. If margins are enabled, a trajectory
-        with no other waypoint within a margin has zero cost and is not changed, not even by the cost of
-        length.
+        with no other waypoint within a margin has zero cost, and neither pushes nor the cost of length
+        change it. Path constraints still do.
         """
         settings = self.settings
         checker = self.checker

@@ -41,7 +41,8 @@ class Planner(ABC, Generic[PlannerSettings]):
     the others. `plan` handles everything else that a problem or a request may contain, for every planner."""
 
     follows_lines: ClassVar[bool] = False
-    """Whether `line_following.py` tries to solve a problem with a Cartesian line before `solve` is called."""
+    """If a constraint of the problem is a `CartesianLine`: whether `line_following.py` is tried before
+    `solve`."""
 
     def __init__(self, settings: PlannerSettings | None = None) -> None:
         self.settings = self.settings_class() if settings is None else settings
@@ -92,8 +93,10 @@ class Planner(ABC, Generic[PlannerSettings]):
         Without `warm_up`, the first call loads this code itself, outside of its planning time. Pass the
         `until` of later calls.
 
-        Returns the results of the planning calls that `warm_up` makes: one without obstacles; two with a ball
-        on the straight line; and a short one with one small obstacle of each kind in the problem's scene.
+        Returns the results of the planning calls that `warm_up` makes: one without obstacles; if that has a
+        path, two with a ball that the tip would meet on the straight line in joint space; and a short one
+        with the first obstacle of each kind in the problem's scene (one triangle of a mesh, one point of a
+        cloud), or with the whole scene if the problem has views.
         """
         from robotdiffuse.collision.exact_meshes import warm_up as load_coal
 

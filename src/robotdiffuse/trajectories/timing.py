@@ -28,7 +28,8 @@ from robotdiffuse.trajectories.speed_limits import (
 from robotdiffuse.trajectories.timing_kernel import evaluate, rounded_line
 
 SHRINK_FACTOR = 0.5
-"""Factor by which the deviation of a corner shrinks each time its rounding fails."""
+"""Factor by which the deviation of a corner, how far its rounding may leave the path, shrinks each time the
+rounding fails."""
 MIN_DEVIATION = 2e-4
 """A corner that cannot be rounded with this deviation is a stop [rad, joint-space L2]."""
 MAX_TIMINGS = 8
@@ -64,8 +65,8 @@ def time_parameterize(
     motion is still refused after MAX_TIMINGS timings. With stops at all corners, the rows lie on the path
     itself, so a free path always has a trajectory; this trajectory is returned without validation.
 
-    The jerk of motions from rest is constant between rows and within `jerk_limits`. A low jerk limit costs
-    time at both ends of the motion and at each stop, and cuts corners slightly more.
+    The jerk of motions from rest is constant between rows and within `speed_limits.jerk_limits`. A low
+    jerk limit costs time at both ends of the motion and at each stop, and cuts corners slightly more.
 
     Args:
         robot: The robot.
@@ -74,13 +75,13 @@ def time_parameterize(
         free: Whether a path is free of collision.
         settings: Settings of timing.
         keeps: Whether the configurations [n, dof] along a rounded corner meet a requirement that the path
-            meets, such as a clearance. Corners that do not meet it are rounded less from the beginning,
-            but by at least MIN_DEVIATION.
+            meets, such as a clearance. Corners that do not meet it get a smaller deviation before the
+            first timing, but none below MIN_DEVIATION.
         start_speed: Speed at the beginning [rad/s, joint-space L2], along the first straight line, which must
             be long enough to stop on.
         extra: Limits on frame speeds and torques, applied only if the motion begins at rest.
-        deviations: How far the motion may pass each waypoint [n] [rad, joint-space L2]; None:
-            `settings.corner_deviation`.
+        deviations: How far the rounding at each waypoint may leave the path [n] [rad, joint-space L2];
+            None: `settings.corner_deviation`.
 
     Returns:
         The motion. Times start at 0 and strictly increase; the first and the last row are exactly the first
@@ -135,9 +136,9 @@ def rounded_corners(
         if (less < deviations).any():
             deviations = less
         elif attempt < MAX_SLOWER_TIMINGS and not start_speed:
-            # Averaging over time, which keeps the jerk limits, cuts corners. Half the accelerations cut
-            # corners an eighth as far: the deviation grows with the acceleration and the square of the
-            # window, and the window with the acceleration.
+            # To obey the jerk limits, positions are averaged over a window of time, which cuts corners. The
+            # cut grows with the acceleration and the square of the window, and the window grows with the
+            # acceleration. So half the acceleration cuts an eighth as far.
             scale = max(SHRINK_FACTOR * slower.acceleration_scale, MIN_SCALING)
             slower = replace(slower, acceleration_scale=scale)
         else:  # the refusal may come from any corner: round all of them less

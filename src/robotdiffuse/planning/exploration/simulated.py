@@ -82,7 +82,8 @@ class RecordedExplorer(Explorer):
     """An Explorer that records all views and steps, on the assumption that each step is executed immediately
     and completely.
 
-    A view gets the time at which the motion is closest to the view's configuration.
+    The recorded time of a view is the time at which the last step's motion is closest to the view's
+    configuration.
     """
 
     def __init__(self, *values: Any, **named: Any) -> None:
