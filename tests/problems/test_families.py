@@ -1,10 +1,12 @@
 """Every family of the table: its problems can be planned, are repeatable and keep the family's settings."""
 
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from helpers.made_arms import chain, read_urdf, row, written
 from helpers.refusals import refuses
 from robotdiffuse import Box, InputError, Scene, Sphere, load_robot
 from robotdiffuse.collision import CollisionChecker
@@ -95,6 +97,18 @@ def test_problems_of_an_arm_of_five_joints_and_a_third_of_the_reach(name: str) -
     assert ((tips >= family.region[0]) & (tips <= family.region[1])).all()
     np.testing.assert_allclose(tips[1:], [drawn.T_base_tip[:3, 3]] * len(drawn.goals), atol=1e-5)
     PackedScenes.pack([drawn.scene], family.max_obstacles, floor=True)
+
+
+def test_values_of_prismatic_joints_are_scaled_too(tmp_path: Path) -> None:
+    """Regression: the start and the goals were those of the arm's copy of a Panda's size."""
+    lift = chain("base", ["lift"], kind="prismatic", axis="0 0 1", limits='lower="0" upper="0.6"')
+    robot = read_urdf(written(tmp_path, lift, chain("lift_link", row("j", 6), xyz="0 0 0.35")))
+    family = family_for("rop", robot)
+    assert isinstance(family, ScaledFamily)
+    drawn = family.draw(robot, np.random.default_rng(3), 2, POSE)
+    for q in drawn.goals:
+        np.testing.assert_allclose(link_pose(robot, q, robot.tip), drawn.T_base_tip, atol=1e-3)
+    assert robot.prismatic[0] and abs(drawn.goals[0][0]) > 0.01
 
 
 FLOORS = 1

@@ -1,12 +1,14 @@
 """Scales families, which are designed for a Panda's reach, to the size of another arm.
 
 A problem is sampled for a copy of the arm that is scaled to a Panda's reach; then scene and targets are
-scaled to the arm's own size. The joint angles of the copy are those of the arm. Problems are thus equally
+scaled to the arm's own size. The joint angles of the copy are those of the arm; values of prismatic joints
+are scaled. Problems are thus equally
 hard for small and large arms, and families do not depend on the size of the arm.
 """
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 from numpy.random import Generator
@@ -68,7 +70,10 @@ class ScaledFamily:
         sample = self.family.draw(_panda_sized(robot), rng, goals, target)
         T_base_tip = sample.T_base_tip.copy()
         T_base_tip[:3, 3] *= self.scale
-        return replace(sample, scene=_scene(sample.scene, self.scale), T_base_tip=T_base_tip)
+        by_joint = np.where(robot.prismatic, self.scale, 1.0)
+        return SampledProblem(
+            _scene(sample.scene, self.scale), sample.start * by_joint, sample.goals * by_joint, T_base_tip
+        )
 
 
 @once_per_robot
