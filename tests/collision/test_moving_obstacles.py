@@ -172,7 +172,7 @@ def test_files_name_the_field(entry: object, message: str) -> None:
 
 def test_moving_obstacles_stand_beside_neither_blends_nor_start_velocities() -> None:
     ball = rd.MovingObstacle(BALL, velocity=[0, 1, 0])
-    with pytest.raises(rd.InputError, match="moving cannot be combined with blend: the motion stops"):
+    with pytest.raises(rd.InputError, match="moving cannot be combined with blend: among moving obstacles, motions stop"):
         rd.Problem(PANDA, rd.Scene(), START, END, waypoints=[END], moving=[ball], blend=0.1)
     with pytest.raises(rd.InputError, match="start_velocity cannot be combined with moving"):
         rd.Problem(PANDA, rd.Scene(), START, END, moving=[ball], start_velocity=[0.1] * 7)

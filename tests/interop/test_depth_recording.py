@@ -168,7 +168,7 @@ def test_bags_of_librealsense(compression: Writer1.CompressionFormat | None, tmp
     assert stamp == 3.0 and view.configuration is None and view.intrinsics == (300.0, 310.0, 0.5, 0.4)
     np.testing.assert_allclose(view.depth, [[0.5, 0.0], [1.5, 2.0]], rtol=1e-6)
     np.testing.assert_array_equal(view.T_base_camera, T)
-    refuses("no transforms lead from panda_link0 to 0", list, rd.read_depth_views(file, PANDA))
+    refuses("no transforms connect 0.* with panda_link0", list, rd.read_depth_views(file, PANDA))
 
 
 @pytest.mark.parametrize("compression", Writer1.CompressionFormat)
@@ -240,7 +240,7 @@ def test_an_image_without_a_joint_state_leaves_the_rest(tmp_path: Path) -> None:
     [
         (lambda of: of["/camera/camera_info"].clear(), "no CameraInfo on /camera/camera_info"),
         (lambda of: of["/camera/image_rect"].clear(), "holds no depth images"),
-        (lambda of: of["/tf"].clear(), "no transforms lead from panda_link0 to camera_optical.*panda_hand"),
+        (lambda of: of["/tf"].clear(), "no transforms connect camera_optical.*with panda_link0.*panda_hand"),
         (
             lambda of: [state["header"]["stamp"].update(sec=3) for state in of["/joint_states"]],
             "no joint state of panda_joint1.* within 0.1 s of the image",
@@ -282,11 +282,11 @@ def test_chains_are_followed_and_interpolated_and_at_the_ends_the_nearest_counts
 
 def test_missing_transforms_are_said() -> None:
     refuses(r"no transform of link within 0\.1 s of the image", history().at, "base", "camera", 6.0, 0.1, "the image")
-    with pytest.raises(rd.InputError, match=r"no transforms lead from world to camera.*lead to link, base"):
+    with pytest.raises(rd.InputError, match=r"no transforms connect camera.*with world.*are link, base"):
         history().at("world", "camera", 5.0, 0.1, "the image")
     circle = history()
     circle.add(pose("camera", "base", 5.0), static=True)
-    refuses("no transforms lead from world", circle.at, "world", "camera", 5.0, 0.1, "the image")
+    refuses("no transforms connect camera", circle.at, "world", "camera", 5.0, 0.1, "the image")
     bad = pose("base", "link", 5.0)
     bad["transform"]["rotation"] = dict.fromkeys("xyzw", 0.0)
     refuses("the transform of link has the rotation", circle.add, bad, static=False)

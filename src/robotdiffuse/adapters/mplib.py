@@ -307,7 +307,7 @@ class Planner:
 
     def _start(self, qpos: ArrayLike) -> ndarray:
         """The planned joints of `qpos`. Its other joints, such as fingers, are locked at their values in
-        `qpos`."""
+        `qpos`, rounded to multiples of HELD_JOINT_STEP."""
         q = np.ravel(np.asarray(qpos, float))
         if len(q) == self.robot.dof:
             return q

@@ -220,8 +220,8 @@ class Claim(NamedTuple):
 
     link: str
     against: str
-    """SCENE, the name of a moving obstacle, or the name of the other link, which is moved by at most as many
-    joints as `link`."""
+    """SCENE, the name of a moving obstacle, or the name of the other link. Of two links, `link` is
+    moved by at least as many joints."""
 
 
 class Stretches(NamedTuple):
@@ -279,8 +279,8 @@ class Bounds:
 
 
 class Prover:
-    """Computes bounds for a robot in a scene, along straight lines through configurations or within a known
-    distance of the lines."""
+    """Computes bounds for a robot in a scene, for a motion along straight lines through configurations, which
+    may leave the lines by a known distance."""
 
     def __init__(
         self,
@@ -485,9 +485,10 @@ class Prover:
         """Clearance and displacement of the `marked` stretches by planes.
 
         Pairs of a part of the link and an obstacle (or a part of the other link) are bounded one by one. The
-        clearance of a pair is the greater of the gap between the balls around them and the widest gap that a
-        plane shows. The margin of a pair is a lower bound of its gap anywhere on the stretch, computed in the
-        same way. The results are the smallest clearance, and its difference from the smallest margin.
+        clearance of a pair is the greater of two gaps: the one between the ball around the part and the
+        obstacle (or the other part's ball), and the widest one that a plane shows. The margin of a pair is a
+        lower bound of its gap anywhere on the stretch, computed in the same way. The results are the smallest
+        clearance, and its difference from the smallest margin.
 
         which: for each stretch, its row in `postures`. ways: for each marked stretch, the `_steps` of its
         joints and their `deviations`.

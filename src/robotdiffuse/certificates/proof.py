@@ -47,7 +47,8 @@ class Tolerances:
     rate_slack: float = 0.01
     """Fraction of the robot's limits."""
     chord: float = 1e-3
-    """How far a joint may leave the certified straight lines on the cubics between rows [rad] or [m]."""
+    """How far the cubic of a joint between two rows may leave the straight line that is certified [rad] or
+    [m]."""
 
 
 @dataclass(frozen=True, eq=False)

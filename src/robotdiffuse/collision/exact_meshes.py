@@ -148,8 +148,8 @@ def _obstacles(scene: Scene) -> tuple[_Obstacle, ...]:
 
 @dataclass(frozen=True)
 class _Candidates:
-    """The pairs of geometries that a check compares: each convex part of `firsts` with each obstacle, or
-    convex part of another link, of `seconds`."""
+    """The pairs of geometries that a check compares: each of `firsts`, the convex parts of a link, with each
+    of `seconds`, obstacles or the convex parts of another link."""
 
     firsts: tuple[_Piece, ...]
     seconds: tuple[_Piece | _Obstacle, ...]

@@ -19,8 +19,8 @@ MAX_POINTS = 400_000
 """Approximate largest number of spheres of a mesh obstacle; larger meshes are divided more coarsely, or their
 pieces merged."""
 MAX_SOLIDS = 1000
-"""Largest number of spheres of a surface that links may touch. These spheres are not in the grid but checked
-one by one; `join_to_few` merges them until few enough are left."""
+"""Largest number of spheres of a surface that some link is allowed to touch. These spheres are not in the
+grid but checked one by one; `join_to_few` merges them until few enough are left."""
 JOIN_VOXEL = 0.004
 """Edge of the voxels by which `join_to_few` first merges spheres [m]; it grows from round to round."""
 EXACT_RANGE = 0.1
@@ -89,7 +89,8 @@ def join_to_few(spheres: Float[ndarray, "n 4"]) -> Float[ndarray, "m 4"]:
 
 
 def cover_triangles(triangles: Float[ndarray, "n 3 3"], reach: float) -> Float[ndarray, "m 4"]:
-    """Spheres around pieces of the triangles that together cover the surface within `reach` [m]."""
+    """Spheres, one around each piece of the triangles, that cover the surface up to POINT_RANGE beyond the
+    arm's `reach` [m]."""
     near = _divide(triangles, reach / 4 if np.isfinite(reach) else np.inf, reach)
     # bisected triangles have an area of about spacing² / 4
     spacing = max(MESH_SPACING, float(np.sqrt(4 * _area(near) / MAX_POINTS)))
@@ -158,7 +159,7 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
     index = index[order]
     cell = cell[order]
     first = np.asarray(np.searchsorted(cell, np.arange(int(np.prod(cells)) + 1)), np.int32)
-    # wide enough to decide whether the robot's largest sphere touches a point
+    # up to this distance, the grid is exact, enough to decide whether the largest sphere touches a point [m]
     band = np.float32(max(radius + float(radii.max()) + 1e-3, 2 * float(voxel)))
     # runs of points in the same voxel
     voxels = _flat(index, shape)

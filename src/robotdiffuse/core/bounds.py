@@ -13,7 +13,8 @@ MAX_COORDINATE = 1e4
 """Largest absolute coordinate, size or joint value [m] or [rad]. At 10 km, adjacent float32 numbers are about
 1 mm apart; compiled code adds a margin for this error."""
 MIN_SIZE = 1e-9
-"""Smallest size [m]. A smaller size must be an error in units: float32 numbers near 1 m are 1e-7 m apart."""
+"""Smallest size [m]. A smaller size must be an error in units: it is far below the 1e-7 m between adjacent
+float32 numbers near 1 m."""
 # Smallest limit of a joint's velocity, acceleration or jerk, and largest value of these rates, in SI units.
 MIN_RATE = 1e-6
 MAX_RATE = 1e6
@@ -139,8 +140,8 @@ def rows(
 ) -> ndarray:
     """The value as an array of `count` rows (None: at least one row) of `columns` numbers within ±most.
 
-    Raises InputError, naming the field `name` or its first wrong row, for anything else. The message states
-    the right shape and then `meaning`, e.g. ", a column for each joint".
+    Raises InputError, naming the field `name` or its first wrong row, for anything else. For a wrong
+    shape, the message states the right one and then `meaning`, e.g. ", a column for each joint".
     """
     array = numbers(value)
     requirement = f"it must be {count or 'n'} x {columns} finite numbers{meaning}"

@@ -130,7 +130,7 @@ class Evaluation:
     collided: Values
     """Fraction of the sampled trajectories in collision."""
     length: Values
-    """Link path length of the shortest trajectory that passed [m]; NaN if none passed."""
+    """Length of the shortest trajectory that passed, see `metrics.link_length` [m]; NaN if none passed."""
     seconds: Values
     """CPU time of encoding and sampling on one thread [s]."""
 
@@ -305,9 +305,9 @@ NOTES = (
 )
 LINE_FAMILIES = {"spheres and cubes": ROP, "spheres alone": Rop(kinds=("sphere",))}
 LINE_NOTES = (
-    "Share of problems on which the straight line in joint space is free, drawn as the authors draw them, "
-    "with inverse kinematics of the position only. The paper's rows include problems that the line solves, "
-    "so a success rate near these shares does not show that a planner avoids obstacles.",
+    "Share of problems on which the straight line in joint space is free. Problems are sampled as by the "
+    "authors, with inverse kinematics of the position only. The paper's rows include problems that the line "
+    "solves, so a success rate near these shares does not show that a planner avoids obstacles.",
 )
 
 
@@ -379,7 +379,10 @@ def straight_line_table(problems: int) -> Table:
     columns = ("row", Column("success", "%"))
     rows.sort(key=lambda row: row[1].value)
     return Table.of(
-        f"No planner among the paper's rows: {problems} problems drawn", columns, rows, LINE_NOTES
+        f"The straight line, without a planner, beside the paper's rows: {problems} sampled problems",
+        columns,
+        rows,
+        LINE_NOTES,
     )
 
 

@@ -53,8 +53,8 @@ from robotdiffuse.processes.workers import EndedError, NotStartedError, OverrunE
 from robotdiffuse.robots.robot import Robot
 
 CALL_ARGUMENTS = [field.name for field in fields(PlanRequest) if field.name not in ("time_limit", "seed")]
-"""Arguments of `Planner.plan` that the text of a planner under test may set; the bench sets time limit and
-seed."""
+"""Arguments of `Planner.plan` that may follow the name of a planner, see `PlannerSpec.parse`. The bench sets
+time limit and seed."""
 
 
 @dataclass(frozen=True)
@@ -394,9 +394,10 @@ Done = Callable[[int, int], None]
 def run_bench(settings: BenchSettings, report: Progress, done: Done) -> int:
     """Make the calls that have no record in the folder; returns how many were made.
 
-    A call with a shorter time limit is not repeated if it ended before its limit, since more time would not
-    change its result. Raises InputError, before any call, for bad settings or a planner that cannot be
-    loaded, and KeyboardInterrupt on Ctrl-C. Running again with the same settings then continues.
+    A call that has a record with a shorter time limit is not repeated if it ended before that limit, since
+    more time would not change its result; with `equal_time` it is, if another seed could change it. Raises
+    InputError, before any call, for bad settings or a planner that cannot be loaded, and KeyboardInterrupt on
+    Ctrl-C. Running again with the same settings then continues.
     """
     with lock_folder(settings.out):
         specs = settings.specs

@@ -97,8 +97,8 @@ class DataFigures:
 
     @property
     def safety_distance(self) -> float:
-        """The safety distance with which searches of the data generation begin [m]: the largest one in the
-        data."""
+        """The safety distance that data generation tries first [m]. Searches that fail lower it, so it is the
+        largest one in the data."""
         return float(self.all["safety_distance"].max())
 
 
@@ -154,7 +154,7 @@ def facts(data: DataFigures) -> list[tuple[str, str]]:
         ),
         (f"in {data.shards:,} shards", f"{data.bytes / 1e6:,.1f} MB"),
         ("splits", ", ".join(f"{count:,} {name}" for name, count in data.splits.items())),
-        ("problems solved", f"{_share(solved)}; of {counts['tried']:,} tried {lost}"),
+        ("problems solved", f"{_share(solved)}; tried: {counts['tried']:,}, of these {lost}"),
         (f"keep {distance}, or the clearance of start or goal if smaller", _share(keeps_distance)),
         (
             f"keep {distance} all along, if start and goal do",
@@ -189,7 +189,7 @@ def tables(data: DataFigures) -> list[Table]:
         )
         for name, rows in data.families.items()
     ]
-    columns = ("medians of", "motions", *QUANTITIES.values())
+    columns = ("family", "motions", *QUANTITIES.values())
     of_shares = (Column(name, "%", ".1f", scale=100.0) for name in shares)
     spreads = []
     for name, column in QUANTITIES.items():
@@ -234,7 +234,7 @@ def data_report(data: DataFigures, name: str) -> Report:
     distance = f"{100 * data.safety_distance:.3g} cm"
     report.plot(
         "motions.svg",
-        f"Motions by family; except near start and goal, the search keeps {distance} from obstacles. "
+        f"Motions by family; except near start and goal, the search tries to keep {distance} from obstacles. "
         "Detours: without trivial motions",
         histograms(_motions(data), 3),
     )

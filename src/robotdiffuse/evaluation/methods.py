@@ -1,5 +1,5 @@
-"""Methods for `runs`: planners, and networks or controls that sample trajectories. Each method yields the
-fields of its records, including the validator's verdict.
+"""Methods for `runs`: planners, and samplers of trajectories: networks, or controls, which are baselines
+without a network. Each method yields the fields of its records, including the validator's verdict.
 
 The time of a planner's call includes its validation; the time of sampling does not include validation.
 """
@@ -178,8 +178,8 @@ def path_lengths(q: Trajectories) -> Values:
 
 
 def sampled(draw: Draw, lengths: Callable[[ndarray], ndarray] = path_lengths) -> Method:
-    """A method that validates a batch of sampled trajectories, and measures the shortest valid one by
-    `lengths`."""
+    """A method that validates a batch of sampled trajectories, and measures the valid one for which `lengths`
+    is smallest."""
 
     def call(run: Run) -> Iterator[Fields]:
         problem = run.problem

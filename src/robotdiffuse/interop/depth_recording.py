@@ -158,7 +158,7 @@ def read_depth_views(
     """
     path = Path(file)
     if path.suffix == ".db3":
-        raise InputError(f"{path} is a part of a ROS 2 bag: give the folder that holds it and metadata.yaml")
+        raise InputError(f"{path} is a part of a ROS 2 bag: give the folder with it and its metadata.yaml")
     with reading(file), opened_recording(path, MAX_SIZE) as recording:
         yield from _read(path, recording, robot, topics, base or robot.base, T_base_camera)
 
@@ -331,8 +331,8 @@ class TransformHistory:
         while at != base.lstrip("/"):
             if at not in self._parent or len(passed) > len(self._parent) + 1:  # no parent, or a cycle
                 raise InputError(
-                    f"no transforms lead from {base} to {frame}, the frame of {where}; from {frame} they"
-                    f" lead to {', '.join(passed[1:]) or 'nothing'}"
+                    f"no transforms connect {frame}, the frame of {where}, with {base}; the parents of "
+                    f"{frame} are {', '.join(passed[1:]) or 'none'}"
                 )
             T = self._pose_in_parent(at, stamp, gap, where) @ T
             at = self._parent[at]

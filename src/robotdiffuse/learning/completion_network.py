@@ -28,7 +28,7 @@ CHANNELS = 7
 """Number of input channels: occupied, free, shadow of the arm, out of view, depth behind a surface, height,
 distance from the base's axis."""
 DEPTH_SCALE = DEPTH_STEP / 0.5
-"""Stored depths behind surfaces, multiples of DEPTH_STEP, are multiplied by this: half a meter becomes 1."""
+"""Depths behind surfaces are stored as numbers of DEPTH_STEP; multiplied by this, half a meter becomes 1."""
 
 
 def _position_inputs() -> Float[Tensor, "28 28 16 16"]:
@@ -46,8 +46,8 @@ def folded(x: Shaped[Tensor, "n i j k"]) -> Shaped[Tensor, "n i//2 j//2 k//2 8"]
 
 
 def unfolded(x: Shaped[Tensor, "n i j k c"]) -> Shaped[Tensor, "n 2*i 2*j 2*k c//8"]:
-    """The inverse of `folded`: a pixel shuffle in three dimensions. The first factor of the features is the
-    index in the block."""
+    """The inverse of `folded`: a pixel shuffle in three dimensions. The features are read as [8, c // 8]:
+    the index in the block, and the features of each voxel."""
     n, i, j, k, c = x.shape
     blocks = x.reshape(n, i, j, k, 2, 2, 2, c // 8).permute(0, 1, 4, 2, 5, 3, 6, 7)
     return blocks.reshape(n, 2 * i, 2 * j, 2 * k, c // 8)

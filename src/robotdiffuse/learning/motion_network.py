@@ -33,7 +33,7 @@ def block_means(
 ) -> tuple[Float[Tensor, "blocks waypoints"], Float[Tensor, "waypoints blocks"], Float[ndarray, "blocks"]]:
     """The matrix that takes means of blocks of waypoints, the matrix that interpolates linearly between the
     middles of the blocks, and these middles [waypoints]. The first and the last waypoint are blocks of their
-    own."""
+    own; `block` must divide waypoints - 2."""
     index = np.r_[0, 1 + np.arange(waypoints - 2) // block, 1 + (waypoints - 2) // block]
     member = np.eye(index[-1] + 1)[:, index]
     means = member / member.sum(1, keepdims=True)
@@ -75,9 +75,9 @@ class MotionNetwork(Network, MotionModel):
         return Statistics(self.residual_scale.numpy(), self.residual_mean.numpy(), self.noise_factor.numpy())
 
     def fit_statistics(self, q: Float[ndarray, "n waypoints dof"], smooth_noise: bool) -> None:
-        """Set scale, mean and covariance of the noise from trajectories [rad].
+        """Set, from trajectories [rad], the scale of residuals, their mean and the covariance of the noise.
 
-        For the target `limits`, which has no such statistics, nothing happens.
+        Nothing is set for the target `limits`, joint values in units of their limits.
         """
         if self.settings.target == "limits":
             return

@@ -96,7 +96,7 @@ MIN_SPREAD = 4e-4
 """Images with less noise than this, at a distance of 1 m [m], are not filtered, since the filter removes
 objects that are one pixel wide."""
 MARGIN_SPREADS = 3.75
-"""Points may belong to the arm if they are this many standard deviations of the filtered depth from it."""
+"""Points within this many standard deviations of the filtered depth from the arm may belong to it."""
 MEDIAN_SPREAD = 0.4
 """Standard deviation of the median of nine independent numbers, relative to that of one number."""
 MEDIAN_LENGTH = 0.85
@@ -213,8 +213,8 @@ def empty_regions(
     of the image with no near surface beside them. None if no pixel is such, or if the image is cropped.
 
     Regions that do not reach the border are left out, since they may be dark or reflecting surfaces. reach:
-    the sensor's range [m] if known; a floor may end there along one row. arm: the pixels of the arm, which
-    may be near.
+    the sensor's range [m] if known; an image in which returns end near it along one row, as on a floor, is
+    not cropped. arm: the pixels of the arm, which may be closer than TOO_NEAR.
     """
     no_return = ~(depth > 0)
     lost = no_return[::2, ::2]
@@ -225,9 +225,10 @@ def empty_regions(
     core = minimum_filter(lost.view(np.uint8), EMPTY_EDGE, mode="nearest")
     large_regions = np.asarray(maximum_filter(core, EMPTY_EDGE, mode="nearest", origin=-1) > 0) & lost
     half = depth[::2, ::2]
-    near = ~lost & (half < AT_RANGE * (np.inf if reach is None else reach))
-    # cropped: the first row with a near surface, from any side, lies along a region in many columns
-    kinds = large_regions + 2 * near
+    in_range = ~lost & (half < AT_RANGE * (np.inf if reach is None else reach))
+    # cropped: counted from one of the four sides, the first row with returns well within the range borders a
+    # large region in many columns
+    kinds = large_regions + 2 * in_range
     for rows in (kinds, kinds.T, kinds[::-1], kinds.T[::-1]):
         first = int((rows == 2).any(axis=1).argmax())
         if first and (rows[first - 1] + rows[first] == 3).mean() > CUT_SHARE:
@@ -237,7 +238,7 @@ def empty_regions(
     for border in (regions[0], regions[-1], regions[:, 0], regions[:, -1]):
         is_empty[border] = True
     too_near = half < TOO_NEAR if arm is None else (half < TOO_NEAR) & ~arm[::2, ::2]
-    # for each region, the number of returns beside it, and the number of near ones
+    # for each region, the number of returns beside it, and the number of those that are too near
     beside = np.zeros((2, len(is_empty)))
     for numbers, seen, close in ((regions, ~lost, too_near), (regions.T, ~lost.T, too_near.T)):
         for own, neighbor in ((slice(1, None), slice(-1)), (slice(-1), slice(1, None))):
@@ -252,8 +253,9 @@ def empty_regions(
 
 
 GRAZED_WIDTH = 0.04
-"""A board that is seen almost edge-on gives no return either. Hence pixels without a return closer to a
-surface in the image than this, measured at the surface's depth, do not show open space behind it [m]."""
+"""A board that is seen almost edge-on gives no return, as open space does. So a pixel without a return does
+not show open space behind a surface if it is less than this beside it in the image, measured at the surface's
+depth [m]."""
 DEPTH_FACTOR = 1.5
 """Surfaces whose depths differ by less than this factor are widened by the same number of pixels."""
 
@@ -311,11 +313,13 @@ def measure_noise(images: Sequence[ArrayLike]) -> DepthNoise:
         whichever has the larger spread; and the fraction of dropouts.
 
     Raises:
-        InputError: For fewer than two images, and if no pixel has a return in all images.
+        InputError: For fewer than two images, for images of different sizes, and if no pixel has a
+            return in all images.
     """
     arrays = [np.asarray(image, np.float32) for image in images]
     if len(arrays) < 2 or len({image.shape for image in arrays}) > 1 or arrays[0].ndim != 2:
-        raise InputError(f"images has {len(arrays)} images; at least two of the same size are needed")
+        sizes = [image.shape for image in arrays]
+        raise InputError(f"images have the sizes {sizes}; at least two images of one size [h, w] are needed")
     stack = np.stack(arrays)
     seen = np.isfinite(stack) & (stack > 0)
     always = np.equal(seen.sum(axis=0), len(stack))

@@ -130,7 +130,7 @@ class Planner(ABC, Generic[PlannerSettings]):
 
 
 def pipeline_for(problem: Problem) -> Callable[[Solver, Problem, PlanRequest], PlanResult]:
-    """The function that plans for a problem: the module of `planning/pipeline` that handles its moving
+    """The function of `planning/pipeline` that plans for a problem: the one that handles its moving
     obstacles, waypoints, start velocity or views, in this order of precedence; `attempt` if it has none. A
     module is imported only when it is needed."""
     if problem.moving:

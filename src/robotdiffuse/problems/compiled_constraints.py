@@ -158,7 +158,7 @@ class PathConstraints:
     def project(
         self, q: Configurations, tolerance_fraction: float, most: int = -1
     ) -> tuple[Configurations, Bool[ndarray, "n"]]:
-        """`projected`, but with a row for each configuration; also returns which rows keep the tolerances."""
+        """Like `projected`, but returns all configurations, and which of them keep the tolerances."""
         rows = np.array(q, np.float64, order="C")
         return rows, project_each(self.rows, self.limits(tolerance_fraction), rows, most)
 

@@ -183,7 +183,8 @@ def _check_independent_links(robot: Robot, field: str, goal: PosesGoal) -> None:
 
 
 def _values(robot: Robot, field: str, value: Any) -> Any:
-    """Planned joint values of a pose's name or of a dict by joint; any other value is returned unchanged."""
+    """The planned joint values for the name of a stored configuration of the robot (`robot.poses`) or for a
+    dict by joint; any other value is returned unchanged."""
     if isinstance(value, str):
         return named_pose(robot, field, value)
     if not isinstance(value, Mapping):
@@ -255,7 +256,7 @@ EXCLUSIVE_FIELDS = (
     ("start_velocity", "moving", ""),
     ("start_velocity", "payload", ""),
     ("moving", "views", ""),
-    ("moving", "blend", ": the motion stops at waypoints"),
+    ("moving", "blend", ": among moving obstacles, motions stop at waypoints; leave out blend"),
 )
 """Pairs of fields that cannot be combined, and advice for the message."""
 
@@ -277,7 +278,8 @@ class ProblemOptions(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class StateValidity:
-    """Whether a configuration is free, and if not, why; true in conditions if it is free."""
+    """Whether a configuration is free, and if not, why. It is true if the configuration is free: `if
+    problem.is_free(q):`."""
 
     reason: str = ""
     """Why the configuration is not free: a joint out of limits, or the deepest contact."""
@@ -474,7 +476,8 @@ class Problem(Value):
             q: A configuration [dof], values by joint, or the name of a pose.
 
         Returns:
-            A value that is true in conditions if the arm is free; otherwise its `reason` says why not.
+            A value that is true if the arm is free (`if problem.is_free(q):`); otherwise its `reason` says
+            why not.
 
         Raises:
             InputError: For q of the wrong shape, and for an unknown name.

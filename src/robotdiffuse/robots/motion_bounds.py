@@ -12,8 +12,8 @@ from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot
 
 COLUMNS = 180
-"""Number of directions around a joint's axis in the grid. With this number, bounds exceed the true maxima by
-about 0.1 % for each joint between axis and link."""
+"""Number of directions around a joint's axis in the grid of `motion_radii`. Each joint between the axis and
+the link adds about 0.1 % to the bound."""
 LIMIT_SLACK = 1e-3
 """Joint limits are widened by this [rad] or [m], so that rounding errors of configurations at the limits do
 not matter."""

@@ -3,9 +3,12 @@
 The check goes from coarse to fine. What a SIMD lane stands for changes with the step:
 
 1. Frames and bounding spheres of the links: a lane is a configuration.
-2. Obstacles that a link may touch in any configuration, from their bounding boxes: a lane is an obstacle.
+2. Obstacles that a link might touch in one of the configurations, from their bounding boxes: a lane is an
+   obstacle.
 3. Configurations in which the link's bounding sphere touches such an obstacle: a lane is a configuration.
 4. Whether the link's spheres touch the obstacle, one configuration after the other: a lane is a sphere.
+
+A group is a link with its covering spheres, which are stored in rows of 16, one sphere in each lane.
 """
 
 from typing import NamedTuple
@@ -174,8 +177,8 @@ def _touching(x, y, z, radius, solids, k):
 
 @allocation_free(forceinline=True)
 def _coordinate(frames, f, i, k, x, y, z):
-    """Coordinate k (0 to 2) in the base frame of the point (x, y, z) of frame f in configuration (lane) i. x,
-    y and z may also be lanes with a point each."""
+    """The coordinate k (0 to 2) in the base frame of the point (x, y, z), which is given in frame f, for
+    configuration i. x, y and z may also be vectors of 16 points."""
     return (
         x * frames[f, 3 * k * W + i]
         + y * frames[f, (3 * k + 1) * W + i]
@@ -327,7 +330,7 @@ def _hits_scene(robot, scene, padding, stop_at_first, work):
             while close:
                 k = row * W + first_lane(close)
                 close &= close - 1
-                if len(scene.may_touch) and scene.may_touch[g, k]:
+                if len(scene.may_touch) and scene.may_touch[g, k]:  # an allowed contact
                     continue
                 near = _touching(x, y, z, reach, solids, k) & ~hits
                 if near:
@@ -400,8 +403,8 @@ def block_hits(robot, scene, q, padding, stop_at_first, work):
 
 @allocation_free()
 def take_block(q, start, block):
-    """Writes 16 rows of q[n, dof] from `start` on to the columns of block[dof, 16]. Row n - 1 fills columns
-    beyond the end of q."""
+    """Copies the rows `start` to `start + 15` of q[n, dof] into the columns of block[dof, 16]; columns beyond
+    the end of q get its last row."""
     for i in range(W):
         for j in range(len(block)):
             block[j, i] = q[min(start + i, len(q) - 1), j]

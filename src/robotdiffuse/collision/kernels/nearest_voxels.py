@@ -9,7 +9,7 @@ _NO_POINTS = np.int32(1 << 30)
 """Squared distance that stands for infinity, in lines without any points [voxels²]."""
 _ROUNDING_SLACK = 1e-6
 """Added before a position along a line is rounded down [voxels]: more than its rounding error, less than the
-distance of a fractional position from the next integer."""
+distance of such a position, a fraction with a small denominator, from the next integer unless it is one."""
 
 
 @kernel(fastmath=True)
@@ -17,8 +17,9 @@ def nearest_voxels(run):
     """For each voxel the squared distance to the nearest voxel with points [voxels²], and the value of `run`
     at this nearest voxel.
 
-    run int32[nx, ny, nz] is the number of the voxel's group of points, -1 without points; at least one voxel
-    has points. The transform goes axis by axis (A. Meijster, J. Roerdink, W. Hesselink, 2000).
+    run int32[nx, ny, nz] is the index of the voxel's run (its consecutive points), -1 without points; at
+    least one voxel has points. The transform goes axis by axis (A. Meijster, J. Roerdink, W. Hesselink,
+    2000).
     """
     nx, ny, nz = run.shape
     # along z: a scan in both directions; then along y and x: lower envelopes of parabolas

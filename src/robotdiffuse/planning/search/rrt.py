@@ -81,8 +81,8 @@ MAX_DETOUR = 1.05
 """For pose goals: once there is a path up to this multiple of the straight line to the nearest goal
 configuration, longer paths are dropped as candidates for the fastest motion."""
 FINAL_CANDIDATES = 2
-"""Number of fastest candidates that are validated at the end, if there is time; the fastest valid motion is
-returned."""
+"""At the end, the fastest candidates are validated until this many are valid, if there is time; the fastest
+valid motion is returned."""
 END_MARGIN = 1e-6
 """Under path constraints, the search widens its tolerances to the values of the constraints at the start and
 the goals, plus this margin."""
@@ -145,7 +145,7 @@ class AnytimeSearch:
         """
         start_goal: start and goals.
         settings: settings of the search.
-        name: the `stage` of results with a path of this search.
+        name: what results report as their `stage`, the part of the planner that found the motion.
         seed: seed of the random numbers.
         clearances: clearances to try in turn, falling [m].
         bounded: whether rounds have a bound on length (AORRTC); False: they are restarts (RRT-Connect).
@@ -264,9 +264,9 @@ class AnytimeSearch:
         return still_improves(self._lengths, self.work, float(self.length), gain, patience)
 
     def offer(self, path: Configurations, stage: str) -> bool:
-        """Simplify a path from the start to a goal that is free in `space`, and make it the best path if it
-        is shorter; returns whether it is. If the objective is time, it may also become a candidate for the
-        fastest motion."""
+        """Simplify a path from the start to a goal, which must be free in `space`, and make it the best path
+        if it is shorter; returns whether it is. If the objective is time, it may also become a candidate for
+        the fastest motion."""
         path = for_kernels(path, np.float32)
         settings = self.settings
         if self._shortens:
@@ -526,8 +526,9 @@ class _Validation:
         self._timed.append(path)
         paths = [self.search.start_goal.complete(path, direct) for direct in (True, False)]
         result = None
-        # If covering spheres collide at the start or goal, the search begins or ends at a lead (`StartGoal`).
-        # The meshes may be free on the direct way without the lead, which is tried first.
+        # If covering spheres collide at the start or goal, the search begins or ends nearby, where they do
+        # not: at a lead, see `StartGoal`. The direct way, without the lead, is tried first, since the meshes
+        # may be free there.
         if len(paths[0]) < len(paths[1]):
             result = self._finished(paths[0], stage, None)
         if result is None:

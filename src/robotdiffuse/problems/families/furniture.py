@@ -1,4 +1,5 @@
-"""Furniture: base of the families with shelves, crates and tables around an arm that stands on the ground.
+"""Furniture: base class of the families (generators of random problems) with shelves, crates and tables
+around an arm that stands on the ground.
 
 All shapes are spheres, and boxes rotated about the vertical axis, so that data sets can store these scenes in
 the same arrays as those of the family `rop`. Each scene has regions in which the arm works: in compartments,
@@ -371,7 +372,7 @@ class Shelf(Furniture):
     """
 
     reach: Positive = 0.85
-    """Larger than for other furniture: a hand that points forward reaches farther than one that points
+    """Larger than the default: a hand that points forward reaches farther than one that points
     down."""
     distance: PositiveRange = (0.45, 0.7)
     """Distance from the base to the middle of the front."""
@@ -598,7 +599,7 @@ class Kitchen(Furniture):
     """
 
     reach: Positive = 0.85
-    """Larger than for other furniture: a hand that points forward reaches farther than one that points
+    """Larger than the default: a hand that points forward reaches farther than one that points
     down."""
     objects: tuple[Natural, Natural] = (1, 5)
     distance: PositiveRange = (0.3, 0.45)

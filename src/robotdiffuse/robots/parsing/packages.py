@@ -13,7 +13,8 @@ from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.input_files import is_file
 
 MAX_PACKAGES = 32
-"""Largest number of packages that a xacro file may refer to."""
+"""Largest number of times that a xacro file is compiled, each time with one more package that was looked
+up."""
 NAMESPACE_PREFIX = re.compile(rb"""</?([A-Za-z_][\w.-]*):[\w.-]+|\s([A-Za-z_][\w.-]*):[\w.-]+\s*=\s*["']""")
 """Matches the namespace prefix of an XML element or attribute."""
 XACRO = Lock()
@@ -26,8 +27,9 @@ PACKAGE_NOT_FOUND = re.compile(r"Package not found: (\S+)")
 class Packages:
     """Finds the ROS packages of a URDF.
 
-    The folder of a package is searched in `folders`, then in ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, then
-    among the URDF's folder and all folders above it. Files that the package's folder lacks are searched
+    The folder of a package is searched in `folders`, then in ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, then in
+    the URDF's folder and all folders above it: one of these with the package's name, or with such a folder in
+    it. Files that the package's folder lacks are searched
     relative to the URDF's folder and all folders above it, with and without the package's name.
     """
 
@@ -118,8 +120,8 @@ def compiled_xacro(path: Path, packages: Packages) -> bytes:
 
 
 def _by_xacro(xacro: Any, known: Any, path: Path, packages: Packages) -> bytes:
-    """Compiles the file again after each error for an unknown package, whose folder is then added to `known`:
-    xacrodoc's package look-up."""
+    """Compiles the file. After an error for an unknown package, adds its folder to `known`, xacrodoc's
+    package look-up, and compiles again."""
     known.reset()
     known.walk_up_from(path)
     known.update_package_cache(packages.folders)
@@ -145,4 +147,4 @@ def _by_xacro(xacro: Any, known: Any, path: Path, packages: Packages) -> bytes:
                     f"or ROS_PACKAGE_PATH"
                 ) from None
             known.update_package_cache({name: folder})
-    raise InputError(f"{path} refers to more than {MAX_PACKAGES} packages")
+    raise InputError(f"{path} refers to {MAX_PACKAGES} packages or more that had to be looked up")
