@@ -56,7 +56,7 @@ MAX_FIRST_MOTIONS = 8
 MIN_FIRST_MOTIONS = 4
 ACCEPTABLE_RISK = 2.0
 NEGLIGIBLE_RISK = 0.1
-CONFIDENCE_TOLERANCE = 0.01
+CONFIDENCE_TOLERANCE = 0.002
 """The shortest motion is chosen among those with a confidence at most this much below the highest."""
 AS_SEEN_TIME_FRACTION = 0.3
 """Fraction of the time limit that is reserved for the assumption "as seen", unless the policy excludes it."""
