@@ -5,18 +5,13 @@ import os
 import re
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator
-from contextlib import suppress
-from functools import cache, wraps
-from inspect import isgeneratorfunction
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import FunctionType
 from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import jaxtyping
-import numpy as np
 import pytest
 from hypothesis import settings
 from jaxtyping import install_import_hook
@@ -52,89 +47,16 @@ def parse_in_one_thread_at_a_time() -> None:
     ast.parse = alone
 
 
-class UnknownError(Exception):
-    """Whether annotations admit a value may depend on more than its type and shape."""
-
-
-ARRAYS: set[type] = {np.ndarray}
-ALONE: set[type] = {int, float, bool, complex, type(None), np.random.Generator}
-"""Types of which annotations admit every instance or none."""
-
-
-def key_of(value: Any) -> Any:
-    """A key that two values share only if the same annotations admit both. Raises UnknownError if there is none."""
-    kind = type(value)
-    if kind in ARRAYS:
-        return kind, value.dtype, value.shape
-    if kind in ALONE:
-        return kind
-    if kind is tuple:
-        return kind, *map(key_of, value)
-    if kind is str:
-        return value
-    module = kind.__module__.partition(".")[0]
-    if module == "torch" and kind.__name__ in ("Tensor", "Parameter"):
-        ARRAYS.add(kind)
-    elif (module == SOURCE.name and not issubclass(kind, Collection)) or issubclass(kind, np.generic):
-        ALONE.add(kind)
-    else:
-        raise UnknownError
-    return key_of(value)
-
-
-def once_for_each_shape(function: Callable[..., Any], jaxtyped: Callable[[Any], Any]) -> Callable[..., Any]:
-    """`function`, checked by jaxtyping in calls whose types and shapes, of arguments and result, are new."""
-    checked = jaxtyped(function)
-    passed = set[Any]()
-    given = threading.local()
-
-    def give(*_: Any, **__: Any) -> Any:
-        return given.returned
-
-    @cache
-    def returns() -> Callable[..., Any]:
-        # jaxtyping looks for the names of annotations among the globals
-        return jaxtyped(wraps(function)(FunctionType(give.__code__, function.__globals__, None, None, give.__closure__)))
-
-    @wraps(function)
-    def remembered(*args: Any, **kwargs: Any) -> Any:
-        try:
-            called = key_of(args), *kwargs, key_of(tuple(kwargs.values()))
-        except UnknownError:
-            return checked(*args, **kwargs)
-        if called not in passed:
-            returned = checked(*args, **kwargs)
-            passed.add(called)
-            return returned
-        returned = function(*args, **kwargs)
-        with suppress(UnknownError):
-            if (both := (called, key_of(returned))) in passed:
-                return returned
-            given.returned = returned
-            returns()(*args, **kwargs)
-            passed.add(both)
-            return returned
-        given.returned = returned
-        return returns()(*args, **kwargs)
-
-    return remembered
-
-
-def check_shapes_once() -> None:
-    """jaxtyping binds the arguments of every call, to compare the dimensions of shapes. That took up to two thirds of a
-    test's time, so it checks each combination of types and shapes once, and only beartype checks functions without shapes."""
+def keep_dimensions_of_shapes_alone() -> None:
+    """jaxtyping binds the arguments of every call, to compare the dimensions of shapes. That took a large part
+    of the suite's time, so only beartype checks functions without shapes."""
     jaxtyped = jaxtyping.jaxtyped
 
     def checked(*, typechecker: Callable[[Any], Any]) -> Callable[[Any], Any]:
         def decorator(of: Any) -> Any:
             hints = getattr(of, "__annotations__", {}).values()
-            if isinstance(of, type):
-                return jaxtyped(typechecker=typechecker)(of)
-            if not any(isinstance(hint, str) for hint in hints) and "jaxtyping." not in repr(hints):
-                return typechecker(of)
-            if not isinstance(of, FunctionType) or isgeneratorfunction(of):
-                return jaxtyped(typechecker=typechecker)(of)
-            return once_for_each_shape(of, jaxtyped(typechecker=typechecker))
+            shapes = any(isinstance(hint, str) for hint in hints) or "jaxtyping." in repr(hints)
+            return (jaxtyped(typechecker=typechecker) if isinstance(of, type) or shapes else typechecker)(of)
 
         return decorator
 
@@ -142,7 +64,7 @@ def check_shapes_once() -> None:
 
 
 parse_in_one_thread_at_a_time()
-check_shapes_once()
+keep_dimensions_of_shapes_alone()
 install_import_hook(checked_modules(), "beartype.beartype")
 
 # the same examples at every run: a suite that fails by chance guards nothing

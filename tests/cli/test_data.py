@@ -26,7 +26,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_info_prints_figures_and_writes_the_page(folder, said: Said):
     printed = said(0, "data", "info", folder)
-    figures = "71.4 %", "of 9 tried", "rop_dense", "length [rad]", "clearance [cm]"
+    figures = "71.4 %", "tried: 9", "rop_dense", "length [rad]", "clearance [cm]"
     for text in ("panda: 5 motions", "waypoints, evenly spaced in length", *figures):
         assert text in printed, text
     assert (folder / "report.html").read_text().startswith("<!doctype html>")

@@ -40,7 +40,7 @@ def test_figures(tmp_path, rows):
     assert np.allclose(shares[:, :4].sum(axis=1), 1) and np.allclose(shares[:, 4:].sum(axis=1), 1)
     assert found.safety_distance == pytest.approx(0.05)
     assert [text for _, text in data_report.facts(found)[4:]] == [
-        "78.6 %; of 17 tried 3 unsolved, 0 refused, 3 thinned",  # 11 of 14
+        "78.6 %; tried: 17, of these 3 unsolved, 0 refused, 3 thinned",  # 11 of 14
         "100.0 %",
         "100.0 %",
         "1.0",
@@ -69,7 +69,7 @@ def test_page(tmp_path, rows):
     data_report.write_page(data, file, ARM)
     page = file.read_text("utf-8")
     assert page.count("<svg") == 3
-    told = "91.7 %; of 13 tried 1 unsolved, 0 refused, 1 thinned", "clearance [cm]", "up to 5 % longer"
+    told = "91.7 %; tried: 13, of these 1 unsolved, 0 refused, 1 thinned", "clearance [cm]", "up to 5 % longer"
     for text in ("arm &lt;1&gt;", "rop_dense", *told, *ARM.joint_names):
         assert text in page, text
     assert "arm <1>" not in page

@@ -245,7 +245,7 @@ def test_packed_data_of_hostile_sizes() -> None:
     bomb = bytes([0, 7]) + bytes([0xE0, 255, 0]) * 10**6  # 264 MB
     with pytest.raises(ValueError, match="do not unpack to 100 bytes"):
         lzf_unpacked(bomb, 100)
-    with pytest.raises(ValueError, match="before their beginning"):
+    with pytest.raises(ValueError, match="before the beginning"):
         lzf_unpacked(bytes([0, 7, 0x20, 200]), 100)
 
 
