@@ -2,7 +2,7 @@
 # make weights   makes training data and trains the weights anew, in runs/panda; the same command resumes
 # make baselines trains the learned baselines on the same data, in runs/panda
 # make install   the development environment with all extras in .venv
-# make test      the quick tests: six minutes on two idle cores; the first run compiles too, for about as long
+# make test      the quick tests: less than five minutes on two idle cores; the first run compiles too, for about as long
 # make test-all  all tests, those marked slow, browser, sim and cluster too
 # make lint      ruff and pyright
 # make bench     all benchmarks
