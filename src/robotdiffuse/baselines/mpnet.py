@@ -16,8 +16,8 @@ has these parts, by the paper's names:
 
 Differences from the paper: `attempts` paths are planned at once, in one batch of the network, until one of
 them is free; the paper plans one path. New attempts begin until time runs out. If the network does not
-connect two states, the next replanning tries again; in the paper, the attempt ends there. Several goals are
-divided evenly among the attempts.
+connect two states, the next replanning tries again; in the paper, the attempt ends there. Attempts are
+divided evenly among several goals.
 """
 
 from dataclasses import dataclass, replace

@@ -95,7 +95,7 @@ class SettingsOf:
     """Marks a field with the settings of the registry entry that another field names: `denoiser_settings`
     holds the settings of the entry whose name is in the field `denoiser`.
 
-    The value is None if the other field holds not a name of the registry but, for example, a folder.
+    The value is None if the other field holds something else than a name of the registry, such as a folder.
     """
 
     field: str
@@ -117,6 +117,7 @@ class Setting(NamedTuple):
     name: str
     """Dotted for a field of settings within settings."""
     default: Any
+    """The value: the default, for settings that were not changed."""
     rule: str
     """Allowed values."""
     description: str
@@ -179,7 +180,7 @@ class Settings:
         for name, field in fields.items():
             if name in values:
                 at = f"{where}.{name}"
-                # if the value is None, the other field may hold a folder, which must not be looked up
+                # if the value is None, the other field may hold a folder, which is not in the registry
                 kind = None if values[name] is None else _settings_class(hints[name], values, fields)
                 if kind is not None:
                     converted[name] = kind.from_json(values[name], at)

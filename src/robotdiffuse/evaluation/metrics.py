@@ -30,8 +30,8 @@ CUTOFF = 10.0
 THRESHOLD = 0.05
 PADDING = 4
 """Parameters of the spectral arc length, from its paper. CUTOFF: highest frequency [Hz]. THRESHOLD: smallest
-amplitude, as a fraction of the amplitude at frequency 0. PADDING: zeros are appended until the number of
-samples is a power of two and has grown by a factor of 2^PADDING to 2^(PADDING + 1)."""
+amplitude, as a fraction of the amplitude at frequency 0. PADDING: zeros are appended up to a power of two,
+between 2^PADDING and 2^(PADDING + 1) times the number of samples."""
 BENDING_SAMPLES = 129
 """Number of evenly spaced samples of a path for measuring bending."""
 DIGITS = 7

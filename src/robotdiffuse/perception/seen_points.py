@@ -237,8 +237,8 @@ POINT_RADIUS = 0.01
 MIN_POINT_RADIUS = 0.001
 """Smallest radius of points near the arm at start or goal, so that they do not collide there [m]."""
 JOINED = 1.4
-"""Collision checks replace large points that are near each other by spheres with about this factor times
-their radius."""
+"""Collision checks merge points that are larger than POINT_RADIUS and near each other into spheres of up to
+about this factor times their radius, so such points need more distance from the arm at start and goals."""
 ARM_DISTANCE = 0.02
 """Points within this distance of the arm, at its configuration in the view, are points of the arm [m];
 `grown_for_errors` adds an allowance for noise."""
@@ -249,7 +249,8 @@ REACH_MARGIN = 0.3
 MIN_CELL_POINTS = 3
 """Minimum number of points in an isolated cell; fewer points are sensor errors."""
 CAMERA_DISTANCE = 2.0
-"""Distance at which a camera of sufficient resolution has many pixels per cell [m]."""
+"""Isolated cells with few points are left out only if every image has at least MIN_CELL_POINTS² pixels per
+cell at this distance [m]."""
 INITIAL_CELLS = 1 << 16
 """Initial capacity of the table of cells."""
 
@@ -259,8 +260,8 @@ def seen_points(
 ) -> Points:
     """The mean of the observed points in each cell of a grid, in the base frame [m].
 
-    Flying pixels, points of the arm at its configuration in each view, and points far beyond its reach are
-    left out.
+    Flying pixels, isolated cells with few points, points of the arm at its configuration in each view, and
+    points far beyond its reach are left out.
     """
     capacity = INITIAL_CELLS
     while True:
@@ -289,8 +290,8 @@ def seen_points(
 
 
 def _min_cell_points(views: Sequence[DepthView], voxel: float) -> int:
-    """Minimum number of points of an isolated cell: more than one only if all images have many pixels per
-    cell."""
+    """Minimum number of points of an isolated cell: more than one only if all images have enough pixels per
+    cell, see CAMERA_DISTANCE."""
     focal = min((0.0 if view.cloud is not None else view.intrinsics[0] for view in views), default=0.0)
     return MIN_CELL_POINTS if (voxel * focal / CAMERA_DISTANCE) ** 2 >= MIN_CELL_POINTS**2 else 1
 
@@ -310,7 +311,8 @@ def seen_shapes(
 END_SPREADS = 3.0
 """Noise of up to this many standard deviations must not make a free start or goal invalid."""
 ERROR_STEP = 0.005
-"""Errors of poses are rounded up to multiples of this; points of equal error form one shape [m]."""
+"""Errors of poses are rounded up to multiples of this; points of equal error and radius form one shape
+[m]."""
 
 
 def point_shapes(
@@ -326,12 +328,12 @@ def point_shapes(
 
     The radius of a point is POINT_RADIUS plus the error of its camera's pose. This safety margin must not
     make a free start or goal invalid, so points that would touch the arm's spheres there get a smaller
-    radius, at least MIN_POINT_RADIUS. Noise does not enlarge points: it puts the nearest points of a surface
-    in front of the surface anyway.
+    radius, at least MIN_POINT_RADIUS. Noise does not enlarge points, since it displaces some points of each
+    surface towards the camera anyway.
 
     Two kinds of points are left out because their errors may have displaced them: those inside the arm at
-    start or goals by less than the error of the pose plus END_SPREADS times the noise, and those nearer to a
-    known shape than KNOWN_DISTANCE plus both errors.
+    start or goals, or less than MIN_POINT_RADIUS outside, by at most the error of the pose plus END_SPREADS
+    times the noise; and those nearer to a known shape than KNOWN_DISTANCE plus the errors of pose and noise.
 
     errors: see `point_errors`. enlarged: whether the error of the pose is added to the radius.
     """

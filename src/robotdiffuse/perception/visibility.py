@@ -21,8 +21,8 @@ from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot
 
 OCCLUSION_START = np.float32(2.0)
-"""Voxels within this distance of a voxel do not hide it, since they are likely unknown too [edges of
-voxels]."""
+"""Voxels nearer than this to a voxel are not counted as hiding it: they are likely unknown too, and a view
+would show all of them or none [edges of voxels]."""
 MIN_VISIBILITY = np.float32(0.02)
 """Smaller probabilities that a voxel is visible count as zero."""
 ARM_CELL = 16
@@ -131,12 +131,12 @@ def see_through(depth, intrinsics, T, balls, radius, errors, border, seen):
     """Mark the balls that are empty in an image: the projection of the ball is inside the image, and all
     returns of its pixels are behind the ball. A few of these pixels may have no return.
 
-    depth: float32[h, w], infinite where nothing is in range, 0 without a return, -d without a return where
-    nothing is nearer than d. intrinsics: fx, fy, cx, cy. T: T_base_camera [4, 4]. balls: centers [n, 3] [m].
-    radius: of all balls [m]. errors: three numbers: the radius grows by the first [m] plus the second [rad]
-    times the distance; returns must be behind the ball by the third [1/m] times the square of the distance.
-    border: width of the margin around the projection that is checked as well [pixels]. seen: bool[n]. All
-    numbers are float32.
+    depth: float32[h, w]. Where nothing is in range it is infinite; without a return it is 0, or -d if it is
+    known that nothing is nearer than d. intrinsics: fx, fy, cx, cy. T: T_base_camera [4, 4]. balls: centers
+    [n, 3] [m]. radius: of all balls [m]. errors: three numbers: the radius grows by the first [m] plus the
+    second [rad] times the distance; returns must be behind the ball by the third [1/m] times the square of
+    the distance. border: width of the margin around the projection that is checked as well [pixels]. seen:
+    bool[n]. All numbers are float32.
     """
     raw = usable_depth(depth, intrinsics[0])
     h, w = raw.shape
@@ -166,7 +166,7 @@ def see_through(depth, intrinsics, T, balls, radius, errors, border, seen):
 @kernel(nogil=True)
 def _all_behind(depth, v0, v1, u0, u1, min_return):
     """Whether all returns in a rectangle of pixels, with inclusive bounds, are deeper than `min_return` [m],
-    and at most MAX_LOST_FRACTION of the pixels have no return."""
+    and at most MAX_LOST_FRACTION of the pixels say nothing about this depth."""
     lost = 0
     max_lost = MAX_LOST_FRACTION * (v1 + 1 - v0) * (u1 + 1 - u0)
     for v in range(v0, v1 + 1):

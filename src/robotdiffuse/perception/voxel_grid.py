@@ -75,8 +75,8 @@ class VoxelGrid:
         return out
 
     def swept(self, robot: Robot, path: Path, margin: float = 0.0) -> Voxels:
-        """Voxels with their centers in the arm's covering spheres, inflated by `margin` [m], anywhere on a
-        path."""
+        """Voxels with their centers in the covering spheres of the arm's moving links, inflated by `margin`
+        [m], anywhere on a path."""
         out = np.zeros(self.shape, np.bool_)
         sweep(compile_robot(robot), path.positions.astype(np.float32), np.float32(margin), *self.frame, out)
         return out
@@ -145,7 +145,8 @@ def mark(spheres, low, voxel, marked):
 
 
 def surface(marked: Voxels) -> Int[ndarray, "n 3"]:
-    """Indices of the marked voxels that share a face with an unmarked voxel of the grid, in order."""
+    """Indices of the marked voxels that share a face with an unmarked voxel of the grid, in the order of the
+    array."""
     inner = np.pad(marked, 1, constant_values=True)
     within = marked.copy()
     for axis in range(3):

@@ -69,8 +69,8 @@ class ExportedPlanner(LearnedPlanner[LearnedPlannerSettings]):
 
 
 def nearest_goals(start: Configuration, goals: Configurations, samples: int) -> Configurations:
-    """The goals among which a batch of `samples` samples is divided, the nearest to the start first. They are
-    so few that each gets at least SAMPLES_PER_GOAL samples; but there is at least one goal."""
+    """The goals among which a batch of `samples` samples is divided, the nearest to the start first: at
+    most as many as can get SAMPLES_PER_GOAL samples each, but at least one."""
     order = np.argsort(np.linalg.norm(goals - start, axis=1))
     return goals[order[: max(samples // SAMPLES_PER_GOAL, 1)]]
 
@@ -78,8 +78,8 @@ def nearest_goals(start: Configuration, goals: Configurations, samples: int) -> 
 def scene_clouds(
     checker: CollisionChecker, region: VisibleRegion, points: int, count: int, rng: np.random.Generator
 ) -> Float32[ndarray, "count points 3"]:
-    """`count` clouds of `points` random points on the surfaces of obstacles within the region [m]; zeros
-    where there are no surfaces."""
+    """`count` clouds of `points` random points on the surfaces of obstacles within the region [m]; all
+    zeros if there is no surface in it."""
     clouds = np.zeros((count, points, 3), np.float32)
     for cloud in clouds:
         surface_points = sample_surface(checker.scene, points, rng, region)

@@ -49,7 +49,7 @@ def check_fields(
         )
     if "rpy" in data and "wxyz" in field_names:
         if "wxyz" in data:
-            raise InputError(f"{where} has wxyz and rpy; it must have one of them")
+            raise InputError(f"{where} has both wxyz and rpy; give one of them")
         rpy = vector(where, "rpy", data["rpy"], 3)
         data = {name: value for name, value in data.items() if name != "rpy"}
         data["wxyz"] = quaternion_from_rotation(rotation_from_rpy(*rpy)).tolist()

@@ -110,7 +110,8 @@ def _shell(level: int) -> Points:
 POINT_RADIUS = 0.01
 """Default radius of points [m]."""
 MIXERS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
-"""Odd factors with many bits, for a hash of a point: the sum of its coordinates' bits times these factors."""
+"""Odd factors with many bits for the hash of a point: its coordinates, read as integers of 64 bits, times
+these factors, summed modulo 2^64."""
 
 
 def voxel_thin(points: Points, voxel: float) -> Points:

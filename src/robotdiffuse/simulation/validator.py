@@ -106,7 +106,8 @@ class PyBulletOracle:
     def check_path(self, path: Path, step: float = 0.01, tolerance: float = 0.001) -> OracleContact | None:
         """The first contact deeper than the tolerance [m] at configurations along the path, or None.
 
-        step: distance between configurations [rad, joint-space L2]. The default tolerance is Bullet's own.
+        step: distance between configurations [rad, joint-space L2]. The default tolerance exceeds the error
+        of Bullet's distances.
         """
         places, q = sample_path(path.positions, step)
         contact = self.check_frames(q, tolerance)

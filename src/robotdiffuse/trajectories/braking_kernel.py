@@ -1,5 +1,5 @@
-"""Compiled speeds of a motion along a path that is as fast as possible for a given time and then brakes to
-rest. It begins at the arm's current place on the path, with its current speed.
+"""Compiled code for the speeds along a path: the motion is as fast as possible for a given time, then brakes
+to rest. It begins at the arm's current place on the path, with its current speed.
 
 The path is q(s), with the derivatives q' and q'' by s; s̈ is constant in each interval of a grid over s.
 Limits are applied at both ends of an interval, even if the motion covers only a part of it. So an s̈ that is
@@ -38,11 +38,11 @@ def _acceleration_bounds(first_derivative, second_derivative, grid, i, s, x, gre
 
 @kernel()
 def advance_then_brake(first_derivative, second_derivative, grid, greatest, s, speed, time, acceleration):
-    """Values of s and of ṡ there, [n] each, of a motion that is as fast as possible for `time` [s] and then
-    brakes to rest. Between two values, s̈ is constant.
+    """Values of s and of ṡ there, in two arrays of one length, of a motion that is as fast as possible for
+    `time` [s] and then brakes to rest. Between two values, s̈ is constant.
 
-    first_derivative, second_derivative: q' and q'' at the grid points [m, dof]. grid: values of s [m].
-    greatest: the greatest ṡ² at each grid point from which the end can be reached within the limits [m]. s,
+    first_derivative, second_derivative: q' and q'' at the grid points, of shape (n, dof). grid: n values of
+    s. greatest: the greatest ṡ² at each grid point from which the end can be reached within the limits. s,
     speed: s and ṡ at the beginning. acceleration: the limit of each joint [dof].
     """
     n = len(grid)

@@ -305,7 +305,7 @@ def test_goals_are_given_as_in_python(goal: object, rows: list[list[float]]) -> 
         ({"robot": "iiwa14", "start": "home"}, "(iiwa14 has no named pose with values for all planned joints)"),
         (
             {"scene": [{"box": {"center": [1, 0, 0], "size": [1] * 3, "rpy": [0] * 3, "wxyz": [1] * 4}}]},
-            "scene[0].box has wxyz and rpy; it must have one of them",
+            "scene[0].box has both wxyz and rpy; give one of them",
         ),
         ({"base": {"rpy": [0, 0]}}, "base.rpy is [0, 0]; it must be 3 finite numbers"),
     ],

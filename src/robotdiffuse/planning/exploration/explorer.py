@@ -9,8 +9,8 @@ arm at the start of a motion, and the space within 2 cm of the arm at its end. S
 as well. With `see_goal`, the arm's surface at the goal must also have been seen free (`seen_free.GoalSeen`).
 The promise is as good as the map: if the scene does not change, and the camera's poses and errors are as
 stated, such a motion does not collide. Seen points may be displaced by the error of their camera's pose.
-Space within this error counts as free only if some view sees it free even with the largest error of its own
-pose, as views from nearby can.
+Space that is nearer to a seen point than this error counts as free only if some view shows it free for every
+camera pose within the error of that view's pose. Views from nearby can show this.
 
 **Probabilistic.** The arm executes a motion whose stated `confidence` is high enough, and otherwise looks
 first. The confidence follows from the predicted occupancy probabilities of the unknown voxels that the motion
@@ -138,8 +138,7 @@ class Explorer:
         self._news: list[DepthView] = []
         """Views since the latest step."""
         self._beside: DepthView | None = None
-        """The last view of a camera that is not on the arm, among the views that the latest step took into
-        account."""
+        """Of the views before the latest step, the last one by a camera that is not on the arm."""
         self._free = self.map.free
         """Voxels that were free at the latest step."""
 
@@ -305,7 +304,8 @@ class Explorer:
         predicted: Probabilities | None,
         motion: PlanResult,
     ) -> Step:
-        """A look at the unseen space that a tentative motion sweeps; or a step that says why there is none.
+        """The step after no motion to the goal kept to the policy: GO, if a tentative motion does; else LOOK,
+        at the unseen space that it sweeps or from farther back on the way in; else STUCK, with the reason.
 
         motion: the motion to the goal that does not keep to the policy, or the failed result.
         """
@@ -360,7 +360,7 @@ class Explorer:
         allowed = self._seen_free(problem) if policy == STRICT else problem
         tree = ReachableTree(self.robot, allowed.scene, problem.start)
         way_in = self._way_in_to(problem.start)
-        # the arm cannot go back to a different place: no motion brought it here, or only a short one
+        # going back along the latest motion would not help: there is none, or it was short
         hemmed_in = way_in is None or bool(moved(self.robot, way_in[:1], [problem.start])[0] < CONFINED)
         taken = self._goal_seen.taken
         for camera in self.cameras:
@@ -497,7 +497,8 @@ class Explorer:
         self, motion: PlanResult, predicted: Probabilities | None, to_goal: bool = True
     ) -> PlanResult:
         """The motion with the confidence that follows from the summed probability of the voxels that it
-        sweeps. The confidence is None if the map holds no measurement.
+        sweeps and from its share of space without returns; None if the map holds no measurement. Without a
+        path or a prediction, the motion is returned unchanged.
 
         The arm counts as free of collision at the start of a motion and at the goal, but not at a viewpoint.
         """

@@ -57,6 +57,7 @@ GO = "go"
 LOOK = "look"
 DONE = "done"
 STUCK = "stuck"
+# Policies for unknown space, see `ExplorerSettings.policy`.
 STRICT = "strict"
 PROBABILISTIC = "probabilistic"
 STRICT_THEN_PROBABILISTIC = "strict_then_probabilistic"
@@ -90,8 +91,8 @@ class ExplorerSettings(Settings, name="explorer"):
         super().__post_init__()
         if self.see_goal and self.policy != STRICT:
             raise InputError(
-                f"explorer.see_goal is true and explorer.policy {self.policy!r}; it needs policy {STRICT!r}:"
-                " others take unseen space as free where that is likely enough"
+                f"explorer.see_goal is true and explorer.policy {self.policy!r}; see_goal needs policy "
+                f"{STRICT!r}: the others take unseen space as free where that is likely enough"
             )
 
 
@@ -111,7 +112,9 @@ class Step:
     confidence: float | None = None
     """Stated probability that a motion is free, under the probabilistic policy."""
     seen: Scene | None = None
-    """The known scene and the points that the kept views saw; None if nothing was planned."""
+    """The known scene and the points of the views that the Explorer still uses; None if nothing was
+    planned."""
     wanted: Voxels | None = None
-    """The voxels that a look should show: unknown voxels of the map that a tentative motion to the goal
-    sweeps, and unseen ones at the goal. None for other steps."""
+    """The voxels that a look should show: voxels that no view saw and that the arm would pass through on a
+    motion to the goal, planned as if unseen space were free, or would fill at the goal. None for other
+    steps."""

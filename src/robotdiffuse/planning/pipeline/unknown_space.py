@@ -86,8 +86,9 @@ def plan_with_unknown_space(
 
     predicted: the probability that each fine voxel of the observed volume is occupied; None: the occupancy
     completion network predicts it if the policy needs it.
-    unknown: the space that no view saw; None: computed from the problem's views. It may be given under the
-    policies padded and predicted, if the problem's scene already contains the observed points.
+    unknown: the space that no view saw; None: computed from the problem's views. A caller
+    that has put the observed points into the scene, as `Explorer` does, may give it under the policies padded
+    and predicted; then the views are not evaluated.
 
     The result states the assumption, the confidence (the probability that the motion is free in the true
     scene), and the unknown space that the motion crosses.
@@ -157,8 +158,8 @@ def plan_with_unknown_space(
 
 
 def policy_for(problem: Problem) -> tuple[str, str]:
-    """The problem's policy for unknown space, or the default policy; and a note if the default is not
-    prediction, otherwise ""."""
+    """The problem's policy for unknown space, or the default; and a note if the default policy padded is
+    used, otherwise ""."""
     if problem.unknown is not None:
         return problem.unknown, ""
     from robotdiffuse.learning.completion import REACH, covers
@@ -311,7 +312,10 @@ class _Motion:
         """The result with its assumption, its confidence and the unknown space that it crosses."""
         result = self._result
         if self._crossed.unseen_share > MAX_UNSEEN_SHARE:
-            result = replace(result, notes=(*result.notes, "the views see nothing of the motion's way"))
+            result = replace(
+                result,
+                notes=(*result.notes, "the views see hardly anything of the space that the motion crosses"),
+            )
         return replace(
             result,
             assumption=self._assumption,

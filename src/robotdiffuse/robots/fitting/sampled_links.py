@@ -33,9 +33,9 @@ MAX_STOPPED_RANGE = 5.2
 """A joint with a range of at most this is taken to have mechanical stops at its limits [rad]; limits of wider
 ranges may be arbitrary."""
 MAX_UNEXPLAINED = 0.25
-"""A pair of links is allowed for the reason `limits` (see `self_collisions`) only if the value of one joint
-explains when the links collide: less than this fraction of the variance of "the links collide" (0 or 1) stays
-unexplained."""
+"""Largest fraction of the variance of "the links collide" (0 or 1) that the value of one joint may leave
+unexplained. Below it, the joint is taken to decide whether they collide, and the pair is not checked because
+the limits of the joint prevent it (the reason `limits` in `self_collisions`)."""
 BALL_MARGIN = 1e-9
 """Margin of bounding and inscribed balls of meshes [m], larger than rounding errors."""
 NEAR_DISTANCE = 0.1
@@ -120,7 +120,7 @@ class Links:
 
     def sphere_distance(self, poses: dict[str, ndarray], a: str, b: str) -> Values:
         """Signed distances [n] between the covering spheres of two links [m]: lower bounds of the distances
-        of the links' meshes."""
+        of the links' meshes. Beyond NEAR_DISTANCE, it is the distance of their bounding balls."""
         first, second = (for_kernels(self.robot.spheres[link]) for link in (a, b))
         return -deepest_touches(poses[a], poses[b], first, second, NEAR_DISTANCE, -np.inf)[0]
 
@@ -210,8 +210,8 @@ ROUNDING = 1e-5
 def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float) -> LinkPairTable:
     """Table over the one or two joints between two links that tells where their convex parts are apart.
 
-    Cells are not split further if the links move by less than `finest` [m] relative to each other within the
-    cell. They count as colliding unless they are proven free.
+    Boxes of joint values are not split further if the links move by less than `finest` [m] relative to each
+    other within the box. Their cells count as colliding unless they are proven free.
     """
     joints = robot.joints_between(*pair)
     far = max(pair, key=robot.link_frame)
@@ -238,7 +238,8 @@ def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float
         poses = links.poses(q, frozenset(pair))
         distance = links.part_distances(poses, *pair, cell_of_row.ravel(), parts, travel)
         touch = distance <= travel
-        # boxes that count as colliding: a cell or box that collides, or one with very little motion
+        # boxes that count as colliding: a single cell with a collision at its center, a box with a collision
+        # deeper than its motion, and a box with very little motion
         given_up = touch & ((size <= 1).all() & (distance <= 0) | (distance < -travel) | (travel < finest))
         for first, last in zip(*_cells(np.unique(low[given_up], axis=0), size), strict=True):
             separated[tuple(slice(*ends) for ends in zip(first, last, strict=True))] = False

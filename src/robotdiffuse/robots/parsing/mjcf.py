@@ -30,7 +30,7 @@ from robotdiffuse.robots.parsing.srdf import Srdf
 
 MOVABLE = ("hinge", "slide")
 DRAWN = ("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
-"""Types of geoms that a URDF can contain."""
+"""Types of geoms that are converted: ellipsoids to meshes, the others to elements that `urdf.py` reads."""
 WORLD = 0
 """Index of the world body, which does not move."""
 EXCLUDED = "excluded by the model"
@@ -123,7 +123,7 @@ class ConvertedModel:
 
     def __init__(self, path: Path) -> None:
         """Raises InputError for a model without hinge or slide joints, for ball joints, and for colliding
-        geoms of types that a URDF cannot contain."""
+        geoms of types that are not converted; for slide joints without a range, if there are no others."""
         self.path = path
         self.model = model = compiled_model(path)
         self.mujoco = imported_mujoco()

@@ -321,7 +321,7 @@ class Panel:
         session = self._session
         options = self._session.state.options
         planners = ", ".join(TREE_PLANNERS)
-        trees = f"Search trees from the start (blue) and the goal (green); planners: {planners}"
+        trees = f"Search trees from the start (blue) and the goal (green), of {planners}"
         boxes = (
             ("follow", "Plan automatically", "Plan again after each change"),
             ("trees", "Search trees", trees),
@@ -555,7 +555,7 @@ def _stages_html(seconds: tuple[tuple[str, float], ...]) -> str:
 
 
 POSE_RATE = 30.0
-"""Number of poses per second of a motion that are precomputed, in addition to the last pose."""
+"""The poses of the arm along a motion are precomputed at this rate [1/s], and at its end."""
 RED = (0xD6, 0x3B, 0x3B)
 GAMMA = 2.2
 """Exponent for converting sRGB colors to linear ones, approximately."""
@@ -566,7 +566,7 @@ MAX_EDGES = 4000
 TREES = ("/trees/start", "/trees/goal")
 GHOST_OFFSET = 0.002
 """Distance by which the surfaces of a see-through arm are moved outwards, so that it covers the solid arm at
-the same place [m]. It is multiplied by the arm's opacity over GHOST_OPACITY."""
+the same place [m]. It is multiplied by the ratio of the arm's opacity to GHOST_OPACITY."""
 # line widths, as fractions of the arm's reach
 TRACE_WIDTH = 0.0094
 TREE_WIDTH = 0.0028
@@ -669,20 +669,20 @@ class Obstacles:
         if selected:
             r, g, b = (round(c + HIGHLIGHT * (255 - c)) for c in color)
             color = r, g, b
-        obstacle_frame = obstacle.own
+        own = obstacle.own  # in the frame of the obstacle
         node = f"/obstacles/{name.encode().hex()}"  # a plain "/" would add a level to the tree
-        if isinstance(obstacle_frame.shape, PointCloud):
-            points = thinned(obstacle_frame.shape.points).astype(np.float32)
-            return self._server.scene.add_point_cloud(
-                node, points, color, point_size=2 * obstacle_frame.shape.point_radius
-            )
-        handle = add_surface(self._server, node, obstacle_frame.surface, color)
+        if isinstance(own.shape, PointCloud):
+            points = thinned(own.shape.points).astype(np.float32)
+            size = 2 * own.shape.point_radius
+            return self._server.scene.add_point_cloud(node, points, color, point_size=size)
+        handle = add_surface(self._server, node, own.surface, color)
         handle.on_click(lambda _event: self._clicked(name))
         return handle
 
 
 def _appearance(shape: Shape) -> object:
-    """A key that is equal for shapes with equal geometry, at any poses."""
+    """Shapes with equal keys have equal geometry, apart from the pose. Shapes without sizes, such as height
+    maps, have a key for each object."""
     if isinstance(shape, Mesh):
         return "mesh", shape.vertices.tobytes(), shape.faces.tobytes()
     if isinstance(shape, PointCloud):
