@@ -52,7 +52,7 @@ test-all: .venv/dev.stamp chromium
 lint: .venv/dev.stamp
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/pyright --threads 2 --pythonpath $(BIN)/python
 
 # the variable silences an advertisement of the theme's authors
 docs: .venv/dev.stamp
