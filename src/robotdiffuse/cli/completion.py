@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from robotdiffuse.cli import build_parser
 from robotdiffuse.cli.arguments import Namespace
-from robotdiffuse.cli.commands import Commands
+from robotdiffuse.cli.command import Commands
 from robotdiffuse.core.tables import Column, Table, show
 from robotdiffuse.planning import PLANNERS, planner_settings
 from robotdiffuse.problems.fields import problem_schema

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from robotdiffuse.cli.arguments import ENDINGS, NO_PLAN, SOLVED, Namespace
-from robotdiffuse.cli.commands import LOOPBACK, PORT
+from robotdiffuse.cli.command import LOOPBACK, PORT
 from robotdiffuse.cli.view import open_in_browser
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import check_output

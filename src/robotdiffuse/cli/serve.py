@@ -4,7 +4,7 @@ import os
 from collections.abc import Sequence
 
 from robotdiffuse.cli.arguments import Namespace
-from robotdiffuse.cli.commands import TOKEN
+from robotdiffuse.cli.command import TOKEN
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.input_files import MEGABYTE
 from robotdiffuse.robots import ROBOTS, known_robots, load_robot
