@@ -35,7 +35,7 @@ import argparse
 import itertools
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -501,10 +501,13 @@ def report_next_view(rows: list[Row]) -> None:
         print()
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Planning on depth views, validated in the true scene.")
+def add_options(parser: argparse.ArgumentParser, count: int, methods: Sequence[str], records: str) -> None:
+    """Add the options that this script and `exploring.py` have, with these defaults."""
     parser.add_argument(
-        "--problems", type=int, default=300, help="number of problems, of all families together (300)"
+        "--problems",
+        type=int,
+        default=count,
+        help=f"number of problems, of all families together ({count})",
     )
     parser.add_argument(
         "--families",
@@ -512,16 +515,14 @@ def main() -> None:
         default=list(FAMILIES),
         help="families, or folders of MotionBenchMaker (all families)",
     )
-    method_names = [*METHODS, TRUE_VOXELS]
     parser.add_argument(
         "--methods",
         nargs="+",
-        default=method_names,
-        choices=method_names,
+        default=methods,
+        choices=methods,
         metavar="NAME",
         help="methods to compare (all)",
     )
-    parser.add_argument("--views", type=int, default=1, help="number of views (1)")
     parser.add_argument(
         "--images",
         default=IDEAL,
@@ -530,15 +531,19 @@ def main() -> None:
         help="errors of images and poses, by name (ideal)",
     )
     parser.add_argument("--walls", action="store_true", help="put a room around the scene")
+    parser.add_argument("--records", default=records, help=f"file of the records ({records})")
+    parser.add_argument("--report", action="store_true", help="only print the tables of the records")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Planning on depth views, validated in the true scene.")
+    add_options(parser, 300, [*METHODS, TRUE_VOXELS], "unknown_space.jsonl")
+    parser.add_argument("--views", type=int, default=1, help="number of views (1)")
     parser.add_argument("--cameras", default=RING, choices=CAMERAS, help="places of the cameras (ring)")
     parser.add_argument(
         "--weights", nargs="*", default=[], metavar="FOLDER", help="folders of weights of completion networks"
     )
-    parser.add_argument(
-        "--records", default="unknown_space.jsonl", help="file of the records (unknown_space.jsonl)"
-    )
     parser.add_argument("--next-view", action="store_true", help="plan with second views")
-    parser.add_argument("--report", action="store_true", help="print the tables of the records")
     parser.add_argument("--odd", action="store_true", help="report only problems with odd numbers")
     parser.add_argument("--fit", action="store_true", help="print the constants of the stated confidence")
     parser.add_argument("--times", action="store_true", help="print the time of the network")

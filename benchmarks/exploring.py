@@ -38,10 +38,10 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import binary_dilation
 
 from cameras import (
-    IDEAL,
     IMAGES,
     PLANNER,
     Images,
+    add_options,
     is_free,
     known_scene,
     problems,
@@ -304,40 +304,13 @@ def line(method: str, rows: list[Row]) -> tuple[str | int, ...]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="An arm explores simulated scenes.")
-    method_names = [*ONCE, *METHODS]
-    parser.add_argument(
-        "--problems", type=int, default=28, help="number of problems, of all families together (28)"
-    )
+    add_options(parser, 28, [*ONCE, *METHODS], "exploring.jsonl")
     parser.add_argument(
         "--skip", type=int, default=0, help="number of first problems of each family that are left out (0)"
     )
     parser.add_argument(
         "--clear", type=float, default=0.0, help="smallest clearance of start and goal [m] (0)"
     )
-    parser.add_argument(
-        "--families",
-        nargs="+",
-        default=list(FAMILIES),
-        help="families, or folders of MotionBenchMaker (all families)",
-    )
-    parser.add_argument(
-        "--methods",
-        nargs="+",
-        default=method_names,
-        choices=method_names,
-        metavar="NAME",
-        help="methods to compare (all)",
-    )
-    parser.add_argument(
-        "--images",
-        default=IDEAL,
-        choices=IMAGES,
-        metavar="NAME",
-        help="errors of images and poses, by name (ideal)",
-    )
-    parser.add_argument("--walls", action="store_true", help="put a room around the scene")
-    parser.add_argument("--records", default="exploring.jsonl", help="file of the records (exploring.jsonl)")
-    parser.add_argument("--report", action="store_true", help="only print the tables of the records")
     arguments = parse(parser, problems=1, families=["rop"], methods=["strict"])
     use_processor_time()
     with TemporaryDirectory() as folder:
