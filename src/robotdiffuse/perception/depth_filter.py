@@ -206,6 +206,15 @@ nearer than this [m] along at least NEAR_SHARE of its border."""
 NEAR_SHARE = 0.05
 
 
+def wide_regions(mask: Bool[ndarray, "*n"], width: int) -> Bool[ndarray, "*n"]:
+    """The parts of a mask that are at least `width` wide along every axis: its morphological opening."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    inner = minimum_filter(mask.view(np.uint8), width, mode="nearest")
+    origin = width % 2 - 1  # windows of an even width are not symmetric
+    return maximum_filter(inner, width, mode="nearest", origin=origin).view(np.bool_)
+
+
 def empty_regions(
     depth: Float32[ndarray, "h w"], reach: float | None = None, arm: Bool[ndarray, "h w"] | None = None
 ) -> Bool[ndarray, "h w"] | None:
@@ -220,10 +229,9 @@ def empty_regions(
     lost = no_return[::2, ::2]
     if not lost.any() or no_return.all():
         return None
-    from scipy.ndimage import label, maximum_filter, minimum_filter
+    from scipy.ndimage import label
 
-    core = minimum_filter(lost.view(np.uint8), EMPTY_EDGE, mode="nearest")
-    large_regions = np.asarray(maximum_filter(core, EMPTY_EDGE, mode="nearest", origin=-1) > 0) & lost
+    large_regions = wide_regions(lost, EMPTY_EDGE)
     half = depth[::2, ::2]
     in_range = ~lost & (half < AT_RANGE * (np.inf if reach is None else reach))
     # cropped: counted from one of the four sides, the first row with returns well within the range borders a

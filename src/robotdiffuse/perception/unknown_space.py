@@ -17,6 +17,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for, reach_bound
 from robotdiffuse.core.types import Configuration, Path, Points
+from robotdiffuse.perception.depth_filter import wide_regions
 from robotdiffuse.perception.depth_view import AssumedPoints
 from robotdiffuse.perception.observed_volume import ObservedVolume
 from robotdiffuse.perception.seen_points import near_scene, sphere_distances
@@ -155,12 +156,7 @@ network was trained with had smaller ones."""
 def lost_regions(volume: ObservedVolume) -> Voxels:
     """The fine voxels on rays without a return, in regions at least LOST_WIDTH wide."""
     lost = volume.lost
-    if lost.any():
-        from scipy.ndimage import maximum_filter, minimum_filter
-
-        inner = minimum_filter(lost.view(np.uint8), LOST_WIDTH, mode="nearest")
-        lost = maximum_filter(inner, LOST_WIDTH, mode="nearest").view(np.bool_)
-    return refined(lost)
+    return refined(wide_regions(lost, LOST_WIDTH) if lost.any() else lost)
 
 
 class UnknownSpace:
