@@ -135,11 +135,14 @@ def run_simulate(arguments: Namespace) -> int:
     for name in (entry.name for entry in problem.moving if not entry.known):
         print(f"note: the motion of {name} is not known; it stands still here")
     rms = float((executed.tip_errors**2).mean() ** 0.5)
-    units = ("mm" if prismatic else "mrad" for prismatic in robot.prismatic)
-    joints = zip(executed.joint_names, executed.max_errors, executed.rms_errors, units, strict=True)
+    joints = zip(robot.planned_joints, executed.max_errors, executed.rms_errors, strict=True)
     rows = [
-        (f"error of {name}", f"{1e3 * maximum:.3f} {unit}", f"{1e3 * root_mean_square:.3f} {unit}")
-        for name, maximum, root_mean_square, unit in joints
+        (
+            f"error of {joint.name}",
+            f"{1e3 * maximum:.3f} m{joint.unit}",
+            f"{1e3 * rms_error:.3f} m{joint.unit}",
+        )
+        for joint, maximum, rms_error in joints
     ]
     rows.append(("error of the tip", f"{1e3 * executed.tip_errors.max():.3f} mm", f"{1e3 * rms:.3f} mm"))
     verdict = "free" if executed.free else "contact"

@@ -248,6 +248,5 @@ def _obstruction(robot: Robot, q: Float[ndarray, "dof"]) -> str:
     j = int(limit_distance.argmin())
     if limit_distance[j] < NEAR_LIMIT:
         joint = robot.planned_joints[j]
-        unit = "m" if joint.kind == "prismatic" else "rad"
-        return f"{joint.name} is at its limit there, {q[j]:.3f} {unit}"
+        return f"{joint.name} is at its limit there, {q[j]:.3f} {joint.unit}"
     return "the arm is at the edge of its reach there, or a joint would have to jump"

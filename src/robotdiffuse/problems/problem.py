@@ -217,7 +217,7 @@ def checked_configuration(robot: Robot, field: str, value: object, notes: list[s
 
 
 def _position(field: str, joint: Joint, value: float, notes: list[str]) -> float:
-    unit = "m" if joint.kind == "prismatic" else "rad"
+    unit = joint.unit
     if not abs(value) <= MAX_COORDINATE:
         raise InputError(
             f"{field}: {joint.name} is {value}; "

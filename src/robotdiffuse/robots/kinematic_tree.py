@@ -58,6 +58,11 @@ class Joint(Value):
     effort: float = 0.0
     """Largest torque [N m] or force [N]; 0 if the URDF gives none."""
 
+    @property
+    def unit(self) -> str:
+        """The unit of the joint's values."""
+        return "m" if self.kind == "prismatic" else "rad"
+
     def motion(self, q: Any) -> Float[ndarray, "*n 4 4"]:
         """T_joint_child at joint values q [*n] [rad] or [m]."""
         values = np.asarray(q)[..., None, None]

@@ -278,11 +278,10 @@ def join(
         gap = np.abs(after.path.positions[0] - before.path.positions[-1])
         if gap.max() > DEFAULT.start_tolerance:
             j = int(gap.argmax())
-            unit = "m" if first.robot.prismatic[j] else "rad"
+            joint = first.robot.planned_joints[j]
             raise InputError(
-                f"results[{i}] begins {gap[j]:.3g} {unit} from the end of results[{i - 1}] in "
-                f"{first.robot.joint_names[j]}: plan "
-                f"it from results[{i - 1}].path.positions[-1]"
+                f"results[{i}] begins {gap[j]:.3g} {joint.unit} from the end of results[{i - 1}] in "
+                f"{joint.name}: plan it from results[{i - 1}].path.positions[-1]"
             )
     if blend and any(len(problem.constraints) > len(shared) for problem in problems):
         raise InputError(
