@@ -93,7 +93,7 @@ def test_the_first_part_trains_enet_alone_and_the_rest_trains_it_along() -> None
 
 @pytest.mark.parametrize(("code", "draws", "tolerance"), [(1, 1, 1e-5), (3, 300, 0.1)])
 def test_the_contractive_penalty_is_the_jacobian_squared(code: int, draws: int, tolerance: float) -> None:
-    """Exact for a single output, whatever the random sign; for several outputs, in the mean over random signs."""
+    """Exact for a single output and any random sign; for several outputs, in the mean over random signs."""
     net, plain = (network(replace(SMALL, code=code, contraction=weight)) for weight in (1.0, 0.0))
     cloud = torch.rand(3, 40, 3, generator=torch.Generator().manual_seed(0)) - 0.5
     rows = sorted_along_curve(cloud, net.region).flatten(1)

@@ -60,7 +60,7 @@ def test_stochastic_samples_have_the_data_s_moments(name):
 @pytest.mark.parametrize("steps", [1, 2, 3, 200])
 def test_calls_of_the_predictor(name, steps):
     """One call per step, from the last level downwards. All values are finite, also between levels of equal
-    noise, whatever the predictor returns. The result is the last prediction."""
+    noise, for any output of the predictor. The result is the last prediction."""
     schedule = cosine_schedule()
     rng = np.random.default_rng(0)
     levels = []

@@ -36,7 +36,7 @@ def planned(planner: str, start: list[float], goal: object, scene: rd.Scene | No
     ("planner", "turns"), [("rrt_connect", 0), ("aorrtc", -5), ("robotdiffuse", 1), ("shared_tree_rrt_star", 1)]
 )
 def test_from_3_to_minus_3_is_a_short_way(planner: str, turns: int) -> None:
-    """The short way is 0.28 rad across half a turn, whatever whole turns the start has. Regression: it was 6
+    """The short way is 0.28 rad across half a turn, also if the start has whole turns. Regression: it was 6
     rad."""
     start = 3.0 + 2 * np.pi * turns
     path = planned(planner, [start, 0.0, 0.0], [-3.0, 0.0, 0.0])
