@@ -121,7 +121,7 @@ def test_nothing_moves_further_than_its_displacement(seed: int) -> None:
     robot = rd.load_robot("panda")
     ends = rng.uniform(robot.lower, robot.upper, (2, robot.dof))
     ends[1] = ends[0] + (ends[1] - ends[0]) * rng.uniform(0, 0.5)
-    prover = proofs.Prover(robot, rd.Scene(), ends)
+    prover = proofs.Prover(robot, rd.Scene(), ends, np.zeros_like(ends[1:]))
     claims = np.arange(len(prover.claims))
     ones = np.ones(len(prover.claims))
     bounds = prover.bounds(proofs.Stretches(claims, 0 * ones, ones), ones < 0, [])
@@ -161,7 +161,7 @@ def test_no_point_goes_further_against_a_normal_than_its_approach(seed: int) -> 
         moved_by = np.flatnonzero(linkage.moved[k] & ~linkage.moved[base])
         origins = places.origins[0]
         axes = places.axes[0]
-        bound = linkage.approach(origins, axes, points[0], moved_by, steps, normals)
+        bound = linkage.approach(origins, axes, points[0], moved_by, steps, normals, np.zeros(robot.dof))
         went = (points[0] - points) @ normals.T
         assert (bound + 1e-12 >= went.max(axis=0).T).all()
 
@@ -179,7 +179,7 @@ def test_a_link_that_is_called_like_the_scene_is_refused(monkeypatch: pytest.Mon
     """Regression: claims about a link with this name were taken for claims about the scene, so the pair was not
     proved."""
     monkeypatch.setattr(proofs, "SCENE", "l2")
-    refuses("a link called 'l2'", proofs.Prover, box_arm(), rd.Scene(), np.zeros((2, 3)))
+    refuses("a link called 'l2'", proofs.Prover, box_arm(), rd.Scene(), np.zeros((2, 3)), np.zeros((1, 3)))
 
 
 def test_bounds_hold_for_cubics_that_leave_the_straight_lines() -> None:
@@ -200,7 +200,7 @@ def test_bounds_hold_for_cubics_that_leave_the_straight_lines() -> None:
         found = prover.bounds(whole, np.zeros(count, bool), [])
         low, high = np.interp([start, stop], np.arange(len(times)), times)
         dense = motion.at(np.linspace(low, high, 40)).positions
-        exact = proofs.Prover(robot, scene, dense)
+        exact = proofs.Prover(robot, scene, dense, np.zeros_like(dense[1:]))
         for place in range(40):
             here = proofs.Stretches(np.arange(count), np.full(count, float(place)), np.full(count, float(place)))
             there = exact.bounds(here, np.zeros(count, bool), [])

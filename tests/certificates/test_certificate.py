@@ -120,7 +120,7 @@ def test_an_empty_proof_of_one_row_is_none(with_times: bool) -> None:
     motion = rd.Trajectory(robot.joint_names, np.zeros(1), here, here, here)
     motion = motion if with_times else rd.Path(robot.joint_names, here)
     none = np.zeros(0)
-    claims = Prover(robot, problem.scene, here).claims
+    claims = Prover(robot, problem.scene, here, np.zeros((0, 3))).claims
     proof = StretchProof(claims, Stretches(none.astype(int), none, none), none.astype(bool), none, none, ())
     parts = robot_parts(robot), scene_parts(problem.scene), hash_of(motion)
     certificate = rd.Certificate(robot.name, *parts, Tolerances(), motion, none, 0.5, 0.5, proof)

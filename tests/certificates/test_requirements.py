@@ -88,7 +88,7 @@ def test_bounds_in_time_are_bounds() -> None:
     bar = rd.MovingObstacle(rd.Box(poses[0, :3, 3], [0.4, 0.1, 0.1], name="bar"), times=[0, 0.4, 1], poses=poses)
     ways = (bar, ACROSS, rd.MovingObstacle(rd.Sphere([0.7, 0.3, 0.5], 0.1, "ball"), max_speed=0.0))
     q = np.array(START) + 0.2 * rng.normal(size=(6, 7)).cumsum(axis=0)
-    prover = MovingProver(PANDA, ways, q, times)
+    prover = MovingProver(PANDA, ways, q, times, np.zeros_like(q[1:]))
     count = len(prover.claims)
     whole = Stretches(np.arange(count), np.full(count, 1.2), np.full(count, 1.9))
     found = prover.bounds(whole, np.zeros(count, bool), [])
@@ -128,5 +128,5 @@ def test_paths_with_constraints_are_certified_and_with_moving_obstacles_refused(
     certificate = rd.load_certificate(tmp_path / "certificate.json")
     assert certificate.check().differences == certificate.check(problem).differences == ()
     refused(certificate, replace(problem, constraints=[NARROWER]), "is not shown to keep its limit")
-    with pytest.raises(rd.InputError, match="certificates prove nothing about moving, without times"):
+    with pytest.raises(rd.InputError, match="certificates prove nothing about moving obstacles"):
         rd.certify(replace(problem, constraints=(), moving=[ACROSS]), path)

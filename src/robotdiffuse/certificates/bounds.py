@@ -9,10 +9,11 @@ of the links count: the joints after the last joint that moves both links.
 The geometry is the checker's own: distances of points to obstacles, and support functions of obstacles.
 """
 
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -21,7 +22,17 @@ from numpy import ndarray
 from robotdiffuse.certificates.kinematics import Linkage, Postures
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import rotation_from_quaternion
-from robotdiffuse.core.types import Configurations, JointRows, Points, Pose, Rotation, Values, Vector
+from robotdiffuse.core.types import (
+    Configurations,
+    JointRows,
+    JointValues,
+    Points,
+    Pose,
+    Poses,
+    Rotation,
+    Values,
+    Vector,
+)
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
@@ -59,16 +70,55 @@ class Rounded(NamedTuple):
         return n @ self.center + np.abs(local) @ self.half + self.disc * across + self.rounding
 
 
-class Surface(NamedTuple):
-    """Triangles or points, inflated by a radius."""
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles or points, inflated by a radius, with a spatial index."""
 
-    corners: Float[ndarray, "m 1|3 3"]
+    corners: Float[ndarray, "m corners 3"]
     radius: float
 
     def reach(self, n: Float[ndarray, "k 3"]) -> Float[ndarray, "m k"]:
         """The support function of each element: the maximum of n · x over its points x, for each unit vector
         n."""
         return (self.corners @ n.T).max(axis=1) + self.radius
+
+    @cached_property
+    def _groups(self) -> list[tuple[Any, ndarray, float]]:
+        """Groups of elements of similar size. For each group: a tree of the elements' middles, their rows,
+        and the radius of balls about the middles that contain them."""
+        from scipy.spatial import KDTree  # imported here: it would double the import time of the checker
+
+        middles = self.corners.mean(axis=1)
+        sizes = np.sqrt(((self.corners - middles[:, None]) ** 2).sum(axis=-1)).max(axis=1)
+        octaves = np.ceil(np.log2(np.maximum(sizes, 1e-6))).astype(int)
+        members = [np.flatnonzero(octaves == octave) for octave in np.unique(octaves)]
+        return [(KDTree(middles[rows]), rows, float(sizes[rows].max())) for rows in members]
+
+    def distances(self, points: Points) -> Values:
+        """Lower bounds of the distances of points to the surface [m], at most CLEARANCE_CAP: exact for near
+        triangles and for points; distances to balls around the triangles for others."""
+        nearest = np.full(len(points), CLEARANCE_CAP)
+        for tree, rows, size in self._groups:
+            to_middle = tree.query(points)[0]
+            near = (to_middle < EXACT_TRIANGLE_RANGE * size) & (to_middle - size < nearest)
+            nearest = np.minimum(nearest, np.where(near, np.inf, to_middle - size))
+            near_points = np.flatnonzero(near)
+            within = tree.query_ball_point(points[near_points], to_middle[near_points] + size)
+            counts = np.array([len(some) for some in within], int)
+            for some in np.array_split(np.arange(len(near_points)), counts.sum() * 9 // MAX_ARRAY_SIZE + 1):
+                if len(some):
+                    point_rows = np.repeat(near_points[some], counts[some])
+                    triangles = self.corners[rows[np.concatenate(within[some]).astype(int)]]
+                    np.minimum.at(nearest, point_rows, _to_triangles(points[point_rows], triangles))
+        return np.minimum(nearest - self.radius, CLEARANCE_CAP)
+
+    def near(self, center: Vector, reach: float) -> "Surface":
+        """The elements that come within `reach` [m] of a point, and possibly others."""
+        reach += self.radius
+        element_rows = [
+            rows[tree.query_ball_point(center, reach + size)] for tree, rows, size in self._groups
+        ]
+        return Surface(self.corners[np.sort(np.concatenate(element_rows).astype(int))], self.radius)
 
 
 class Obstacles:
@@ -87,7 +137,6 @@ class Obstacles:
         self._half = np.array([body.half for _, body in rounded]).reshape(-1, 3)
         self._disc = np.array([body.disc for _, body in rounded])
         self._rounding = np.array([body.rounding for _, body in rounded])
-        self._indices = {i: _Index(body) for i, body in enumerate(self.bodies) if isinstance(body, Surface)}
 
     def distances(self, points: Points) -> Float[ndarray, "n obstacles"]:
         """Distances of points to each obstacle [m], at most CLEARANCE_CAP; 0 or less inside."""
@@ -96,15 +145,16 @@ class Obstacles:
         for first in range(0, len(points), step):
             some = slice(first, first + step)
             distances_to_each[some, self._at] = np.minimum(self._to_rounded(points[some]), CLEARANCE_CAP)
-        for i, index in self._indices.items():
-            distances_to_each[:, i] = index.distances(points)
+        for i, body in enumerate(self.bodies):
+            if isinstance(body, Surface):
+                distances_to_each[:, i] = body.distances(points)
         return distances_to_each
 
     def near(self, center: Vector, radius: float) -> tuple[Rounded | Surface, ...]:
         """The bodies, with surfaces reduced to the elements that may be within PLANE_RANGE of a ball."""
         return tuple(
-            self._indices[i].near(center, radius + PLANE_RANGE) if isinstance(body, Surface) else body
-            for i, body in enumerate(self.bodies)
+            body.near(center, radius + PLANE_RANGE) if isinstance(body, Surface) else body
+            for body in self.bodies
         )
 
     def _to_rounded(self, points: ndarray) -> ndarray:
@@ -138,57 +188,6 @@ def _body(shape: Shape) -> Rounded | Surface:
             return Surface(vertices[mesh.faces], 0.0)
         case _:
             raise InputError(f"{shape.name}: a {type(shape).__name__} cannot be certified")
-
-
-class _Index:
-    """A spatial index of the elements of a surface."""
-
-    def __init__(self, surface: Surface) -> None:
-        from scipy.spatial import KDTree  # imported here: it would double the import time of the checker
-
-        self.surface = surface
-        self._classes = [(KDTree(middles), rows, size) for middles, rows, size in _by_size(surface.corners)]
-
-    def distances(self, points: Points) -> Values:
-        """Lower bounds of the distances of points to the surface [m], at most CLEARANCE_CAP: exact for near
-        elements; distances to balls around the elements for others."""
-        nearest = np.full(len(points), CLEARANCE_CAP)
-        for tree, rows, size in self._classes:
-            to_middle = tree.query(points)[0]
-            near = (to_middle <= EXACT_TRIANGLE_RANGE * size) & (to_middle - size < nearest)
-            if len(self.surface.corners[0]) == 1:
-                near[:] = False
-            nearest = np.where(near, nearest, np.minimum(nearest, to_middle - size))
-            near_points = np.flatnonzero(near)
-            within = tree.query_ball_point(points[near_points], to_middle[near_points] + size)
-            counts = np.array([len(some) for some in within], int)
-            for some in np.array_split(np.arange(len(near_points)), counts.sum() * 9 // MAX_ARRAY_SIZE + 1):
-                if len(some):
-                    point_rows = np.repeat(near_points[some], counts[some])
-                    triangles = self.surface.corners[rows[np.concatenate(within[some]).astype(int)]]
-                    np.minimum.at(nearest, point_rows, _to_triangles(points[point_rows], triangles))
-        return np.minimum(nearest - self.surface.radius, CLEARANCE_CAP)
-
-    def near(self, center: Vector, reach: float) -> Surface:
-        """The elements that come within `reach` [m] of a point, and possibly others."""
-        reach += self.surface.radius
-        element_rows = [
-            rows[tree.query_ball_point(center, reach + size)] for tree, rows, size in self._classes
-        ]
-        return self.surface._replace(
-            corners=self.surface.corners[np.sort(np.concatenate(element_rows).astype(int))]
-        )
-
-
-def _by_size(corners: Float[ndarray, "m c 3"]) -> Iterator[tuple[ndarray, ndarray, float]]:
-    """Groups of elements of similar size. For each group: middles of the elements, their rows, and the radius
-    of balls about the middles that contain them."""
-    middles = corners.mean(axis=1)
-    sizes = np.sqrt(((corners - middles[:, None]) ** 2).sum(axis=-1)).max(axis=1)
-    octaves = np.ceil(np.log2(np.maximum(sizes, 1e-6))).astype(int)
-    for octave in np.unique(octaves):
-        rows = np.flatnonzero(octaves == octave)
-        yield middles[rows], rows, float(sizes[rows].max())
 
 
 def _to_triangles(p: Points, triangles: Float[ndarray, "n 3 3"]) -> Values:
@@ -266,6 +265,10 @@ class Part(NamedTuple):
     radius: float
     """Radius of this ball [m]."""
 
+    def reach(self, n: Float[ndarray, "k 3"]) -> Values:
+        """The support function: the maximum of n · x over the part's points x, for each unit vector n."""
+        return (self.vertices @ n.T).max(axis=0) + self.rounding
+
 
 @dataclass(frozen=True)
 class Bounds:
@@ -278,6 +281,11 @@ class Bounds:
     [m]."""
 
 
+Body = Rounded | Surface | Part
+Normals = dict[tuple[int, int], list[tuple[float, float, float]]]
+"""Normals of planes, by the part and the other body of their `Plane`."""
+
+
 class Prover:
     """Computes bounds for a robot in a scene, for a motion along straight lines through configurations, which
     may leave the lines by a known distance."""
@@ -287,13 +295,13 @@ class Prover:
         robot: Robot,
         scene: Scene,
         q: Configurations,
-        off: JointRows | None = None,
+        off: JointRows,
     ) -> None:
         """off: how far each joint may leave the straight line from each configuration to the next [rad] or
-        [m]; None: 0."""
+        [m]."""
         self.robot = robot
         self.q = q
-        self.off = np.zeros_like(q[1:]) if off is None else off
+        self.off = off
         self.linkage, self.obstacles = Linkage(robot), Obstacles(scene)
         self.links = [link for link in self.linkage.links if _has_geometry(robot, link)]
         if SCENE in self.links:
@@ -312,6 +320,10 @@ class Prover:
         counts = [len(rows) for rows in balls]
         self._first = np.cumsum([0, *counts])
         self.parts = {link: _parts(robot, link) for link in self.links}
+
+    def _links_of(self, claim: Claim) -> tuple[int, int]:
+        """Indices of the two links of a claim; the base, which no joint moves, stands for the scene."""
+        return self._link_index[claim.link], self._link_index.get(claim.against, 0)
 
     @cached_property
     def claims(self) -> tuple[Claim, ...]:
@@ -335,10 +347,10 @@ class Prover:
         share = (places - low)[:, None]
         return (1 - share) * self.q[low] + share * self.q[high]
 
-    def spans(self, start: ndarray, stop: ndarray, middle: ndarray) -> JointRows:
+    def spans(self, start: ndarray, stop: ndarray) -> JointRows:
         """For each stretch and joint, the largest distance from its position in the middle to its position
         anywhere on the stretch [rad] or [m]."""
-        q = self.at(middle)
+        q = self.at((start + stop) / 2)
         spans = np.maximum(np.abs(self.at(start) - q), np.abs(self.at(stop) - q))
         first = np.floor(start).astype(int) + 1
         last = np.ceil(stop).astype(int) - 1
@@ -362,31 +374,25 @@ class Prover:
 
     def bounds(self, stretches: Stretches, by_planes: ndarray, planes: list[Plane]) -> Bounds:
         """Bounds of stretches: by `planes` where `by_planes` is true, otherwise by the covering spheres."""
-        ends, inverse_indices = np.unique(
-            np.column_stack([stretches.start, stretches.stop]), axis=0, return_inverse=True
-        )
-        inverse_indices = inverse_indices.ravel()
-        middle = (ends[:, 0] + ends[:, 1]) / 2
-        spans = self.spans(ends[:, 0], ends[:, 1], middle)
-        postures = self.linkage.place(self.at(middle))
-        clearance = np.full(len(inverse_indices), CLEARANCE_CAP)
-        displacement = np.zeros(len(inverse_indices))
-        for pairs in (False, True):
-            is_pair = np.array([claim.against != SCENE for claim in self.claims], bool)
-            rows = np.flatnonzero(is_pair[stretches.claim] == pairs)
-            if len(rows):
-                pair_bounds = self._by_spheres(
-                    stretches.claim[rows], inverse_indices[rows], postures, spans, pairs
-                )
-                clearance[rows], displacement[rows] = pair_bounds
-        marked = np.flatnonzero(by_planes)
-        if len(marked):
-            off = self.deviations(ends[:, 0], ends[:, 1])
-            ways = [(_steps(self, *ends[k]), off[k]) for k in inverse_indices[marked]]
-            pair_bounds = self._by_planes(
-                stretches, marked, planes, postures, inverse_indices, ways, displacement[marked]
+        ends, row = np.unique(np.column_stack([stretches.start, stretches.stop]), axis=0, return_inverse=True)
+        row = row.ravel()
+        start, stop = ends.T
+        postures = self.linkage.place(self.at((start + stop) / 2))
+        clearance, displacement = self._by_spheres(stretches.claim, row, postures, self.spans(start, stop))
+        off = self.deviations(start, stop)
+        normals = defaultdict[int, Normals](lambda: defaultdict(list))
+        for plane in planes:
+            normals[plane.stretch][plane.part, plane.other].append(plane.normal)
+        for i in np.flatnonzero(by_planes).tolist():
+            k = row[i]
+            clearance[i], displacement[i] = self._by_planes(
+                self.claims[stretches.claim[i]],
+                Postures(*(array[k] for array in postures)),
+                _steps(self, start[k], stop[k]),
+                off[k],
+                normals[i],
+                displacement[i],
             )
-            clearance[marked], displacement[marked] = pair_bounds
         return Bounds(clearance, displacement)
 
     def _expand(self, links: ndarray) -> tuple[ndarray, ndarray, ndarray]:
@@ -426,22 +432,11 @@ class Prover:
         return clearance, np.maximum.reduceat(went, begin)
 
     def _by_spheres(
-        self, claim: ndarray, posture: ndarray, postures: Postures, spans: ndarray, pairs: bool
+        self, claim: ndarray, posture: ndarray, postures: Postures, spans: ndarray
     ) -> tuple[ndarray, ndarray]:
-        """Clearances and displacements by the covering spheres, for claims against the scene, or between
-        links if `pairs` is true."""
-        links = np.array([self._link_index[c.link] for c in self.claims])[claim]
+        """Clearances and displacements by the covering spheres."""
+        links, others = np.array([self._links_of(c) for c in self.claims], int).reshape(-1, 2)[claim].T
         moved = self._moved[links]
-        if not pairs:
-
-            def to_scene(row: ndarray, at: ndarray, centers: ndarray) -> ndarray:
-                gaps = self.obstacles.distances(centers)
-                if self.may_touch.any():
-                    gaps[self.may_touch[links[row]]] = CLEARANCE_CAP
-                return gaps.min(axis=1, initial=CLEARANCE_CAP)
-
-            return self._ball_bounds(links, moved, posture, postures, spans, to_scene)
-        others = np.array([self._link_index.get(c.against, 0) for c in self.claims])[claim]
         moves_other_only = self._moved[others] & ~moved
         other_displacement = np.zeros(len(claim))
         some = np.flatnonzero(moves_other_only.any(axis=1))
@@ -449,15 +444,20 @@ class Prover:
             other_displacement[some] = self._ball_bounds(
                 others[some], moves_other_only[some], posture[some], postures, spans
             )[1]
-        clearance, link_displacement = self._ball_bounds(
-            links,
-            moved & ~self._moved[others],
-            posture,
-            postures,
-            spans,
-            lambda row, at, centers: self._to_links(postures, at, centers, others[row]),
-        )
-        return clearance, link_displacement + other_displacement
+        against_scene = np.array([c.against == SCENE for c in self.claims], bool)[claim]
+
+        def distances(row: ndarray, at: ndarray, centers: ndarray) -> Values:
+            to_other = np.empty(len(row))
+            scene = against_scene[row]
+            gaps = self.obstacles.distances(centers[scene])
+            gaps[self.may_touch[links[row[scene]]]] = CLEARANCE_CAP
+            to_other[scene] = gaps.min(axis=1, initial=CLEARANCE_CAP)
+            to_other[~scene] = self._to_links(postures, at[~scene], centers[~scene], others[row[~scene]])
+            return to_other
+
+        moved_alone = moved & ~self._moved[others]
+        clearance, displacement = self._ball_bounds(links, moved_alone, posture, postures, spans, distances)
+        return clearance, displacement + other_displacement
 
     def _to_links(self, postures: Postures, at: ndarray, centers: ndarray, link: ndarray) -> ndarray:
         """The distance of each point to the spheres of its link [m]. at: the posture; link: the link's
@@ -474,15 +474,14 @@ class Prover:
 
     def _by_planes(
         self,
-        stretches: Stretches,
-        marked: ndarray,
-        planes: list[Plane],
-        postures: Postures,
-        which: ndarray,
-        ways: list[tuple[ndarray, ndarray]],
-        displacement: ndarray,
-    ) -> tuple[ndarray, ndarray]:
-        """Clearance and displacement of the `marked` stretches by planes.
+        claim: Claim,
+        posture: Postures,
+        steps: JointRows,
+        off: JointValues,
+        normals: Normals,
+        displacement: float,
+    ) -> tuple[float, float]:
+        """Clearance and displacement of a stretch by planes.
 
         Pairs of a part of the link and an obstacle (or a part of the other link) are bounded one by one. The
         clearance of a pair is the greater of two gaps: the one between the ball around the part and the
@@ -490,77 +489,57 @@ class Prover:
         lower bound of its gap anywhere on the stretch, computed in the same way. The results are the smallest
         clearance, and its difference from the smallest margin.
 
-        which: for each stretch, its row in `postures`. ways: for each marked stretch, the `_steps` of its
-        joints and their `deviations`.
+        posture: in the middle of the stretch. steps, off: the `_steps` of the joints and their `deviations`.
+        displacement: by the covering spheres.
         """
-        normals: dict[tuple[int, int, int], list[tuple[float, float, float]]] = {}
-        for plane in planes:
-            normals.setdefault(plane[:3], []).append(plane.normal)
-        clearance = np.full(len(marked), CLEARANCE_CAP)
-        margin = np.full(len(marked), CLEARANCE_CAP)
-        places = [(self.claims[stretches.claim[i]], postures.T[which[i]]) for i in marked]
-        standing = [placed(self.parts[claim.link], T[self._link_index[claim.link]]) for claim, T in places]
-        in_scene = [k for k, (claim, _) in enumerate(places) if claim.against == SCENE]
-        centers = [part.center for k in in_scene for part in standing[k]]
-        to_scene = iter(self.obstacles.distances(np.array(centers).reshape(-1, 3)))
-        for k, (claim, T) in enumerate(places):
-            # joints that move only the link, and joints that move only the other link
-            mine = self._moved[self._link_index[claim.link]]
-            theirs = np.zeros(len(self.linkage.slides), bool)
-            if claim.against != SCENE:
-                moved_other = self._moved[self._link_index[claim.against]]
-                mine, theirs = mine & ~moved_other, moved_other & ~mine
-            mine = np.flatnonzero(mine)
-            theirs = np.flatnonzero(theirs)
-            at, (way, off) = which[marked[k]], ways[k]
-            for p, part in enumerate(standing[k]):
-                bodies = self.others(claim, T, part)
-                if claim.against == SCENE:
-                    ball_gaps = next(to_scene) - part.radius
-                    ball_gaps[self.may_touch[self._link_index[claim.link]]] = CLEARANCE_CAP
-                else:
-                    ball_gaps = self.balls_apart(part, bodies)
-                ball_gaps, margins = ball_gaps.copy(), ball_gaps - displacement[k]
-                for o, body in enumerate(bodies):
-                    known_normal = normals.get((int(marked[k]), p, o))
-                    if known_normal is not None:
-                        n = np.array(known_normal)
-                        n /= np.sqrt((n**2).sum(axis=1, keepdims=True))
-                        axes = postures.origins[at], postures.axes[at]
-                        approach = self.linkage.approach(*axes, part.vertices, mine, way, n, off)
-                        other_rise = np.zeros(len(n))
-                        if len(theirs):
-                            assert isinstance(body, Part)
-                            other_approach = self.linkage.approach(*axes, body.vertices, theirs, way, -n, off)
-                            heights = n @ body.vertices.T
-                            other_rise = (heights + other_approach).max(axis=1) - heights.max(axis=1)
-                        widest = gaps(part, body, n).max(axis=-1)
-                        remaining = (gaps(part, body, n, approach) - other_rise).max(axis=-1)
-                        element_gaps = np.maximum(ball_gaps[o], widest)
-                        element_margins = np.maximum(margins[o], remaining)
-                        beyond = PLANE_RANGE if isinstance(body, Surface) else CLEARANCE_CAP
-                        ball_gaps[o] = max(ball_gaps[o], element_gaps.min(initial=beyond))
-                        margins[o] = max(margins[o], element_margins.min(initial=beyond - displacement[k]))
-                clearance[k] = min(clearance[k], ball_gaps.min(initial=CLEARANCE_CAP))
-                margin[k] = min(margin[k], margins.min(initial=CLEARANCE_CAP))
+        link, other = self._links_of(claim)
+        # joints that move only the link, and joints that move only the other link
+        mine = np.flatnonzero(self._moved[link] & ~self._moved[other])
+        theirs = np.flatnonzero(self._moved[other] & ~self._moved[link])
+        axes = posture.origins, posture.axes
+        clearance = margin = CLEARANCE_CAP
+        for p, (part, bodies, ball_gaps) in enumerate(self.pairs(claim, posture.T)):
+            margins = ball_gaps - displacement
+            for o, body in enumerate(bodies):
+                if (p, o) not in normals:
+                    continue
+                n = np.array(normals[p, o])
+                n /= np.sqrt((n**2).sum(axis=1, keepdims=True))
+                approach = self.linkage.approach(*axes, part.vertices, mine, steps, n, off)
+                other_rise = np.zeros(len(n))
+                if isinstance(body, Part):
+                    other_approach = self.linkage.approach(*axes, body.vertices, theirs, steps, -n, off)
+                    heights = n @ body.vertices.T
+                    other_rise = (heights + other_approach).max(axis=1) - heights.max(axis=1)
+                widest = gaps(part, body, n).max(axis=-1)
+                remaining = (gaps(part, body, n, approach) - other_rise).max(axis=-1)
+                element_gaps = np.maximum(ball_gaps[o], widest)
+                element_margins = np.maximum(margins[o], remaining)
+                beyond = PLANE_RANGE if isinstance(body, Surface) else CLEARANCE_CAP
+                ball_gaps[o] = max(ball_gaps[o], element_gaps.min(initial=beyond))
+                margins[o] = max(margins[o], element_margins.min(initial=beyond - displacement))
+            clearance = ball_gaps.min(initial=clearance)
+            margin = margins.min(initial=margin)
         return clearance, clearance - margin
 
-    def others(self, claim: Claim, T: ndarray, part: Part) -> Sequence[Rounded | Surface | Part]:
-        """The bodies that a part of a link is checked against; surfaces are reduced to their near
-        elements."""
-        if claim.against == SCENE:
-            return self.obstacles.near(part.center, part.radius)
-        return placed(self.parts[claim.against], T[self._link_index[claim.against]])
+    def pairs(self, claim: Claim, T: Poses) -> Iterator[tuple[Part, Sequence[Body], Values]]:
+        """Each part of a claim's link, with the bodies that it is checked against and its distances from
+        them: of the ball around the part to each obstacle, or to the balls around the parts of the other link
+        [m].
 
-    def balls_apart(self, part: Part, bodies: Sequence[Rounded | Surface | Part]) -> Float[ndarray, "bodies"]:
-        """Distances of the ball around a part to each obstacle, or to the balls around the parts of another
-        link [m]."""
-        parts_of_link = [body for body in bodies if isinstance(body, Part)]
-        if not parts_of_link:
-            return self.obstacles.distances(part.center[None])[0] - part.radius
-        centers = np.array([near_body.center for near_body in parts_of_link])
-        radii = [near_body.radius for near_body in parts_of_link]
-        return np.sqrt(((part.center - centers) ** 2).sum(axis=1)) - part.radius - radii
+        T: poses of all links. Surfaces are reduced to their near elements.
+        """
+        link, other = self._links_of(claim)
+        others = placed(self.parts.get(claim.against, ()), T[other])
+        for part in placed(self.parts[claim.link], T[link]):
+            if claim.against == SCENE:
+                distances = self.obstacles.distances(part.center[None])[0] - part.radius
+                distances[self.may_touch[link]] = CLEARANCE_CAP
+                yield part, self.obstacles.near(part.center, part.radius), distances
+            else:
+                between = part.center - np.array([body.center for body in others])
+                radii = np.array([body.radius for body in others])
+                yield part, others, np.sqrt((between**2).sum(axis=1)) - part.radius - radii
 
 
 def _steps(prover: Prover, start: float, stop: float) -> JointRows:
@@ -573,7 +552,7 @@ def _steps(prover: Prover, start: float, stop: float) -> JointRows:
 
 def gaps(
     part: Part,
-    body: Rounded | Surface | Part,
+    body: Body,
     normals: Float[ndarray, "k 3"],
     nearer: Float[ndarray, "k v"] | None = None,
 ) -> Float[ndarray, "*elements k"]:
@@ -584,8 +563,6 @@ def gaps(
     """
     heights = normals @ part.vertices.T
     nearest = (heights if nearer is None else heights - nearer).min(axis=1) - part.rounding
-    if isinstance(body, Part):
-        return nearest - (body.vertices @ normals.T).max(axis=0) - body.rounding
     return nearest - body.reach(normals)
 
 
@@ -644,7 +621,7 @@ class MovingProver(Prover):
         moving: Sequence[MovingObstacle],
         q: Configurations,
         times: Values,
-        off: JointRows | None = None,
+        off: JointRows,
     ) -> None:
         super().__init__(robot, Scene(), q, off)
         self.times, self.moving = times, tuple(moving)
@@ -659,7 +636,7 @@ class MovingProver(Prover):
     def bounds(self, stretches: Stretches, by_planes: ndarray, planes: list[Plane]) -> Bounds:
         """Bounds of stretches by the spheres; planes are not used."""
         middle = (stretches.start + stretches.stop) / 2
-        spans = self.spans(stretches.start, stretches.stop, middle)
+        spans = self.spans(stretches.start, stretches.stop)
         postures = self.linkage.place(self.at(middle))
         rows = np.arange(len(self.times))
         begin, at, end = (np.interp(s, rows, self.times) for s in (stretches.start, middle, stretches.stop))

@@ -12,7 +12,7 @@ from numpy import ndarray
 
 from robotdiffuse.certificates.bounds import Claim, Plane, Stretches
 from robotdiffuse.certificates.checker import Findings, check
-from robotdiffuse.certificates.proof import DECIMALS, MotionProof, StretchProof, Tolerances
+from robotdiffuse.certificates.proof import DECIMALS, MotionProof, StretchProof, Tolerances, joined
 from robotdiffuse.core.bounds import MAX_RATE, numbers, one_line, within
 from robotdiffuse.core.errors import InputError, reading, shown
 from robotdiffuse.core.input_files import read_json
@@ -23,7 +23,7 @@ from robotdiffuse.problems.problem import Problem
 FILE_MARK = "robotdiffuse certificate"
 VERSION = 1
 RATE_ROWS = ("times", "velocities", "accelerations")
-STRETCH_FIELDS = ("start", "stop", "by_planes", "clearance", "displacement")
+STRETCH_FIELDS = ("start", "stop", "clearance", "displacement")
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,34 +131,29 @@ def _motion(_: str, record: dict[str, Any]) -> Path | Trajectory:
 def _proof(_: str, record: list[dict[str, Any]] | None) -> StretchProof | None:
     if record is None:
         return None
-    claims = []
-    columns = {name: [np.zeros(0)] for name in ("claim", *STRETCH_FIELDS)}
+    parts = [_claim_proof(k, entry) for k, entry in enumerate(record)]
+    return joined(tuple(claim for part in parts for claim in part.claims), parts)
+
+
+def _claim_proof(k: int, entry: dict[str, Any]) -> StretchProof:
+    """The proof of claim number k."""
+    claim = Claim(str(entry["link"]), str(entry["against"]))
+    start, stop, clearance, displacement = (_vector(name, entry[name]) for name in STRETCH_FIELDS)
+    count = len(start)
+    if not len(stop) == len(clearance) == len(displacement) == count:
+        raise InputError(f"proof of {claim.link}: its columns must have equal lengths")
+    by_planes = np.zeros(count, bool)
+    by_planes[[int(i) for i in entry["by_planes"]]] = True
     planes = []
-    begin = 0
-    for k, entry in enumerate(record):
-        claims.append(Claim(str(entry["link"]), str(entry["against"])))
-        values_by_name = {name: _vector(name, entry[name]) for name in STRETCH_FIELDS if name != "by_planes"}
-        count = len(values_by_name["start"])
-        if any(len(values) != count for values in values_by_name.values()):
-            raise InputError(f"proof of {claims[-1].link}: its columns must have equal lengths")
-        marked = np.zeros(count)
-        marked[[int(i) for i in entry["by_planes"]]] = 1
-        for name, values in (("claim", np.full(count, k)), ("by_planes", marked), *values_by_name.items()):
-            columns[name].append(values)
-        for stretch, part, partner, *normal in entry["planes"]:
-            if not 0 <= int(stretch) < count:
-                raise InputError(f"proof of {claims[-1].link}: it has no stretch {shown(stretch)}")
-            plane = Plane(begin + int(stretch), int(part), int(partner), tuple(map(float, normal)))  # type: ignore[arg-type]
-            if len(normal) != 3 or not 0 < math.hypot(*normal) < math.inf:
-                raise InputError(f"proof of {claims[-1].link}: {shown(normal)} is not the normal of a plane")
-            planes.append(plane)
-        begin += count
-    joined = {name: np.concatenate(values) for name, values in columns.items()}
-    stretches = Stretches(joined["claim"].astype(int), joined["start"], joined["stop"])
-    by_planes = joined["by_planes"] > 0
-    return StretchProof(
-        tuple(claims), stretches, by_planes, joined["clearance"], joined["displacement"], tuple(planes)
-    )
+    for stretch, part, partner, *normal in entry["planes"]:
+        if not 0 <= int(stretch) < count:
+            raise InputError(f"proof of {claim.link}: it has no stretch {shown(stretch)}")
+        x, y, z = map(float, normal)
+        if not 0 < math.hypot(x, y, z) < math.inf:
+            raise InputError(f"proof of {claim.link}: {shown(normal)} is not the normal of a plane")
+        planes.append(Plane(int(stretch), int(part), int(partner), (x, y, z)))
+    stretches = Stretches(np.full(count, k), start, stop)
+    return StretchProof((claim,), stretches, by_planes, clearance, displacement, tuple(planes))
 
 
 def _named_bounds(_: str, rows: list[Any]) -> tuple[tuple[str, float], ...]:

@@ -35,6 +35,7 @@ from robotdiffuse.certificates.requirements import (
 )
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Trajectory
+from robotdiffuse.problems.files import problem_from_record
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 
@@ -72,8 +73,6 @@ def check(
     if problem is None:
         if certificate.problem is None:
             raise InputError("the certificate holds no problem; give the problem that it is for")
-        from robotdiffuse.problems.files import problem_from_record
-
         problem = problem_from_record(certificate.problem)
     errors = [
         *differences("robot", certificate.robot_parts, robot_parts(problem.robot)),

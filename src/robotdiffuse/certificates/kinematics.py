@@ -162,7 +162,7 @@ class Linkage:
         moved_by: Int[ndarray, "joints"],
         steps: JointRows,
         normals: Float[ndarray, "k 3"],
-        off: JointValues | float = 0.0,
+        off: JointValues,
     ) -> Float[ndarray, "k v"]:
         """Upper bound on the movement of each point against each unit normal [m].
 
@@ -176,14 +176,13 @@ class Linkage:
         point by joints j <= k is at most L_k.
         """
         moving_joints = moved_by.tolist()
-        off = np.broadcast_to(off, steps.shape[1])
         spans = np.abs(steps).max(axis=0) + off
         rates = np.cross(axes[moving_joints, None], points[None] - origins[moving_joints, None])
         rates[self.slides[moving_joints]] = axes[moving_joints, None][self.slides[moving_joints]]
         lengths = np.sqrt((rates**2).sum(axis=2))
-        along = np.moveaxis(rates @ normals.T, 2, 1).reshape(len(moving_joints), -1)
-        towards = off[moving_joints] @ np.abs(along) - (steps[:, moving_joints] @ along).min(axis=0)
-        towards = towards.reshape(len(normals), len(points))
+        along = np.moveaxis(rates @ normals.T, 2, 1)
+        towards = np.tensordot(off[moving_joints], np.abs(along), 1)
+        towards -= np.tensordot(steps[:, moving_joints], along, 1).min(axis=0)
         went = np.zeros(len(points))
         remainder = np.zeros(len(points))
         for i in reversed(range(len(moving_joints))):

@@ -3,7 +3,7 @@ of the parts of robots, scenes and motions, by which the checker names the parts
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -68,6 +68,27 @@ class StretchProof:
     planes: tuple[Plane, ...]
 
 
+NOTHING = np.zeros(0)
+EMPTY = StretchProof((), Stretches(NOTHING.astype(int), NOTHING, NOTHING), NOTHING > 0, NOTHING, NOTHING, ())
+
+
+def joined(claims: tuple[Claim, ...], proofs: Iterable[StretchProof]) -> StretchProof:
+    """The stretches of several proofs, one after the other, as a proof of these claims."""
+    parts = [EMPTY, *proofs]
+    offsets = np.cumsum([len(part.by_planes) for part in parts])
+    planes = [
+        plane._replace(stretch=plane.stretch + int(offset))
+        for offset, part in zip(offsets, parts[1:], strict=False)
+        for plane in part.planes
+    ]
+    by_planes, clearance, displacement = (
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ("by_planes", "clearance", "displacement")
+    )
+    stretches = Stretches(*map(np.concatenate, zip(*(part.stretches for part in parts), strict=True)))
+    return StretchProof(claims, stretches, by_planes, clearance, displacement, tuple(planes))
+
+
 @dataclass(frozen=True, eq=False)
 class MotionProof:
     """A motion, what was proved of it, and the proof."""
@@ -99,7 +120,7 @@ class MotionProof:
     constraints: tuple[tuple[str, float], ...] = ()
     """Name of each quantity that a path constraint limits, and its upper bound along the whole motion [m] or
     [rad]."""
-    torque_samples: Values = field(default_factory=lambda: np.zeros(0))
+    torque_samples: Values = field(default_factory=lambda: NOTHING)
     """Places between the rows at which torques are computed too; in the form of `between`."""
     torques: tuple[tuple[str, float], ...] = ()
     """Name of each joint, and an upper bound of its torque with the payload along the whole motion [N m] or

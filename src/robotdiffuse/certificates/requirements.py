@@ -477,6 +477,7 @@ MIN_JERK = 1e-6
 # of the blend, and largest number from one row to the next.
 BLEND_SHARE = 0.25
 MAX_BLEND_SAMPLES = 10_000
+UNTIMED = "certificates prove nothing about moving obstacles for a path, which has no times"
 MIN_TIME = 1e-12
 """Smallest time by which a displacement is divided [s], so that mean rates are finite."""
 
@@ -499,11 +500,6 @@ def deviations(motion: Path | Trajectory, between: Values) -> JointRows:
     return cubics_of(motion).deviations(places_of(motion, between))
 
 
-def not_covered(problem: Problem, motion: Path | Trajectory) -> str:
-    """The requirement of the problem that a certificate of this motion cannot prove; "" if there is none."""
-    return "moving, without times" if problem.moving and isinstance(motion, Path) else ""
-
-
 def not_checked(problem: Problem, motion: Path | Trajectory) -> list[str]:
     """Descriptions of what the checker does not check; only the validator does."""
     path = isinstance(motion, Path)
@@ -521,9 +517,8 @@ def requirement_errors(problem: Problem, certificate: MotionProof) -> Iterator[s
     robot = problem.robot
     motion = certificate.motion
     tolerances = certificate.tolerances
-    name = not_covered(problem, motion)
-    if name:
-        yield f"problem: certificates do not prove anything about {name}"
+    if problem.moving and isinstance(motion, Path):
+        yield f"problem: {UNTIMED}"
     extreme_positions = np.concatenate([motion.positions, cubics_of(motion).turning_points])
     beyond = np.maximum(robot.lower - extreme_positions, extreme_positions - robot.upper)
     beyond[:, robot.continuous] = 0.0

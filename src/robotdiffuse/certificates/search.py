@@ -9,6 +9,7 @@ perpendicular to the line between the bodies' nearest points. Coal finds these p
 # pyright: reportAttributeAccessIssue=false
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -30,7 +31,6 @@ from robotdiffuse.certificates.bounds import (
     Stretches,
     Surface,
     gaps,
-    placed,
 )
 from robotdiffuse.certificates.certificate import Certificate
 from robotdiffuse.certificates.kinematics import cubics_of, places_of
@@ -39,21 +39,23 @@ from robotdiffuse.certificates.proof import (
     StretchProof,
     Tolerances,
     hash_of,
+    joined,
     request_parts,
     robot_parts,
     scene_parts,
 )
 from robotdiffuse.certificates.requirements import (
+    UNTIMED,
     configurations,
     constraint_bounds,
     cubic_jerks,
     deviations,
-    not_covered,
     torque_bounds,
 )
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.core.types import Path, Pose, Trajectory, Values
+from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose, coal_rounded
 from robotdiffuse.robots.motion_bounds import motion_radii
@@ -79,51 +81,38 @@ class PlaneFinder:
     def __init__(self, prover: Prover) -> None:
         self.prover = prover
         self._parts = {link: tuple(map(_hull, parts)) for link, parts in prover.parts.items()}
-        self._obstacles = tuple(
-            _Body(coal_rounded(*body[2:]), transform(body.center, body.R))
-            if isinstance(body, Rounded)
-            else None
-            for body in prover.obstacles.bodies
-        )
 
-    def planes(self, todo: Stretches, rows: ndarray, needed: Values) -> list[Plane]:
-        """Separating planes for some of the stretches in `todo`, by their indices `rows`.
+    def planes(self, stretches: Stretches, needed: Values) -> list[Plane]:
+        """Separating planes for stretches.
 
-        needed: for each of these stretches, the clearance that it needs [m]. No plane is made for bodies with
+        needed: for each of the stretches, the clearance that it needs [m]. No plane is made for bodies with
         balls further apart, or for bodies that touch, which have no separating plane.
         """
         prover = self.prover
-        middle = (todo.start[rows] + todo.stop[rows]) / 2
-        postures = prover.linkage.place(prover.at(middle))
+        T = prover.linkage.place(prover.at((stretches.start + stretches.stop) / 2)).T
         return [
-            Plane(row, *plane)
-            for k, row in enumerate(rows.tolist())
-            for plane in self._of(prover.claims[todo.claim[row]], postures.T[k], float(needed[k]))
+            Plane(k, *plane)
+            for k, claim in enumerate(stretches.claim)
+            for plane in self._of(prover.claims[claim], T[k], float(needed[k]))
         ]
 
     def _of(self, claim: Claim, T: ndarray, needed: float) -> Iterator[tuple[int, int, Normal]]:
         prover = self.prover
-        links = self.prover.linkage.links
+        links = prover.linkage.links
         T_base_link = T[links.index(claim.link)]
-        for p, part in enumerate(placed(prover.parts[claim.link], T_base_link)):
-            bodies = prover.others(claim, T, part)
-            ball_gaps = prover.balls_apart(part, bodies)
+        for p, (part, bodies, ball_gaps) in enumerate(prover.pairs(claim, T)):
             first = self._parts[claim.link][p]
             first = first._replace(T=T_base_link @ first.T)
-            if claim.against == SCENE:
-                ball_gaps[prover.may_touch[links.index(claim.link)]] = np.inf
-            for o, body in enumerate(bodies):
-                if ball_gaps[o] >= needed:
-                    continue
+            for o in np.flatnonzero(ball_gaps < needed).tolist():
+                body = bodies[o]
                 if isinstance(body, Surface):
                     yield from ((p, o, normal) for normal in _around(first, part, body, needed))
                     continue
-                if claim.against == SCENE:
-                    second = self._obstacles[o]
+                if isinstance(body, Rounded):
+                    second = _Body(coal_rounded(*body[2:]), transform(body.center, body.R))
                 else:
                     second = self._parts[claim.against][o]
                     second = second._replace(T=T[links.index(claim.against)] @ second.T)
-                assert second is not None
                 normal = _normal(first, second)
                 if normal is not None:
                     yield p, o, normal
@@ -215,9 +204,8 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
     check_problem(problem)
     check_motion("motion", motion, (Path, Trajectory))
     check_type("settings", settings, VerifySettings, "VerifySettings")
-    unsupported = not_covered(problem, motion)
-    if unsupported:
-        raise InputError(f"certificates prove nothing about {unsupported}, which the problem has")
+    if problem.moving and isinstance(motion, Path):
+        raise InputError(UNTIMED)
     report = verify(problem, motion, settings)
     if report.violation is not None:
         raise NotValidError(f"the motion is not valid: {report.violation.line}")
@@ -232,9 +220,8 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
     reach = float(motion_radii(problem.robot).max(axis=0, initial=0.0).sum())
     chord = min(tolerances.chord, CHORD_SHARE * min(clearances, default=np.inf) / max(reach, 1e-3))
     between = _between(motion, chord)
-    bounds = ()
+    bounds = torques = ()
     samples = np.zeros(0)
-    torques = ()
     if problem.constraints:
 
         def of_constraints(places: Values) -> tuple[Any, ...]:
@@ -259,6 +246,9 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
         times = places_of(motion, between)
         moving, moving_margins = _prove(MovingProver(problem.robot, problem.moving, q, times, off), {"": 0.0})
         margins[SCENE] = min(margins[SCENE], *moving_margins.values())  # an obstacle may be called "scene"
+    record = None
+    with suppress(InputError):  # the robot may have been made in this program, and have no file
+        record = problem_record(problem)
     jerks = cubic_jerks(problem.robot, motion)
     return Certificate(
         problem.robot.name,
@@ -271,7 +261,7 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
         margins[SCENE],
         margins[""],
         proof,
-        _record(problem),
+        record,
         request_parts(problem),
         moving,
         bounds,
@@ -303,15 +293,6 @@ def _refined(
             break
         places = np.sort(np.concatenate([places, ((at[:-1] + at[1:]) / 2)[open_]]))
     raise InputError(f"no proof was found for the {what}: the motion is too near to their limits")
-
-
-def _record(problem: Problem) -> dict[str, object] | None:
-    from robotdiffuse.problems.files import problem_record
-
-    try:
-        return problem_record(problem)
-    except InputError:  # a robot that was made in this program and has no file
-        return None
 
 
 def _between(motion: Path | Trajectory, chord: float) -> Values:
@@ -354,17 +335,17 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[
         )
         if plane_finder is not None and close.any():
             rows = np.flatnonzero(close)
-            planes = plane_finder.planes(todo, rows, displacement[rows] + target[rows])
-            index_of = {row: k for k, row in enumerate(rows.tolist())}
-            numbered_planes = [plane._replace(stretch=index_of[plane.stretch]) for plane in planes]
-            tighter = prover.bounds(todo.some(rows), np.ones(len(rows), bool), numbered_planes)
+            near = todo.some(rows)
+            planes = plane_finder.planes(near, displacement[rows] + target[rows])
+            tighter = prover.bounds(near, np.ones(len(rows), bool), planes)
             plane_clearance = _down(tighter.clearance)
             plane_displacement = _up(tighter.displacement)
-            by_planes[rows] = plane_clearance - plane_displacement > clearance[rows] - displacement[rows]
-            chosen = by_planes[rows]
+            chosen = plane_clearance - plane_displacement > clearance[rows] - displacement[rows]
+            by_planes[rows] = chosen
             clearance[rows[chosen]] = plane_clearance[chosen]
             displacement[rows[chosen]] = plane_displacement[chosen]
-            _check_parts_are_apart(prover, todo.some(rows[plane_clearance <= 0]))
+            planes = [plane._replace(stretch=int(rows[plane.stretch])) for plane in planes]
+            _check_parts_are_apart(prover, near.some(plane_clearance <= 0))
         proved = clearance - displacement >= target
         proved_index = np.cumsum(proved) - 1
         kept_planes = tuple(
@@ -378,7 +359,13 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[
         if total > MAX_STRETCHES:
             raise InputError(f"no proof of less than {MAX_STRETCHES:,} stretches was found for the motion")
         todo = _cut(todo, clearance, displacement, target, ~proved)
-    return _join(prover, proofs)
+    proof = _sorted(joined(prover.claims, proofs))
+    margins = proof.clearance - proof.displacement
+    of_scene = against_scene[proof.stretches.claim]
+    return proof, {
+        SCENE: float(_down(margins[of_scene]).min(initial=CLEARANCE_CAP)),
+        "": float(_down(margins[~of_scene]).min(initial=CLEARANCE_CAP)),
+    }
 
 
 def _check_parts_are_apart(prover: Prover, stretches: Stretches) -> None:
@@ -418,33 +405,13 @@ def _cut(
     return Stretches(claim.astype(int), start, stop)
 
 
-def _join(prover: Prover, done: list[StretchProof]) -> tuple[StretchProof, dict[str, float]]:
-    """Join proofs of stretches, sorted by claim and place; and the proved clearance of each kind (see
-    `_prove`)."""
-    claim, start, stop = (np.concatenate(parts) for parts in zip(*(f.stretches for f in done), strict=True))
-    order = np.lexsort((start, claim))
-    place = np.empty(len(order), int)
-    place[order] = np.arange(len(order))
-    offsets = np.cumsum([0] + [len(f.stretches.claim) for f in done])
-    planes = [
-        plane._replace(stretch=int(place[offset + plane.stretch]))
-        for f, offset in zip(done, offsets, strict=False)
-        for plane in f.planes
-    ]
-    clearance, displacement, by_planes = (
-        np.concatenate([getattr(f, name) for f in done])[order]
-        for name in ("clearance", "displacement", "by_planes")
-    )
-    stretches = Stretches(claim[order], start[order], stop[order])
-    margins = clearance - displacement
-    of_scene = np.array([c.against == SCENE for c in prover.claims], bool)[stretches.claim]
-    lowest = {
-        SCENE: float(_down(margins[of_scene]).min(initial=CLEARANCE_CAP)),
-        "": float(_down(margins[~of_scene]).min(initial=CLEARANCE_CAP)),
-    }
-    planes.sort()
-    proof = StretchProof(prover.claims, stretches, by_planes, clearance, displacement, tuple(planes))
-    return proof, lowest
+def _sorted(proof: StretchProof) -> StretchProof:
+    """The proof, sorted by claim and place."""
+    order = np.lexsort((proof.stretches.start, proof.stretches.claim))
+    place = np.argsort(order)
+    planes = sorted(plane._replace(stretch=int(place[plane.stretch])) for plane in proof.planes)
+    columns = proof.by_planes[order], proof.clearance[order], proof.displacement[order]
+    return StretchProof(proof.claims, proof.stretches.some(order), *columns, tuple(planes))
 
 
 def _down(values: Values) -> Values:
