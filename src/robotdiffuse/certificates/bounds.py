@@ -21,7 +21,7 @@ from numpy import ndarray
 
 from robotdiffuse.certificates.kinematics import Linkage, Postures
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.transforms import rotation_from_quaternion
+from robotdiffuse.core.transforms import ball_around, rotation_from_quaternion
 from robotdiffuse.core.types import (
     Configurations,
     JointRows,
@@ -588,7 +588,7 @@ def _balls(robot: Robot, link: str) -> Float[ndarray, "n 4"]:
     if not robot.meshes.get(link):
         return np.zeros((0, 4))
     vertices = np.concatenate([mesh.vertices for mesh in robot.meshes[link]])
-    center, radius = _ball(vertices)
+    center, radius = ball_around(vertices)
     return np.array([[*center, radius]])
 
 
@@ -596,13 +596,8 @@ def _parts(robot: Robot, link: str) -> tuple[Part, ...]:
     meshes = robot.meshes.get(link, ())
     none = np.zeros((0, 3), int)
     if meshes:
-        return tuple(Part(mesh.vertices, mesh.faces, 0.0, *_ball(mesh.vertices)) for mesh in meshes)
+        return tuple(Part(mesh.vertices, mesh.faces, 0.0, *ball_around(mesh.vertices)) for mesh in meshes)
     return tuple(Part(s[None, :3], none, float(s[3]), s[:3], float(s[3])) for s in robot.spheres[link])
-
-
-def _ball(vertices: ndarray) -> tuple[ndarray, float]:
-    center = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-    return center, float(np.sqrt(((vertices - center) ** 2).sum(axis=1)).max())
 
 
 class MovingProver(Prover):

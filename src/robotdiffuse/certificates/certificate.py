@@ -17,6 +17,7 @@ from robotdiffuse.core.bounds import MAX_RATE, numbers, one_line, within
 from robotdiffuse.core.errors import InputError, reading, shown
 from robotdiffuse.core.input_files import read_json
 from robotdiffuse.core.output_files import check_output, write_atomically
+from robotdiffuse.core.results import number, text
 from robotdiffuse.core.types import Path, Trajectory, check_motion_arrays
 from robotdiffuse.problems.problem import Problem
 
@@ -157,7 +158,7 @@ def _claim_proof(k: int, entry: dict[str, Any]) -> StretchProof:
 
 
 def _named_bounds(_: str, rows: list[Any]) -> tuple[tuple[str, float], ...]:
-    return tuple((str(name), _number(str(name), limit)) for name, limit in rows)
+    return tuple((str(name), number(str(name), limit)) for name, limit in rows)
 
 
 def _hashes(name: str, value: object) -> dict[str, str]:
@@ -173,27 +174,17 @@ def _vector(name: str, value: object) -> ndarray:
     return array
 
 
-def _number(name: str, value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{name} is {shown(value)}; it must be a finite number")
-    return float(value)
-
-
 def _tolerances(_: str, value: object) -> Tolerances:
     names = {f.name for f in fields(Tolerances)}
     if not isinstance(value, dict) or set(value) != names:
         raise InputError(f"tolerances must have the fields {', '.join(sorted(names))}")
-    return Tolerances(**{name: _number(name, number) for name, number in value.items()})
+    return Tolerances(**{name: number(name, entry) for name, entry in value.items()})
 
 
 def _problem(_: str, value: object) -> dict[str, Any] | None:
     if value is not None and not isinstance(value, dict):
         raise InputError("problem must be an object")
     return value
-
-
-def _text(_: str, value: object) -> str:
-    return str(value)
 
 
 class Field(NamedTuple):
@@ -209,13 +200,13 @@ class Field(NamedTuple):
 
 NUMBERS = Field(_vector, lambda array: array.tolist())
 FIELDS = {
-    "robot": Field(_text),
+    "robot": Field(text),
     "robot_parts": Field(_hashes),
     "scene_parts": Field(_hashes),
-    "motion_hash": Field(_text),
+    "motion_hash": Field(text),
     "tolerances": Field(_tolerances, asdict),
-    "scene_clearance": Field(_number),
-    "self_clearance": Field(_number),
+    "scene_clearance": Field(number),
+    "self_clearance": Field(number),
     "problem": Field(_problem),
     "motion": Field(_motion, _motion_record),
     "between": NUMBERS,

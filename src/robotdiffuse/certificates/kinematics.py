@@ -10,16 +10,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
+from robotdiffuse.core.transforms import rotation_about
 from robotdiffuse.core.types import (
     Configurations,
     JointRows,
     JointValues,
     Path,
     Points,
-    Rotation,
     Trajectory,
     Values,
-    Vector,
 )
 from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.robots.robot import Robot
@@ -56,39 +55,29 @@ class Linkage:
         return np.stack([moved[link] for link in self.links])
 
     def place(self, q: Configurations, link: str | None = None) -> Postures:
-        """Poses at configurations. If `link` is given, only links from the base to it are placed; rotations
-        and positions of other links are 0."""
+        """Poses at configurations. If `link` is given, only links from the base to it are placed; the
+        poses of other links are 0."""
         n, dof = q.shape
         T = np.zeros((n, len(self.links), 4, 4))
-        T[:, :, 3, 3] = 1.0
         origins = np.zeros((n, dof, 3))
         axes = np.zeros((n, dof, 3))
-        at = {self.robot.base: (np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)))}
+        at = {self.robot.base: np.tile(np.eye(4), (n, 1, 1))}
         for joint in self.robot.joints if link is None else self._up_to(link):
-            R, p = at[joint.parent]
-            turn = joint.T_parent_joint[:3, :3]
-            p = p + R @ joint.T_parent_joint[:3, 3]
+            T_base_joint = at[joint.parent] @ joint.T_parent_joint
             j = self._planned.get(joint.name)
-            axis = R @ (turn @ joint.axis)
-            value = np.full((n, 1), self.robot.locked.get(joint.name, 0.0)) if j is None else q[:, j, None]
+            value = np.full(n, self.robot.locked.get(joint.name, 0.0)) if j is None else q[:, j]
             if j is not None:
-                origins[:, j] = p
-                axes[:, j] = axis
-            if joint.kind in ("fixed", "prismatic"):
-                R = _times(R, turn)
-                p = p + value * axis * (joint.kind == "prismatic")
-            else:
-                K = cross_matrix(joint.axis)  # for Rodrigues' formula
-                angle = value[:, None]
-                R = (
-                    _times(R, turn)
-                    + np.sin(angle) * _times(R, turn @ K)
-                    + (1 - np.cos(angle)) * _times(R, turn @ K @ K)
-                )
-            at[joint.child] = R, p
+                origins[:, j] = T_base_joint[:, :3, 3]
+                axes[:, j] = T_base_joint[:, :3, :3] @ joint.axis
+            motion = np.tile(np.eye(4), (n, 1, 1))
+            if joint.kind == "prismatic":
+                motion[:, :3, 3] = value[:, None] * joint.axis
+            elif joint.kind != "fixed":
+                motion[:, :3, :3] = rotation_about(joint.axis, value[:, None, None])
+            at[joint.child] = T_base_joint @ motion
         for k, name in enumerate(self.links):
             if name in at:
-                T[:, k, :3, :3], T[:, k, :3, 3] = at[name]
+                T[:, k] = at[name]
         return Postures(T, origins, axes)
 
     def _up_to(self, link: str) -> list[Joint]:
@@ -191,16 +180,6 @@ class Linkage:
             went = went + spans[j] * arm
             remainder += spans[j] * arm * (spans[j] / 2 + spans[moving_joints[:i]].sum())
         return np.minimum(np.maximum(towards, 0.0) + remainder, went)
-
-
-def _times(R: Float[ndarray, "n 3 3"], right: Float[ndarray, "3 m"]) -> Float[ndarray, "n 3 m"]:
-    return (R.reshape(-1, 3) @ right).reshape(len(R), 3, right.shape[1])
-
-
-def cross_matrix(axis: Vector) -> Rotation:
-    """The matrix of the cross product with a vector."""
-    x, y, z = axis
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
 class Cubics(NamedTuple):

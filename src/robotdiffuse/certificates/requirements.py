@@ -29,13 +29,12 @@ from robotdiffuse.certificates.kinematics import (
     Linkage,
     Postures,
     clock,
-    cross_matrix,
     cubics_of,
     places_of,
 )
 from robotdiffuse.certificates.proof import BOUND_TOLERANCE, MotionProof, Tolerances
 from robotdiffuse.core.errors import InputError, joined
-from robotdiffuse.core.transforms import rotation_z_to
+from robotdiffuse.core.transforms import rotation_about, rotation_z_to
 from robotdiffuse.core.types import (
     Configurations,
     JointRows,
@@ -254,23 +253,27 @@ def _angle_bounds(along: _FrameMotion, chord: float, *ends: Pose) -> Values:
     length = float(np.linalg.norm(displacement))
     turn = T_goal[:3, :3] @ T_start[:3, :3].T
     total_angle = float(_angles(turn[None], np.eye(3))[0])
-    K = cross_matrix(np.linalg.eigh(turn + turn.T)[1][:, -1])
-    K = K if (turn * K).sum() >= 0 else -K  # an eigenvector's sign is arbitrary
+    axis = np.linalg.eigh(turn + turn.T)[1][:, -1]
+    axis = axis if _skew(turn) @ axis >= 0 else -axis  # an eigenvector's sign is arbitrary
     if length < MIN_LINE_LENGTH:  # rotation in place: compare with its nearest orientation
         turned = along.R @ T_start[:3, :3].T
-        sines = (turned * K).sum(axis=(1, 2))
-        cosines = -(turned * (K @ K)).sum(axis=(1, 2))
-        angles = np.clip(np.arctan2(sines, cosines), 0.0, total_angle)[:, None, None]
+        cosines = np.trace(turned, axis1=1, axis2=2) - turned @ axis @ axis
+        angles = np.clip(np.arctan2(_skew(turned) @ axis, cosines), 0.0, total_angle)
         angle_per_length = 0.0
     else:
         fraction = np.clip((along.p - T_start[:3, 3]) @ displacement / length**2, 0.0, 1.0)
-        angles = (fraction * total_angle)[:, None, None]
+        angles = fraction * total_angle
         angle_per_length = total_angle / length
-    target_rotations = (np.eye(3) + np.sin(angles) * K + (1 - np.cos(angles)) * (K @ K)) @ T_start[:3, :3]
+    target_rotations = rotation_about(axis, angles[:, None, None]) @ T_start[:3, :3]
     errors = _angles(along.R, target_rotations)
     return (errors[1:] + errors[:-1] + along.turn + angle_per_length * along.travel) / 2 + chord * (
         along.joints + angle_per_length * along.sensitivity
     )
+
+
+def _skew(R: Float[ndarray, "*n 3 3"]) -> Float[ndarray, "*n 3"]:
+    """The axis of each rotation, times twice the sine of its angle."""
+    return R[..., [2, 0, 1], [1, 2, 0]] - R[..., [1, 2, 0], [2, 0, 1]]
 
 
 def _angles(first: ndarray, second: ndarray) -> Values:

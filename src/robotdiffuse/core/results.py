@@ -190,7 +190,8 @@ def load_result(file: str | FilePath) -> ResultFile:
         return ResultFile(_result(record), problem)
 
 
-def _text(name: str, value: object) -> str:
+def text(name: str, value: object) -> str:
+    """The value, if it is a string. Raises InputError that names the field for anything else."""
     if not isinstance(value, str):
         raise InputError(f"{name} is {shown(value)}; it must be a string")
     return value
@@ -202,7 +203,8 @@ def _texts(name: str, value: object) -> tuple[str, ...]:
     return tuple(value)
 
 
-def _number(name: str, value: object) -> float:
+def number(name: str, value: object) -> float:
+    """The value as a number. Raises InputError that names the field for anything but a finite number."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise InputError(f"{name} is {shown(value)}; it must be a finite number")
     return float(value)
@@ -219,24 +221,24 @@ def _rows(name: str, value: object, count: int | None, columns: int) -> tuple[tu
 
 
 READERS: dict[str, Callable[[str, Any], Any]] = {
-    "reason": _text,
-    "planner": _text,
-    "stage": _text,
-    "robot": _text,
-    "planning_time": _number,
-    "seed": lambda name, value: int(_number(name, value)),
-    "min_clearance": _number,
-    "scene_clearance": _number,
-    "self_clearance": _number,
+    "reason": text,
+    "planner": text,
+    "stage": text,
+    "robot": text,
+    "planning_time": number,
+    "seed": lambda name, value: int(number(name, value)),
+    "min_clearance": number,
+    "scene_clearance": number,
+    "self_clearance": number,
     "notes": _texts,
     "goal_index": _index,
     "progress": lambda name, value: _rows(name, value, None, 2) if value else (),
-    "refused": _text,
-    "assumption": _text,
-    "confidence": _number,
-    "swept_probability": _number,
+    "refused": text,
+    "assumption": text,
+    "confidence": number,
+    "swept_probability": number,
     "unknown_region": lambda name, value: _rows(name, value, 2, 3),
-    "fraction": _number,
+    "fraction": number,
 }
 """Fields that result files hold under the same name, in this order, with the function that checks and
 converts each value."""
