@@ -70,11 +70,6 @@ count = number(int, lambda x: x > 0, "an integer of at least 1")
 port = number(int, lambda x: x < 2**16, "a port, an integer from 0 to 65535")
 
 
-def jerk_limit(text: str) -> float:
-    """A positive number, or infinity for "none"."""
-    return math.inf if text == "none" else positive(text)
-
-
 def assignment(text: str) -> tuple[str, float]:
     """NAME=VALUE with a finite value."""
     name, _, value = text.partition("=")

@@ -1,15 +1,15 @@
 """All commands with their options, by topic. The module of a command is imported when it runs."""
 
+from inspect import signature
+
 from robotdiffuse.cli.arguments import (
     address,
     assignment,
     count,
     folder,
-    jerk_limit,
     natural,
     not_negative,
     positive,
-    share,
 )
 from robotdiffuse.cli.command import (
     ADDRESS,
@@ -27,8 +27,19 @@ from robotdiffuse.cli.command import (
     Group,
 )
 from robotdiffuse.cli.study_commands import BENCH, DATA, REPRODUCE, TRAIN
-from robotdiffuse.core.types import CONVERGED, OBJECTIVES, TIME, UNTIL
+from robotdiffuse.planning import described_arguments, plan
 
+_DESCRIPTIONS = described_arguments()
+REQUEST = tuple(
+    (
+        f"--{name.replace('_', '-')} {name.upper()}",
+        _DESCRIPTIONS[name].replace("None:", "Default:")
+        + ("" if argument.default is None else f" Default: {argument.default}."),
+    )
+    for name, argument in signature(plan).parameters.items()
+    if name != "problem" and argument.kind is argument.POSITIONAL_OR_KEYWORD
+)
+"""The options that are arguments of `rd.plan`, as its docstring describes them."""
 PLANNING = (
     Command(
         "plan",
@@ -50,20 +61,7 @@ PLANNING = (
                 "a setting of the planner; see `robotdiffuse planner info NAME`; repeatable",
                 {"dest": "settings"},
             ),
-            ("--time-limit S", "time limit for planning (default: 1 s)", positive, 1.0),
-            (
-                "--until",
-                "stop at the first motion, when more time hardly improves it (default), or at the time limit",
-                None,
-                CONVERGED,
-                {"choices": UNTIL},
-            ),
-            (
-                "--clearance M",
-                "distance to obstacles to keep where possible, up to 0.5 m (default: the problem's, or 0.01 "
-                "m)",
-                not_negative,
-            ),
+            *REQUEST,
             (
                 "--unknown POLICY",
                 "policy for space that the problem's views do not show: optimistic (free), padded, predicted "
@@ -75,34 +73,12 @@ PLANNING = (
                 "--next-view",
                 "propose a camera pose that shows most of the unknown space that the motion crosses",
             ),
-            *(
-                (
-                    f"--{rate}-scaling X",
-                    f"fraction of the robot's {rate} limits to use, from 0.001 to 1 (default: 1)",
-                    share,
-                    1.0,
-                )
-                for rate in ("velocity", "acceleration")
-            ),
-            (
-                "--jerk J",
-                "jerk limit of each joint, at least 0.01 rad/s³, or none (default: the robot's limits)",
-                jerk_limit,
-            ),
-            (
-                "--objective",
-                "what searches minimize: the path's length or the motion's duration (default: time)",
-                None,
-                TIME,
-                {"choices": OBJECTIVES},
-            ),
             (
                 "--blend R",
                 "pass the problem's waypoints without stopping, within this distance: in rad for "
                 "configurations, in m for poses (default: the problem's, or stop)",
                 positive,
             ),
-            SEED,
             (
                 "--out FILE *",
                 "file to write: result (.json), trajectory (.csv), replay (.html), picture (.png), or for "

@@ -1,10 +1,10 @@
 """The command `robotdiffuse plan`."""
 
-from dataclasses import fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from robotdiffuse.cli.arguments import ENDINGS, NO_PLAN, SOLVED, Namespace
+from robotdiffuse.cli.arguments import ENDINGS, NO_PLAN, SOLVED, Namespace, chosen
 from robotdiffuse.cli.compile_ahead import compiling_ahead
 from robotdiffuse.cli.console import Spinner, print_next_view, print_result
 from robotdiffuse.core.errors import InputError
@@ -26,13 +26,13 @@ def run_plan(arguments: Namespace) -> int:
     PLANNERS.entry(name)
     settings = planner_settings(name, arguments.settings) if arguments.settings else None
     outputs = _outputs(arguments)
+    request = _request(arguments)
     problem = _problem(arguments)
-    request = {field.name: getattr(arguments, field.name) for field in fields(PlanRequest)}
     picture = any(file.suffix.lower() == ".png" for file in outputs)
-    result = load_and_plan(problem, name, settings, arguments.weights, picture, **request)
+    result = load_and_plan(problem, name, settings, arguments.weights, picture, **asdict(request))
     # files first: printing into `| head` can end the process
     written = [file for file in outputs if _write(problem, result, file)]
-    print_result(result, asked_clearance(problem, name, arguments.clearance))
+    print_result(result, asked_clearance(problem, name, request.clearance))
     if arguments.next_view and result.path is not None:
         print_next_view(problem, result)
     for file in outputs:
@@ -42,6 +42,14 @@ def run_plan(arguments: Namespace) -> int:
 
         open_in_browser(outputs[-1])
     return SOLVED if result.solved else NO_PLAN
+
+
+def _request(arguments: Namespace) -> PlanRequest:
+    """The request of the options; `--jerk none` removes the limits."""
+    options = chosen(arguments, PlanRequest.__dataclass_fields__)
+    if options.get("jerk") == "none":
+        options["jerk"] = "inf"
+    return PlanRequest().changed(f"{name}={value}" for name, value in options.items())
 
 
 def _outputs(arguments: Namespace) -> list[Path]:

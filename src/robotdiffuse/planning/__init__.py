@@ -1,5 +1,7 @@
 """The planners by name. A new planner is one file and one line in PLANNERS."""
 
+import inspect
+import re
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
@@ -209,8 +211,8 @@ def plan(
             None: the problem's clearance, or 1 cm if it has none. Other planners refuse a clearance.
         velocity_scaling: Fraction of the velocity limits that the motion uses, from 0.001 to 1.
         acceleration_scaling: Fraction of the acceleration limits that the motion uses, from 0.001 to 1.
-        jerk: Largest jerk of any joint [rad/s³], at least 0.01; infinite: no limit. None: each joint's own
-            jerk limit; for a joint without one, 10 / s times its acceleration limit.
+        jerk: Largest jerk of any joint [rad/s³], at least 0.01; infinite (`--jerk none`): no limit. None:
+            each joint's own jerk limit; for a joint without one, 10 / s times its acceleration limit.
         objective: What aorrtc, rrt_connect and robotdiffuse minimize: "time", the motion's duration, or
             "length" of the path in joint space.
         planner: A name that `robotdiffuse planner list` shows. A planner stays loaded for later calls with
@@ -247,3 +249,10 @@ def plan(
     return loaded.plan(
         problem, time_limit, seed, until, clearance, velocity_scaling, acceleration_scaling, jerk, objective
     )
+
+
+def described_arguments() -> dict[str, str]:
+    """The arguments of `plan`, as its docstring describes them, for the command line and the server."""
+    _, _, arguments = (inspect.getdoc(plan) or "").partition("Args:\n")
+    texts = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", arguments, re.MULTILINE)
+    return {name: " ".join(text.split()) for name, text in texts}

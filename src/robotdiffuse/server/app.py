@@ -1,9 +1,7 @@
 """The HTTP application: endpoints, limits of requests, and errors as one line of JSON."""
 
 import asyncio
-import inspect
 import json
-import re
 import secrets
 import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping
@@ -26,7 +24,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import shown
 from robotdiffuse.core.types import MAX_SAMPLE_RATE, Status
-from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, plan
+from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, described_arguments
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.problems.fields import problem_schema
 from robotdiffuse.robots.robot import Robot
@@ -59,14 +57,7 @@ class _Request(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
 
-def _documented() -> dict[str, str]:
-    """The arguments of `rd.plan`, as its docstring describes them."""
-    _, _, arguments = (inspect.getdoc(plan) or "").partition("Args:\n")
-    texts = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", arguments, re.MULTILINE)
-    return {name: " ".join(text.split()) for name, text in texts}
-
-
-_DESCRIPTIONS = _documented()
+_DESCRIPTIONS = described_arguments()
 _TYPES = get_type_hints(PlanRequest, include_extras=True)
 _ARGUMENTS: dict[str, Any] = {
     field.name: (_TYPES[field.name], Field(field.default, description=_DESCRIPTIONS.get(field.name)))
