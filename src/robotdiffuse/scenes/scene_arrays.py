@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float, Float32, Int, Int8
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.transforms import rotation_from_quaternion
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Shape, Sphere
 
@@ -33,8 +32,7 @@ class PackedScenes:
     """Parameters of a sphere: center, radius. Of a box: center, size, wxyz. Other entries are zero."""
     floors: Float[ndarray, "n 6"] | None = None
     """Center and size of each scene's floor, zeros for a scene without a floor; None if no scene has one.
-    Floors do not count as obstacles: point clouds and `distances` leave them out, and `turned` does not turn
-    them."""
+    Floors do not count as obstacles: point clouds leave them out, and `turned` does not turn them."""
 
     def __len__(self) -> int:
         return len(self.kinds)
@@ -110,23 +108,6 @@ class PackedScenes:
         w, i, j, k = np.moveaxis(params[..., 6:].copy(), -1, 0)
         params[..., 6:] = np.stack([c * w - s * k, c * i - s * j, c * j + s * i, c * k + s * w], -1)
         return PackedScenes(self.kinds, params, self.floors)
-
-    def distances(self, at: Float[ndarray, "points 3"]) -> Float[ndarray, "n points"]:
-        """Signed distance [m] of points to the nearest obstacle of each scene; infinite if the scene has no
-        obstacles."""
-        nearest = np.full((len(self), len(at)), np.inf)
-        for kind, p in zip(self.kinds.T, self.params.transpose(1, 0, 2).astype(np.float64), strict=True):
-            is_box = kind == BOX
-            is_shape = kind != NONE
-            offsets = at - p[:, None, :3]
-            distance = np.linalg.norm(offsets, axis=-1) - p[:, 3, None]
-            local = (
-                np.abs(offsets[is_box] @ rotation_from_quaternion(p[is_box, 6:])) - p[is_box, None, 3:6] / 2
-            )
-            outside = np.linalg.norm(local.clip(min=0), axis=-1)
-            distance[is_box] = outside + local.max(-1).clip(max=0)
-            nearest[is_shape] = np.minimum(nearest[is_shape], distance[is_shape])
-        return nearest
 
 
 def floor_row(floor: Shape | None) -> Float[ndarray, "6"]:

@@ -131,7 +131,7 @@ def test_device_is_checked(data, tmp_path, monkeypatch):
 @pytest.mark.parametrize("kind", ["encoder", "planner"])
 @pytest.mark.usefixtures("no_export")
 def test_interrupted_training_ends_the_same(kind, tmp_path, data, monkeypatch):
-    monkeypatch.setattr(training, "READOUT_SCENES", 256)
+    monkeypatch.setattr(training, "STANDARDIZATION_SCENES", 256)
 
     def train(out):
         if kind == "encoder":

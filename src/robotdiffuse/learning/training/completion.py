@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path as FilePath
 from typing import Annotated, Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.settings import Count, Filled, Natural, OneOf, Positive
-from robotdiffuse.learning.checkpoint import load_completion, save_network
+from robotdiffuse.learning.checkpoint import load_completion
 from robotdiffuse.learning.completion import (
     FREE,
     OCCUPIED,
@@ -34,7 +33,7 @@ from robotdiffuse.learning.completion import (
 from robotdiffuse.learning.completion_network import CompletionNetwork, folded
 from robotdiffuse.learning.network import Scalar
 from robotdiffuse.learning.training.config import ShareBelowOne, TrainingSettings
-from robotdiffuse.learning.training.loop import Processes, TrainingTask, Validation, on_cpu, train
+from robotdiffuse.learning.training.loop import Processes, TrainingTask, Validation, train
 from robotdiffuse.perception.voxel_grid import VOXEL
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.processes.workers import Workers
@@ -161,11 +160,10 @@ class CompletionTask(TrainingTask):
         self.identity = {}
         self.robot = load_robot(settings.robot)
         torch.manual_seed(settings.seed)
-        self.module = self._trained = self._initial(settings).to(processes.device)
+        self.module = self._initial(settings).to(processes.device)
         self.prefetcher = SamplePrefetcher(settings.families, self.robot, settings.batch, settings.workers)
         self._reachable, self._above = reachable(), voxel_centers()[..., 2] > VOXEL / 2
         self._validation_samples = self._held_out(settings.families, 0, VALIDATION_SAMPLES)
-        self._figures: dict[str, Any] = {}
 
     def _initial(self, settings: CompletionTraining) -> CompletionNetwork:
         """The network that training begins with."""
@@ -189,23 +187,23 @@ class CompletionTask(TrainingTask):
         return Validation(float(np.mean(parts)))
 
     def finish(self) -> dict[str, float]:
-        network = self._trained = on_cpu(self.module)
         families = self.settings.families
         loss = self.validate(1.0).loss
         logits, truth, _ = self._predictions(
             self._held_out(families, VALIDATION_SAMPLES, CALIBRATION_SAMPLES)
         )
         with torch.no_grad():
-            network.temperature.fill_(
+            self.module.temperature.fill_(
                 fitted_temperature(logits[::CALIBRATION_STRIDE], truth[::CALIBRATION_STRIDE])
             )
-        report = {"validation": loss, "temperature": float(network.temperature)}
+        temperature = float(self.module.temperature)
+        report = {"validation": loss, "temperature": temperature}
         all_p = []
         all_truth = []
         for name in FAMILIES:
             held_out = self._held_out((name,), VALIDATION_SAMPLES + CALIBRATION_SAMPLES, TEST_SAMPLES)
             logits, truth, unknown = self._predictions(held_out)
-            p = 1 / (1 + np.exp(-logits / float(network.temperature)))
+            p = 1 / (1 + np.exp(-logits / temperature))
             p = p[unknown]
             truth = truth[unknown]
             predicted_occupied = p > OCCUPIED_PROBABILITY
@@ -220,14 +218,7 @@ class CompletionTask(TrainingTask):
         p = np.concatenate(all_p)
         truth = np.concatenate(all_truth)
         report["calibration error"] = calibration_error(p, truth)
-        self._figures = {"reliability": reliability(p, truth)}
         return report
-
-    def about(self) -> dict[str, Any]:
-        return self._figures
-
-    def save(self, folder: FilePath, training: dict[str, Any]) -> None:
-        save_network("completion", self._trained, folder, training)
 
     def _held_out(self, families: tuple[str, ...], first: int, count: int) -> Samples:
         """`count` held-out samples of each family, beginning with sample number `first`."""
@@ -289,22 +280,12 @@ def fitted_temperature(logits: Floats, truth: Flags) -> float:
     return float(np.exp(optimum.x))
 
 
-def reliability(p: Floats, truth: Flags) -> list[list[float]]:
-    """For each bin of predicted probabilities: their mean, the share of occupied voxels, and the count."""
-    bin_indices = np.minimum((p * CALIBRATION_BINS).astype(int), CALIBRATION_BINS - 1)
-    count = np.bincount(bin_indices, minlength=CALIBRATION_BINS)
-    predicted, true_share = (
-        np.bincount(bin_indices, values, CALIBRATION_BINS) / np.maximum(count, 1) for values in (p, truth)
-    )
-    rows = zip(predicted.tolist(), true_share.tolist(), count.tolist(), strict=True)
-    return [[round(a, 4), round(b, 4), float(n)] for a, b, n in rows]
-
-
 def calibration_error(p: Floats, truth: Flags) -> float:
     """Expected calibration error: the mean over the voxels of |mean predicted probability - share of occupied
     voxels| of their bins."""
-    rows = np.array(reliability(p, truth))
-    return float((np.abs(rows[:, 0] - rows[:, 1]) * rows[:, 2]).sum() / max(1.0, rows[:, 2].sum()))
+    bins = np.minimum((p * CALIBRATION_BINS).astype(int), CALIBRATION_BINS - 1)
+    excess = np.bincount(bins, p.astype(np.float64) - truth, CALIBRATION_BINS)
+    return float(np.abs(excess).sum() / max(1, len(p)))
 
 
 def average_precision(p: Floats, truth: Flags) -> float:

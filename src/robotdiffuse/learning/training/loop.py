@@ -32,7 +32,7 @@ from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError, needs
 from robotdiffuse.core.output_files import lock_folder, write_atomically
 from robotdiffuse.learning import need_packages
-from robotdiffuse.learning.checkpoint import read_tensors, write_tensors
+from robotdiffuse.learning.checkpoint import read_tensors, save_network, write_tensors
 from robotdiffuse.learning.encoders.networks import Encoder
 from robotdiffuse.learning.network import EXPORT_PACKAGES, Scalar
 from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16, load_data
@@ -162,7 +162,7 @@ class TrainingTask(ABC):
     """Settings, of a subclass of `TrainingSettings`."""
     processes: Processes
     title: str
-    """Name in progress and messages."""
+    """Name of the network, in files, progress and messages."""
     module: nn.Module
     """The network, on the device of the processes."""
     identity: dict[str, str]
@@ -185,9 +185,9 @@ class TrainingTask(ABC):
         """Further information on the training for the description of the weights."""
         return {}
 
-    @abstractmethod
     def save(self, folder: FilePath, training: dict[str, Any]) -> None:
-        """Write the weights and their description."""
+        """Write the weights, in files named by the title, and their description."""
+        save_network(self.title, self.module, folder, training)
 
 
 @dataclass

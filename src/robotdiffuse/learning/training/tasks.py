@@ -4,7 +4,6 @@ import copy
 from abc import ABC, abstractmethod
 from dataclasses import fields
 from functools import partial
-from pathlib import Path as FilePath
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,7 +16,7 @@ from torch import Tensor
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Mask
-from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, save_network
+from robotdiffuse.learning.checkpoint import fingerprint, load_encoder
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.encoders import encoder_name, make_encoder
 from robotdiffuse.learning.encoders.networks import Autoencoder, Encoder, Loss
@@ -55,28 +54,18 @@ from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 
-# Number of scenes to which a linear read-out is fitted, and number of further scenes on which it is tested.
-READOUT_SCENES = 2048
-TEST_SCENES = 512
-READOUT_POSITIONS = np.stack(
-    np.meshgrid([-0.6, -0.2, 0.2, 0.6], [-0.6, -0.2, 0.2, 0.6], [0.2, 0.5, 0.8], indexing="ij"), -1
-).reshape(-1, 3)
-"""Positions around the arm [m] whose distance to the obstacles is read out."""
-MAX_READOUT_DISTANCE = 0.3
-"""Distances are clipped to plus and minus this [m]."""
+STANDARDIZATION_SCENES = 2048
+"""Number of scenes over which the numbers of z are standardized."""
 REGULARIZATION = 1e-7
 """The paper's lambda: factor of the sum of the network's squared weights, which is added to the loss."""
-RELATIVE_RIDGE = 1e-3
-"""Ridge regularization of `linear_readout`, relative to the mean variance of the entries of the
-embeddings."""
 
 
 def train_encoder(settings: EncoderTraining, out: str) -> dict[str, float]:
     """Train an auto-encoder; write encoder.safetensors and encoder.json into the folder `out`.
 
     The same call continues a run that was interrupted. Returns the errors on new clouds [m] that the
-    encoder's `loss` and `linear_readout` report, and `samples`, the number of training samples. Raises the
-    errors of `loop.train`.
+    encoder's `loss` reports, and `samples`, the number of training samples. Raises the errors of
+    `loop.train`.
     """
     return train(_EncoderTask(settings, Processes(settings.device)), out)
 
@@ -92,7 +81,7 @@ class _EncoderTask(TrainingTask):
         torch.manual_seed(settings.seed)
         module = make_encoder(settings.name, settings.encoder)
         assert isinstance(module, Autoencoder)  # by EncoderTraining
-        self.module = self._trained = module.to(processes.device)
+        self.module = module.to(processes.device)
         self._max_points = settings.points if module.settings.any_size else module.settings.cloud
 
     def loss(self, fraction: float, rng: Generator) -> Scalar:
@@ -109,16 +98,12 @@ class _EncoderTask(TrainingTask):
     def finish(self) -> dict[str, float]:
         settings = self.settings
         rng = np.random.default_rng(settings.seed + 1)
-        scenes = self._scenes(READOUT_SCENES, rng)
-        report = self._validation(512, settings.seed + 2)[1]
-        trained = self._trained = on_cpu(self.module)
+        scenes = self._scenes(STANDARDIZATION_SCENES, rng)
+        encoder = on_cpu(self.module)
         with torch.no_grad():
-            clouds = scene_clouds(trained, scenes, rng).split(256)
-            trained.standardize(torch.cat([trained.encode(part) for part in clouds]))
-        return report | linear_readout(trained, self._scenes(READOUT_SCENES + TEST_SCENES, rng), rng)
-
-    def save(self, folder: FilePath, training: dict[str, Any]) -> None:
-        save_network("encoder", self._trained, folder, training)
+            clouds = scene_clouds(encoder, scenes, rng).split(256)
+            self.module.standardize(torch.cat([encoder.encode(part) for part in clouds]))
+        return self._validation(512, settings.seed + 2)[1]
 
     def _scenes(self, count: int, rng: Generator) -> PackedScenes:
         settings = self.settings
@@ -133,34 +118,6 @@ class _EncoderTask(TrainingTask):
         cloud = scene_clouds(self.module, scenes, rng, points).to(self.processes.device)
         with self.processes.autocast():
             return self.module.loss(cloud, rng)
-
-
-def linear_readout(encoder: Encoder, scenes: PackedScenes, rng: Generator) -> dict[str, float]:
-    """Errors of a linear read-out of z, a measure that all encoders can be compared by.
-
-    A linear map from z to the signed distances of fixed positions around the arm to the obstacles is fitted
-    to the first READOUT_SCENES and tested on the others. `readout`: mean error of this map [m];
-    `readout_of_constant`: mean error if the mean distances are predicted, without z [m].
-    """
-    with torch.no_grad():
-        clouds = scene_clouds(encoder, scenes, rng).split(256)
-        z = torch.cat([encoder(part) for part in clouds]).numpy().astype(np.float64)
-    targets = (
-        scenes.distances(READOUT_POSITIONS)
-        .clip(-MAX_READOUT_DISTANCE, MAX_READOUT_DISTANCE)
-        .astype(np.float64)
-    )
-    # z and targets relative to their means over the scenes of the fit
-    (z, z_test), (target_fit, target_test) = (
-        np.split(values - values[:READOUT_SCENES].mean(0), [READOUT_SCENES]) for values in (z, targets)
-    )
-    gram = z.T @ z
-    ridge = max(RELATIVE_RIDGE * np.trace(gram) / len(gram), np.finfo(np.float64).tiny)
-    weights = np.linalg.solve(gram + ridge * np.eye(len(gram)), z.T @ target_fit)
-    return {
-        "readout": float(np.abs(target_test - z_test @ weights).mean()),
-        "readout_of_constant": float(np.abs(target_test).mean()),
-    }
 
 
 SAMPLING_STEPS = 6
@@ -287,9 +244,6 @@ class PlannerTask(MotionTask):
 
     def _encoder_fingerprint(self, name: str) -> dict[str, str]:
         return {} if self.model.encoder is None else {name: fingerprint(self.model.encoder)}
-
-    def save(self, folder: FilePath, training: dict[str, Any]) -> None:
-        save_network(self.title, self.model, folder, training)
 
 
 def model_settings(settings: PlannerTraining, encoder: Encoder | None) -> MotionModelSettings:
@@ -442,6 +396,3 @@ class _BaselineTask(MotionTask):
         validation = super().validate(fraction)
         self.module.train()
         return validation
-
-    def save(self, folder: FilePath, training: dict[str, Any]) -> None:
-        save_network(self.title, self.module, folder, training)
