@@ -275,18 +275,18 @@ def history() -> depth_recording.TransformHistory:
 
 @pytest.mark.parametrize(("at", "share"), [(5.0, 0.0), (5.025, 0.25), (5.1, 1.0), (5.15, 1.0)])
 def test_chains_are_followed_and_interpolated_and_at_the_ends_the_nearest_counts(at: float, share: float) -> None:
-    T = history().at("base", "camera", at, 0.1, "the image")
+    T = history().at("base", "camera", at, "the image")
     np.testing.assert_allclose(T[:3, :3], Rotation.from_rotvec([0, 0, share]).as_matrix(), atol=1e-6)
     np.testing.assert_allclose(T[:3, 3], [2 * np.cos(share), 2 * np.sin(share), 0.0], atol=1e-6)
 
 
 def test_missing_transforms_are_said() -> None:
-    refuses(r"no transform of link within 0\.1 s of the image", history().at, "base", "camera", 6.0, 0.1, "the image")
+    refuses(r"no transform of link within 0\.1 s of the image", history().at, "base", "camera", 6.0, "the image")
     with pytest.raises(rd.InputError, match=r"no transforms connect camera.*with world.*are link, base"):
-        history().at("world", "camera", 5.0, 0.1, "the image")
+        history().at("world", "camera", 5.0, "the image")
     circle = history()
     circle.add(pose("camera", "base", 5.0), static=True)
-    refuses("no transforms connect camera", circle.at, "world", "camera", 5.0, 0.1, "the image")
+    refuses("no transforms connect camera", circle.at, "world", "camera", 5.0, "the image")
     bad = pose("base", "link", 5.0)
     bad["transform"]["rotation"] = dict.fromkeys("xyzw", 0.0)
     refuses("the transform of link has the rotation", circle.add, bad, static=False)

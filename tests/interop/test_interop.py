@@ -380,7 +380,7 @@ def test_unknown_endings_list_the_known_ones(planned: Planned, tmp_path: Path) -
     [
         ("mcap.reader", "mcap", "ros", lambda: import_module("robotdiffuse.interop.ros2")),
         ("rerun", "rerun-sdk", "rerun", lambda: import_module("robotdiffuse.interop.rerun_file")),
-        ("roslibpy", "roslibpy", "ros", lambda: publish(MOTION, "")),
+        ("roslibpy", "roslibpy", "ros", lambda: publish(MOTION, "", 1, "/a", 1.0)),
     ],
 )
 def test_a_missing_extra_says_what_to_install(
@@ -409,19 +409,19 @@ def test_motions_are_published_to_a_rosbridge(planned: Planned, monkeypatch: pyt
     monkeypatch.setattr(recorded_motion, "sleep", wait)
     with serve(lambda client: heard.extend(map(json.loads, client)), "127.0.0.1", 0) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        publish(trajectory, "127.0.0.1", server.socket.getsockname()[1], "/arm/joint_trajectory")
+        publish(trajectory, "127.0.0.1", server.socket.getsockname()[1], "/arm/joint_trajectory", 5.0)
         server.shutdown()
     assert waited == ["advertise", "publish"]
     advertised, published = heard[:2]
     assert (advertised["op"], advertised["type"]) == ("advertise", "trajectory_msgs/msg/JointTrajectory")
     assert (published["op"], published["topic"]) == ("publish", "/arm/joint_trajectory")
-    assert published["msg"] == joint_trajectory(trajectory.joint_names, trajectory)
+    assert published["msg"] == joint_trajectory(trajectory)
     found = motion_of_robot(motion_from_record(published["msg"], "it"), PANDA).motion
     np.testing.assert_array_equal(found.positions, trajectory.positions)
 
 
 def test_no_rosbridge_is_one_line() -> None:
-    refuses(r"no rosbridge answers at 127\.0\.0\.1:1 within 1 s", publish, MOTION, "127.0.0.1", 1, timeout=1.0)
+    refuses(r"no rosbridge answers at 127\.0\.0\.1:1 within 1 s", publish, MOTION, "127.0.0.1", 1, "/a", 1.0)
 
 
 def test_a_bag_replaces_a_link_to_one(tmp_path: Path) -> None:

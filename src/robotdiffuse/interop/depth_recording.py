@@ -13,7 +13,7 @@ from bisect import bisect_left, insort
 from collections.abc import Iterator, Mapping, Sequence
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -25,11 +25,13 @@ from robotdiffuse.core.errors import InputError, reading
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
 from robotdiffuse.core.types import Configuration, JointValues, Pose
+from robotdiffuse.interop.recorded_motion import time_message
 from robotdiffuse.interop.ros2 import (
     JOINT_STATE,
     McapWriter,
     Recording,
     header_seconds,
+    joint_state,
     opened_recording,
     to_plain,
 )
@@ -41,7 +43,6 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 ENCODINGS = {"32FC1": ("f4", 1.0), "16UC1": ("u2", 0.001), "mono16": ("u2", 0.001)}
 """For each encoding of depth images, the type of the pixels and the meters per unit (REP 118)."""
-Stamped = TypeVar("Stamped", bound=tuple[float, Any])
 MAX_SIZE = 64 * 10**9
 """Largest size of a recording [bytes]."""
 MAX_GAP = 0.1
@@ -68,26 +69,17 @@ def write_depth_views(robot: Robot, views: Mapping[str, Sequence[StampedView]], 
             for name, views_of_camera in views.items()
             for recorded in views_of_camera
         ),
-        key=lambda recorded: recorded[0],
+        key=itemgetter(0),
     )
     for stamp, name, view in ordered:
         at = round(1e9 * stamp)
         if view.configuration is None:
             raise InputError(f"the view of {name} at {stamp:g} s has no configuration")
         frame = f"{name}_depth_optical_frame"
-        times = {"sec": at // 10**9, "nanosec": at % 10**9}
-        header = {"stamp": times, "frame_id": frame}
-        names = [*robot.joint_names, *robot.locked]
-        positions = [*view.configuration.tolist(), *robot.locked.values()]
-        out.ros(
-            "/joint_states",
-            JOINT_STATE,
-            {"header": {"stamp": times}, "name": names, "position": positions},
-            at,
-        )
-        out.ros(
-            "/tf", TRANSFORMS, {"transforms": [_transform(robot.base, frame, times, view.T_base_camera)]}, at
-        )
+        header = {"stamp": time_message(at), "frame_id": frame}
+        out.ros("/joint_states", JOINT_STATE, joint_state(robot, view.configuration, at), at)
+        stamped = _transform(robot.base, frame, header["stamp"], view.T_base_camera)
+        out.ros("/tf", TRANSFORMS, {"transforms": [stamped]}, at)
         out.ros(f"/{name}/depth/camera_info", CAMERA_INFO, _camera_info(header, view), at)
         out.ros(f"/{name}/depth/image_rect_raw", IMAGE, _image(header, view), at)
     out.writer.finish()
@@ -105,11 +97,11 @@ def _transform(parent: str, child: str, stamp: dict[str, int], T: Pose) -> dict[
 
 
 def _camera_info(header: dict[str, Any], view: DepthView) -> dict[str, Any]:
-    (height, width), (fx, fy, cx, cy) = view.depth.shape, view.intrinsics
+    fx, fy, cx, cy = view.intrinsics
     return {
         "header": header,
-        "height": height,
-        "width": width,
+        "height": view.depth.shape[0],
+        "width": view.depth.shape[1],
         "distortion_model": "plumb_bob",
         "d": [0.0] * 5,
         "k": [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
@@ -178,9 +170,10 @@ def _read(
     infos: dict[str, dict[str, Any]] = {}
     units: dict[str, float] = {}
     has_states = JOINT_STATE in kinds.values()
+    # the meters per unit of a sensor's depth images, as librealsense writes them
+    unit_topics = [name for name in kinds if name.replace(" ", "_").endswith("/option/Depth_Units/value")]
     other_topics = [name for name, kind in kinds.items() if kind in (JOINT_STATE, TRANSFORMS, CAMERA_INFO)]
-    other_topics += [name for name in kinds if _is_unit(name)]
-    for topic, at, message in recording.messages(other_topics):
+    for topic, at, message in recording.messages(other_topics + unit_topics):
         kind = kinds[topic]
         if kind == CAMERA_INFO:  # the names are upper-case in ROS 1: K, D, P
             infos.setdefault(_folder(topic), {k.lower(): value for k, value in to_plain(message).items()})
@@ -191,19 +184,17 @@ def _read(
                 transforms.add(to_plain(stamped), static=topic.endswith("static"))
         else:
             units[topic.partition("/option/")[0]] = float(message.data)
-    has_images = False
     has_views = False
     reason: InputError | None = None
     for topic, at, message in recording.messages(images):
         if message.encoding not in ENCODINGS and topics is None:
             continue
-        has_images = True
         stamp = _seconds(message, at)
         location = f"the image of {topic} at {stamp:.3f} s"
         try:
             T = T_base_camera
             if T is None:
-                T = transforms.at(base, message.header.frame_id, stamp, MAX_GAP, location)
+                T = transforms.at(base, message.header.frame_id, stamp, location)
             q = states.at(stamp, location) if has_states or T_base_camera is None else None
         except InputError as error:
             reason = reason or error
@@ -212,11 +203,9 @@ def _read(
         intrinsics = _intrinsics(topic, infos.get(_folder(topic)), message)
         unit = next((unit for device, unit in units.items() if topic.startswith(f"{device}/")), None)
         yield StampedView(stamp, DepthView(_depth(location, message, unit), intrinsics, T, q))
-    if reason is not None and not has_views:
-        raise reason
-    if not has_images:
+    if not has_views:
         listed = ", ".join(f"{topic} ({kind})" for topic, kind in kinds.items()) or "none"
-        raise InputError(f"{path} holds no depth images (32FC1 or 16UC1); topics: {listed}")
+        raise reason or InputError(f"{path} holds no depth images (32FC1 or 16UC1); topics: {listed}")
 
 
 def _image_topics(kinds: Mapping[str, str], requested: Sequence[str] | None) -> list[str]:
@@ -234,15 +223,9 @@ def _folder(topic: str) -> str:
     return folder if last in ("image", "info") else f"{folder}/{last}"  # librealsense's
 
 
-def _is_unit(topic: str) -> bool:
-    """Whether a topic has the meters per unit of a sensor's depth images, as librealsense writes them."""
-    return topic.replace(" ", "_").endswith("/option/Depth_Units/value")
-
-
 def _seconds(message: Any, logged: int) -> float:
     """The stamp of a message; its log time if the message has no stamp [s]."""
-    stamp = message.header.stamp
-    return header_seconds({"sec": stamp.sec, "nanosec": stamp.nanosec}) or 1e-9 * logged
+    return header_seconds(to_plain(message.header.stamp)) or 1e-9 * logged
 
 
 def _intrinsics(topic: str, info: Any, image: Any) -> tuple[float, float, float, float]:
@@ -274,18 +257,12 @@ def _depth(where: str, image: Any, unit: float | None) -> Float[ndarray, "h w"]:
     return scale * pixels.astype(np.float32)
 
 
-def insert_by_time(history: list[Stamped], stamped: Stamped) -> None:
-    """Insert an entry into a history sorted by time. Messages may be logged in another order than that of
-    their stamps."""
-    insort(history, stamped, key=itemgetter(0))
-
-
-def around(history: list[Stamped], stamp: float, gap: float) -> tuple[Any, Any, float] | None:
-    """The entries before and after a time, and the fraction of the interval between them that has passed at
-    the time. If only one entry is within `gap` [s] of the time, it is returned twice; None if there is
-    none."""
+def around(history: list[tuple[float, Any]], stamp: float) -> tuple[Any, Any, float] | None:
+    """The entries before and after a time in a history sorted by time, and the fraction of the interval
+    between them that has passed at the time. If only one entry is within MAX_GAP of the time, it is returned
+    twice; None if there is none."""
     i = bisect_left(history, stamp, key=itemgetter(0))
-    near = [history[k] for k in (i - 1, i) if 0 <= k < len(history) and abs(history[k][0] - stamp) <= gap]
+    near = [row for row in history[max(i - 1, 0) : i + 1] if abs(row[0] - stamp) <= MAX_GAP]
     if not near:
         return None
     (t0, first), (t1, last) = near[0], near[-1]
@@ -301,6 +278,7 @@ class TransformHistory:
         self._parent: dict[str, str] = {}
         self._static: set[str] = set()
         self._poses: dict[str, list[tuple[float, Pose]]] = {}
+        """Sorted by time: messages may be logged in another order than that of their stamps."""
 
     def add(self, message: Mapping[str, Any], static: bool) -> None:
         """Add a geometry_msgs/TransformStamped, as plain data."""
@@ -317,10 +295,10 @@ class TransformHistory:
         if static:
             self._static.add(child)
         stamped = header_seconds(message["header"]["stamp"]), T
-        insert_by_time(self._poses.setdefault(child, []), stamped)
+        insort(self._poses.setdefault(child, []), stamped, key=itemgetter(0))
 
-    def at(self, base: str, frame: str, stamp: float, gap: float, where: str) -> Pose:
-        """T_base_frame at a time, interpolated between two transforms at most `gap` from it [s].
+    def at(self, base: str, frame: str, stamp: float, where: str) -> Pose:
+        """T_base_frame at a time, interpolated between two transforms at most MAX_GAP from it.
 
         Raises InputError, naming `where`, if no chain of transforms leads from the base to the frame, or if a
         transform of the chain is not near in time.
@@ -334,19 +312,19 @@ class TransformHistory:
                     f"no transforms connect {frame}, the frame of {where}, with {base}; the parents of "
                     f"{frame} are {', '.join(passed[1:]) or 'none'}"
                 )
-            T = self._pose_in_parent(at, stamp, gap, where) @ T
+            T = self._pose_in_parent(at, stamp, where) @ T
             at = self._parent[at]
             passed.append(at)
         return T
 
-    def _pose_in_parent(self, frame: str, stamp: float, gap: float, where: str) -> Pose:
+    def _pose_in_parent(self, frame: str, stamp: float, where: str) -> Pose:
         """The pose of a frame relative to its parent frame at a time."""
         poses = self._poses[frame]
         if frame in self._static:
             return poses[-1][1]
-        near = around(poses, stamp, gap)
+        near = around(poses, stamp)
         if near is None:
-            raise InputError(f"there is no transform of {frame} within {gap:g} s of {where}")
+            raise InputError(f"there is no transform of {frame} within {MAX_GAP:g} s of {where}")
         first, last, share = near
         turn = Slerp([0, 1], Rotation.from_matrix([first[:3, :3], last[:3, :3]]))(share).as_matrix()
         return transform((1 - share) * first[:3, 3] + share * last[:3, 3], turn)
@@ -363,14 +341,13 @@ class _States:
         """Add a message, if it has positions of all joints of the arm."""
         positions = dict(zip(state["name"], state["position"], strict=False))  # positions may be empty
         if all(name in positions for name in self._robot.joint_names):
-            insert_by_time(
-                self._states, (stamp, np.array([positions[name] for name in self._robot.joint_names]))
-            )
+            q = np.array([positions[name] for name in self._robot.joint_names])
+            insort(self._states, (stamp, q), key=itemgetter(0))
 
     def at(self, stamp: float, where: str) -> Configuration:
         """The configuration at a time, interpolated. Raises InputError, naming `where`, if there is no joint
         state within MAX_GAP of the time."""
-        near = around(self._states, stamp, MAX_GAP)
+        near = around(self._states, stamp)
         if near is None:
             names = ", ".join(self._robot.joint_names)
             raise InputError(f"there is no joint state of {names} within {MAX_GAP:g} s of {where}")

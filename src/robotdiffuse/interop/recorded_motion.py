@@ -120,10 +120,9 @@ def motion_of_robot(motion: RecordedMotion, robot: Robot) -> RobotMotion:
         parts += [f"has {joined(unknown, MAX_NAMES)}, which {robot.name} lacks"] if unknown else []
         right = joined(robot.joint_names, MAX_NAMES)
         raise InputError(f"the motion {' and '.join(parts)}; the robot's joints are {right}")
-    for name in columns:
-        if name not in robot.joint_names:
-            _check_locked(motion.positions[:, columns[name]], name, robot)
     extra = [name for name in columns if name not in robot.joint_names]
+    for name in extra:
+        _check_locked(motion.positions[:, columns[name]], name, robot)
     if extra:
         notes.append(f"{joined(extra, MAX_NAMES)} stay at their locked values")
     order = [columns[name] for name in robot.joint_names]
@@ -196,8 +195,6 @@ def problem_of_motion(motion: RecordedMotion, robot: Robot, scene: Scene) -> Pro
 
 
 JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
-PORT = 9090
-"""Default port of rosbridge."""
 MATCH_TIME = 0.5
 """Waiting time before the message is sent, so that subscribers match the publisher, and after it, so that
 they receive it [s]."""
@@ -222,7 +219,7 @@ def read_yaml(file: FilePath, topic: str | None = None) -> RecordedMotion:
 
 def write_yaml(problem: Problem, trajectory: Trajectory, file: FilePath) -> None:
     """Write a JointTrajectory as `ros2 topic pub` takes it; see `interop.write_motion`."""
-    record = joint_trajectory(trajectory.joint_names, trajectory)
+    record = joint_trajectory(trajectory)
     text = yaml.dump(record, Dumper=yaml.CSafeDumper, sort_keys=False, default_flow_style=None, width=110)
     write_atomically(file, text)
 
@@ -314,22 +311,26 @@ def _seconds(where: str, value: Any) -> float:
     return float(parts[0]) + 1e-9 * float(parts[1])
 
 
-def joint_trajectory(names: tuple[str, ...], trajectory: Any) -> dict[str, Any]:
+def time_message(nanoseconds: int) -> dict[str, int]:
+    """A time or a duration as a message in plain data."""
+    sec, nanosec = divmod(nanoseconds, 10**9)
+    return {"sec": sec, "nanosec": nanosec}
+
+
+def joint_trajectory(trajectory: Trajectory) -> dict[str, Any]:
     """A trajectory as a trajectory_msgs/msg/JointTrajectory in plain data."""
-    points = []
-    for i, t in enumerate(trajectory.times.tolist()):
-        nanoseconds = round(t * 1e9)
-        points.append(
-            {
-                "positions": trajectory.positions[i].tolist(),
-                "velocities": trajectory.velocities[i].tolist(),
-                "accelerations": trajectory.accelerations[i].tolist(),
-                "effort": [],
-                "time_from_start": {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9},
-            }
-        )
-    header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
-    return {"header": header, "joint_names": list(names), "points": points}
+    points = [
+        {
+            "positions": trajectory.positions[i].tolist(),
+            "velocities": trajectory.velocities[i].tolist(),
+            "accelerations": trajectory.accelerations[i].tolist(),
+            "effort": [],
+            "time_from_start": time_message(round(t * 1e9)),
+        }
+        for i, t in enumerate(trajectory.times.tolist())
+    ]
+    header = {"stamp": time_message(0), "frame_id": ""}
+    return {"header": header, "joint_names": list(trajectory.joint_names), "points": points}
 
 
 def _table(text: str) -> RecordedMotion:
@@ -371,19 +372,13 @@ def _table(text: str) -> RecordedMotion:
         if columns_of[quantity] and sorted(columns_of[quantity]) != sorted(names):
             raise InputError(f"the header has {quantity} of other joints than positions")
     table = {
-        quantity: [list(r) for r in zip(*(c[n] for n in names), strict=True)] if c else None
-        for quantity, c in columns_of.items()
+        quantity: np.transpose([of_joint[name] for name in names]) if of_joint else None
+        for quantity, of_joint in columns_of.items()
     }
     return checked_motion(names, table["positions"], times, table["velocities"], table["accelerations"])
 
 
-def publish(
-    trajectory: Trajectory,
-    host: str,
-    port: int = PORT,
-    topic: str = "/joint_trajectory",
-    timeout: float = 5.0,
-) -> None:
+def publish(trajectory: Trajectory, host: str, port: int, topic: str, timeout: float) -> None:
     """Publish a trajectory once through rosbridge, as a JointTrajectory. The caller must have validated it.
 
     ROS does not confirm deliveries, so the caller does not learn whether a subscriber received the message.
@@ -401,7 +396,7 @@ def publish(
         publisher = roslibpy.Topic(ros, topic, JOINT_TRAJECTORY, latch=True)
         publisher.advertise()
         sleep(MATCH_TIME)
-        publisher.publish(roslibpy.Message(joint_trajectory(trajectory.joint_names, trajectory)))
+        publisher.publish(roslibpy.Message(joint_trajectory(trajectory)))
         sleep(MATCH_TIME)
         publisher.unadvertise()
     finally:

@@ -9,7 +9,7 @@ from robotdiffuse.core.errors import needs
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.core.types import Pose, Trajectory
-from robotdiffuse.drawables import Drawable, Surface, drawables, link_surfaces
+from robotdiffuse.drawables import Drawable, Surface, drawables, link_surfaces, own_frame
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.kinematics import link_poses
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
@@ -33,9 +33,9 @@ def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
     recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     if problem.T_world_base is not None:
         T = problem.T_world_base
-        turn = _quaternion(problem.T_world_base)
+        placed = rr.Transform3D(translation=T[:3, 3], quaternion=_quaternion(T))
         for part in ("scene", "robot"):
-            recording.log(part, rr.Transform3D(translation=T[:3, 3], quaternion=turn), static=True)
+            recording.log(part, placed, static=True)
     for obstacle in drawables(problem.scene, problem.moving):
         recording.log(_entity(obstacle.name), _archetype(obstacle.fixed), static=True)
     for link, surface in link_surfaces(robot).items():
@@ -80,30 +80,29 @@ def _quaternion(T: Pose) -> rr.Quaternion:
 
 def _archetype(obstacle: Drawable) -> rr.AsComponents:
     shape = obstacle.shape
-    if isinstance(shape, PointCloud):
-        return rr.Points3D(shape.points, radii=shape.point_radius, colors=[obstacle.color])
-    if not isinstance(shape, Box | Sphere | Cylinder | Capsule):
-        return _mesh(obstacle.surface)
-    T = shape.T_base_shape
+    T = own_frame(shape)
     solid = rr.components.FillMode.Solid
     placed = {"quaternions": [_quaternion(T)], "colors": [obstacle.color], "fill_mode": solid}
     match shape:
+        case PointCloud():
+            return rr.Points3D(shape.points, radii=shape.point_radius, colors=[obstacle.color])
         case Box():
             return rr.Boxes3D(half_sizes=[shape.size / 2], centers=[T[:3, 3]], **placed)
         case Sphere():
             return rr.Ellipsoids3D(half_sizes=[[shape.radius] * 3], centers=[T[:3, 3]], **placed)
         case Cylinder():
             return rr.Cylinders3D(radii=[shape.radius], lengths=[shape.height], centers=[T[:3, 3]], **placed)
-        case _:
+        case Capsule():
             # the origin of a capsule of Rerun is at one end
             begin = (T @ [0.0, 0.0, -0.5 * shape.height, 1.0])[:3]
             return rr.Capsules3D(radii=[shape.radius], lengths=[shape.height], translations=[begin], **placed)
+        case _:
+            return _mesh(obstacle.surface)
 
 
 def _mesh(surface: Surface) -> rr.Mesh3D:
-    colors = np.round(255 * surface.colors).astype(np.uint8)
     return rr.Mesh3D(
         vertex_positions=surface.vertices,
         triangle_indices=surface.faces,
-        vertex_colors=colors,
+        vertex_colors=np.round(255 * surface.colors).astype(np.uint8),
     )

@@ -15,7 +15,7 @@ import struct
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import fields, is_dataclass
+from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -27,7 +27,7 @@ from robotdiffuse.core.errors import InputError, OutputError, needs, reading, sh
 from robotdiffuse.core.input_files import MAX_FILE_SIZE, MEGABYTE, input_file, parse_json, read_yaml
 from robotdiffuse.core.output_files import write_atomically, write_error
 from robotdiffuse.core.transforms import quaternion_from_rotation
-from robotdiffuse.core.types import Pose, Trajectory
+from robotdiffuse.core.types import Configuration, Pose, Trajectory
 from robotdiffuse.drawables import Color, Drawable, Surface, drawables, link_surfaces
 from robotdiffuse.interop.recorded_motion import (
     JOINT_TRAJECTORY,
@@ -35,6 +35,7 @@ from robotdiffuse.interop.recorded_motion import (
     checked_motion,
     joint_trajectory,
     motion_from_record,
+    time_message,
 )
 from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.problems.problem import Problem
@@ -115,10 +116,7 @@ def _value(definition: Any, value: Any) -> Any:
     node = int(definition[0])
     detail = definition[1]
     if node == 1:  # a base type
-        kind = detail[0]
-        if kind == "string":
-            return "" if value is None else str(value)
-        return bool(value) if kind == "bool" else (value or 0.0 if kind.startswith("float") else value or 0)
+        return value or ("" if detail[0] == "string" else 0)
     if node == 2:  # a message
         return to_message(detail, value or {})
     element = detail[0]
@@ -128,33 +126,35 @@ def _value(definition: Any, value: Any) -> Any:
     return [_value(element, item) for item in items]
 
 
-def to_plain(value: Any) -> Any:
+def to_plain(message: Any) -> dict[str, Any]:
     """A message as plain data."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return {
-            f.name: to_plain(getattr(value, f.name)) for f in fields(value) if not f.name.startswith("__")
-        }
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    return [to_plain(item) for item in value] if isinstance(value, list | tuple) else value
+    return asdict(message, dict_factory=_with_lists)
+
+
+def _with_lists(items: list[tuple[str, Any]]) -> dict[str, Any]:
+    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in items}
+
+
+def joint_state(robot: Robot, q: Configuration, at: int) -> dict[str, Any]:
+    """A JointState in plain data, with the locked joints. at: time [ns]."""
+    names = [*robot.joint_names, *robot.locked]
+    positions = [*q.tolist(), *robot.locked.values()]
+    return {"header": {"stamp": time_message(at)}, "name": names, "position": positions}
 
 
 def display_trajectory(problem: Problem, trajectory: Trajectory, record: Mapping[str, Any]) -> dict[str, Any]:
     """A DisplayTrajectory in plain data: a JointTrajectory, and the state in which the arm starts."""
     robot = problem.robot
-    names = [*trajectory.joint_names, *robot.locked]
-    values = [*trajectory.positions[0].tolist(), *robot.locked.values()]
-    state = {"joint_state": {"header": record["header"], "name": names, "position": values}}
     return {
         "model_id": robot.name,
         "trajectory": [{"joint_trajectory": record}],
-        "trajectory_start": state,
+        "trajectory_start": {"joint_state": joint_state(robot, trajectory.positions[0], 0)},
     }
 
 
 def header_seconds(stamp: Mapping[str, Any]) -> float:
     """The time stamp of a message header [s]."""
-    return float(stamp.get("sec", 0)) + 1e-9 * float(stamp.get("nanosec", 0))
+    return stamp["sec"] + 1e-9 * stamp["nanosec"]
 
 
 def choose_topic(topics: Mapping[str, str], requested: str | None, where: str) -> str:
@@ -165,14 +165,13 @@ def choose_topic(topics: Mapping[str, str], requested: str | None, where: str) -
     topic. Raises InputError if no topic has one of these types, or if several have the first one.
     """
     kinds = (JOINT_TRAJECTORY, ROBOT_TRAJECTORY, DISPLAY_TRAJECTORY, JOINT_STATE)
-    motions = {topic: kind for topic, kind in topics.items() if kind in kinds}
     listed = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items()) or "none"
     if requested is not None:
-        if requested not in motions:
+        if topics.get(requested) not in kinds:
             raise InputError(f"{where}: topic {requested!r} holds no motion; topics: {listed}")
         return requested
     for kind in kinds:
-        candidates = [topic for topic, motion_kind in motions.items() if motion_kind == kind]
+        candidates = [topic for topic, topic_kind in topics.items() if topic_kind == kind]
         if len(candidates) > 1:
             raise InputError(
                 f"{where}: several topics hold motions: {', '.join(candidates)}; choose one with --topic"
@@ -264,7 +263,7 @@ def write_mcap(problem: Problem, trajectory: Trajectory, file: Path) -> None:
     for shape in problem.scene.shapes:
         if isinstance(shape, PointCloud):
             out.protobuf(f"/points/{shape.name}", _cloud(shape, robot.base), 0)
-    record = joint_trajectory(trajectory.joint_names, trajectory)
+    record = joint_trajectory(trajectory)
     out.ros("/joint_trajectory", JOINT_TRAJECTORY, record, 0)
     out.ros("/display_planned_path", DISPLAY_TRAJECTORY, display_trajectory(problem, trajectory, record), 0)
     urdf = _urdf(robot.source)
@@ -276,7 +275,6 @@ def write_mcap(problem: Problem, trajectory: Trajectory, file: Path) -> None:
         out.writer.add_attachment(0, 0, PROBLEM_ATTACHMENT, "application/json", content)
     except InputError:
         pass  # a robot that was made in Python has no problem file
-    names = [*trajectory.joint_names, *robot.locked]
     links = [link for link in robot.link_names if link != robot.base]
     poses = {link: link_poses(robot, trajectory.positions, link) for link in links}
     for i, t in enumerate(trajectory.times.tolist()):
@@ -288,10 +286,8 @@ def write_mcap(problem: Problem, trajectory: Trajectory, file: Path) -> None:
             if obstacle.moving is not None
         }
         out.protobuf("/tf", _transforms(problem, frames, at), at)
-        stamp = {"sec": at // 10**9, "nanosec": at % 10**9}
-        values = [*trajectory.positions[i].tolist(), *robot.locked.values()]
         rates = [*trajectory.velocities[i].tolist(), *(0.0 for _ in robot.locked)]
-        state = {"header": {"stamp": stamp}, "name": names, "position": values, "velocity": rates}
+        state = joint_state(robot, trajectory.positions[i], at) | {"velocity": rates}
         out.ros("/joint_states", JOINT_STATE, state, at)
     out.writer.finish()
     write_atomically(file, stream.getvalue())
@@ -456,7 +452,7 @@ def write_bag(problem: Problem, trajectory: Trajectory, file: Path) -> None:
     RViz's MoveIt plugin shows. An existing bag is replaced; see `interop.write_motion`."""
     if file.exists() and not (file / "metadata.yaml").is_file():
         raise InputError(f"{file} cannot be written: it exists and is not a ROS 2 bag")
-    record = joint_trajectory(trajectory.joint_names, trajectory)
+    record = joint_trajectory(trajectory)
     topics = {
         "/joint_trajectory": (JOINT_TRAJECTORY, record),
         "/display_planned_path": (DISPLAY_TRAJECTORY, display_trajectory(problem, trajectory, record)),
