@@ -17,7 +17,7 @@ from robotdiffuse.core.bounds import MAX_RATE, numbers, one_line, within
 from robotdiffuse.core.errors import InputError, reading, shown
 from robotdiffuse.core.input_files import read_json
 from robotdiffuse.core.output_files import check_output, write_atomically
-from robotdiffuse.core.results import number, text
+from robotdiffuse.core.settings import Number, converted
 from robotdiffuse.core.types import Path, Trajectory, check_motion_arrays
 from robotdiffuse.problems.problem import Problem
 
@@ -158,13 +158,7 @@ def _claim_proof(k: int, entry: dict[str, Any]) -> StretchProof:
 
 
 def _named_bounds(_: str, rows: list[Any]) -> tuple[tuple[str, float], ...]:
-    return tuple((str(name), number(str(name), limit)) for name, limit in rows)
-
-
-def _hashes(name: str, value: object) -> dict[str, str]:
-    if not isinstance(value, dict) or not all(isinstance(text, str) for text in value.values()):
-        raise InputError(f"{name} must map names to hashes")
-    return value
+    return tuple((str(name), converted(str(name), Number, limit)) for name, limit in rows)
 
 
 def _vector(name: str, value: object) -> ndarray:
@@ -178,13 +172,7 @@ def _tolerances(_: str, value: object) -> Tolerances:
     names = {f.name for f in fields(Tolerances)}
     if not isinstance(value, dict) or set(value) != names:
         raise InputError(f"tolerances must have the fields {', '.join(sorted(names))}")
-    return Tolerances(**{name: number(name, entry) for name, entry in value.items()})
-
-
-def _problem(_: str, value: object) -> dict[str, Any] | None:
-    if value is not None and not isinstance(value, dict):
-        raise InputError("problem must be an object")
-    return value
+    return Tolerances(**{name: converted(name, Number, entry) for name, entry in value.items()})
 
 
 class Field(NamedTuple):
@@ -198,20 +186,26 @@ class Field(NamedTuple):
     """Name of the attribute of `Certificate`; empty: the field's name."""
 
 
+def _typed(kind: Any) -> Field:
+    """A field of a type that `converted` takes."""
+    return Field(lambda name, value: converted(name, kind, value))
+
+
+HASHES = _typed(dict[str, str])
 NUMBERS = Field(_vector, lambda array: array.tolist())
 FIELDS = {
-    "robot": Field(text),
-    "robot_parts": Field(_hashes),
-    "scene_parts": Field(_hashes),
-    "motion_hash": Field(text),
+    "robot": _typed(str),
+    "robot_parts": HASHES,
+    "scene_parts": HASHES,
+    "motion_hash": _typed(str),
     "tolerances": Field(_tolerances, asdict),
-    "scene_clearance": Field(number),
-    "self_clearance": Field(number),
-    "problem": Field(_problem),
+    "scene_clearance": _typed(Number),
+    "self_clearance": _typed(Number),
+    "problem": _typed(dict | None),
     "motion": Field(_motion, _motion_record),
     "between": NUMBERS,
     "proof": Field(_proof, _proof_record),
-    "request_parts": Field(_hashes),
+    "request_parts": HASHES,
     "moving": Field(_proof, _proof_record),
     "constraints": Field(_named_bounds),
     "looks": NUMBERS._replace(attribute="torque_samples"),  # the name in files of this version

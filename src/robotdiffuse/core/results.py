@@ -1,17 +1,15 @@
 """PlanResult, the answer of a planner, and the result file format."""
 
 import json
-import math
-from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path as FilePath
 from types import NoneType
 from typing import Any
 
-from robotdiffuse.core.bounds import MAX_RATE, rows
 from robotdiffuse.core.errors import InputError, check_type, located, shown
 from robotdiffuse.core.input_files import read_json
 from robotdiffuse.core.output_files import check_output, write_atomically
+from robotdiffuse.core.settings import Natural, Number, converted
 from robotdiffuse.core.types import (
     RATES,
     ROWS,
@@ -151,7 +149,22 @@ class PlanResult:
         Args:
             problem: The content of a problem file, to include.
         """
-        return _record(self, problem)
+        path = self.path
+        record: dict[str, Any] = {"status": self.status.value}
+        record |= {name: getattr(self, name) for name in RECORDED}
+        record |= {
+            "verified": self.solved,
+            "path_length": self.path_length,
+            "duration": self.duration,
+            "stops": self.stops,
+            "joint_names": [] if path is None else list(path.joint_names),
+            "waypoints": None if path is None else path.positions.tolist(),
+            "times": [],
+            **{name: [] for name in ROWS},
+        }
+        if self.trajectory is not None:
+            record |= self.trajectory.record()
+        return record if problem is None else record | {"problem": problem}
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +194,7 @@ def load_result(file: str | FilePath) -> ResultFile:
         raise InputError(f"{file} is not a result file: it must hold one JSON object")
     if "scene" in record and "status" not in record:
         raise InputError(f"{file} is not a result file: {planned}")
-    missing = [name for name in REQUIRED if name not in record]
+    missing = [name for name in REQUIRED if record.get(name) is None]
     if missing:
         raise InputError(f"{file} is not a result file: {', '.join(missing)} missing")
     with located(file):
@@ -190,82 +203,29 @@ def load_result(file: str | FilePath) -> ResultFile:
         return ResultFile(_result(record), problem)
 
 
-def text(name: str, value: object) -> str:
-    """The value, if it is a string. Raises InputError that names the field for anything else."""
-    if not isinstance(value, str):
-        raise InputError(f"{name} is {shown(value)}; it must be a string")
-    return value
-
-
-def _texts(name: str, value: object) -> tuple[str, ...]:
-    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-        raise InputError(f"{name} is {shown(value)}; it must be a list of strings")
-    return tuple(value)
-
-
-def number(name: str, value: object) -> float:
-    """The value as a number. Raises InputError that names the field for anything but a finite number."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{name} is {shown(value)}; it must be a finite number")
-    return float(value)
-
-
-def _index(name: str, value: object) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise InputError(f"{name} is {shown(value)}; it must be a whole number from 0 on")
-    return value
-
-
-def _rows(name: str, value: object, count: int | None, columns: int) -> tuple[tuple[float, ...], ...]:
-    return tuple(map(tuple, rows(name, value, count, columns, MAX_RATE).tolist()))
-
-
-READERS: dict[str, Callable[[str, Any], Any]] = {
-    "reason": text,
-    "planner": text,
-    "stage": text,
-    "robot": text,
-    "planning_time": number,
-    "seed": lambda name, value: int(number(name, value)),
-    "min_clearance": number,
-    "scene_clearance": number,
-    "self_clearance": number,
-    "notes": _texts,
-    "goal_index": _index,
-    "progress": lambda name, value: _rows(name, value, None, 2) if value else (),
-    "refused": text,
-    "assumption": text,
-    "confidence": number,
-    "swept_probability": number,
-    "unknown_region": lambda name, value: _rows(name, value, 2, 3),
-    "fraction": number,
+Corner = tuple[Number, Number, Number]
+RECORDED: dict[str, Any] = {
+    "reason": str,
+    "planner": str,
+    "stage": str,
+    "robot": str,
+    "planning_time": Number,
+    "seed": int,
+    "min_clearance": Number,
+    "scene_clearance": Number,
+    "self_clearance": Number,
+    "notes": tuple[str, ...],
+    "goal_index": Natural,
+    "progress": tuple[tuple[Number, Number], ...],
+    "refused": str,
+    "assumption": str,
+    "confidence": Number,
+    "swept_probability": Number,
+    "unknown_region": tuple[Corner, Corner],
+    "fraction": Number,
 }
-"""Fields that result files hold under the same name, in this order, with the function that checks and
-converts each value."""
-NONE_ALLOWED = {"progress"} | {f.name for f in fields(PlanResult) if f.default is None}
-
-
-def _record(result: PlanResult, problem: dict[str, Any] | None) -> dict[str, Any]:
-    path = result.path
-    record: dict[str, Any] = {"status": result.status.value}
-    record |= {name: _plain(getattr(result, name)) for name in READERS}
-    record |= {
-        "verified": result.solved,
-        "path_length": result.path_length,
-        "duration": result.duration,
-        "stops": result.stops,
-        "joint_names": [] if path is None else list(path.joint_names),
-        "waypoints": None if path is None else path.positions.tolist(),
-        "times": [],
-        **{name: [] for name in ROWS},
-    }
-    if result.trajectory is not None:
-        record |= result.trajectory.record()
-    return record if problem is None else record | {"problem": problem}
-
-
-def _plain(value: Any) -> Any:
-    return [_plain(entry) for entry in value] if isinstance(value, tuple) else value
+"""Fields that result files hold under the same name, in this order, with their types. A field that the result
+lacks is null."""
 
 
 def _result(record: dict[str, Any]) -> PlanResult:
@@ -277,19 +237,15 @@ def _result(record: dict[str, Any]) -> PlanResult:
     if record["verified"] is not solved:
         raise InputError(f"verified is {shown(record['verified'])}, but status is {shown(status.value)}")
     values = {
-        name: read(name, record[name])
-        for name, read in READERS.items()
-        if name in record and not (record[name] is None and name in NONE_ALLOWED)
+        name: converted(name, kind, record[name])
+        for name, kind in RECORDED.items()
+        if record.get(name) is not None
     }
     if solved:
-        values["path"] = _path(record)
+        names, arrays = check_motion_arrays(record["joint_names"], {"waypoints": record.get("waypoints")})
+        values["path"] = Path(names, arrays["waypoints"])
         values["trajectory"] = _trajectory(record) if record.get("times") else None
     return PlanResult(status=status, **values)
-
-
-def _path(record: dict[str, Any]) -> Path:
-    names, arrays = check_motion_arrays(record["joint_names"], {"waypoints": record.get("waypoints")})
-    return Path(names, arrays["waypoints"])
 
 
 def _trajectory(record: dict[str, Any]) -> Trajectory:

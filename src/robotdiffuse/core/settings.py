@@ -72,7 +72,7 @@ class Bound:
             return f"between {self.least:g} and {self.most:g}"
         if not high and self.above == 0:
             return "positive"
-        return " and ".join(part for part in (low, high) if part) or "a number"
+        return " and ".join(part for part in (low, high) if part) or "finite"
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +102,8 @@ class SettingsOf:
     table: Registry
 
 
+Number = Annotated[float, Bound()]
+"""Any finite number."""
 Positive = Annotated[float, Bound(above=0.0)]
 NotNegative = Annotated[float, Bound(least=0.0)]
 Share = Annotated[float, Bound(least=0.0, most=1.0)]
@@ -154,7 +156,7 @@ class Settings:
         """
         prefix = f"{self.settings_name}." if self.settings_name else ""
         for name, hint in _hints(type(self)).items():
-            object.__setattr__(self, name, _converted(prefix + name, hint, getattr(self, name), self))
+            object.__setattr__(self, name, converted(prefix + name, hint, getattr(self, name), self))
 
     def to_json(self) -> dict[str, Any]:
         """All fields as plain JSON values."""
@@ -176,19 +178,19 @@ class Settings:
                 raise InputError(
                     f"{where}.{shortened(str(name))} is not a setting; known: {', '.join(fields)}"
                 )
-        converted: dict[str, Any] = {}
+        checked: dict[str, Any] = {}
         for name, field in fields.items():
             if name in values:
                 at = f"{where}.{name}"
                 # if the value is None, the other field may hold a folder, which is not in the registry
                 kind = None if values[name] is None else _settings_class(hints[name], values, fields)
                 if kind is not None:
-                    converted[name] = kind.from_json(values[name], at)
+                    checked[name] = kind.from_json(values[name], at)
                 else:
-                    converted[name] = _converted(at, hints[name], values[name])
+                    checked[name] = converted(at, hints[name], values[name])
             elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
                 raise InputError(f"{where}.{name} is missing")
-        return cls(**converted)
+        return cls(**checked)
 
     def changed(self: Given, assignments: Iterable[str]) -> Given:
         """A copy with some settings replaced: "step=0.5", "guidance.margin=0.02"; values as in YAML.
@@ -237,7 +239,7 @@ class Settings:
                 root, _, path = f"{where}.{name}".partition(".")
                 raise InputError(f"{root} has no setting {shown(path)}; it has {', '.join(known)}")
             else:
-                replaced[name] = _converted(f"{where}.{name}", hints[name], value)
+                replaced[name] = converted(f"{where}.{name}", hints[name], value)
         for name, changes in within.items():
             replaced[name] = getattr(self, name)._replaced(changes, f"{where}.{name}", known)
         return dataclasses.replace(self, **replaced)  # type: ignore[type-var]
@@ -292,7 +294,7 @@ def _fits(hint: Any, value: Any) -> bool:
     return False
 
 
-def _converted(where: str, hint: Any, value: Any, owner: object = None) -> Any:
+def converted(where: str, hint: Any, value: Any, owner: object = None) -> Any:
     """The value as its field stores it: a list as a tuple, a number of NumPy as Python's int or float.
 
     owner: the settings object, for marks that compare the field with another field; None before it exists.
@@ -305,13 +307,13 @@ def _converted(where: str, hint: Any, value: Any, owner: object = None) -> Any:
     kinds = get_args(bare)
     if kind in (Union, UnionType):
         fitting = next(option for option in kinds if _fits(option, value))
-        value = _converted(where, fitting, value, owner)
+        value = converted(where, fitting, value, owner)
     elif kind is tuple:
         if kinds[-1] is not Ellipsis and len(value) != len(kinds):
             raise InputError(f"{where} is {shown(value)}; it must have {len(kinds)} entries")
-        value = tuple(_converted(where, kinds[0], entry, owner) for entry in value)
+        value = tuple(converted(where, kinds[0], entry, owner) for entry in value)
     elif kind is dict:
-        value = {str(key): _converted(where, kinds[1], entry, owner) for key, entry in value.items()}
+        value = {str(key): converted(where, kinds[1], entry, owner) for key, entry in value.items()}
     elif bare in (int, float):
         value = bare(value)
     for mark in marks:
