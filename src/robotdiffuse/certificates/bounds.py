@@ -303,7 +303,9 @@ class Prover:
         self.q = q
         self.off = off
         self.linkage, self.obstacles = Linkage(robot), Obstacles(scene)
-        self.links = [link for link in self.linkage.links if _has_geometry(robot, link)]
+        parts_of_links = {link: _parts(robot, link) for link in self.linkage.links}
+        self.parts = {link: parts for link, parts in parts_of_links.items() if parts}
+        self.links = [*self.parts]
         if SCENE in self.links:
             raise InputError(
                 f"the robot has a link called {SCENE!r}; rename it: certificates use this name for the scene"
@@ -319,7 +321,6 @@ class Prover:
         self._balls = np.concatenate([np.zeros((0, 4)), *balls])
         counts = [len(rows) for rows in balls]
         self._first = np.cumsum([0, *counts])
-        self.parts = {link: _parts(robot, link) for link in self.links}
 
     def _links_of(self, claim: Claim) -> tuple[int, int]:
         """Indices of the two links of a claim; the base, which no joint moves, stands for the scene."""
@@ -577,27 +578,24 @@ def _placed_points(T: Float[ndarray, "n 4 4"], points: Points) -> Float[ndarray,
     return np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]
 
 
-def _has_geometry(robot: Robot, link: str) -> bool:
-    return bool(len(robot.spheres.get(link, ())) or robot.meshes.get(link))
-
-
 def _balls(robot: Robot, link: str) -> Float[ndarray, "n 4"]:
     """The spheres that cover a link; one sphere around its meshes if it has none."""
-    if len(robot.spheres.get(link, ())):
-        return robot.spheres[link]
-    if not robot.meshes.get(link):
-        return np.zeros((0, 4))
-    vertices = np.concatenate([mesh.vertices for mesh in robot.meshes[link]])
-    center, radius = ball_around(vertices)
+    spheres = robot.spheres.get(link, np.zeros((0, 4)))
+    meshes = robot.meshes.get(link)
+    if len(spheres) or not meshes:
+        return spheres
+    center, radius = ball_around(np.concatenate([mesh.vertices for mesh in meshes]))
     return np.array([[*center, radius]])
 
 
 def _parts(robot: Robot, link: str) -> tuple[Part, ...]:
-    meshes = robot.meshes.get(link, ())
-    none = np.zeros((0, 3), int)
+    """The convex meshes of a link; its spheres if it has no meshes."""
+    meshes = robot.meshes.get(link)
     if meshes:
         return tuple(Part(mesh.vertices, mesh.faces, 0.0, *ball_around(mesh.vertices)) for mesh in meshes)
-    return tuple(Part(s[None, :3], none, float(s[3]), s[:3], float(s[3])) for s in robot.spheres[link])
+    none = np.zeros((0, 3), int)
+    spheres = robot.spheres.get(link, ())
+    return tuple(Part(s[None, :3], none, float(s[3]), s[:3], float(s[3])) for s in spheres)
 
 
 class MovingProver(Prover):

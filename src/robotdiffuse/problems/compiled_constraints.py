@@ -131,11 +131,15 @@ class PathConstraints:
         goals = [(pose.frame, row) for pose in poses for row in _pose_rows(pose, *exact)]
         frames = [owner.frame for owner in self.owners] + [frame for frame, _ in goals]
         self.rows = _arrays(problem.robot, frames, [row for _, row in own + goals])
-        self._speed_limited_rows = [
-            (m, owner.speed)
+        self._speed_rows = [
+            m
             for m, owner in enumerate(self.owners)
             if isinstance(owner, CartesianLine) and owner.speed is not None and own[m][1].row_kind == DISTANCE
         ]
+        self.speed_limited = [self.owners[m] for m in self._speed_rows]
+        """The constraints with a speed limit."""
+        self.speed_limits = np.array([constraint.speed for constraint in self.speed_limited])  # type: ignore[union-attr]
+        """Their speed limits [m/s]."""
 
     def values(self, q: Configurations) -> Float[ndarray, "n rows"]:
         """The value of each row [m] or [rad]."""
@@ -195,10 +199,7 @@ class PathConstraints:
     def speeds(self, q: Configurations, rates: JointRows) -> Float[ndarray, "n limited"]:
         """Speeds of the frames with a speed limit [m/s], one column each, at joint velocities `rates`
         [rad/s]."""
-        columns = [
-            kernel.speeds(self.rows, m, for_kernels(q), for_kernels(rates))
-            for m, _ in self._speed_limited_rows
-        ]
+        columns = [kernel.speeds(self.rows, m, for_kernels(q), for_kernels(rates)) for m in self._speed_rows]
         return np.stack(columns, axis=1) if columns else np.zeros((len(q), 0))
 
     def third_derivative_bounds(self, derivatives: Float[ndarray, "3 n dof"]) -> Float[ndarray, "n limited"]:
@@ -211,8 +212,8 @@ class PathConstraints:
 
         derivatives: bounds on the first three derivatives of the joint positions, for each piece.
         """
-        bounds = np.empty((derivatives.shape[1], len(self._speed_limited_rows)))
-        for k, (m, _) in enumerate(self._speed_limited_rows):
+        bounds = np.empty((derivatives.shape[1], len(self._speed_rows)))
+        for k, m in enumerate(self._speed_rows):
             count = self.rows.chain_length[m]
             first, second, third = derivatives[:, :, self.rows.chain[m, :count]]
             first_sums = np.cumsum(first, axis=1)
@@ -220,16 +221,6 @@ class PathConstraints:
             products = np.diff(3 * second_sums * first_sums + first_sums**3, axis=1, prepend=0.0)
             bounds[:, k] = (third + products) @ self.rows.lever_bounds[m, :count]
         return bounds
-
-    @property
-    def speed_limits(self) -> Float[ndarray, "limited"]:
-        """Speed limits of the frames that have one [m/s]."""
-        return np.array([speed for _, speed in self._speed_limited_rows])
-
-    @property
-    def speed_limited(self) -> list[Constraint]:
-        """The constraints with a speed limit."""
-        return [self.owners[m] for m, _ in self._speed_limited_rows]
 
     def _maximum(self, q: ndarray, segment: int, fraction: float, row: int) -> float:
         """The maximum value of a row from a place on the motion until the row is satisfied again."""
@@ -320,14 +311,14 @@ def line_end(problem: Problem, line: CartesianLine) -> Pose:
             return poses[0]
         why = f"the {len(poses)} goal configurations put {line.frame} at different poses"
     elif poses := poses_of(goal):
-        for pose in poses:
-            if robot.link_frame(pose.frame) == robot.link_frame(line.frame) and not pose.tolerant:
-                between = inverse(robot.T_frame_link(pose.frame)) @ robot.T_frame_link(line.frame)
-                return pose.T_base_frame @ between
         frames = " and ".join(pose.frame for pose in poses)
         why = f"no pose of the goal, for {frames}, is rigidly connected to {line.frame}"
-        if any(robot.link_frame(pose.frame) == robot.link_frame(line.frame) for pose in poses):
-            why = "the goal has tolerances"
+        for pose in poses:
+            if robot.link_frame(pose.frame) == robot.link_frame(line.frame):
+                if not pose.tolerant:
+                    between = inverse(robot.T_frame_link(pose.frame)) @ robot.T_frame_link(line.frame)
+                    return pose.T_base_frame @ between
+                why = "the goal has tolerances"
     else:
         why = "the goal is any of several goals"
     raise InputError(
@@ -368,7 +359,6 @@ def _pose_rows(pose: PoseGoal, position: float, angle: float) -> list[_Row]:
 
 
 def _arrays(robot: Robot, frames: list[str], rows: list[_Row]) -> Rows:
-    levers = {frame: _lever_bounds(robot, frame) for frame in frames}
     chains = [robot.chain(frame) for frame in frames]
     joints = np.zeros((len(chains), robot.dof), np.int64)
     for row, chain in zip(joints, chains, strict=True):
@@ -388,7 +378,7 @@ def _arrays(robot: Robot, frames: list[str], rows: list[_Row]) -> Rows:
         same_frame=np.array([False, *(a == b for a, b in pairwise(frames))]),
         T_joint_frame=np.stack([robot.T_frame_link(frame) for frame in frames]),
         inner_limit=PROJECTION_FRACTION * row_fields["limit"],
-        lever_bounds=np.stack([levers[frame] for frame in frames]),
+        lever_bounds=np.stack([_lever_bounds(robot, frame) for frame in frames]),
         **row_fields,
     )
 

@@ -32,14 +32,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy import ndarray
 
 from robotdiffuse.core.bounds import numbers, unit_quaternion, vector
 from robotdiffuse.core.errors import InputError, located, shown, unknown_name
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
 from robotdiffuse.core.types import Pose
 from robotdiffuse.perception.depth_view_files import read_views, view_entry
-from robotdiffuse.problems.constraints import CONSTRAINTS, Constraint
+from robotdiffuse.problems.constraints import CONSTRAINTS, Constraint, PositionBox
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal
 from robotdiffuse.problems.problem import UNKNOWN_POLICIES, check_clearance
 from robotdiffuse.robots import ROBOTS
@@ -50,6 +49,7 @@ from robotdiffuse.scenes.files import (
     SHAPES,
     check_fields,
     contacts_entry,
+    plain_fields,
     read_scene,
     required_fields,
     scene_entries,
@@ -336,13 +336,9 @@ def _constraint(where: str, entry: object) -> Constraint:
 
 def constraint_entry(constraint: Constraint) -> dict[str, Any]:
     """The entry of a constraint in a problem file."""
-    values: dict[str, Any] = {}
-    for field in fields(constraint):
-        value = getattr(constraint, field.name)
-        if field.name != "T_base_box":
-            values[field.name] = value.tolist() if isinstance(value, ndarray) else value
-        elif not np.array_equal(value, np.eye(4)):
-            values |= pose_entry(value)
+    values = plain_fields(constraint, "T_base_box")
+    if isinstance(constraint, PositionBox) and not np.array_equal(constraint.T_base_box, np.eye(4)):
+        values |= pose_entry(constraint.T_base_box)
     return {constraint.kind: values}
 
 
@@ -383,12 +379,8 @@ def moving_entry(obstacle: MovingObstacle, folder: Path | None) -> dict[str, obj
 
 def payload_entry(payload: Payload) -> dict[str, object]:
     """The entry of a payload in a problem file."""
-    data: dict[str, object] = {"mass": payload.mass, "com": payload.com.tolist()}
-    if payload.link is not None:
-        data["link"] = payload.link
-    if payload.moments.any():
-        data["moments"] = payload.moments.tolist()
-    return data
+    given = {"link": payload.link is not None, "moments": payload.moments.any()}
+    return plain_fields(payload, *(name for name in given if not given[name]))
 
 
 def _views(data: object, setting: Setting) -> Any:

@@ -4,7 +4,7 @@ Also reads folders of MotionBenchMaker, which hold MoveIt files.
 """
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from numbers import Integral
 from pathlib import Path
@@ -221,7 +221,13 @@ def load_motion_bench_maker(
     for scene_file in scenes:
         name = f"{folder.resolve().name}/{scene_file.stem.removeprefix('scene')}"
         try:
-            problem = _moveit_problem(scene_file, robot, ignore_joints)
+            record = {
+                "robot": robot.name if robot else moveit_model(read_yaml(scene_file)),
+                "scene": scene_file.name,
+                "request": scene_file.name.replace("scene", "request", 1),
+            }
+            robots = {robot.name: robot} if robot else None
+            problem = _problem(str(scene_file), record, folder, robots, ignore_joints)
         except InputError as error:
             entries.append(ProblemEntry(name, None, str(error)))
         else:
@@ -229,31 +235,8 @@ def load_motion_bench_maker(
     return entries
 
 
-def _moveit_problem(scene_file: Path, robot: Robot | None, ignore_joints: bool) -> Problem:
-    request_file = scene_file.with_name(scene_file.name.replace("scene", "request", 1))
-    with located(scene_file):
-        data = read_yaml(scene_file)
-        if robot is None:
-            robot_name = data.get("robot_model_name") if isinstance(data, dict) else None
-            robot = _robot(robot_name, {}, scene_file.parent)
-        notes = scene_robot_notes(data, robot, ignore_joints)
-        frames = moveit_frames(data, robot)
-    with located(request_file):
-        request = moveit_request(read_yaml(request_file), frames, scene_file.parent)
-    with located(scene_file):
-        scene = moveit_scene(data, frames, scene_file.parent, _link_and_object_names(robot, request))
-    with located(request_file):
-        notes += request.robot_notes(robot, moveit_model(data), ignore_joints)
-        return _requested(robot, scene, request, notes, {})
-
-
-def _link_and_object_names(robot: Robot, request: MoveItRequest | None) -> tuple[str, ...]:
-    """Names of the robot's links and of the objects that it holds at the start."""
-    return (*robot.link_names, *(attached.name for attached in (request.attached if request else ())))
-
-
 def _requested(
-    robot: Robot, scene: Scene, request: MoveItRequest, notes: Iterable[str], options: dict[str, Any]
+    robot: Robot, scene: Scene, request: MoveItRequest, notes: list[str], options: dict[str, Any]
 ) -> Problem:
     """The problem of a MoveIt request. Joints that are not planned are locked at its start state."""
     unplanned = {j.name for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None}
@@ -261,17 +244,13 @@ def _requested(
     robot = robot.with_locked({name: value for name, value in request.start.items() if name in unplanned})
     notes = [*request.notes, *notes]
     for joint in robot.joints:
-        start_value = request.start.get(joint.name)
         locked = robot.locked.get(joint.name)
-        if (
-            joint.mimic is None
-            or start_value is None
-            or locked is None
-            or abs(locked - start_value) <= MIMIC_SLACK
-        ):
+        if joint.mimic is None or locked is None:
             continue
-        implied = f"it mimics {joint.mimic.joint}: planned at {locked:g}"
-        notes.append(f"start_state: {joint.name} is {start_value:g}, but {implied}")
+        start_value = request.start.get(joint.name, locked)
+        if abs(locked - start_value) > MIMIC_SLACK:
+            implied = f"it mimics {joint.mimic.joint}: planned at {locked:g}"
+            notes.append(f"start_state: {joint.name} is {start_value:g}, but {implied}")
 
     start = robot.planned_values("start_state", request.start)
     for attached in request.attached:
@@ -309,23 +288,25 @@ def _problem(
             raise InputError(
                 "base cannot be combined with MoveIt files, which contain the pose of their robot's base"
             )
-        content = {}
-        request = None
-        contacts = values.get("allowed_contacts", {})
-        if from_moveit:
-            content = read_yaml(folder / values["scene"])
+        scene_place = folder / values["scene"] if from_moveit else where
+        request_place = folder / str(values["request"]) if requested else where
+        with located(scene_place):
+            content = read_yaml(scene_place) if from_moveit else {}
             notes += scene_robot_notes(content, robot, ignore_joints)
-        frames = moveit_frames(content, robot)
+            frames = moveit_frames(content, robot)
+        request = None
+        names = robot.link_names
         if requested:
             for name, field in FIELDS.items():
                 if name in values and not field.with_request:
                     raise InputError(f"{name} cannot be combined with request")
-            request = moveit_request(read_yaml(folder / str(values["request"])), frames, folder)
+            with located(request_place):
+                request = moveit_request(read_yaml(request_place), frames, folder)
+            names += tuple(attached.name for attached in request.attached)
+        contacts = values.get("allowed_contacts", {})
         if from_moveit:
-            scene_folder = (folder / values["scene"]).parent
-            scene = moveit_scene(
-                content, frames, scene_folder, _link_and_object_names(robot, request), contacts
-            )
+            with located(scene_place):
+                scene = moveit_scene(content, frames, Path(scene_place).parent, names, contacts)
         else:
             scene, scene_notes = read_scene(values["scene"], folder, contacts)
             notes += scene_notes
@@ -336,8 +317,9 @@ def _problem(
             if name in values and name not in ("scene", "allowed_contacts")
         }
         if request is not None:
-            notes += request.robot_notes(robot, moveit_model(content), ignore_joints)
-            return _requested(robot, scene, request, notes, options)
+            with located(request_place):
+                notes += request.robot_notes(robot, moveit_model(content), ignore_joints)
+                return _requested(robot, scene, request, notes, options)
         if base is None:
             return Problem(robot, scene, notes=tuple(notes), **options)
         return Problem.in_world(base, robot, scene, notes=tuple(notes), **options)

@@ -106,25 +106,23 @@ def frame_name(where: str, entry: dict[str, Any]) -> str:
 
 
 def read_moveit_scene(
-    file: str | Path, robot: Robot | None = None, ignore_joints: bool = False
+    file: str | Path, robot: Robot, ignore_joints: bool = False
 ) -> tuple[Scene, tuple[str, ...]]:
     """The collision objects of a planning scene, in the frame of the robot's base, and notes on differences
     between the scene's robot and `robot`.
 
     The pose of the root of the robot's URDF comes from robot_state.multi_dof_joint_state, and the pose of the
-    base relative to this root from `robot` (None: base and root are the same link). Other known frames are
-    those in fixed_frame_transforms and the links that are fixed to the base. The allowed collision matrix
-    says which links may touch which objects; its entries for two links are ignored, because the robot has its
-    own pairs of links to check.
+    base relative to this root from `robot`. Other known frames are those in fixed_frame_transforms and the
+    links that are fixed to the base. The allowed collision matrix says which links may touch which objects;
+    its entries for two links are ignored, because the robot has its own pairs of links to check.
 
     Raises InputError, naming file and object, for a missing or damaged file, unknown frames, shapes that are
     not supported (prisms), and, unless `ignore_joints`, joints that the robot lacks.
     """
     data = read_yaml(file)
     with located(file):
-        notes = () if robot is None else scene_robot_notes(data, robot, ignore_joints)
-        links = () if robot is None else robot.link_names
-        return moveit_scene(data, moveit_frames(data, robot), Path(file).parent, links), notes
+        notes = scene_robot_notes(data, robot, ignore_joints)
+        return moveit_scene(data, moveit_frames(data, robot), Path(file).parent, robot.link_names), notes
 
 
 class MoveItFrames(dict[str, ndarray]):
@@ -134,19 +132,10 @@ class MoveItFrames(dict[str, ndarray]):
     the links that fixed joints connect with the robot's base.
     """
 
-    def __init__(self, robot: Robot | None, T_own_root: Pose, own: tuple[str, ...] = ("", "world")) -> None:
-        """own: names of the scene's own frame. T_own_root: pose of the URDF's root in this frame."""
-        super().__init__({} if robot is None else robot.above | robot.links_fixed_to_base)
-        self.links = frozenset(self)
-        """Links of the robot; a file cannot change their poses."""
-        T_base_root = np.eye(4) if robot is None else robot.T_base_root
-        self.unknown_reason = ""
-        """Why the pose of the scene's own frame is unknown; empty if it is known."""
-        if T_base_root is not None:
-            T_base_own = T_base_root @ inverse(T_own_root)
-            self.update({name: T_base_own for name in own if name not in self.links})
-        elif robot is not None:
-            self.unknown_reason = f"a joint moves {robot.base} relative to {robot.root}"
+    links: frozenset[str] = frozenset()
+    """Links of the robot; a file cannot change their poses."""
+    unknown_reason: str = ""
+    """Why the pose of the scene's own frame is unknown; empty if it is known."""
 
     def of_header(self, where: str, entry: dict[str, Any]) -> Pose:
         """T_base_frame of the frame that the header of an entry names.
@@ -166,7 +155,7 @@ class MoveItFrames(dict[str, ndarray]):
         raise unknown_name(f"frame_id of {where}:", name, frame_names)
 
 
-def moveit_frames(data: object, robot: Robot | None = None) -> MoveItFrames:
+def moveit_frames(data: object, robot: Robot) -> MoveItFrames:
     """The frames of a parsed planning scene; `robot` as in `read_moveit_scene`.
 
     The scene's own frame is the frame in which robot_state.multi_dof_joint_state gives the pose of the
@@ -185,8 +174,14 @@ def moveit_frames(data: object, robot: Robot | None = None) -> MoveItFrames:
     if transforms:
         T_own_root = pose_of(f"{location}.transforms[0]", transforms[0], "translation", "rotation")
     named = frame_name(location, floating)
-    root = "" if robot is None else robot.root or robot.base
-    frames = MoveItFrames(robot, T_own_root, ("", "world" if named in ("", root) else named))
+    frames = MoveItFrames(robot.above | robot.links_fixed_to_base)
+    frames.links = frozenset(frames)
+    if robot.T_base_root is None:
+        frames.unknown_reason = f"a joint moves {robot.base} relative to {robot.root}"
+    else:
+        T_base_own = robot.T_base_root @ inverse(T_own_root)
+        own = "world" if named in ("", robot.root or robot.base) else named
+        frames.update({name: T_base_own for name in ("", own) if name not in frames.links})
     for location, entry in mappings_of("", mapping_of(SCENE, data), "fixed_frame_transforms"):
         child = str(entry.get("child_frame_id", "")).removeprefix("/")
         T = pose_of(f"{location}.transform", entry.get("transform"), "translation", "rotation")
@@ -517,7 +512,7 @@ def _attached(location: str, entry: dict[str, Any], frames: MoveItFrames, folder
     location, object_entry = f"{location}.object", mapping_of(location, entry, "object")
     in_link = frame_name(location, object_entry) == link
     if in_link:  # the shapes are already in the frame of the link
-        frames = MoveItFrames(None, np.eye(4), (link,))
+        frames = MoveItFrames({link: np.eye(4)})
     with located(location):
         shapes = tuple(object_shapes(object_entry, frames, folder))
     touch = tuple(map(str, list_of(f"{location}.", entry, "touch_links")))

@@ -142,18 +142,25 @@ def scene_entries(scene: Scene, folder: Path | None) -> list[dict[str, dict[str,
     entries = []
     for shape in scene.shapes:
         file = getattr(shape, "file", None)
-        left_out = {"file"} if file is None else {*FILE_CONTENT[shape.kind], "file"}
-        values: dict[str, object] = {} if file is None else {"file": name_from(folder, Path(file))}
-        for field in fields(shape):  # type: ignore[arg-type]
-            value = getattr(shape, field.name)
-            if field.name not in left_out:
-                values[field.name] = value.tolist() if isinstance(value, ndarray) else value
+        if file is None:
+            values = plain_fields(shape, "file")
+        else:
+            values = plain_fields(shape, "file", *FILE_CONTENT[shape.kind])
+            values = {"file": name_from(folder, Path(file)), **values}
         if values["name"] == shape.kind:
             del values["name"]
         if values.get("wxyz") == list(IDENTITY):
             del values["wxyz"]
         entries.append({shape.kind: values})
     return entries
+
+
+def plain_fields(value: Any, *left_out: str) -> dict[str, Any]:
+    """The fields of a dataclass by name, with lists in place of arrays."""
+    names = [field.name for field in fields(value) if field.name not in left_out]
+    content = [getattr(value, name) for name in names]
+    plain = (part.tolist() if isinstance(part, ndarray) else part for part in content)
+    return dict(zip(names, plain, strict=True))
 
 
 def contacts_entry(scene: Scene) -> dict[str, object]:

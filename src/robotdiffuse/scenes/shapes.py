@@ -506,15 +506,11 @@ class HeightMap(_Posed, Triangulated):
 
     @property
     def _faces(self) -> ndarray:
-        rows, columns = self.heights.shape
-        corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
-        complete = ~np.isnan(self.heights)
-        complete = (complete[:-1, :-1] & complete[1:, :-1] & complete[:-1, 1:] & complete[1:, 1:]).ravel()
-        a = corner[complete]
-        b = a + 1
-        c = a + columns
-        d = a + columns + 1
-        return np.concatenate([np.column_stack([a, b, d]), np.column_stack([a, d, c])])
+        index = np.arange(self.heights.size).reshape(self.heights.shape)
+        corners = [index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]]
+        cells = np.stack(corners, axis=-1).reshape(-1, 4)
+        cells = cells[~np.isnan(self.heights.ravel()[cells]).any(axis=1)]
+        return np.concatenate([cells[:, [0, 1, 3]], cells[:, [0, 3, 2]]])
 
     @cached_property
     def mesh(self) -> Mesh:

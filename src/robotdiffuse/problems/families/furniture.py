@@ -9,6 +9,7 @@ in crates and between the objects on a table. `sample_target` samples poses with
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Annotated
 
 import numpy as np
@@ -232,19 +233,30 @@ class FurnitureFrame:
         """Adds a box. `low` and `high` are opposite corners in this frame, before the box is rotated by
         `turn` about the vertical axis through its middle [rad]."""
         half = (self.yaw + turn) / 2
-        middle = (np.array(low) + high) / 2
-        size = np.subtract(high, low)
-        self.shapes.append(Box(self.point(middle), size, (np.cos(half), 0.0, 0.0, np.sin(half)), name))
+        place = self._place(low, high)
+        self.shapes.append(Box(*place, (np.cos(half), 0.0, 0.0, np.sin(half)), name))
 
     def region(self, low: Corner, high: Corner, approach: Vector) -> None:
-        middle = (np.array(low) + high) / 2
-        size = np.subtract(high, low)
-        self.regions.append(Region(self.point(middle), size, self.yaw, self.rotation @ approach))
+        self.regions.append(Region(*self._place(low, high), self.yaw, self.rotation @ approach))
+
+    def _place(self, low: Corner, high: Corner) -> tuple[Vector, Vector]:
+        """The middle, in the base frame, and the size of a box between opposite corners."""
+        return self.point((np.array(low) + high) / 2), np.subtract(high, low)
 
     def boxes(self, corners: Iterable[tuple[Corner, Corner]], name: str) -> None:
         """Adds several boxes of one name."""
         for low, high in corners:
             self.box(low, high, name)
+
+    def case(self, depth: float, t: float, low: float, height: float, boards: Values, sides: Values) -> None:
+        """Adds boards between uprights from `low` to `height`, all of thickness `t`, open in front.
+
+        boards: z of the boards' tops. sides: y of the uprights' right sides.
+        """
+        left = sides[0] + t
+        right = sides[-1]
+        self.boxes((((0.0, left, z - t), (depth, right, z)) for z in boards), "board")
+        self.boxes((((0.0, y, low), (depth, y + t, height)) for y in sides), "upright")
 
 
 class LooseObject:
@@ -357,6 +369,12 @@ def edges(sizes: Values, t: float) -> Values:
     return np.concatenate([[0.0], np.cumsum(sizes + t)])
 
 
+def centered(widths: Values, t: float) -> Values:
+    """As `edges`, centered: y of the right sides of uprights, separated by gaps of these widths."""
+    sides = edges(widths, t)
+    return sides - (sides[-1] + t) / 2
+
+
 def count(numbers: tuple[int, int], rng: Generator) -> int:
     """A random integer between the two numbers, inclusive."""
     return int(rng.integers(numbers[0], numbers[1] + 1))
@@ -402,15 +420,11 @@ class Shelf(Furniture):
         rows = rng.uniform(*self.row_height, count(self.boards, rng) - 1)
         tops = rng.uniform(*self.lowest) + t + edges(rows, t)
         columns = rng.uniform(*self.column_width, count(self.columns, rng))
-        sides = edges(columns, t)
-        sides -= (sides[-1] + t) / 2
-        left = sides[0]
-        right = sides[-1] + t
+        sides = centered(columns, t)
         height = tops[-1]
-        frame.boxes((((0.0, left + t, z - t), (depth, right - t, z)) for z in tops), "board")
-        frame.boxes((((0.0, y, 0.0), (depth, y + t, height)) for y in sides), "upright")
+        frame.case(depth, t, 0.0, height, tops, sides)
         if rng.random() < self.back_share:
-            frame.box((depth, left, 0.0), (depth + t, right, height), "back")
+            frame.box((depth, sides[0], 0.0), (depth + t, sides[-1] + t, height), "back")
         ceilings = [*(tops[1:] - t), height + self.row_height[1]]
         compartments = [
             [y + t, y + t + w, z, ceiling]
@@ -665,14 +679,11 @@ class Kitchen(Furniture):
         front = depth - rng.uniform(*self.cupboard_depth)
         top = low + rng.uniform(*self.cupboard_height)
         if len(widths):
-            sides = edges(widths, t)
-            sides -= (sides[-1] + t) / 2
-            left = float(sides[0])
-            right = float(sides[-1]) + t
-            ends = (((front, left, z), (depth, right, z + t)) for z in (low, top - t))
-            uprights = (((front, y, low + t), (depth, y + t, top - t)) for y in sides.tolist())
+            sides = centered(widths, t)
+            ends = (((front, sides[0], z), (depth, sides[-1] + t, z + t)) for z in (low, top - t))
+            uprights = (((front, y, low + t), (depth, y + t, top - t)) for y in sides)
             frame.boxes((*ends, *uprights), "cupboard")
-            for y, w in zip(sides[:-1].tolist(), widths.tolist(), strict=True):
+            for y, w in zip(sides[:-1], widths, strict=True):
                 frame.region((front, y + t, low + t), (depth, y + t + w, top - t), AHEAD)
                 if rng.random() < self.door_share:  # open at a right angle, hinged on the left or the right
                     hinge = y if rng.random() < 0.5 else y + w + t
@@ -686,8 +697,11 @@ class Kitchen(Furniture):
             b = rng.uniform(*self.appliance_width) / 2
             b *= 1.0 if i < ovens else rng.uniform(0.5, 1.0)
             (x, y), high = counter.place(a, b, rng), height + rng.uniform(*self.appliance_height)
-            add, name = (hollow, "oven") if i < ovens else (frame.box, "appliance")
-            add((x - a, y - b, height), (x + a, y + b, high), name)
+            corners = (x - a, y - b, height), (x + a, y + b, high)
+            if i < ovens:
+                hollow(*corners, "oven")
+            else:
+                frame.box(*corners, "appliance")
         counter.furnish(self, rng)
         return [frame]
 
@@ -757,15 +771,12 @@ class Cabinet(Furniture):
         on_ground = rng.random() < self.ground_share
         low = 0.0 if on_ground else rng.uniform(*self.lowest)
         tops = low + t + edges(rng.uniform(*self.row_height, count(self.rows, rng)), t)
-        sides = edges(rng.uniform(*self.column_width, count(self.columns, rng)), t)
-        sides -= (sides[-1] + t) / 2
-        left = float(sides[0])
-        right = float(sides[-1]) + t
-        height = float(tops[-1])
+        sides = centered(rng.uniform(*self.column_width, count(self.columns, rng)), t)
+        left = sides[0]
+        right = sides[-1] + t
+        height = tops[-1]
         boards = tops if rng.random() < self.top_share else tops[:-1]
-        corners = (((0.0, left + t, z - t), (depth, right - t, z)) for z in boards.tolist())
-        frame.boxes(corners, "board")
-        frame.boxes((((0.0, y, low), (depth, y + t, height)) for y in sides.tolist()), "upright")
+        frame.case(depth, t, low, height, boards, sides)
         if rng.random() < self.back_share:
             frame.box((depth, left, low), (depth + t, right, height), "back")
         regions: list[tuple[Corner, Corner, Vector]] = []
@@ -780,8 +791,8 @@ class Cabinet(Furniture):
             regions.append(((0.0, left, height), (depth, right, height + TOP_HEIGHT), AHEAD))
         cells = [
             (y + t, end, z, ceiling)
-            for z, ceiling in zip(tops[:-1].tolist(), (tops[1:] - t).tolist(), strict=True)
-            for y, end in zip(sides[:-1].tolist(), sides[1:].tolist(), strict=True)
+            for z, ceiling in zip(tops[:-1], tops[1:] - t, strict=True)
+            for y, end in pairwise(sides)
         ]
         kinds = rng.random(len(cells))
         drawers = np.flatnonzero(kinds < self.drawer_share)[: self.max_drawers]

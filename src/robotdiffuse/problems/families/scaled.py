@@ -19,7 +19,7 @@ from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.kinematics import reach
 from robotdiffuse.robots.robot import Robot, scaled
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Shape, Sphere
+from robotdiffuse.scenes.shapes import Box, Shape
 
 PANDA_REACH = 0.855
 """A Panda's reach, as computed by `robots.kinematics.reach` [m]."""
@@ -50,7 +50,8 @@ class ScaledFamily:
 
     @property
     def floor(self) -> Box | None:
-        return None if self.family.floor is None else _box(self.family.floor, self.scale)
+        floor = self.family.floor
+        return None if floor is None else _sized(floor, self.scale)  # type: ignore[return-value]
 
     @property
     def region(self) -> Float[ndarray, "2 3"]:
@@ -88,11 +89,7 @@ def _scene(scene: Scene, scale: float) -> Scene:
 
 def _sized(shape: Shape, scale: float) -> Shape:
     """The shape, a sphere or a box, with its lengths multiplied by `scale`."""
-    if isinstance(shape, Sphere):
-        return replace(shape, center=shape.center * scale, radius=shape.radius * scale)
-    assert isinstance(shape, Box)
-    return _box(shape, scale)
-
-
-def _box(box: Box, scale: float) -> Box:
-    return replace(box, center=box.center * scale, size=box.size * scale)
+    lengths = {
+        name: getattr(shape, name) * scale for name in ("center", "radius", "size") if hasattr(shape, name)
+    }
+    return replace(shape, **lengths)  # type: ignore[type-var]
