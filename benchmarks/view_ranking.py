@@ -39,7 +39,6 @@ from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.unknown_space import CARVING_MARGIN, THRESHOLDS, OccupiedVoxels, confidence
 from robotdiffuse.perception.voxel_grid import COARSE, SHAPE, refined
 from robotdiffuse.planning.context import PlanRequest
-from robotdiffuse.planning.pipeline import attempt
 from robotdiffuse.planning.pipeline.unknown_space import (
     ACCEPTABLE_RISK,
     CONFIDENCE_TOLERANCE,
@@ -108,7 +107,7 @@ def record(problem: Problem, family: str, number: int, depth: str) -> Row:
 
     def attempted(kind: str, threshold: float, assumed: Problem, request: PlanRequest) -> bool:
         began = time.process_time()
-        result = attempt(PLANNER, assumed, request)
+        result = PLANNER.attempt(assumed, request)
         planned = time.process_time()
         if result.path is None or result.trajectory is None:
             spent[kind] += planned - began

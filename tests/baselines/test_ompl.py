@@ -120,7 +120,7 @@ def test_an_error_below_ompl_comes_out(planner, monkeypatch):
         patched.setattr(ompl, "motions_free", broken)
         patched.setattr(ompl.lane_collision, "free_many", broken)
         # start and goal are checked by the kernel too
-        patched.setattr("robotdiffuse.planning.pipeline.usable_start_goal", UncheckedStartGoal)
+        patched.setattr("robotdiffuse.planning.planner.usable_start_goal", UncheckedStartGoal)
         with pytest.raises(RuntimeError, match="broken kernel"):
             planner().plan(problem(RIGHT), time_limit=120.0)
     assert plan(planner, problem(RIGHT)).solved

@@ -83,7 +83,7 @@ class PlanResult:
     fraction: float | None = None
     """Problems with a Cartesian line: the fraction of the line that the arm can follow from the start, 1 if
     there is a motion. If it is below 1, `reason` says what stops the arm."""
-    corner_deviations: tuple[float, ...] | None = field(default=None, repr=False)
+    corner_deviations: tuple[float, ...] | Any = field(default=None, repr=False)
     """For each waypoint of the path, the largest distance at which the motion may pass it, rounding the
     corner [rad, joint-space L2]; None: `TimingSettings.corner_deviation`. Result files omit this field."""
     trees: tuple[Tree, ...] = field(default=(), repr=False)

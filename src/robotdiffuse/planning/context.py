@@ -1,11 +1,11 @@
 """The request and the context of a planning call: its arguments, clock, random numbers and results."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -39,7 +39,7 @@ from robotdiffuse.trajectories.speed_limits import (
 )
 from robotdiffuse.trajectories.timing import time_parameterize
 from robotdiffuse.validation.report import Report, Violation
-from robotdiffuse.validation.validator import Verifier, verifier
+from robotdiffuse.validation.validator import verifier
 
 DEFAULT_CLEARANCE = 0.01
 """Clearance if neither the request nor the problem sets one [m]."""
@@ -160,7 +160,11 @@ class PlanningContext:
 
     def note(self, text: str) -> None:
         """Add a note to the result."""
-        self.notes = (*self.notes, text)
+        self.notes = self.notes_with([text])
+
+    def notes_with(self, more: Iterable[str]) -> tuple[str, ...]:
+        """The notes of this call and others, each once."""
+        return tuple(dict.fromkeys((*self.notes, *more)))
 
     def keeps_constraints(self, q: Configurations) -> bool:
         """Whether the polyline through configurations, such as a rounded corner, deviates from the path
@@ -269,60 +273,50 @@ class PlanningContext:
             reason: The result's reason; empty: "solved by" and the stage.
             notes: Notes on this path, added to those of the call.
             keeps: As in `time_parameterize`.
-            deviations: As in `time_parameterize`.
+            deviations: As in `time_parameterize`; None: the corner deviation of `timing`.
             trajectory: The motion along the path, if it is timed already.
 
         Returns:
             The solved result; None if the validator refuses the path or the motion, or if time runs out.
         """
-        began = self.elapsed
-        try:
-            with self.deadline():
-                result = self._finished(waypoints, stage, reason, notes, keeps, deviations, trajectory)
-        except OutOfTimeError as error:
-            self._ended = Status.TIMEOUT, self._too_short(error)
-            return None
-        self._reserved = max(self._reserved, RESERVED_FACTOR * (self.elapsed - began))
-        return result
-
-    def _finished(
-        self,
-        waypoints: Configurations,
-        stage: str,
-        reason: str,
-        notes: tuple[str, ...],
-        keeps: Callable[[ndarray], bool],
-        deviations: Float[ndarray, "n"] | None,
-        trajectory: Trajectory | None,
-    ) -> PlanResult | None:
         problem = self.problem
+        began = self.elapsed
         waypoints = np.asarray(waypoints, dtype=np.float64)
+        if deviations is None:
+            deviations = np.full(len(waypoints), self.timing.corner_deviation)
         turns = np.flatnonzero(problem.robot.wraps(waypoints).any(axis=1))
         # A controller that wraps angles could take a step of nearly a whole turn for a small step back, so
         # such a step gets a waypoint at its middle.
         if len(turns):
             middles = 0.5 * (waypoints[turns] + waypoints[turns + 1])
             waypoints = np.insert(waypoints, turns + 1, middles, axis=0)
-            if deviations is not None:
-                deviations = np.insert(deviations, turns + 1, self.timing.corner_deviation)
+            deviations = np.insert(deviations, turns + 1, self.timing.corner_deviation)
         path = Path(problem.robot.joint_names, waypoints)
-        report = self.validator.path(path)
-        if report.violation is not None:
-            return self._refuse(report.violation, float(len(path.positions) - 1))
-        planning_time = self.elapsed
-        motion = _TimedMotion(self.validator)
-        trajectory = trajectory or time_parameterize(
-            problem.robot,
-            path,
-            motion.valid,
-            self.validator.collision_free,
-            self.timing,
-            keeps,
-            0.0 if problem.start_velocity is None else float(np.linalg.norm(problem.start_velocity)),
-            self.beside,
-            deviations,
-        )
-        timed = motion.report(trajectory)
+        # timing usually has just validated the trajectory that it returns
+        report_of = lru_cache(maxsize=1)(self.validator.trajectory)
+        try:
+            with self.deadline():
+                report = self.validator.path(path)
+                if report.violation is not None:
+                    return self._refuse(report.violation, float(len(waypoints) - 1))
+                planning_time = self.elapsed
+                trajectory = trajectory or time_parameterize(
+                    problem.robot,
+                    path,
+                    lambda motion: report_of(motion).valid,
+                    self.validator.collision_free,
+                    self.timing,
+                    keeps,
+                    0.0 if problem.start_velocity is None else float(np.linalg.norm(problem.start_velocity)),
+                    self.beside,
+                    deviations,
+                )
+                timed = report_of(trajectory)
+        except OutOfTimeError as error:
+            self._ended = Status.TIMEOUT, self._too_short(error)
+            return None
+        finally:
+            self._reserved = max(self._reserved, RESERVED_FACTOR * (self.elapsed - began))
         if timed.violation is not None:
             if timed.violation.kind == "time":  # every motion of this problem would take too long to validate
                 self._ended = Status.NO_PATH, timed.violation.message
@@ -330,14 +324,11 @@ class PlanningContext:
         stops = ", ".join(f"{at:.3g} s" for at in trajectory.stops)
         if stops:
             notes = (*notes, f"the motion stops on its way, at {stops}: corners there could not be rounded")
-        scene = _least(report.scene_clearance, timed.scene_clearance)
-        itself = _least(report.self_clearance, timed.self_clearance)
         # Progress ends with the returned path, at the time when the search recorded its length. Shorter
         # recorded paths are left out, since they were refused.
-        final_length = path.length
-        tolerance = final_length * 1e-3
-        longer = [(at, length) for at, length in self._progress if length > final_length + tolerance]
-        times = [at for at, length in self._progress if abs(length - final_length) <= tolerance]
+        tolerance = path.length * 1e-3
+        longer = [(at, length) for at, length in self._progress if length > path.length + tolerance]
+        times = [at for at, length in self._progress if abs(length - path.length) <= tolerance]
         return PlanResult(
             status=Status.SOLVED,
             reason=reason or f"solved by {stage}",
@@ -348,12 +339,10 @@ class PlanningContext:
             stage=stage,
             path=path,
             trajectory=trajectory,
-            corner_deviations=None if deviations is None else tuple(deviations.tolist()),
-            min_clearance=min(scene, itself),
-            scene_clearance=scene,
-            self_clearance=itself,
-            notes=(*self.notes, *notes),
-            progress=(*longer, (times[0] if times else planning_time, final_length)),
+            corner_deviations=tuple(deviations.tolist()),
+            **least_clearances(report, timed),
+            notes=self.notes_with(notes),
+            progress=(*longer, (times[0] if times else planning_time, path.length)),
             refused=self._refused,
         )
 
@@ -376,22 +365,8 @@ class PlanningContext:
         self.refused_at = violation.time / end, violation.message
 
 
-def _least(*clearances: float | None) -> float:
-    return min(clearance for clearance in clearances if clearance is not None)
-
-
-class _TimedMotion:
-    """Validates trajectories. The last report is cached, because timing usually has just validated the
-    trajectory that it returns."""
-
-    def __init__(self, validator: Verifier) -> None:
-        self.validator = validator
-        self.last: tuple[Trajectory, Report] | None = None
-
-    def report(self, trajectory: Trajectory) -> Report:
-        if self.last is None or self.last[0] is not trajectory:
-            self.last = trajectory, self.validator.trajectory(trajectory)
-        return self.last[1]
-
-    def valid(self, trajectory: Trajectory) -> bool:
-        return self.report(trajectory).valid
+def least_clearances(*motions: Report | PlanResult) -> dict[str, Any]:
+    """The smallest clearances [m] of valid motions, as fields of a `PlanResult`."""
+    scene = min(motion.scene_clearance for motion in motions)  # type: ignore[type-var]
+    itself = min(motion.self_clearance for motion in motions)  # type: ignore[type-var]
+    return {"scene_clearance": scene, "self_clearance": itself, "min_clearance": min(scene, itself)}

@@ -6,15 +6,16 @@ from dataclasses import replace
 from typing import Any, ClassVar, Generic, TypeVar
 
 from robotdiffuse.collision.motions import finer_resolution
+from robotdiffuse.core.deadline import OutOfTimeError
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.loading import compile_note
+from robotdiffuse.core.loading import compile_note, loading
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.core.types import CONVERGED
 from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS, planners_that_support
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
-from robotdiffuse.planning.pipeline import Solver, attempt
-from robotdiffuse.planning.start_goal import StartGoal
+from robotdiffuse.planning.start_goal import StartGoal, usable_start_goal
+from robotdiffuse.problems.constraints import CartesianLine
 from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
@@ -119,6 +120,35 @@ class Planner(ABC, Generic[PlannerSettings]):
             kinds = replace(kinds, scene=one_of_each(problem.scene))
         return [*results, call(kinds, SHORT_TIME_LIMIT)]
 
+    def attempt(self, problem: Problem, request: PlanRequest) -> PlanResult:
+        """Plan from the problem's start to its goal by one call of `solve`. The problem's waypoints, moving
+        obstacles, start velocity and unknown space are ignored: `planning/pipeline` handles them."""
+        context = PlanningContext(self.name, problem, request)
+        followed = None
+        lines = any(isinstance(constraint, CartesianLine) for constraint in problem.constraints)
+        with context.deadline():
+            try:
+                if self.follows_lines and lines:
+                    with loading():
+                        from robotdiffuse.planning.line_following import follow_line  # compiled code
+
+                    followed = follow_line(context)
+                result = followed if followed is not None and followed.solved else self._searched(context)
+            except OutOfTimeError as error:
+                result = context.out_of_time(error)
+        if lines and result.solved:
+            return replace(result, fraction=1.0)
+        if followed is None:
+            return result
+        return replace(result, fraction=followed.fraction, reason=f"{result.reason}; {followed.reason}")
+
+    def _searched(self, context: PlanningContext) -> PlanResult:
+        start_goal = usable_start_goal(context)
+        if isinstance(start_goal, PlanResult):
+            return start_goal
+        context.begin_search()
+        return self.solve(context, start_goal)
+
     def prepare(self, robot: Robot) -> None:
         """Preparation that does not count as planning time: learned planners load their weights for the
         robot, and raise InputError if there are none."""
@@ -129,10 +159,10 @@ class Planner(ABC, Generic[PlannerSettings]):
         `context.unsolved()` if none is found."""
 
 
-def pipeline_for(problem: Problem) -> Callable[[Solver, Problem, PlanRequest], PlanResult]:
+def pipeline_for(problem: Problem) -> Callable[[Planner, Problem, PlanRequest], PlanResult]:
     """The function of `planning/pipeline` that plans for a problem: the one that handles its moving
-    obstacles, waypoints, start velocity or views, in this order of precedence; `attempt` if it has none. A
-    module is imported only when it is needed."""
+    obstacles, waypoints, start velocity or views, in this order of precedence; `Planner.attempt` if it has
+    none. A module is imported only when it is needed."""
     if problem.moving:
         from robotdiffuse.planning.pipeline.moving_obstacles import plan_among_moving_obstacles
 
@@ -149,7 +179,7 @@ def pipeline_for(problem: Problem) -> Callable[[Solver, Problem, PlanRequest], P
         from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
 
         return plan_with_unknown_space
-    return attempt
+    return Planner.attempt
 
 
 def ever_finer(context: PlanningContext, settings: PlannerSettings) -> Iterator[tuple[PlannerSettings, int]]:

@@ -223,10 +223,10 @@ def _time_segments(
         part = waypoints[a : b + 1]
         line = BlendedPolyline(part, half_widths(part, deviations[a : b - 1]))
         segments.append(time_line(robot, line, settings, 0.0 if segments else start_speed, extra))
-    return Trajectory(path.joint_names, *_joined(segments))
+    return Trajectory(path.joint_names, *joined_rows(segments))
 
 
-def _joined(pieces: Sequence[tuple[ndarray, ...]]) -> tuple[ndarray, ...]:
+def joined_rows(pieces: Sequence[tuple[ndarray, ...]]) -> tuple[ndarray, ...]:
     """Joins motions, which are tuples of times and further columns. Each motion begins with the last row of
     the motion before it."""
     start = 0.0
@@ -364,4 +364,4 @@ class StopGraph:
                 segments.append((np.array([0.0, self.step]), q, 0 * q, 0 * q))
             else:
                 segments.append(part.rows)
-        return Trajectory(self.joint_names, *_joined(segments))
+        return Trajectory(self.joint_names, *joined_rows(segments))

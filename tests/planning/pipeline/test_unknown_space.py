@@ -15,7 +15,7 @@ from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_with
 from robotdiffuse.perception.unknown_space import CARVING_MARGIN, PADDINGS, RATES, OccupiedVoxels, Padded
 from robotdiffuse.perception.voxel_grid import COARSE, FINE
 from robotdiffuse.planning.context import PlanRequest
-from robotdiffuse.planning.pipeline import attempt, unknown_space
+from robotdiffuse.planning.pipeline import unknown_space
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.robots.kinematics import placed_spheres
 
@@ -77,7 +77,7 @@ def test_of_several_motions_the_one_that_sweeps_least_probability(planner: Plann
     everywhere = np.full(FINE.shape, np.float32(0.01))
     problem = partial("predicted")
     chosen = unknown_space.plan_with_unknown_space(planner, problem, REQUEST, everywhere)
-    first = attempt(planner, replace(problem, views=()), PlanRequest(1.0))
+    first = planner.attempt(replace(problem, views=()), PlanRequest(1.0))
     unknown = observe(problem.views, PANDA, START).unknown.repeat(2, 0).repeat(2, 1).repeat(2, 2)
     crossed = FINE.swept(PANDA, first.path) & unknown & ~FINE.filled(PANDA, (START, GOAL))
     assert chosen.swept_probability is not None

@@ -26,9 +26,9 @@ from robotdiffuse.core.deadline import OutOfTimeError, check_timing
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path, Status, Trajectory
-from robotdiffuse.planning.context import PlanningContext, PlanRequest
-from robotdiffuse.planning.pipeline import Solver, attempt
+from robotdiffuse.planning.context import PlanningContext, PlanRequest, least_clearances
 from robotdiffuse.planning.pipeline.waypoints import plan_through_waypoints
+from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.trajectories.timing import MIN_DISTANCE, SPEED_FACTORS, StopGraph, time_parameterize
 from robotdiffuse.validation.tolerances import goal_error
@@ -134,12 +134,12 @@ PATH_TIME_FRACTION = 0.5
 """Time limit for planning a path, as a fraction of the remaining time."""
 
 
-def plan_among_moving_obstacles(solver: Solver, problem: Problem, request: PlanRequest) -> PlanResult:
+def plan_among_moving_obstacles(planner: Planner, problem: Problem, request: PlanRequest) -> PlanResult:
     """A motion among the problem's moving obstacles, certified at every time until it ends."""
-    context = PlanningContext(solver.name, problem, request)
+    context = PlanningContext(planner.name, problem, request)
     robot = problem.robot
     still = replace(problem, moving=())
-    plan_path = plan_through_waypoints if problem.waypoints else attempt
+    plan_path = plan_through_waypoints if problem.waypoints else Planner.attempt
     contact = context.validator.settings.contact
     collision = MovingCollision(robot, problem.moving, contact, 0.0)
     first = collision.sweep(np.zeros(1), problem.start[None]).contact
@@ -161,7 +161,7 @@ def plan_among_moving_obstacles(solver: Solver, problem: Problem, request: PlanR
             scene = scene.with_shapes([*scene.shapes, *standing])
         limit = max(PATH_TIME_FRACTION * (request.time_limit - context.elapsed), 1e-3)
         path_request = replace(request, time_limit=limit, seed=request.seed + attempts // 2)
-        result = plan_path(solver, replace(still, scene=scene), path_request)
+        result = plan_path(planner, replace(still, scene=scene), path_request)
         attempts += 1
         if result.path is None or result.trajectory is None:
             if attempted_paths == 0 and scene is problem.scene:
@@ -182,34 +182,20 @@ def plan_among_moving_obstacles(solver: Solver, problem: Problem, request: PlanR
                 continue
             report = context.validator.trajectory(timed)
             if report.violation is None:
-                return _solved(context, result, timed, report.scene_clearance, report.self_clearance)
+                return replace(
+                    result,
+                    reason=f"{result.reason}, timed among moving obstacles",
+                    planning_time=context.elapsed,
+                    seed=request.seed,
+                    trajectory=timed,
+                    **least_clearances(result, report),
+                    notes=context.notes_with(result.notes),
+                )
             reason = f"; last: {report.violation.message}"
     paths = "one path" if attempted_paths == 1 else f"{attempted_paths} paths"
     return context.fail(
         Status.TIMEOUT,
         f"no timing of {paths}, with waits and retreats, passes the moving obstacles{reason}",
-    )
-
-
-def _solved(
-    context: PlanningContext, static: PlanResult, timed: Trajectory, scene: float | None, itself: float | None
-) -> PlanResult:
-    """The result of the static scene with the trajectory `timed`; scene, itself: its clearances to obstacles
-    and between links [m]."""
-    assert static.scene_clearance is not None and static.self_clearance is not None
-    assert scene is not None and itself is not None
-    scene = min(scene, static.scene_clearance)
-    itself = min(itself, static.self_clearance)
-    return replace(
-        static,
-        reason=f"{static.reason}, timed among moving obstacles",
-        planning_time=context.elapsed,
-        seed=context.request.seed,
-        trajectory=timed,
-        scene_clearance=scene,
-        self_clearance=itself,
-        min_clearance=min(scene, itself),
-        notes=(*context.notes, *(note for note in static.notes if note not in context.notes)),
     )
 
 

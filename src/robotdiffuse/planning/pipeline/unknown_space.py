@@ -44,7 +44,7 @@ from robotdiffuse.perception.unknown_space import (
 )
 from robotdiffuse.perception.voxel_grid import Probabilities, refined
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
-from robotdiffuse.planning.pipeline import Solver, attempt
+from robotdiffuse.planning.planner import Planner
 from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.problem import OCCUPIED, OPTIMISTIC, PADDED, PREDICTED, JointGoal, Problem
 from robotdiffuse.robots.kinematics import placed_spheres
@@ -76,7 +76,7 @@ AS_SEEN = "as seen"
 
 
 def plan_with_unknown_space(
-    solver: Solver,
+    planner: Planner,
     problem: Problem,
     request: PlanRequest,
     predicted: Probabilities | None = None,
@@ -100,7 +100,7 @@ def plan_with_unknown_space(
         exported_completion()  # loaded before the clock starts
     else:
         predict = None
-    context = PlanningContext(solver.name, problem, request)
+    context = PlanningContext(planner.name, problem, request)
     volume = None
     if unknown is None:
         volume = observe(problem.views, problem.robot, problem.start)
@@ -121,7 +121,7 @@ def plan_with_unknown_space(
                 f"views[{i}]: {100 * (1 - share):.0f} % of the pixels measure nothing, which lowers the"
                 " confidence; if the sensor gives 0 where nothing is in range, state the view's range"
             )
-    attempts = _Attempts(solver, context, unknown)
+    attempts = _Attempts(planner, context, unknown)
     as_seen = replace(problem, views=())
     limit = request.time_limit
     failed = list[str]()
@@ -179,8 +179,7 @@ def _failed_note(failed: list[str], used: str) -> str:
 
 def _with_notes(context: PlanningContext, result: PlanResult, *notes: str) -> PlanResult:
     """The result with the notes of the call and with further notes; each note once."""
-    every = (*context.notes, *result.notes, *(note for note in notes if note))
-    return replace(result, notes=tuple(dict.fromkeys(every)))
+    return replace(result, notes=context.notes_with((*result.notes, *filter(None, notes))))
 
 
 def assumptions_of(
@@ -248,8 +247,8 @@ def with_assumption(problem: Problem, assumption: Assumption, goals: Configurati
 class _Attempts:
     """Calls a planner for problems under assumptions, within one planning call."""
 
-    def __init__(self, solver: Solver, context: PlanningContext, unknown: UnknownSpace) -> None:
-        self.solver = solver
+    def __init__(self, planner: Planner, context: PlanningContext, unknown: UnknownSpace) -> None:
+        self.planner = planner
         self.context = context
         self.unknown = unknown
 
@@ -288,7 +287,7 @@ class _Attempts:
         context_request = self.context.request
         began = self.context.elapsed
         limit = max(until - began, MIN_TIME_FRACTION * context_request.time_limit)
-        result = attempt(self.solver, problem, replace(request, time_limit=limit))
+        result = self.planner.attempt(problem, replace(request, time_limit=limit))
         progress = tuple((began + at, length) for at, length in result.progress)
         return replace(
             result, planning_time=began + result.planning_time, progress=progress, seed=context_request.seed

@@ -26,14 +26,16 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Path, Status, Trajectory
-from robotdiffuse.planning.context import MIN_TIME_LIMIT, PlanningContext, PlanRequest
-from robotdiffuse.planning.pipeline import Solver, attempt
+from robotdiffuse.core.types import ROWS, Path, Status, Trajectory
+from robotdiffuse.planning.context import MIN_TIME_LIMIT, PlanningContext, PlanRequest, least_clearances
+from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.constraints import CartesianLine
 from robotdiffuse.problems.goals import Goal, JointGoal
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.trajectories.corner_rounding import corner_middle
+from robotdiffuse.trajectories.speed_limits import DEFAULT as TIMING
 from robotdiffuse.trajectories.speed_limits import stopping_distance
+from robotdiffuse.trajectories.timing import joined_rows
 from robotdiffuse.validation.tolerances import DEFAULT, goal_error
 from robotdiffuse.validation.validator import verifier
 
@@ -47,14 +49,14 @@ DEVIATION_FACTOR = 0.9
 MAX_DEVIATIONS = 80
 
 
-def plan_through_waypoints(solver: Solver, problem: Problem, request: PlanRequest) -> PlanResult:
+def plan_through_waypoints(planner: Planner, problem: Problem, request: PlanRequest) -> PlanResult:
     """A motion that visits the problem's waypoints in order and ends at its goal. It stops at each waypoint,
     or passes it within its blend.
 
     The remaining time is divided equally among the remaining segments. `planning_time` of the result counts
     all segments and the final validation; `progress` has one entry, for the whole path.
     """
-    context = PlanningContext(solver.name, problem, request)
+    context = PlanningContext(planner.name, problem, request)
     goals = (*problem.waypoints, problem.goal)
     has_choice = [not (isinstance(goal, JointGoal) and len(goal.positions) == 1) for goal in goals]
     attempts = 0
@@ -65,7 +67,7 @@ def plan_through_waypoints(solver: Solver, problem: Problem, request: PlanReques
             segment_limit = max(request.time_limit - context.elapsed, MIN_TIME_LIMIT) / (len(goals) - k)
             segment = replace(problem, start=start, goal=goal, waypoints=(), blend=(), notes=())
             segment_request = replace(request, time_limit=segment_limit, seed=request.seed + attempts)
-            segments.append(attempt(solver, segment, segment_request))
+            segments.append(planner.attempt(segment, segment_request))
             path = segments[-1].path
             if path is None:
                 break
@@ -91,10 +93,10 @@ def _motions(context: PlanningContext, segments: Sequence[PlanResult]) -> list[T
     for k in range(len(segments)):
         if k == len(blend) or blend[k] == 0:
             run = segments[first : k + 1]
-            stopping = [segment.trajectory for segment in run if segment.trajectory is not None]
+            stopping = [segment.trajectory for segment in run]
             blended = _without_stops(context, run, first) if len(run) > 1 else None
-            faster = blended is not None and blended.duration < sum(motion.duration for motion in stopping)
-            motions += [blended] if blended is not None and faster else stopping
+            longest = sum(motion.duration for motion in stopping)
+            motions += [blended] if blended is not None and blended.duration < longest else stopping
             first = k + 1
     return motions
 
@@ -118,11 +120,10 @@ def _without_stops(context: PlanningContext, segments: Sequence[PlanResult], fir
     remaining = max(context.remaining, MIN_TIME_LIMIT)
     request = replace(context.request, time_limit=remaining)
     combined = PlanningContext(context.planner_name, part, request, len(segments))
-    corners, deviations = _corners(segments, combined.timing.corner_deviation)
+    corners, deviations = _corners(segments)
     for row, goal, radius in zip(corners, part.waypoints, blend, strict=True):
         deviations[row] = _deviation(part, path, int(row), goal, radius)
-    clearances = [s.min_clearance for s in segments if s.min_clearance is not None]
-    clearance = min(combined.clearance, *clearances)
+    clearance = min(combined.clearance, *(segment.min_clearance for segment in segments))
     distant = verifier(part, replace(DEFAULT, contact=max(clearance, DEFAULT.contact)))
     result = combined.finish(
         path.positions,
@@ -133,15 +134,12 @@ def _without_stops(context: PlanningContext, segments: Sequence[PlanResult], fir
     return None if result is None else result.trajectory
 
 
-def _corners(
-    segments: Sequence[PlanResult], default: float
-) -> tuple[Int[ndarray, "waypoints"], Float[ndarray, "n"]]:
+def _corners(segments: Sequence[PlanResult]) -> tuple[Int[ndarray, "waypoints"], Float[ndarray, "n"]]:
     """For the joined path of segments: the rows at which the waypoints are, and how far from each row the
     motion may pass [rad, joint-space L2], which is 0 at the waypoints."""
-    lengths = [len(segment.path.positions) - 1 for segment in segments if segment.path is not None]
-    ends = np.cumsum(lengths)
-    deviations = np.full(ends[-1] + 1, default)
-    for row, segment in zip(ends - lengths, segments, strict=True):
+    ends = np.cumsum([len(segment.path.positions) - 1 for segment in segments])
+    deviations = np.full(ends[-1] + 1, TIMING.corner_deviation)
+    for row, segment in zip((0, *ends), segments, strict=False):
         if segment.corner_deviations is not None:
             deviations[row : row + len(segment.corner_deviations)] = segment.corner_deviations
     deviations[ends[:-1]] = 0.0
@@ -163,9 +161,9 @@ def _deviation(problem: Problem, path: Path, row: int, goal: Goal, blend: float)
 
 def _path(segments: Sequence[PlanResult]) -> Path:
     """The paths of the segments as one path; the row that two paths share appears once."""
-    paths = [segment.path for segment in segments if segment.path is not None]
-    rows = np.concatenate([paths[0].positions, *(path.positions[1:] for path in paths[1:])])
-    return Path(paths[0].joint_names, rows)
+    path = segments[0].path
+    rows = np.concatenate([path.positions, *(segment.path.positions[1:] for segment in segments[1:])])
+    return replace(path, positions=rows)
 
 
 def _joined(
@@ -181,11 +179,7 @@ def _joined(
                 Status.NO_PATH,
                 f"the segments are valid alone, but not as one motion: {report.violation.message}",
             )
-    scene = min(report.scene_clearance for report in reports if report.scene_clearance is not None)
-    itself = min(report.self_clearance for report in reports if report.self_clearance is not None)
     stages = dict.fromkeys(segment.stage for segment in segments)
-    notes = dict.fromkeys(note for segment in segments for note in segment.notes)
-    deviations = _corners(segments, context.timing.corner_deviation)[1]
     return replace(
         segments[-1],
         reason=f"solved in {len(segments)} segments by {', '.join(stages)}",
@@ -194,28 +188,17 @@ def _joined(
         stage=next(iter(stages)) if len(stages) == 1 else segments[-1].planner,
         path=path,
         trajectory=trajectory,
-        corner_deviations=None if any(context.problem.blend) else tuple(deviations.tolist()),
-        min_clearance=min(scene, itself),
-        scene_clearance=scene,
-        self_clearance=itself,
-        notes=(*context.notes, *(note for note in notes if note not in context.notes)),
+        corner_deviations=tuple(_corners(segments)[1].tolist()),
+        **least_clearances(*reports),
+        notes=context.notes_with(note for segment in segments for note in segment.notes),
         progress=((context.elapsed, path.length),),
     )
 
 
 def one_after_another(motions: Sequence[Trajectory]) -> Trajectory:
     """Motions from rest to rest as one trajectory; the row that two motions share appears once."""
-    times = [motions[0].times]
-    parts = [motions[0]]
-    for motion in motions[1:]:
-        if len(motion.times) > 1:  # a segment that ends where it begins takes no time
-            times.append(times[-1][-1] + motion.times[1:])
-            parts.append(motion)
-    rows = [
-        np.concatenate([getattr(parts[0], name), *(getattr(part, name)[1:] for part in parts[1:])])
-        for name in ("positions", "velocities", "accelerations")
-    ]
-    return Trajectory(motions[0].joint_names, np.concatenate(times), *rows)
+    rows = [(motion.times, *(getattr(motion, name) for name in ROWS)) for motion in motions]
+    return Trajectory(motions[0].joint_names, *joined_rows(rows))
 
 
 def join(
@@ -261,16 +244,14 @@ def join(
         constraint
         for constraint in first.constraints
         if all(constraint in problem.constraints for problem in problems)
+        and not isinstance(constraint, CartesianLine)
     ]
-    shared = [constraint for constraint in shared if not isinstance(constraint, CartesianLine)]
     for i, (before, after) in enumerate(pairwise(results), 1):
-        problem_after = after.problem
-        if problem_after.robot is not first.robot or (
-            problem_after.scene.shapes,
-            problem_after.scene.allowed_contacts,
-        ) != (
-            first.scene.shapes,
-            first.scene.allowed_contacts,
+        scene = after.problem.scene
+        if (
+            after.problem.robot is not first.robot
+            or scene.shapes != first.scene.shapes
+            or scene.allowed_contacts != first.scene.allowed_contacts
         ):
             raise InputError(
                 f"results[{i}] is for another robot or scene than results[0]: execute one after the other"
@@ -294,12 +275,12 @@ def join(
     return replace(_joined(context, results, _motions(context, results)), problem=problem)
 
 
-def plan_from_start_velocity(solver: Solver, problem: Problem, request: PlanRequest) -> PlanResult:
+def plan_from_start_velocity(planner: Planner, problem: Problem, request: PlanRequest) -> PlanResult:
     """A motion from the problem's start velocity to rest at its goal.
 
     Raises InputError for a velocity beyond the scaled velocity limits of the request.
     """
-    context = PlanningContext(solver.name, problem, request)
+    context = PlanningContext(planner.name, problem, request)
     robot = problem.robot
     velocity = problem.start_velocity
     assert velocity is not None
@@ -316,17 +297,13 @@ def plan_from_start_velocity(solver: Solver, problem: Problem, request: PlanRequ
     if len(beyond):
         name = robot.joint_names[int(beyond[0])]
         return context.fail(Status.INVALID_START, f"{name} cannot stop from start_velocity within its limits")
-    result = attempt(solver, replace(problem, start=stop, start_velocity=None), request)
+    result = planner.attempt(replace(problem, start=stop, start_velocity=None), request)
     if result.path is None:
         return replace(result, reason=f"from where the arm can stop: {result.reason}")
     waypoints = np.concatenate([problem.start[None], result.path.positions])
-    notes = tuple(note for note in result.notes if note not in context.notes)
-    deviations = np.full(len(waypoints), context.timing.corner_deviation)
-    if result.corner_deviations is not None:
-        deviations[2:] = result.corner_deviations[1:]
-    verified_result = context.finish(
-        waypoints, result.stage or solver.name, notes=notes, deviations=deviations
-    )
+    deviations = np.full(len(waypoints), TIMING.corner_deviation)
+    deviations[2:] = result.corner_deviations[1:]
+    verified_result = context.finish(waypoints, result.stage, notes=result.notes, deviations=deviations)
     if verified_result is not None:
         return verified_result
     if context.ended:
