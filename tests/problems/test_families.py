@@ -36,7 +36,8 @@ def test_problems_are_as_the_family_says(name: str, target: str) -> None:
         q = np.concatenate([drawn.start[None], drawn.goals]).astype(np.float64)
         assert 1 <= len(drawn.goals) <= 3 and CollisionChecker(PANDA, drawn.scene).free(q).all()
         poses = np.stack([link_pose(PANDA, row, PANDA.tip) for row in q])
-        assert ((poses[:, :3, 3] >= family.region[0]) & (poses[:, :3, 3] <= family.region[1])).all()
+        if isinstance(family, Rop):
+            assert ((poses[:, :3, 3] >= family.region[0]) & (poses[:, :3, 3] <= family.region[1])).all()
         np.testing.assert_allclose(poses[1:, :3, 3], [drawn.T_base_tip[:3, 3]] * len(drawn.goals), atol=1e-3)
         floors = () if family.floor is None else (family.floor,)
         assert drawn.scene.shapes[: len(floors)] == floors
@@ -94,7 +95,6 @@ def test_problems_of_an_arm_of_five_joints_and_a_third_of_the_reach(name: str) -
     q = np.concatenate([drawn.start[None], drawn.goals]).astype(np.float64)
     assert CollisionChecker(SMALL, drawn.scene).free(q).all()
     tips = np.array([link_pose(SMALL, row, SMALL.tip)[:3, 3] for row in q])
-    assert ((tips >= family.region[0]) & (tips <= family.region[1])).all()
     np.testing.assert_allclose(tips[1:], [drawn.T_base_tip[:3, 3]] * len(drawn.goals), atol=1e-5)
     PackedScenes.pack([drawn.scene], family.max_obstacles, floor=True)
 

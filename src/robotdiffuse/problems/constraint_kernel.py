@@ -166,19 +166,25 @@ def in_box(rows, m, T, r):
 
 
 @inner_kernel()
+def length(vector):
+    """The length of the first three entries."""
+    return np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+
+
+@inner_kernel()
 def _cone(rows, m, T, normal):
     """The angle of a CONE. Writes to `normal` the rotation axis [3] that reduces the angle, of length
     sin(angle)."""
-    a = rows.a[m]
     b = rows.b[m]
-    x = T[0, 0] * a[0] + T[0, 1] * a[1] + T[0, 2] * a[2]
-    y = T[1, 0] * a[0] + T[1, 1] * a[1] + T[1, 2] * a[2]
-    z = T[2, 0] * a[0] + T[2, 1] * a[1] + T[2, 2] * a[2]
+    x = y = z = 0.0
+    for k in range(3):
+        x += T[0, k] * rows.a[m, k]
+        y += T[1, k] * rows.a[m, k]
+        z += T[2, k] * rows.a[m, k]
     normal[0] = y * b[2] - z * b[1]
     normal[1] = z * b[0] - x * b[2]
     normal[2] = x * b[1] - y * b[0]
-    sine = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
-    return np.arctan2(sine, x * b[0] + y * b[1] + z * b[2])
+    return np.arctan2(length(normal), x * b[0] + y * b[1] + z * b[2])
 
 
 @inner_kernel()
@@ -275,10 +281,8 @@ def evaluate(rows, q, end, work):
         work.values[end, m] = row_value(rows, m, work)
         if rows.row_kind[m] != CONE:
             for k in range(rows.chain_length[m]):
-                velocity = work.y
-                velocity[0] = velocity[1] = velocity[2] = 0.0
-                add_velocity(rows, m, k, 1.0, work, velocity)
-                work.levers[end, m, k] = np.sqrt(velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2)
+                frame_velocity(rows, m, k, work, work.y)
+                work.levers[end, m, k] = length(work.y)
 
 
 @kernel()
@@ -301,31 +305,31 @@ def speeds(rows, m, q, rates):
         pose_frame(rows, m, q[i], work)
         total = np.zeros(3)
         for k in range(rows.chain_length[m]):
-            add_velocity(rows, m, k, rates[i, rows.chain[m, k]], work, total)
-        out[i] = np.sqrt((total * total).sum())
+            frame_velocity(rows, m, k, work, work.y)
+            for r in range(3):
+                total[r] += rates[i, rows.chain[m, k]] * work.y[r]
+        out[i] = length(total)
     return out
 
 
 @inner_kernel()
-def add_velocity(rows, m, k, rate, work, total):
-    """Adds to `total` the velocity of the origin of row m's frame that joint k of the chain causes [m/s]."""
+def frame_velocity(rows, m, k, work, out):
+    """Writes to `out` the velocity of the origin of row m's frame while joint k of the chain moves at 1 rad/s
+    or 1 m/s."""
     a = work.axes[k, 0]
     b = work.axes[k, 1]
     c = work.axes[k, 2]
     if rows.joint_kinds[m, k] == PRISMATIC:
-        x = a
-        y = b
-        z = c
+        out[0] = a
+        out[1] = b
+        out[2] = c
     else:
         dx = work.T[0, 3] - work.origins[k, 0]
         dy = work.T[1, 3] - work.origins[k, 1]
         dz = work.T[2, 3] - work.origins[k, 2]
-        x = b * dz - c * dy
-        y = c * dx - a * dz
-        z = a * dy - b * dx
-    total[0] += rate * x
-    total[1] += rate * y
-    total[2] += rate * z
+        out[0] = b * dz - c * dy
+        out[1] = c * dx - a * dz
+        out[2] = a * dy - b * dx
 
 
 @inner_kernel()
@@ -339,21 +343,20 @@ def _unproved(rows, limits, a, b, fraction, first, second, work):
         u = work.values[first, m]
         v = work.values[second, m]
         turn = 0.0  # bound of the frame's rotation along the piece [rad]
+        beyond = 0.0  # how far the joints after joint k can move the frame's origin [m]
         for k in range(rows.chain_length[m]):
+            j = rows.chain[m, k]
+            d = fraction * abs(b[j] - a[j])
+            beyond += rows.lever_bounds[m, k] * d
             if rows.joint_kinds[m, k] != PRISMATIC:
-                j = rows.chain[m, k]
-                turn += fraction * abs(b[j] - a[j])
+                turn += d
         if rows.row_kind[m] == CONE:
             if limits[m] < np.pi and min(np.cos(u), np.cos(v)) - turn * turn / 8 < np.cos(limits[m]):
                 return m
             continue
-        beyond = 0.0  # how far the joints after joint k can move the frame's origin [m]
         before = 0.0  # summed motion of the joints before joint k
         travel = 0.0  # bound of the length of the origin's path [m]
         bend = 0.0  # bound of the origin's second derivative over the piece [m]
-        for k in range(rows.chain_length[m]):
-            j = rows.chain[m, k]
-            beyond += rows.lever_bounds[m, k] * fraction * abs(b[j] - a[j])
         for k in range(rows.chain_length[m]):
             j = rows.chain[m, k]
             d = fraction * abs(b[j] - a[j])
@@ -370,8 +373,7 @@ def _unproved(rows, limits, a, b, fraction, first, second, work):
                 return m
             continue
         # how much the interpolated orientation turns for each meter along the segment [rad/m]
-        spin = np.sqrt(rows.a[m, 0] ** 2 + rows.a[m, 1] ** 2 + rows.a[m, 2] ** 2)
-        spin *= np.sqrt(rows.b[m, 0] ** 2 + rows.b[m, 1] ** 2 + rows.b[m, 2] ** 2)
+        spin = length(rows.a[m]) * length(rows.b[m])
         if 0.5 * (u + v + turn + spin * travel) > limits[m]:
             return m
     return -1

@@ -11,8 +11,9 @@ from robotdiffuse.problems.constraint_kernel import (
     DISTANCE,
     ROLL_PITCH_YAW,
     TURN,
-    add_velocity,
+    frame_velocity,
     in_box,
+    length,
     make_work,
     pose_frame,
     row_value,
@@ -66,7 +67,7 @@ def _residuals(rows, limits, q, work):
         residuals = 1 if rows.row_kind[m] == CONE else 3
         # the fraction of the error to remove, so that inner_limit is left
         share = 1.0 - rows.inner_limit[m] / value if value > 0 else 1.0
-        sine = np.sqrt(work.error[0] ** 2 + work.error[1] ** 2 + work.error[2] ** 2)  # of a CONE's angle
+        sine = length(work.error)  # of a CONE's angle
         for r in range(residuals):
             if rows.row_kind[m] == DISTANCE:
                 x = in_box(rows, m, work.T, r)
@@ -90,19 +91,19 @@ def _residuals(rows, limits, q, work):
             for k in range(rows.chain_length[m]):
                 entry = 0.0
                 if rows.row_kind[m] == DISTANCE:
-                    velocity = work.y
-                    velocity[0] = velocity[1] = velocity[2] = 0.0
-                    add_velocity(rows, m, k, 1.0, work, velocity)
+                    frame_velocity(rows, m, k, work, work.y)
                     for i in range(3):
-                        entry += rows.reference_pose[m, i, r] * velocity[i]
-                elif rows.joint_kinds[m, k] != PRISMATIC and rows.row_kind[m] == TURN:
+                        entry += rows.reference_pose[m, i, r] * work.y[i]
+                elif rows.joint_kinds[m, k] == PRISMATIC:
+                    pass  # it does not turn the frame
+                elif rows.row_kind[m] == TURN:
                     entry = ANGLE_WEIGHT * work.axes[k, r]
-                elif rows.joint_kinds[m, k] != PRISMATIC and rows.row_kind[m] == ROLL_PITCH_YAW:
+                elif rows.row_kind[m] == ROLL_PITCH_YAW:
                     entry = ANGLE_WEIGHT * _angle_rate(rows.reference_pose[m], work.axes[k], work.error, r)
-                elif rows.joint_kinds[m, k] != PRISMATIC and sine > 1e-9:
+                elif sine > 1e-9:
                     for i in range(3):
                         entry += ANGLE_WEIGHT * work.axes[k, i] * work.error[i] / sine
-                elif rows.joint_kinds[m, k] != PRISMATIC:
+                else:
                     # the axis of the CONE is opposite to its direction: any rotation axis reduces the angle
                     entry = ANGLE_WEIGHT * work.axes[k, 0]
                 work.J[count, rows.chain[m, k]] = entry
@@ -132,10 +133,10 @@ def step(rows, limits, q, most, work):
             work.held[k] = clamped_joint = True
     if clamped_joint:
         damped_step(work.J, work.e, DAMPING, count, dof, work.held, work.A, work.y, work.step)
-    length = np.sqrt((work.step * work.step).sum())
-    scale = min(1.0, most / max(length, 1e-12))
-    if length < 1e-9:
+    distance = np.sqrt((work.step * work.step).sum())
+    if distance < 1e-9:
         return -1
+    scale = min(1.0, most / distance)
     for k in range(dof):
         q[k] += scale * work.step[k]
         if not rows.continuous[k]:

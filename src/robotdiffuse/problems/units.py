@@ -5,7 +5,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import reach_bound
-from robotdiffuse.core.types import Configuration, Points, Values, Vector
+from robotdiffuse.core.types import Configuration, Points, Vector
 from robotdiffuse.perception.depth_view import AssumedPoints, DepthView, SeenPoints
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.kinematics import placed_spheres
@@ -36,8 +36,11 @@ def unit_notes(problem: Problem) -> tuple[str, ...]:
     notes = [_size_note(shapes[i], extents[i]) for i in large]
     notes += [_view_note(i, view, reach) for i, view in enumerate(problem.views)]
     messages = tuple(note for note in notes if note)
-    solid = [i for i, shape in enumerate(shapes) if not _is_empty(shape)]
-    distances = _distances(bounds[solid])
+    solid = [
+        i for i, shape in enumerate(shapes) if not (isinstance(shape, PointCloud) and not len(shape.points))
+    ]
+    # distances of the axis-aligned boxes from the origin [m]
+    distances = np.linalg.norm(np.maximum(bounds[solid, 0], -bounds[solid, 1]).clip(0.0), axis=1)
     if (
         not messages
         and len(distances)
@@ -87,15 +90,6 @@ def _view_note(i: int, view: DepthView, reach: float) -> str:
         return ""
     depths_are = f"depths of views[{i}] begin at {nearest:.4g} m, and half of them exceed {middle:.4g} m"
     return f"check the units: the {depths_are}; {ADVICE}"
-
-
-def _is_empty(shape: Shape) -> bool:
-    return isinstance(shape, PointCloud) and len(shape.points) == 0
-
-
-def _distances(bounds: Float[ndarray, "n 2 3"]) -> Values:
-    """Distances of axis-aligned boxes from the origin [m]."""
-    return np.linalg.norm(np.maximum(np.maximum(bounds[:, 0], -bounds[:, 1]), 0.0), axis=1)
 
 
 def _points_within(points: Points, spheres: Float[ndarray, "m 4"]) -> int:

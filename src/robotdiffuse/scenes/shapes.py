@@ -330,10 +330,9 @@ class PointCloud(Shape):
             warnings.warn(note, stacklevel=2)
         scale = positive("point_cloud", "scale", scale)
         point_radius = default_radius(file, scale) if point_radius is None else point_radius
-        if scale == 1:
-            return cls(points, point_radius, str(Path(file).absolute()), name)
-        # without `file`, since problem files cannot state its scale
-        return cls(scale * points, point_radius, name=name)
+        # a scaled cloud has no `file`, since problem files cannot state its scale
+        source = str(Path(file).absolute()) if scale == 1 else None
+        return cls(scale * points, point_radius, source, name)
 
     @cached_property
     def distinct_points(self) -> Points:
@@ -439,10 +438,9 @@ class Mesh(_Posed, Triangulated):
         """
         vertices, faces = read_triangles(file)
         scale = positive("mesh", "scale", scale)
-        if scale == 1:
-            return cls(vertices, faces, xyz, wxyz, str(Path(file).absolute()), name)
-        # without `file`, since problem files cannot state its scale
-        return cls(scale * vertices, faces, xyz, wxyz, name=name)
+        # a scaled mesh has no `file`, since problem files cannot state its scale
+        source = str(Path(file).absolute()) if scale == 1 else None
+        return cls(scale * vertices, faces, xyz, wxyz, source, name)
 
     @property
     def mesh(self) -> "Mesh":

@@ -93,11 +93,6 @@ class Family(Protocol):
         ...
 
     @property
-    def region(self) -> Float[ndarray, "2 3"]:
-        """Lower and upper corner of a box that contains the tip's positions at start and goal [m]."""
-        ...
-
-    @property
     def max_obstacles(self) -> int:
         """Maximum number of obstacles of a scene, without the floor."""
         ...

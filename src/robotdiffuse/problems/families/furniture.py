@@ -13,8 +13,6 @@ from itertools import pairwise
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 from numpy.random import Generator
 
 from robotdiffuse.collision import CollisionChecker
@@ -48,8 +46,6 @@ REGION_MARGIN = 0.03
 """Distance of targets from the sides of their region, if the region is wide enough [m]."""
 FINGER_LENGTH = 0.1
 """Approximate distance from the origin of a Panda's tip link, along its z axis, to its fingertips [m]."""
-HAND_LENGTH = 0.3
-"""Maximum distance of the tip from the middle of the region that contains its fingers [m]."""
 DOWN = np.array([0.0, 0.0, -1.0])
 AHEAD = np.array([1.0, 0.0, 0.0])
 """Direction away from the arm, in the frame of the furniture."""
@@ -149,12 +145,6 @@ class Furniture(Ranges, ABC):
     @property
     def floor(self) -> Box:
         return FLOOR
-
-    @property
-    def region(self) -> Float[ndarray, "2 3"]:
-        """Box of tip positions [m]. The hand may be outside the region that contains its fingers."""
-        far = self.reach + HAND_LENGTH
-        return np.array([[-far, -far, 0.0], [far, far, SHOULDER[2] + far]])
 
     def furnish(self, rng: Generator, keep_out: Spheres | None = None) -> FurnishedScene:
         """A random scene; the same state of `rng` gives the same scene.

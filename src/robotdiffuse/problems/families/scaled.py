@@ -9,8 +9,6 @@ hard for small and large arms, and families do not depend on the size of the arm
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 from numpy.random import Generator
 
 from robotdiffuse.problems.families import load_family
@@ -52,10 +50,6 @@ class ScaledFamily:
     def floor(self) -> Box | None:
         floor = self.family.floor
         return None if floor is None else _sized(floor, self.scale)  # type: ignore[return-value]
-
-    @property
-    def region(self) -> Float[ndarray, "2 3"]:
-        return self.family.region * self.scale
 
     @property
     def max_obstacles(self) -> int:
