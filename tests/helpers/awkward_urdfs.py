@@ -125,7 +125,7 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
         solid(b"v nan 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 2 3 4\n", "part.obj"),
         "has no triangle mesh",
     ),
-    "a damaged mesh": (solid(b"this is no mesh", "part.dae"), "cannot be read"),
+    "a damaged mesh": (solid(b"this is no mesh", "part.dae"), "not well-formed"),
     "two links of one name": (arm(ARM, link("j4_link")), "two links have the name 'j4_link'"),
     "two joints of one name": (arm(ARM, link("end"), joint("j4", "j4_link", "end")), "two joints have the name 'j4'"),
     "two rotations": (

@@ -126,7 +126,7 @@ def test_surface_of_nothing_visible() -> None:
         (lambda: rd.Sphere([0, 0], 1), r"sphere.center is \[0, 0\]; it must be 3 finite numbers"),
         (lambda: rd.Sphere([0, 0, np.nan], 1), "sphere.center"),
         (lambda: rd.Sphere(["a", 0, 0], 1), "sphere.center"),
-        (lambda: rd.Sphere([0, 0, 0], -1), "sphere.radius is -1; it must be a positive number"),
+        (lambda: rd.Sphere([0, 0, 0], -1), "sphere.radius is -1; it must be a number from"),
         (lambda: rd.Sphere([0, 0, 0], 1, name=""), "sphere.name"),
         (lambda: rd.Box([0, 0, 0], [1, 0, 1]), "box.size"),
         (lambda: rd.Box([0, 0, 0], [1, 1, 1], [0, 0, 0, 0]), "must not be zero"),
@@ -135,8 +135,8 @@ def test_surface_of_nothing_visible() -> None:
         (lambda: rd.Mesh([[0, 0, 0]], [[0, 0, 1]]), "indices of the 1 vertices"),
         (lambda: rd.Mesh([[0, 0, 0]], []), "mesh.faces"),
         (lambda: rd.PointCloud([[0, 0]]), "an array of 1 x 2; it must be n x 3"),
-        (lambda: rd.PointCloud([[0, 0, np.inf]]), r"points\[0\] is \[0.0, 0.0, inf\]; it must be finite"),
-        (lambda: rd.PointCloud([[0, 0, 0], [1]]), "not numbers"),
+        (lambda: rd.PointCloud([[0, 0, np.inf]]), r"points\[0\] is \[0.0, 0.0, inf\]; its numbers must be finite"),
+        (lambda: rd.PointCloud([[0, 0, 0], [1]]), "it must be n x 3"),
         (lambda: rd.Scene(["ball"]), r"scene\[0\] is a str"),  # type: ignore[list-item]
         (lambda: rd.Scene(None), "scene is None; it must be a list of shapes"),  # type: ignore[arg-type]
         (lambda: rd.Scene(5), "scene is 5; it must be a list of shapes"),  # type: ignore[arg-type]
@@ -370,4 +370,4 @@ def test_meshes_and_clouds_from_files_with_a_scale(tmp_path: Path) -> None:
     assert cloud.point_radius == 0.02
     with pytest.warns(UserWarning, match="not finite"):
         assert rd.PointCloud.from_file(tmp_path / "cloud.npy", scale=0.001).point_radius == 0.01, "it was 10 µm"
-    refuses(r"mesh\.scale is 0; it must be a positive number", rd.Mesh.from_file, tmp_path / "cube.stl", scale=0)
+    refuses(r"mesh\.scale is 0; it must be a number from", rd.Mesh.from_file, tmp_path / "cube.stl", scale=0)

@@ -22,9 +22,8 @@ MAX_DURATION = 1e6
 """Longest motion in files and requests [s]."""
 RIGID_SLACK = 1e-4
 """Largest allowed error of a pose matrix: of each entry of R R^T against the identity, and of each entry of
-the last row against 0 0 0 1."""
-IDENTITY = np.eye(4)
-IDENTITY.setflags(write=False)
+the last row against LAST_ROW."""
+LAST_ROW = (0.0, 0.0, 0.0, 1.0)
 
 T = TypeVar("T")
 
@@ -123,10 +122,9 @@ def within(array: ndarray, most: float = MAX_COORDINATE) -> bool:
 def vector(owner: str, name: str, value: object, size: int, most: float = MAX_COORDINATE) -> ndarray:
     """The value as `size` numbers within ±most. Raises InputError, naming owner.name, for anything else."""
     array = numbers(value)
-    if array is None or array.shape != (size,) or not np.isfinite(array).all():
-        raise InputError(f"{owner}.{name} is {shown(value)}; it must be {size} finite numbers")
-    if not within(array, most):
-        raise InputError(f"{owner}.{name} is {shown(value)}; its numbers must be within ±{most:g}")
+    if array is None or array.shape != (size,) or not within(array, most):
+        rule = f"it must be {size} finite numbers within ±{most:g}"
+        raise InputError(f"{owner}.{name} is {shown(value)}; {rule}")
     return array
 
 
@@ -166,28 +164,21 @@ def points(owner: str, name: str, value: object) -> ndarray:
     array = numbers(value)
     if array is not None and array.size == 0:
         array = array.reshape(0, 3)
-    if array is None or array.ndim != 2 or array.shape[1] != 3:
-        raise InputError(f"{owner}.{name} is {form(array)}; it must be n x 3 finite numbers")
-    bad = np.flatnonzero(~(np.abs(array) <= MAX_COORDINATE).all(axis=1))
-    if len(bad):
-        row = array[bad[0]]
-        more = "" if len(bad) == 1 else f" and {len(bad) - 1} more"
-        rule = f"finite numbers within ±{MAX_COORDINATE:g} m"
-        raise InputError(f"{owner}.{name}[{bad[0]}]{more} is {shown(row)}; it must be {rule}")
+    else:
+        array = rows(f"{owner}.{name}", value, None, 3)
     array.setflags(write=False)  # so that `Value` does not copy a large array
     return array
 
 
-def positive(owner: str, name: str, value: object, most: float = MAX_COORDINATE) -> float:
-    """The value as a number from MIN_SIZE to `most`. Raises InputError, naming owner.name, for anything
-    else."""
+def positive(owner: str, name: str, value: object) -> float:
+    """The value as a number from MIN_SIZE to MAX_COORDINATE.
+
+    Raises InputError, naming owner.name, for anything else.
+    """
     array = numbers(value)
-    if array is None or array.ndim != 0 or not np.isfinite(array) or array <= 0:
-        raise InputError(f"{owner}.{name} is {shown(value)}; it must be a positive number")
-    if not MIN_SIZE <= array <= most:
-        raise InputError(
-            f"{owner}.{name} is {shown(value)}; it must be a number from {MIN_SIZE:g} to {most:g}"
-        )
+    if array is None or array.ndim != 0 or not MIN_SIZE <= array <= MAX_COORDINATE:
+        rule = f"it must be a number from {MIN_SIZE:g} to {MAX_COORDINATE:g}"
+        raise InputError(f"{owner}.{name} is {shown(value)}; {rule}")
     return float(array)
 
 
@@ -215,10 +206,10 @@ def rigid_transform(what: str, value: object, slack: float = RIGID_SLACK) -> nda
             f"{what} is {shown(value)}; it must be 4 x 4 finite numbers within ±{MAX_COORDINATE:g}"
         )
     rotation = T[:3, :3]
-    off = max(np.abs(rotation @ rotation.T - IDENTITY[:3, :3]).max(), np.abs(T[3] - IDENTITY[3]).max())
+    off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(T[3] - LAST_ROW).max())
     if off > slack or np.linalg.det(rotation) < 0:
         raise InputError(f"{what} is {shown(T)}; it must be a rotation and a translation over a row 0 0 0 1")
-    T[3] = IDENTITY[3]
+    T[3] = LAST_ROW
     return T
 
 

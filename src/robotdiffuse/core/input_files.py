@@ -137,11 +137,9 @@ def read_arrays(file: str | Path) -> dict[str, ndarray]:
                 return {"": np.lib.format.read_array(stream, allow_pickle=False)}
         with zipfile.ZipFile(path) as archive:
             size = sum(member.file_size for member in archive.infolist())
-            size_limit = MAX_FILE_SIZE
-        if size > size_limit:
-            raise InputError(
-                f"{file} unpacks to {size // MEGABYTE} MB; at most {size_limit // MEGABYTE} MB are read"
-            )
+        if size > MAX_FILE_SIZE:
+            most = MAX_FILE_SIZE // MEGABYTE
+            raise InputError(f"{file} unpacks to {size // MEGABYTE} MB; at most {most} MB are read")
         with np.load(path, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
 

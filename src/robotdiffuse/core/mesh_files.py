@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
+from robotdiffuse.core.errors import InputError, reading, shown, unknown_name
 from robotdiffuse.core.input_files import (
     MAX_DEPTH,
     MAX_FILE_SIZE,
@@ -29,14 +29,10 @@ R_UP = {
 }
 """Rotations to z up, by the <up_axis> of Collada. glTF has y up."""
 LFS_POINTER = b"version https://git-lfs"
-NO_GEOMETRY = frozenset(
-    f"{kind}_{what}"
-    for kind, things in (
-        ("library", ("animations", "cameras", "effects", "images", "lights", "materials")),
-        ("instance", ("camera", "light")),
-        ("bind", ("material",)),
-    )
-    for what in things
+NO_GEOMETRY = (
+    *("library_animations", "library_cameras", "library_effects"),
+    *("library_images", "library_lights", "library_materials"),
+    *("instance_camera", "instance_light", "bind_material"),
 )
 """Elements of Collada that contain no geometry. They are removed before reading, since trimesh also drops
 geometry if one of them is damaged."""
@@ -82,7 +78,7 @@ def read_triangles(
     options: dict[str, Any] = {}
     up = "Z_UP"
     meters = 1.0
-    try:
+    with reading(f"mesh file {file}"):
         if ending == ".dae":
             content, up, meters = _collada(content)
             options = {"ignore_broken": False}
@@ -94,10 +90,6 @@ def read_triangles(
             options["skip_materials"] = True
         with np.errstate(all="ignore"):
             mesh = trimesh.load_mesh(io.BytesIO(content), ending[1:], process=merge, **options)
-    except InputError as error:
-        raise InputError(f"mesh file {file} cannot be read: {error}") from None
-    except Exception as error:  # trimesh raises many kinds of errors for a damaged file
-        raise InputError(f"mesh file {file} cannot be read: {shortened(str(error))}") from None
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise InputError(f"mesh file {file} holds no triangles")
     if mesh.vertices.shape[1:] != (3,):

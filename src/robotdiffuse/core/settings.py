@@ -199,14 +199,12 @@ class Settings:
         and a value of the wrong type or out of bounds.
         """
         owner = self.settings_name or type(self).__name__
-        valid_assignments = {setting.name: setting.assignment for setting in self.describe()}
+        valid_assignments = ", ".join(setting.assignment for setting in self.describe())
         values: dict[str, Any] = {}
         for text in assignments:
             name, equals, value = text.partition("=")
             if not equals or not name:
-                raise InputError(
-                    f"{shown(text)} is not NAME=VALUE; {owner} has {', '.join(valid_assignments.values())}"
-                )
+                raise InputError(f"{shown(text)} is not NAME=VALUE; {owner} has {valid_assignments}")
             try:
                 parsed = parse_yaml(value, name)
             except InputError:
