@@ -17,7 +17,6 @@ from numpy import ndarray
 from numpy.random import Generator
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Count, Settings
 from robotdiffuse.core.types import Configuration
@@ -198,10 +197,9 @@ def unpack_fine(truth: UInt8[ndarray, "*b"]) -> Bool[ndarray, "*b 8"]:
 
 def camera_view(scene: Scene, robot: Robot, q: Configuration, rng: Generator) -> DepthView:
     """A depth view of the scene from a random pose, without noise."""
-    obstacles = compile_scene_for(robot, scene)
     for _ in range(CAMERA_DRAWS):
         T, angle = CameraPlaces().draw(scene, rng)
-        if not near_scene(obstacles, T[None, :3, 3].astype(np.float32), np.float32(CAMERA_CLEARANCE))[0]:
+        if not near_scene(robot, scene, T[None, :3, 3], CAMERA_CLEARANCE)[0]:
             break
     width, height = IMAGE_SIZE
     focal = height / 2 / np.tan(angle / 2)

@@ -42,12 +42,6 @@ POINTS_PER_ERROR = 25
 neighboring points are correlated."""
 
 
-def offset(first: Pose, second: Pose) -> tuple[float, float]:
-    """Distance [m] and angle [rad] between two poses."""
-    turn = Rotation.from_matrix(first[:3, :3].T @ second[:3, :3])
-    return float(np.linalg.norm(first[:3, 3] - second[:3, 3])), float(turn.magnitude())
-
-
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
     """The pose of a camera, estimated from views of the arm."""

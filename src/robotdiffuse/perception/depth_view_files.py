@@ -18,7 +18,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import numbers, positive, unit_quaternion, vector
-from robotdiffuse.core.errors import InputError, reading, shortened, shown, unknown_name
+from robotdiffuse.core.errors import InputError, needs, reading, shortened, shown, unknown_name
 from robotdiffuse.core.input_files import input_file, read_arrays, read_json, read_yaml
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
 from robotdiffuse.core.types import Points
@@ -89,21 +89,15 @@ def _read_npz(file: Path) -> ndarray:
 
 
 def _read_exr(file: Path) -> ndarray:
-    try:
+    with needs("OpenEXR", "exr"):
         import OpenEXR
-    except ImportError:
-        raise InputError(
-            f"depth image {file} needs the package OpenEXR: pip install 'robotdiffuse[exr]'"
-        ) from None
     parts = [part.header for part in OpenEXR.File(str(file), header_only=True).parts]
     _check_size(file, sum(len(part["channels"]) * _area(*part["dataWindow"]) for part in parts))
     channels = OpenEXR.File(str(file)).channels()
-    for name in ("Z", "Y", "depth", "R"):
-        if name in channels:
-            return np.asarray(channels[name].pixels)
-    if len(channels) == 1:
-        return np.asarray(next(iter(channels.values())).pixels)
-    raise InputError(f"depth image {file} has the channels {', '.join(channels)}; one must be named Z")
+    depths = [channels[name] for name in ("Z", "Y", "depth", "R") if name in channels]
+    if not depths and len(channels) > 1:
+        raise InputError(f"depth image {file} has the channels {', '.join(channels)}; one must be named Z")
+    return np.asarray((depths or [*channels.values()])[0].pixels)
 
 
 def read_intrinsics(file: Path) -> Any:

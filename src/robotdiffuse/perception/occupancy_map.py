@@ -3,6 +3,7 @@ ViewMemory: keeps the views that showed most new voxels.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -190,31 +191,28 @@ ALONE_DISTANCE = 0.02
 1 m, 99 of 100 points have at least three others within it."""
 
 
+@dataclass(frozen=True, eq=False)
 class _RememberedView:
     """A view, and what it observes, computed when it is first needed."""
 
-    def __init__(self, view: DepthView, robot: Robot, new_voxels: int, stated: DepthView) -> None:
-        self.view = view
-        self._robot = robot
-        self.new_voxels = new_voxels
-        self.stated = stated
+    view: DepthView
+    configuration: Configuration
+    """The view's configuration."""
+    robot: Robot
+    new_voxels: int
+    stated: DepthView
 
     @cached_property
     def volume(self) -> ObservedVolume:
-        return observe([self.view], self._robot, self._configuration)
+        return observe([self.view], self.robot, self.configuration)
 
     @cached_property
     def points(self) -> Points:
-        return seen_points([self.view], self._robot, self._configuration)
+        return seen_points([self.view], self.robot, self.configuration)
 
     @cached_property
     def errors(self) -> PointErrors:
         return point_errors([self.view], self.points)
-
-    @property
-    def _configuration(self) -> Configuration:
-        assert self.view.configuration is not None
-        return self.view.configuration
 
 
 class ViewMemory:
@@ -233,7 +231,8 @@ class ViewMemory:
         stated: the same view with the pose that the caller stated."""
         if len(self) >= self._most:
             self._memories.remove(min(self._memories, key=lambda memory: memory.new_voxels))
-        self._memories.append(_RememberedView(view, self._robot, new_voxels, stated))
+        assert view.configuration is not None
+        self._memories.append(_RememberedView(view, view.configuration, self._robot, new_voxels, stated))
 
     def refine(self, refined: Callable[[DepthView], DepthView]) -> None:
         """Give the kept views their refined poses, if these are much better. refined: takes a view with the
@@ -241,7 +240,7 @@ class ViewMemory:
         for i, memory in enumerate(self._memories):
             view = refined(memory.stated)
             if sum(view.pose_deviation) < MUCH_BETTER * sum(memory.view.pose_deviation):
-                self._memories[i] = _RememberedView(view, self._robot, memory.new_voxels, memory.stated)
+                self._memories[i] = replace(memory, view=view)
 
     @property
     def views(self) -> list[DepthView]:
@@ -266,10 +265,7 @@ class ViewMemory:
         points = np.stack(sums, axis=1) / counts[:, None]
         errors = np.zeros((len(counts), 2))
         np.maximum.at(errors, cell, np.concatenate([memory.errors for memory in self._memories]))
-        at = MAP.indices(points)
-        inside = MAP.contains(at)
-        stray = np.zeros(len(points), np.bool_)
-        stray[inside] = free[tuple(at[inside].T)]
+        stray = MAP.hold(free, points)
         if any(filtered(memory.view).spread for memory in self._memories):
             once = counts == 1
             distances, _ = KDTree(points).query(points[once], k=2, distance_upper_bound=ALONE_DISTANCE)

@@ -16,15 +16,12 @@ from numpy import ndarray
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from robotdiffuse.collision.kernel_arrays import compile_scene_for
-from robotdiffuse.collision.kernels.collision_cost import scene_distance
-from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.transforms import placed, transform
 from robotdiffuse.core.types import Configuration, Points, Pose, Values
 from robotdiffuse.perception.camera_calibration import arm_surface, neighborhoods
 from robotdiffuse.perception.depth_filter import filtered, grown_for_errors, pose_error
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.seen_points import ARM_DISTANCE, sphere_distances
+from robotdiffuse.perception.seen_points import ARM_DISTANCE, nearest_surfaces, sphere_distances
 from robotdiffuse.perception.voxel_grid import MAP
 from robotdiffuse.robots.kinematics import link_poses, placed_spheres
 from robotdiffuse.robots.robot import Robot
@@ -138,7 +135,7 @@ class PoseRefinement:
         """known: shapes whose poses are exact. on_arm: link and nominal T_link_camera of each camera on the
         arm."""
         self._robot = robot
-        self._known = compile_scene_for(robot, known) if known.shapes else None
+        self._known = known
         self._on_arm = on_arm
         self._cameras = list[_Camera]()
         self._images = list[_Image]()
@@ -272,8 +269,8 @@ class PoseRefinement:
                 yield _selected(matched, is_near & (np.abs(facing) > FACING))
             use = np.flatnonzero(~image.arm)
             mine = owners == i
-            if self._known is not None and len(use):
-                surfaces = nearest_surfaces(self._known, points[mine].astype(np.float32)).astype(np.float64)
+            if self._known.shapes:
+                surfaces = nearest_surfaces(self._robot, self._known, points[mine], FAR).astype(np.float64)
                 n = surfaces[:, 1:]
                 matched = match(i, use, n, surfaces[:, 0], KNOWN_ERROR)
                 yield _selected(matched, (n * normals[mine]).sum(axis=1) > ALIKE)
@@ -286,7 +283,7 @@ class PoseRefinement:
             near = near[np.arange(len(near)), other.argmax(axis=1)][ok]
             n = normals[near]
             matched = match(i, use[ok], n, ((points[mine][ok] - points[near]) * n).sum(axis=1), KNOWN_ERROR)
-            for j in np.unique(owners[near]):
+            for j in np.unique(owners[near]).tolist():
                 rows = owners[near] == j
                 opposite = match(j, numbers[near[rows]], n[rows], matched.distances[rows], KNOWN_ERROR)
                 matched.derivatives[rows] -= opposite.derivatives
@@ -298,16 +295,6 @@ class PoseRefinement:
 def is_on(robot: Robot, link: str, nominal: Pose, T: Pose, q: Configuration) -> bool:
     """Whether a camera at T = T_base_camera is the camera on `link` with T_link_camera = `nominal`."""
     return bool(np.abs(T - link_poses(robot, q[None], link)[0] @ nominal).max() < SAME_CAMERA)
-
-
-@kernel(nogil=True)
-def nearest_surfaces(scene, points):
-    """For points [n, 3], rows of the signed distance to the nearest obstacle of SceneArrays, at most FAR [m],
-    and the normal there."""
-    out = np.empty((len(points), 4), np.float32)
-    for p in range(len(points)):
-        out[p] = scene_distance(scene, points[p, 0], points[p, 1], points[p, 2], np.float32(FAR))
-    return out
 
 
 def _selected(match: _Match, ok: Bool[ndarray, "n"]) -> _Match:

@@ -4,6 +4,8 @@ grid. A hash table holds the cells."""
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Bool, Float32
+from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for, reach_bound
 from robotdiffuse.collision.kernels.collision_cost import scene_distance
@@ -59,25 +61,6 @@ def _key(x, y, z, voxel):
     return ((i + span) << 42) | ((j + span) << 21) | (k + span)
 
 
-@kernel(nogil=True, inline="always")
-def _row(keys, cells, count, key):
-    """The row of a cell in the sums, and the number of rows; a new cell gets a new row."""
-    at = _slot(keys, key)
-    if keys[at] == -1:
-        keys[at] = key
-        cells[at] = count
-        count += 1
-    return cells[at], count
-
-
-@kernel(nogil=True, inline="always")
-def _add(sums, row, x, y, z):
-    sums[row, 0] += x
-    sums[row, 1] += y
-    sums[row, 2] += z
-    sums[row, 3] += np.float32(1.0)
-
-
 @kernel(nogil=True)
 def gather(points, reach, spheres, voxel, keys, cells, sums, count):
     """Adds points [3, n] to cells `voxel` wide. Returns the number of cells; -1 if `sums` is too small.
@@ -100,14 +83,24 @@ def gather(points, reach, spheres, voxel, keys, cells, sums, count):
         z = points[2, p]
         if not x * x + y * y + z * z <= reach * reach:
             continue
-        if _in_box(box, x, y, z) and _within(x, y, z, *columns):
+        in_box = box[0] < x < box[3] and box[1] < y < box[4] and box[2] < z < box[5]
+        if in_box and _within(x, y, z, *columns):
             continue
         key = _key(x, y, z, voxel)
         at = (key ^ (key >> 18) ^ (key >> 37)) & (RECENT - 1)
         if recent[at] != key:
             recent[at] = key
-            rows[at], count = _row(keys, cells, count, key)
-        _add(sums, rows[at], x, y, z)
+            slot = _slot(keys, key)
+            if keys[slot] == -1:
+                keys[slot] = key
+                cells[slot] = count
+                count += 1
+            rows[at] = cells[slot]
+        row = sums[rows[at]]
+        row[0] += x
+        row[1] += y
+        row[2] += z
+        row[3] += np.float32(1.0)
     return count
 
 
@@ -191,11 +184,6 @@ def _columns(spheres):
     return spheres[:, 0].copy(), spheres[:, 1].copy(), spheres[:, 2].copy(), spheres[:, 3].copy()
 
 
-@kernel(nogil=True, inline="always")
-def _in_box(box, x, y, z):
-    return box[0] < x < box[3] and box[1] < y < box[4] and box[2] < z < box[5]
-
-
 @kernel(nogil=True)
 def sphere_distances(points, spheres):
     """Signed distance of each point [n, 3] to the nearest sphere [m, 4]; infinite without spheres."""
@@ -219,15 +207,23 @@ def _nearest(at, x, y, z, radii):
 
 
 @kernel(nogil=True)
-def near_scene(scene, points, limit):
-    """Whether each point [n, 3] is inside an obstacle of SceneArrays, or nearer to one than `limit` [m]."""
-    out = np.empty(len(points), np.bool_)
+def _nearest_surfaces(scene, points, limit):
+    out = np.empty((len(points), 4), np.float32)
     for p in range(len(points)):
-        x = points[p, 0]
-        y = points[p, 1]
-        z = points[p, 2]
-        out[p] = scene_distance(scene, x, y, z, limit)[0] < limit
+        out[p] = scene_distance(scene, points[p, 0], points[p, 1], points[p, 2], limit)
     return out
+
+
+def nearest_surfaces(robot: Robot, scene: Scene, points: Points, limit: float) -> Float32[ndarray, "n 4"]:
+    """For each point, its signed distance to the nearest obstacle that the robot can come near, at most
+    `limit` [m], and the normal there."""
+    arrays = compile_scene_for(robot, scene)
+    return _nearest_surfaces(arrays, points.astype(np.float32), np.float32(limit))
+
+
+def near_scene(robot: Robot, scene: Scene, points: Points, limit: float) -> Bool[ndarray, "n"]:
+    """Which points are inside an obstacle, or nearer to one than `limit` [m]."""
+    return nearest_surfaces(robot, scene, points, limit)[:, 0] < np.float32(limit)
 
 
 CELL = 0.015
@@ -255,9 +251,7 @@ INITIAL_CELLS = 1 << 16
 """Initial capacity of the table of cells."""
 
 
-def seen_points(
-    views: Sequence[DepthView], robot: Robot, start: Configuration, voxel: float = CELL
-) -> Points:
+def seen_points(views: Sequence[DepthView], robot: Robot, start: Configuration) -> Points:
     """The mean of the observed points in each cell of a grid, in the base frame [m].
 
     Flying pixels, isolated cells with few points, points of the arm at its configuration in each view, and
@@ -280,20 +274,20 @@ def seen_points(
                 intrinsics = tuple(map(np.float32, view.intrinsics))
                 points = image_points(depth, intrinsics, view.T_base_camera.astype(np.float32))
             reach = np.float32(reach_bound(robot) + REACH_MARGIN)
-            count = gather(points, reach, spheres, np.float32(voxel), keys, cells, sums, count)
+            count = gather(points, reach, spheres, np.float32(CELL), keys, cells, sums, count)
             if count < 0:
                 break
         if count >= 0:
-            supported_cells = supported(keys, cells, sums, count, np.float32(_min_cell_points(views, voxel)))
+            supported_cells = supported(keys, cells, sums, count, np.float32(_min_cell_points(views)))
             return sums[:count, :3][supported_cells] / sums[:count, 3:][supported_cells]
         capacity *= 4
 
 
-def _min_cell_points(views: Sequence[DepthView], voxel: float) -> int:
+def _min_cell_points(views: Sequence[DepthView]) -> int:
     """Minimum number of points of an isolated cell: more than one only if all images have enough pixels per
     cell, see CAMERA_DISTANCE."""
     focal = min((0.0 if view.cloud is not None else view.intrinsics[0] for view in views), default=0.0)
-    return MIN_CELL_POINTS if (voxel * focal / CAMERA_DISTANCE) ** 2 >= MIN_CELL_POINTS**2 else 1
+    return MIN_CELL_POINTS if (CELL * focal / CAMERA_DISTANCE) ** 2 >= MIN_CELL_POINTS**2 else 1
 
 
 def seen_shapes(
@@ -340,13 +334,11 @@ def point_shapes(
     points = points.astype(np.float32)
     shifts = ERROR_STEP * np.ceil(errors[:, 0] / ERROR_STEP)
     ends = np.concatenate([placed_spheres(robot, q) for q in (start, *goals)]).astype(np.float32)
-    arrays = compile_scene_for(robot, known) if known.shapes else None
     shapes = list[SeenPoints]()
     for shift in np.unique(shifts):
         alike = points[shifts == shift]
         noise = errors[shifts == shift, 1].max()
-        if arrays is not None:
-            alike = alike[~near_scene(arrays, alike, np.float32(KNOWN_DISTANCE + shift + noise))]
+        alike = alike[~near_scene(robot, known, alike, KNOWN_DISTANCE + shift + noise)]
         distances = sphere_distances(alike, ends)
         remaining = np.ones(len(alike), np.bool_)
         error = shift + END_SPREADS * noise

@@ -6,8 +6,7 @@ start and goals is removed from them (carved out).
 """
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 from numpy import ndarray
 
-from robotdiffuse.collision.kernel_arrays import compile_scene_for, reach_bound
+from robotdiffuse.collision.kernel_arrays import reach_bound
 from robotdiffuse.core.types import Configuration, Path, Points
 from robotdiffuse.perception.depth_filter import wide_regions
 from robotdiffuse.perception.depth_view import AssumedPoints
@@ -33,7 +32,6 @@ from robotdiffuse.perception.voxel_grid import (
     surface,
 )
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.point_cloud import voxel_thin
 from robotdiffuse.scenes.scene import Scene
 
 PADDINGS = (0.09, 0.06, 0.04)
@@ -42,34 +40,14 @@ PADDINGS = (0.09, 0.06, 0.04)
 # PADDING_MARGIN [m] are left out: thinning may enlarge points by so much.
 PADDING_FACTOR = 1.3
 PADDING_MARGIN = 0.01
-THINNING_CELL = 1 / 3
-"""Thinning keeps one point in each cell of this edge length, as a fraction of the padding."""
 THRESHOLDS = (0.1, 0.2, 0.35, 0.5)
 """Probabilities above which a predicted voxel is an obstacle, the most cautious first."""
 CARVING_MARGIN = 0.02
 """Voxels nearer to the arm's covering spheres at start or goals than this are carved out [m]."""
 
 
-class Assumption(ABC):
-    """Obstacles in unknown space, in addition to the observed ones."""
-
-    name: str
-
-    @abstractmethod
-    def _touched(self, spheres: Float32[ndarray, "n 4"]) -> Bool[ndarray, "..."]:
-        """Which obstacles touch the arm's covering spheres (x, y, z, radius [m]) at start or goals."""
-
-    def touched(self, spheres: Float32[ndarray, "n 4"]) -> int:
-        """The number of obstacles that touch these spheres and have to be carved out."""
-        return int(self._touched(spheres).sum())
-
-    @abstractmethod
-    def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> AssumedPoints:
-        """The obstacles without those that touch these spheres."""
-
-
 @dataclass(frozen=True, eq=False)
-class Padded(Assumption):
+class Padded:
     """Observed points, inflated."""
 
     points: Points
@@ -77,19 +55,21 @@ class Padded(Assumption):
     """Radius of the inflated points [m]."""
 
     @property
-    def name(self) -> str:  # type: ignore[override]
+    def name(self) -> str:
         return f"points padded by {100 * self.padding:.0f} cm"
 
-    def _touched(self, spheres: Float32[ndarray, "n 4"]) -> Bool[ndarray, "points"]:
+    def touched(self, spheres: Float32[ndarray, "n 4"]) -> Bool[ndarray, "points"]:
+        """Which points touch the arm's covering spheres (x, y, z, radius [m]) at start or goals and have to
+        be carved out."""
         return sphere_distances(self.points, spheres) < PADDING_FACTOR * self.padding + PADDING_MARGIN
 
     def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> AssumedPoints:
-        """See `Assumption`."""
-        return AssumedPoints(self.points[~self._touched(spheres)], self.padding, name="padded")
+        """The obstacles without those that touch these spheres."""
+        return AssumedPoints(self.points[~self.touched(spheres)], self.padding, name="padded")
 
 
 @dataclass(frozen=True, eq=False)
-class OccupiedVoxels(Assumption):
+class OccupiedVoxels:
     """Occupied voxels of the observed volume, coarse or fine."""
 
     name: str
@@ -102,46 +82,27 @@ class OccupiedVoxels(Assumption):
     def grid(self) -> VoxelGrid:
         return COARSE if self.occupied.shape == SHAPE else FINE
 
-    def _touched(self, spheres: Float32[ndarray, "n 4"]) -> Voxels:
+    def touched(self, spheres: Float32[ndarray, "n 4"]) -> Voxels:
+        """Which voxels touch these spheres and have to be carved out."""
         return self.occupied & self.grid.within(spheres, CARVING_MARGIN + self.grid.edge / 2)
 
     def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> AssumedPoints:
         """The occupied voxels at the boundary of the occupied region; the arm, which starts outside, cannot
         reach inner ones. Voxels out of the arm's reach or in the known scene are left out."""
         edge = self.grid.edge
-        points = self.grid.centers(surface(self.occupied & ~self._touched(spheres)))
+        points = self.grid.centers(surface(self.occupied & ~self.touched(spheres)))
         points = points[np.linalg.norm(points, axis=1) < reach_bound(self.robot) + edge]
         points = without_known(points, edge, self.robot, self.known_scene)
         return AssumedPoints(points, edge / 2, name="unknown")
 
 
+Assumption = Padded | OccupiedVoxels
+"""Obstacles in unknown space, in addition to the observed ones."""
+
+
 def without_known(centers: Points, edge: float, robot: Robot, known_scene: Scene) -> Points:
     """The centers of those voxels that are not in the known scene [m]. edge: edge of the voxels [m]."""
-    if not known_scene.shapes:
-        return centers
-    scene = compile_scene_for(robot, known_scene)
-    inside = np.float32(edge / 2 - 1e-3)
-    return centers[~near_scene(scene, centers.astype(np.float32), inside)]
-
-
-def padded_assumptions(points: Points) -> Iterator[Assumption]:
-    """Assumptions of inflated observed points, the largest padding first."""
-    for padding in PADDINGS:
-        yield Padded(voxel_thin(points, padding * THINNING_CELL), padding)
-
-
-def predicted_assumptions(predicted: Probabilities, robot: Robot, known_scene: Scene) -> Iterator[Assumption]:
-    """Assumptions of voxels whose probability is above a threshold, the lowest threshold first.
-
-    predicted: the probability that each fine voxel is occupied.
-    """
-    for threshold in THRESHOLDS:
-        yield OccupiedVoxels(f"predicted, p > {threshold:g}", predicted > threshold, robot, known_scene)
-
-
-def occupied_assumption(volume: ObservedVolume, robot: Robot, known_scene: Scene) -> Assumption:
-    """The assumption that every unknown voxel is occupied."""
-    return OccupiedVoxels("unknown is occupied", volume.unknown, robot, known_scene)
+    return centers[~near_scene(robot, known_scene, centers, edge / 2 - 1e-3)]
 
 
 Box = tuple[tuple[float, ...], tuple[float, ...]]

@@ -182,10 +182,7 @@ def _all_behind(depth, v0, v1, u0, u1, min_return):
 def within_voxels(balls: Points, radius: float, marked: Voxels, grid: VoxelGrid) -> Bool[ndarray, "n"]:
     """Which balls lie entirely in marked voxels of the grid. radius: at most half a voxel's edge [m]."""
     corners = balls[:, None] + list(product((-radius, radius), repeat=3))
-    at = grid.indices(corners.reshape(-1, 3))
-    within = grid.contains(at)
-    within[within] = marked[tuple(at[within].T)]
-    return np.asarray(within.reshape(-1, 8).all(axis=1))
+    return np.asarray(grid.hold(marked, corners.reshape(-1, 3)).reshape(-1, 8).all(axis=1))
 
 
 # Edge of the grid cells by which surface samples are merged; largest distance of a surface point from the

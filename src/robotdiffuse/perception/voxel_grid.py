@@ -63,6 +63,13 @@ class VoxelGrid:
         """Which of these indices are inside the grid."""
         return np.asarray(((at >= 0) & (at < self.shape)).all(axis=1))
 
+    def hold(self, marked: Voxels, points: Points) -> Bool[ndarray, "n"]:
+        """Whether each point is in one of the marked voxels."""
+        at = self.indices(points)
+        held = self.contains(at)
+        held[held] = marked[tuple(at[held].T)]
+        return held
+
     def filled(self, robot: Robot, configurations: Iterable[Configuration], margin: float = 0.0) -> Voxels:
         """Voxels with their centers in the arm's covering spheres, inflated by `margin` [m], at any of these
         configurations."""

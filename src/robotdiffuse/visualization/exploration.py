@@ -15,7 +15,6 @@ from jaxtyping import Bool, Int
 from numpy import ndarray
 from PIL import Image
 
-from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.transforms import placed
 from robotdiffuse.core.types import Mask, Path, Points, Trajectory
@@ -137,12 +136,8 @@ def shown_voxels(
 
 def in_known_scene(explorer: RecordedExplorer) -> Voxels:
     """The voxels in or near obstacles that are known without views."""
-    if not explorer.scene.shapes:
-        return np.zeros(MAP.shape, np.bool_)
     centers = MAP.centers(np.indices(MAP.shape).reshape(3, -1).T)
-    scene = compile_scene_for(explorer.robot, explorer.scene)
-    near = near_scene(scene, centers.astype(np.float32), np.float32(MAP.edge))
-    return near.reshape(MAP.shape)
+    return near_scene(explorer.robot, explorer.scene, centers, MAP.edge).reshape(MAP.shape)
 
 
 def frustum(explorer: RecordedExplorer, act: RecordedAct) -> list[Points]:

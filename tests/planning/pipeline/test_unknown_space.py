@@ -118,7 +118,7 @@ def test_assumptions_are_carved_free_at_the_ends() -> None:
         cloud = assumption.obstacles(ends)
         away = np.linalg.norm(cloud.points[:, None] - ends[None, :, :3], axis=2) - ends[:, 3]
         assert len(cloud.points) and away.min() > cloud.point_radius
-        assert assumption.touched(ends) > 0 or isinstance(assumption, Padded)
+        assert assumption.touched(ends).any() or isinstance(assumption, Padded)
     assert len(OccupiedVoxels("all", solid, PANDA, rd.Scene()).obstacles(ends[:1]).points) < 0.15 * solid.size
 
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
@@ -230,8 +229,7 @@ def taken(
     `q`."""
     T = camera.poses(problem.robot, q[None])[0]
     view = ray_cast(problem.scene, T, camera.intrinsics, camera.size, problem.robot, q)
-    obstacles = compile_scene_for(problem.robot, problem.scene)
-    if near_scene(obstacles, T[None, :3, 3].astype(np.float32), np.float32(LENS_RADIUS))[0]:
+    if near_scene(problem.robot, problem.scene, T[None, :3, 3], LENS_RADIUS)[0]:
         # the ray caster ignores shapes that enclose the camera, so their inside would appear free
         view = replace(view, depth=np.zeros_like(view.depth))
     return measured(view, camera.range, noise, rng)

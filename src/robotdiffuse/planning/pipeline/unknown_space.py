@@ -33,14 +33,14 @@ from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
 from robotdiffuse.perception.observed_volume import ObservedVolume, observe
 from robotdiffuse.perception.unknown_space import (
     MAX_UNSEEN_SHARE,
+    PADDINGS,
+    THRESHOLDS,
     Assumption,
     OccupiedVoxels,
+    Padded,
     UnknownSpace,
     confidence,
     lost_regions,
-    occupied_assumption,
-    padded_assumptions,
-    predicted_assumptions,
 )
 from robotdiffuse.perception.voxel_grid import Probabilities, refined
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
@@ -48,6 +48,7 @@ from robotdiffuse.planning.planner import Planner
 from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.problem import OCCUPIED, OPTIMISTIC, PADDED, PREDICTED, JointGoal, Problem
 from robotdiffuse.robots.kinematics import placed_spheres
+from robotdiffuse.scenes.point_cloud import voxel_thin
 
 # Under an assumption, at most MAX_FIRST_MOTIONS first motions are planned. The risk of a motion is the sum of
 # the predicted probabilities of all unknown voxels that it sweeps. No more first motions are planned once the
@@ -64,6 +65,8 @@ ASSUMPTION_TIME_FRACTION = 0.25
 """Time for each other assumption, as a fraction of the remaining time that is not reserved."""
 MIN_TIME_FRACTION = 0.1
 """Smallest fraction of the time limit for an attempt of the planner."""
+THINNING_CELL = 1 / 3
+"""Thinning keeps one point in each cell of this edge length, as a fraction of the padding."""
 PICTURE_THRESHOLD = 0.2
 """`predicted_obstacles` has the voxels with a probability above this."""
 FREE_UNKNOWN_SPACE = "unknown space taken as free"
@@ -194,13 +197,16 @@ def assumptions_of(
     policy, _ = policy_for(problem)
     if policy == PADDED:
         seen = [shape.points for shape in problem.scene.shapes if isinstance(shape, SeenPoints)]
-        yield from padded_assumptions(np.concatenate([np.zeros((0, 3)), *seen]))
+        points = np.concatenate([np.zeros((0, 3)), *seen])
+        for padding in PADDINGS:
+            yield Padded(voxel_thin(points, padding * THINNING_CELL), padding)
     elif policy == PREDICTED:
         assert predicted is not None
-        yield from predicted_assumptions(predicted, robot, known_scene)
+        for threshold in THRESHOLDS:
+            yield OccupiedVoxels(f"predicted, p > {threshold:g}", predicted > threshold, robot, known_scene)
     elif policy == OCCUPIED:
         assert volume is not None
-        yield occupied_assumption(volume, robot, known_scene)
+        yield OccupiedVoxels("unknown is occupied", volume.unknown, robot, known_scene)
 
 
 def unknown_space_of(
@@ -237,7 +243,8 @@ def with_assumption(problem: Problem, assumption: Assumption, goals: Configurati
     """The problem with an assumption's obstacles added to the observed scene, except those at the start or at
     the goals. Only the goals at which the fewest obstacles have to be removed are kept."""
     start, *at_goals = (placed_spheres(problem.robot, q).astype(np.float32) for q in (problem.start, *goals))
-    touched = np.array([assumption.touched(spheres) for spheres in at_goals] if len(at_goals) > 1 else [0])
+    several = at_goals if len(at_goals) > 1 else ()
+    touched = np.array([assumption.touched(spheres).sum() for spheres in several] or [0])
     easiest = np.flatnonzero(touched == touched.min())
     obstacles = assumption.obstacles(np.concatenate([start, *(at_goals[i] for i in easiest)]))
     scene = problem.scene.with_shapes([*problem.scene.shapes, obstacles])
