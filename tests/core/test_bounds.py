@@ -34,7 +34,7 @@ FAR = [1e20, 0, 0]
         (lambda: box_arm().with_locked({"j0": 1e20}), r"locked: j0 is 1e\+20; it must be a number within"),
         (lambda: rd.Problem(box_arm(), rd.Scene(), [1e20, 0, 0], [0, 0, 0]), "start: j0"),
         (lambda: rd.Sphere([False, 0.5, 0], 1), r"sphere.center is \[False, 0.5, 0\]; it must be 3 finite"),
-        (lambda: rd.PointCloud([[0, 0, 1], [0, True, 0]]), "points is \[\[.*; it must be n x 3"),
+        (lambda: rd.PointCloud([[0, 0, 1], [0, True, 0]]), r"points is \[\[.*; it must be n x 3"),
         (lambda: rd.Problem(box_arm(), rd.Scene(), [0, 0, 0], [0, 0, 0], clearance=1e39), "clearance"),
     ],
 )

@@ -64,8 +64,6 @@ def read_triangles(
     Raises:
         InputError: For files that `input_file` refuses, other formats, and empty or damaged files.
     """
-    import trimesh
-
     path = input_file(file, "mesh file")
     ending = path.suffix.lower()
     if ending not in MESH_FORMATS:
@@ -75,6 +73,8 @@ def read_triangles(
         raise InputError(f"mesh file {file} is empty")
     if content.startswith(LFS_POINTER):
         raise InputError(f"mesh file {file} is a pointer of Git LFS; get the file itself: git lfs pull")
+    import trimesh  # takes seconds, which a file that cannot be read need not cost
+
     options: dict[str, Any] = {}
     up = "Z_UP"
     meters = 1.0

@@ -29,7 +29,7 @@ from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.problems.fields import problem_schema
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.server.connection import REFUSED, log_access
-from robotdiffuse.server.settings import MAX_ARRIVING, ServeSettings
+from robotdiffuse.server.settings import ServeSettings
 from robotdiffuse.server.worker import PLAN, VERIFY, Answer, failed
 from robotdiffuse.server.worker_pool import RequestError, WorkerPool
 
@@ -205,6 +205,8 @@ ABOUT = (
 )
 JSON = "application/json"
 REQUEST_ID = "X-Request-ID"
+MAX_ARRIVING = 64
+"""Largest amount of data of incomplete requests, as a multiple of the largest request."""
 MAX_REQUEST_ID = 100
 """Longest request ID [characters]."""
 ERRORS = {
@@ -224,11 +226,17 @@ REQUEST_ERRORS = (400, 401, 408, 409, 413, 415, 421, 429, 500, 503)
 RequestID = Annotated[str, Header(alias=REQUEST_ID, description="names the request, to cancel it")]
 
 
-class AccessLog:
-    """Middleware: logs a line for each request."""
+class Access:
+    """Middleware: checks the bearer token and, on loopback, that the Host header names this machine; logs a
+    line for each request.
 
-    def __init__(self, app: ASGIApp) -> None:
+    The Host check stops DNS rebinding, in which a page of another site reaches this server by a name of its
+    own that resolves to 127.0.0.1.
+    """
+
+    def __init__(self, app: ASGIApp, settings: ServeSettings) -> None:
         self.app = app
+        self.settings = settings
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         began = time.monotonic()
@@ -240,30 +248,14 @@ class AccessLog:
                 code = message["status"]
             await send(message)
 
+        request = Request(scope)
         try:
-            await self.app(scope, receive, noting)
+            await (self._refusal(request) or self.app)(scope, receive, noting)
         finally:
-            if scope["type"] == "http":
-                name = Request(scope).headers.get(REQUEST_ID, "")
-                target = f"{scope['method']} {scope['raw_path'].decode('latin-1')}"
-                code = scope.get("state", {}).get(REFUSED, code)
-                log_access(scope["client"], target, code, time.monotonic() - began, name)
-
-
-class AccessControl:
-    """Middleware: checks the bearer token and, on loopback, that the Host header names this machine.
-
-    The Host check stops DNS rebinding, in which a page of another site reaches this server by a name of its
-    own that resolves to 127.0.0.1.
-    """
-
-    def __init__(self, app: ASGIApp, settings: ServeSettings) -> None:
-        self.app = app
-        self.settings = settings
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        refusal = self._refusal(Request(scope)) if scope["type"] == "http" else None
-        await (refusal or self.app)(scope, receive, send)
+            name = request.headers.get(REQUEST_ID, "")
+            target = f"{scope['method']} {scope['raw_path'].decode('latin-1')}"
+            code = scope.get("state", {}).get(REFUSED, code)
+            log_access(scope["client"], target, code, time.monotonic() - began, name)
 
     def _refusal(self, request: Request) -> Response | None:
         host = request.headers.get("host", "")
@@ -295,8 +287,7 @@ def make_app(pool: WorkerPool, robots: dict[str, Robot]) -> FastAPI:
         redoc_url=None,
         redirect_slashes=False,
     )
-    app.add_middleware(AccessControl, settings=pool.settings)
-    app.add_middleware(AccessLog)
+    app.add_middleware(Access, settings=pool.settings)
     app.exception_handler(RequestError)(_request_error)
     app.exception_handler(HTTPException)(_http_error)
     app.exception_handler(Exception)(_unexpected)

@@ -8,10 +8,13 @@ import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from robotdiffuse.core.errors import shown
-from robotdiffuse.server.settings import READ_TIMEOUT, WRITE_TIMEOUT
 from robotdiffuse.server.worker import failed
 
 LOG = logging.getLogger("robotdiffuse.server")
+READ_TIMEOUT = 10.0
+"""Time for a client to send a request, from its first byte [s]."""
+WRITE_TIMEOUT = 60.0
+"""Time for a client to read an answer that is waiting for it [s]."""
 REFUSED = "refused"
 """Key in the state of a request that the connection itself has answered; the value is the status code."""
 

@@ -13,9 +13,11 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.server.app import make_app
 from robotdiffuse.server.connection import LOG, Connection
-from robotdiffuse.server.settings import GRACE_TIME, KEEP_ALIVE_TIMEOUT, ServeSettings
+from robotdiffuse.server.settings import GRACE_TIME, ServeSettings
 from robotdiffuse.server.worker_pool import WorkerPool
 
+KEEP_ALIVE_TIMEOUT = 5
+"""Time that an idle connection stays open [s]."""
 BACKLOG = 128
 """Number of connections that may wait to be accepted."""
 SIGNALS = signal.SIGINT, signal.SIGTERM

@@ -7,7 +7,7 @@ import signal
 import sys
 import time
 import traceback
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from functools import lru_cache
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
@@ -30,22 +30,31 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.files import check_fields
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
-from robotdiffuse.server.settings import (
-    COMPILE_TIMEOUT,
-    GRACE_TIME,
-    MAX_ANSWER_ROWS,
-    MAX_ENTRIES,
-    MAX_ROWS,
-    MAX_SEED,
-    WARM_UP_TIMEOUT,
-    ServeSettings,
-)
+from robotdiffuse.server.settings import GRACE_TIME, ServeSettings
 from robotdiffuse.validation.report import Report
 from robotdiffuse.validation.validator import Verifier
 
 PLAN = "plan"
 VERIFY = "verify"
 TOO_LARGE = 413
+# Time until a worker is killed while it compiles code for a request, and while it loads code and weights [s].
+COMPILE_TIMEOUT = 300.0
+WARM_UP_TIMEOUT = 60.0
+MAX_ENTRIES = {
+    "scene": 10_000,
+    "goal": 1000,
+    "waypoints": 200,
+    "constraints": 50,
+    "moving": 200,
+    "views": 20,
+    "attached": 50,
+}
+"""Largest number of entries of the lists of a problem."""
+# Largest number of rows of a motion in a request, and in the answer to a request with `rate`.
+MAX_ROWS = 100_000
+MAX_ANSWER_ROWS = 20_000
+MAX_SEED = 2**32 - 1
+"""Largest seed that all random generators accept."""
 
 
 class Answer(NamedTuple):
@@ -66,16 +75,9 @@ class Cancelled(BaseException):
     """The call was cancelled."""
 
 
-@dataclass
-class _State:
-    """State of a worker process between requests."""
-
-    robots: dict[str, Robot]
-    """Robots that requests may name."""
-    settings: ServeSettings
-
-
-_state: _State | None = None
+_robots: dict[str, Robot]
+"""Robots that requests may name."""
+_settings: ServeSettings
 _warm: set[tuple[str, str]] = set()
 
 
@@ -91,15 +93,15 @@ def prepare(robots: dict[str, Robot], settings: ServeSettings) -> bool:
 
 
 def accept(robots: dict[str, Robot], settings: ServeSettings) -> None:
-    """Accept requests from now on; see `_State`."""
-    global _state
-    _state = _State(robots, settings)
+    """Accept requests for these robots from now on."""
+    global _robots, _settings
+    _robots = robots
+    _settings = settings
 
 
 def warm_up() -> bool:
     """Load or compile the code that most requests need; returns whether anything was compiled."""
-    assert _state is not None
-    name, robot = next(iter(_state.robots.items()))
+    name, robot = next(iter(_robots.items()))
     start = (robot.lower + robot.upper) / 2
     start[1:2] += 0.3  # if the arm pointed straight up, turning its first joint would not move its tip
     goal = start.copy()
@@ -111,29 +113,26 @@ def warm_up() -> bool:
 
 def respond(endpoint: str, body: bytes) -> Answer:
     """The answer to a request. Raises Cancelled if the server cancels the call."""
-    state = _state
-    assert state is not None
     began = time.monotonic()
     loading.on_first_compilation = lambda: allow(COMPILE_TIMEOUT)
-    answer = _answer_of(state, endpoint, body)
-    renewed = False
-    if answer.code == TOO_LARGE or _memory() > state.settings.max_worker_memory / 2:
+    answer = _answer_of(endpoint, body)
+    renewed = answer.code == TOO_LARGE or _memory() > _settings.max_worker_memory / 2
+    if renewed:
         renew()
-        renewed = True
     return answer._replace(seconds=time.monotonic() - began, renewed=renewed)
 
 
-def _answer_of(state: _State, endpoint: str, body: bytes) -> Answer:
+def _answer_of(endpoint: str, body: bytes) -> Answer:
     try:
         with cancel_check(_raise_if_cancelled):
             check_cancelled()  # the call may have been cancelled before it began
-            return (answer_plan if endpoint == PLAN else answer_verify)(state, body)
+            return (answer_plan if endpoint == PLAN else answer_verify)(body)
     except InputError as error:
         return failed(400, str(error))
     except Cancelled:
         raise
     except MemoryError:
-        limit_text = f"{state.settings.max_worker_memory / MEGABYTE:.0f} MB"
+        limit_text = f"{_settings.max_worker_memory / MEGABYTE:.0f} MB"
         return failed(TOO_LARGE, f"the request needs more memory than a worker may use, {limit_text}")
     except BaseException as error:  # a SystemExit of a planner would end the server's event loop
         traceback.print_exc(file=sys.stderr)
@@ -169,7 +168,7 @@ def _record(body: bytes) -> object:
     return parse_json(text, "the request")
 
 
-def _problem(state: _State, record: Any) -> Problem:
+def _problem(record: Any) -> Problem:
     """The problem of a request. Raises InputError if it is wrong or too large."""
     for name, max_entries in MAX_ENTRIES.items() if isinstance(record, dict) else ():
         value = record.get(name)
@@ -177,24 +176,24 @@ def _problem(state: _State, record: Any) -> Problem:
             [value] = value.values()
         if isinstance(value, list | dict) and len(value) > max_entries:
             raise InputError(f"problem.{name} has {len(value)} entries; a request may have {max_entries}")
-    return problem_from_record(record, state.robots)
+    return problem_from_record(record, _robots)
 
 
-def answer_plan(state: _State, body: bytes) -> Answer:
+def answer_plan(body: bytes) -> Answer:
     """The answer to a request to plan. Raises InputError for a bad request."""
     began = time.monotonic()
     requested = check_fields("the request", _record(body), ("problem",), ARGUMENTS)
     call_arguments = {name: value for name, value in requested.items() if name in CALL_ARGUMENTS}
     request = PlanRequest(**call_arguments)
-    if request.time_limit > state.settings.max_time_limit:
-        rule = f"it must be at most {state.settings.max_time_limit:g} s here"
+    if request.time_limit > _settings.max_time_limit:
+        rule = f"it must be at most {_settings.max_time_limit:g} s here"
         raise InputError(f"time_limit is {shown(request.time_limit)}; {rule}")
     rate = requested.get("rate")
     if rate is not None:
         check_sample_rate(rate)
     limit = request.time_limit + GRACE_TIME
     allow(began + limit - time.monotonic())
-    problem = _problem(state, requested["problem"])
+    problem = _problem(requested["problem"])
     if request.seed > MAX_SEED:
         raise InputError(f"seed is {shown(request.seed)}; it must be at most {MAX_SEED}")
     planner = _planner(requested.get("planner", DEFAULT_PLANNER))
@@ -246,10 +245,10 @@ def _warm_up_once(planner: Planner, problem: Problem, robot: str) -> None:
         _warm.add((planner.name, robot))
 
 
-def answer_verify(state: _State, body: bytes) -> Answer:
+def answer_verify(body: bytes) -> Answer:
     """The answer to a request to validate. Raises InputError for a bad request."""
     values = check_fields("the request", _record(body), ("problem",), MOTIONS)
-    problem = _problem(state, values["problem"])
+    problem = _problem(values["problem"])
     motions = {name: read_motion(name, values[name]) for name in MOTIONS if name in values}
     if not motions:
         raise InputError("the request has neither path nor trajectory")

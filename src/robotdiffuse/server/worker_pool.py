@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from math import ceil
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
@@ -161,21 +162,14 @@ class Metrics:
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
-        self._requests = Counter(
+        counter = partial(Counter, namespace=PREFIX, registry=self.registry)
+        self._requests = counter(
             "requests",
             "Answers of the worker pool by endpoint and HTTP status code; each line of a batch counts; "
             "requests refused because the queue is full, and cancelled ones, do not.",
             ("endpoint", "code"),
-            namespace=PREFIX,
-            registry=self.registry,
         )
-        self._results = Counter(
-            "results",
-            "Results by endpoint and status.",
-            ("endpoint", "status"),
-            namespace=PREFIX,
-            registry=self.registry,
-        )
+        self._results = counter("results", "Results by endpoint and status.", ("endpoint", "status"))
         self._seconds = Histogram(
             "request_seconds",
             "Time from the request to its answer.",
@@ -183,13 +177,10 @@ class Metrics:
             registry=self.registry,
             buckets=BUCKETS,
         )
-        self.lost_workers = self._counter("workers_lost", "Workers that died or were killed.")
-        self.renewed_workers = self._counter(
+        self.lost_workers = counter("workers_lost", "Workers that died or were killed.")
+        self.renewed_workers = counter(
             "workers_renewed", "Workers replaced because they used too much memory."
         )
-
-    def _counter(self, name: str, description: str) -> Counter:
-        return Counter(name, description, namespace=PREFIX, registry=self.registry)
 
     def gauge(self, name: str, description: str, value: Callable[[], float]) -> None:
         """Add a gauge; `value()` is called for each report."""
