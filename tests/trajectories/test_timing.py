@@ -455,5 +455,5 @@ def test_a_timed_path_is_as_fast_as_its_timing() -> None:
     waypoints = np.array([np.zeros(7), np.full(7, 0.8), np.linspace(0, 1, 7)])
     line = BlendedPolyline(waypoints, half_widths(waypoints, np.array([0.1])))
     fastest = speed_limits.time_line(robot, line, TimingSettings())[0][-1]
-    found = TimedPath(robot, 0.96 * robot.acceleration, line, True).onwards(0.0, 0.0).duration
+    found = TimedPath(robot, 0.96 * robot.acceleration, line, True).on_then_rest(0.0, 0.0).duration
     assert found == pytest.approx(fastest, rel=0.05)

@@ -217,7 +217,7 @@ def test_limits_hold_at_every_time_however_often_the_arm_brakes(seed: int) -> No
     filtered = JerkFilter(PANDA, jerk, step, waypoints[0])
     path = TimedPath(PANDA, filtered.acceleration, line, True)
     given = SpeedProfile(np.zeros(2), np.zeros(2))
-    dense = path.coarse(path.onwards(0.0, 0.0), 0.002)[1]
+    dense = path.positions(path.on_then_rest(0.0, 0.0), np.arange(0.0, 20.0, 0.002))
     reach = motion_radii(PANDA).max(axis=0)
     since = 0.0
     last = None

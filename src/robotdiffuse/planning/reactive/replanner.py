@@ -16,7 +16,6 @@ observed. The guarantee does not depend on the prediction.
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, replace
-from numbers import Integral
 from typing import Annotated
 
 import numpy as np
@@ -57,11 +56,12 @@ class ObservedObstacle:
     """An obstacle as it was last seen."""
 
     obstacle: MovingObstacle
-    """The problem's obstacle before the first observation; then the obstacle at its last observed pose."""
+    """The obstacle at the pose where it was last seen, or before at that of the problem, as one that moves in
+    any way up to its maximum speed."""
     time: float = np.nan
     """Time of the last observation [s]; NaN: never observed."""
     velocity: Float[ndarray, "3"] | None = None
-    """Velocity of its origin by the last two observations [m/s]; None: unknown."""
+    """Velocity of its origin by the last two observations, or before by the problem [m/s]; None: unknown."""
 
     def again(self, value: ArrayLike, now: float) -> "ObservedObstacle":
         """The obstacle after a new observation at the time `now` [s]. value: T_base_obstacle [4, 4], or the
@@ -77,7 +77,7 @@ class ObservedObstacle:
         else:
             T = rigid_transform(f"observation[{name!r}]", value)
         max_speed = self.obstacle.top_speed
-        velocity = self.obstacle.velocity
+        velocity = self.velocity
         if np.isfinite(self.time):
             passed = now - self.time
             moved = np.linalg.norm(T[:3, 3] - T_before[:3, 3])
@@ -92,10 +92,6 @@ class ObservedObstacle:
         shape = self.obstacle.shape.moved(T @ inverse(T_before))
         return ObservedObstacle(MovingObstacle(shape, max_speed=max_speed), now, velocity)
 
-    def anywhere(self) -> MovingObstacle:
-        """The obstacle as one that moves in any way, up to its maximum speed, since it was last seen."""
-        return MovingObstacle(self.obstacle.shape, max_speed=self.obstacle.top_speed)
-
     def straight_on(self, now: float) -> MovingObstacle:
         """The obstacle as one that keeps its last observed velocity, from the time `now` [s] on."""
         velocity = np.zeros(3) if self.velocity is None else self.velocity
@@ -105,7 +101,7 @@ class ObservedObstacle:
 
 class PredictedObstacles:
     """Moving obstacles from the time `since` [s] on, for checks of timed motions. They are predicted
-    (`straight_on`), or grown: each fills all space that it can have reached (`anywhere`)."""
+    (`straight_on`), or grown: each fills all space that it can have reached."""
 
     def __init__(self, robot: Robot, moving: list[MovingObstacle], since: float) -> None:
         self._moving = moving
@@ -124,37 +120,22 @@ class PredictedObstacles:
         """The obstacles at a time [s]."""
         return [obstacle.at(time - self._since) for obstacle in self._moving]
 
-    def near(self, motion: Trajectory, begins: float, clearance: float) -> float | None:
-        """Time at which an obstacle first comes closer to the arm than the clearance [m], during a motion
-        that begins at `begins` [s]; None if no obstacle does."""
+    def clear_of(self, motion: Trajectory, begins: float, clearance: float) -> bool:
+        """Whether no obstacle comes closer to the arm than the clearance [m], during a motion that begins at
+        `begins` [s]."""
         times = motion.times + (begins - self._since)
-        first = self._collision.first_unproved_time(times, motion.positions, clearance)
-        return None if first is None else first + self._since
+        return self._collision.first_unproved_time(times, motion.positions, clearance) is None
 
-    def comes_to(self, q: Configurations, times: Float[ndarray, "n"], rest_time: float) -> float | None:
+    def comes(
+        self, q: Float[ndarray, "*n dof"], times: float | Float[ndarray, "n"], rest_time: float
+    ) -> float | None:
         """Time at which an obstacle first touches the arm [s], while it moves through the configurations q at
-        `times` [s] and then rests for `rest_time` [s]; None if no obstacle does."""
-        times = np.append(times, times[-1] + rest_time) - self._since
+        `times` [s] and then rests for `rest_time` [s], or rests at a single configuration from a single time
+        on; None if no obstacle does."""
+        times = np.append(times, np.max(times) + rest_time) - self._since
+        q = np.atleast_2d(q)
         first = self._collision.first_unproved_time(times, np.concatenate([q, q[-1:]]), 0.0)
         return None if first is None else first + self._since
-
-    def comes(self, q: Configuration, time: float, rest_time: float) -> float | None:
-        """Time at which an obstacle first touches the arm [s], if it rests at q from `time` on for
-        `rest_time` [s]; None if no obstacle does."""
-        return self.comes_to(q[None], np.array([time]), rest_time)
-
-    def free(
-        self,
-        times: Float[ndarray, "n"],
-        q: Configurations,
-        begins: float,
-    ) -> bool:
-        """Whether no obstacle touches the arm during a motion: within HORIZON, or until it has rested at the
-        end for REST_TIME if the motion is shorter. times: since the beginning of the motion [s]. begins: time
-        of this beginning [s]."""
-        soon = max(int(np.searchsorted(times, HORIZON)), 1)
-        rest_time = REST_TIME if soon == len(times) else 0.0
-        return self.comes_to(q[:soon], times[:soon] + begins, rest_time + 1e-3) is None
 
 
 SEARCH_TIME_LIMIT = 10.0
@@ -236,8 +217,7 @@ class Replanner:
         """
         check_problem(problem)
         check_type("settings", settings, ReplannerSettings, "ReplannerSettings")
-        if not isinstance(seed, Integral) or seed < 0:
-            raise InputError(f"seed is {shown(seed)}; it must be a whole number, at least 0")
+        self._request = PlanRequest(SEARCH_TIME_LIMIT, seed)
         if not problem.moving:
             raise InputError("problem.moving is empty; a Replanner needs moving obstacles")
         for field in ("waypoints", "constraints", "payload"):
@@ -249,7 +229,12 @@ class Replanner:
         self._robot, self._still = problem.robot, replace(problem, moving=())
         self._validator = verifier(self._still)
         self._rng = np.random.default_rng(seed)
-        self._seen = {obstacle.name: ObservedObstacle(obstacle) for obstacle in problem.moving}
+        self._seen = {
+            obstacle.name: ObservedObstacle(
+                MovingObstacle(obstacle.shape, max_speed=obstacle.top_speed), velocity=obstacle.velocity
+            )
+            for obstacle in problem.moving
+        }
         self._now = -np.inf
         self._searches = 0
         self._next: TimedPath | None = None
@@ -285,9 +270,8 @@ class Replanner:
         """
         rest = self._path.at(float(self._motion.s[-1]))
         problem = replace(self.problem, goal=goal)  # type: ignore[arg-type]
-        request = PlanRequest(SEARCH_TIME_LIMIT, self.seed)
         start_goal = usable_start_goal(
-            PlanningContext("replanner", replace(problem, start=rest, moving=()), request)
+            PlanningContext("replanner", replace(problem, start=rest, moving=()), self._request)
         )
         if isinstance(start_goal, PlanResult):
             raise InputError(f"the replanner cannot take this goal: {start_goal.reason}")
@@ -324,7 +308,7 @@ class Replanner:
         oldest = min(observed.time for observed in self._seen.values())
         predicted = self._predict()
         grown = PredictedObstacles(
-            self._robot, [observed.anywhere() for observed in self._seen.values()], oldest
+            self._robot, [observed.obstacle for observed in self._seen.values()], oldest
         )
         clear = self._choose_path(predicted)
         self._change_path()
@@ -353,7 +337,7 @@ class Replanner:
 
     def _first_path(self) -> tuple[TimedPath, Configurations, Space]:
         """The first path, the goal configurations, and the space in which motions are checked."""
-        context = PlanningContext("replanner", self._still, PlanRequest(SEARCH_TIME_LIMIT, self.seed))
+        context = PlanningContext("replanner", self._still, self._request)
         start_goal = usable_start_goal(context)
         if isinstance(start_goal, PlanResult):
             raise InputError(f"the replanner cannot begin: {start_goal.reason}")
@@ -411,12 +395,16 @@ class Replanner:
         return clear
 
     def _path_clear(self, predicted: PredictedObstacles, path: TimedPath, under_way: bool) -> bool:
-        """Whether the arm is predicted to meet no obstacle on a path. under_way: it is on the path already;
-        False: it begins the path when it rests."""
+        """Whether the arm is predicted to meet no obstacle on a path: within HORIZON, or until it has rested
+        at the end for REST_TIME if the motion is shorter. under_way: it is on the path already; False: it
+        begins the path when it rests."""
         s, speed = (float(self._motion.s[0]), float(self._motion.speeds[0])) if under_way else (0.0, 0.0)
         begins = self._since if under_way else self._rest_time
-        motion = path.coarse(path.onwards(s, speed), COARSE_SAMPLE_TIME)
-        return predicted.free(*motion, begins)
+        motion = path.on_then_rest(s, speed)
+        times = COARSE_SAMPLE_TIME * np.arange(int(np.ceil(motion.duration / COARSE_SAMPLE_TIME)) + 2)
+        soon = times[: max(int(np.searchsorted(times, HORIZON)), 1)]
+        rest_time = REST_TIME if len(soon) == len(times) else 0.0
+        return predicted.comes(path.positions(motion, soon), soon + begins, rest_time + 1e-3) is None
 
     def _search(self, predicted: PredictedObstacles, start: Configuration, time: float) -> TimedPath | None:
         """A path from `start`, where the arm rests at `time`, to a goal, around the predicted obstacles. It
@@ -427,30 +415,27 @@ class Replanner:
         still = self._still.scene
         scene = still.with_shapes([*still.shapes, *predicted.shapes(later)])
         checker = CollisionChecker(self._robot, scene)
-        # the goals of the search, and for each the waypoints that follow it on the current path
-        roots = list(self._goals)
-        after = [np.zeros((0, self._robot.dof))] * len(self._goals)
+        # the end of the current path, from its first waypoint from which it is free
+        old = self._goals[:0]
         if self._path.to_goal and not self._must_leave:
             old = self._path.remaining(float(self._motion.s[-1]))
             free = motions_free(search_space(checker, COARSE_RESOLUTION), old.astype(np.float32))
-            first = len(free) - int(np.argmin(free[::-1])) if not free.all() else 1
-            roots += list(old[first:-1])
-            after += [old[i + 1 :] for i in range(first, len(old) - 1)]
-        usable = checker.free(np.array([start, *roots]))
+            old = old[1 + np.flatnonzero(~free).max(initial=0) :]
+        roots = np.concatenate([self._goals, old[:-1]])
+        usable = checker.free(np.concatenate([start[None], roots]))
         if not usable[0] or not usable[1:].any():
             return None
-        chosen = np.array([root for root, free in zip(roots, usable[1:], strict=True) if free])
         clearance = min(float(predicted.margin.min()) + self.settings.clearance, MAX_CLEARANCE)
-        request = PlanRequest(SEARCH_TIME_LIMIT, self.seed + self._searches, clearance=clearance)
+        request = replace(self._request, seed=self.seed + self._searches, clearance=clearance)
         context = PlanningContext("replanner", self._still, request)
-        search = AnytimeSearch.of(
-            context, StartGoal(checker, start, chosen), SearchSettings(), "replanner", bounded=False
-        )
+        start_goal = StartGoal(checker, start, roots[usable[1:]])
+        search = AnytimeSearch.of(context, start_goal, SearchSettings(), "replanner", bounded=False)
         if not search.first(work=ITERATIONS) or search.best is None:
             return None
-        path = search.start_goal.complete(search.best)
-        end = int(np.abs(np.array(roots) - path[-1]).max(axis=1).argmin())
-        return self._certified(np.concatenate([path, after[end]]), True)
+        path = start_goal.complete(search.best)
+        end = int(np.abs(roots - path[-1]).max(axis=1).argmin())
+        after = old[end - len(self._goals) + 1 :] if end >= len(self._goals) else old[:0]
+        return self._certified(np.concatenate([path, after]), True)
 
     def _evasion(self, predicted: PredictedObstacles, rest: Configuration, time: float) -> TimedPath | None:
         """A straight path from `rest` to the random configuration at which an obstacle is predicted to arrive
@@ -459,22 +444,19 @@ class Replanner:
         directions = self._rng.normal(size=(EVASIONS, robot.dof))
         directions *= EVASION_RADIUS / np.linalg.norm(directions, axis=1, keepdims=True)
         ends = np.clip(rest + directions, robot.lower, robot.upper)
-        best = None
+        best = np.stack([rest, rest])
         best_time = predicted.comes(rest, time, HORIZON) or np.inf
         for end in ends:
+            line = np.stack([rest, end])
             lasts = float((np.abs(end - rest) / robot.velocity).max()) + EVASION_OVERHEAD
-            comes = predicted.comes_to(np.stack([rest, end]), np.array([time, time + lasts]), HORIZON)
-            if comes is not None and comes <= best_time:
-                continue
-            if not motions_free(self._space, np.stack([rest, end]).astype(np.float32)).all():
-                continue
-            best = end
-            best_time = np.inf if comes is None else comes
-            if comes is None:
-                break
-        if best is None:
-            return None
-        return self._certified(np.stack([rest, best]), False)
+            comes = predicted.comes(line, np.array([time, time + lasts]), HORIZON)
+            later = comes is None or comes > best_time
+            if later and motions_free(self._space, line.astype(np.float32)).all():
+                best = line
+                if comes is None:
+                    break
+                best_time = comes
+        return self._certified(best, False)
 
     def _certified(self, waypoints: Configurations, to_goal: bool) -> TimedPath | None:
         """See `TimedPath.certified`."""
@@ -485,14 +467,14 @@ class Replanner:
         """If the arm rests, change to the next path, or to the path that follows the current one."""
         if not self._rests:
             return
-        if self._next is not None:
-            self._path = self._next
+        following = self._next
+        if following is None and not self._must_leave and self._motion.s[0] >= self._path.end:
+            following = self._path.then
+        if following is not None:
+            self._path = following
             self._next = None
             self._motion = AT_REST
             self._must_leave = False
-        elif not self._must_leave and self._path.then is not None and self._motion.s[0] >= self._path.end:
-            self._path = self._path.then
-            self._motion = AT_REST
 
     def _extend(self, predicted: PredictedObstacles, grown: PredictedObstacles, clear: bool) -> bool:
         """Extend the motion along the path if the extension is certified. It must also end where no obstacle
@@ -508,7 +490,7 @@ class Replanner:
             motion = self._filter.follow(path, extended)
             end_time = self._since + motion.duration
             left_alone = clear or predicted.comes(motion.positions[-1], end_time, REST_TIME) is None
-            certified = grown.near(motion, self._since, settings.clearance) is None
+            certified = grown.clear_of(motion, self._since, settings.clearance)
             if certified and (left_alone or not path.to_goal):
                 self._motion = extended
                 return True

@@ -48,13 +48,9 @@ class SpeedProfile(NamedTuple):
     s: Float[ndarray, "m"]
     speeds: Float[ndarray, "m"]
 
-    def after(self, time: float) -> tuple[float, float]:
-        """s and ṡ at a time [s] after the beginning of the motion."""
-        return braking_kernel.state_after(self.s, self.speeds, time)
-
     def rest(self, time: float) -> "SpeedProfile":
         """The remaining motion from a time [s] after its beginning on."""
-        s, speed = self.after(time)
+        s, speed = braking_kernel.state_after(self.s, self.speeds, time)
         later = self.s > s + 1e-12
         return SpeedProfile(np.append(s, self.s[later]), np.append(speed, self.speeds[later]))
 
@@ -121,31 +117,16 @@ class TimedPath:
         """The path's first and second derivatives on the grid, the grid of s, and the largest ṡ² on it."""
         count = max(int(self.line.length / LINE_INTERVAL), 8)
         grid = timing_grid(self.line, TimingSettings(line_intervals=count, corner_intervals=CORNER_INTERVALS))
-        first_derivative = self.line(grid, 1)
-        second_derivative = self.line(grid, 2)
-        return (
-            first_derivative,
-            second_derivative,
-            grid,
-            controllable(
-                first_derivative,
-                second_derivative,
-                grid,
-                VELOCITY_FRACTION * self.robot.velocity,
-                *symmetric_bounds(self.acceleration, len(grid)),
-            ),
-        )
+        path = self.line(grid, 1), self.line(grid, 2), grid
+        bounds = symmetric_bounds(self.acceleration, len(grid))
+        return *path, controllable(*path, VELOCITY_FRACTION * self.robot.velocity, *bounds)
 
-    def on_then_rest(self, s: float, speed: float, time: float) -> SpeedProfile:
+    def on_then_rest(self, s: float, speed: float, time: float = np.inf) -> SpeedProfile:
         """The motion from s, with the speed ṡ, that is as fast as possible for `time` [s], then brakes to
-        rest."""
+        rest, at the latest at the end."""
         return SpeedProfile(
             *braking_kernel.advance_then_brake(*self._grid, s, speed, time, self.acceleration)
         )
-
-    def onwards(self, s: float, speed: float) -> SpeedProfile:
-        """The fastest motion from s, with the speed ṡ, to the end."""
-        return self.on_then_rest(s, speed, np.inf)
 
     @property
     def end(self) -> float:
@@ -167,11 +148,6 @@ class TimedPath:
         s = np.append(motion.s, motion.s[-1])
         speeds = np.append(motion.speeds, 0.0)
         return sample_positions(self.line.arrays, s, speeds, times)
-
-    def coarse(self, motion: SpeedProfile, step: float) -> tuple[Float[ndarray, "n"], Configurations]:
-        """Times [s], `step` apart, and configurations of a motion from its beginning until it rests."""
-        times = step * np.arange(int(np.ceil(motion.duration / step)) + 2)
-        return times, self.positions(motion, times)
 
 
 MAX_DISPLACEMENT = 0.005
