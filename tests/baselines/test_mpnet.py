@@ -63,8 +63,7 @@ def planning(weights: str, problem: Problem, **changes: object) -> NeuralPlannin
     checker = CollisionChecker(problem.robot, problem.scene)
     start_goal = StartGoal(checker, problem.start, np.array([RIGHT]))
     context = PlanningContext("mpnet", problem, PlanRequest(60.0))
-    rng = np.random.default_rng(1)
-    return NeuralPlanning(context, start_goal, network(), settings, rng)
+    return NeuralPlanning(context, start_goal, network(), settings)
 
 
 def wall_problem(scene: Scene = WALL) -> Problem:
@@ -143,7 +142,7 @@ def test_dropout_is_on_in_planning_and_drawn_from_the_generator(weights: str) ->
     assert not torch.equal(first, second) and torch.equal(first, again)
     assert torch.equal(net.next_states(z, q, goal, None), net.next_states(z, q, goal, None))
     one = planning(weights, wall_problem())
-    states = one.next_states(np.tile(LEFT, (8, 1)).astype(np.float32), one.goals[:8])
+    states = one.network.proposals(one.z, np.tile(LEFT, (8, 1)).astype(np.float32), one.goals[:8], one.generator)
     assert len(np.unique(states, axis=0)) == 8
 
 
@@ -154,9 +153,8 @@ def test_replanning_keeps_what_is_free_and_leaves_out_states_in_collision(weight
     assert not CollisionChecker(PANDA, WALL).free(middle[None])[0]
     np.testing.assert_array_equal(one.without_collisions(path), path[[0, 1, 3]])
     good = np.array([LEFT, UP, RIGHT], np.float32)
-    assert one.segments_free(good).all()
-    np.testing.assert_array_equal(one.replan([path, good]), [good, good])
-    blocked = one.replan([np.array([LEFT, RIGHT], np.float32)])[0]
+    np.testing.assert_array_equal(one.replan([path, good], one.between), [good, good])
+    blocked = one.replan([np.array([LEFT, RIGHT], np.float32)], one.between)[0]
     assert len(blocked) > 2
     np.testing.assert_array_equal(blocked[[0, -1]], np.stack([LEFT, RIGHT]).astype(np.float32))
 

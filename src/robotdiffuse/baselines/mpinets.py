@@ -63,19 +63,18 @@ class MPiNets(LearnedPlanner[MPiNetsSettings]):
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
         network = self.network(context.problem.robot)
-        rng = context.rng
         best: _Motion | None = None
         roll_outs = 0
         while best is None or context.remaining > 0:
-            count = self.settings.batch if roll_outs else 1
-            for motion in self._roll_outs(context, network, start_goal, roll_outs, count, rng):
+            motions = self._roll_outs(context, network, start_goal, roll_outs)
+            roll_outs += len(motions)
+            for motion in motions:
                 if motion.free:
                     result = context.finish(motion.path(start_goal), "policy")
                     if result is not None:
                         return result
                 if best is None or motion.arrived > best.arrived:
                     best = motion
-            roll_outs += count
         # the validator checks the meshes, which are smaller than the covering spheres: the best motion may be
         # valid after all
         outcome = "reached the goal, but not free of collision" if best.arrived else "did not reach the goal"
@@ -89,16 +88,16 @@ class MPiNets(LearnedPlanner[MPiNetsSettings]):
         network: "MPiNetsNetwork",
         start_goal: StartGoal,
         tried: int,
-        count: int,
-        rng: np.random.Generator,
     ) -> "list[_Motion]":
-        """Runs `count` roll-outs until all have ended, one has reached the goal without a collision, or time
-        runs out.
+        """Runs a batch of roll-outs until all have ended, one has reached the goal without a collision, or
+        time runs out.
 
         `tried` is the number of earlier roll-outs. The very first roll-out goes on even if it collides.
         """
         settings = self.settings
+        rng = context.rng
         first = tried == 0
+        count = 1 if first else settings.batch
         space = search_space(start_goal.checker, settings.resolution)
         start, goals = start_goal.rows()
         order = np.argsort(np.linalg.norm(goals - start, axis=1), kind="stable")

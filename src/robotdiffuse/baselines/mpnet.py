@@ -20,12 +20,11 @@ connect two states, the next replanning tries again; in the paper, the attempt e
 divided evenly among several goals.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
 from numpy import ndarray
 
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
@@ -33,7 +32,7 @@ from robotdiffuse.collision.kernels.random import random_state
 from robotdiffuse.collision.motions import finer_resolution, search_space
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, Natural, NotNegative, Positive
-from robotdiffuse.core.types import Configuration, Configurations
+from robotdiffuse.core.types import Configurations
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings, scene_clouds
 from robotdiffuse.planning.search import rrt_kernel
@@ -82,11 +81,15 @@ class MPNet(LearnedPlanner[MPNetPlannerSettings]):
         best = Attempt(np.inf, np.inf, np.zeros((0, 0)))
         rounds = 0
         while rounds == 0 or context.remaining > 0:
-            planning = NeuralPlanning(context, start_goal, network, settings, context.rng)
+            planning = NeuralPlanning(context, start_goal, network, settings)
             candidate = planning.best()
             rounds += 1
             if candidate.broken == 0:
-                reason = planning.reason(rounds)
+                methods = " and RRT-Connect" if planning.searched else ""
+                reason = (
+                    f"solved by {self.name}: round {rounds}, after {planning.replanned} neural replannings"
+                    f"{methods}"
+                )
                 result = context.finish(start_goal.complete(candidate.path), self.name, reason)
                 if result is not None:
                     return result
@@ -118,8 +121,8 @@ class NeuralPlanning:
         start_goal: StartGoal,
         network: "MPNetNetwork",
         settings: MPNetPlannerSettings,
-        rng: np.random.Generator,
     ) -> None:
+        rng = context.rng
         self.context = context
         self.network = network
         self.settings = settings
@@ -140,27 +143,26 @@ class NeuralPlanning:
 
     def best(self) -> Attempt:
         """The shortest free path, or the path with the fewest segments in collision."""
-        paths = [self.contracted(path) for path in self.between(self.starts, self.goals, True)]
-        free = [self.segments_free(path) for path in paths]
-        while not any(f.all() for f in free):
-            if self.replanned == self.settings.replanning or self.context.remaining <= 0:
+        attempts = self.contracted(self.between(self.starts, self.goals, True))
+        while attempts[0].broken and self.context.remaining > 0:
+            if self.replanned == self.settings.replanning:
                 break
             self.replanned += 1
-            paths = [self.contracted(path) for path in self.replan(paths)]
-            free = [self.segments_free(path) for path in paths]
-        if self.settings.hybrid and not any(f.all() for f in free):
-            best_index = int(np.argmin([(~f).sum() for f in free]))
-            paths = [self.contracted(self.search(paths[best_index]))]
-            free = [self.segments_free(paths[0])]
-        attempts = [
-            Attempt(float((~f).sum()), float(path_length(path)), path)
-            for path, f in zip(paths, free, strict=True)
-        ]
-        return min(attempts, key=lambda attempt: attempt[:2])
+            attempts = self.contracted(self.replan([attempt.path for attempt in attempts], self.between))
+        if self.settings.hybrid and attempts[0].broken:
+            self.searched = True
+            attempts = self.contracted(self.replan([attempts[0].path], self.searched_between))
+        return attempts[0]
 
-    def reason(self, rounds: int) -> str:
-        methods = " and RRT-Connect" if self.searched else ""
-        return f"solved by {MPNet.name}: round {rounds}, after {self.replanned} neural replannings{methods}"
+    def contracted(self, paths: list[Configurations]) -> list[Attempt]:
+        """The paths after lazy states contraction, without states that free straight lines can skip: those
+        with the fewest segments in collision first, and of these the shortest."""
+        attempts = list[Attempt]()
+        for path in paths:
+            path = shortcut(self.space, path, 0, self.state)
+            broken = float((~motions_free(self.space, path)).sum())
+            attempts.append(Attempt(broken, float(path_length(path)), path))
+        return sorted(attempts, key=lambda attempt: attempt[:2])
 
     def between(
         self, starts: Configurations, goals: Configurations, stop_at_free: bool = False
@@ -180,30 +182,36 @@ class NeuralPlanning:
             if not unconnected or self.context.remaining <= 0:
                 break
             q, goal = (np.stack([rows[i][-1] for i in unconnected]) for rows in (near, far))
-            for i, state in zip(unconnected, self.next_states(q, goal), strict=True):
+            states = self.network.proposals(self.z, q, goal, self.generator)
+            for i, state in zip(unconnected, states, strict=True):
                 near[i].append(state)
-            connected = [i for i in unconnected if self.segments_free(np.stack([near[i][-1], far[i][-1]]))[0]]
+            ends = {i: np.stack([near[i][-1], far[i][-1]]) for i in unconnected}
+            connected = [i for i in unconnected if motions_free(self.space, ends[i])[0]]
             if stop_at_free and any(
-                self.segments_free(_joined(start_sides[i], goal_sides[i])).all() for i in connected
+                motions_free(self.space, _joined(start_sides[i], goal_sides[i])).all() for i in connected
             ):
                 break
             unconnected = [i for i in unconnected if i not in connected]
             near, far = far, near
         return [_joined(*rows) for rows in zip(start_sides, goal_sides, strict=True)]
 
-    def replan(self, paths: list[Configurations]) -> list[Configurations]:
+    def replan(
+        self,
+        paths: list[Configurations],
+        connect: Callable[[Configurations, Configurations], list[Configurations]],
+    ) -> list[Configurations]:
         """The paths without their states in collision. Where the straight line between two remaining states
-        is not free, the network proposes new states between them."""
+        is not free, `connect` plans a path between them: `between` or `searched_between`."""
         free_states = [self.without_collisions(path) for path in paths]
         broken = [
             (a, int(i))
             for a, path in enumerate(free_states)
-            for i in np.flatnonzero(~self.segments_free(path))
+            for i in np.flatnonzero(~motions_free(self.space, path))
         ]
         if not broken:
             return free_states
         starts, goals = (np.stack([free_states[a][i + end] for a, i in broken]) for end in (0, 1))
-        connections = dict(zip(broken, self.between(starts, goals), strict=True))
+        connections = dict(zip(broken, connect(starts, goals), strict=True))
         return [
             np.concatenate(
                 [path[:1]]
@@ -215,43 +223,25 @@ class NeuralPlanning:
             for a, path in enumerate(free_states)
         ]
 
-    def search(self, path: Configurations) -> Configurations:
-        """The path without its states in collision. Where the straight line between two remaining states is
-        not free, RRT-Connect plans a path between them, as long as time allows."""
-        self.searched = True
-        path = self.without_collisions(path)
-        segments = [path[:1]]
-        for (a, b), free in zip(pairwise(path), self.segments_free(path), strict=True):
-            segments.append(b[None] if free else self.searched_between(a, b)[1:])
-        return np.concatenate(segments)
-
-    def searched_between(self, a: Configuration, b: Configuration) -> Configurations:
-        """A free path from a to b by RRT-Connect; the straight line if time or SEARCH_CAPACITY runs out."""
-        trees = rrt_kernel.make_trees(a, b[None], SEARCH_CAPACITY)
-        while self.context.remaining > 0 and trees.sizes.max() < SEARCH_CAPACITY:
-            path = rrt_kernel.search(
-                self.space, None, trees, rrt_kernel.INFINITE, SEARCH_RANGE, SEARCH_ITERATIONS, self.state
-            )
-            if len(path):
-                return path
-        return np.stack([a, b])
+    def searched_between(self, starts: Configurations, goals: Configurations) -> list[Configurations]:
+        """Free paths by RRT-Connect; straight lines where time or SEARCH_CAPACITY runs out."""
+        paths = list[Configurations]()
+        for ends in np.stack([starts, goals], axis=1):
+            trees = rrt_kernel.make_trees(ends[0], ends[1:], SEARCH_CAPACITY)
+            path = ends[:0]
+            while not len(path) and self.context.remaining > 0 and trees.sizes.max() < SEARCH_CAPACITY:
+                path = rrt_kernel.search(
+                    self.space, None, trees, rrt_kernel.INFINITE, SEARCH_RANGE, SEARCH_ITERATIONS, self.state
+                )
+            paths.append(path if len(path) else ends)
+        return paths
 
     def without_collisions(self, path: Configurations) -> Configurations:
         """The path without its colliding states; the first and the last state are kept."""
         # a motion from a state to itself checks that state
-        free = np.array([self.segments_free(np.stack([q, q]))[0] for q in path[1:-1]], bool)
-        return np.concatenate([path[:1], path[1:-1][free], path[-1:]])
-
-    def contracted(self, path: Configurations) -> Configurations:
-        """The path after lazy states contraction: without states that free straight lines can skip."""
-        return shortcut(self.space, path, 0, self.state)
-
-    def segments_free(self, path: Configurations) -> Bool[ndarray, "segments"]:
-        return motions_free(self.space, path)
-
-    def next_states(self, q: Configurations, goal: Configurations) -> Configurations:
-        """The next states from q towards the goal that the paper's Pnet proposes, with dropout."""
-        return self.network.proposals(self.z, q, goal, self.generator)
+        free = motions_free(self.space, np.repeat(path, 2, axis=0))[::2]
+        free[[0, -1]] = True
+        return path[free]
 
 
 def _joined(forth: list[ndarray], back: list[ndarray]) -> Configurations:

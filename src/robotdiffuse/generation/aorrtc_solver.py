@@ -5,7 +5,6 @@ As in Shared-Tree Informed RRT*, paths keep a safety distance to obstacles, exce
 is closer to them. The safety distance is lowered in steps if no path is found.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -17,7 +16,6 @@ from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Posit
 from robotdiffuse.core.types import Configuration, Configurations, Values
 from robotdiffuse.planning.search.rrt import AnytimeSearch, SearchSettings
 from robotdiffuse.planning.start_goal import StartGoal, falling_clearances
-from robotdiffuse.robots.kinematic_tree import TURN
 
 ITERATIONS_PER_STEP = 500
 """Number of iterations between two checks whether the search must stop."""
@@ -55,40 +53,37 @@ class AORRTCSearch:
         """Start and goals must be free of collision. `state`: a random state, see `random_state`."""
         self.settings = settings
         self.goals = goals.astype(np.float32)
-        self._robot = checker.robot
         self._start_goal = StartGoal(checker, start.astype(np.float64), goals.astype(np.float64))
-        states = np.stack([start, *goals]).astype(np.float32)
-        self._distances = falling_clearances(settings.safety_distance, checker, states)
+        distances = falling_clearances(settings.safety_distance, checker, np.stack([start, *goals]))
+        self._levels = len(distances) + 2
+        """Largest number of times that `tries` iterations are made without a path."""
         self._search = AnytimeSearch(
             self._start_goal,
             SearchSettings(range=settings.range, resolution=settings.resolution),
             "aorrtc",
             int(state[0] >> np.uint64(32)),
-            self._distances,
+            distances,
             tries=settings.tries,
         )
         self.best_goal = -1
         """Index of the goal to which the path leads; -1 if there is no path."""
 
-    def run(self, stop: Callable[[], bool] = lambda: False) -> None:
-        """Search until no path can be shorter, further iterations hardly shorten the path (`gain`), the
-        iterations without a path are used up, or `stop` returns True."""
+    def run(self) -> None:
+        """Search until no path can be shorter, further iterations hardly shorten the path (`gain`), or the
+        iterations without a path are used up."""
         settings = self.settings
         search = self._search
-        iteration_limit = settings.tries * (len(self._distances) + 2)
-        while search.best is None and search.work < iteration_limit and not stop():
-            search.first(work=ITERATIONS_PER_STEP)
-        while search.best is not None and not (search.shortest or stop()):
-            if not search.improves(settings.gain, settings.patience):
-                break
+        if not search.first(work=settings.tries * self._levels):
+            return
+        while not search.shortest and search.improves(settings.gain, settings.patience):
             search.improve(ITERATIONS_PER_STEP)
-        if search.best is not None:
-            # find the goal that was reached; a continuous joint may end whole turns from the goal's value
-            end = self._start_goal.complete(search.best)[-1]
-            turns = np.abs(self.goals - end) / TURN
-            distances = np.where(self._robot.continuous, np.abs(turns - np.round(turns)), turns)
-            self.best_goal = int(distances.max(axis=1).argmin())
-            self.goals[self.best_goal] = end
+        path = self.path()
+        assert path is not None
+        # find the goal that was reached; a continuous joint may end whole turns from the goal's value
+        offsets = self.goals - path[-1]
+        offsets -= self._start_goal.checker.robot.whole_turns(offsets)
+        self.best_goal = int(np.abs(offsets).max(axis=1).argmin())
+        self.goals[self.best_goal] = path[-1]
 
     @property
     def cost(self) -> float:
