@@ -118,7 +118,6 @@ def test_an_error_below_ompl_comes_out(planner, monkeypatch):
 
     with monkeypatch.context() as patched:
         patched.setattr(ompl, "motions_free", broken)
-        patched.setattr(ompl.lane_collision, "free_many", broken)
         # start and goal are checked by the kernel too
         patched.setattr("robotdiffuse.planning.planner.usable_start_goal", UncheckedStartGoal)
         with pytest.raises(RuntimeError, match="broken kernel"):

@@ -83,17 +83,17 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.collision.motions import search_space
+from robotdiffuse.core.deadline import OutOfTimeError, check_time, deadline
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Filled, Natural, NotNegative, Positive, Settings, Share
-from robotdiffuse.core.types import Configuration, Configurations, Values
+from robotdiffuse.core.types import Configurations
 from robotdiffuse.learning.diffusion import NoiseLevels, NoiseSchedule, reverse_process
 from robotdiffuse.learning.guidance import Trajectories
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.planning.context import PlanningContext
-from robotdiffuse.planning.learned import ExportedPlanner, LearnedSettings, nearest_goals
+from robotdiffuse.planning.learned import Attempt, ExportedPlanner, LearnedSettings, nearest_goals, ranked
 from robotdiffuse.planning.start_goal import StartGoal
 
 SAMPLE_RESOLUTION = 0.02
@@ -146,51 +146,40 @@ class GuidedPrior(ExportedPlanner[GuidedPriorSettings]):
         """See `planning.planner.Planner`."""
         prior = self.network(context.problem.robot)
         samples = self.settings.samples
-        start, goals = shared_out(*start_goal.rows(), samples)
+        start, goals = start_goal.rows()
+        goals = nearest_goals(start, goals, samples)
+        ends = np.repeat(start[None], samples, 0), goals[np.arange(samples) % len(goals)]
+        levels = self.levels(prior.schedule, self.settings.sampling_steps)
+        guide = partial(self.guided, start_goal.checker)
         space = search_space(start_goal.checker, SAMPLE_RESOLUTION)
-        closest: tuple[int, float, ndarray] | None = None
-        """The best colliding sample so far: its number of segments in collision, length [rad] and
-        waypoints."""
+        colliding = list[Attempt]()
+        """The best colliding sample of each batch."""
         batches = 0
         while context.remaining > 0:
-            trajectories = sample(
-                prior,
-                start,
-                goals,
-                self.levels(prior.schedule, self.settings.sampling_steps),
-                context.rng,
-                partial(self.guided, start_goal.checker),
-                self.noise_scale,
-                self.quiet_steps,
-                lambda: context.remaining <= 0,
-            )
-            if trajectories is None:
+            try:
+                with deadline(lambda: context.remaining):
+                    trajectories = sample(
+                        prior, *ends, levels, context.rng, guide, self.noise_scale, self.quiet_steps
+                    )
+            except OutOfTimeError:
                 break
             batches += 1
-            attempts = [
-                (int((~motions_free(space, path)).sum()), float(path_length(path)), path)
-                for path in np.ascontiguousarray(trajectories, np.float32)
-            ]
-            for attempt in sorted(attempts, key=lambda attempt: attempt[:2]):
-                if attempt[0]:
-                    if closest is None or attempt[:2] < closest[:2]:
-                        closest = attempt
+            for attempt in ranked(space, np.ascontiguousarray(trajectories, np.float32)):
+                if attempt.broken:
+                    colliding.append(attempt)
                     break
-                result = context.finish(start_goal.complete(attempt[2]), self.name)
+                result = context.finish(start_goal.complete(attempt.path), self.name)
                 if result is not None:
                     return result
         # validates the best colliding sample, so that the result tells what is wrong with it; the sample was
         # checked by covering spheres, so the exact meshes may even be free
-        result = None if closest is None else context.finish(start_goal.complete(closest[2]), self.name)
+        closest = min(colliding, key=lambda attempt: attempt[:2], default=None)
+        result = None if closest is None else context.finish(start_goal.complete(closest.path), self.name)
         return result or context.unsolved(
             f"none of {batches * samples} samples of the network is free of collision"
             if batches
             else f"time ran out before the first {samples} samples were complete; use a longer time limit"
         )
-
-
-class _StoppedError(Exception):
-    """Time ran out while trajectories were sampled."""
 
 
 def sample(
@@ -202,8 +191,7 @@ def sample(
     guide: Guide,
     noise_scale: float = 1.0,
     quiet_steps: int = 0,
-    stop: Callable[[], bool] = lambda: False,
-) -> Trajectories | None:
+) -> Trajectories:
     """A trajectory from each start to its goal, float32. Inner waypoints are within the joint limits.
 
     Args:
@@ -215,32 +203,30 @@ def sample(
         guide: Moves the mean of each denoising step.
         noise_scale: See `reverse_process`.
         quiet_steps: Additional steps at the last level, without noise (MPD: 5).
-        stop: Called before every step.
 
     Returns:
-        The trajectories; None if `stop` returned True.
+        The trajectories.
+
+    Raises:
+        OutOfTimeError: If no time is left before a step, see `core.deadline`.
     """
     reference = prior.reference(starts, goals)
     condition = prior.condition(np.zeros((len(starts), 0), np.float32), starts, goals)
     predicted = prior.predictor(reference, condition, lambda _: np.zeros(0))
 
     def predict(x: ndarray, level: int) -> ndarray:
-        if stop():
-            raise _StoppedError
+        check_time("sampling trajectories")
         return predicted(x, level)
 
     def move(x: ndarray, left: int) -> ndarray:
         mean = prior.joints(prior.hold_ends(x, reference), reference)
         return prior.normalize(guide(mean, left), reference)
 
-    try:
-        x = reverse_process(
-            predict, prior.schedule, lambda: prior.draw_noise(len(starts), rng), levels, move, noise_scale
-        )
-        for _ in range(quiet_steps):
-            x = move(predict(x, int(levels[-1])), 0)
-    except _StoppedError:
-        return None
+    x = reverse_process(
+        predict, prior.schedule, lambda: prior.draw_noise(len(starts), rng), levels, move, noise_scale
+    )
+    for _ in range(quiet_steps):
+        x = move(predict(x, int(levels[-1])), 0)
     q = prior.joints(prior.clipped(x), reference)
     q[:, 0] = starts
     q[:, -1] = goals
@@ -255,23 +241,14 @@ def falling(rising: NoiseLevels, most: int) -> NoiseLevels:
     return np.minimum(spaced, most - at[::-1])[::-1].copy()
 
 
-def shared_out(
-    start: Configuration, goals: Configurations, samples: int
-) -> tuple[Configurations, Configurations]:
-    """Start and goal of each sample. The nearest goals are assigned to the samples in turn."""
-    nearest = nearest_goals(start, goals, samples)
-    return np.repeat(start[None], samples, 0), nearest[np.arange(samples) % len(nearest)]
-
-
 def collision_gradient(
     checker: CollisionChecker,
     q: Trajectories,
     margin: float,
     self_margin: float,
     between: int,
-) -> tuple[Values, Trajectories]:
-    """Collision cost of trajectories [m], and its gradient by all waypoints [m/rad], including start and
-    goal.
+) -> Trajectories:
+    """The gradient of the collision cost of trajectories by all waypoints [m/rad], including start and goal.
 
     The cost of a configuration is sqrt(sum of h²) over the covering spheres and pairs of links, where h is
     the hinge of a signed distance (see `learning.guidance`). It measures how far the arm violates the
@@ -287,15 +264,12 @@ def collision_gradient(
     depth = np.sqrt(2 * squares)
     gradients = gradients / np.maximum(depth, np.float32(1e-6))[:, None]
     at_waypoints = count * waypoints
-    costs = depth[:at_waypoints].reshape(q.shape[:2]).sum(1)
     by_waypoint = gradients[:at_waypoints].reshape(q.shape)
     if between:
-        weight = np.float32(1 / between)
-        costs = costs + weight * depth[at_waypoints:].reshape(count, -1).sum(1)
-        by_configuration = weight * gradients[at_waypoints:].reshape(between_waypoints.shape)
+        by_configuration = gradients[at_waypoints:].reshape(between_waypoints.shape) / np.float32(between)
         by_waypoint[:, :-1] += ((1 - shares)[:, None] * by_configuration).sum(2)
         by_waypoint[:, 1:] += (shares[:, None] * by_configuration).sum(2)
-    return costs, by_waypoint
+    return by_waypoint
 
 
 def limited(moves: Trajectories, most: float) -> Trajectories:
@@ -357,16 +331,14 @@ class MPD(GuidedPrior[MPDSettings]):
 
     levels = staticmethod(exponential_levels)
 
-    def guided(self, checker: CollisionChecker, q: Trajectories, left: int = 0) -> Trajectories:
+    def guided(self, checker: CollisionChecker, q: Trajectories, left: int) -> Trajectories:
         """Trajectories after the gradient steps of one denoising step. Start and goal stay fixed."""
         settings = self.settings
         if left >= ceil(settings.guided_share * settings.sampling_steps):
             return q
         robot = checker.robot
         for _ in range(GUIDE_STEPS):
-            _, gradient = collision_gradient(
-                checker, q, settings.margin, settings.self_margin, settings.between
-            )
+            gradient = collision_gradient(checker, q, settings.margin, settings.self_margin, settings.between)
             limit_margin = np.minimum(LIMIT_MARGIN, (robot.upper - robot.lower) / 2)
             within_limits = np.clip(q, robot.lower + limit_margin, robot.upper - limit_margin)
             moves = limited(-COLLISION_WEIGHT * gradient, settings.push) + (within_limits - q)
@@ -445,14 +417,6 @@ class GuideSettings(Settings, name="edmp.guides"):
     guided_share: Share
     """Fraction of the denoising steps that are guided: the last ones."""
 
-    def margin(self, left: int, steps: int) -> float | None:
-        """The margin at a denoising step after which `left` of `steps` steps follow [m]; None if the step is
-        not guided."""
-        guided = self.guided_share * steps
-        if left >= guided:
-            return None
-        return self.near_margin + (self.far_margin - self.near_margin) * left / guided
-
 
 ENSEMBLE = tuple(
     GuideSettings(between, far, near, weight, share)
@@ -512,10 +476,11 @@ class EDMP(GuidedPrior[EDMPSettings]):
         settings = self.settings
         moved = q.copy()
         for share, guide in zip(settings.shares(), settings.guides, strict=True):
-            margin = guide.margin(left, settings.sampling_steps)
-            if margin is None:
+            guided_steps = guide.guided_share * settings.sampling_steps
+            if left >= guided_steps:
                 continue
-            _, gradient = collision_gradient(checker, q[share], margin, settings.self_margin, guide.between)
+            margin = guide.near_margin + (guide.far_margin - guide.near_margin) * left / guided_steps
+            gradient = collision_gradient(checker, q[share], margin, settings.self_margin, guide.between)
             moves = limited(-guide.weight * gradient, settings.push)
             moved[share, 1:-1] += moves[:, 1:-1]
         return moved

@@ -22,19 +22,19 @@ divided evenly among several goals.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy import ndarray
 
-from robotdiffuse.collision.kernels.motions import motions_free, path_length
+from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.kernels.random import random_state
 from robotdiffuse.collision.motions import finer_resolution, search_space
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, Natural, NotNegative, Positive
 from robotdiffuse.core.types import Configurations
 from robotdiffuse.planning.context import PlanningContext
-from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings, scene_clouds
+from robotdiffuse.planning.learned import Attempt, LearnedPlanner, LearnedSettings, ranked, scene_clouds
 from robotdiffuse.planning.search import rrt_kernel
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.trajectories.simplification import shortcut
@@ -78,7 +78,7 @@ class MPNet(LearnedPlanner[MPNetPlannerSettings]):
         """See `planning.planner.Planner`."""
         network = self.network(context.problem.robot)
         settings = self.settings
-        best = Attempt(np.inf, np.inf, np.zeros((0, 0)))
+        best: Attempt | None = None
         rounds = 0
         while rounds == 0 or context.remaining > 0:
             planning = NeuralPlanning(context, start_goal, network, settings)
@@ -94,22 +94,13 @@ class MPNet(LearnedPlanner[MPNetPlannerSettings]):
                 if result is not None:
                     return result
                 settings = replace(settings, resolution=finer_resolution(settings.resolution))
-            elif candidate.broken < best.broken:
+            elif best is None or candidate.broken < best.broken:
                 best = candidate
-        result = context.finish(start_goal.complete(best.path), self.name) if len(best.path) else None
+        result = None if best is None else context.finish(start_goal.complete(best.path), self.name)
         return result or context.unsolved(
             f"no path of the network was free in {context.elapsed:.2f} s and {rounds} rounds of "
             f"{settings.attempts} attempts; a longer time limit or hybrid replanning may find one"
         )
-
-
-class Attempt(NamedTuple):
-    broken: float
-    """Number of segments in collision; infinite if there is no path."""
-    length: float
-    """Length of the path [rad]."""
-    path: Configurations
-    """Waypoints of the path."""
 
 
 class NeuralPlanning:
@@ -155,14 +146,9 @@ class NeuralPlanning:
         return attempts[0]
 
     def contracted(self, paths: list[Configurations]) -> list[Attempt]:
-        """The paths after lazy states contraction, without states that free straight lines can skip: those
-        with the fewest segments in collision first, and of these the shortest."""
-        attempts = list[Attempt]()
-        for path in paths:
-            path = shortcut(self.space, path, 0, self.state)
-            broken = float((~motions_free(self.space, path)).sum())
-            attempts.append(Attempt(broken, float(path_length(path)), path))
-        return sorted(attempts, key=lambda attempt: attempt[:2])
+        """The paths after lazy states contraction, without states that free straight lines can skip; the best
+        first."""
+        return ranked(self.space, [shortcut(self.space, path, 0, self.state) for path in paths])
 
     def between(
         self, starts: Configurations, goals: Configurations, stop_at_free: bool = False

@@ -27,7 +27,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from robotdiffuse.collision.kernels import lane_collision
 from robotdiffuse.collision.kernels.motions import Space, motions_free
 from robotdiffuse.collision.motions import finer_resolution, search_space
 from robotdiffuse.core.errors import InputError, needs
@@ -37,7 +36,6 @@ from robotdiffuse.core.types import Configuration, Configurations, Path
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.planner import Planner, ever_finer
 from robotdiffuse.planning.start_goal import StartGoal
-from robotdiffuse.robots.robot import Robot
 
 with needs("OMPL's Python bindings", "baselines"):
     from ompl import base as ob
@@ -80,20 +78,27 @@ class Watch:
         self._shorter_than = np.inf
 
     @contextmanager
-    def until_time_is_over(self) -> Iterator[ob.PlannerTerminationCondition]:
-        """A condition that ends the search when time runs out. At the end of the context, a stored exception
-        is raised."""
-        # not a Python callback: PRM's second thread would wait forever for Python's lock, which the first
-        # thread holds
-        yield from self._while(ob.timedPlannerTerminationCondition(max(self.context.remaining, 0.0)))
-
-    @contextmanager
-    def until_shorter(self, planner: Any, than: float) -> Iterator[ob.PlannerTerminationCondition]:
-        """A condition that ends the search when time runs out, or the planner has a path shorter than `than`
-        [rad]. At the end of the context, a stored exception is raised."""
+    def until(
+        self, planner: Any = None, shorter_than: float = 0.0
+    ) -> Iterator[ob.PlannerTerminationCondition]:
+        """A condition that ends the search when time runs out, or the planner, if one is given, has a path
+        shorter than `shorter_than` [rad]. At the end of the context, a stored exception is raised."""
         self._planner = planner
-        self._shorter_than = than
-        yield from self._while(ob.PlannerTerminationCondition(self._is_over))
+        self._shorter_than = shorter_than
+        # Not a Python callback for first-solution planners: PRM's second thread would wait forever for
+        # Python's lock, which the first thread holds.
+        self._condition = condition = (
+            ob.timedPlannerTerminationCondition(max(self.context.remaining, 0.0))
+            if planner is None
+            else ob.PlannerTerminationCondition(self._is_over)
+        )
+        try:
+            yield condition
+        finally:
+            # AORRTC keeps the condition, which refers to the planner: a cycle invisible to the garbage
+            # collector
+            self._condition = self._planner = None
+        self.raise_caught()
 
     def caught(self, error: BaseException) -> None:
         """Stores the search's first exception, and ends the search."""
@@ -112,42 +117,12 @@ class Watch:
         finally:
             del error
 
-    def _while(self, condition: ob.PlannerTerminationCondition) -> Iterator[ob.PlannerTerminationCondition]:
-        self._condition = condition
-        try:
-            yield condition
-        finally:
-            # AORRTC keeps the condition, which refers to the planner: a cycle invisible to the garbage
-            # collector
-            self._condition = self._planner = None
-        self.raise_caught()
-
     def _is_over(self) -> bool:
         try:
             return self.context.remaining <= 0 or self._planner.bestCost().value() < self._shorter_than
         except BaseException as error:
             self.caught(error)
             return True
-
-
-class StateChecks(ob.StateValidityChecker):
-    """Validity of single states."""
-
-    def __init__(self, information: ob.SpaceInformation, space: Space, watch: Watch) -> None:
-        super().__init__(information)
-        self._space = space
-        self._watch = watch
-        self._joints = slice(0, len(space.lower))
-        self._q = np.empty((1, len(space.lower)), np.float32)
-
-    def isValid(self, state: ob.RealVectorStateType) -> bool:
-        try:
-            space = self._space
-            self._q[0] = state[self._joints]
-            return bool(lane_collision.free_many(space.robot, space.scene, self._q, space.padding)[0])
-        except BaseException as error:
-            self._watch.caught(error)
-            return False
 
 
 class MotionChecks(ob.MotionValidator):
@@ -157,18 +132,25 @@ class MotionChecks(ob.MotionValidator):
         super().__init__(information)
         self._space = space
         self._watch = watch
-        self._joints = slice(0, len(space.lower))
-        self._line = np.empty((2, len(space.lower)), np.float32)
 
     def checkMotion(self, a: ob.RealVectorStateType, b: ob.RealVectorStateType) -> bool:
-        line = self._line
+        joints = slice(0, len(self._space.lower))
         try:
-            line[0] = a[self._joints]
-            line[1] = b[self._joints]
-            return bool(motions_free(self._space, line)[0])
+            return bool(motions_free(self._space, np.array([a[joints], b[joints]], np.float32))[0])
         except BaseException as error:
             self._watch.caught(error)
             return False
+
+
+class StateChecks(ob.StateValidityChecker):
+    """Validity of single states, as motions from a state to itself."""
+
+    def __init__(self, information: ob.SpaceInformation, motions: MotionChecks) -> None:
+        super().__init__(information)
+        self._motions = motions
+
+    def isValid(self, state: ob.RealVectorStateType) -> bool:
+        return self._motions.checkMotion(state, state)
 
 
 class OmplPlanner(Planner[OmplSettings]):
@@ -325,10 +307,15 @@ class _Search:
             start_goal.checker, settings.resolution, start_goal.kept_clearance(settings.clearance)
         )
         # keeps objects that C++ refers to alive until the search is over
-        self._states = _state_space(self._robot)
+        self._states = ob.RealVectorStateSpace(self._robot.dof)
+        bounds = ob.RealVectorBounds(self._robot.dof)
+        for joint in range(self._robot.dof):
+            bounds.setLow(joint, float(self._robot.lower[joint]))
+            bounds.setHigh(joint, float(self._robot.upper[joint]))
+        self._states.setBounds(bounds)
         self._information = ob.SpaceInformation(self._states)
-        self._validity = StateChecks(self._information, space, self._watch)
         self._motions = MotionChecks(self._information, space, self._watch)
+        self._validity = StateChecks(self._information, self._motions)
         self._information.setStateValidityChecker(self._validity)
         self._information.setMotionValidator(self._motions)
         self._information.setup()
@@ -345,10 +332,10 @@ class _Search:
         if planner.anytime:
             # with an objective, first-solution planners would go on after their first path
             self._definition.setOptimizationObjective(ob.PathLengthOptimizationObjective(self._information))
-        self._anytime = planner.anytime
         # bestCost, setRange and the constructor are not part of a common base class
         algorithm: Any = planner.algorithm
         self._planner: Any = algorithm(self._information)
+        self._watched = self._planner if planner.anytime else None
         if settings.range is not None:
             self._planner.setRange(settings.range)
         self._planner.setProblemDefinition(self._definition)
@@ -374,29 +361,22 @@ class _Search:
         Returns whether there is a path; it may be as long as before. An exception that was raised in a
         collision check is raised here.
         """
-        watch = self._watch
-        until = (
-            watch.until_shorter(self._planner, shorter_than) if self._anytime else watch.until_time_is_over()
-        )
-        with until as condition:
+        with self._watch.until(self._watched, shorter_than) as condition:
             self._status = self._planner.solve(condition).asString()
         return self._definition.hasExactSolution()
 
     def simplify(self) -> None:
         """Shorten the path by OMPL's PathSimplifier, within the time left."""
-        with self._watch.until_time_is_over() as condition:
+        with self._watch.until() as condition:
             og.PathSimplifier(self._information, self._goals).simplify(self._solution(), condition)
 
     def path(self) -> Configurations:
         """Waypoints of the shortest path."""
-        states: Any = self._solution().getStates()
-        rows = np.array([state[0 : self._robot.dof] for state in states])
+        rows = np.array([state[0 : self._robot.dof] for state in self._solution().getStates()])
         return rows[::-1] if self._backwards else rows
 
-    def _solution(self) -> og.PathGeometric:
-        solution = self._definition.getSolutionPath()
-        assert isinstance(solution, og.PathGeometric)
-        return solution
+    def _solution(self) -> Any:
+        return self._definition.getSolutionPath()
 
     def _state(self, q: Configuration) -> ob.RealVectorStateType:
         state = self._information.allocState()
@@ -405,16 +385,6 @@ class _Search:
         for joint, value in enumerate(np.clip(q.astype(np.float64), self._robot.lower, self._robot.upper)):
             state[joint] = float(value)
         return state
-
-
-def _state_space(robot: Robot) -> ob.RealVectorStateSpace:
-    states = ob.RealVectorStateSpace(robot.dof)
-    bounds = ob.RealVectorBounds(robot.dof)
-    for joint in range(robot.dof):
-        bounds.setLow(joint, float(robot.lower[joint]))
-        bounds.setHigh(joint, float(robot.upper[joint]))
-    states.setBounds(bounds)
-    return states
 
 
 @contextmanager

@@ -1,13 +1,15 @@
 """The base class of planners with a network: finds and loads the weights."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.motions import Space, motions_free, path_length
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.core.types import Configuration, Configurations
 from robotdiffuse.learning import need_packages
@@ -73,6 +75,25 @@ def nearest_goals(start: Configuration, goals: Configurations, samples: int) -> 
     most as many as can get SAMPLES_PER_GOAL samples each, but at least one."""
     order = np.argsort(np.linalg.norm(goals - start, axis=1))
     return goals[order[: max(samples // SAMPLES_PER_GOAL, 1)]]
+
+
+class Attempt(NamedTuple):
+    """A path that a network proposed."""
+
+    broken: int
+    """Number of segments in collision."""
+    length: float
+    """Length of the path [rad]."""
+    path: Configurations
+    """Waypoints of the path."""
+
+
+def ranked(space: Space, paths: Iterable[Configurations]) -> list[Attempt]:
+    """The paths with the fewest segments in collision first, and of these the shortest first."""
+    attempts = [
+        Attempt(int((~motions_free(space, path)).sum()), float(path_length(path)), path) for path in paths
+    ]
+    return sorted(attempts, key=lambda attempt: attempt[:2])
 
 
 def scene_clouds(
