@@ -23,7 +23,7 @@ from common import FIRST, draw_hard_cases, header, parse, print_table, progress
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.kernels.lane_collision import make_workspace, place_frames
-from robotdiffuse.collision.kernels.motions import Space, motion_free
+from robotdiffuse.collision.kernels.motions import Space, make_scratch, motion_free
 from robotdiffuse.collision.kernels.simd import W, lanes_array
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.planning import load_planner
@@ -80,11 +80,10 @@ def family_places(folder: Path) -> list[Place]:
 
 @njit
 def check_edges(space: Space, starts: ndarray, ends: ndarray) -> ndarray:
-    work = make_workspace(space.robot, space.scene)
-    block = np.empty((starts.shape[1], W), np.float32)
+    scratch = make_scratch(space, starts)
     free = np.empty(len(starts), np.bool_)
     for i in range(len(starts)):
-        free[i] = motion_free(space, starts[i], ends[i], block, work)
+        free[i] = motion_free(space, starts[i], ends[i], scratch)
     return free
 
 

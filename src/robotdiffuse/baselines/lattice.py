@@ -27,8 +27,7 @@ from typing import Annotated
 import numpy as np
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.kernels.lane_collision import W, make_workspace
-from robotdiffuse.collision.kernels.motions import motion_free
+from robotdiffuse.collision.kernels.motions import make_scratch, motion_free
 from robotdiffuse.collision.motions import FINEST_RESOLUTION, search_space
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.kernels import allocation_free, kernel
@@ -65,7 +64,7 @@ NODE = np.dtype([("at", "i8"), ("g", "f8"), ("rhs", "f8"), ("parent", "i8")])
 # - values: counters, see below.
 # - offers: costs of one node through each of its neighbors and goals [steps].
 FIELDS = "origin spacing counts strides moves costs goals corners inflation slots nodes q queue "
-Search = namedtuple("Search", FIELDS + "values offers block space work", defaults=(None, ()))
+Search = namedtuple("Search", FIELDS + "values offers space scratch", defaults=(None, ()))
 NODES, EXPANSIONS, START = range(3)  # in `values`: number of nodes, number of expansions, index of the start
 
 
@@ -138,10 +137,10 @@ def _choose_parent(s, v):
         if s.offers[m] >= node.rhs:
             return
         u = find(s, node.at + s.moves[m], False) if m < len(s.moves) else len(s.offers) - m
-        if motion_free(s.space, s.q[u], q, s.block, s.work):
+        if motion_free(s.space, s.q[u], q, s.scratch):
             node.rhs = s.offers[m]
             node.parent = u
-        elif not motion_free(s.space, q, q, s.block, s.work):
+        elif not motion_free(s.space, q, q, s.scratch):
             return
         s.offers[m] = np.inf
 
@@ -172,7 +171,7 @@ def search(s, expansions):
     """ComputeShortestPath of D* Lite, for up to `expansions` iterations; returns an Outcome."""
     start = s.nodes[s.values[START]]
     q = s.q[s.values[START]]
-    blocked = not motion_free(s.space, q, q, s.block, s.work)
+    blocked = not motion_free(s.space, q, q, s.scratch)
     for _ in range(expansions):
         if s.values[NODES] == len(s.nodes):
             return Outcome.FULL
@@ -201,7 +200,7 @@ def update(s, start):
     and computes all keys again."""
     s.values[START] = find(s, start, True)
     for goal in range(1, s.goals + 1):
-        s.nodes[goal].g = 0.0 if motion_free(s.space, s.q[goal], s.q[goal], s.block, s.work) else np.inf
+        s.nodes[goal].g = 0.0 if motion_free(s.space, s.q[goal], s.q[goal], s.scratch) else np.inf
     for at in s.corners:
         _choose_parent(s, find(s, at, True))
     for v in range(s.goals + 1, s.values[NODES]):
@@ -295,8 +294,8 @@ class LatticeSearch:
         first = len(goals) + 1
         capacity = settings.max_nodes + len(corners) + first + 1
         size = 2 << capacity.bit_length()
-        shapes = size, capacity, (capacity, robot.dof), size, 3, len(moves) + len(goals), (robot.dof, W)
-        kinds = np.int32, NODE, np.float32, float, np.int64, float, np.float32
+        shapes = size, capacity, (capacity, robot.dof), size, 3, len(moves) + len(goals)
+        kinds = np.int32, NODE, np.float32, float, np.int64, float
         self._search = s = Search(*lattice, *map(np.zeros, shapes, kinds))
         s.values[NODES] = first
         s.nodes["g"][0] = np.inf
@@ -318,7 +317,7 @@ class LatticeSearch:
             self._start = at.astype(np.int64) @ s.strides
         self.checker = checker
         space = search_space(checker, self.settings.resolution, self.padding)
-        self._search = s._replace(space=space, work=make_workspace(space.robot, space.scene))
+        self._search = s._replace(space=space, scratch=make_scratch(space, space.lower))
         update(self._search, self._start)
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> Outcome:

@@ -7,8 +7,7 @@ Microseconds via Vectorized Sampling-Based Planning", ICRA 2024, and in OMPL's p
 
 import numpy as np
 
-from robotdiffuse.collision.kernels.lane_collision import W, make_workspace
-from robotdiffuse.collision.kernels.motions import distance, motion_free, path_length
+from robotdiffuse.collision.kernels.motions import distance, make_scratch, motion_free, path_length
 from robotdiffuse.collision.kernels.random import random
 from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
 
@@ -35,17 +34,17 @@ def simplify(space, path, rounds):
     Waypoints that a straight line can skip are removed. Each of at most `rounds` rounds then smooths corners
     and removes such waypoints again.
     """
-    work, block, a, _ = _make_scratch(space, path)
-    points = _skipped(space, path, block, work)
+    scratch = make_scratch(space, space.lower)
+    points = _skipped(space, path, scratch)
     length = path_length(points)
     for _ in range(rounds):
         if len(points) <= 2:
             return points
-        smooth = _skipped(space, _smoothed(space, points, a, block, work), block, work)
+        smooth = _skipped(space, _smoothed(space, points, scratch), scratch)
         shorter = path_length(smooth)
         # Smoothing splits segments without a check. The halves are sampled at other configurations than the
         # whole segment was, so the path is checked again.
-        if shorter >= length or not _free(space, smooth, block, work):
+        if shorter >= length or not _free(space, smooth, scratch):
             break
         points = smooth
         if shorter > length * (_ONE - MIN_GAIN):
@@ -62,11 +61,11 @@ def shortcut(space, path, tries, state):
     shortcut from one segment to another and a move of a waypoint towards the chord of its neighbors. state:
     of the random generator.
     """
-    work, block, a, b = _make_scratch(space, path)
-    points = _skipped(space, path, block, work)
+    scratch = make_scratch(space, space.lower)
+    points = _skipped(space, path, scratch)
     if tries == 0 or len(points) <= 2:
         return points
-    return _shortcuts(space, points, tries, a, b, block, work, state)
+    return _shortcuts(space, points, tries, scratch, state)
 
 
 @kernel(nogil=True)
@@ -77,7 +76,7 @@ def tighten(space, path, tries, state):
     little longer than the shortest path of the homotopy class. Tightening comes closer without new corners,
     which would slow the motion down. state: of the random generator.
     """
-    work, block, a, _ = _make_scratch(space, path)
+    scratch = make_scratch(space, space.lower)
     points = path.copy()
     n = len(path)
     for _ in range(tries):
@@ -86,33 +85,24 @@ def tighten(space, path, tries, state):
         i = 1 + min(int(random(state) * np.float32(n - 2)), n - 3)
         change = random(state)
         if change < REMOVE_SHARE:
-            if motion_free(space, points[i - 1], points[i + 1], block, work):
+            if motion_free(space, points[i - 1], points[i + 1], scratch):
                 points[i : n - 1] = points[i + 1 : n].copy()
                 n -= 1
         else:
-            _move(space, points, i, change >= PULL_SHARE, a, block, work, state)
+            _move(space, points, i, change >= PULL_SHARE, scratch, state)
     return points[:n].copy()
 
 
 @inner_kernel(inline="always")
-def _make_scratch(space, path):
-    """Scratch memory of the motion checks, and two configurations."""
-    dof = path.shape[1]
-    work = make_workspace(space.robot, space.scene)
-    block = np.empty((dof, W), np.float32)
-    return work, block, np.empty(dof, np.float32), np.empty(dof, np.float32)
-
-
-@inner_kernel(inline="always")
-def _free(space, path, block, work):
+def _free(space, path, scratch):
     for i in range(len(path) - 1):  # noqa: SIM110
-        if not motion_free(space, path[i], path[i + 1], block, work):
+        if not motion_free(space, path[i], path[i + 1], scratch):
             return False
     return True
 
 
 @inner_kernel()
-def _skipped(space, path, block, work):
+def _skipped(space, path, scratch):
     """The path without waypoints that straight lines can skip. After each waypoint comes the last waypoint of
     the path that a free straight line reaches."""
     out = np.empty(path.shape, np.float32)
@@ -125,16 +115,17 @@ def _skipped(space, path, block, work):
             return out[:n].copy()
         following = i + 1
         for k in range(len(path) - 1, i + 1, -1):
-            if motion_free(space, path[i], path[k], block, work):
+            if motion_free(space, path[i], path[k], scratch):
                 following = k
                 break
         i = following
 
 
 @inner_kernel(inline="always")
-def _smoothed(space, path, trial, block, work):
+def _smoothed(space, path, scratch):
     """The path after repeated subdivision: segment middles become waypoints, corners move towards them."""
     points = path
+    trial = scratch.a
     dof = path.shape[1]
     for _ in range(MAX_SUBDIVISIONS):
         finer = np.empty((2 * len(points) - 1, dof), np.float32)
@@ -151,8 +142,8 @@ def _smoothed(space, path, trial, block, work):
                 moved += (trial[j] - finer[i, j]) ** 2
             if moved < MIN_MOVE * MIN_MOVE:
                 continue
-            if motion_free(space, finer[i - 1], trial, block, work) and motion_free(
-                space, trial, finer[i + 1], block, work
+            if motion_free(space, finer[i - 1], trial, scratch) and motion_free(
+                space, trial, finer[i + 1], scratch
             ):
                 finer[i] = trial
                 changed = True
@@ -163,7 +154,9 @@ def _smoothed(space, path, trial, block, work):
 
 
 @inner_kernel()
-def _shortcuts(space, path, tries, a, b, block, work, state):
+def _shortcuts(space, path, tries, scratch, state):
+    a = scratch.a
+    b = scratch.b
     capacity = len(path) + tries + 2
     dof = path.shape[1]
     points = np.empty((capacity, dof), np.float32)
@@ -173,7 +166,7 @@ def _shortcuts(space, path, tries, a, b, block, work, state):
         if n <= 2:
             break
         if attempt % 2 == 1:
-            _pull_in(space, points, n, a, block, work, state)
+            _pull_in(space, points, n, scratch, state)
             continue
         total = path_length(points[:n])
         s = random(state) * total
@@ -186,9 +179,9 @@ def _shortcuts(space, path, tries, a, b, block, work, state):
         # configurations than the check of its segment did.
         if (
             i == k
-            or not motion_free(space, a, b, block, work)
-            or not motion_free(space, points[i], a, block, work)
-            or not motion_free(space, b, points[k + 1], block, work)
+            or not motion_free(space, a, b, scratch)
+            or not motion_free(space, points[i], a, scratch)
+            or not motion_free(space, b, points[k + 1], scratch)
         ):
             continue
         # keep points[..i], a, b, points[k + 1..]
@@ -204,7 +197,7 @@ def _shortcuts(space, path, tries, a, b, block, work, state):
         points[i + 1] = a
         points[i + 2] = b
         n += shift
-    return _skipped(space, points[:n], block, work)
+    return _skipped(space, points[:n], scratch)
 
 
 @allocation_free()
@@ -223,9 +216,10 @@ def _place_at(points, n, length, out):
 
 
 @inner_kernel()
-def _pull_in(space, points, n, trial, block, work, state):
+def _pull_in(space, points, n, scratch, state):
     """Moves a random inner waypoint towards the chord of its neighbors. Each failed check reduces the move to
     40 %; after four failed checks, the waypoint stays."""
+    trial = scratch.a
     i = 1 + int(random(state) * np.float32(n - 2))
     i = min(i, n - 2)
     before = points[i - 1]
@@ -238,16 +232,17 @@ def _pull_in(space, points, n, trial, block, work, state):
         for j in range(points.shape[1]):
             chord = before[j] + share * (after[j] - before[j])
             trial[j] = points[i, j] + pull * (chord - points[i, j])
-        if motion_free(space, before, trial, block, work) and motion_free(space, trial, after, block, work):
+        if motion_free(space, before, trial, scratch) and motion_free(space, trial, after, scratch):
             points[i] = trial
             return
         pull *= np.float32(0.4)
 
 
 @inner_kernel(inline="always")
-def _move(space, points, i, anywhere, trial, block, work, state):
+def _move(space, points, i, anywhere, scratch, state):
     """Moves waypoint i towards the chord of its neighbors if the path stays free and becomes shorter.
     anywhere: whether a random move is added."""
+    trial = scratch.a
     before = points[i - 1]
     at = points[i]
     after = points[i + 1]
@@ -265,7 +260,7 @@ def _move(space, points, i, anywhere, trial, block, work, state):
     if (
         new1 + new2 < d1 + d2
         and min(new1, new2) >= MIN_MOVE
-        and motion_free(space, before, trial, block, work)
-        and motion_free(space, trial, after, block, work)
+        and motion_free(space, before, trial, scratch)
+        and motion_free(space, trial, after, scratch)
     ):
         points[i] = trial

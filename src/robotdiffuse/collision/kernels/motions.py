@@ -38,6 +38,24 @@ class Space(NamedTuple):
     padding that is free of collision there [m]."""
 
 
+class Scratch(NamedTuple):
+    """Scratch memory for checks of motions, and two configurations for the caller's use."""
+
+    work: tuple
+    block: np.ndarray
+    """[dof, W] configurations that are checked at once."""
+    a: np.ndarray
+    b: np.ndarray
+
+
+@kernel()
+def make_scratch(space, q):
+    """Scratch memory for one thread, with configurations of the data type of q."""
+    dof = len(space.lower)
+    work = make_workspace(space.robot, space.scene)
+    return Scratch(work, np.empty((dof, W), np.float32), np.empty(dof, q.dtype), np.empty(dof, q.dtype))
+
+
 @allocation_free(fastmath=True)
 def distance(a, b):
     """Distance of two configurations in joint space [rad, L2]."""
@@ -58,7 +76,7 @@ def path_length(path):
 
 
 @allocation_free(inner=False)
-def motion_free(space, a, b, block, work):
+def motion_free(space, a, b, scratch):
     """Whether the straight motion from a (exclusive) to b (inclusive) is free of collision.
 
     a and b may be of any float type. The 16 configurations of a block are spread over the whole motion, so
@@ -66,7 +84,7 @@ def motion_free(space, a, b, block, work):
     Microseconds", ICRA 2024).
     """
     if len(space.near_ends) == 0:
-        return _stretch_free(space, a, b, np.float32(0.0), _ONE, space.padding, block, work)
+        return _stretch_free(space, a, b, np.float32(0.0), _ONE, space.padding, scratch)
     length = distance(a, b)
     steps = max(int(np.ceil(length / RELAXATION_STEP)), 1)
     half = np.float32(0.5) * length / np.float32(steps)
@@ -79,7 +97,7 @@ def motion_free(space, a, b, block, work):
         if padding != first_padding:
             s = np.float32(first) / np.float32(steps)
             t = np.float32(k) / np.float32(steps)
-            if not _stretch_free(space, a, b, s, t, first_padding, block, work):
+            if not _stretch_free(space, a, b, s, t, first_padding, scratch):
                 return False
             first = k
             first_padding = padding
@@ -107,7 +125,7 @@ def padding_near(space, a, b, share, around):
 
 
 @allocation_free()
-def _stretch_free(space, a, b, s, t, padding, block, work):
+def _stretch_free(space, a, b, s, t, padding, scratch):
     """Whether the motion from a + s (b - a), exclusive, to a + t (b - a), inclusive, is free of collision."""
     dof = len(a)
     travel = np.float32(0.0)
@@ -120,8 +138,8 @@ def _stretch_free(space, a, b, s, t, padding, block, work):
         shares = (lane_numbers() * np.float32(blocks) + np.float32(blocks - k)) * step
         for j in range(dof):
             far = np.float32(b[j] - a[j])
-            store(block, j, 0, shares * far + (np.float32(a[j]) + s * far))
-        if block_hits(space.robot, space.scene, block, padding, True, work):
+            store(scratch.block, j, 0, shares * far + (np.float32(a[j]) + s * far))
+        if block_hits(space.robot, space.scene, scratch.block, padding, True, scratch.work):
             return False
     return True
 
@@ -131,9 +149,8 @@ def motions_free(space, path):
     """For each row of path[n, dof] but the last, whether the straight motion to the next row is free of
     collision: bool[n - 1]. Row 0 itself is not checked.
     """
-    work = make_workspace(space.robot, space.scene)
-    block = np.empty((path.shape[1], W), np.float32)
+    scratch = make_scratch(space, space.lower)
     out = np.empty(len(path) - 1, np.bool_)
     for i in range(len(path) - 1):
-        out[i] = motion_free(space, path[i], path[i + 1], block, work)
+        out[i] = motion_free(space, path[i], path[i + 1], scratch)
     return out

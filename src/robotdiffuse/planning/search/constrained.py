@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numba.extending import overload
 
-from robotdiffuse.collision.kernels.motions import distance, motion_free, path_length
+from robotdiffuse.collision.kernels.motions import distance, make_scratch, motion_free, path_length
 from robotdiffuse.collision.kernels.random import random
 from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.planning.search import rrt_kernel
@@ -90,7 +90,7 @@ def _keep(limits, q):
 def _extended(space, limits, trees, tree, near, q, longest, scratch):
     def extended(space, limits, trees, tree, near, q, longest, scratch):
         origin = trees.nodes[tree, near]
-        end = scratch.end
+        end = scratch.a
         gap = distance(origin, q)
         if gap <= longest:
             end[:] = q
@@ -128,7 +128,7 @@ def _straight(limits, a, b):
 
 @inner_kernel()
 def _usable(space, limits, a, b, scratch):
-    return _straight(limits, a, b) and motion_free(space, a, b, scratch.block, scratch.work)
+    return _straight(limits, a, b) and motion_free(space, a, b, scratch)
 
 
 @inner_kernel()
@@ -151,7 +151,7 @@ def between(space, limits, a, b, most, scratch):
         if length + gap > most:
             return 0
         if _straight(limits, current, target):
-            if count == MAX_PIECES or not motion_free(space, current, target, scratch.block, scratch.work):
+            if count == MAX_PIECES or not motion_free(space, current, target, scratch):
                 return 0
             limits.out[count] = target
             current[:] = target
@@ -174,10 +174,9 @@ def between(space, limits, a, b, most, scratch):
 @kernel(nogil=True)
 def line(space, limits, a, b):
     """The waypoints [n, dof] of a motion from a to b by `between`; n = 0 if none was found."""
-    trees = rrt_kernel.make_trees(a, b.reshape(1, -1), MAX_PIECES + 1)
-    scratch = rrt_kernel.make_scratch(space, trees.nodes)
-    end = rrt_kernel.extended(space, limits, trees, 0, 0, b, 2.0 * distance(a, b), scratch)
-    return rrt_kernel.branch(trees, 0, end)
+    count = between(space, limits, a, b, MAX_STEP_FACTOR * distance(a, b), make_scratch(space, a))
+    path = np.concatenate((a.reshape(1, -1), limits.out[:count]))
+    return path if count else path[:0]
 
 
 @kernel(nogil=True)
@@ -185,7 +184,7 @@ def simplify(space, limits, path, rounds, tries, state):
     """A path that is not longer than `path` and has its start and goal. First `tries` shortcuts between
     random waypoints are tried, and waypoints that a straight piece can skip are removed. Then each of
     `rounds` rounds smooths the corners. At the end, waypoints that can be skipped are removed again."""
-    scratch = rrt_kernel.make_scratch(space, path)
+    scratch = make_scratch(space, path)
     points = _finer(path)
     failed = 0
     for _ in range(tries):
@@ -212,15 +211,14 @@ def simplify(space, limits, path, rounds, tries, state):
 @inner_kernel()
 def _finer(path):
     """The path with each piece split into equal parts that are at most MAX_INITIAL_PIECE long."""
-    total = 1
-    for i in range(len(path) - 1):
-        total += max(1, int(np.ceil(distance(path[i], path[i + 1]) / MAX_INITIAL_PIECE)))
-    out = np.empty((total, path.shape[1]))
+    parts = np.ones(len(path) - 1, np.int64)
+    for i in range(len(parts)):
+        parts[i] = max(1, int(np.ceil(distance(path[i], path[i + 1]) / MAX_INITIAL_PIECE)))
+    out = np.empty((parts.sum() + 1, path.shape[1]))
     n = 0
-    for i in range(len(path) - 1):
-        parts = max(1, int(np.ceil(distance(path[i], path[i + 1]) / MAX_INITIAL_PIECE)))
-        for part in range(parts):
-            out[n] = path[i] + part / parts * (path[i + 1] - path[i])
+    for i in range(len(parts)):
+        for part in range(parts[i]):
+            out[n] = path[i] + part / parts[i] * (path[i + 1] - path[i])
             n += 1
     out[n] = path[-1]
     return out
@@ -250,15 +248,10 @@ def _skipped(space, limits, path, scratch):
 def _smoothed(space, limits, path, scratch):
     """The path with the middles of its pieces as waypoints, and its corners moved towards them."""
     finer = np.empty((2 * len(path) - 1, path.shape[1]))
-    dof = path.shape[1]
-    for i in range(len(path)):
-        finer[2 * i] = path[i]
-        if i > 0:
-            finer[2 * i - 1] = 0.5 * (path[i - 1] + path[i])
-    trial = np.empty(dof)
+    finer[::2] = path
+    finer[1::2] = 0.5 * (path[:-1] + path[1:])
     for i in range(2, len(finer) - 1, 2):
-        for j in range(dof):
-            trial[j] = 0.5 * finer[i, j] + 0.25 * (finer[i - 1, j] + finer[i + 1, j])
+        trial = 0.5 * finer[i] + 0.25 * (finer[i - 1] + finer[i + 1])
         if distance(trial, finer[i]) < MIN_CORNER_MOVE:
             continue
         if (

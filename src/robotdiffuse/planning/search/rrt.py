@@ -26,7 +26,16 @@ from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.loading import loading
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings
-from robotdiffuse.core.types import FIRST, LENGTH, TIME, TIME_LIMIT, Configuration, Configurations, Tree
+from robotdiffuse.core.types import (
+    FIRST,
+    LENGTH,
+    TIME,
+    TIME_LIMIT,
+    Configuration,
+    Configurations,
+    Tree,
+    Values,
+)
 from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS
 from robotdiffuse.planning.context import DEFAULT_CLEARANCE, TOLERANCE_FRACTION, PlanningContext
 from robotdiffuse.planning.planner import Planner
@@ -55,8 +64,7 @@ paths become shorter when they are simplified."""
 TIGHTENING_FACTOR = 1.05
 """Paths longer than this multiple of the best length are not tightened, since tightening would not make them
 shorter than the best path."""
-OPTIMALITY_TOLERANCE = 1e-4
-"""A path counts as optimal if it is longer than the straight line by at most this fraction."""
+
 NEAR_FACTOR = 1.3
 """Paths up to this multiple of the best length become candidates for the fastest motion."""
 LONG_ROUND_FACTOR = 5
@@ -89,9 +97,7 @@ the goals, plus this margin."""
 PATHS_TO_FIND = 2
 """With until="converged", RRT-Connect and searches under path constraints end after this many paths; the best
 path is returned."""
-STRAIGHT_EXCESS = 0.02
-"""Under path constraints, a path counts as optimal if it is longer than the straight line by at most this
-fraction."""
+
 SHORTCUTS = 60
 """Number of shortcuts that are tried on each path under path constraints."""
 
@@ -129,6 +135,9 @@ class AnytimeSearch:
     """Number of nodes, in addition to one, that an iteration may add to a tree."""
     limits: tuple | None = None
     """`constrained.Limits`: path constraints that the edges of trees keep; None: no constraints."""
+    optimality_tolerance = 1e-4
+    """The best path counts as optimal if it is longer than the straight line to the nearest goal by at most
+    this fraction."""
 
     def __init__(
         self,
@@ -161,8 +170,6 @@ class AnytimeSearch:
         self.best: Configurations | None = None
         """The shortest path so far, free at the resolution of the search."""
         self.length = np.float32(np.inf)
-        self.stage = ""
-        """The stage that found the best path."""
         self.work = 0
         """Number of iterations so far."""
         self.found = 0
@@ -219,13 +226,12 @@ class AnytimeSearch:
     @property
     def shortest(self) -> bool:
         """Whether the best path is about as short as the straight line to the nearest goal."""
-        return self._near_straight(OPTIMALITY_TOLERANCE)
+        return bool(self.length <= self.straight.min() * (1 + self.optimality_tolerance))
 
-    def _near_straight(self, fraction: float) -> bool:
-        """Whether the best path is longer than the straight line to the nearest goal by at most
-        `fraction`."""
-        straight = np.linalg.norm(self.goals - self.start, axis=1).min()
-        return bool(self.length <= straight * (1 + fraction))
+    @property
+    def straight(self) -> Values:
+        """Lengths of the straight lines to the goals [rad]."""
+        return np.linalg.norm(self.goals - self.start, axis=1)
 
     @property
     def trees(self) -> tuple[Tree, ...]:
@@ -254,7 +260,7 @@ class AnytimeSearch:
         """Search for shorter paths, for at most `work` more iterations, or until the path is optimal."""
         work_limit = self.work + work
         if self._untightened and self.best is not None:
-            self.offer(self.best, self.stage)
+            self.offer(self.best, self.history[-1][1])
             self._untightened = False
         while not self.shortest and self.work < work_limit and not self._stop():
             self._iterate()
@@ -283,7 +289,7 @@ class AnytimeSearch:
 
     def _take(self, path: Configurations, length: float, stage: str) -> bool:
         """Make a path the best one and end the round; returns True."""
-        self.best, self.length, self.stage = path, np.float32(length), stage
+        self.best, self.length = path, np.float32(length)
         self.history.append((path, stage))
         self._lengths.append((self.work, length))
         self._trees = None
@@ -292,8 +298,7 @@ class AnytimeSearch:
 
     def keeps_clearance(self, q: Configurations) -> bool:
         """Whether the polyline through configurations keeps the clearance of the search."""
-        rows = np.ascontiguousarray(q if len(q) > 1 else np.repeat(q, 2, axis=0), np.float32)
-        return bool(motions_free(self.space, rows).all())
+        return bool(motions_free(self.space, for_kernels(q, np.float32)).all())
 
     def refuse(self, accepted: Configurations | None) -> None:
         """Go back to `accepted`, the last valid path (None: no path), after the validator refused the best
@@ -316,7 +321,7 @@ class AnytimeSearch:
     def _try_straight_lines(self) -> None:
         if not self._shortens:
             return
-        for goal in sorted(self.goals, key=lambda goal: float(np.linalg.norm(goal - self.start))):
+        for goal in self.goals[np.argsort(self.straight, kind="stable")]:
             path = self._line(goal)
             if len(path) and self.offer(path, "straight_line"):
                 self.found += 1
@@ -358,6 +363,7 @@ class ConstrainedSearch(AnytimeSearch):
     """Restarts of RRT-Connect under path constraints; the best path is the one of the lowest cost."""
 
     clock_interval = 20
+    optimality_tolerance = 0.02
 
     def __init__(self, context: PlanningContext, start_goal: StartGoal, settings: SearchSettings) -> None:
         constraints = context.validator.constraints
@@ -387,11 +393,6 @@ class ConstrainedSearch(AnytimeSearch):
             improved=context.improved,
         )
         self.start, self.goals = start, np.stack(start_goal.goal_leads)
-
-    @property
-    def shortest(self) -> bool:
-        """Whether the best path is hardly longer than the straight line to the nearest goal."""
-        return self._near_straight(STRAIGHT_EXCESS)
 
     def keeps_clearance(self, q: Configurations) -> bool:
         """Whether the polyline through configurations keeps the clearance and the constraints."""
@@ -483,7 +484,7 @@ class _Validation:
             self._accepts_motion(motions.best)
         if motions is not None and self.best is not None:
             return True
-        if search.best is self._path or self._accepts(search.best, search.stage):
+        if search.best is self._path or self._accepts(*search.history[-1]):
             return True
         if self.context.remaining <= 0 and self.best is None:
             # no time is left to search: try the best path before the refused one
@@ -510,7 +511,7 @@ class _Validation:
             return
         self.best = None
         accepted = 0
-        for candidate in motions.fastest():
+        for candidate in sorted(motions.candidates, key=motions.least_time):
             accepted += self._accepts_motion(candidate)
             if accepted == FINAL_CANDIDATES or self.context.remaining <= 0:
                 break
@@ -518,21 +519,19 @@ class _Validation:
             if search.best is self._path:
                 self._keep(self._shortest)
             else:
-                self._accepts(search.best, search.stage)
+                self._accepts(*search.history[-1])
         if self.best is None or self.context.remaining <= 0:
             self._keep(before)
 
     def _accepts(self, path: ndarray, stage: str) -> bool:
         self._timed.append(path)
-        paths = [self.search.start_goal.complete(path, direct) for direct in (True, False)]
-        result = None
         # If covering spheres collide at the start or goal, the search begins or ends nearby, where they do
         # not: at a lead, see `StartGoal`. The direct way, without the lead, is tried first, since the meshes
         # may be free there.
-        if len(paths[0]) < len(paths[1]):
-            result = self._finished(paths[0], stage, None)
-        if result is None:
-            result = self._finished(paths[1], stage, None)
+        direct, by_leads = (self.search.start_goal.complete(path, direct) for direct in (True, False))
+        result = self._finished(direct, stage)
+        if result is None and len(direct) < len(by_leads):
+            result = self._finished(by_leads, stage)
         if result is not None:
             self._path = path
             self._shortest = result
@@ -540,31 +539,30 @@ class _Validation:
 
     def _accepts_motion(self, candidate: Candidate) -> bool:
         start_goal = self.search.start_goal
-        max_deviation = self.context.timing.corner_deviation
         path = start_goal.complete(candidate.path)
         # `complete` may have added the start before the search's first waypoint, or the goal after its last
-        deviations = np.full(len(path), max_deviation)
-        lead = start_goal.start_lead
-        assert lead is not None  # otherwise there would be no path
-        first = 1 if np.array_equal(lead, start_goal.start) else 2
+        deviations = np.full(len(path), self.context.timing.corner_deviation)
+        assert start_goal.start_lead is not None  # otherwise there would be no path
+        first = 1 if np.array_equal(start_goal.start_lead, start_goal.start) else 2
         deviations[first : first + len(candidate.deviations)] = candidate.deviations
         return self._finished(path, candidate.stage, deviations) is not None
 
-    def _finished(self, path: ndarray, stage: str, deviations: ndarray | None) -> PlanResult | None:
+    def _finished(self, path: ndarray, stage: str, deviations: ndarray | None = None) -> PlanResult | None:
         """Validate and time a path, and make its result the best one if it is better; None if it is
         refused."""
         search = self.search
-        target_clearance = self.context.clearance
-        keeps = search.keeps_clearance
-        notes = ()
-        if search.clearance < target_clearance:
-            used_cm = 100 * search.clearance
-            target_cm = 100 * target_clearance
-            notes = (
-                f"no path was found with a clearance of {target_cm:.2g} cm; "
-                f"this one was searched with {used_cm:.2g} cm",
-            )
-        result = self.context.finish(path, stage, notes=notes, keeps=keeps, deviations=deviations)
+        wanted = self.context.clearance
+        notes = (
+            f"no path was found with a clearance of {100 * wanted:.2g} cm; "
+            f"this one was searched with {100 * search.clearance:.2g} cm",
+        )
+        result = self.context.finish(
+            path,
+            stage,
+            notes=notes if search.clearance < wanted else (),
+            keeps=search.keeps_clearance,
+            deviations=deviations,
+        )
         self._keep(result)
         return result
 
@@ -592,10 +590,9 @@ def anytime(
     request = context.request
     problem = context.problem
     if request.objective == TIME and request.until != FIRST and not problem.constraints:
-        straight = float(np.linalg.norm(search.goals - search.start, axis=1).min())
         goals = problem.goal.goals if isinstance(problem.goal, AnyGoal) else (problem.goal,)
         joint_goals_only = all(isinstance(goal, JointGoal) for goal in goals)
-        longest = np.inf if joint_goals_only else MAX_DETOUR * straight
+        longest = np.inf if joint_goals_only else MAX_DETOUR * float(search.straight.min())
         search.motions = TimeOptimization(
             problem.robot, context.timing, search.start, search.goals, request.seed, longest
         )

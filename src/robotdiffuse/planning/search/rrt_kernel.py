@@ -15,8 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robotdiffuse.collision.kernels.lane_collision import make_workspace
-from robotdiffuse.collision.kernels.motions import distance, motion_free
+from robotdiffuse.collision.kernels.motions import distance, make_scratch, motion_free
 from robotdiffuse.collision.kernels.random import random
 from robotdiffuse.collision.kernels.simd import W, lane, load
 from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
@@ -58,16 +57,6 @@ class Trees(NamedTuple):
     """[2] numbers of nodes."""
 
 
-class Scratch(NamedTuple):
-    """Working memory for checks of motions."""
-
-    work: tuple
-    block: np.ndarray
-    """[dof, W] configurations that are checked at once."""
-    end: np.ndarray
-    """[dof] where a motion ends."""
-
-
 @kernel()
 def make_trees(start, goals, capacity):
     """Trees with the start and the goals as their roots; nodes have the start's data type."""
@@ -88,16 +77,6 @@ def make_trees(start, goals, capacity):
     return trees
 
 
-@inner_kernel()
-def make_scratch(space, q):
-    dof = q.shape[-1]
-    return Scratch(
-        make_workspace(space.robot, space.scene),
-        np.empty((dof, W), np.float32),
-        np.empty(dof, q.dtype),
-    )
-
-
 def keep(limits, q):
     """Project q onto the path constraints, in place; returns whether q then keeps them. Only compiled code
     can call this function."""
@@ -116,7 +95,7 @@ def extended_straight(space, trees, tree, near, q, longest, bound, scratch):
     end is at least as long as `bound` [rad], or if the tree is full.
     """
     origin = trees.nodes[tree, near]
-    end = scratch.end
+    end = scratch.a
     gap = distance(origin, q)
     share = _ONE if gap <= longest else longest / gap
     for j in range(len(end)):
@@ -126,7 +105,7 @@ def extended_straight(space, trees, tree, near, q, longest, bound, scratch):
         return -1
     if bound < INFINITE and cost + _to_roots(trees, 1 - tree, end) >= bound:
         return -1
-    if not motion_free(space, origin, end, scratch.block, scratch.work):
+    if not motion_free(space, origin, end, scratch):
         return -1
     return add(trees, tree, end, cost, near)
 
@@ -149,8 +128,8 @@ def search(space, limits, trees, bound, longest, iterations, state):
     nodes = trees.nodes
     costs = trees.costs
     sizes = trees.sizes
-    scratch = make_scratch(space, trees.nodes)
-    sample = np.empty(nodes.shape[2], nodes.dtype)
+    scratch = make_scratch(space, nodes)
+    sample = scratch.b
     start = nodes[0, 0]
     goals = nodes[1, : _root_count(trees, 1)]
     bounded = bound < INFINITE
@@ -191,8 +170,7 @@ def search(space, limits, trees, bound, longest, iterations, state):
         if x_new < 0:
             continue
         c_new = costs[tree, x_new]
-        for j in range(len(sample)):
-            sample[j] = nodes[tree, x_new, j]
+        sample[:] = nodes[tree, x_new]
         # CONNECT(T_b, x_new): T_b must reach x_new at a cost of at most c_max - c_new
         x_near = nearest(trees, other_tree, sample, bound - c_new)
         while True:
@@ -213,7 +191,7 @@ def search(space, limits, trees, bound, longest, iterations, state):
             if gap <= longest:
                 return _joined(trees, tree, x_new, x_connect)
             x_near = x_connect
-    return np.empty((0, nodes.shape[2]), nodes.dtype)
+    return nodes[0, :0].copy()
 
 
 @kernel(nogil=True)
@@ -389,7 +367,7 @@ def _lower_cost(space, trees, tree, leaf, scratch, state):
         cost = trees.costs[tree, x_near] + distance(trees.nodes[tree, x_near], x_new)
         if x_near == parent or cost >= c_new:
             break
-        if not motion_free(space, trees.nodes[tree, x_near], x_new, scratch.block, scratch.work):
+        if not motion_free(space, trees.nodes[tree, x_near], x_new, scratch):
             break
         parent = x_near
         c_new = cost
@@ -488,9 +466,5 @@ def _joined(trees, tree, x_new, x_connect):
     """The path from the start to a goal through the configuration where the trees meet. This is the node
     x_new of `tree` and the node x_connect of the other tree."""
     first, second = (x_new, x_connect) if tree == 0 else (x_connect, x_new)
-    forth = branch(trees, 0, first)
     back = branch(trees, 1, trees.parents[1, second])
-    path = np.empty((len(forth) + len(back), forth.shape[1]), forth.dtype)
-    path[: len(forth)] = forth
-    path[len(forth) :] = back[::-1]
-    return path
+    return np.concatenate((branch(trees, 0, first), back[::-1]))

@@ -32,7 +32,13 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.kernels.motions import distance, motion_free, motions_free, path_length
+from robotdiffuse.collision.kernels.motions import (
+    distance,
+    make_scratch,
+    motion_free,
+    motions_free,
+    path_length,
+)
 from robotdiffuse.collision.kernels.random import random, random_state
 from robotdiffuse.core.kernels import allocation_free, kernel
 from robotdiffuse.core.results import PlanResult
@@ -188,7 +194,7 @@ def add_node(space, trees, goals, q, scratch, index, gaps):
         if chosen < 0 or cost + remaining >= best or gaps[chosen] <= np.float32(1e-6):
             return -1
         parent = index[chosen]
-        if motion_free(space, nodes[parent], q, scratch.block, scratch.work):
+        if motion_free(space, nodes[parent], q, scratch):
             break
         gaps[chosen] = -_ONE - gaps[chosen]
     node = add(trees, 0, q, cost, parent)
@@ -198,7 +204,7 @@ def add_node(space, trees, goals, q, scratch, index, gaps):
         through = cost + gaps[i]
         if gaps[i] < _ZERO or near == parent or through >= costs[near] * (_ONE - GAIN):
             continue
-        if motion_free(space, q, nodes[near], scratch.block, scratch.work):
+        if motion_free(space, q, nodes[near], scratch):
             rewire(trees, 0, near, node, through)
     return node
 
@@ -223,7 +229,7 @@ def _try_goals(space, trees, goals, node, drawn, longest, scratch):
         # a goal gets its own first path even if another goal's path is shorter
         if (g != drawn and gap > longest) or cost >= _goal_cost(trees, goals, g) * (_ONE - GAIN):
             continue
-        if motion_free(space, trees.nodes[0, node], goals.at[g], scratch.block, scratch.work):
+        if motion_free(space, trees.nodes[0, node], goals.at[g], scratch):
             _reach(trees, goals, g, node, cost)
 
 
@@ -231,17 +237,16 @@ def _try_goals(space, trees, goals, node, drawn, longest, scratch):
 def grow(space, trees, goals, longest, iterations, state):
     """RRT* iterations with extensions of at most `longest` [rad]; they end early when the tree is full or no
     path can be shortened."""
-    dof = trees.nodes.shape[2]
-    scratch = rrt_kernel.make_scratch(space, trees.nodes)
-    x_rand = np.empty(dof, np.float32)
     index = np.empty(NEIGHBORS, np.int32)
     gaps = np.empty(NEIGHBORS, np.float32)
-    _grow(space, trees, goals, longest, iterations, state, scratch, x_rand, index, gaps)
+    scratch = make_scratch(space, trees.nodes)
+    _grow(space, trees, goals, longest, iterations, state, scratch, index, gaps)
 
 
 @allocation_free()
-def _grow(space, trees, goals, longest, iterations, state, scratch, x_rand, index, gaps):
-    x_new = scratch.end
+def _grow(space, trees, goals, longest, iterations, state, scratch, index, gaps):
+    x_new = scratch.a
+    x_rand = scratch.b
     for _ in range(iterations):
         if trees.sizes[0] + len(goals.at) >= trees.nodes.shape[1]:
             return
@@ -318,6 +323,7 @@ class SharedTreeSearch:
         self.targets = make_goals(self.start, self.goals)
         self.costs: list[float] = []
         """The best cost after each round [rad], infinite while there is no path."""
+        self._longest = np.float32(settings.range)
         self._state = state
         self._ends = np.concatenate([self.start[None], self.goals])
         self._distances = falling_clearances(settings.safety_distance, checker, self._ends)
@@ -340,10 +346,10 @@ class SharedTreeSearch:
         """The goal that the best path leads to; -1 if there is no path."""
         return int(self.goal_costs.argmin()) if (self.targets.node >= 0).any() else -1
 
-    def path(self, goal: int | None = None) -> Configurations | None:
-        """Waypoints of the best path, or of the best one to a goal; None if there is none."""
-        g = self.best_goal if goal is None else goal
-        path = rrt_kernel.branch(self.tree, 0, self.targets.node[g] if g >= 0 else -1)
+    def path(self) -> Configurations | None:
+        """Waypoints of the best path; None if there is none."""
+        # without a path, no goal has a node
+        path = rrt_kernel.branch(self.tree, 0, self.targets.node[self.best_goal])
         return path if len(path) else None
 
     @property
@@ -372,11 +378,10 @@ class SharedTreeSearch:
     def round(self) -> None:
         """Run a round: one path by RRT-Connect, RRT* iterations, and shortcuts of the best path."""
         settings = self.settings
-        longest = np.float32(self.settings.range)
         g = draw_goal(self.tree, self.targets, self._state)
         if g >= 0:
             self._connect(np.arange(len(self.goals)) if self.best_goal < 0 else np.array([g]))
-            grow(self._space, self.tree, self.targets, longest, settings.growth, self._state)
+            grow(self._space, self.tree, self.targets, self._longest, settings.growth, self._state)
             path = self.path()
             if path is not None:
                 self._graft(path, self.best_goal)
@@ -401,8 +406,7 @@ class SharedTreeSearch:
     def _connect(self, targets: ndarray) -> None:
         iterations = self.settings.connect_iterations
         trees = rrt_kernel.make_trees(self.start, self.goals[targets], 8 * iterations + len(targets))
-        longest = np.float32(self.settings.range)
-        path = rrt_kernel.search(self._space, None, trees, INFINITE, longest, iterations, self._state)
+        path = rrt_kernel.search(self._space, None, trees, INFINITE, self._longest, iterations, self._state)
         if len(path):
             self._graft(path, int(targets[np.abs(self.goals[targets] - path[-1]).max(axis=1).argmin()]))
         elif len(targets) == 1:
@@ -433,15 +437,13 @@ class SharedTreeRRTStar(Planner[SharedTreeSettings]):
             path = search.path()
             if path is None:
                 break
-            result = context.finish(start_goal.complete(path), self.name, reason=_reason(search))
+            reached = int(np.isfinite(search.goal_costs).sum())
+            reason = (
+                f"solved by {self.name}: {len(search.costs)} rounds, {reached} of {len(search.goals)} goals "
+                f"reached, {100 * search.safety_distance:.0f} cm of safety distance, except near start and "
+                "goal"
+            )
+            result = context.finish(start_goal.complete(path), self.name, reason)
             if result is not None:
                 return result
         return context.unsolved()
-
-
-def _reason(search: SharedTreeSearch) -> str:
-    reached = int(np.isfinite(search.goal_costs).sum())
-    return (
-        f"solved by {SharedTreeRRTStar.name}: {len(search.costs)} rounds, {reached} of {len(search.goals)} "
-        f"goals reached, {100 * search.safety_distance:.0f} cm of safety distance, except near start and goal"
-    )

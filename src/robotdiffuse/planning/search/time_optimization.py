@@ -12,10 +12,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.collision.kernels.lane_collision import make_workspace
-from robotdiffuse.collision.kernels.motions import Space, motion_free
+from robotdiffuse.collision.kernels.motions import Space, make_scratch, motion_free
 from robotdiffuse.collision.kernels.random import random, random_state
-from robotdiffuse.collision.kernels.simd import W
 from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.core.types import Configuration, Configurations
 from robotdiffuse.robots.robot import Robot
@@ -58,13 +56,9 @@ def reduce_time(space, path, deviations, time, velocity, acceleration, longest, 
 
     If a move makes the path faster, the next attempt moves this waypoint further in the same direction.
     """
-    dof = path.shape[1]
-    work = make_workspace(space.robot, space.scene)
-    block = np.empty((dof, W), np.float32)
-    a = np.empty(dof, np.float32)
-    b = np.empty(dof, np.float32)
+    scratch = make_scratch(space, space.lower)
     # a literal 0 would be compiled separately
-    step = np.zeros(dof)
+    step = np.zeros(path.shape[1])
     moved = np.int64(0)
     for _ in range(tries):
         new, new_deviations, first, last = _candidate(space, path, deviations, step, moved, state)
@@ -75,7 +69,7 @@ def reduce_time(space, path, deviations, time, velocity, acceleration, longest, 
         if line[1][-1] > longest:
             continue
         new_time = estimated_time(line, velocity, acceleration)
-        if new_time < time and _is_free(space, line, first, last, a, b, block, work):
+        if new_time < time and _is_free(space, line, first, last, scratch):
             if len(new) == len(path):
                 step[:] = new[last] - path[last]
                 moved = last if np.abs(step).max() > 0 else 0
@@ -136,33 +130,33 @@ def _candidate(space, path, deviations, step, again, state):
 
 
 @inner_kernel(inline="always")
-def _is_free(space, line, first, last, a, b, block, work):
+def _is_free(space, line, first, last, scratch):
     """Whether these parts of the polyline are free: segments `first` to `last`, the rounded corners at their
     ends, and one more corner on each side, whose width may have changed."""
     waypoints = line[0]
     widths = line[3]
     for i in range(first, last + 1):
-        a[:] = waypoints[i]
-        b[:] = waypoints[i + 1]
-        if not motion_free(space, a, b, block, work):
+        scratch.a[:] = waypoints[i]
+        scratch.b[:] = waypoints[i + 1]
+        if not motion_free(space, scratch.a, scratch.b, scratch):
             return False
     for corner in range(max(first - 2, 0), min(last + 2, len(widths))):
-        if not _corner_is_free(space, line, corner, a, b, block, work):
+        if not _corner_is_free(space, line, corner, scratch):
             return False
     return True
 
 
 @inner_kernel()
-def _corner_is_free(space, line, corner, a, b, block, work):
+def _corner_is_free(space, line, corner, scratch):
     waypoints, knots, directions, widths = line
     width = widths[corner]
     chords = min(max(int(np.ceil(2 * width / MAX_CHORD)), 2), MAX_CHORDS)
     for k in range(chords + 1):
         s = knots[corner + 1] + width * (2 * k / chords - 1)
-        evaluate_at(waypoints, knots, directions, widths, s, 0, b)
-        if k > 0 and not motion_free(space, a, b, block, work):
+        evaluate_at(waypoints, knots, directions, widths, s, 0, scratch.b)
+        if k > 0 and not motion_free(space, scratch.a, scratch.b, scratch):
             return False
-        a[:] = b
+        scratch.a[:] = scratch.b
     return True
 
 
@@ -170,16 +164,12 @@ def _corner_is_free(space, line, corner, a, b, block, work):
 def free_deviations(space, path, deviation):
     """For each corner of a free polyline [n, dof], `deviation`, halved until the rounded corner is free or
     the deviation is at most MIN_DEVIATION [n - 2]."""
-    dof = path.shape[1]
-    work = make_workspace(space.robot, space.scene)
-    block = np.empty((dof, W), np.float32)
-    a = np.empty(dof, np.float32)
-    b = np.empty(dof, np.float32)
+    scratch = make_scratch(space, space.lower)
     out = np.full(len(path) - 2, deviation)
     for i in range(len(out)):
         while out[i] > MIN_DEVIATION:
             line = rounded_line(path, out)
-            if _corner_is_free(space, line, i, a, b, block, work):
+            if _corner_is_free(space, line, i, scratch):
                 break
             out[i] *= 0.5
     return out
@@ -291,12 +281,8 @@ class TimeOptimization:
         return (
             best is not None
             and best.time <= ESTIMATE_ERROR * threshold
-            and self._least_time(best) <= threshold
+            and self.least_time(best) <= threshold
         )
-
-    def fastest(self) -> list[Candidate]:
-        """The candidates, ordered by the exact time of the fastest motion without limits of jerk."""
-        return sorted(self.candidates, key=self._least_time)
 
     def offer(self, space: Space, path: Configurations, stage: str) -> None:
         """Make a path whose polyline is free in `space` a candidate, if it is among the fastest."""
@@ -321,12 +307,13 @@ class TimeOptimization:
         """`still_improves` for the least time and the number of attempts."""
         return still_improves(self.times, self.attempts, self.times[-1][1], gain, patience)
 
-    def _least_time(self, candidate: Candidate) -> float:
+    def least_time(self, candidate: Candidate) -> float:
+        """The exact time of the fastest motion without limits of jerk [s]."""
         line = rounded_line(candidate.path, candidate.deviations)
         return least_time(line, *self._limits, *self._intervals)
 
     def _improve(self, space: Space, candidate: Candidate, attempts: int) -> None:
-        reduced = reduce_time(
+        candidate.path, candidate.deviations, candidate.time = reduce_time(
             space,
             candidate.path,
             candidate.deviations,
@@ -336,7 +323,6 @@ class TimeOptimization:
             attempts,
             self._state,
         )
-        candidate.path, candidate.deviations, candidate.time = reduced[0], reduced[1], float(reduced[2])
         self.attempts += attempts
 
     def _sort(self) -> None:
