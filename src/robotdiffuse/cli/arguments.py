@@ -6,6 +6,8 @@ from argparse import _ActionsContainer as ActionsContainer
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from robotdiffuse.core.input_files import MEGABYTE
+
 # Exit statuses: done; no valid motion; bad input; the output could not be written; stopped by the user.
 SOLVED = 0
 NO_PLAN = 1
@@ -68,6 +70,11 @@ share = number(float, lambda x: 0 <= x <= 1, "between 0 and 1")
 natural = number(int, lambda _: True, "an integer of at least 0")
 count = number(int, lambda x: x > 0, "an integer of at least 1")
 port = number(int, lambda x: x < 2**16, "a port, an integer from 0 to 65535")
+
+
+def megabytes(text: str) -> int:
+    """The number of bytes of an integer of megabytes, at least 1."""
+    return MEGABYTE * count(text)
 
 
 def assignment(text: str) -> tuple[str, float]:

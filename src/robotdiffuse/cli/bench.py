@@ -48,10 +48,7 @@ def _bench_settings(arguments: Namespace) -> list[BenchSettings]:
     """The settings of each run of the bench: those of the preset, or a single one from the options."""
     if arguments.cluster is not None and arguments.workers is not None:
         raise InputError("--workers sets the processes on this machine; --cluster always uses all its cores")
-    changes: dict[str, Any] = {"workers": HALF_OF_CORES} | chosen(
-        arguments, BenchSettings.__dataclass_fields__
-    )
-    changes["out"] = Path(arguments.out)
+    changes = _changes(arguments, BenchSettings)
     if arguments.preset is not None:
         fixed = ("planners", "time_limit", "seeds", "equal_time")
         options = [f"--{name.replace('_', '-')}" for name in fixed if changes.pop(name, None)]
@@ -61,6 +58,12 @@ def _bench_settings(arguments: Namespace) -> list[BenchSettings]:
     if arguments.planners is None or not arguments.problems:
         raise InputError("name --planners and --problems, or a --preset")
     return [BenchSettings(**changes)]
+
+
+def _changes(arguments: Namespace, settings: Any) -> dict[str, Any]:
+    """The fields of settings that options set; one planner for two cores by default."""
+    options = chosen(arguments, settings.__dataclass_fields__)
+    return {"workers": HALF_OF_CORES} | options | {"out": Path(arguments.out)}
 
 
 def run_report(arguments: Namespace) -> None:
@@ -128,10 +131,7 @@ def _write(page: Report, file: Path) -> int:
 
 def _table1(arguments: Namespace) -> tuple[paper.Table1Settings, Bench]:
     """The settings of table 1, and the records of its calls; calls that the folder lacks are made first."""
-    changes: dict[str, Any] = {"workers": HALF_OF_CORES}
-    changes |= chosen(arguments, paper.Table1Settings.__dataclass_fields__)
-    changes["out"] = Path(arguments.out)
-    settings = paper.Table1Settings(**changes)
+    settings = paper.Table1Settings(**_changes(arguments, paper.Table1Settings))
     with progress("calls") as update:
         return settings, paper.run_table1(settings, _say, update)
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from robotdiffuse.cli.arguments import ENDINGS, NO_PLAN, SOLVED, Namespace
+from robotdiffuse.cli.arguments import ENDINGS, NO_PLAN, SOLVED, Namespace, chosen
 from robotdiffuse.cli.command import LOOPBACK, PORT
 from robotdiffuse.cli.view import open_in_browser
 from robotdiffuse.core.errors import InputError
@@ -26,9 +26,7 @@ def run_explore(arguments: Namespace) -> int:
     if arguments.record is not None:
         recording = check_output(arguments.record, (RECORDING,))
         WRITERS.load(RECORDING)  # its packages are installed
-    settings = ExplorerSettings(
-        arguments.policy, arguments.confidence, arguments.time_limit, see_goal=arguments.see_goal
-    )
+    settings = ExplorerSettings(**chosen(arguments, ExplorerSettings.__dataclass_fields__))
     if arguments.live:
         if outputs or recording is not None:
             raise InputError("--live writes no files; leave out --out, --view and --record")

@@ -8,8 +8,7 @@ from typing import NoReturn
 
 from rich.console import Console
 
-from robotdiffuse.cli.arguments import STOPPED, Namespace
-from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS
+from robotdiffuse.cli.arguments import STOPPED, Namespace, chosen
 from robotdiffuse.planning.exploration.steps import ExplorerSettings
 from robotdiffuse.problems.files import load_problem
 from robotdiffuse.visualization.live.exploration import ExplorationPage, ExplorationSession
@@ -19,9 +18,7 @@ from robotdiffuse.visualization.live.session import PageOptions, Session, first_
 
 
 def run_live(arguments: Namespace) -> NoReturn:
-    planner = arguments.planner or DEFAULT_PLANNER
-    PLANNERS.entry(planner)
-    options = PageOptions(planner, arguments.time_limit)
+    options = PageOptions(**chosen(arguments, PageOptions.__dataclass_fields__))
     number = free_port(arguments.host, arguments.port)
     with Console(stderr=True).status("loading the robot (preparing a new URDF takes a minute)"):
         problem = first_problem(arguments.problem, arguments.robot)

@@ -3,10 +3,9 @@
 import os
 from collections.abc import Sequence
 
-from robotdiffuse.cli.arguments import Namespace
+from robotdiffuse.cli.arguments import Namespace, chosen
 from robotdiffuse.cli.command import TOKEN
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.core.input_files import MEGABYTE
 from robotdiffuse.robots import ROBOTS, known_robots, load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.server.server import serve
@@ -14,16 +13,8 @@ from robotdiffuse.server.settings import ServeSettings
 
 
 def run(arguments: Namespace) -> None:
-    settings = ServeSettings(
-        host=arguments.host,
-        port=arguments.port,
-        workers=arguments.workers or os.cpu_count() or 1,
-        queue=arguments.queue,
-        max_time_limit=arguments.max_time_limit,
-        max_request_size=arguments.max_request_size * MEGABYTE,
-        max_worker_memory=arguments.max_worker_memory * MEGABYTE,
-        token=os.environ.get(TOKEN, ""),
-    )
+    options = chosen(arguments, ServeSettings.__dataclass_fields__)
+    settings = ServeSettings(**options, token=os.environ.get(TOKEN, ""))
     if not settings.on_loopback and not settings.token:
         raise InputError(f"host is {shown(settings.host)}, which others can reach: set a token in {TOKEN}")
     serve(served_robots(arguments.robot), settings, lambda line: print(line, flush=True))

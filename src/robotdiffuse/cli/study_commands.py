@@ -338,8 +338,8 @@ BENCH = Command(
 )
 TABLE_1 = (
     ("--out FOLDER !", "folder for problems, results, page"),
-    ("--problems N", "nontrivial problems for each kind of goal (default: 60)", count, 60),
-    ("--time-limit S", "time limit of a call [s] (default: 10)", positive, 10.0),
+    ("--problems N", "nontrivial problems for each kind of goal (default: 60)", count),
+    ("--time-limit S", "time limit of a call [s] (default: 10)", positive),
     (
         "--paper-weights FOLDER",
         "weights of `train planner --config paper` or `--config points`, whose single samples get two rows, "
