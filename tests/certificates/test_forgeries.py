@@ -210,8 +210,8 @@ FORGED: dict[str, tuple[Callable[[Record], object], str]] = {
     "more clearance": (of_widest("clearance", lambda x: [v + 1e-3 for v in x]), "proof: clearance of"),
     "less displacement": (of_widest("displacement", lambda x: [0.0 for _ in x]), "proof: displacement of"),
     "endless clearance": (of_widest("clearance", lambda x: [1e308 for _ in x]), "clearance"),
-    "clearance of 5 m": (set_to("scene_clearance", to=5.0), "more than 1 m, the largest"),
-    "clearance below 0": (set_to("self_clearance", to=-1.0), "not positive"),
+    "clearance of 5 m": (set_to("scene_clearance", to=5.0), "5 m; it must be positive, and at most 1 m"),
+    "clearance below 0": (set_to("self_clearance", to=-1.0), "-1 m; it must be positive"),
     "no moving claim": (lambda record: record["moving"].pop(), "is missing"),
     "less displacement beside what moves": (
         lambda record: record["moving"][0].update(displacement=[0.0] * len(record["moving"][0]["start"])),

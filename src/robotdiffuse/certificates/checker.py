@@ -105,9 +105,9 @@ def _cover_errors(robot: Robot) -> Iterator[str]:
     """A message for each link with corners of meshes outside its spheres, since spheres prove most stretches.
     The preparation of a robot proves that the spheres cover all of the meshes."""
     for link, meshes in robot.meshes.items():
-        if link not in robot.spheres or not len(robot.spheres[link]) or not meshes:
+        spheres = robot.spheres.get(link)
+        if spheres is None or not len(spheres) or not meshes:
             continue
-        spheres = robot.spheres[link]
         corners = np.concatenate([mesh.vertices for mesh in meshes])
         gaps = np.linalg.norm(corners[:, None] - spheres[:, :3], axis=2) - spheres[:, 3]
         beyond = float(gaps.min(axis=1).max())
@@ -183,12 +183,10 @@ def _bound_errors(
     for quantity, marked in kinds.items():
         stated_clearance = stated[quantity]
         if not 0 < stated_clearance <= CLEARANCE_CAP:
-            rule = (
-                "not positive"
-                if not stated_clearance > 0
-                else f"more than {CLEARANCE_CAP:g} m, the largest clearance that a proof can state"
+            yield (
+                f"proof: its {quantity} clearance is {stated_clearance:g} m; it must be positive, and at "
+                f"most {CLEARANCE_CAP:g} m"
             )
-            yield f"proof: its {quantity} clearance is {stated_clearance:g} m, which is {rule}"
         unproved = np.flatnonzero(marked & ~(margin >= stated_clearance - BOUND_TOLERANCE))
         if len(unproved):
             i = int(unproved[0])

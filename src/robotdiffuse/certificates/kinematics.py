@@ -260,10 +260,8 @@ class Cubics(NamedTuple):
         which include the times of all rows: an eighth of its greatest acceleration between two times,
         multiplied by the square of the time between them."""
         row = self.rows(times[:-1])
-        max_acceleration = 0.0
-        for end in (times[:-1], times[1:]):
-            max_acceleration = np.maximum(max_acceleration, np.abs(self.at(row, end - self.times[row])[2]))
-        return max_acceleration * np.diff(times)[:, None] ** 2 / 8
+        ends = (self.at(row, end - self.times[row])[2] for end in (times[:-1], times[1:]))
+        return np.abs([*ends]).max(axis=0) * np.diff(times)[:, None] ** 2 / 8
 
     def jumps(self) -> JointRows:
         """The jump of the acceleration at each row, with zero acceleration before and after the motion."""

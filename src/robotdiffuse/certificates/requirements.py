@@ -17,7 +17,7 @@ rotate with the links. So the product rule bounds the second derivative by bound
 joints.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -630,12 +630,9 @@ def _torque_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
         if stated:
             yield "torques: the problem has no payload"
         return
-    if [name for name, _ in stated] != [*problem.robot.joint_names]:
-        yield "torques: their joints are not those of the robot"
-        return
     max_torques = torque_bounds(problem, motion, certificate.torque_samples).max(axis=0)
     allowed = problem.robot.effort * (1 + certificate.tolerances.rate_slack)
-    yield from _stated_errors("torques", stated, max_torques, allowed)
+    yield from _stated_errors("torques", stated, problem.robot.joint_names, max_torques, allowed)
 
 
 def _constraint_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
@@ -645,19 +642,23 @@ def _constraint_errors(problem: Problem, certificate: MotionProof) -> Iterator[s
         return
     q = configurations(certificate.motion, certificate.between)
     bounds = constraint_bounds(problem, q, certificate.tolerances.chord)
-    if [bound.name for bound in bounds] != [name for name, _ in certificate.constraints]:
-        yield "constraints: they are not those of the problem"
-        return
-    max_values = [float(bound.bounds.max()) for bound in bounds]
-    limits = [bound.limit for bound in bounds]
-    yield from _stated_errors("constraints", certificate.constraints, max_values, limits)
+    names, limits, each = zip(*bounds, strict=True) if bounds else ((), (), ())
+    max_values = [float(values.max()) for values in each]
+    yield from _stated_errors("constraints", certificate.constraints, names, max_values, limits)
 
 
 def _stated_errors(
-    what: str, stated: Iterable[tuple[str, float]], most: Iterable[float], limits: Iterable[float]
+    what: str,
+    stated: Sequence[tuple[str, float]],
+    names: Sequence[str],
+    most: Iterable[float],
+    limits: Iterable[float],
 ) -> Iterator[str]:
     """A message for each bound that differs from the bound in the proof, and for each bound that exceeds its
     limit."""
+    if [name for name, _ in stated] != [*names]:
+        yield f"{what}: they are not those of the problem"
+        return
     for (name, written), bound, limit in zip(stated, most, limits, strict=True):
         if not abs(bound - written) <= BOUND_TOLERANCE:
             yield f"{what}: the bound of {name} is {bound:.6f}, not {written:.6f}"

@@ -35,10 +35,11 @@ import numpy as np
 
 from robotdiffuse.core.bounds import numbers, unit_quaternion, vector
 from robotdiffuse.core.errors import InputError, located, shown, unknown_name
+from robotdiffuse.core.settings import converted
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
 from robotdiffuse.core.types import Pose
 from robotdiffuse.perception.depth_view_files import read_views, view_entry
-from robotdiffuse.problems.constraints import CONSTRAINTS, Constraint, PositionBox
+from robotdiffuse.problems.constraints import CONSTRAINTS, Constraint
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal
 from robotdiffuse.problems.problem import UNKNOWN_POLICIES, check_clearance
 from robotdiffuse.robots import ROBOTS
@@ -51,6 +52,7 @@ from robotdiffuse.scenes.files import (
     contacts_entry,
     plain_fields,
     read_scene,
+    read_shape,
     required_fields,
     scene_entries,
 )
@@ -166,21 +168,7 @@ def _text(where: str, value: object) -> str:
 
 
 def _touch_links(where: str, entry: dict[str, Any]) -> tuple[str, ...]:
-    where = f"{where}.touch_links"
-    value = entry.get("touch_links", [])
-    if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
-        raise InputError(f"{where} is {shown(value)}; it must be a list of link names")
-    return tuple(value)
-
-
-def _one_shape(where: str, entry: dict[str, Any], folder: Path, notes: list[str]) -> Shape:
-    """The shape of an entry such as {box: {...}}."""
-    try:
-        scene, shape_notes = read_scene([entry], folder, field=where)
-    except InputError as error:
-        raise InputError(str(error).replace(f"{where}[0]", where, 1)) from None
-    notes += shape_notes
-    return scene.shapes[0]
+    return converted(f"{where}.touch_links", tuple[str, ...], entry.get("touch_links", ()))
 
 
 def equipped(robot: Robot, values: dict[str, Any], folder: Path, notes: list[str]) -> Robot:
@@ -205,7 +193,7 @@ def equipped(robot: Robot, values: dict[str, Any], folder: Path, notes: list[str
             )
         shape = {key: value for key, value in entry.items() if key not in ("link", "touch_links")}
         with located(location):
-            attached_shape = _one_shape(location, shape, folder, notes)
+            attached_shape = read_shape(location, shape, folder, notes)
             touch = _touch_links(location, entry)
             robot = robot.attach(attached_shape, _text(f"{location}.link", entry["link"]), touch)
     return robot
@@ -337,8 +325,9 @@ def _constraint(where: str, entry: object) -> Constraint:
 def constraint_entry(constraint: Constraint) -> dict[str, Any]:
     """The entry of a constraint in a problem file."""
     values = plain_fields(constraint, "T_base_box")
-    if isinstance(constraint, PositionBox) and not np.array_equal(constraint.T_base_box, np.eye(4)):
-        values |= pose_entry(constraint.T_base_box)
+    T = getattr(constraint, "T_base_box", None)
+    if T is not None and not np.array_equal(T, np.eye(4)):
+        values |= pose_entry(T)
     return {constraint.kind: values}
 
 
@@ -355,7 +344,7 @@ def _moving(where: str, entry: object, setting: Setting) -> MovingObstacle:
             f"{where} has the fields {', '.join(map(str, entry))}; it must have one shape of "
             f"{', '.join(SHAPES)}, and a motion of {', '.join(MOTION_FIELDS)}"
         )
-    obstacle_shape = _one_shape(where, shape, setting.folder, [])
+    obstacle_shape = read_shape(where, shape, setting.folder, [])
     with located(where):
         if "poses" in motion:
             poses = entries_of("poses", motion["poses"], "{xyz, wxyz}")
@@ -363,18 +352,14 @@ def _moving(where: str, entry: object, setting: Setting) -> MovingObstacle:
         return MovingObstacle(obstacle_shape, **motion)
 
 
-def moving_entry(obstacle: MovingObstacle, folder: Path | None) -> dict[str, object]:
+def moving_entry(obstacle: MovingObstacle, folder: Path | None) -> dict[str, Any]:
     """The entry of a moving obstacle in a problem file; files of meshes are named relative to `folder`."""
     [shape] = scene_entries(Scene([obstacle.shape]), folder)
-    entry: dict[str, object] = dict(shape)
-    if obstacle.velocity is not None:
-        return entry | {"velocity": obstacle.velocity.tolist()}
-    if obstacle.times is not None and obstacle.poses is not None:
-        return entry | {
-            "times": obstacle.times.tolist(),
-            "poses": [pose_entry(T) for T in obstacle.poses],
-        }
-    return entry | {"max_speed": obstacle.max_speed}
+    unset = [name for name in MOTION_FIELDS if getattr(obstacle, name) is None]
+    motion = plain_fields(obstacle, "shape", "poses", *unset)
+    if obstacle.poses is not None:
+        motion["poses"] = [pose_entry(T) for T in obstacle.poses]
+    return shape | motion
 
 
 def payload_entry(payload: Payload) -> dict[str, object]:

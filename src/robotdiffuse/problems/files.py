@@ -12,10 +12,10 @@ from typing import Any
 
 import yaml
 
-from robotdiffuse.core.bounds import numbers
 from robotdiffuse.core.errors import InputError, check_type, located, shown, unknown_name
 from robotdiffuse.core.input_files import file_name, no_files, parse_json, parse_yaml, read_text, read_yaml
 from robotdiffuse.core.output_files import write_atomically, write_error
+from robotdiffuse.core.settings import Number, converted
 from robotdiffuse.core.transforms import pose_entry
 from robotdiffuse.problems.fields import (
     FIELDS,
@@ -82,9 +82,7 @@ def load_problem(file: str | Path, index: int = 0, ignore_joints: bool = False) 
         lines = _lines(text)
         if not 0 <= index < len(lines):
             raise InputError(f"index is {index}; {file} holds {len(lines)} problems, counted from 0")
-        number, line = lines[index]
-        location = f"{file}, line {number}"
-        return _problem(location, parse_json(line, location), file.parent, ignore_joints=ignore_joints)
+        return _problem_of_line(file, *lines[index], ignore_joints)
     if index != 0:
         raise InputError(f"index is {index}; {file} holds one problem, and only .jsonl files hold more")
     data = parse_json(text, str(file)) if file.suffix.lower() == ".json" else parse_yaml(text, str(file))
@@ -103,12 +101,15 @@ def load_problems(file: str | Path, ignore_joints: bool = False) -> list[Problem
         return load_motion_bench_maker(file, ignore_joints=ignore_joints)
     if file.suffix.lower() != ".jsonl":
         return [ProblemEntry(file.stem, load_problem(file, ignore_joints=ignore_joints))]
-    entries = []
-    for number, line in _lines(read_text(file)):
-        location = f"{file}, line {number}"
-        problem = _problem(location, parse_json(line, location), file.parent, ignore_joints=ignore_joints)
-        entries.append(ProblemEntry(f"{file.stem}:{number}", problem))
-    return entries
+    return [
+        ProblemEntry(f"{file.stem}:{number}", _problem_of_line(file, number, line, ignore_joints))
+        for number, line in _lines(read_text(file))
+    ]
+
+
+def _problem_of_line(file: Path, number: int, line: str, ignore_joints: bool) -> Problem:
+    location = f"{file}, line {number}"
+    return _problem(location, parse_json(line, location), file.parent, ignore_joints=ignore_joints)
 
 
 def _lines(text: str) -> list[tuple[int, str]]:
@@ -334,12 +335,5 @@ def _robot(name: object, locked: object, folder: Path, robots: Mapping[str, Robo
         )
     if name not in ROBOTS and (name.endswith((".urdf", ".xacro", ".xml")) or "/" in name):
         name = str((folder / name).absolute())
-    if not isinstance(locked, dict):
-        raise InputError(f"locked is {shown(locked)}; it must map joint names to values")
-    values = {}
-    for joint, value in locked.items():
-        array = numbers(value)
-        if not isinstance(joint, str) or array is None or array.ndim != 0:
-            raise InputError(f"locked: {shown(joint)} is {shown(value)}; it must be a number")
-        values[joint] = float(array)
+    values = converted("locked", dict[str, Number], locked)
     return load_robot(name, locked=values) if robots is None else robots[name].with_locked(values)

@@ -43,10 +43,6 @@ MIN_BLEND = 1e-3
 MAX_BLEND = 10.0
 
 
-def base_pose(T_world_base: object) -> Pose | None:
-    return None if T_world_base is None else rigid_transform("T_world_base", T_world_base)
-
-
 def waypoint_goals(robot: Robot, waypoints: Any, notes: list[str]) -> tuple[Goal, ...]:
     check_list("waypoints", waypoints, object, "goals")
     return tuple(checked_goal(robot, f"waypoints[{i}]", goal, notes) for i, goal in enumerate(waypoints))
@@ -352,6 +348,7 @@ class Problem(Value):
         check_type("scene", self.scene, Scene, "a Scene, e.g. rd.Scene([shape, ...])")
         check_contacts(self.robot, self.scene)
         notes = list(self.notes)
+        T = self.T_world_base
         checked: dict[str, Any] = {
             "start": checked_configuration(self.robot, "start", self.start, notes),
             "goal": checked_goal(self.robot, "goal", self.goal, notes),
@@ -361,7 +358,7 @@ class Problem(Value):
             "views": depth_views(self.robot, self.views),
             "moving": moving_obstacles(self.moving, self.scene),
             "start_velocity": velocity_at_start(self.robot, self.start_velocity, notes),
-            "T_world_base": base_pose(self.T_world_base),
+            "T_world_base": T if T is None else rigid_transform("T_world_base", T),
             "notes": tuple(notes),
         }
         checked["blend"] = blend_radii(self.blend, len(checked["waypoints"]))

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import lru_cache
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -41,8 +42,7 @@ def mesh_parts(vertices: bytes, faces: bytes) -> tuple[ConvexMesh, ...]:
 
 
 def _box(shape: Any) -> ConvexMesh:
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    return convex_hull(corners * shape.size / 2)
+    return convex_hull(np.array([*product((-1, 1), repeat=3)]) * shape.size / 2)
 
 
 def _prism(shape: Any) -> ConvexMesh:

@@ -76,20 +76,22 @@ def read_scene(
             f"{field} is {shown(entries)}; it must be a list of shapes"
             + (" or the name of a MoveIt scene file" if field == "scene" else "")
         )
-    shapes: list[Shape] = []
     notes: list[str] = []
-    for i, entry in enumerate(entries):
-        location = f"{field}[{i}]"
-        if not isinstance(entry, dict) or len(entry) != 1:
-            raise InputError(
-                f"{location} is {shown(entry)}; it must be one shape, e.g. {{sphere: {{...}}}}; "
-                f"known: {', '.join(SHAPES)}"
-            )
-        [(kind, values)] = entry.items()
-        if kind not in SHAPES:
-            raise unknown_name(f"shape in {location}:", kind, SHAPES)
-        shapes.append(_shape(f"{location}.{kind}", SHAPES[kind], values, folder, notes))
+    shapes = [read_shape(f"{field}[{i}]", entry, folder, notes) for i, entry in enumerate(entries)]
     return Scene(shapes, contacts), tuple(notes)  # type: ignore[arg-type]
+
+
+def read_shape(where: str, entry: object, folder: Path, notes: list[str]) -> Shape:
+    """The shape of an entry such as {box: {...}}; as `read_scene`. Notes are added to `notes`."""
+    if not isinstance(entry, dict) or len(entry) != 1:
+        raise InputError(
+            f"{where} is {shown(entry)}; it must be one shape, e.g. {{sphere: {{...}}}}; "
+            f"known: {', '.join(SHAPES)}"
+        )
+    [(kind, values)] = entry.items()
+    if kind not in SHAPES:
+        raise unknown_name(f"shape in {where}:", kind, SHAPES)
+    return _shape(f"{where}.{kind}", SHAPES[kind], values, folder, notes)
 
 
 def required_fields(kind: Any) -> list[str]:

@@ -157,16 +157,13 @@ class Scene(Value):
         Raises:
             InputError: For an unknown obstacle, and in the cases in which `Robot.attach` raises it.
         """
-        names = [shape.name for shape in self.shapes]
-        if name not in names:
-            raise unknown_name("obstacle to attach:", name, names)
+        obstacles = {shape.name: shape for shape in self.shapes}
+        if name not in obstacles:
+            raise unknown_name("obstacle to attach:", name, obstacles)
         link = robot.tip if link is None else link
         robot.link_frame(link)  # raises InputError, with the known links, for an unknown one
-        taken_shape = self.shapes[names.index(name)].moved(
-            inverse(link_pose(robot, np.asarray(q, float), link))
-        )
-        remaining_scene = self.with_shapes([shape for shape in self.shapes if shape.name != name])
-        return remaining_scene, robot.attach(taken_shape, link, touch_links)
+        taken_shape = obstacles.pop(name).moved(inverse(link_pose(robot, np.asarray(q, float), link)))
+        return self.with_shapes(obstacles.values()), robot.attach(taken_shape, link, touch_links)
 
     def detach(self, name: str, robot: Robot, q: Configuration) -> tuple["Scene", Robot]:
         """Lets the robot release a held object.

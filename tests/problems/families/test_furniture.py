@@ -82,16 +82,18 @@ def test_targets_have_the_fingers_in_the_region() -> None:
     approach = np.array([0.6, 0.0, -0.8])
     region = furniture.Region(np.array([0.5, 0.1, 0.3]), np.array([0.4, 0.2, 2 * furniture.REGION_MARGIN]), 0.7, approach)
     rng = np.random.default_rng(5)
-    T = np.stack([furniture.sample_target(region, rng, spread=0.3, finger_length=0.1) for _ in range(1000)])
+    T = np.stack([furniture.sample_target(region, rng) for _ in range(1000)])
     products = T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1)
     np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), (1000, 3, 3)), atol=1e-12)
     local = (T[:, :3, 3] + 0.1 * T[:, :3, 2] - region.center) @ turned(0.7)
     assert (np.abs(local) <= region.size / 2 - furniture.REGION_MARGIN + 1e-12).all()
     assert (np.abs(local).max(axis=0) > 0.95 * (region.size / 2 - furniture.REGION_MARGIN) - 1e-12).all()
     cosines = T[:, :3, 2] @ approach
-    assert cosines.min() > np.cos(0.3) - 1e-12
+    assert cosines.min() > np.cos(furniture.MAX_TILT) - 1e-12
     # uniform on the cap: the cosine is uniform; mean of 1000 draws within five standard deviations
-    assert abs(cosines.mean() - (1 + np.cos(0.3)) / 2) < 5 * (1 - np.cos(0.3)) / np.sqrt(12 * 1000)
+    assert abs(cosines.mean() - (1 + np.cos(furniture.MAX_TILT)) / 2) < 5 * (1 - np.cos(furniture.MAX_TILT)) / np.sqrt(
+        12 * 1000
+    )
 
 
 @pytest.mark.parametrize(

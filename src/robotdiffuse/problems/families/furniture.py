@@ -46,6 +46,8 @@ REGION_MARGIN = 0.03
 """Distance of targets from the sides of their region, if the region is wide enough [m]."""
 FINGER_LENGTH = 0.1
 """Approximate distance from the origin of a Panda's tip link, along its z axis, to its fingertips [m]."""
+MAX_TILT = 0.4
+"""Maximum angle between the hand and the approach of its region [rad]."""
 DOWN = np.array([0.0, 0.0, -1.0])
 AHEAD = np.array([1.0, 0.0, 0.0])
 """Direction away from the arm, in the frame of the furniture."""
@@ -94,23 +96,20 @@ class FurnishedScene:
     regions: tuple[Region, ...]
 
 
-def sample_target(
-    region: Region, rng: Generator, spread: float = 0.4, finger_length: float = FINGER_LENGTH
-) -> Pose:
+def sample_target(region: Region, rng: Generator) -> Pose:
     """A random pose T_base_tip of the robot's tip link, with its fingers in the region.
 
-    The fingertips, at `finger_length` [m] along the link's z axis, are uniform in the region less a margin.
-    The z axis is uniform among the directions within `spread` [rad] of the region's approach; the rotation
-    about the z axis is uniform.
+    The fingertips are uniform in the region less a margin. The z axis is uniform among the directions within
+    MAX_TILT of the region's approach; the rotation about the z axis is uniform.
     """
     half = np.maximum(region.size / 2 - REGION_MARGIN, 0)
     point = region.center + rotation_about(-DOWN, region.yaw) @ rng.uniform(-half, half)
-    tilt = np.arccos(rng.uniform(np.cos(spread), 1.0))
+    tilt = np.arccos(rng.uniform(np.cos(MAX_TILT), 1.0))
     turn, roll = rng.uniform(-np.pi, np.pi, 2)
     about_z = [rotation_about(-DOWN, float(angle)) for angle in (turn, roll)]
     tilted = about_z[0] @ rotation_about(np.array([0.0, 1.0, 0.0]), float(tilt)) @ about_z[1]
     rotation = rotation_z_to(region.approach) @ tilted
-    return transform(point - finger_length * rotation[:, 2], rotation)
+    return transform(point - FINGER_LENGTH * rotation[:, 2], rotation)
 
 
 @dataclass(frozen=True)
