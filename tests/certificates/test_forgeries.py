@@ -258,7 +258,7 @@ FORGED: dict[str, tuple[Callable[[Record], object], str]] = {
     # what is stated besides
     "less jerk": (set_to("jerks", 0, 1, to=1.0), "jerks: that of panda_joint1"),
     "less torque": (set_to("torques", 1, 1, to=1.0), "torques: the bound of panda_joint2"),
-    "no torques": (set_to("torques", to=[]), "torques: their joints"),
+    "no torques": (set_to("torques", to=[]), "torques: they are not those"),
     "a smaller angle": (set_to("constraints", 0, 1, to=0.0), "constraints: the bound of axis_cone"),
     "no constraints": (set_to("constraints", to=[]), "constraints: they are not those"),
     "another name": (set_to("robot", to="ur5e"), "robot: it is panda, not ur5e"),

@@ -25,6 +25,7 @@ MIDDLE = [0, -0.9, 0, -2.6, 0, 1.8, 0.2]
 END = [0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]
 POST = rd.Cylinder([0.5, 0.0, 0.3], 0.04, 0.6, name="post")
 TABLE = {"box": {"center": [0.55, 0, 0.1], "size": [0.5, 1.0, 0.2], "wxyz": [0.9, 0, 0, 0.2], "name": "table"}}
+AHEAD = transform(np.array([0.5, 0.0, 0.35]), rotation_from_rpy(np.pi, 0.0, 0.0))
 DOWN = transform(np.array([0.45, 0.3, 0.35]), rotation_from_rpy(np.pi, 0.0, 0.0))
 
 
@@ -62,25 +63,22 @@ def test_tolerances_are_along_the_axes_of_the_goal(xyz: Any, rpy: Any, within: A
 
 
 def test_a_box_of_positions_is_reached_where_its_middle_is_blocked() -> None:
-    middle = transform(np.array([0.5, 0.0, 0.35]), rotation_from_rpy(np.pi, 0.0, 0.0))
-    blocked = rd.Problem(ROBOT, rd.Scene([POST]), START, rd.PoseGoal("panda_hand", middle))
+    blocked = rd.Problem(ROBOT, rd.Scene([POST]), START, rd.PoseGoal("panda_hand", AHEAD))
     assert rd.plan(blocked).status is rd.Status.INVALID_GOAL
-    wide = rd.PoseGoal("panda_hand", middle, [0.0, 0.35, 0.0], [0.0, 0.0, np.pi])
+    wide = rd.PoseGoal("panda_hand", AHEAD, [0.0, 0.35, 0.0], [0.0, 0.0, np.pi])
     problem = rd.Problem(ROBOT, rd.Scene([POST]), START, wide)
     result = rd.plan(problem, time_limit=10.0)
     assert result.path is not None, result.reason
-    T = inverse(middle) @ link_pose(ROBOT, result.path.positions[-1], "panda_hand")
+    T = inverse(AHEAD) @ link_pose(ROBOT, result.path.positions[-1], "panda_hand")
     assert np.abs(T[[0, 2], 3]).max() < 1e-5 and abs(T[1, 3]) < 0.35
     assert abs(T[2, 2] - 1) < 1e-9, "upside down as asked"
 
 
 def test_a_box_of_positions_is_reached_where_only_its_middle_is_free() -> None:
     """Projections end at the edges of the tolerances, which are blocked by obstacles here."""
-    middle = transform(np.array([0.5, 0.0, 0.35]), rotation_from_rpy(np.pi, 0.0, 0.0))
     blocks = [rd.Box([0.5, side * 0.42, 0.35], [0.6, 0.4, 0.7]) for side in (-1, 1)]
-    wide = rd.PoseGoal("panda_hand", middle, [0.0, 0.35, 0.0], [0.0, 0.0, np.pi])
-    start = [0, -0.9, 0, -2.6, 0, 1.8, 0.2]
-    result = rd.plan(rd.Problem(ROBOT, rd.Scene(blocks), start, wide), time_limit=10.0)
+    wide = rd.PoseGoal("panda_hand", AHEAD, [0.0, 0.35, 0.0], [0.0, 0.0, np.pi])
+    result = rd.plan(rd.Problem(ROBOT, rd.Scene(blocks), MIDDLE, wide), time_limit=10.0)
     assert result.path is not None, result.reason
     assert abs(link_pose(ROBOT, result.path.positions[-1], "panda_hand")[1, 3]) < 0.2
 
@@ -152,7 +150,7 @@ def test_a_waypoint_between_obstacles_is_blended_no_further_than_is_free() -> No
 
 
 def test_the_leg_that_fails_is_named() -> None:
-    blocked = rd.PoseGoal("panda_hand", transform(np.array([0.5, 0.0, 0.35]), rotation_from_rpy(np.pi, 0.0, 0.0)))
+    blocked = rd.PoseGoal("panda_hand", AHEAD)
     problem = rd.Problem(ROBOT, rd.Scene([POST]), START, END, waypoints=[MIDDLE, blocked])
     result = rd.plan(problem, time_limit=10.0)
     assert result.status is rd.Status.INVALID_GOAL and result.reason.startswith("segment 2 of 3: all")
@@ -210,9 +208,8 @@ def test_wrong_goals_are_one_line(case: str, tmp_path: Path) -> None:
 
 def test_poses_are_drawn_on_as_long_as_none_is_free() -> None:
     """The goal is a line of 10 m, of which 3 % can be reached and are free, so 20 draws usually miss that part."""
-    T = transform(np.array([0.5, 0.0, 0.35]), rotation_from_rpy(np.pi, 0.0, 0.0))
     block = rd.Box([0.65, 0.325, 0.5], [0.7, 1.35, 1.0], name="block")
-    narrow = rd.PoseGoal("panda_hand", T, [0.0, 5.0, 0.0], [0.0, 0.0, np.pi])
+    narrow = rd.PoseGoal("panda_hand", AHEAD, [0.0, 5.0, 0.0], [0.0, 0.0, np.pi])
     problem = rd.Problem(ROBOT, rd.Scene([block]), [-1.5, 0.2, 0, -2.0, 0, 2.2, 0.2], narrow)
     result = rd.plan(problem, time_limit=60.0, seed=5)
     assert result.path is not None, result.reason

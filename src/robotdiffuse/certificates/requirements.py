@@ -130,7 +130,7 @@ def constraint_bounds(problem: Problem, q: Configurations, chord: float) -> list
     return bounds_of_constraints
 
 
-def frame_speed_errors(problem: Problem, motion: Trajectory, slack: float) -> list[str]:
+def frame_speed_errors(problem: Problem, motion: Trajectory, slack: float) -> Iterator[str]:
     """A message for each frame that is not proved to keep its constraint's speed limit along the cubics. The
     limit may be exceeded by the fraction `slack`.
 
@@ -139,7 +139,6 @@ def frame_speed_errors(problem: Problem, motion: Trajectory, slack: float) -> li
     last of these joints.
     """
     linkage = Linkage(problem.robot)
-    lines = []
     cubics = cubics_of(motion)
     extreme_positions = np.concatenate([motion.positions, cubics.turning_points])
     for constraint in problem.constraints:
@@ -175,8 +174,7 @@ def frame_speed_errors(problem: Problem, motion: Trajectory, slack: float) -> li
                 if max_speeds.max() <= allowed
                 else f"moves at {max_speeds.max():.4g} m/s"
             )
-            lines.append(f"motion: {constraint.frame} {finding}; {constraint.speed:g} m/s is allowed")
-    return lines
+            yield f"motion: {constraint.frame} {finding}; {constraint.speed:g} m/s is allowed"
 
 
 def _frame_speeds(linkage: Linkage, cubics: Cubics, frame: str, row: ndarray, time: ndarray) -> Values:

@@ -52,14 +52,14 @@ from robotdiffuse.certificates.requirements import (
     deviations,
     torque_bounds,
 )
-from robotdiffuse.core.errors import InputError, check_type
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.core.types import Path, Pose, Trajectory, Values
 from robotdiffuse.problems.files import problem_record
-from robotdiffuse.problems.problem import Problem, check_problem
+from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose, coal_rounded
 from robotdiffuse.robots.motion_bounds import motion_radii
-from robotdiffuse.validation.validator import DEFAULT, VerifySettings, check_motion, verify
+from robotdiffuse.validation.validator import DEFAULT, VerifySettings, verify
 
 MAX_PLANES = 64
 """Largest number of planes between a part and a surface; a concave surface needs several."""
@@ -201,12 +201,9 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
         InputError: For obstacles and requirements that certificates do not support, and if no proof of
             reasonable size is found.
     """
-    check_problem(problem)
-    check_motion("motion", motion, (Path, Trajectory))
-    check_type("settings", settings, VerifySettings, "VerifySettings")
+    report = verify(problem, motion, settings)
     if problem.moving and isinstance(motion, Path):
         raise InputError(UNTIMED)
-    report = verify(problem, motion, settings)
     if report.violation is not None:
         raise NotValidError(f"the motion is not valid: {report.violation.line}")
     required = {

@@ -41,10 +41,6 @@ def mesh_parts(vertices: bytes, faces: bytes) -> tuple[ConvexMesh, ...]:
     return convex_parts((Surface(points, np.frombuffer(faces, np.int64).reshape(-1, 3)),))
 
 
-def _box(shape: Any) -> ConvexMesh:
-    return convex_hull(np.array([*product((-1, 1), repeat=3)]) * shape.size / 2)
-
-
 def _prism(shape: Any) -> ConvexMesh:
     """A prism around a cylinder."""
     ring = polygon_around_circle(shape.radius)
@@ -54,7 +50,7 @@ def _prism(shape: Any) -> ConvexMesh:
 
 SOLIDS: dict[str, Callable[[Any], tuple[ConvexMesh, ...]]] = {
     "sphere": lambda shape: (capsule_polyhedron(shape.radius, 0.0),),
-    "box": lambda shape: (_box(shape),),
+    "box": lambda shape: (convex_hull(np.array([*product((-1, 1), repeat=3)]) * shape.size / 2),),
     "cylinder": lambda shape: (_prism(shape),),
     "capsule": lambda shape: (capsule_polyhedron(shape.radius, shape.height),),
     "mesh": lambda shape: mesh_parts(shape.vertices.tobytes(), shape.faces.tobytes()),
