@@ -60,8 +60,8 @@ def depth_views(robot: Robot, views: Any) -> tuple[DepthView, ...]:
 
 
 def path_constraints(robot: Robot, constraints: Any) -> tuple[Constraint, ...]:
-    kinds = tuple(CONSTRAINTS.values())
-    check_list("constraints", constraints, kinds, ", ".join(f"rd.{kind.__name__}" for kind in kinds))
+    names = ", ".join(f"rd.{kind.__name__}" for kind in CONSTRAINTS.values())
+    check_list("constraints", constraints, Constraint, names)
     for i, constraint in enumerate(constraints):
         robot.check_moved(f"constraints[{i}].frame", constraint.frame)
     return tuple(constraints)

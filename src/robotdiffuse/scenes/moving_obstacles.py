@@ -12,7 +12,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import Value, form, numbers, read_only, rigid_transform, vector, within
-from robotdiffuse.core.errors import InputError, distinct, shown
+from robotdiffuse.core.errors import InputError, distinct, located, shown
 from robotdiffuse.core.transforms import (
     inverse,
     quaternion_from_rotation,
@@ -20,7 +20,7 @@ from robotdiffuse.core.transforms import (
     rotation_from_quaternion,
     transform,
 )
-from robotdiffuse.core.types import ArrayOrNone, Pose, Poses, Values, VectorOrNone
+from robotdiffuse.core.types import ArrayOrNone, Pose, Poses, Values, VectorOrNone, check_increasing
 from robotdiffuse.scenes.shapes import Shape
 
 MAX_POINT_SPEED = 100.0
@@ -101,11 +101,8 @@ class MovingObstacle(Value):
                 f"{self.name}.times is {shown(self.times)}; it must be two or more times within "
                 f"±{MAX_DURATION:g} s, one for each of the poses"
             )
-        backwards = np.flatnonzero(np.diff(times) <= 0)
-        if len(backwards):
-            i = int(backwards[0])
-            time, before = distinct(times[i + 1], times[i])
-            raise InputError(f"{self.name}.times[{i + 1}] is {time} after {before}; times must increase")
+        with located(self.name):
+            check_increasing(times)
         if poses is None or poses.shape != (len(times), 4, 4):
             raise InputError(
                 f"{self.name}.poses is {form(poses)}; it must be {len(times)} transforms of 4 x 4, one for "
