@@ -235,17 +235,13 @@ class Trajectory(Value):
             wrong = float(times[outside].flat[0])
             time_text, _, end = distinct(wrong, 0.0, self.duration)
             raise InputError(f"time is {time_text} s; it must be in [0, {end}]")
-        if len(self.times) == 1:
-            rows = (
-                np.broadcast_to(getattr(self, name)[0], (*times.shape, self.positions.shape[1]))
-                for name in ROWS
-            )
-            q, v, a = (row.copy() for row in rows)
-            return State(q, v, a, np.zeros_like(q))
-        row = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
-        h = np.asarray(self.times[row + 1] - self.times[row])[..., None]
+        last = len(self.times) - 1
+        row = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, max(last - 1, 0))
+        after = np.minimum(row + 1, last)
+        h = np.asarray(self.times[after] - self.times[row])[..., None]
+        h = np.where(h > 0, h, 1.0)  # 0 for a trajectory of one row
         u = np.clip(np.asarray(times - self.times[row])[..., None] / h, 0.0, 1.0)
-        (q0, v0, a0), (q1, v1, a1) = (tuple(getattr(self, name)[i] for name in ROWS) for i in (row, row + 1))
+        (q0, v0, a0), (q1, v1, a1) = (tuple(getattr(self, name)[i] for name in ROWS) for i in (row, after))
         # Hermite's basis and its derivative
         rise = u * u * (3 - 2 * u)
         slope = 6 * u * (1 - u) / h

@@ -165,8 +165,8 @@ class RowResult(NamedTuple):
 def run_ablation(
     settings: AblationSettings,
     rows: list[str],
-    workers: int = 1,
-    report: Callable[[str], None] = lambda text: None,
+    workers: int,
+    report: Callable[[str], None],
 ) -> list[RowResult]:
     """Train the networks of the rows and evaluate every row. After an interruption, the same call continues
     the work.
@@ -176,8 +176,6 @@ def run_ablation(
     for name in rows:
         if name not in ROWS:
             raise unknown_name("row of Table 2", name, ROWS)
-    if workers < 1:
-        raise InputError(f"workers is {workers}; it must be at least 1")
     read_manifest(settings.data).check_robot(load_robot("panda"))
     out = FilePath(settings.out)
     configs = dict.fromkeys(ROWS[name].config for name in rows)

@@ -126,7 +126,7 @@ def trivial_share(out: FilePath, problem_set: str) -> float:
     return 1 - len(cases) / (1 + int(cases[-1].name.partition("/")[2]))
 
 
-def straight_line_counts(count: int, family: Rop = ROP) -> dict[str, int]:
+def straight_line_counts(count: int, family: Rop) -> dict[str, int]:
     """Numbers of problems out of `count` in which the straight line is free: to a single goal configuration,
     to the nearest of ten, and to any of ten.
 

@@ -276,9 +276,7 @@ class Clock:
         return {"time": round(self.wall, 6), "cpu": round(self.cpu, 6)}
 
 
-def runs_of(
-    cases: Sequence[Case], methods: Iterable[str], seeds: Iterable[int] = (0,), limit: float = np.inf
-) -> list[Run]:
+def runs_of(cases: Sequence[Case], methods: Iterable[str], seeds: Iterable[int], limit: float) -> list[Run]:
     """All runs in the order in which they are made: methods take turns on each case, so that other work on
     the machine affects all methods alike."""
     names = list(methods)
@@ -296,7 +294,7 @@ def keep_records(
     runs: Sequence[Run],
     results: Results,
     files: Mapping[str, RecordFile],
-    on_progress: Callable[[int], None] = lambda remaining: None,
+    on_progress: Callable[[int], None],
 ) -> int:
     """Store the records of runs as the runs end; returns the number of runs that were made.
 
