@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path as FilePath
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from robotdiffuse.core.bounds import MAX_COORDINATE, MAX_DURATION, MAX_RATE, Value, numbers, one_line, rows
 from robotdiffuse.core.errors import InputError, distinct, joined, repeated, shown
 from robotdiffuse.core.output_files import check_output, write_atomically
+from robotdiffuse.core.settings import Bound, converted
 
 Configuration = Float[ndarray, "dof"]
 """Joint positions [rad], [m] for prismatic joints."""
@@ -72,8 +73,8 @@ ROWS = ("positions", "velocities", "accelerations")
 """Names of a trajectory's arrays that have a row for each time and a column for each joint."""
 REST = 1e-3
 """The arm counts as resting if its speed is at most this fraction of the greatest speed of the motion."""
-MAX_SAMPLE_RATE = 1e5
-"""Largest rate at which trajectories are resampled [Hz]."""
+SampleRate = Annotated[float, Bound(above=0.0, most=1e5)]
+"""Rate at which trajectories are resampled [Hz]."""
 ACCELERATION_GAIN = 1.005
 """`resample` averages the rows if a joint's greatest acceleration grows by more than this factor, ..."""
 ACCELERATION_SHARE = 0.25
@@ -154,18 +155,6 @@ class State(NamedTuple):
     velocities: Float[ndarray, "*n dof"]
     accelerations: Float[ndarray, "*n dof"]
     jerks: Float[ndarray, "*n dof"]
-
-
-def check_sample_rate(rate: object) -> None:
-    """Raise InputError unless the rate is a number in (0, MAX_SAMPLE_RATE]."""
-    if (
-        not isinstance(rate, int | float | np.number)
-        or isinstance(rate, bool)
-        or not 0 < rate <= MAX_SAMPLE_RATE
-    ):
-        raise InputError(
-            f"rate is {shown(rate)}; it must be a positive number, at most {MAX_SAMPLE_RATE:g} [Hz]"
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,7 +262,7 @@ class Trajectory(Value):
         Raises:
             InputError: For another rate.
         """
-        check_sample_rate(rate)
+        rate = converted("rate", SampleRate, rate)
         if len(self.times) == 1:
             return self
         count = int(np.ceil((self.duration - TIME_TOLERANCE) * rate))

@@ -23,7 +23,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import shown
-from robotdiffuse.core.types import MAX_SAMPLE_RATE, Status
+from robotdiffuse.core.types import SampleRate, Status
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, described_arguments
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.problems.fields import problem_schema
@@ -70,11 +70,9 @@ PlanBody = create_model(
     problem=(ProblemField, ...),
     planner=(str, Field(DEFAULT_PLANNER, description="a name of /planners")),
     rate=(
-        float | None,
+        SampleRate | None,
         Field(
             None,
-            gt=0,
-            le=MAX_SAMPLE_RATE,
             description="rows per second of the answer's motion [Hz], which is validated again with these "
             "rows; null: the rows of the plan",
         ),

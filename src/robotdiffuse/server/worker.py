@@ -19,7 +19,8 @@ from robotdiffuse.core.deadline import cancel_check, check_cancelled
 from robotdiffuse.core.errors import InputError, shortened, shown
 from robotdiffuse.core.input_files import MEGABYTE, parse_json
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import RATES, Path, Trajectory, check_motion_arrays, check_sample_rate
+from robotdiffuse.core.settings import converted
+from robotdiffuse.core.types import RATES, Path, SampleRate, Trajectory, check_motion_arrays
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, load_planner
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.planner import Planner
@@ -188,9 +189,7 @@ def answer_plan(body: bytes) -> Answer:
     if request.time_limit > _settings.max_time_limit:
         rule = f"it must be at most {_settings.max_time_limit:g} s here"
         raise InputError(f"time_limit is {shown(request.time_limit)}; {rule}")
-    rate = requested.get("rate")
-    if rate is not None:
-        check_sample_rate(rate)
+    rate = converted("rate", SampleRate | None, requested.get("rate"))
     limit = request.time_limit + GRACE_TIME
     allow(began + limit - time.monotonic())
     problem = _problem(requested["problem"])
