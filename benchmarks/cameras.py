@@ -58,12 +58,12 @@ from robotdiffuse.learning.completion import (
     exported_completion,
     pack,
     predict,
-    true_voxels,
 )
 from robotdiffuse.perception.depth_view import DepthNoise, DepthView
 from robotdiffuse.perception.observed_volume import observe
-from robotdiffuse.perception.ray_caster import MAX_RANGE, ray_cast
+from robotdiffuse.perception.ray_caster import MAX_RANGE, ray_cast, voxels_within
 from robotdiffuse.perception.unknown_space import MIN_RISK
+from robotdiffuse.perception.voxel_grid import FINE
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.exploration.looks import next_view, poses_around
@@ -222,7 +222,7 @@ def plan(problem: Problem, partial: Problem, method: str, network: Completion | 
     problem: with the true scene. partial: with the known scene and the views. network: a completion network
     in place of the bundled one.
     """
-    voxels = true_voxels(unknown_scene(problem)).astype(np.float32) if method == TRUE_VOXELS else None
+    voxels = voxels_within(unknown_scene(problem), FINE).astype(np.float32) if method == TRUE_VOXELS else None
     began = time.process_time()
     if network is not None:
         voxels = predict(observe(partial.views, partial.robot, partial.start), network)

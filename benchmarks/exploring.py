@@ -56,10 +56,10 @@ from robotdiffuse.core.output_files import JsonLines
 from robotdiffuse.core.types import FIRST
 from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.evaluation.statistics import wilson_interval
-from robotdiffuse.learning.completion import true_voxels
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.occupancy_map import Corners
-from robotdiffuse.perception.voxel_grid import FINE_VOXEL_SIZE, LOW
+from robotdiffuse.perception.ray_caster import voxels_within
+from robotdiffuse.perception.voxel_grid import FINE, FINE_VOXEL_SIZE, LOW
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.exploration.explorer import Explorer
 from robotdiffuse.planning.exploration.simulated import explore, measured, taken, wrist_camera
@@ -211,7 +211,8 @@ def play(problem: Problem, family: str, number: int, method: str, images: Images
 def free_zone(problem: Problem) -> Corners | None:
     """The largest box around the base without obstacles, as a user who knows the work cell would declare it;
     None if there is none."""
-    filled = true_voxels(unknown_scene(problem))[:, :, : round((ZONE_HEIGHT - LOW[2]) / FINE_VOXEL_SIZE)]
+    layers = round((ZONE_HEIGHT - LOW[2]) / FINE_VOXEL_SIZE)
+    filled = voxels_within(unknown_scene(problem), FINE)[:, :, :layers]
     columns = np.asarray(filled.any(axis=2))
 
     def has_obstacle(low: tuple[float, float], high: tuple[float, float]) -> bool:

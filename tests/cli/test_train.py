@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from helpers.commands import Said, run
-from robotdiffuse.learning.denoisers import UNetSettings
+from robotdiffuse.learning.denoisers import PAPER_SIZES
 from robotdiffuse.learning.training.config import CONFIGS, PlannerTraining
 
 TRAIN = ["train", "planner", "--data", "d", "--encoder", "dgcnn", "--out", "o"]
@@ -42,7 +42,7 @@ def test_parts_replace_those_of_the_config(trained: list[PlannerTraining]) -> No
     assert run(*TRAIN, "--config", "paper") == 0
     assert run(*TRAIN, "--config", "table2_unet", "--denoiser", "decoder_only") == 0
     changed, paper, row = trained
-    wanted = {"denoiser": "unet", "denoiser_settings": UNetSettings.paper_size(), "objective": "noise", "sampler": "ddim"}
+    wanted = {"denoiser": "unet", "denoiser_settings": PAPER_SIZES["unet"], "objective": "noise", "sampler": "ddim"}
     wanted |= {"target": "residual", "waypoints": 64, "progressive": False, "condition_drop": 0.2, "device": "cpu"}
     assert changed == replace(paper, **wanted)
     assert row.denoiser == "decoder_only" and row.denoiser_settings is None

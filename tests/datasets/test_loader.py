@@ -118,13 +118,6 @@ def test_resampling():
     np.testing.assert_array_equal(even[1], q[1, [0] * 5])
     assert resample(q[:0], 5).shape == (0, 5, 2)
     assert (resample(q[1:], 3) == q[1, 0]).all()
-    long = np.random.default_rng(0).standard_normal((4, 254, 3)).cumsum(1).astype(np.float32)
-    long[2, 40:80] = long[2, 40]
-    for path, found in zip(long, resample(long, 48), strict=True):
-        at = np.concatenate([[0], np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum(dtype=np.float64)])
-        wanted = [np.interp(np.linspace(0, at[-1], 48), at, path[:, j]) for j in range(3)]
-        np.testing.assert_array_equal(found[[0, -1]], path[[0, -1]])
-        np.testing.assert_array_equal(found, np.stack(wanted, 1).astype(np.float32))
 
 
 def test_bad_input(store, tmp_path):

@@ -20,7 +20,7 @@ def test_checkpoint_round_trip(tmp_path):
     model = small_model()
     model.fit_statistics(np.random.default_rng(0).uniform(-2, 2, (9, 16, 3)).astype(np.float32), True)
     checkpoint.save_network("model", model, tmp_path, {"samples": 3})
-    loaded = checkpoint.load_model(tmp_path, box_arm())
+    loaded = checkpoint.load_network("model", tmp_path, box_arm())
     assert loaded.settings == model.settings
     torch.testing.assert_close(loaded.noise_factor, model.noise_factor, atol=0, rtol=0)
     read = loaded.denoiser.state_dict()
@@ -28,7 +28,7 @@ def test_checkpoint_round_trip(tmp_path):
         torch.testing.assert_close(read[name].float(), weight, atol=1e-3, rtol=1e-2)
     z = [m.encode(cloud(50)[0].numpy()) for m in (model.requires_grad_(False), loaded)]
     np.testing.assert_allclose(z[1], z[0], atol=5e-3)
-    assert checkpoint.fingerprint(checkpoint.load_model(tmp_path)) == checkpoint.fingerprint(loaded)
+    assert checkpoint.fingerprint(checkpoint.load_network("model", tmp_path, box_arm())) == checkpoint.fingerprint(loaded)
     assert checkpoint.fingerprint(loaded) != checkpoint.fingerprint(small_model(1))
     refuses(r"no trained model: encoder\.json", checkpoint.load_encoder, tmp_path / "nothing")
 
@@ -43,7 +43,7 @@ def test_wrong_robot_is_refused(tmp_path):
         (planar_arm(0.5, 0.4), r"model\.json was trained for .* with joints"),
         (bare, "has spheres on the links l1, l2, not l1, l2, l3"),
     ):
-        refuses(message, checkpoint.load_model, tmp_path, robot)
+        refuses(message, checkpoint.load_network, "model", tmp_path, robot)
 
 
 def weights(change):
@@ -79,7 +79,7 @@ def setting(**values):
         (weights(lambda data: data[:-100]), "model.safetensors"),
         (weights(lambda data: data[:-50] + bytes([data[-50] ^ 1]) + data[-49:]), "model.safetensors"),
         (weights(None), "model.safetensors"),
-        (lambda folder: (folder / "model.json").unlink(), "model.json"),
+        (lambda folder: (folder / "model.json").unlink(), "holds no model"),
         (lambda folder: (folder / "model.json").write_text('{"robot": '), "model.json"),
         (described(lambda about: about["settings"].update(wings=2)), "model.json"),
         (setting(width=32), "model.safetensors"),
@@ -88,4 +88,4 @@ def setting(**values):
 def test_damaged_weights_give_one_line(tmp_path, damage, file):
     save_small_model(tmp_path)
     damage(tmp_path)
-    refuses(file, checkpoint.load_model, tmp_path)
+    refuses(file, checkpoint.load_network, "model", tmp_path, box_arm())

@@ -22,16 +22,14 @@ from robotdiffuse.learning.completion import (
     pack_fine,
     predict,
     reachable,
-    true_voxels,
     unpack_fine,
     voxel_centers,
 )
 from robotdiffuse.learning.completion_network import CompletionNetwork, folded, unfolded
 from robotdiffuse.learning.training import completion
-from robotdiffuse.learning.training import completion as training
-from robotdiffuse.perception.observed_volume import observe
-from robotdiffuse.perception.ray_caster import looking_at, ray_cast
-from robotdiffuse.perception.voxel_grid import SHAPE
+from robotdiffuse.perception.observed_volume import ObservedVolume, observe
+from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
+from robotdiffuse.perception.voxel_grid import FINE, SHAPE, refined
 from robotdiffuse.problems.families import FAMILIES, load_family
 
 PANDA = rd.load_robot("panda")
@@ -43,7 +41,12 @@ TINY = completion.CompletionTraining(samples=8, batch=2, workers=0, network=SMAL
 @pytest.fixture(autouse=True)
 def few_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("VALIDATION_SAMPLES", "CALIBRATION_SAMPLES", "TEST_SAMPLES"):
-        monkeypatch.setattr(training, name, 1)
+        monkeypatch.setattr(completion, name, 1)
+
+
+def seen_from_behind(scene: rd.Scene) -> ObservedVolume:
+    T = looking_at(np.array([-1.0, 0.3, 1.0]), np.array([0.5, 0.0, 0.3]))
+    return observe([ray_cast(scene, T, (130.0, 130.0, 79.5, 59.5), (160, 120), PANDA, HOME)], PANDA, HOME)
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -59,17 +62,17 @@ def test_samples_agree_with_the_scene(family: str) -> None:
 
 def test_training_begins_with_the_weights_that_it_is_given() -> None:
     settings = replace(TINY, network=CompletionSettings(), weights="bundled")
-    task = training.CompletionTask(settings, training.Processes("cpu"))
+    task = completion.CompletionTask(settings, completion.Processes("cpu"))
     given = load_completion().state_dict()
     assert all(torch.equal(value, given[name]) for name, value in task.module.state_dict().items())
     with pytest.raises(rd.InputError, match="weights bundled are of a network of"):
-        training.CompletionTask(replace(TINY, weights="bundled"), training.Processes("cpu"))
+        completion.CompletionTask(replace(TINY, weights="bundled"), completion.Processes("cpu"))
     refuses(r"families.*rap.*crate", replace, TINY, families=("rap",))
 
 
 def test_voxels_pack_and_unpack() -> None:
     scene = load_family("table").scene(np.random.default_rng(0))
-    fine = true_voxels(scene)
+    fine = voxels_within(scene, FINE)
     bits = unpack_fine(pack_fine(fine))
     for place in np.argwhere(bits.any(axis=-1))[::97]:
         for bit in range(8):
@@ -85,10 +88,7 @@ def test_folding_and_unfolding_are_inverse() -> None:
 
 
 def test_the_network_s_inputs() -> None:
-    scene = rd.Scene([rd.Box((0.5, 0.0, 0.3), (0.1, 0.6, 0.6))])
-    T = looking_at(np.array([-1.0, 0.3, 1.0]), np.array([0.5, 0.0, 0.3]))
-    view = ray_cast(scene, T, (130.0, 130.0, 79.5, 59.5), (160, 120), PANDA, HOME)
-    volume = observe([view], PANDA, HOME)
+    volume = seen_from_behind(rd.Scene([rd.Box((0.5, 0.0, 0.3), (0.1, 0.6, 0.6))]))
     seen, behind = (torch.from_numpy(array)[None] for array in pack(volume))
     network = CompletionNetwork(SMALL)
     inputs = network.features(seen, behind)[0].reshape(7, 8, 28, 28, 16).permute(0, 2, 3, 4, 1)
@@ -103,13 +103,11 @@ def test_the_network_s_inputs() -> None:
 @pytest.mark.slow
 def test_voxels_of_predictions_and_samples_agree(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     settings = replace(TINY, learning_rate=1e-2)
-    task = training.CompletionTask(settings, training.Processes("cpu"))
+    task = completion.CompletionTask(settings, completion.Processes("cpu"))
     rng = np.random.default_rng(1)
     scene = load_family("table").scene(rng)
-    T = looking_at(np.array([-1.2, 0.4, 1.0]), np.array([0.3, 0.0, 0.2]))
-    view = ray_cast(scene, T, (120.0, 120.0, 79.5, 59.5), (160, 120), PANDA, HOME)
-    volume = observe([view], PANDA, HOME)
-    fine = true_voxels(scene)
+    volume = seen_from_behind(scene)
+    fine = voxels_within(scene, FINE)
     seen, behind = pack(volume)
     sample = Samples(seen[None], behind[None], pack_fine(fine)[None])
     monkeypatch.setattr(task.prefetcher, "next", lambda rng: sample)
@@ -118,10 +116,9 @@ def test_voxels_of_predictions_and_samples_agree(monkeypatch: pytest.MonkeyPatch
     save_network("completion", task.module, tmp_path, {})
     p = predict(volume, exported_completion(tmp_path))
     assert p.shape == tuple(2 * n for n in SHAPE) and p.dtype == np.float32
-    free = volume.free.repeat(2, 0).repeat(2, 1).repeat(2, 2)
+    free = refined(volume.free)
     assert (p[free] == 0).all()
-    reach = reachable().repeat(2, 0).repeat(2, 1).repeat(2, 2)
-    counted = ~free & reach
+    counted = ~free & refined(reachable())
     assert completion.average_precision(p[counted], fine[counted]) > 2 * fine[counted].mean()
 
 
@@ -171,8 +168,8 @@ def test_nothing_is_predicted_beyond_reach() -> None:
     """Training has no voxels there, so the network would predict walls a meter around the arm."""
     unknown = np.zeros(SHAPE, np.uint8)
     p = exported_completion()(unknown, unknown)
-    reachable = training.reachable().repeat(2, 0).repeat(2, 1).repeat(2, 2)
-    assert not p[~reachable].any() and p[reachable].any()
+    reach = refined(reachable())
+    assert not p[~reach].any() and p[reach].any()
 
 
 @pytest.mark.parametrize("family", ["rop_dense", "shelf", "kitchen"])
@@ -181,10 +178,10 @@ def test_bundled_weights_are_better_than_a_constant(family: str) -> None:
     occupied voxels."""
     samples = draw_samples((family,), PANDA, range(11, 19))
     network = exported_completion()
-    above = training.voxel_centers()[..., 2] > 0.02
+    above = voxel_centers()[..., 2] > 0.02
     p = [network(*volume) for volume in zip(samples.seen, samples.behind, strict=True)]
     truth = unpack_fine(samples.truth)
-    counted = ((samples.seen & (FREE | OCCUPIED)) == 0) & training.reachable() & above
+    counted = ((samples.seen & (FREE | OCCUPIED)) == 0) & reachable() & above
     stated = np.stack([unpack_fine(pack_fine(one > 0.1)) for one in p])
     called = stated[counted]
     true = truth[counted]

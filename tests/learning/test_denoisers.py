@@ -13,7 +13,7 @@ from helpers.refusals import refuses
 from helpers.small_model import SMALL_ENCODER, small_model
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning import denoisers
-from robotdiffuse.learning.checkpoint import load_model, save_network
+from robotdiffuse.learning.checkpoint import load_network, save_network
 from robotdiffuse.learning.denoisers.networks import MAX_UNFUSED_TOKENS, Denoiser, attend
 from robotdiffuse.learning.encoders import PointsSettings
 from robotdiffuse.learning.exported_model import exported_model
@@ -33,6 +33,7 @@ SMALL = {
     "cross_attention": denoisers.CrossAttentionSettings(32, 2, 2, 48, 1),
     "unet": denoisers.UNetSettings(16, (1, 2, 2), 3, 32),
 }
+UNEVEN = replace(SMALL["decoder_only"], patch=5)
 SMALL_ENCODERS = {"points": PointsSettings(CODE, CODE // 3), "point_autoencoder": replace(SMALL_ENCODER, code=CODE)}
 
 
@@ -130,15 +131,11 @@ def test_unet_pads_and_crops():
         (denoisers.TransformerSettings, {"width": 15, "heads": 5}, "transformer.width is 15"),
         (denoisers.UNetSettings, {"kernel": 4}, "unet.kernel is 4"),
         (denoisers.UNetSettings, {"width": 7}, "unet.width is 7"),
+        (denoiser, {"name": "decoder_only", "settings": UNEVEN}, r"decoder_only\.patch is 5; it must divide the 12 waypoints"),
     ],
 )
 def test_bad_settings(kind, values, message):
     refuses(message, kind, **values)
-
-
-def test_waypoints_must_fill_the_patches():
-    with pytest.raises(InputError, match=r"decoder_only\.patch is 5; it must divide the 12 waypoints"):
-        denoiser("decoder_only", 12, replace(SMALL["decoder_only"], patch=5))
 
 
 def encoder_for(name: str) -> str:
@@ -175,7 +172,7 @@ def test_files(tmp_path, name, null_condition):
         if isinstance(module, torch.nn.Linear):
             module.weight.data = module.weight.data.half().float()  # as they are stored
     save_network("model", model, tmp_path, {})
-    loaded = load_model(tmp_path)
+    loaded = load_network("model", tmp_path, box_arm())
     assert loaded.settings == model.settings
     assert type(loaded.denoiser) is denoisers.DENOISERS.load(name)
     scale = 2.0 if null_condition else 1.0

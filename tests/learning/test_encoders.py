@@ -17,7 +17,7 @@ from robotdiffuse.cli import main
 from robotdiffuse.datasets.shards import write_manifest, write_shard
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning import encoders
-from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, load_model, save_network
+from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, load_network, save_network
 from robotdiffuse.learning.denoisers import CrossAttentionSettings, TransformerSettings
 from robotdiffuse.learning.encoders import networks
 from robotdiffuse.learning.exported_model import exported_model
@@ -26,7 +26,7 @@ from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.training import tasks as training
 from robotdiffuse.learning.training.batches import Batches, load_data, random_scenes, scene_clouds
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
-from robotdiffuse.learning.training.tasks import linear_readout, train_encoder, train_planner
+from robotdiffuse.learning.training.tasks import train_encoder, train_planner
 from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.scenes.scene_arrays import SPHERE
 from robotdiffuse.scenes.surface_points import PANDA_REGION
@@ -191,7 +191,7 @@ def test_edge_convolution_is_the_maximum_over_edges():
 
 @pytest.mark.parametrize("name", ALONE)
 def test_training_alone(name, tmp_path, monkeypatch):
-    monkeypatch.setattr(training, "READOUT_SCENES", 256)
+    monkeypatch.setattr(training, "STANDARDIZATION_SCENES", 256)
     training_settings = EncoderTraining(
         name=name, minutes=None, samples=1600, batch=16, points=64, warmup_steps=10, encoder=SMALL[name]
     )
@@ -219,7 +219,7 @@ def test_training_alone(name, tmp_path, monkeypatch):
 
 
 def test_training_from_the_command_line(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(training, "READOUT_SCENES", 32)
+    monkeypatch.setattr(training, "STANDARDIZATION_SCENES", 32)
     out = str(tmp_path / "out")
     command = ["train", "encoder", "--samples", "4", "--batch", "2", "--out", out, "--encoder"]
     assert main([*command, "compression_autoencoder"]) == 0
@@ -227,18 +227,6 @@ def test_training_from_the_command_line(tmp_path, capsys, monkeypatch):
     assert load_encoder(out).settings == encoders.CompressionAutoencoderSettings()
     assert main([*command, "pointnett"]) == 2
     assert "known: compression_autoencoder, dgcnn" in capsys.readouterr().err
-
-
-def test_readout_of_constant_codes(monkeypatch):
-    monkeypatch.setattr(training, "READOUT_SCENES", 256)
-    encoder = small("pointnet")
-    reports = []
-    for _ in range(2):
-        rng = np.random.default_rng(0)
-        reports.append(linear_readout(encoder, random_scenes(768, 4, rng), rng))
-        torch.nn.init.zeros_(list(encoder.parameters())[-2])  # the matrix of the last layer
-    assert reports[0]["readout"] < reports[0]["readout_of_constant"]
-    assert reports[1]["readout"] == pytest.approx(reports[1]["readout_of_constant"])
 
 
 @pytest.fixture
@@ -265,7 +253,7 @@ def test_joint_training_changes_the_encoder(name, data, tmp_path):
     planned = planner(data, name, encoder_settings=SMALL[name], learning_rate=1e-2)
     fresh = small(name)
     train_planner(planned, str(tmp_path / "out"))
-    model = load_model(tmp_path / "out", box_arm())
+    model = load_network("model", tmp_path / "out", box_arm())
     assert type(model.encoder) is encoders.ENCODERS.load(name)
     assert model.encoder is not None
     trained = dict(model.encoder.named_parameters())
@@ -286,7 +274,7 @@ def test_a_frozen_encoder_stays_as_it_is(name, data, tmp_path):
     save_network("encoder", small(name), tmp_path / "encoder", {})
     before = fingerprint(load_encoder(tmp_path / "encoder"))
     train_planner(planner(data, str(tmp_path / "encoder")), str(tmp_path / "out"))
-    encoder = load_model(tmp_path / "out").encoder
+    encoder = load_network("model", tmp_path / "out", box_arm()).encoder
     assert encoder is not None and fingerprint(encoder) == before
     assert fingerprint(load_encoder(tmp_path / "encoder")) == before
 

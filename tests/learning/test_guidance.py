@@ -126,9 +126,7 @@ def test_a_full_step_is_newton_s() -> None:
 def test_together_they_reach_a_free_and_short_path_that_none_reaches_alone() -> None:
     """A zigzag through a ball: the cost of collision alone leaves the zigzag, and the cost of length alone
     leaves the path in the ball."""
-    checker = CollisionChecker(box_arm(), Scene([Sphere([1.02, 0.55, 0.0], 0.08)]))
-    t = np.linspace(0.0, 1.0, 24, dtype=np.float32)[:, None]
-    line = np.array([-0.8, 0.6, 0.6], np.float32) + t * np.array([1.6, 0.0, 0.0], np.float32)
+    checker, (line, _) = swing()
     line[1::2, 0] += 0.05
     line[-1, 0] = 0.8
 
@@ -156,7 +154,7 @@ EACH: list[Constraint] = [
     rd.OnLine(HAND, AT, [0, 1, 0], 0.002),
     rd.CartesianLine(HAND),
 ]
-NO_OTHERS = GuidanceSettings(margin=None, self_margin=None, length=0.0, push=0.3)
+NO_OTHERS = replace(NOTHING, push=0.3)
 NO_OBSTACLES = CollisionChecker(PANDA, rd.Scene())
 
 

@@ -201,11 +201,11 @@ def test_a_denoiser_on_blocks_learns_all_waypoints():
     torch.nn.init.normal_(model.denoiser.out.weight, std=0.1)
     inputs = torch.randn(3, 38, model.feature_count), torch.ones(3), torch.zeros(3, model.condition_count)
     fine = model.denoise(*inputs)
-    for stage in STAGES:
-        model.coarsen(stage.block)
+    for _, block in STAGES:
+        model.coarsen(block)
         output = model.denoise(*inputs)
         assert output.shape == fine.shape
-        assert torch.equal(output, fine) == (stage.block == 1)
+        assert torch.equal(output, fine) == (block == 1)
 
 
 def test_progressive_training_needs_white_noise_and_blocks_that_fit():

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from robotdiffuse.learning.checkpoint import load_model
+import robotdiffuse as rd
+from robotdiffuse.learning.checkpoint import load_network
 from robotdiffuse.learning.diffusion import OBJECTIVES, SAMPLERS, NoiseSchedule, ScheduleSettings
 
 MEAN = np.array([0.7, -0.3])
@@ -144,7 +145,7 @@ def test_the_schedule_which_is_that_of_the_bundled_model():
     schedule = cosine_schedule()
     curve = np.cos((np.arange(201) / 200 + 0.008) / 1.008 * np.pi / 2) ** 2
     np.testing.assert_array_equal(schedule.signal, np.sqrt(np.maximum(curve / curve[0], 1e-4)))
-    np.testing.assert_array_equal(load_model("panda").schedule.signal, schedule.signal)
+    np.testing.assert_array_equal(load_network("model", "panda", rd.load_robot("panda")).schedule.signal, schedule.signal)
     np.testing.assert_allclose(schedule.signal**2 + schedule.noise**2, 1)
     snr = (schedule.signal[1:] / schedule.noise[1:]) ** 2
     np.testing.assert_allclose(schedule.weight(np.arange(1, 201), 5.0), np.minimum(1 + snr, 5))
@@ -155,7 +156,7 @@ def test_the_schedule_which_is_that_of_the_bundled_model():
 @pytest.mark.parametrize("name", OBJECTIVES)
 def test_objective_round_trip(name, as_given):
     schedule = cosine_schedule()
-    objective = OBJECTIVES.make(name)
+    objective = OBJECTIVES[name]
     clean, noise = map(as_given, np.random.default_rng(0).standard_normal((2, 201, 5, 2)))
     a, s = (as_given(v[:, None, None]) for v in (schedule.signal, schedule.noise))
     back = objective.clean(a * clean + s * noise, objective.target(clean, noise, a, s), a, s)
@@ -168,7 +169,7 @@ def test_objectives_weigh_levels_alike(name, limit):
     """The weighted error of the output equals that of the clean trajectory wherever the weight is below its
     limit."""
     schedule = cosine_schedule()
-    objective = OBJECTIVES.make(name)
+    objective = OBJECTIVES[name]
     t = np.arange(1, 200)
     a = schedule.signal[t]
     s = schedule.noise[t]

@@ -1,10 +1,9 @@
-"""Scenes packed in arrays: round trips, floors stored separately, turned scenes."""
+"""Scenes packed in arrays: round trips, floors stored separately."""
 
 import numpy as np
 import pytest
 
 from helpers.refusals import refuses
-from helpers.sphere_oracles import distance
 from robotdiffuse import Box, Capsule, Cylinder, Scene
 from robotdiffuse.problems.families.rop import ROP_DENSE
 from robotdiffuse.scenes.scene_arrays import PackedScenes
@@ -54,20 +53,6 @@ def test_rows_and_parts() -> None:
     assert packed.floors is not None
     packed.floors[0] = 0
     assert packed.floor(0) is None and packed.floor(1) is not None
-
-
-def test_turned_scenes_have_turned_distances() -> None:
-    scenes = PackedScenes.pack(some_scenes(6), 12, floor=True)
-    rng = np.random.default_rng(1)
-    angle = rng.uniform(-np.pi, np.pi, 6).astype(np.float32)
-    turned = scenes.turned(angle)
-    at = rng.uniform(-1, 1, (20, 3))
-    for i, (c, s) in enumerate(zip(np.cos(angle), np.sin(angle), strict=True)):
-        moved = at @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-        pairs = zip(scenes.scene(i).shapes[1:], turned.scene(i).shapes[1:], strict=True)
-        for before, after in pairs:
-            np.testing.assert_allclose(distance(after, moved), distance(before, at), atol=1e-5)
-    assert turned.floors is scenes.floors
 
 
 def test_what_cannot_be_packed() -> None:

@@ -20,13 +20,14 @@ from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 
 with needs("torch", "train"):
-    from robotdiffuse.learning.checkpoint import export_weights, load_model, save_network
-    from robotdiffuse.learning.denoisers import DENOISERS
+    from robotdiffuse.learning.checkpoint import export_weights, load_network, save_network
+    from robotdiffuse.learning.denoisers import DENOISERS, PAPER_SIZES
     from robotdiffuse.learning.training.completion import CompletionTraining, train_completion
     from robotdiffuse.learning.training.config import (
         CONFIGS,
         EncoderTraining,
         PlannerTraining,
+        one_length,
         planner_training,
     )
     from robotdiffuse.learning.training.tasks import (
@@ -49,17 +50,13 @@ MODEL_OPTIONS = (
 
 def run_encoder(arguments: Namespace) -> None:
     options = chosen(arguments, ("name", "scenes", "device", *TRAINING_OPTIONS))
-    if "samples" in options:
-        options["minutes"] = None
-    settings = EncoderTraining(**options)
+    settings = EncoderTraining(**one_length(options))
     _print_report(train_encoder(settings, arguments.out), arguments.out)
 
 
 def run_completion(arguments: Namespace) -> None:
     options = chosen(arguments, ("families", "robot", "workers", "weights", "device", *TRAINING_OPTIONS))
-    if "minutes" in options:
-        options["samples"] = None
-    settings = CompletionTraining(**options)
+    settings = CompletionTraining(**one_length(options))
     _print_report(train_completion(settings, arguments.out), arguments.out)
 
 
@@ -71,7 +68,9 @@ def run_planner(arguments: Namespace) -> None:
     config = CONFIGS[arguments.config].changes
     if "denoiser" in options and config.get("denoiser_settings") is not None:
         # the config's settings are for its own denoiser; another denoiser gets its paper-sized settings
-        options["denoiser_settings"] = DENOISERS.defaults(arguments.denoiser).paper_size()
+        options["denoiser_settings"] = PAPER_SIZES.get(arguments.denoiser) or DENOISERS.defaults(
+            arguments.denoiser
+        )
     if {"denoiser", "objective", "waypoints"} & set(options):
         options["progressive"] = False  # its stages suit the config's own denoiser, objective and waypoints
     if "encoder" in config:
@@ -224,7 +223,6 @@ def copy_bundled_encoder(folder: Path) -> Path:
     """Save the encoder of the bundled weights in the form that the training reads; returns the folder."""
     if (folder / "encoder.json").is_file():
         return folder
-    encoder = load_model(BUNDLED / "panda").encoder
-    assert encoder is not None
+    encoder = load_network("model", BUNDLED / "panda", load_robot("panda")).encoder
     save_network("encoder", encoder, folder, {"from": "the weights that come with the package for panda"})
     return folder

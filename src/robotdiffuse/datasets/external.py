@@ -62,7 +62,6 @@ margin of 5 cm."""
 END_TOLERANCE = 1e-4
 """Largest difference between the start and the first waypoint, and between the goal and the last waypoint
 [rad]."""
-ARRAYS_READ = ("trajectories", "start", "target_pose", "obstacle_kinds", "obstacle_params")
 
 
 def write_dataset(
@@ -170,16 +169,16 @@ def measured_row(
         packed,
         q,
         checker.link_clearances(q).min(axis=1, initial=1.0),
-        goals=q[-1:],
-        goal_costs=np.array([cost]),
+        q[-1:],
+        np.array([cost]),
+        cost,
+        link_pose(robot, q[-1].astype(np.float64), robot.tip),
+        most_goals=1,
         goal_index=0,
-        T_base_tip=link_pose(robot, q[-1].astype(np.float64), robot.tip),
         family=0,
-        cost=cost,
         safety_distance=0.0,
         line_free=bool(line[0] and checker.free(ends[:1])[0]),
         seed=number,
-        most_goals=1,
     )
 
 
@@ -233,7 +232,7 @@ def export_npz(folder: str | FilePath, file: str | FilePath) -> tuple[int, int]:
     y = [np.zeros((0, CONDITION_NUMBERS), np.float32)]
     total = 0
     for index in shard_indices(folder):
-        shard = read_shard(folder, index, ARRAYS_READ)
+        shard = read_shard(folder, index)
         check_shapes(folder, shard, manifest)
         total += len(shard["trajectories"])
         kinds = shard["obstacle_kinds"]
@@ -304,10 +303,10 @@ def _read(file: str | FilePath) -> tuple[Float32[ndarray, "n 254 7"], Float32[nd
             raise InputError(f"{file}: {name} has shape {array.shape}; it must be {shape}, with n at least 1")
         if not np.isfinite(array).all():
             raise InputError(f"{file}: {name} holds numbers that are not finite")
-    for name, stated, actual in (("start", y[:, :DOF], x[:, 0]), ("goal", y[:, DOF : 2 * DOF], x[:, -1])):
+    ends = ("start", "first", y[:, :DOF], x[:, 0]), ("goal", "last", y[:, DOF : 2 * DOF], x[:, -1])
+    for name, end, stated, actual in ends:
         difference = np.abs(stated - actual).max(axis=1)
         if difference.max() > END_TOLERANCE:
-            end = "first" if name == "start" else "last"
             raise InputError(
                 f"{file}: row {difference.argmax()} has a {name} that differs from its {end} waypoint by "
                 f"{difference.max():.3g} rad; they must be the same"

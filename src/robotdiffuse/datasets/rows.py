@@ -9,11 +9,11 @@ of reach.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path as FilePath
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Int8
 from numpy import ndarray
-from numpy.typing import ArrayLike
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
@@ -46,47 +46,36 @@ def row_of(
     clearances: Values,
     goals: Configurations,
     goal_costs: Values,
-    goal_index: int,
-    T_base_tip: Pose,
-    family: int,
     cost: float,
-    safety_distance: float,
-    line_free: bool,
-    seed: int,
+    T_base_tip: Pose,
     most_goals: int,
-    times: Values | None = None,
+    **values: Any,
 ) -> Row:
     """The row of a motion q in a packed scene.
 
     clearances: clearance of each waypoint [m].
     T_base_tip: the target.
     most_goals: number of goals that a row of the data set has room for; unused entries are NaN.
+    values: the other arrays, by their names.
 
-    The other arguments are the values of the arrays with their names, see `shards.ARRAYS`.
+    `goals`, `goal_costs` and `cost` are the values of the arrays with these names, see `shards.ARRAYS`.
     """
     padding = [(0, most_goals - len(goals)), (0, 0)]
     straight = float(np.linalg.norm(q[-1].astype(np.float64) - q[0]))
     wxyz = quaternion_from_rotation(T_base_tip[:3, :3])
-    row: dict[str, ArrayLike] = {
+    row: dict[str, Any] = values | {
         "trajectories": q,
         "start": q[0],
         "goals": np.pad(goals, padding, constant_values=np.nan),
         "goal_costs": np.pad(goal_costs, padding[0], constant_values=np.nan),
-        "goal_index": goal_index,
         "target_pose": np.concatenate([wxyz, T_base_tip[:3, 3]]),
         "obstacle_kinds": scene.kinds[0],
         "obstacle_params": scene.params[0],
-        "family": family,
         "cost": cost,
         "clearance": clearances.min(),
         "end_clearance": clearances[[0, -1]],
-        "safety_distance": safety_distance,
-        "line_free": line_free,
         "detour": cost / max(straight, 1e-9),
-        "seed": seed,
     }
-    if times is not None:
-        row["times"] = times
     return {name: np.asarray(value, ARRAYS[name][0]) for name, value in row.items()}
 
 
@@ -194,21 +183,12 @@ def resample(q: Float[ndarray, "n stored dof"], waypoints: int) -> Float[ndarray
     """Resample each motion to `waypoints` waypoints, evenly spaced in joint-space length; the first and the
     last are kept exactly.
     """
-    n, stored = q.shape[:2]
-    steps = np.linalg.norm(np.diff(q, axis=1), axis=2)
-    lengths = np.concatenate([np.zeros((n, 1)), np.cumsum(steps, axis=1, dtype=np.float64)], axis=1)
-    target_lengths = np.linspace(0.0, lengths[:, -1], waypoints, axis=1)
-    # Row offsets make the lengths of all rows one ascending array, for a single call of searchsorted.
-    row_offsets = 2.0 * lengths.max(initial=0.0) * np.arange(n)[:, None]
-    after = np.searchsorted(
-        (lengths + row_offsets).reshape(-1), (target_lengths + row_offsets).reshape(-1), side="right"
-    )
-    after = np.clip(after.reshape(n, waypoints) - np.arange(n)[:, None] * stored, 1, stored - 1)
-    low, high = (np.take_along_axis(lengths, i, 1)[..., None] for i in (after - 1, after))
-    below, above = (np.take_along_axis(q, i[..., None], 1) for i in (after - 1, after))
-    into = target_lengths[..., None] - low
-    interval = np.maximum(high - low, np.finfo(np.float64).tiny)
-    resampled = ((above.astype(np.float64) - below) / interval * into + below).astype(q.dtype)
+    steps = np.linalg.norm(np.diff(q, axis=1, prepend=q[:, :1]), axis=2)
+    resampled = np.empty((len(q), waypoints, q.shape[2]), q.dtype)
+    for motion, lengths, out in zip(q, np.cumsum(steps, axis=1, dtype=np.float64), resampled, strict=True):
+        at = np.linspace(0.0, lengths[-1], waypoints)
+        for joint in range(q.shape[2]):
+            out[:, joint] = np.interp(at, lengths, motion[:, joint])
     resampled[:, 0] = q[:, 0]
     resampled[:, -1] = q[:, -1]
     return resampled

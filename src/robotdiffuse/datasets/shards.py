@@ -266,15 +266,12 @@ def write_shard(
     rows = {name: len(array) for name, array in arrays.items()}
     if wrong or len(set(rows.values())) != 1:
         raise InputError(f"shard {index}: missing or unknown arrays {sorted(wrong)}, or unequal rows: {rows}")
-    converted = {
-        name: np.ascontiguousarray(arrays[name], ARRAYS[name][0]).reshape(arrays[name].shape)
-        for name in sorted(arrays)
-    }
+    converted = {name: np.ascontiguousarray(arrays[name], ARRAYS[name][0]) for name in sorted(arrays)}
     attributes = {
         "format": FORMAT,
         "index": index,
         "fingerprint": _fingerprint(converted),
-        "counts": {name: int(counts[name]) for name in sorted(counts)},
+        "counts": dict(sorted(counts.items())),
     }
     try:
         FilePath(folder).mkdir(parents=True, exist_ok=True)
@@ -304,8 +301,7 @@ def _fingerprint(arrays: dict[str, ndarray]) -> str:
     """A hash of the hashes of the arrays, in the order of their names."""
     fingerprints = []
     for name, array in sorted(arrays.items()):
-        digest = hashlib.sha256(f"{array.dtype.str} {array.shape}".encode())
-        digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
+        digest = hashlib.sha256(f"{array.dtype.str} {array.shape}".encode() + array.tobytes())
         fingerprints.append((name, digest.hexdigest()[:16]))
     return hashlib.sha256(json.dumps(fingerprints).encode()).hexdigest()[:16]
 

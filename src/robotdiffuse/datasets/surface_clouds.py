@@ -14,7 +14,7 @@ from robotdiffuse.core.kernels import kernel
 from robotdiffuse.scenes.scene_arrays import NONE, SPHERE, PackedScenes
 from robotdiffuse.scenes.surface_points import VisibleRegion
 
-# Maximum number of samples for each requested point, if there is a region in which points must be.
+# Maximum number of samples for each requested point; those outside the region are dropped.
 _OVERSAMPLING = 8
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
@@ -26,13 +26,15 @@ _PI = np.float32(np.pi)
 _UNIT = np.float32(2.0**-24)
 _MASK = np.uint64(2**24 - 1)
 
+EVERYWHERE = VisibleRegion(floor=-1e9, reach=1e9)
+
 
 def surface_clouds(
     scenes: PackedScenes,
     count: int,
     generator: Generator,
     *,
-    region: VisibleRegion | None = None,
+    region: VisibleRegion = EVERYWHERE,
     ordered: bool = False,
 ) -> Float32[Tensor, "n count 3"]:
     """`count` points on the obstacles of each scene [m], independent and uniform by area.
@@ -46,12 +48,11 @@ def surface_clouds(
     clouds = torch.zeros(len(scenes), count, 3)
     if scenes.kinds.size and count:
         seeds = torch.randint(2**62, (len(scenes),), generator=generator, device=generator.device)
-        bounds = () if region is None else (*region.center, region.reach, region.floor)
         fill_clouds(
             np.ascontiguousarray(scenes.kinds),
             np.ascontiguousarray(scenes.params),
             seeds.cpu().numpy().view(np.uint64),
-            np.array(bounds, np.float32),
+            np.array([*region.center, region.reach, region.floor], np.float32),
             clouds.numpy(),
         )
         if ordered:
@@ -75,20 +76,19 @@ def fill_clouds(kinds, params, seeds, region, out):
     """Writes points that are uniform by area over the shapes of each scene to out[n, count, 3].
 
     Scenes without shapes get zeros. kinds: [n, k], and params: [n, k, 10], as in `PackedScenes`. seeds:
-    uint64[n]. region: x, y and z of its center, its reach and its floor [m], or empty.
+    uint64[n]. region: x, y and z of its center, its reach and its floor [m].
     """
     n, k = kinds.shape
     count = out.shape[1]
     ends = np.empty(k, np.float32)
     faces = np.empty((k, 2), np.float32)
     axes = np.empty((k, 3, 3), np.float32)
-    bounded = len(region) > 0
     for i in range(n):
         total = _ZERO
         last = 0
         for j in range(k):
             area = _prepare(kinds[i, j], params[i, j], faces[j], axes[j])
-            if area > _ZERO and (not bounded or _may_intersect(region, params[i, j], axes[j])):
+            if area > _ZERO and _may_intersect(region, params[i, j], axes[j]):
                 total += area
                 last = j
             ends[j] = total
@@ -96,9 +96,7 @@ def fill_clouds(kinds, params, seeds, region, out):
         for _ in range(8):  # mixes seeds that differ in few bits
             x = _next(x)
         filled = 0
-        draws = count
-        if bounded:
-            draws *= _OVERSAMPLING
+        draws = _OVERSAMPLING * count
         if total <= _ZERO:
             draws = 0
         for _ in range(draws):
@@ -135,9 +133,8 @@ def fill_clouds(kinds, params, seeds, region, out):
                     out[i, filled, r] = (
                         params[i, j, r] + axis[face] * side + axis[face - 1] * u + axis[face - 2] * v
                     )
-            if bounded and not _inside(region, out[i, filled]):
-                continue
-            filled += 1
+            if _inside(region, out[i, filled]):
+                filled += 1
         for p in range(filled, count):
             for r in range(3):
                 out[i, p, r] = out[i, p - filled, r] if filled > 0 else _ZERO

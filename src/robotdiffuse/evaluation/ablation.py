@@ -41,7 +41,7 @@ from robotdiffuse.evaluation.problem_sets import hard_cases
 from robotdiffuse.evaluation.report import Report, share_cell
 from robotdiffuse.evaluation.runs import Record, run_all
 from robotdiffuse.evaluation.statistics import bootstrap_interval, wilson_interval
-from robotdiffuse.learning.checkpoint import load_model
+from robotdiffuse.learning.checkpoint import load_network
 from robotdiffuse.learning.training.config import CONFIGS, EncoderTraining, planner_training
 from robotdiffuse.learning.training.tasks import train_encoder, train_planner
 from robotdiffuse.planning.diffusion import Diffusion
@@ -273,7 +273,7 @@ def _evaluate(
         draw = from_control(planner)
     else:
         folder = out / which.folder
-        encoder = load_model(str(folder), robot).encoder
+        encoder = load_network("model", folder, robot).encoder
         assert encoder is not None  # every row has an encoder
         steps = NETWORK_ALONE.guidance_steps if guided else 0
         planner = replace(

@@ -221,15 +221,15 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
         checker.link_clearances(q).min(axis=1),
         search.goals,
         search.goal_costs,
-        search.best_goal,
-        sample.T_base_tip,
-        family,
         search.cost,
-        search.safety_distance,
-        line_free,
-        number,
+        sample.T_base_tip,
         settings.goals,
-        times if settings.timing == "time" else None,
+        goal_index=search.best_goal,
+        family=family,
+        safety_distance=search.safety_distance,
+        line_free=line_free,
+        seed=number,
+        **({"times": times} if settings.timing == "time" else {}),
     )
 
 

@@ -23,7 +23,6 @@ from robotdiffuse.learning.completion import CompletionSettings
 from robotdiffuse.learning.completion_network import CompletionNetwork
 from robotdiffuse.learning.encoders import ENCODERS, encoder_name
 from robotdiffuse.learning.encoders.networks import Encoder
-from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.network import Network, SavedModule
 from robotdiffuse.learning.weight_files import (
     FORMAT,
@@ -31,7 +30,6 @@ from robotdiffuse.learning.weight_files import (
     RobotIdentity,
     checked_bytes,
     completion_folder,
-    folder_of,
     kept_by_stamp,
     read_description,
     weights_folder,
@@ -103,18 +101,17 @@ def _load(name: str, folder: FilePath) -> Any:
     location = f"{folder / name}.json"
     weights = folder / f"{name}.safetensors"
     checked_bytes(weights, about.get("weights_sha256"), f"{name}.json")
-    robots: list[RobotIdentity] = []
     kind: Any = CompletionNetwork
     settings: Any = CompletionSettings
     if name != "completion":
         table, entry = (ENCODERS, about.get("network", "")) if name == "encoder" else (NETWORKS, name)
         kind = table.load(entry)
         settings = table.settings(entry)
-        if table is NETWORKS:
-            robots = [RobotIdentity.from_json(about.get("robot"), f"{location}: robot")]
-    loaded_settings = settings.from_json(about.get("settings"), f"{location}: settings")
+    parts = [settings.from_json(about.get("settings"), f"{location}: settings")]
+    if name in NETWORKS:
+        parts.insert(0, RobotIdentity.from_json(about.get("robot"), f"{location}: robot"))
     try:
-        network = kind(*robots, loaded_settings)
+        network = kind(*parts)
     except (RuntimeError, TypeError, MemoryError, OverflowError) as error:
         # PyTorch's errors for impossible sizes
         raise InputError(
@@ -153,20 +150,6 @@ def load_network(name: str, folder: str | FilePath | None, robot: Robot) -> Any:
 
 
 _loaded = kept_by_stamp(_load)
-
-
-def load_model(folder: str | FilePath, robot: Robot | None = None) -> MotionNetwork:
-    """The diffusion model of a folder of weights, as a PyTorch module.
-
-    folder: its path, or the name of a folder that comes with the package, such as "panda". Raises InputError,
-    naming the file, if it is missing, damaged, or made for another robot than `robot`.
-    """
-    folder = folder_of(folder)
-    model = _load("model", folder)
-    assert isinstance(model, MotionNetwork)
-    if robot is not None:
-        model.robot.check(robot, str(folder / "model.json"))
-    return model
 
 
 def export_weights(folder: str | FilePath) -> list[str]:

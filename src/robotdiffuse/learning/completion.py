@@ -30,7 +30,7 @@ from robotdiffuse.perception.depth_view import DepthNoise, DepthView
 from robotdiffuse.perception.observed_volume import ObservedVolume, observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
 from robotdiffuse.perception.seen_points import near_scene
-from robotdiffuse.perception.voxel_grid import FINE, LOW, SHAPE, VOXEL
+from robotdiffuse.perception.voxel_grid import COARSE, FINE, SHAPE
 from robotdiffuse.problems.families import load_family
 from robotdiffuse.problems.families.family import Range, base_spheres
 from robotdiffuse.robots.kinematic_tree import once_per_robot
@@ -59,8 +59,7 @@ class CompletionSettings(Settings, name="completion"):
 
 def voxel_centers() -> Float[ndarray, "56 56 32 3"]:
     """Centers of the voxels of an observed volume [m]."""
-    axes = [(np.arange(n) + 0.5) * VOXEL + low for n, low in zip(SHAPE, LOW, strict=True)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    return COARSE.centers(np.argwhere(np.ones(SHAPE))).reshape(*SHAPE, 3)
 
 
 def reachable() -> Bool[ndarray, "56 56 32"]:
@@ -177,11 +176,6 @@ def pack(volume: ObservedVolume) -> tuple[Packed, Packed]:
     return seen, np.minimum(np.rint(volume.behind / DEPTH_STEP), 255).astype(np.uint8)
 
 
-def true_voxels(scene: Scene) -> Bool[ndarray, "112 112 64"]:
-    """The voxels of 2 cm that hold obstacles."""
-    return voxels_within(scene, FINE)
-
-
 def pack_fine(fine: Bool[ndarray, "112 112 64"]) -> Packed:
     """`Samples.truth` of the occupancy of fine voxels."""
     out = np.zeros(SHAPE, np.uint8)
@@ -222,14 +216,10 @@ def draw_sample(families: Sequence[str], robot: Robot, rng: Generator) -> tuple[
         hide_far = rng.random() < OUT_OF_RANGE_SHARE
         default = replace(DepthNoise(), missing=MISSING_SHARE)
         noise = replace(default, **{name: strength * getattr(default, name) for name in NOISE_FIELDS})
-        views = [noise.applied(_without_infinity(view) if hide_far else view, rng) for view in views]
-    return *pack(observe(views, robot, q)), pack_fine(true_voxels(scene))
-
-
-def _without_infinity(view: DepthView) -> DepthView:
-    """The view with no measurement (0) where nothing was in range."""
-    depth = np.where(np.isfinite(view.depth), view.depth, 0.0)
-    return DepthView(depth, view.intrinsics, view.T_base_camera, view.configuration)
+        if hide_far:  # no measurement (0) where nothing is in range
+            views = [replace(view, depth=np.nan_to_num(view.depth, posinf=0.0)) for view in views]
+        views = [noise.applied(view, rng) for view in views]
+    return *pack(observe(views, robot, q)), pack_fine(voxels_within(scene, FINE))
 
 
 def draw_samples(families: Sequence[str], robot: Robot, seeds: Sequence[int]) -> Samples:

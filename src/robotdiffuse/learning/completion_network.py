@@ -33,7 +33,7 @@ DEPTH_SCALE = DEPTH_STEP / 0.5
 
 def _position_inputs() -> Float[Tensor, "28 28 16 16"]:
     """The inputs that do not depend on the observation: height, and distance from the base's axis [m]."""
-    centers = torch.from_numpy(voxel_centers().astype(np.float32))
+    centers = torch.from_numpy(np.ascontiguousarray(voxel_centers(), np.float32))
     places = torch.stack([centers[..., 2], centers[..., :2].norm(dim=-1)])
     return folded(places).permute(1, 2, 3, 0, 4).reshape(28, 28, 16, 16)
 

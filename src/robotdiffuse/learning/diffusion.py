@@ -165,14 +165,8 @@ class NoiseObjective(Objective):
         return -noise_level / signal
 
 
-OBJECTIVES = Registry(
-    "objective",
-    {
-        "clean": Entry(f"{__name__}:Objective", "the clean trajectory, the paper's"),
-        "noise": Entry(f"{__name__}:NoiseObjective", "the noise"),
-    },
-)
-"""Objectives by their name in settings. A new objective is a class and a line here."""
+OBJECTIVES = {"clean": Objective(), "noise": NoiseObjective()}
+"""Objectives by their name in settings. A new objective is a class and an entry here."""
 
 Samples = Float[ndarray, "count ..."]
 NoiseLevels = Int[ndarray, "steps"]

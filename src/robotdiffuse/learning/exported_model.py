@@ -51,8 +51,6 @@ class OnnxNetwork:
             self._session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # ONNX Runtime's own classes of errors have no common base
             raise InputError(f"{name} is no network that ONNX Runtime can run: {str(error)[:200]}") from None
-        self.inputs = tuple(node.name for node in self._session.get_inputs())
-        """Names of the inputs."""
 
     def __call__(self, **inputs: ndarray) -> ndarray:
         """The output for these inputs."""
@@ -64,7 +62,7 @@ class OnnxNetwork:
 class ExportedModel(MotionModel):
     """The model of a folder with weights."""
 
-    def __init__(self, folder: FilePath, name: str) -> None:
+    def __init__(self, name: str, folder: FilePath) -> None:
         """name: a name in NETWORKS. Raises InputError, naming the file, for a missing or damaged file."""
         about = read_description(folder, name)
         location = str(folder / f"{name}.json")
@@ -130,4 +128,4 @@ def exported_model(name: str, folder: str | FilePath | None, robot: Robot) -> Mo
     return model
 
 
-_loaded = kept_by_stamp(lambda name, folder: ExportedModel(folder, name))
+_loaded = kept_by_stamp(ExportedModel)

@@ -26,7 +26,6 @@ from robotdiffuse.learning.diffusion import (
     OBJECTIVES,
     SAMPLERS,
     NoiseSchedule,
-    Objective,
     Predict,
     ScheduleSettings,
     white_noise_factor,
@@ -218,7 +217,7 @@ class MotionModel(ABC):
         self.waypoints = settings.waypoints
         self.dof = robot.dof
         self.schedule = NoiseSchedule(settings.schedule)
-        self.objective: Objective = OBJECTIVES.make(settings.objective)
+        self.objective = OBJECTIVES[settings.objective]
         self.is_unit_joints = settings.target == "limits"
         """Whether x is the normalized joint values themselves, relative to nothing."""
 
@@ -313,7 +312,7 @@ class MotionModel(ABC):
         points = points[encoder_settings.region.holds(points)]
         max_points = MAX_POINTS if encoder_settings.any_size else encoder_settings.cloud
         if len(points) > max_points:
-            rng = np.random.default_rng(0) if rng is None else rng
+            rng = rng or np.random.default_rng(0)
             points = points[rng.choice(len(points), max_points, replace=False)]
         return self.code_of(encoder_settings.prepared(points))
 
@@ -326,11 +325,9 @@ class MotionModel(ABC):
         parts = [x] if self.is_unit_joints else [x, unit]
         if not self.settings.clearance_features:
             return np.concatenate(parts, axis=-1)
-        low = MIN_CLEARANCE
-        high = MAX_CLEARANCE
         inputs = clearances(self.normalizer.from_unit(unit))
-        near = np.clip(inputs[..., : len(self.robot.links)], low, high)
-        near = (near - (low + high) / 2) * (2 / (high - low))
+        near = np.clip(inputs[..., : len(self.robot.links)], MIN_CLEARANCE, MAX_CLEARANCE)
+        near = (near - (MIN_CLEARANCE + MAX_CLEARANCE) / 2) * (2 / (MAX_CLEARANCE - MIN_CLEARANCE))
         parts.append(near.astype(np.float32, copy=False))
         if self.settings.clearance_gradients:
             parts.append(np.clip(inputs[..., -self.dof :] / np.float32(GRADIENT_UNIT), -1, 1))

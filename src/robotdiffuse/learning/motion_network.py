@@ -72,7 +72,7 @@ class MotionNetwork(Network, MotionModel):
     @property
     def statistics(self) -> Statistics:
         """See `MotionModel`; the network must be on the CPU."""
-        return Statistics(self.residual_scale.numpy(), self.residual_mean.numpy(), self.noise_factor.numpy())
+        return Statistics(*(getattr(self, name).numpy() for name in Statistics._fields))
 
     def fit_statistics(self, q: Float[ndarray, "n waypoints dof"], smooth_noise: bool) -> None:
         """Set, from trajectories [rad], the scale of residuals, their mean and the covariance of the noise.
@@ -83,10 +83,11 @@ class MotionNetwork(Network, MotionModel):
             return
         self.residual_scale.fill_(1.0)
         self.residual_mean.fill_(0.0)
-        if self.settings.target == "absolute":
-            x = self.normalize(q, self.reference(q[:, 0], q[:, -1]))
-            self.residual_mean.copy_(torch.from_numpy(x[:, 1:-1].mean((0, 1))))
         x = self.normalize(q, self.reference(q[:, 0], q[:, -1]))
+        if self.settings.target == "absolute":
+            mean = x[:, 1:-1].mean((0, 1))
+            self.residual_mean.copy_(torch.from_numpy(mean))
+            x = x - mean
         scale = np.maximum(np.sqrt((x[:, 1:-1] ** 2).mean((0, 1))), 1e-4)
         self.residual_scale.copy_(torch.from_numpy(scale))
         self.noise_factor.copy_(torch.from_numpy(noise_factor(x / scale, smooth_noise)))

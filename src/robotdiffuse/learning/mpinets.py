@@ -227,11 +227,11 @@ class MPiNetsNetwork(BaselineNetwork):
         self._distance = ArmDistance(kinematics)
         on_arm = self._surface(torch.zeros(self.dof)).shape[0]
         links = on_arm // s.robot_points
-        at = torch.arange(on_arm).view(links, s.robot_points)
-        self._target = at[:, : s.target_points].reshape(-1)
-        labels = [torch.zeros(s.scene_points, dtype=torch.int64), 1 + at // s.robot_points]
-        labels.append(1 + links + self._target // s.robot_points)
-        label = torch.cat([part.reshape(-1) for part in labels])
+        self._target = torch.arange(on_arm).view(links, -1)[:, : s.target_points].flatten()
+        link = 1 + torch.arange(links)
+        scene = torch.zeros(s.scene_points, dtype=torch.int64)
+        on_robot = link.repeat_interleave(s.robot_points)
+        label = torch.cat([scene, on_robot, links + link.repeat_interleave(s.target_points)])
         self._labels = nn.functional.one_hot(label, 1 + 2 * links).float()
         """One-hot labels: scene, each link of the robot, each link of the target."""
         self.first = SetAbstraction(1 + 2 * links, s.first_widths, s.centers[0], s.neighbors[0], RADII[0])

@@ -96,12 +96,6 @@ def exported(
         )
     assert program is not None
     model = program.model_proto
-    for graph_input in model.graph.input:
-        sizes = graph_input.type.tensor_type.shape.dim
-        fixed = [axis for axis in dynamic.get(graph_input.name, {}) if not sizes[axis].dim_param]
-        assert not fixed, (
-            f"axes {fixed} of {graph_input.name} have become fixed: use shape[axis], not len or int"
-        )
     _store_in_half(model.graph)
     for node in model.graph.node:
         del node.metadata_props[:]  # stack traces with paths of this machine

@@ -42,8 +42,8 @@ class VisibleRegion(Settings, name="region"):
                 f"floor is {self.floor}; it must be below the top of the reach, {self.center[2] + self.reach}"
             )
 
-    def holds(self, points: Float[ndarray, "*b 3"]) -> ndarray:
-        """Which points are in the region."""
+    def holds(self, points: Any) -> Any:
+        """Which points are in the region; points: array or tensor [..., 3] [m]."""
         x, y, z = (points[..., i] - self.center[i] for i in range(3))
         return (points[..., 2] > self.floor) & (x * x + y * y + z * z < self.reach**2)
 

@@ -17,7 +17,7 @@ from helpers.small_model import SMALL_ENCODER
 from helpers.training_log import read_log
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.output_files import lock_folder
-from robotdiffuse.learning.checkpoint import load_encoder, load_model, read_tensors
+from robotdiffuse.learning.checkpoint import load_encoder, load_network, read_tensors
 from robotdiffuse.learning.denoisers import DENOISERS, TransformerSettings, UNetSettings
 from robotdiffuse.learning.diffusion import OBJECTIVES
 from robotdiffuse.learning.encoders import make_encoder
@@ -30,7 +30,7 @@ from robotdiffuse.learning.training.batches import Batch, Batches, fast_bf16, lo
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
 from robotdiffuse.learning.training.loop import Processes, TrainingRun
 from robotdiffuse.learning.training.losses import LossSettings
-from robotdiffuse.learning.training.tasks import free_in_scene, train_encoder, train_planner
+from robotdiffuse.learning.training.tasks import train_encoder, train_planner
 from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.surface_points import sample_surface
@@ -216,7 +216,7 @@ def test_planner_learns_which_side(tmp_path, data, arm):
     assert report["samples"] == 4800
     assert 0.0 <= report["success"] <= 1.0 and float(rows[-1]["success"]) == pytest.approx(report["success"])
     assert list((out / "tensorboard").iterdir()), "the extra `train` is installed: a log for TensorBoard"
-    model = load_model(out, arm)
+    model = load_network("model", out, arm)
     about = json.loads((out / "model.json").read_text())
     loaded = load_data(str(data), arm, model.encoder, WAYPOINTS, print)
     assert about["training"]["trajectories"] == len(loaded)
@@ -250,19 +250,9 @@ def test_other_settings_and_a_damaged_checkpoint_are_refused(tmp_path, data):
 
 
 @pytest.mark.usefixtures("no_export")
-def test_trains_without_some_conditions(data, tmp_path):
+def test_trains_without_some_conditions(data, tmp_path, arm):
     small = UNetSettings(width=8, multiples=(1, 2), kernel=3, condition_width=16)
     settings = planner_settings(data, condition_drop=0.5, denoiser="unet", denoiser_settings=small)
     assert np.isfinite(train_planner(settings, str(tmp_path / "out"))["validation"])
-    model = load_model(tmp_path / "out")
+    model = load_network("model", tmp_path / "out", arm)
     assert model.null_condition is not None and model.null_condition.abs().min() > 0
-
-
-def test_motion_through_the_floor_or_an_obstacle_is_not_free() -> None:
-    panda = rd.load_robot("panda")
-    start = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
-    beside, down = start + np.array([[1.0, 0, 0, 0, 0, 0, 0], [0, 2.485, 0, 0, 0, 0, 0]])
-    motions = np.linspace([start, start], [beside, down], 5, axis=1)
-    shapes = rd.Box((0.0, 0.0, -0.05), (2.0, 2.0, 0.1)), rd.Sphere((0.4, 0.2, 0.6), 0.1)
-    for scene, free in ((rd.Scene(shapes[:1]), [True, False]), (rd.Scene(shapes), [False, False])):
-        assert free_in_scene(CollisionChecker(panda, scene), motions).tolist() == free

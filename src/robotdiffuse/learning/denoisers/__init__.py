@@ -3,7 +3,7 @@
 Nothing here loads PyTorch, so that planning can read the settings. The networks are in `denoisers.networks`.
 
 The table gives the millions of parameters for a Panda, of the default settings (48 waypoints) and of
-`paper_size` (254 waypoints). The last two columns are the time of a forward pass with the default settings,
+`PAPER_SIZES` (254 waypoints). The last two columns are the time of a forward pass with the default settings,
 relative to the transformer, which takes 5.8 ms in bf16 and 10.7 ms in fp32 (batch of 16, one thread, torch
 2.13, CPU with AVX-512 BF16). Other processes were running, so times are accurate to about 20 %.
 
@@ -28,18 +28,12 @@ from robotdiffuse.core.settings import Count, Settings, Sizes
 class DenoiserSettings(Settings):
     """Settings of a denoiser."""
 
-    @classmethod
-    def paper_size(cls) -> "DenoiserSettings":
-        """Settings of about the size of the paper's network: 8 layers of width 512 and a token per
-        waypoint."""
-        return cls()
-
 
 @dataclass(frozen=True)
 class AttentionSettings(DenoiserSettings):
     """Settings of all transformers. z_tk is the token that carries the condition and the noise level.
 
-    The paper states neither the number of heads nor the size of the hidden layer: `paper_size` has the sizes
+    The paper states neither the number of heads nor the size of the hidden layer: `PAPER_SIZES` has those
     of the network that the paper follows, the motion diffusion model of Tevet et al. 2023.
     """
 
@@ -67,10 +61,6 @@ class AttentionSettings(DenoiserSettings):
         if self.width % 2:  # sines and cosines
             raise InputError(f"{kind}.width is {self.width}; it must be even")
 
-    @classmethod
-    def paper_size(cls) -> "AttentionSettings":
-        return cls(512, 8, 4, 1024, patch=1)
-
     def tokens(self, waypoints: int) -> int:
         """The number of patches. Raises InputError unless the waypoints can be divided into patches."""
         if waypoints % self.patch:
@@ -86,10 +76,6 @@ class TransformerSettings(AttentionSettings, name="transformer"):
     """Whether z_tk is also added to every other token, so that the first layer need not distribute it. If
     not, z_tk is only a token, as in the paper."""
 
-    @classmethod
-    def paper_size(cls) -> "TransformerSettings":
-        return cls(512, 8, 4, 1024, patch=1, add_z_tk=False)
-
 
 @dataclass(frozen=True)
 class EncoderDecoderSettings(AttentionSettings, name="encoder_decoder"):
@@ -104,10 +90,6 @@ class EncoderDecoderSettings(AttentionSettings, name="encoder_decoder"):
     hidden: Count = 432
     """Size of the hidden layer of each feed-forward network."""
 
-    @classmethod
-    def paper_size(cls) -> "EncoderDecoderSettings":
-        return cls(512, 4, 4, 1024, patch=1)
-
 
 @dataclass(frozen=True)
 class DecoderOnlySettings(AttentionSettings, name="decoder_only"):
@@ -121,10 +103,6 @@ class CrossAttentionSettings(AttentionSettings, name="cross_attention"):
     points = True
     patch: Count = 8
     """Number of waypoints in a token; a divisor of the number of waypoints."""
-
-    @classmethod
-    def paper_size(cls) -> "CrossAttentionSettings":
-        return cls(512, 5, 4, 1024, patch=1)
 
 
 @dataclass(frozen=True)
@@ -146,10 +124,6 @@ class UNetSettings(DenoiserSettings, name="unet"):
         for name, width in (("width", self.width), ("condition_width", self.condition_width)):
             if width % 2:
                 raise InputError(f"unet.{name} is {width}; it must be even")
-
-    @classmethod
-    def paper_size(cls) -> "UNetSettings":
-        return cls(width=144, multiples=(1, 2, 4), kernel=5, condition_width=512)
 
 
 _NETWORKS = "robotdiffuse.learning.denoisers.networks"
@@ -180,3 +154,11 @@ DENOISERS = Registry(
     },
 )
 """Denoisers by their name in settings and checkpoints."""
+PAPER_SIZES: dict[str, DenoiserSettings] = {
+    "transformer": TransformerSettings(512, 8, 4, 1024, patch=1, add_z_tk=False),
+    "encoder_decoder": EncoderDecoderSettings(512, 4, 4, 1024, patch=1),
+    "decoder_only": DecoderOnlySettings(512, 8, 4, 1024, patch=1),
+    "cross_attention": CrossAttentionSettings(512, 5, 4, 1024, patch=1),
+    "unet": UNetSettings(width=144, condition_width=512),
+}
+"""Settings of about the size of the paper's network, 8 layers of width 512 and a token per waypoint."""

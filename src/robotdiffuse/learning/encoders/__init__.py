@@ -71,9 +71,7 @@ def curve_keys(points: Any) -> Any:
     return key
 
 
-def in_order(
-    points: Float32[ndarray, "n 3"], count: int, along_curve: bool = False
-) -> Float32[ndarray, "{count} 3"]:
+def in_order(points: Float32[ndarray, "n 3"], count: int, along_curve: bool) -> Float32[ndarray, "{count} 3"]:
     """`count` points of a cloud, sorted by x, then y, then z, or along the Z-order curve. A larger cloud is
     thinned evenly; points of a smaller cloud are repeated; an empty cloud gives zeros.
 

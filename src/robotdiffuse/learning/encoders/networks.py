@@ -41,12 +41,10 @@ class Encoder(SavedModule, ABC):
     empty."""
 
     settings: EncoderSettings
-    center: Tensor
 
     def __init__(self, settings: EncoderSettings) -> None:
         super().__init__()
         self.settings = settings
-        self.register_buffer("center", torch.tensor(settings.region.center), persistent=False)
 
     @abstractmethod
     def forward(self, cloud: Cloud) -> Codes:
@@ -61,9 +59,7 @@ class Encoder(SavedModule, ABC):
 
     def near(self, cloud: Cloud) -> Near:
         """Which points count: those in the region that are not the zeros with which `surface_clouds` pads."""
-        region = self.settings.region
-        inside = (cloud - self.center).square().sum(-1) < region.reach**2
-        return inside & (cloud[..., 2] > region.floor) & (cloud != 0).any(-1)
+        return self.settings.region.holds(cloud) & (cloud != 0).any(-1)
 
     def arrange(self, cloud: Cloud) -> Ordered:
         """The points of each cloud that count, in the form of `EncoderSettings.prepared`."""
@@ -141,6 +137,11 @@ def pool_max(features: Features, near: Near) -> Pooled:
 def pool_mean(features: Features, near: Near) -> Pooled:
     """Mean feature over the points that count; zeros for clouds without any."""
     return (features.float() * near[..., None]).sum(1) / near.sum(1, keepdim=True).clamp(min=1)
+
+
+def pool_both(features: Features, near: Near) -> Float[Tensor, "batch 2*channels"]:
+    """Maximum and mean feature over the points that count."""
+    return torch.cat([pool_max(features, near).float(), pool_mean(features, near)], -1)
 
 
 class CompressionAutoencoder(Autoencoder):
@@ -227,15 +228,12 @@ class PointAutoencoder(Autoencoder):
 
     def encode(self, cloud: Cloud) -> Codes:
         """z before standardization."""
-        near = self.near(cloud)[..., None]
+        near = self.near(cloud)
         with fp32(cloud):
             x = functional.relu(self.points[0](self._waves(cloud)))
         for layer in list(self.points)[1:]:
             x = functional.relu(layer(x))
-        x = x * near  # zeros do not change the maximum, because features are not negative
-        count = near.sum(1)
-        pooled = torch.cat([x.amax(1).float(), x.float().sum(1) / count.clamp(min=1)], -1)
-        return self.head(torch.where(count > 0, pooled, self.empty)).float()
+        return self.head(torch.where(near.any(1, keepdim=True), pool_both(x, near), self.empty)).float()
 
     def _waves(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch waves"]:
         """Coordinates with the sines and cosines of `wave_angles`."""
@@ -280,20 +278,13 @@ class PointAutoencoder(Autoencoder):
         low = np.array([-1.0, -1.0, 0.0])
         high = np.array([1.0, 1.0, 1.3])
         positions = torch.from_numpy(rng.uniform(low, high, (batch, DISTANCE_QUERIES, 3)).astype(np.float32))
-        chosen = torch.from_numpy(rng.integers(0, points, DISTANCE_QUERIES // 2))
-        spread = torch.from_numpy(
-            0.1 * rng.standard_normal((batch, DISTANCE_QUERIES // 2, 3), dtype=np.float32)
-        )
         positions = positions.to(cloud.device)
+        half = DISTANCE_QUERIES // 2
+        chosen = rng.integers(0, points, half)
+        spread = torch.from_numpy(0.1 * rng.standard_normal((batch, half, 3), dtype=np.float32))
         close = cloud[:, chosen] + spread.to(cloud.device)
-        away = ~self.near(close)[..., None]
-        return torch.cat(
-            [
-                torch.where(away, positions[:, : DISTANCE_QUERIES // 2], close),
-                positions[:, DISTANCE_QUERIES // 2 :],
-            ],
-            1,
-        )
+        positions[:, :half] = torch.where(self.near(close)[..., None], close, positions[:, :half])
+        return positions
 
     def penalized(self) -> Iterable[Tensor]:
         """All parameters."""
@@ -458,8 +449,7 @@ class DGCNN(Encoder):
         for layer in further_layers:
             features.append(layer(features[-1], near))
         x = self.embed(torch.cat(features, -1))
-        pooled = torch.cat([pool_max(x, near).float(), pool_mean(x, near)], -1)
-        return self.head(torch.where(near.any(1, keepdim=True), pooled, self.empty)).float()
+        return self.head(torch.where(near.any(1, keepdim=True), pool_both(x, near), self.empty)).float()
 
 
 class Points(Encoder):

@@ -3,7 +3,7 @@ drawn from both."""
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path as FilePath
@@ -73,7 +73,8 @@ class TrajectoryData:
     digest: str
     """The first 16 digits of the SHA-256 of the shards."""
     validation: int
-    """Number of rows of the validation split. They come last; all other rows are of the training split."""
+    """Number of rows of the validation split in the data of `load_data`. They come last; all other rows are
+    of the training split."""
 
     def __len__(self) -> int:
         return len(self.q)
@@ -81,7 +82,7 @@ class TrajectoryData:
     def split(self, most: int) -> "tuple[TrajectoryData, TrajectoryData]":
         """The rows for training, and at most `most` rows for validation."""
         cut = len(self) - self.validation
-        return self._rows(slice(None, cut), 0), self._rows(slice(cut, cut + most), min(most, self.validation))
+        return self._rows(slice(None, cut)), self._rows(slice(cut, cut + most))
 
     @cached_property
     def pools(self) -> tuple[Int[ndarray, "m"], Int[ndarray, "k"]]:
@@ -98,14 +99,10 @@ class TrajectoryData:
             rows[mask] = pool[rng.integers(0, max(len(pool), 1), int(mask.sum()))]
         return rows
 
-    def _rows(self, rows: slice, validation: int) -> "TrajectoryData":
-        return TrajectoryData(
-            self.q[rows],
-            self.scenes[rows],
-            self.trivial[rows],
-            None if self.codes is None else self.codes[rows],
-            self.digest,
-            validation,
+    def _rows(self, rows: slice) -> "TrajectoryData":
+        codes = None if self.codes is None else self.codes[rows]
+        return replace(
+            self, q=self.q[rows], scenes=self.scenes[rows], trivial=self.trivial[rows], codes=codes
         )
 
 

@@ -2,7 +2,6 @@
 
 import copy
 import os
-from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
@@ -64,22 +63,17 @@ class SamplePrefetcher:
         self._robot = robot
         self._batch = batch
         self._count, self._workers = workers, Workers(workers, partial(os.nice, NICENESS))
-        self._pending: deque[tuple[tuple[int, ...], Future[Samples]]] = deque()
+        self._pending: dict[tuple[int, ...], Future[Samples]] = {}
+        """Batches that are being drawn, by their seeds."""
 
     def next(self, rng: Generator) -> Samples:
         """The batch of samples with the seeds that `rng` draws."""
-        seeds = self._seeds(rng)
         if not self._count:
-            return draw_samples(self._families, self._robot, seeds)
-        if not self._pending or self._pending[0][0] != seeds:
-            self._pending.clear()
-            self._submit(seeds)
+            return draw_samples(self._families, self._robot, self._seeds(rng))
         following = copy.deepcopy(rng)
-        for _ in range(len(self._pending) - 1):
-            self._seeds(following)
-        while len(self._pending) <= BATCHES_AHEAD * self._count:
-            self._submit(self._seeds(following))
-        return self._pending.popleft()[1].result()
+        upcoming = [self._seeds(following) for _ in range(1 + BATCHES_AHEAD * self._count)]
+        self._pending = {seeds: self._pending.get(seeds) or self._submitted(seeds) for seeds in upcoming}
+        return self._pending[self._seeds(rng)].result()
 
     def close(self) -> None:
         """Stop the workers."""
@@ -88,9 +82,8 @@ class SamplePrefetcher:
     def _seeds(self, rng: Generator) -> tuple[int, ...]:
         return tuple(rng.integers(SEED_LIMIT, size=self._batch).tolist())
 
-    def _submit(self, seeds: tuple[int, ...]) -> None:
-        job = self._workers.submit(draw_samples, self._families, self._robot, seeds)
-        self._pending.append((seeds, job))
+    def _submitted(self, seeds: tuple[int, ...]) -> "Future[Samples]":
+        return self._workers.submit(draw_samples, self._families, self._robot, seeds)
 
 
 BUNDLED_WEIGHTS = "bundled"

@@ -17,33 +17,37 @@ from robotdiffuse.core.settings import (
     SettingsOf,
     Share,
 )
-from robotdiffuse.learning.denoisers import DENOISERS, DenoiserSettings, TransformerSettings, UNetSettings
+from robotdiffuse.learning.denoisers import (
+    DENOISERS,
+    PAPER_SIZES,
+    DenoiserSettings,
+    TransformerSettings,
+    UNetSettings,
+)
 from robotdiffuse.learning.diffusion import ScheduleSettings
 from robotdiffuse.learning.encoders import ENCODERS, EncoderSettings
 from robotdiffuse.learning.motion_model import MAX_WAYPOINTS, ModelParts, check_points
 from robotdiffuse.learning.training.losses import LossSettings
 from robotdiffuse.learning.weight_files import NETWORKS
 
-
-class Stage(NamedTuple):
-    """A part of a progressive training."""
-
-    end: float
-    """Share of the training after which the stage ends."""
-    block: int
-    """Number of waypoints in a block; their mean is a token."""
-
-
-STAGES = (Stage(0.72, 9), Stage(0.90, 4), Stage(1.0, 1))
-"""The stages of a progressive training."""
+STAGES = ((0.72, 9), (0.90, 4), (1.0, 1))
+"""The stages of a progressive training: the share of the training after which each ends, and its number of
+waypoints in a block; the mean of a block is a token."""
 
 
 def block_at(fraction: float) -> int:
     """Waypoints in a block when this fraction of a progressive training is done."""
-    return next((stage.block for stage in STAGES if fraction < stage.end), STAGES[-1].block)
+    return next((block for end, block in STAGES if fraction < end), STAGES[-1][1])
 
 
 ShareBelowOne = Annotated[float, Bound(least=0.0, below=1.0)]
+
+
+def one_length(given: dict[str, Any]) -> dict[str, Any]:
+    """Changes of settings in which the given length of a run, `minutes` or `samples`, replaces the other."""
+    if given.get("minutes") is not None:
+        return given | {"samples": None}
+    return given if given.get("samples") is None else given | {"minutes": None}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,8 +73,7 @@ class TrainingSettings(Settings):
     average: ShareBelowOne = 0.9995
     """Decay of the moving average of the weights; the average is what is saved."""
     bad_steps: Count = 10
-    """After this number of consecutive steps with a loss that is not finite, training goes back to the last
-    checkpoint."""
+    """After this number of consecutive steps with a loss that is not finite, training ends with an error."""
     threads: Count = 1
     """Number of threads of PyTorch. While other processes keep the cores busy, one thread is several times
     faster than two."""
@@ -188,10 +191,10 @@ class PlannerTraining(MotionTraining, ModelParts):
                 "progressive is True; it needs smooth_noise False, the denoiser transformer with patch 1, "
                 "and the objective clean"
             )
-        for stage in STAGES:
-            if (self.waypoints - 2) % stage.block:
+        for _, block in STAGES:
+            if (self.waypoints - 2) % block:
                 raise InputError(
-                    f"progressive is True and waypoints is {self.waypoints}; blocks of {stage.block} must "
+                    f"progressive is True and waypoints is {self.waypoints}; blocks of {block} must "
                     f"divide the {self.waypoints - 2} waypoints between start and goal"
                 )
 
@@ -211,7 +214,6 @@ class BaselineTraining(MotionTraining):
     """The networks are small: they train on the CPU."""
 
 
-JOINT = LossSettings()
 JOINT_POINT = LossSettings(point=0.3, waypoints=4)
 JOINT_POINT_COLLISION = LossSettings(point=0.3, collision=0.05, begin=0.3, waypoints=4)
 """Weights of the losses; the paper gives none. With these weights, the three losses are about equally large
@@ -256,7 +258,7 @@ CONFIGS: dict[str, Config] = {
             "sampling_steps": None,
             "validation_problems": 100,
             "checkpoint_seconds": 1_800.0,
-            "denoiser_settings": TransformerSettings.paper_size(),
+            "denoiser_settings": PAPER_SIZES["transformer"],
             **_TABLE2_ROW,
         },
     ),
@@ -281,7 +283,7 @@ CONFIGS: dict[str, Config] = {
     "table2_noise": Config(
         "the noise is predicted instead of x_0", {**_TABLE2_ROW, "objective": "noise", "smooth_noise": False}
     ),
-    "table2_joint": Config("L_joint alone", {**_TABLE2_ROW, "losses": JOINT}),
+    "table2_joint": Config("L_joint alone", {**_TABLE2_ROW, "losses": LossSettings()}),
     "table2_joint_point": Config("L_joint and L_point", {**_TABLE2_ROW, "losses": JOINT_POINT}),
     "table2_jpc": Config("L_joint, L_point and L_collision", _TABLE2_ROW),
     "trajectory_prior": Config(
@@ -315,11 +317,7 @@ def planner_training(name: str, given: dict[str, Any]) -> PlannerTraining:
     """
     if name not in CONFIGS:
         raise unknown_name("config", name, CONFIGS)
-    changes = CONFIGS[name].changes | given
+    changes = CONFIGS[name].changes | one_length(given)
     if "encoder" not in changes:
         raise InputError(f"config {name} needs an encoder: name a folder with a trained one")
-    if given.get("minutes") is not None:
-        changes["samples"] = None
-    elif given.get("samples") is not None:
-        changes["minutes"] = None
     return PlannerTraining(**changes)

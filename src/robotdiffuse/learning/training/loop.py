@@ -14,7 +14,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple, TypeVar
@@ -142,8 +142,6 @@ BAR_WIDTH = 24
 be printed again at every update."""
 LOG_EVERY = 50
 """log.csv gets a row every so many steps, and at each checkpoint."""
-MAX_ROLLBACKS = 5
-"""A run counts as diverged after this many returns to a checkpoint."""
 
 
 class Validation(NamedTuple):
@@ -199,8 +197,6 @@ class Position:
     seconds: float = 0.0
     skipped: int = 0
     """Number of steps that were skipped because loss or gradient was not finite."""
-    rollbacks: int = 0
-    """Number of returns to a checkpoint after such steps."""
 
 
 class TrainingRun:
@@ -211,7 +207,7 @@ class TrainingRun:
 
     Several processes, started by torchrun, are one run: each draws its own batches of the size in the
     settings, and all step by their mean gradient. The first process validates, shows progress and writes all
-    files; all processes read the folder. They stop, skip steps and return to checkpoints together.
+    files; all processes read the folder. They stop and skip steps together.
     """
 
     def __init__(self, task: TrainingTask, out: str) -> None:
@@ -240,7 +236,7 @@ class TrainingRun:
         self._bad = 0
         self._file = self.out / "training.safetensors"
         if self._file.is_file():
-            self._restore(check=True)
+            self._restore()
 
     @property
     def fraction(self) -> float:
@@ -272,7 +268,7 @@ class TrainingRun:
                     last = now
                     if self.at.step % LOG_EVERY == 0:
                         self._log(None)
-                        text = f"{self.rows[-1]['loss']:.4f}" if self.rows else ""
+                        text = f"{self.rows[-1]['loss']:.4f}"
                         progress.update(bar, completed=self.fraction, rate=f"{rate:,.0f}/s", loss=text)
                     if due:
                         self._checkpoint(progress.console)
@@ -295,7 +291,12 @@ class TrainingRun:
         self.at.step += 1
         self.at.samples += self._samples_per_step
         if not (math.isfinite(mean) and math.isfinite(norm.item())):
-            self._skip()
+            self._bad += 1
+            self.at.skipped += 1
+            if self._bad == self.settings.bad_steps:
+                raise InputError(
+                    f"training in {self.out} diverged: the loss is not finite at step {self.at.step}"
+                )
             return
         self._bad = 0
         self.optimizer.step()
@@ -316,22 +317,6 @@ class TrainingRun:
         share = self.settings.decay_share
         decay = max(0.0, (self.fraction - 1 + share) / share)
         return warmup * 0.5 * (1 + math.cos(math.pi * decay))
-
-    def _skip(self) -> None:
-        self._bad += 1
-        self.at.skipped += 1
-        if self._bad < self.settings.bad_steps:
-            return
-        at = self.at
-        if at.rollbacks >= MAX_ROLLBACKS or not self._file.is_file():
-            raise InputError(f"training in {self.out} diverged: the loss is not finite at step {at.step}")
-        random_state = self.rng.bit_generator.state  # kept, so that other batches follow this time
-        self._restore(check=False)
-        self.rng.bit_generator.state = random_state
-        self.at.skipped = at.skipped
-        self.at.rollbacks = at.rollbacks + 1
-        self.at.seconds = at.seconds
-        self._bad = 0
 
     @contextmanager
     def averaged(self) -> Iterator[None]:
@@ -430,18 +415,17 @@ class TrainingRun:
         with SummaryWriter(str(folder)) as writer:
             for row in self.rows:
                 for name in ("learning_rate", "loss", "validation", "success"):
-                    if row.get(name, "") != "":
+                    if row[name] != "":
                         writer.add_scalar(name, float(row[name]), int(row["samples"]))
 
-    def _restore(self, check: bool) -> None:
+    def _restore(self) -> None:
         tensors, notes = read_tensors(self._file)
 
         def state(part: str) -> dict[str, Tensor]:
             return {name.removeprefix(part): t for name, t in tensors.items() if name.startswith(part)}
 
         try:
-            if check:
-                self._check_same(notes)
+            self._check_same(notes)
             self.module.load_state_dict(state("module."))
             self.average.load_state_dict(state("average."))
             moments: dict[int, dict[str, Tensor]] = {}
@@ -449,7 +433,7 @@ class TrainingRun:
                 place, _, name = key.partition(".")
                 moments.setdefault(int(place), {})[name] = tensor
             self.optimizer.load_state_dict(self.optimizer.state_dict() | {"state": moments})
-            self.at = Position(**notes["at"])
+            self.at = Position(**{field.name: notes["at"][field.name] for field in fields(Position)})
             self.rng.bit_generator.state = notes["random"][self.processes.index]
             self._losses = notes["losses"]
             self.rows = notes["rows"]
@@ -508,10 +492,10 @@ def train(task: TrainingTask, out: str) -> dict[str, float]:
     with run.averaged():
         report = task.finish() | {"samples": float(run.at.samples)}
         minutes = round(run.at.seconds / 60, 2)
-        about = task.about() | {"minutes": minutes} | report
-        about |= {"robotdiffuse": __version__, "torch": torch.__version__}
-        about["made"] = f"{datetime.now(UTC):%Y-%m-%d}"
-        task.save(FilePath(out), {"settings": task.settings.to_json(), **about})
+        about = {"settings": task.settings.to_json(), **task.about(), "minutes": minutes, **report}
+        made = f"{datetime.now(UTC):%Y-%m-%d}"
+        versions = {"robotdiffuse": __version__, "torch": torch.__version__}
+        task.save(FilePath(out), about | versions | {"made": made})
     return task.processes.share(report)
 
 
@@ -548,7 +532,7 @@ class MotionTask(TrainingTask):
             print(text, file=sys.stderr)
 
     @abstractmethod
-    def loss_of(self, data: TrajectoryData, fraction: float, rng: Generator, validating: bool) -> Scalar:
+    def loss_of(self, data: TrajectoryData, fraction: float, rng: Generator) -> Scalar:
         """The loss of a random batch of these data."""
 
     def success(self, rng: Generator) -> float | None:
@@ -556,7 +540,7 @@ class MotionTask(TrainingTask):
         return None
 
     def loss(self, fraction: float, rng: Generator) -> Scalar:
-        return self.loss_of(self.train_data, fraction, rng, validating=False)
+        return self.loss_of(self.train_data, fraction, rng)
 
     def validate(self, fraction: float) -> Validation:
         if not len(self.validation_data):
@@ -564,8 +548,7 @@ class MotionTask(TrainingTask):
         rng = np.random.default_rng(7)
         with torch.no_grad():
             losses = [
-                self.loss_of(self.validation_data, fraction, rng, validating=True).item()
-                for _ in range(VALIDATION_BATCHES)
+                self.loss_of(self.validation_data, fraction, rng).item() for _ in range(VALIDATION_BATCHES)
             ]
             return Validation(float(np.mean(losses)), self.success(rng))
 

@@ -14,13 +14,14 @@ from numpy.random import Generator
 from torch import Tensor
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.motions import motions_free
+from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Mask
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.encoders import encoder_name, make_encoder
 from robotdiffuse.learning.encoders.networks import Autoencoder, Encoder, Loss
-from robotdiffuse.learning.guidance import CollisionGuidance, Trajectories
+from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.motion_model import (
     ModelParts,
     MotionModelSettings,
@@ -39,7 +40,13 @@ from robotdiffuse.learning.training.batches import (
     random_scenes,
     scene_clouds,
 )
-from robotdiffuse.learning.training.config import BaselineTraining, EncoderTraining, PlannerTraining, block_at
+from robotdiffuse.learning.training.config import (
+    BaselineTraining,
+    EncoderTraining,
+    PlannerTraining,
+    block_at,
+    one_length,
+)
 from robotdiffuse.learning.training.loop import MotionTask, Processes, TrainingTask, Validation, on_cpu, train
 from robotdiffuse.learning.training.losses import (
     POINT_UNIT,
@@ -126,8 +133,8 @@ time than the training between two validations."""
 PRIOR_GUIDANCE_STEPS = 4
 """Number of gradient steps of the guidance in each sampling step of a prior: a motion model without the scene
 as input."""
-CHECKS_PER_SEGMENT = 6
-"""Number of configurations that are checked in each segment from waypoint to waypoint."""
+CHECK_STEP = 0.02
+"""No point of the arm moves further than this between two checks of a sampled motion [m]."""
 
 
 def planning_success(
@@ -156,21 +163,13 @@ def planning_success(
             guide = partial(_guided, CollisionGuidance(checker))
         clearances = link_clearances(checker, model.settings)
         q = model.sample(start, goal, code.astype(np.float32), clearances, rng, settings, guide)
-        free.append(free_in_scene(checker, q).mean())
+        space = search_space(checker, CHECK_STEP)
+        free.append(np.mean([motions_free(space, motion).all() for motion in q]))
     return float(np.mean(free)) if free else float("nan")
 
 
 def _guided(guidance: CollisionGuidance, q: ndarray, _level: float) -> ndarray:
     return guidance(q, PRIOR_GUIDANCE_STEPS)[0]
-
-
-def free_in_scene(checker: CollisionChecker, q: Trajectories) -> Mask:
-    """Which motions are free in the checker's scene, at their waypoints and between them."""
-    fractions = np.linspace(0, 1, CHECKS_PER_SEGMENT, endpoint=False)[:, None]
-    dense = q[:, :-1, None] + fractions * np.diff(q, axis=1)[:, :, None]
-    dense = np.concatenate([dense.reshape(len(q), -1, q.shape[-1]), q[:, -1:]], 1)
-    free = checker.free(dense.reshape(-1, q.shape[-1])).reshape(len(q), -1)
-    return free.min(axis=1)
 
 
 VALIDATION_SAMPLES = 4
@@ -218,14 +217,14 @@ class PlannerTask(MotionTask):
         self.clearances = packed_clearances(robot, model.settings)
         self._loss = PlannerLoss(model, robot, settings, processes)
 
-    def loss_of(self, data: TrajectoryData, fraction: float, rng: Generator, validating: bool) -> Scalar:
+    def loss_of(self, data: TrajectoryData, fraction: float, rng: Generator) -> Scalar:
         settings = self.settings
         if settings.progressive:
             self.model.coarsen(block_at(fraction))
         batches = Batches(data, self._on_cpu, self.clearances, settings.trivial_share, settings.weight_limit)
         batch = batches.draw(settings.batch, rng)
         dropped = None
-        if settings.condition_drop > 0 and not validating:
+        if settings.condition_drop > 0 and data is self.train_data:
             dropped = torch.from_numpy(rng.random(settings.batch) < settings.condition_drop)
         return self._loss(batch, fraction, rng, dropped)
 
@@ -270,7 +269,7 @@ class PlannerLoss:
         self.points = (
             SurfacePoints(kinematics, self.settings.points, rng) if self.settings.point > 0 else None
         )
-        self.arm = ArmDistance(kinematics) if self.settings.collision > 0 else None
+        self.arm = ArmDistance(kinematics)
 
     def __call__(
         self,
@@ -284,9 +283,9 @@ class PlannerLoss:
         model = self.model
         losses = self.settings
         device = self.processes.device
-        features, level, condition, target, weight = (
-            torch.from_numpy(a).to(device)
-            for a in (batch.features, batch.level, batch.condition, batch.target, batch.weight)
+        features, level, condition, target, weight, clean_weight = (
+            torch.from_numpy(getattr(batch, name)).to(device)
+            for name in ("features", "level", "condition", "target", "weight", "clean_weight")
         )
         with self.processes.autocast():
             if batch.clouds is not None and model.encoder is not None:
@@ -297,7 +296,6 @@ class PlannerLoss:
         error = weight * losses.joint * (output - target)[:, 1:-1].square().mean((1, 2))
         collision_weight = losses.collision_weight(fraction)
         if self.points is not None or collision_weight > 0:
-            clean_weight = torch.from_numpy(batch.clean_weight).to(device)
             error = error + clean_weight * self._workspace_losses(batch, output, collision_weight, rng)
         return error.mean()
 
@@ -327,7 +325,7 @@ class PlannerLoss:
         if self.points is not None:
             moved = self.points(q) - self.points(model.joints_at(clean, base, waypoints))
             error = error + losses.point * (moved / POINT_UNIT).square().sum(-1).mean((1, 2))
-        if self.arm is not None and collision_weight > 0:
+        if collision_weight > 0:
             near = hinge(self.arm(q, batch.scenes), SAFE_DISTANCE) / POINT_UNIT
             error = error + collision_weight * near.sum(-1).mean(1)
         return error
@@ -361,9 +359,7 @@ def baseline_training(name: str, changes: dict[str, Any]) -> BaselineTraining:
     kind = NETWORKS.load(name)
     if not issubclass(kind, BaselineNetwork):
         raise InputError(f"{name} is no baseline; train it: robotdiffuse train {NETWORKS[name].kind}")
-    if changes.get("samples") is not None:
-        changes = changes | {"minutes": None}
-    return BaselineTraining(name=name, **(kind.training_defaults | changes))
+    return BaselineTraining(name=name, **(kind.training_defaults | one_length(changes)))
 
 
 def train_baseline(settings: BaselineTraining, out: str) -> dict[str, float]:
@@ -388,11 +384,5 @@ class _BaselineTask(MotionTask):
         self.module.fit_statistics(self.train_data)
         self.identity = {"robot": robot.name, "network": repr(default_settings)}
 
-    def loss_of(self, data: TrajectoryData, fraction: float, rng: Generator, validating: bool) -> Scalar:
+    def loss_of(self, data: TrajectoryData, fraction: float, rng: Generator) -> Scalar:
         return self.module.loss(data, self.settings.batch, fraction, rng)
-
-    def validate(self, fraction: float) -> Validation:
-        self.module.eval()
-        validation = super().validate(fraction)
-        self.module.train()
-        return validation
