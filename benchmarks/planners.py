@@ -190,11 +190,11 @@ def timing(cases: Sequence[Case], count: int = TIMED_PATHS) -> None:
         with Clock() as clock:
             time_parameterize(PANDA, path, always, always, TimingSettings())
         times.append(1e3 * clock.cpu)
-        fine = time_parameterize(PANDA, path, always, always, TimingSettings(sample_time=0.001))
+        fine = time_parameterize(PANDA, path, always, always, TimingSettings(sample_time=0.001)).trajectory
         worst[0] = max(worst[0], float((np.abs(fine.velocities) / PANDA.velocity).max()))
         worst[1] = max(worst[1], float((np.abs(fine.accelerations) / PANDA.acceleration).max()))
         limited = TimingSettings(sample_time=0.001, jerk=JERK)
-        gentle = time_parameterize(PANDA, path, always, always, limited)
+        gentle = time_parameterize(PANDA, path, always, always, limited).trajectory
         rates = np.diff(gentle.accelerations, axis=0) / np.diff(gentle.times)[:, None]
         jerk = max(jerk, float(np.abs(rates).max()) / JERK)
         longer.append(gentle.duration / fine.duration)

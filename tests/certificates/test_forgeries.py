@@ -38,7 +38,7 @@ def true(tmp_path_factory: pytest.TempPathFactory) -> tuple[FilePath, rd.Problem
     asked = {"waypoints": [MIDDLE], "moving": [ball], "constraints": [cone], "payload": rd.Payload(1.0, [0.0, 0.0, 0.05], HAND)}
     problem = rd.Problem(robot, rd.Scene([table]), START, GOAL, **asked)  # type: ignore[arg-type]
     ends = rd.Path(robot.joint_names, np.array([START, MIDDLE]))
-    half = time_parameterize(robot, ends, lambda _: True, lambda _: True)
+    half = time_parameterize(robot, ends, lambda _: True, lambda _: True).trajectory
     positions = np.concatenate([half.positions, half.positions[1:] + np.subtract(GOAL, MIDDLE)])
     rates = [np.concatenate([of, of[1:]]) for of in (half.velocities, half.accelerations)]
     times = np.append(half.times, half.duration + half.times[1:])

@@ -27,7 +27,7 @@ PANDA_START = np.array([-0.6, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 
 def motion(robot: rd.Robot, *waypoints: np.ndarray) -> rd.Trajectory:
     path = rd.Path(robot.joint_names, np.stack(waypoints))
-    return time_parameterize(robot, path, lambda _: True, lambda _: True)
+    return time_parameterize(robot, path, lambda _: True, lambda _: True).trajectory
 
 
 def test_a_motion_of_one_row_holds_still() -> None:

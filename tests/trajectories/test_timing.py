@@ -57,7 +57,7 @@ def timed(
     **more: Any,
 ) -> rd.Trajectory:
     path = rd.Path(robot.joint_names, np.asarray(q, float))
-    return time_parameterize(robot, path, valid, free or valid, settings, **more)
+    return time_parameterize(robot, path, valid, free or valid, settings, **more).trajectory
 
 
 def distance_to_polyline(points: np.ndarray, waypoints: np.ndarray) -> np.ndarray:

@@ -417,7 +417,9 @@ def test_jerk_is_reported_and_not_required() -> None:
     rows = np.array([[0.0, -1.5, 1.5, -1.5, -1.5, 0.0], [1.0, -1.2, 1.0, -1.5, -1.0, 0.0]])
     problem = rd.Problem(robot, rd.Scene(), rows[0], rd.JointGoal(rows[-1:]))
     reports = [
-        rd.verify(problem, time_parameterize(robot, rd.Path(robot.joint_names, rows), yes, yes, TimingSettings(jerk=jerk)))
+        rd.verify(
+            problem, time_parameterize(robot, rd.Path(robot.joint_names, rows), yes, yes, TimingSettings(jerk=jerk)).trajectory
+        )
         for jerk in (None, np.inf)
     ]
     limited, free = [report.jerk_share for report in reports]
@@ -511,7 +513,7 @@ def test_resampled_motions_keep_the_accelerations() -> None:
     robot = rd.load_robot("panda")
     rows = np.array([[0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785], [0.4, -0.5, 0.3, -2.0, 0.2, 1.8, 0.3]])
     problem = rd.Problem(robot, rd.Scene(), rows[0], rd.JointGoal(rows[-1:]))
-    motion = time_parameterize(robot, rd.Path(robot.joint_names, rows), yes, yes)
+    motion = time_parameterize(robot, rd.Path(robot.joint_names, rows), yes, yes).trajectory
     for rate in (30, 50, 125, 250, 1000):
         fewer = motion.resample(rate)
         assert rd.verify(problem, fewer).valid

@@ -152,8 +152,7 @@ class Planner:
             pose: Pose of the box in the frame of the move group.
             link_id: Ignored: the move group holds the box.
         """
-        T = matrix(pose)
-        self._hold(Box(np.zeros(3), size, name=HELD).moved(T))
+        self._hold(Box(np.zeros(3), size, name=HELD).moved(matrix(pose)))
 
     def update_attached_sphere(self, radius: float, pose: Any, link_id: int = -1) -> None:
         """Hold a sphere; see `update_attached_box`."""
@@ -249,14 +248,11 @@ class Planner:
         """A list with the reason why a configuration is refused even if all obstacles are ignored; empty if
         it is free."""
         start = self._start(qpos)
-        state = Workspace(self.workspace.robot, self.workspace.tip).is_free(start)
-        return [] if state else [state.reason]
+        return _reasons(Workspace(self.workspace.robot), start)
 
     def check_for_env_collision(self, qpos: ArrayLike, *_: Any, **_options: Any) -> list[str]:
         """A list with the reason why a configuration is refused among the obstacles; empty if it is free."""
-        start = self._start(qpos)
-        state = self.workspace.is_free(start)
-        return [] if state else [state.reason]
+        return _reasons(self.workspace, self._start(qpos))
 
     def _planned(
         self, failed: str, plan: Callable[..., PlanResult], qpos: ArrayLike, options: dict[str, Any]
@@ -335,6 +331,12 @@ class Planner:
     def _hold(self, shape: RigidShape) -> None:
         self.detach_object()
         self.workspace.robot = self.workspace.robot.attach(shape, self.workspace.tip)
+
+
+def _reasons(workspace: Workspace, q: ndarray) -> list[str]:
+    """The reason why a configuration is refused, in a list; empty if it is free."""
+    state = workspace.is_free(q)
+    return [] if state else [state.reason]
 
 
 def matrix(value: Any) -> ndarray:

@@ -37,7 +37,7 @@ from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.learned import Attempt, LearnedPlanner, LearnedSettings, ranked, scene_clouds
 from robotdiffuse.planning.search import rrt_kernel
 from robotdiffuse.planning.start_goal import StartGoal
-from robotdiffuse.trajectories.simplification import shortcut
+from robotdiffuse.trajectories.simplification import simplify
 
 if TYPE_CHECKING:
     from robotdiffuse.learning.mpnet import MPNetNetwork
@@ -148,7 +148,7 @@ class NeuralPlanning:
     def contracted(self, paths: list[Configurations]) -> list[Attempt]:
         """The paths after lazy states contraction, without states that free straight lines can skip; the best
         first."""
-        return ranked(self.space, [shortcut(self.space, path, 0, self.state) for path in paths])
+        return ranked(self.space, [simplify(self.space, path, 0) for path in paths])
 
     def between(
         self, starts: Configurations, goals: Configurations, stop_at_free: bool = False

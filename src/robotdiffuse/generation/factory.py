@@ -252,7 +252,7 @@ def _resampled(
         return None
     timed = time_parameterize(
         robot, waypoints, lambda motion: validator.trajectory(motion).valid, validator.collision_free
-    )
+    ).trajectory
     if not validator.trajectory(timed).valid:
         return None
     times = np.linspace(0.0, timed.duration, settings.waypoints)

@@ -3,6 +3,7 @@
 import inspect
 import re
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 from robotdiffuse.core.errors import InputError, shown
@@ -179,7 +180,8 @@ def planners_that_support(what: str) -> list[str]:
     return [name for name, entry in PLANNERS.items() if what in entry.supports]
 
 
-_planners: dict[tuple[str, str], "Planner"] = {}
+# a planner stays loaded for later calls with the same settings
+_loaded = lru_cache(MAX_LOADED)(load_planner)
 
 
 def plan(
@@ -241,12 +243,7 @@ def plan(
     PLANNERS.entry(planner)  # an unknown planner is reported before unknown settings
     if isinstance(settings, Mapping):
         settings = _default_settings(planner).replaced(settings)
-    loaded = _planners.get(key := (planner, repr(settings)))
-    if loaded is None:
-        while len(_planners) >= MAX_LOADED:  # drop the planner that was loaded first
-            _planners.pop(next(iter(tuple(_planners))), None)
-        loaded = _planners[key] = load_planner(planner, settings)
-    return loaded.plan(
+    return _loaded(planner, settings).plan(
         problem, time_limit, seed, until, clearance, velocity_scaling, acceleration_scaling, jerk, objective
     )
 

@@ -30,7 +30,6 @@ from robotdiffuse.problems.units import unit_notes
 from robotdiffuse.scenes.scene import contact_notes
 from robotdiffuse.trajectories.speed_limits import (
     DEFAULT,
-    NO_EXTRA_LIMITS,
     ExtraLimits,
     FrameSpeedLimits,
     Jerk,
@@ -300,16 +299,21 @@ class PlanningContext:
                 if report.violation is not None:
                     return self._refuse(report.violation, float(len(waypoints) - 1))
                 planning_time = self.elapsed
-                trajectory = trajectory or time_parameterize(
-                    problem.robot,
-                    path,
-                    lambda motion: report_of(motion).valid,
-                    self.validator.collision_free,
-                    self.timing,
-                    keeps,
-                    0.0 if problem.start_velocity is None else float(np.linalg.norm(problem.start_velocity)),
-                    self.beside,
-                    deviations,
+                trajectory = (
+                    trajectory
+                    or time_parameterize(
+                        problem.robot,
+                        path,
+                        lambda motion: report_of(motion).valid,
+                        self.validator.collision_free,
+                        self.timing,
+                        keeps,
+                        0.0
+                        if problem.start_velocity is None
+                        else float(np.linalg.norm(problem.start_velocity)),
+                        self.beside,
+                        deviations,
+                    ).trajectory
                 )
                 timed = report_of(trajectory)
         except OutOfTimeError as error:
@@ -354,8 +358,6 @@ class PlanningContext:
         frame_speeds = None
         if constraints is not None and len(constraints.speed_limited):
             frame_speeds = FrameSpeedLimits(constraints.speeds, constraints.speed_limits)
-        if frame_speeds is None and self.validator.dynamics is None:
-            return NO_EXTRA_LIMITS
         return ExtraLimits(frame_speeds, self.validator.dynamics)
 
     def _refuse(self, violation: Violation, end: float) -> None:

@@ -33,7 +33,7 @@ from robotdiffuse.robots.inverse_kinematics import (
 from robotdiffuse.robots.kinematics import link_jacobians, link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.curve_timing import time_curve
-from robotdiffuse.trajectories.speed_limits import scaled_limits, symmetric_bounds
+from robotdiffuse.trajectories.speed_limits import duration_of, scaled_limits, symmetric_bounds
 from robotdiffuse.trajectories.timing_kernel import fastest_speeds
 
 STAGE = "line"
@@ -104,8 +104,8 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
         second = np.diff(rows, 2, axis=0)
         second = np.concatenate([second[:1], second, second[-1:]])
         bounds = symmetric_bounds(limits[1], len(rows))
-        speeds = fastest_speeds(first, second, np.arange(float(len(rows))), limits[0], *bounds)
-        return float((2 / (speeds[1:] + speeds[:-1])).sum())
+        grid = np.arange(float(len(rows)))
+        return duration_of(grid, fastest_speeds(first, second, grid, limits[0], *bounds))
 
     def tried(end: Float[ndarray, "dof"] | None) -> bool:
         """Whether the line can be followed to its last pose, while joints are steered to the configuration

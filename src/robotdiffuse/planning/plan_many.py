@@ -6,7 +6,7 @@ from concurrent.futures import as_completed
 from contextlib import closing
 from dataclasses import fields, replace
 from numbers import Integral
-from typing import Any, NamedTuple
+from typing import Any
 
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.results import PlanResult
@@ -14,7 +14,6 @@ from robotdiffuse.core.settings import Settings
 from robotdiffuse.core.types import Status
 from robotdiffuse.planning import DEFAULT_PLANNER, load_planner
 from robotdiffuse.planning.context import PlanRequest
-from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.processes.ray_cluster import CLUSTERS
 from robotdiffuse.processes.workers import (
@@ -150,15 +149,11 @@ def _planned_on_cluster(
 def _plan_on_node(
     loaded: PlannerArguments, request: PlanRequest, problems: list[Problem]
 ) -> list[PlanResult]:
-    planner = load_planner(*loaded)
-    warm = set[Robot]()
+    session = _Session(loaded, request)
     results = []
     for problem in problems:
         try:
-            if problem.robot not in warm:
-                planner.warm_up(problem)
-                warm.add(problem.robot)
-            results.append(replace(planner.plan(problem, **vars(request)), problem=None))
+            results.append(session.plan(problem))
         except Exception as error:
             results.append(_error(loaded[0], problem, f"{type(error).__name__}: {error}", request))
     return results
@@ -168,27 +163,32 @@ def _error(planner: str, problem: Problem, reason: str, request: PlanRequest) ->
     return PlanResult(Status.ERROR, reason, planner, problem.robot.name, 0.0, request.seed)
 
 
-class _State(NamedTuple):
-    """What a worker process keeps between problems."""
+class _Session:
+    """A loaded planner, which compiles its code before the first problem of each robot."""
 
-    planner: Planner
-    robots: list[Robot]
-    request: PlanRequest
-    warm: set[Robot]
+    def __init__(self, loaded: PlannerArguments, request: PlanRequest) -> None:
+        self.planner = load_planner(*loaded)
+        self.request = request
+        self.warm = set[Robot]()
+
+    def plan(self, problem: Problem) -> PlanResult:
+        """The result without its problem, which the caller has."""
+        if problem.robot not in self.warm:
+            self.planner.warm_up(problem)
+            self.warm.add(problem.robot)
+        return replace(self.planner.plan(problem, **vars(self.request)), problem=None)
 
 
-_state: _State | None = None
+_state: tuple[_Session, list[Robot]] | None = None
+"""What a worker process keeps between problems."""
 
 
 def _prepare(loaded: PlannerArguments, robots: list[Robot], request: PlanRequest) -> None:
     global _state
-    _state = _State(load_planner(*loaded), robots, request, set())
+    _state = _Session(loaded, request), robots
 
 
 def _plan(robot: int, values: dict[str, Any]) -> PlanResult:
     assert _state is not None
-    problem = Problem(_state.robots[robot], **values)
-    if problem.robot not in _state.warm:
-        _state.planner.warm_up(problem)
-        _state.warm.add(problem.robot)
-    return replace(_state.planner.plan(problem, **vars(_state.request)), problem=None)  # the caller has it
+    session, robots = _state
+    return session.plan(Problem(robots[robot], **values))

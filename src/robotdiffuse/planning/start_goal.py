@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING
 
@@ -189,9 +190,9 @@ def usable_start_goal(context: PlanningContext) -> StartGoal | PlanResult:
         why = closeness(checker, context.problem.start)
         return context.fail(Status.INVALID_START, f"the start is too close to contact to plan from: {why}")
     if not start_goal.goals:
-        subject = "the goal is" if len(goals) == 1 else f"all {len(goals)} goal configurations are"
         why = closeness(checker, goals[0])
-        return context.fail(Status.INVALID_GOAL, f"{subject} too close to contact to plan to: {why}")
+        reason = f"{_all_goals(goals, 'is', 'are')} too close to contact to plan to: {why}"
+        return context.fail(Status.INVALID_GOAL, reason)
     return start_goal
 
 
@@ -223,10 +224,7 @@ def closeness(checker: CollisionChecker, q: Configuration) -> str:
     clearances = np.concatenate([checker.link_clearances(q[None])[0], checker.pair_clearances(q[None])[0]])
     deepest = int(clearances.argmin())
     link, partner = [*((link, None) for link in checker.links), *checker.pairs][deepest]
-    with loading():
-        from robotdiffuse.collision.exact_meshes import ExactCollision  # imports Coal, rarely needed
-
-    exact = ExactCollision(checker.robot, checker.scene)
+    exact = _loaded("collision.exact_meshes").ExactCollision(checker.robot, checker.scene)
     check = [frozenset(check) for check in exact.checks].index(frozenset((link, partner)))
     [distance], [obstacle] = exact.nearest(q[None], np.array([check]), np.array([np.inf]))
     spheres = str(obstacle) if partner is None else f"those of {partner}"
@@ -290,7 +288,7 @@ def _any_goals(
     many = MANY_GOALS <= len(goals) == len(exact) and len({goal.frame for goal in exact}) == 1
     if many and not context.problem.constraints:
         batches = list[ndarray]()
-        for configurations in _pose_goals_module().at_poses(
+        for configurations in _loaded("planning.pose_goals").at_poses(
             context.problem, exact, FIRST_TRY_COUNT, context.rng
         ):
             batches.append(configurations)
@@ -329,7 +327,7 @@ def _first_try(context: PlanningContext, goal: OneGoal, checker: CollisionChecke
         constraints = context.validator.constraints
         free = checker.free(goal.positions)
         return goal.positions[free if constraints is None else free & constraints.satisfied(goal.positions)]
-    configurations = _pose_goals_module().pose_configurations(
+    configurations = _loaded("planning.pose_goals").pose_configurations(
         context.problem, goal, context.rng, checker.free, count=FIRST_TRY_COUNT, rounds=1
     )
     return _with_turns(context, configurations) if len(configurations) else configurations
@@ -343,12 +341,9 @@ def _free_goals(
     if constraints is not None:
         satisfied = constraints.satisfied(positions)
         if not satisfied.any():
-            subject = (
-                "the goal does" if len(satisfied) == 1 else f"all {len(satisfied)} goal configurations do"
-            )
             wrong = constraints.worst_violation(positions[0])
             assert wrong is not None
-            reason = f"{subject} not keep the constraints: {wrong.message}"
+            reason = f"{_all_goals(positions, 'does', 'do')} not keep the constraints: {wrong.message}"
             return context.fail(Status.INVALID_GOAL, reason)
         positions = positions[satisfied]
     free = checker.free(positions)
@@ -358,14 +353,19 @@ def _free_goals(
     usable = [q for q, collision in zip(positions, collisions, strict=True) if collision is None]
     if usable:
         return np.stack(usable)
-    subject = "the goal is" if len(collisions) == 1 else f"all {len(collisions)} goal configurations are"
-    return context.fail(Status.INVALID_GOAL, f"{subject} in collision: {collisions[0]}")
+    reason = f"{_all_goals(positions, 'is', 'are')} in collision: {collisions[0]}"
+    return context.fail(Status.INVALID_GOAL, reason)
+
+
+def _all_goals(goals: Configurations, singular: str, plural: str) -> str:
+    """The beginning of a sentence about all goal configurations, with its verb."""
+    return f"the goal {singular}" if len(goals) == 1 else f"all {len(goals)} goal configurations {plural}"
 
 
 def _pose_goals(
     context: PlanningContext, goal: PoseGoal | PosesGoal, checker: CollisionChecker
 ) -> Configurations | PlanResult:
-    pose_configurations = _pose_goals_module().pose_configurations
+    pose_configurations = _loaded("planning.pose_goals").pose_configurations
     problem = context.problem
     rng = context.rng
     robot = problem.robot
@@ -435,12 +435,11 @@ def _pose_goals(
     )
 
 
-def _pose_goals_module() -> ModuleType:
-    """The module `pose_goals`, imported on first use because it imports compiled code."""
+def _loaded(name: str) -> ModuleType:
+    """A module of the package, imported on first use because it imports compiled code or Coal; this takes no
+    planning time."""
     with loading():
-        from robotdiffuse.planning import pose_goals
-
-    return pose_goals
+        return import_module(f"robotdiffuse.{name}")
 
 
 def _with_turns(context: PlanningContext, goals: Iterable[ndarray]) -> Configurations:
@@ -452,18 +451,12 @@ def _with_turns(context: PlanningContext, goals: Iterable[ndarray]) -> Configura
 
 def _free_meshes(robot: Robot, scene: Scene, q: Configurations) -> Configurations:
     """The configurations whose exact meshes are free."""
-    with loading():
-        from robotdiffuse.collision.exact_meshes import ExactCollision  # imports Coal, rarely needed
-
-    return q[~ExactCollision(robot, scene).collides(q)]
+    return q[~_loaded("collision.exact_meshes").ExactCollision(robot, scene).collides(q)]
 
 
 def _explained(robot: Robot, scene: Scene, q: Configuration) -> str | None:
     """A message that says what collides at q, by `explain_collision`; None if the meshes are free."""
-    with loading():
-        from robotdiffuse.collision.exact_meshes import explain_collision  # imports Coal, rarely needed
-
-    message = explain_collision(robot, scene, q)
+    message = _loaded("collision.exact_meshes").explain_collision(robot, scene, q)
     if message and any(isinstance(shape, SeenPoints) and shape.name in message for shape in scene.shapes):
         return f"{message}; these points may be the arm's own: state the view's noise and pose_deviation"
     return message

@@ -219,14 +219,13 @@ def plan_steps(
             return StepsResult(tuple(steps), results, space, f"solved in {k} steps", clock() - began)
         step = steps[k]
         where = f"step {k + 1} of {len(steps)}, {step.name}"
-        with located(where):
-            if isinstance(step, Attach | Detach):
-                space = copy(space)
+        if isinstance(step, Attach | Detach):
+            space = copy(space)
+            with located(where):
                 if isinstance(step, Attach):
                     space.attach(step.obstacle, q, step.link, step.touch_links)
                 else:
                     space.detach(step.held, q)
-        if isinstance(step, Attach | Detach):
             return planned(k + 1, space, q, (*results, None))
         alternatives = motions(k, space, q)
         while True:

@@ -80,22 +80,3 @@ def advance_then_brake(first_derivative, second_derivative, grid, greatest, s, s
         out[0, count], out[1, count] = s, np.sqrt(x)
     out[1, count] = 0.0
     return out[0, : count + 1].copy(), out[1, : count + 1].copy()
-
-
-@kernel()
-def state_after(path_values, speeds, time):
-    """s and ṡ at a time [s] after the beginning of a motion from `advance_then_brake`; at its end and later,
-    the last s and 0."""
-    time_left = time
-    for i in range(len(path_values) - 1):
-        width = path_values[i + 1] - path_values[i]
-        speed_sum = speeds[i] + speeds[i + 1]
-        if speed_sum <= 0:
-            return path_values[i], 0.0
-        duration = 2 * width / speed_sum
-        if time_left < duration:
-            path_acceleration = (speeds[i + 1] - speeds[i]) / duration
-            travel = (speeds[i] + 0.5 * path_acceleration * time_left) * time_left
-            return path_values[i] + travel, speeds[i] + path_acceleration * time_left
-        time_left -= duration
-    return path_values[-1], 0.0

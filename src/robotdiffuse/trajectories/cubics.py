@@ -16,14 +16,6 @@ from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.core.types import Configuration, Configurations, JointRows, JointValues, Trajectory, Values
 
 
-class CubicStates(NamedTuple):
-    """Positions, velocities and accelerations on the cubics."""
-
-    positions: Configurations
-    velocities: JointRows
-    accelerations: JointRows
-
-
 class Extremes(NamedTuple):
     """Extremes of the cubics of a motion."""
 
@@ -58,7 +50,7 @@ class Cubics:
         rows = trajectory.times, trajectory.positions, trajectory.velocities
         self.extremes = Extremes(*_extremes(*map(for_kernels, rows)))
 
-    def states(self, step: Int[ndarray, "n"], share: Values) -> CubicStates:
+    def states(self, step: Int[ndarray, "n"], share: Values) -> tuple[Configurations, JointRows, JointRows]:
         """Positions, velocities and accelerations within steps; `share`, from 0 to 1, is the fraction of the
         step's duration that has passed."""
         u = share[:, None]
@@ -68,32 +60,24 @@ class Cubics:
         q = self.trajectory.positions[step]
         v = self.trajectory.velocities[step]
         jerk = end - start
-        return CubicStates(
+        return (
             q + u * h * (v + u * h * (start / 2 + u * jerk / 6)),
             v + u * h * (start + u * jerk / 2),
             start + u * jerk,
         )
 
     def turns(self) -> tuple[Values, Configurations]:
-        """Times [s] within steps at which a joint reverses its direction, so that its position is extreme,
+        """Times [s] at which a joint reverses its direction, so that its position is extreme,
         and the positions of all joints at these times."""
-        # roots u in (0, 1) of the velocity divided by h, v + start u + curve u² / 2, in a form without
-        # cancellation
-        start = self.extremes.start
-        v = self.trajectory.velocities[:-1] / self.steps
-        curve = self.extremes.end - start
-        root = np.sqrt(np.maximum(start**2 - 2 * curve * v, 0.0))
-        far = -start - np.copysign(root, start)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            shares = np.stack([2 * v / far, far / curve])
-        within = (shares > 0) & (shares < 1)
-        steps = np.nonzero(within)[1]
-        shares = shares[within]
-        order = np.argsort(steps + shares)
-        steps = steps[order]
-        shares = shares[order]
-        times = self.trajectory.times[steps] + shares * self.steps[steps, 0]
-        return times, self.states(steps, shares).positions
+        if not len(self.steps):
+            return self.trajectory.times[:0], self.trajectory.positions[:0]
+        from scipy.interpolate import CubicHermiteSpline  # slow to import, rarely needed
+
+        rows = self.trajectory.times, self.trajectory.positions, self.trajectory.velocities
+        motion = CubicHermiteSpline(*rows)
+        roots = np.concatenate(motion.derivative().roots(discontinuity=False, extrapolate=False))
+        times = np.unique(roots[np.isfinite(roots)])  # where a joint rests, a root is NaN
+        return times, motion(times)
 
     def sampled(self, chord: float) -> tuple[Values, Configurations, JointValues]:
         """Times and positions of samples of the cubics, between which straight lines differ from the cubics
@@ -112,7 +96,7 @@ class Cubics:
         counts = np.maximum(counts, 1)
         step = np.repeat(np.arange(len(counts)), counts)
         share = np.concatenate([np.arange(n) / n for n in counts])
-        between = self.states(step, share).positions
+        between = self.states(step, share)[0]
         acceleration = self.extremes.acceleration
         joint_bounds = (acceleration * (self.steps / counts[:, None]) ** 2 / 8).max(axis=0)
         at = times[step] + share * self.steps[step, 0]

@@ -17,13 +17,14 @@ from robotdiffuse.trajectories.speed_limits import (
     ExtraLimits,
     TimingSettings,
     derivatives_and_limits,
+    duration_of,
     extra_slowdown,
     jerk_limits,
     jerk_windows,
     row_count,
     scaled_limits,
 )
-from robotdiffuse.trajectories.timing_kernel import ROUNDING_MARGIN, fastest_speeds
+from robotdiffuse.trajectories.timing_kernel import ROUNDING_MARGIN, fastest_speeds, states_at
 
 GRID_INTERVALS = 128
 """Number of equal intervals of s in which s̈ is constant."""
@@ -32,33 +33,21 @@ ACCELERATION_SHARES = (1.0, 0.7, 0.5, 0.35)
 longer. With lower accelerations, the jerk limits need a shorter averaging window."""
 
 
-class SmoothCurve:
-    """The cubic spline through configurations; its parameter s is the arc length of their polyline."""
-
-    def __init__(self, waypoints: Float[ndarray, "n dof"]) -> None:
-        self.knots = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1)))
-        self._spline = CubicSpline(self.knots, waypoints)
-
-    def __call__(self, s: Float[ndarray, "m"], order: int) -> Float[ndarray, "m dof"]:
-        """The curve (order 0) or its derivative of this order by s, at each s."""
-        return self._spline(s, order)
-
-
 def time_curve(
     robot: Robot,
     waypoints: Float[ndarray, "n dof"],
     settings: TimingSettings,
     extra: ExtraLimits = NO_EXTRA_LIMITS,
 ) -> Trajectory:
-    """The fastest motion from rest to rest along the smooth curve through configurations. There must be at
+    """The fastest motion from rest to rest along the cubic spline through configurations. There must be at
     least four, and neighbors must differ.
 
     Velocity, acceleration and jerk limits hold at every time. Raises OutOfTimeError if the deadline leaves no
     time.
     """
-    curve = SmoothCurve(waypoints)
-    grid = np.linspace(0.0, curve.knots[-1], GRID_INTERVALS + 1)
-    widths = np.diff(grid)
+    knots = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1)))
+    curve = CubicSpline(knots, waypoints)
+    grid = np.linspace(0.0, knots[-1], GRID_INTERVALS + 1)
     velocity, acceleration = scaled_limits(robot, settings)
     jerk = jerk_limits(robot, settings)
     best = None
@@ -66,14 +55,10 @@ def time_curve(
     for share in ACCELERATION_SHARES:
         limits = derivatives_and_limits(curve, grid, velocity, share * acceleration, extra)
         speeds = fastest_speeds(*limits)
-        ends = np.append(0.0, np.cumsum(2 * widths / (speeds[1:] + speeds[:-1])))
-        count = row_count(ends[-1], settings)
-        step = ends[-1] / count
-        times = step * np.arange(count + 1)
-        interval = np.clip(np.searchsorted(ends, times, side="right") - 1, 0, GRID_INTERVALS - 1)
-        s_acceleration = np.diff(speeds**2) / (2 * widths)
-        dt = times - ends[interval]
-        s = grid[interval] + (speeds[interval] + 0.5 * s_acceleration[interval] * dt) * dt
+        duration = duration_of(grid, speeds)
+        count = row_count(duration, settings)
+        step = duration / count
+        s = states_at(grid, speeds, step * np.arange(count + 1))[0]
         s[-1] = grid[-1]
         # average s over each window; the longer the window, the lower the jerk, and the later the end
         shortest = np.inf
@@ -89,8 +74,7 @@ def time_curve(
                 float(np.sqrt((np.abs(a) / acceleration).max())),
                 float(np.cbrt((np.abs(np.diff(a, axis=0)) / (step * jerk)).max())),
             )
-            if extra is not NO_EXTRA_LIMITS:
-                slower = max(slower, extra_slowdown(extra, q, v / slower, a / slower**2) * slower)
+            slower *= extra_slowdown(extra, q, v / slower, a / slower**2)
             duration = slower * clock[-1]
             shortest = min(shortest, duration)
             if duration < shortest_duration:

@@ -1,6 +1,5 @@
-"""Compiled simplification of paths: removing waypoints, smoothing corners, shortcuts.
+"""Compiled simplification of paths: removing waypoints, smoothing corners, tightening.
 
-Shortcuts follow R. Geraerts and M. Overmars, "Creating high-quality paths for motion planning", IJRR 2007.
 Corners are smoothed by B-spline subdivision as in W. Thomason, Z. Kingston and L. Kavraki, "Motions in
 Microseconds via Vectorized Sampling-Based Planning", ICRA 2024, and in OMPL's path simplifier.
 """
@@ -9,7 +8,7 @@ import numpy as np
 
 from robotdiffuse.collision.kernels.motions import distance, make_scratch, motion_free, path_length
 from robotdiffuse.collision.kernels.random import random
-from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
+from robotdiffuse.core.kernels import inner_kernel, kernel
 
 _ONE, _HALF = np.float32(1.0), np.float32(0.5)
 MAX_SUBDIVISIONS = 5
@@ -54,27 +53,12 @@ def simplify(space, path, rounds):
 
 
 @kernel(nogil=True)
-def shortcut(space, path, tries, state):
-    """A free path [n, dof] that is not longer than the free path `path` and has its start and goal.
-
-    Waypoints that a straight line can skip are removed. Then `tries` attempts alternate between a random
-    shortcut from one segment to another and a move of a waypoint towards the chord of its neighbors. state:
-    of the random generator.
-    """
-    scratch = make_scratch(space, space.lower)
-    points = _skipped(space, path, scratch)
-    if tries == 0 or len(points) <= 2:
-        return points
-    return _shortcuts(space, points, tries, scratch, state)
-
-
-@kernel(nogil=True)
 def tighten(space, path, tries, state):
     """A free path [n, dof] near the free path `path` that is not longer and has its start and goal.
 
-    Each of `tries` attempts removes or moves a random waypoint. Shortcuts and smoothing end with paths a
-    little longer than the shortest path of the homotopy class. Tightening comes closer without new corners,
-    which would slow the motion down. state: of the random generator.
+    Each of `tries` attempts removes or moves a random waypoint. Smoothing ends with paths a little longer
+    than the shortest path of the homotopy class. Tightening comes closer without new corners, which would
+    slow the motion down. state: of the random generator.
     """
     scratch = make_scratch(space, space.lower)
     points = path.copy()
@@ -151,91 +135,6 @@ def _smoothed(space, path, scratch):
             return points
         points = finer
     return points
-
-
-@inner_kernel()
-def _shortcuts(space, path, tries, scratch, state):
-    a = scratch.a
-    b = scratch.b
-    capacity = len(path) + tries + 2
-    dof = path.shape[1]
-    points = np.empty((capacity, dof), np.float32)
-    n = len(path)
-    points[:n] = path
-    for attempt in range(tries):
-        if n <= 2:
-            break
-        if attempt % 2 == 1:
-            _pull_in(space, points, n, scratch, state)
-            continue
-        total = path_length(points[:n])
-        s = random(state) * total
-        t = random(state) * total
-        if t < s:
-            s, t = t, s
-        i = _place_at(points, n, s, a)
-        k = _place_at(points, n, t, b)
-        # The remaining parts of both cut segments are checked again, since a check of a part samples other
-        # configurations than the check of its segment did.
-        if (
-            i == k
-            or not motion_free(space, a, b, scratch)
-            or not motion_free(space, points[i], a, scratch)
-            or not motion_free(space, b, points[k + 1], scratch)
-        ):
-            continue
-        # keep points[..i], a, b, points[k + 1..]
-        shift = 2 - (k - i)
-        if n + shift > capacity:
-            continue
-        if shift > 0:
-            for m in range(n - 1, k, -1):
-                points[m + shift] = points[m]
-        elif shift < 0:
-            for m in range(k + 1, n):
-                points[m + shift] = points[m]
-        points[i + 1] = a
-        points[i + 2] = b
-        n += shift
-    return _skipped(space, points[:n], scratch)
-
-
-@allocation_free()
-def _place_at(points, n, length, out):
-    """Writes the configuration at a distance `length` along the first n points to `out` [dof]; returns the
-    index of its segment."""
-    for i in range(n - 1):
-        d = distance(points[i], points[i + 1])
-        if length <= d or i == n - 2:
-            share = min(length / max(d, np.float32(1e-9)), _ONE)
-            for j in range(points.shape[1]):
-                out[j] = points[i, j] + share * (points[i + 1, j] - points[i, j])
-            return i
-        length -= d
-    return 0
-
-
-@inner_kernel()
-def _pull_in(space, points, n, scratch, state):
-    """Moves a random inner waypoint towards the chord of its neighbors. Each failed check reduces the move to
-    40 %; after four failed checks, the waypoint stays."""
-    trial = scratch.a
-    i = 1 + int(random(state) * np.float32(n - 2))
-    i = min(i, n - 2)
-    before = points[i - 1]
-    after = points[i + 1]
-    d1 = distance(before, points[i])
-    d2 = distance(points[i], after)
-    share = d1 / max(d1 + d2, np.float32(1e-9))
-    pull = np.float32(0.5) + np.float32(0.5) * random(state)
-    for _ in range(4):
-        for j in range(points.shape[1]):
-            chord = before[j] + share * (after[j] - before[j])
-            trial[j] = points[i, j] + pull * (chord - points[i, j])
-        if motion_free(space, before, trial, scratch) and motion_free(space, trial, after, scratch):
-            points[i] = trial
-            return
-        pull *= np.float32(0.4)
 
 
 @inner_kernel(inline="always")

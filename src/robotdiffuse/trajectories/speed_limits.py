@@ -14,7 +14,7 @@ from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories import timing_kernel
 from robotdiffuse.trajectories.corner_rounding import BlendedPolyline
-from robotdiffuse.trajectories.timing_kernel import fastest_speeds, sample_positions, slowdown
+from robotdiffuse.trajectories.timing_kernel import fastest_speeds, slowdown, states_at
 
 MAX_ROWS = 200_000
 """Largest number of rows of a motion between two stops; averaging for jerk limits adds further rows. Longer
@@ -141,13 +141,13 @@ def time_line(
         limits = velocity, share * acceleration
         speeds = _fastest_speeds(line, grid, *limits, extra=extra)
         speeds = _slow_to_extra_limits(line, grid, speeds, extra)
-        duration = _duration(grid, speeds)
+        duration = duration_of(grid, speeds)
         if 2 * (limits[1] / jerk).max() > duration:  # lower accelerations may then give a shorter motion
             share *= ACCELERATION_FACTOR
             continue
         count = row_count(duration, settings)
         step = duration / count
-        controls = sample_positions(line.arrays, grid, speeds, step * np.arange(count + 1))
+        controls = line(states_at(grid, speeds, step * np.arange(count + 1))[0], 0)
         controls[-1] = line.waypoints[-1]
         for window in jerk_windows(step, limits[1], jerk):
             rows = spline_rows(controls, step, window)
@@ -162,7 +162,7 @@ def time_line(
             break
     times, q, v, a = best
     # Averaging a motion within the extra limits may exceed these limits slightly.
-    slower = 1.0 if extra is NO_EXTRA_LIMITS else extra_slowdown(extra, q, v, a)
+    slower = extra_slowdown(extra, q, v, a)
     return times * slower, q, v / slower, a / slower**2
 
 
@@ -200,9 +200,9 @@ def _moving_start(robot: Robot, line: BlendedPolyline, settings: TimingSettings,
                 speeds = _fastest_speeds(after_lead, grid, velocity, share * acceleration, start_speed)
             except TooFastError:
                 break
-            count = int(np.ceil(_duration(grid, speeds) / step))
+            count = int(np.ceil(duration_of(grid, speeds) / step))
             check_timing(f"the {count} rows of a motion", SECONDS_PER_ROW * count)
-            controls = sample_positions(after_lead.arrays, grid, speeds, step * np.arange(count + 1))
+            controls = after_lead(states_at(grid, speeds, step * np.arange(count + 1))[0], 0)
             rows = spline_rows(controls, step, window, start_speed * direction)
             if window == windows[-1] or _keeps_jerk(rows, step, jerk):
                 rows[1][0] = line.waypoints[0]
@@ -252,7 +252,7 @@ def row_count(duration: float, settings: TimingSettings) -> int:
     return count
 
 
-def _duration(grid: Values, speeds: Values) -> float:
+def duration_of(grid: Values, speeds: Values) -> float:
     """Duration of a motion with these speeds [s]."""
     return float((2 * np.diff(grid) / (speeds[1:] + speeds[:-1])).sum())
 
@@ -310,8 +310,6 @@ def derivatives_and_limits(
     first = line(grid, 1)
     second = line(grid, 2)
     lowest, highest = symmetric_bounds(acceleration, len(grid))
-    if extra is NO_EXTRA_LIMITS:
-        return first, second, grid, velocity, lowest, highest
     columns = [(first, second, velocity, lowest, highest)]
     if extra.frame_speeds is not None:
         speeds = extra.frame_speeds.speeds(line(grid, 0), first)
@@ -340,7 +338,7 @@ def derivatives_and_limits(
 def _slow_to_extra_limits(line: BlendedPolyline, grid: Values, speeds: Values, extra: ExtraLimits) -> Values:
     """The speeds, slowed down so that frame speeds and torques keep their limits between grid points as
     well."""
-    if extra is NO_EXTRA_LIMITS:
+    if extra == NO_EXTRA_LIMITS:
         return speeds
     intervals = np.repeat(np.arange(len(grid) - 1), CHECKS_PER_INTERVAL + 1)
     share = np.tile(np.linspace(0.0, 1.0, CHECKS_PER_INTERVAL + 1), len(grid) - 1)

@@ -46,6 +46,16 @@ SAME_WAYPOINT_DISTANCE = 1e-6
 """Consecutive waypoints closer than this are merged [rad]."""
 
 
+class Timing(NamedTuple):
+    """A motion along a path."""
+
+    waypoints: Configurations
+    """The distinct waypoints of the path."""
+    deviations: Values
+    """How far the rounding of each inner waypoint leaves the path [rad, joint-space L2]; 0: a stop."""
+    trajectory: Trajectory
+
+
 def time_parameterize(
     robot: Robot,
     path: Path,
@@ -56,7 +66,8 @@ def time_parameterize(
     start_speed: float = 0.0,
     extra: ExtraLimits = NO_EXTRA_LIMITS,
     deviations: Values | None = None,
-) -> Trajectory:
+    stops: Sequence[int] = (),
+) -> Timing:
     """The fastest motion along the path, from rest to rest, within the robot's limits at every row.
 
     Corners of the path are rounded so that the motion need not stop there. If `valid` refuses the motion,
@@ -82,33 +93,16 @@ def time_parameterize(
         extra: Limits on frame speeds and torques, applied only if the motion begins at rest.
         deviations: How far the rounding at each waypoint may leave the path [n] [rad, joint-space L2];
             None: `settings.corner_deviation`.
+        stops: Rows of the path at which corners are not rounded.
 
     Returns:
-        The motion. Times start at 0 and strictly increase; the first and the last row are exactly the first
-        and the last waypoint. A path of length zero becomes two equal rows at rest.
+        The motion and its corners. Times start at 0 and strictly increase; the first and the last row are
+        exactly the first and the last waypoint. A path of length zero becomes two equal rows at rest.
 
     Raises:
         InputError: If a velocity or acceleration limit of a joint is below MIN_RATE.
         OutOfTimeError: If the deadline leaves no time.
     """
-    rounding = valid, free, settings, keeps, extra, deviations
-    return rounded_corners(robot, path, *rounding, start_speed=start_speed)[2]
-
-
-def rounded_corners(
-    robot: Robot,
-    path: Path,
-    valid: Callable[[Trajectory], bool],
-    free: Callable[[Path], bool],
-    settings: TimingSettings = DEFAULT,
-    keeps: Callable[[ndarray], bool] = lambda _: True,
-    extra: ExtraLimits = NO_EXTRA_LIMITS,
-    deviations: Values | None = None,
-    stops: Sequence[int] = (),
-    start_speed: float = 0.0,
-) -> tuple[Configurations, Values, Trajectory]:
-    """The distinct waypoints of a path [m, dof], the deviation of each rounded corner [m - 2] (0: a stop),
-    and the motion; see `time_parameterize`. Corners at the path's rows `stops` are not rounded."""
     _check_limits(robot)
     rows = _distinct(path.positions)
     waypoints = path.positions[rows]
@@ -116,7 +110,7 @@ def rounded_corners(
         still = np.zeros((2, robot.dof))
         times = np.array([0.0, settings.sample_time])
         resting = Trajectory(path.joint_names, times, path.positions[[0, -1]], still, still)
-        return waypoints, np.zeros(0), resting
+        return Timing(waypoints, np.zeros(0), resting)
     allowed = np.full(len(rows), settings.corner_deviation) if deviations is None else deviations[rows]
     allowed[np.searchsorted(rows, stops, side="right") - 1] = 0.0
     deviations = _shrunk(waypoints, allowed[1:-1], keeps, MIN_DEVIATION)
@@ -131,7 +125,7 @@ def rounded_corners(
     for attempt in range(MAX_TIMINGS):
         trajectory = _time_segments(robot, path, waypoints, deviations, slower, start_speed, extra)
         if not deviations.any() or valid(trajectory):
-            return waypoints, deviations, trajectory
+            return Timing(waypoints, deviations, trajectory)
         less = _shrunk(waypoints, deviations, lambda corner: free(replace(path, positions=corner)))
         if (less < deviations).any():
             deviations = less
@@ -146,7 +140,7 @@ def rounded_corners(
             slower = settings
     deviations = np.zeros(len(waypoints) - 2)
     trajectory = _time_segments(robot, path, waypoints, deviations, settings, start_speed, extra)
-    return waypoints, deviations, trajectory
+    return Timing(waypoints, deviations, trajectory)
 
 
 def _smaller(deviations: Values) -> Values:
@@ -266,28 +260,18 @@ class StopGraph:
     def __init__(
         self,
         robot: Robot,
-        path: Path,
-        valid: Callable[[Trajectory], bool],
-        free: Callable[[Path], bool],
+        timing: Timing,
         settings: TimingSettings,
         step: float,
-        keeps: Callable[[ndarray], bool] = lambda _: True,
         extra: ExtraLimits = NO_EXTRA_LIMITS,
-        deviations: Values | None = None,
-        required_stops: Sequence[int] = (),
     ) -> None:
-        """Every motion lasts a whole number of time steps `step` [s].
-
-        Corners are rounded as in `time_parameterize`, with its arguments `valid`, `free`, `keeps`, `extra`
-        and `deviations`. The path's rows `required_stops` are stops that no motion passes without stopping.
-        """
-        self.joint_names = path.joint_names
+        """The graph along the path of `timing`. Every motion lasts a whole number of time steps `step`
+        [s]."""
+        self.joint_names = robot.joint_names
         self.step = step
         self._extra = extra
-        waypoints, rounded, _ = rounded_corners(
-            robot, path, valid, free, settings, keeps, extra, deviations, required_stops
-        )
-        self.line = BlendedPolyline(waypoints, half_widths(waypoints, rounded))
+        rounded = timing.deviations
+        self.line = BlendedPolyline(timing.waypoints, half_widths(timing.waypoints, rounded))
         self.stops = self._find_stops(rounded)
         """The values of s along the path at which motions may stop, in order."""
         sharp = self.line.knots[1:-1][rounded == 0]

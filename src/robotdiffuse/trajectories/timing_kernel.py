@@ -94,11 +94,13 @@ def evaluate_at(waypoints, knots, directions, half_widths, s, order, out):
 @kernel()
 def evaluate(line, s, order):
     """q, q' or q'' (order 0, 1, 2) at values of s [m], as an array [m, dof]. `line` is the tuple (waypoints,
-    knots, directions, half_widths)."""
+    knots, directions, half_widths). At its end, q is exactly the last waypoint."""
     waypoints, knots, directions, half_widths = line
     out = np.empty((len(s), waypoints.shape[1]))
     for i in range(len(s)):
         evaluate_at(waypoints, knots, directions, half_widths, s[i], order, out[i])
+        if order == 0 and s[i] == knots[-1]:
+            out[i] = waypoints[-1]
     return out
 
 
@@ -363,30 +365,29 @@ def slowdown(line, grid, speeds, velocity, acceleration):
 
 
 @kernel()
-def sample_positions(line, grid, speeds, times):
-    """Positions [n, dof] of a motion at increasing times [n], from 0 on [s]; after its end, the last
-    waypoint.
+def states_at(grid, speeds, times):
+    """s and ṡ of a motion at increasing times [n], from 0 on [s]; after its end, the last s, at rest.
 
     grid, speeds: m values of s and ṡ there [m]; s̈ is constant between them.
     """
-    waypoints, knots, directions, half_widths = line
-    ends = np.zeros(len(grid))  # time at each grid point [s]
-    for i in range(len(grid) - 1):
-        speed_sum = speeds[i] + speeds[i + 1]
-        ends[i + 1] = ends[i] + (2 * (grid[i + 1] - grid[i]) / speed_sum if speed_sum > 0 else 0.0)
-    q = np.empty((len(times), waypoints.shape[1]))
+    s = np.full(len(times), grid[-1])
+    rates = np.zeros(len(times))
+    last = len(grid) - 1
     i = 0
+    begins = 0.0  # time at grid point i [s]
+    duration = 0.0
     for k in range(len(times)):
-        time = min(times[k], ends[-1])
-        while i < len(grid) - 2 and ends[i + 1] <= time:
+        while i < last:
+            speed_sum = speeds[i] + speeds[i + 1]
+            duration = 2 * (grid[i + 1] - grid[i]) / speed_sum if speed_sum > 0 else 0.0
+            if times[k] < begins + duration:
+                break
+            begins += duration
             i += 1
-        duration = ends[i + 1] - ends[i]
-        dt = time - ends[i]
-        u = (speeds[i + 1] - speeds[i]) / duration if duration > 0 else 0.0
-        s = min(grid[i] + (speeds[i] + 0.5 * u * dt) * dt, grid[i + 1])
-        if times[k] >= ends[-1]:
-            s = grid[-1]
-        evaluate_at(waypoints, knots, directions, half_widths, s, 0, q[k])
-        if s == knots[-1]:
-            q[k] = waypoints[-1]
-    return q
+        if i == last:
+            break
+        dt = times[k] - begins
+        u = (speeds[i + 1] - speeds[i]) / duration
+        s[k] = min(grid[i] + (speeds[i] + 0.5 * u * dt) * dt, grid[i + 1])
+        rates[k] = speeds[i] + u * dt
+    return s, rates

@@ -12,7 +12,7 @@ from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.deadline import OutOfTimeError, deadline
 from robotdiffuse.planning.pipeline.moving_obstacles import GRID_STEP, WAITED, earliest
 from robotdiffuse.trajectories.speed_limits import TimingSettings, jerk_limits
-from robotdiffuse.trajectories.timing import StopGraph
+from robotdiffuse.trajectories.timing import StopGraph, time_parameterize
 
 PANDA = rd.load_robot("panda")
 START, END = np.array([-1.0, 0.3, 0, -1.8, 0, 2.1, 0.8]), np.array([1.0, 0.3, 0, -1.8, 0, 2.1, 0.8])
@@ -118,7 +118,8 @@ def test_corners_are_rounded_as_far_as_the_planner_certified() -> None:
     path = rd.Path(PANDA.joint_names, np.stack([START, middle, END]))
     shortest = []
     for deviations in (None, np.zeros(3), np.full(3, 0.02)):
-        graph = StopGraph(PANDA, path, lambda _: True, lambda _: True, TimingSettings(), GRID_STEP, deviations=deviations)
+        timing = time_parameterize(PANDA, path, lambda _: True, lambda _: True, deviations=deviations)
+        graph = StopGraph(PANDA, timing, TimingSettings(), GRID_STEP)
         ends = 0, len(graph.stops) - 1
         shortest.append(min((m.ticks for m in graph.motions if (m.source, m.target) == ends), default=0))
     assert shortest[1] == 0 < shortest[0] < shortest[2]

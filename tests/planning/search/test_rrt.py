@@ -20,8 +20,8 @@ from robotdiffuse.planning.search import rrt_kernel
 from robotdiffuse.planning.search.rrt import AORRTC, AORRTCSettings, RRTConnect
 from robotdiffuse.planning.start_goal import retreat
 from robotdiffuse.problems.held_out import held_out_problem
-from robotdiffuse.trajectories.simplification import shortcut, simplify, tighten
-from robotdiffuse.trajectories.timing import time_parameterize
+from robotdiffuse.trajectories.simplification import simplify, tighten
+from robotdiffuse.trajectories.timing import Timing, time_parameterize
 
 PANDA = rd.load_robot("panda")
 WALL = rd.Scene([rd.Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.8], name="wall")])
@@ -148,7 +148,7 @@ def test_one_slow_validation_does_not_use_up_later_calls(monkeypatch: pytest.Mon
     """Regression: a first call, which loaded kernels, validated for a second; shorter calls then ended at once."""
     late = [0.0]
 
-    def slow(*arguments: Any, **others: Any) -> rd.Trajectory:
+    def slow(*arguments: Any, **others: Any) -> Timing:
         late[0] += 1.0
         return time_parameterize(*arguments, **others)
 
@@ -161,7 +161,7 @@ def test_one_slow_validation_does_not_use_up_later_calls(monkeypatch: pytest.Mon
         assert AORRTC().plan(AROUND, 0.3, until="time_limit").solved
 
 
-def test_simplification_and_shortcuts_keep_ends_and_freedom_and_do_not_lengthen() -> None:
+def test_simplification_keeps_ends_and_freedom_and_does_not_lengthen() -> None:
     space = search_space(CollisionChecker(PANDA, WALL), 0.04)
     for seed in range(5):
         state = random_state(seed)
@@ -170,12 +170,11 @@ def test_simplification_and_shortcuts_keep_ends_and_freedom_and_do_not_lengthen(
         simplified = [
             tighten(space, simplify(space, path, rounds), tries, state) for rounds, tries in ((0, 0), (1, 0), (4, 10), (1, 300))
         ]
-        for short in (*simplified, shortcut(space, path, 50, state)):
+        for short in simplified:
             assert np.array_equal(short[[0, -1]], path[[0, -1]])
             assert path_length(short) <= path_length(path) + 1e-4
             assert motions_free(space, short).all()
-        in_double = shortcut(space, path.astype(np.float64), 0, state)
-        assert np.array_equal(in_double, shortcut(space, path, 0, state))
+        assert np.array_equal(simplify(space, path.astype(np.float64), 0), simplify(space, path, 0))
 
 
 def test_a_long_detour_is_replaced() -> None:

@@ -7,11 +7,13 @@ that were seen since then.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import product
 
 import numpy as np
 from jaxtyping import Bool
 from numpy import ndarray
+from scipy.interpolate import BSpline
 
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.types import Path, Points, Trajectory
@@ -121,27 +123,22 @@ def _rows(motion: Trajectory, time: float, delay: float, braking: float, ramp: f
     duration = delay + braking
     count = max(int(np.ceil(duration / ROW_TIME)), 1)
     times = duration * np.arange(count + 1) / count
-    passed = times  # time of the motion that has passed [s]
-    speed = np.ones(count + 1)  # its first derivative
-    slowing = np.zeros(count + 1)  # its second derivative [1/s]
-    if braking > 0:
-        u = np.clip((times - delay) / braking, 0.0, 1.0)
-        peak = 1 / (1 - ramp)
-        remaining = 1 - u
-        # In the three parts, the deceleration rises, is constant and falls. Its integral is the loss of
-        # speed; u minus its second integral is the time of the motion that has passed, in braking times.
-        parts = [u < ramp, u <= 1 - ramp]
-        early = u - peak * u**3 / (6 * ramp)
-        middle = u - peak * (u**2 / 2 - ramp * u / 2 + ramp**2 / 6)
-        late = 0.5 - peak * remaining**3 / (6 * ramp)
-        passed = np.where(times < delay, times, delay + braking * np.select(parts, [early, middle], late))
-        slower = [peak * u**2 / (2 * ramp), peak * (u - ramp / 2)]
-        speed = 1 - np.select(parts, slower, 1 - peak * remaining**2 / (2 * ramp))
-        slowing = -np.select(parts, [peak * u / ramp, peak + 0 * u], peak * remaining / ramp) / braking
+    scale = max(braking, ROW_TIME)  # `braking` is 0 if the motion does not brake
+    u = np.maximum(times - delay, 0.0) / scale
+    slowing, loss, lost_time = _braking(ramp)
+    passed = times + braking * lost_time(u)  # time of the motion
     q, v, a, _ = motion.at(np.minimum(time + passed, motion.duration))
-    speed = speed[:, None]
-    slowing = slowing[:, None]
-    return Trajectory(motion.joint_names, times, q, v * speed, a * speed**2 + v * slowing)
+    speed = 1 + loss(u)[:, None]
+    return Trajectory(motion.joint_names, times, q, v * speed, a * speed**2 + v * slowing(u)[:, None] / scale)
+
+
+@lru_cache
+def _braking(ramp: float) -> tuple[BSpline, BSpline, BSpline]:
+    """The negative deceleration over the share of the braking time, its integral and its second integral."""
+    peak = 1 / (1 - ramp)
+    slowing = BSpline([0, 0, ramp, 1 - ramp, 1, 1], np.array([0, -peak, -peak, 0]), 1)
+    loss = slowing.antiderivative()
+    return slowing, loss, loss.antiderivative()
 
 
 def _within_limits(robot: Robot, motion: Trajectory) -> bool:

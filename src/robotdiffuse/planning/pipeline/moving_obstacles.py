@@ -226,20 +226,20 @@ def _timed(
     assert path is not None
     robot = problem.robot
     validator = verifier(replace(problem, moving=()))
-    if path.length < MIN_DISTANCE:
-        return time_parameterize(robot, path, lambda _: True, validator.collision_free, context.timing)
-    graph = StopGraph(
+    timing = time_parameterize(
         robot,
         path,
-        lambda t: validator.trajectory(t).valid,
+        lambda motion: validator.trajectory(motion).valid,
         validator.collision_free,
         context.timing,
-        GRID_STEP,
         context.keeps_constraints,
-        context.beside,
-        None if static.corner_deviations is None else np.array(static.corner_deviations),
-        _stops(problem, path),
+        extra=context.beside,
+        deviations=np.array(static.corner_deviations),
+        stops=_stops(problem, path),
     )
+    if path.length < MIN_DISTANCE:
+        return timing.trajectory
+    graph = StopGraph(robot, timing, context.timing, GRID_STEP, context.beside)
     links = compile_links(robot)[1]
     s, configurations = graph.sample(links.motion_radii.max(axis=0), GRID_TRAVEL)
     # ticks of a motion that stops at every place: the mean over the speed factors

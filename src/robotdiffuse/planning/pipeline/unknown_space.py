@@ -20,7 +20,7 @@ from observed ones.
 """
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -251,13 +251,13 @@ def with_assumption(problem: Problem, assumption: Assumption, goals: Configurati
     return replace(problem, scene=scene, goal=JointGoal(goals[easiest]), views=())
 
 
+@dataclass
 class _Attempts:
     """Calls a planner for problems under assumptions, within one planning call."""
 
-    def __init__(self, planner: Planner, context: PlanningContext, unknown: UnknownSpace) -> None:
-        self.planner = planner
-        self.context = context
-        self.unknown = unknown
+    planner: Planner
+    context: PlanningContext
+    unknown: UnknownSpace
 
     def best(self, problem: Problem, assumption: str, until: float) -> PlanResult:
         """A motion found before `until` [s since the call], or the result that says why there is none.
@@ -267,65 +267,47 @@ class _Attempts:
         """
         request = self.context.request
         if self.unknown.probability is None:
-            result = self._attempt(problem, until, request)
-            return _Motion(result, assumption, self.unknown).result if result.solved else result
-        motions = list[_Motion]()
+            return self._attempt(problem, assumption, until, request)
+        motions = list[PlanResult]()
         while len(motions) < MAX_FIRST_MOTIONS:
             quick = replace(request, until=FIRST, seed=request.seed + len(motions))
-            result = self._attempt(problem, until, quick)
+            result = self._attempt(problem, assumption, until, quick)
             if not result.solved and not motions:
                 return result
             if not result.solved:
                 break
-            motions.append(_Motion(result, assumption, self.unknown))
-            lowest_risk = min(motion.risk or 0.0 for motion in motions)
+            motions.append(result)
+            lowest_risk = min(motion.swept_probability or 0.0 for motion in motions)
             acceptable = ACCEPTABLE_RISK if len(motions) >= MIN_FIRST_MOTIONS else NEGLIGIBLE_RISK
             if self.context.elapsed >= until or lowest_risk <= acceptable:
                 break
         if request.until != FIRST and self.context.elapsed < until:
-            result = self._attempt(problem, until, request)
-            motions += [_Motion(result, assumption, self.unknown)] if result.solved else []
-        highest = max(motion.confidence for motion in motions)
-        best = [motion for motion in motions if motion.confidence >= highest - CONFIDENCE_TOLERANCE]
-        chosen = min(best, key=lambda motion: motion.length)
-        return replace(chosen.result, planning_time=self.context.elapsed)
+            result = self._attempt(problem, assumption, until, request)
+            motions += [result] if result.solved else []
+        least = max(motion.confidence or 0.0 for motion in motions) - CONFIDENCE_TOLERANCE
+        best = [motion for motion in motions if (motion.confidence or 0.0) >= least]
+        return replace(min(best, key=lambda motion: motion.path_length), planning_time=self.context.elapsed)
 
-    def _attempt(self, problem: Problem, until: float, request: PlanRequest) -> PlanResult:
+    def _attempt(self, problem: Problem, assumption: str, until: float, request: PlanRequest) -> PlanResult:
+        """The planner's result; a motion with the confidence under the assumption and with the unknown space
+        that it crosses."""
         context_request = self.context.request
         began = self.context.elapsed
         limit = max(until - began, MIN_TIME_FRACTION * context_request.time_limit)
         result = self.planner.attempt(problem, replace(request, time_limit=limit))
         progress = tuple((began + at, length) for at, length in result.progress)
-        return replace(
+        result = replace(
             result, planning_time=began + result.planning_time, progress=progress, seed=context_request.seed
         )
-
-
-class _Motion:
-    """A motion under an assumption, and the unknown space that it crosses."""
-
-    def __init__(self, result: PlanResult, assumption: str, unknown: UnknownSpace) -> None:
-        assert result.path is not None
-        self._result = result
-        self._assumption = assumption
-        self.length = result.path.length
-        self._crossed = unknown.crossed(result.path)
-        self.risk = self._crossed.risk
-        self.confidence = confidence(assumption, self._crossed)
-
-    @property
-    def result(self) -> PlanResult:
-        """The result with its assumption, its confidence and the unknown space that it crosses."""
-        result = self._result
-        if self._crossed.unseen_share > MAX_UNSEEN_SHARE:
-            result = replace(
-                result,
-                notes=(*result.notes, "the views see hardly anything of the space that the motion crosses"),
-            )
+        if not result.solved:
+            return result
+        crossed = self.unknown.crossed(result.path)
+        blind = "the views see hardly anything of the space that the motion crosses"
         return replace(
             result,
-            assumption=self._assumption,
-            confidence=self.confidence,
-            swept_probability=self.risk,
-            unknown_region=self._crossed.region,
+            notes=(*result.notes, blind) if crossed.unseen_share > MAX_UNSEEN_SHARE else result.notes,
+            assumption=assumption,
+            confidence=confidence(assumption, crossed),
+            swept_probability=crossed.risk,
+            unknown_region=crossed.region,
         )

@@ -23,8 +23,8 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories import braking_kernel
 from robotdiffuse.trajectories.corner_rounding import BlendedPolyline, half_widths
 from robotdiffuse.trajectories.speed_limits import TimingSettings, symmetric_bounds, timing_grid
-from robotdiffuse.trajectories.timing import rounded_corners
-from robotdiffuse.trajectories.timing_kernel import controllable, sample_positions
+from robotdiffuse.trajectories.timing import time_parameterize
+from robotdiffuse.trajectories.timing_kernel import controllable, states_at
 from robotdiffuse.validation.tolerances import DEFAULT
 from robotdiffuse.validation.validator import Verifier, verifier
 
@@ -50,7 +50,7 @@ class SpeedProfile(NamedTuple):
 
     def rest(self, time: float) -> "SpeedProfile":
         """The remaining motion from a time [s] after its beginning on."""
-        s, speed = braking_kernel.state_after(self.s, self.speeds, time)
+        s, speed = states_at(self.s, self.speeds, np.array([time]))
         later = self.s > s + 1e-12
         return SpeedProfile(np.append(s, self.s[later]), np.append(speed, self.speeds[later]))
 
@@ -99,7 +99,9 @@ class TimedPath:
             return distant.collision_free(Path(robot.joint_names, q))
 
         distant = verifier(validator.problem, replace(DEFAULT, contact=max(displacement, DEFAULT.contact)))
-        rows, deviations, _ = rounded_corners(robot, path, free, validator.collision_free, keeps=free_around)
+        rows, deviations, _ = time_parameterize(
+            robot, path, free, validator.collision_free, keeps=free_around
+        )
         line = BlendedPolyline(rows, half_widths(rows, deviations))
         for i in np.flatnonzero(deviations):
             width = line.half_widths[i]
@@ -145,9 +147,7 @@ class TimedPath:
 
     def positions(self, motion: SpeedProfile, times: Float[ndarray, "n"]) -> Configurations:
         """Configurations [n, dof] at times [s] after the beginning of a motion; at its end, the arm rests."""
-        s = np.append(motion.s, motion.s[-1])
-        speeds = np.append(motion.speeds, 0.0)
-        return sample_positions(self.line.arrays, s, speeds, times)
+        return self.line(states_at(*motion, times)[0], 0)
 
 
 MAX_DISPLACEMENT = 0.005

@@ -49,7 +49,7 @@ from robotdiffuse.planning.planner import Planner, ever_finer
 from robotdiffuse.planning.search import rrt_kernel
 from robotdiffuse.planning.search.rrt_kernel import INFINITE, add, nearest_few, rewire
 from robotdiffuse.planning.start_goal import StartGoal, falling_clearances, padded_space
-from robotdiffuse.trajectories.simplification import shortcut
+from robotdiffuse.trajectories.simplification import simplify, tighten
 
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 CAPACITY = 500_000
@@ -65,7 +65,7 @@ REMAINING_EXCESS = np.float32(0.5)
 MIN_PROMISE = np.float32(0.03)
 """Smallest weight in `draw_goal` of a goal that may still have the shortest path, so that every such goal is
 drawn at times."""
-SHORTCUTS = 20
+TIGHTENINGS = 200
 """Number of attempts to shorten a path."""
 
 
@@ -376,7 +376,7 @@ class SharedTreeSearch:
             self.round()
 
     def round(self) -> None:
-        """Run a round: one path by RRT-Connect, RRT* iterations, and shortcuts of the best path."""
+        """Run a round: one path by RRT-Connect, RRT* iterations, and a shorter best path."""
         settings = self.settings
         g = draw_goal(self.tree, self.targets, self._state)
         if g >= 0:
@@ -413,7 +413,8 @@ class SharedTreeSearch:
             self.targets.failures[targets] += 1
 
     def _graft(self, path: Configurations, g: int) -> None:
-        graft(self.tree, self.targets, shortcut(self._space, path, SHORTCUTS, self._state), g)
+        shorter = tighten(self._space, simplify(self._space, path, 0), TIGHTENINGS, self._state)
+        graft(self.tree, self.targets, shorter, g)
 
 
 class SharedTreeRRTStar(Planner[SharedTreeSettings]):
