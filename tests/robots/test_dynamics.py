@@ -108,7 +108,7 @@ def test_what_cannot_be_held_is_told(start: Any, goal: Any, status: rd.Status, w
 
 GOOD: dict[str, Any] = {"robot": "panda", "scene": [], "start": LOW, "goal": {"joints": FAR}}
 WRONG = {
-    "mass": ({"mass": -1}, "payload.mass is -1; it must be a number from 0 to 10000 kg"),
+    "mass": ({"mass": -1}, "payload.mass is -1; it must be a number of kg from 0 to 10000"),
     "no mass": ({"com": [0, 0, 0]}, "missing field of payload: mass|payload.*mass"),
     "link": ({"mass": 1, "link": "hand"}, "unknown link in payload.link: 'hand'"),
     "field": ({"mass": 1, "weight": 2}, "unknown field of payload: 'weight'"),

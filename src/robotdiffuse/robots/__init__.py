@@ -64,12 +64,10 @@ def names_a_file(name: str | Path) -> bool:
 
 
 def _by_name(name: str) -> Robot:
-    if name in ROBOTS:
-        return _read(DATA / name, None)
-    added = _added()
-    if name not in added:
-        raise unknown_name("robot", name, known_robots())
-    return _read(added[name], name)
+    robots = known_robots()
+    if name not in robots:
+        raise unknown_name("robot", name, robots)
+    return _read(robots[name], None if name in ROBOTS else name)
 
 
 def _read(folder: Path, source: str | None) -> Robot:

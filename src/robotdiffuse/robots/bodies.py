@@ -65,18 +65,13 @@ class AttachedBody(Value):
     tool: bool = False
     """Whether the body is a tool, which may become the tip."""
 
-
-class BodyContent:
-    """A key for caches: equal for bodies of equal content."""
-
-    def __init__(self, body: AttachedBody) -> None:
-        self.body, self._content = body, _content(body)
+    # bodies of equal content are equal, as keys of caches
 
     def __hash__(self) -> int:
-        return hash(self._content)
+        return hash(_content(self))
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, BodyContent) and self._content == other._content
+        return _content(self) == _content(other)
 
 
 def _content(value: Any) -> object:
@@ -142,24 +137,20 @@ class Payload(Value):
     """Moments of inertia about the center of mass, along the frame's axes [kg m²]; 0 for a point mass."""
 
     def __post_init__(self) -> None:
-        mass = numbers(self.mass)
-        if mass is None or mass.ndim != 0 or not 0 <= mass <= MAX_COORDINATE:
-            raise InputError(
-                f"payload.mass is {shown(self.mass)}; it must be a number from 0 to {MAX_COORDINATE:g} kg"
-            )
-        object.__setattr__(self, "mass", float(mass))
-        for name, lower in (("com", -MAX_COORDINATE), ("moments", 0.0)):
-            value = numbers(getattr(self, name))
+        for name, shape, lower in (("mass", (), 0.0), ("com", (3,), -MAX_COORDINATE), ("moments", (3,), 0.0)):
+            given = getattr(self, name)
+            value = numbers(given)
             if (
                 value is None
-                or value.shape != (3,)
+                or value.shape != shape
                 or not ((value >= lower) & (value <= MAX_COORDINATE)).all()
             ):
+                wanted = "a number of kg" if name == "mass" else "3 numbers"
                 raise InputError(
-                    f"payload.{name} is {shown(getattr(self, name))}; it must be 3 numbers from {lower:g} to "
+                    f"payload.{name} is {shown(given)}; it must be {wanted} from {lower:g} to "
                     f"{MAX_COORDINATE:g}"
                 )
-            object.__setattr__(self, name, value)
+            object.__setattr__(self, name, value if shape else float(value))
         if self.link is not None and not isinstance(self.link, str):
             raise InputError(f"payload.link is {shown(self.link)}; it must be the name of a link")
         super().__post_init__()

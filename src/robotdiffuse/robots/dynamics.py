@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, distinct
+from robotdiffuse.core.errors import InputError, distinct, needs
 from robotdiffuse.core.types import Configuration, Configurations
 from robotdiffuse.robots.bodies import Inertia, Payload
 from robotdiffuse.robots.robot import Robot
@@ -64,64 +64,6 @@ def product(a: Jet, b: Jet) -> Jet:
     return np.stack([a[0] * b[0], a[1] * b[0] + a[0] * b[1], a[2] * b[0] + 2 * a[1] * b[1] + a[0] * b[2]])
 
 
-def second_derivative_bounds(bodies: list[Body], gravity: float, along: Stretches) -> Configurations:
-    """Upper bounds on the second derivatives of joint torques by the fraction of the stretch, for each
-    stretch and joint."""
-    still = np.zeros((3, len(along.q)))
-    weight = still.copy()
-    weight[0] = gravity
-    # From the base to the tips, for each frame: its rate of rotation (by the fraction of the stretch), its
-    # angular velocity omega and angular acceleration alpha (by time), and the acceleration of its origin.
-    # The base accelerates upwards in place of gravity.
-    frames: list[tuple[Jet, Jet, Jet, Jet]] = []
-    axes: list[Jet] = []
-    arms: list[Jet] = []
-    for j, body in enumerate(bodies):
-        rotation, omega, alpha, linear = (
-            frames[body.parent] if body.parent >= 0 else (still, still, still, weight)
-        )
-        axis = _fixed(1.0, rotation)
-        arm = _fixed(body.offset, rotation)
-        v = along.v[:, :, j]
-        speed = along.speed[:, :, j]
-        joint_acceleration = along.acceleration[:, :, j]
-        along_axis = product(speed, axis)
-        if body.slides:
-            arm = arm + product(np.stack([along.q[:, j], v[0], v[1]]), axis)
-        linear = linear + product(alpha, arm) + product(omega, product(omega, arm))
-        if body.slides:
-            linear = linear + product(joint_acceleration, axis) + 2 * product(omega, along_axis)
-        else:
-            alpha = alpha + product(joint_acceleration, axis) + product(omega, along_axis)
-            omega = omega + along_axis
-            rotation = rotation + product(np.stack([v[0], v[1], v[2]]), axis)
-        frames.append((rotation, omega, alpha, linear))
-        axes.append(axis)
-        arms.append(arm)
-    # from the tips to the base: the force and moment that move each body and all bodies after it, and their
-    # components along the joints
-    forces = [still] * len(bodies)
-    moments = [still] * len(bodies)
-    bounds = np.empty(along.q.shape)
-    for j in reversed(range(len(bodies))):
-        body, (rotation, omega, alpha, linear) = bodies[j], frames[j]
-        lever = _fixed(body.lever, rotation)
-        body_force = body.mass * (linear + product(alpha, lever) + product(omega, product(omega, lever)))
-        inertia = body.moment * np.stack(
-            [np.ones_like(rotation[0]), 2 * rotation[0], 2 * rotation[1] + 4 * rotation[0] ** 2]
-        )
-        moment = (
-            product(inertia, alpha) + product(omega, product(inertia, omega)) + product(lever, body_force)
-        )
-        forces[j] = forces[j] + body_force
-        moments[j] = moments[j] + moment
-        bounds[:, j] = product(axes[j], forces[j] if body.slides else moments[j])[2]
-        if body.parent >= 0:
-            forces[body.parent] = forces[body.parent] + forces[j]
-            moments[body.parent] = moments[body.parent] + moments[j] + product(arms[j], forces[j])
-    return bounds
-
-
 def _fixed(length: float, turn: Jet) -> Jet:
     """Bounds for a vector of constant length that is fixed in a body with the rate of rotation `turn`."""
     return length * np.stack([np.ones_like(turn[0]), turn[0], turn[1] + turn[0] ** 2])
@@ -142,12 +84,8 @@ class Dynamics:
         Raises InputError for a robot without inertias or effort limits, for an unknown link, and if Pinocchio
         is not installed.
         """
-        try:
+        with needs("Pinocchio (for the payload)", "dynamics"):
             import pinocchio as installed
-        except ImportError:
-            raise InputError(
-                "payload needs Pinocchio, which is not installed: pip install robotdiffuse[dynamics]"
-            ) from None
         pinocchio: Any = installed  # compiled, without types
         check_dynamics(robot)
         link = payload.link or robot.tip
@@ -168,17 +106,18 @@ class Dynamics:
         up = np.array([0.0, 0.0, 1.0]) if T_world_base is None else T_world_base[2, :3]
         model.gravity.linear = -GRAVITY * up
         self._model, self._data = model, model.createData()
-        link_inertias = model.inertias.tolist()[1:]
         self._bodies = [
             Body(
                 int(robot.parents[j]) - 1,
                 bool(robot.prismatic[j]),
                 float(np.linalg.norm(T[:3, 3])),
-                float(link_inertias[j].mass),
-                float(np.linalg.norm(link_inertias[j].lever)),
-                float(np.linalg.eigvalsh(link_inertias[j].inertia)[-1]),
+                float(inertia.mass),
+                float(np.linalg.norm(inertia.lever)),
+                float(np.linalg.eigvalsh(inertia.inertia)[-1]),
             )
-            for j, T in enumerate(robot.frame_offsets)
+            for j, (T, inertia) in enumerate(
+                zip(robot.frame_offsets, model.inertias.tolist()[1:], strict=True)
+            )
         ]
 
     def torques(self, q: Configurations, v: Configurations, a: Configurations) -> Configurations:
@@ -191,7 +130,60 @@ class Dynamics:
     def second_derivatives(self, along: Stretches) -> Configurations:
         """Bounds on the second derivatives of torques by the fraction of the stretch, for each stretch and
         joint."""
-        return second_derivative_bounds(self._bodies, GRAVITY, along)
+        bodies = self._bodies
+        still = np.zeros((3, len(along.q)))
+        weight = still.copy()
+        weight[0] = GRAVITY
+        # From the base to the tips, for each frame: its rate of rotation (by the fraction of the stretch),
+        # its angular velocity omega and angular acceleration alpha (by time), and the acceleration of its
+        # origin. The base accelerates upwards in place of gravity.
+        frames: list[tuple[Jet, Jet, Jet, Jet]] = []
+        axes: list[Jet] = []
+        arms: list[Jet] = []
+        for j, body in enumerate(bodies):
+            rotation, omega, alpha, linear = (
+                frames[body.parent] if body.parent >= 0 else (still, still, still, weight)
+            )
+            axis = _fixed(1.0, rotation)
+            arm = _fixed(body.offset, rotation)
+            v = along.v[:, :, j]
+            speed = along.speed[:, :, j]
+            joint_acceleration = along.acceleration[:, :, j]
+            along_axis = product(speed, axis)
+            if body.slides:
+                arm = arm + product(np.stack([along.q[:, j], v[0], v[1]]), axis)
+            linear = linear + product(alpha, arm) + product(omega, product(omega, arm))
+            if body.slides:
+                linear = linear + product(joint_acceleration, axis) + 2 * product(omega, along_axis)
+            else:
+                alpha = alpha + product(joint_acceleration, axis) + product(omega, along_axis)
+                omega = omega + along_axis
+                rotation = rotation + product(v, axis)
+            frames.append((rotation, omega, alpha, linear))
+            axes.append(axis)
+            arms.append(arm)
+        # from the tips to the base: the force and moment that move each body and all bodies after it, and
+        # their components along the joints
+        forces = [still] * len(bodies)
+        moments = [still] * len(bodies)
+        bounds = np.empty(along.q.shape)
+        for j in reversed(range(len(bodies))):
+            body, (rotation, omega, alpha, linear) = bodies[j], frames[j]
+            lever = _fixed(body.lever, rotation)
+            body_force = body.mass * (linear + product(alpha, lever) + product(omega, product(omega, lever)))
+            inertia = body.moment * np.stack(
+                [np.ones_like(rotation[0]), 2 * rotation[0], 2 * rotation[1] + 4 * rotation[0] ** 2]
+            )
+            moment = (
+                product(inertia, alpha) + product(omega, product(inertia, omega)) + product(lever, body_force)
+            )
+            forces[j] = forces[j] + body_force
+            moments[j] = moments[j] + moment
+            bounds[:, j] = product(axes[j], forces[j] if body.slides else moments[j])[2]
+            if body.parent >= 0:
+                forces[body.parent] = forces[body.parent] + forces[j]
+                moments[body.parent] = moments[body.parent] + moments[j] + product(arms[j], forces[j])
+        return bounds
 
     def holding_torques(self, q: Configurations) -> Configurations:
         """Torques at rest [N m] or [N]."""

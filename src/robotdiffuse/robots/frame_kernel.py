@@ -59,10 +59,10 @@ def step(parent, offset, slides, q, child):
     """
     c, s, slide = (1.0, 0.0, q) if slides else (np.cos(q), np.sin(q), 0.0)
     for r in range(3):
-        x = parent[r, 0] * offset[0, 0] + parent[r, 1] * offset[1, 0] + parent[r, 2] * offset[2, 0]
-        y = parent[r, 0] * offset[0, 1] + parent[r, 1] * offset[1, 1] + parent[r, 2] * offset[2, 1]
-        z = parent[r, 0] * offset[0, 2] + parent[r, 1] * offset[1, 2] + parent[r, 2] * offset[2, 2]
-        t = parent[r, 0] * offset[0, 3] + parent[r, 1] * offset[1, 3] + parent[r, 2] * offset[2, 3]
+        x = dot(parent[r], column(offset, 0))
+        y = dot(parent[r], column(offset, 1))
+        z = dot(parent[r], column(offset, 2))
+        t = dot(parent[r], column(offset, 3))
         child[r, 0] = x * c + y * s
         child[r, 1] = y * c - x * s
         child[r, 2] = z

@@ -10,7 +10,7 @@ import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.core.kernels import inner_kernel, kernel
-from robotdiffuse.robots.frame_kernel import step
+from robotdiffuse.robots.frame_kernel import dot, length, step
 
 # values of `IKChain.kinds`
 REVOLUTE = 0
@@ -32,8 +32,8 @@ REQUIRED_PROGRESS = 0.5
 
 
 @inner_kernel()
-def forward(q, offsets, tool, kinds, length, T, axes, origins):
-    """Write the axes and origins of the first `length` joints, and the pose of the tool into T [3, 4].
+def forward(q, offsets, tool, kinds, joints, T, axes, origins):
+    """Write the axes and origins of the first `joints` joints, and the pose of the tool into T [3, 4].
 
     q [dof] is the configuration, offsets [dof, 4, 4], tool [4, 4] and kinds [dof] are as in `IKChain`; axes
     and origins are [dof, 3], in the base frame.
@@ -41,7 +41,7 @@ def forward(q, offsets, tool, kinds, length, T, axes, origins):
     T[:] = 0.0
     for i in range(3):
         T[i, i] = 1.0
-    for j in range(length):
+    for j in range(joints):
         step(T, offsets[j], kinds[j] == PRISMATIC, q[j], T)
         for i in range(3):
             axes[j, i] = T[i, 2]
@@ -61,21 +61,13 @@ def pose_error(T, target, rows, rotation_weight, error):
         error[i] = target[i, 3] - T[i, 3]
     if rows == 6:
         # the rotation vector of R = target @ T.T, from the sine and cosine of its angle
-        r01 = r02 = r10 = r12 = r20 = r21 = r00 = r11 = r22 = 0.0
-        for k in range(3):
-            r00 += target[0, k] * T[0, k]
-            r01 += target[0, k] * T[1, k]
-            r02 += target[0, k] * T[2, k]
-            r10 += target[1, k] * T[0, k]
-            r11 += target[1, k] * T[1, k]
-            r12 += target[1, k] * T[2, k]
-            r20 += target[2, k] * T[0, k]
-            r21 += target[2, k] * T[1, k]
-            r22 += target[2, k] * T[2, k]
-        x = 0.5 * (r21 - r12)
-        y = 0.5 * (r02 - r20)
-        z = 0.5 * (r10 - r01)
-        sine = np.sqrt(x * x + y * y + z * z)
+        x = 0.5 * (dot(target[2], T[1]) - dot(target[1], T[2]))
+        y = 0.5 * (dot(target[0], T[2]) - dot(target[2], T[0]))
+        z = 0.5 * (dot(target[1], T[0]) - dot(target[0], T[1]))
+        r00 = dot(target[0], T[0])
+        r11 = dot(target[1], T[1])
+        r22 = dot(target[2], T[2])
+        sine = length((x, y, z))
         cosine = 0.5 * (r00 + r11 + r22 - 1.0)
         scale = 1.0
         if sine > 1e-12:
@@ -84,7 +76,7 @@ def pose_error(T, target, rows, rotation_weight, error):
             x = np.sqrt(max(r00 + 1, 0.0))
             y = np.sqrt(max(r11 + 1, 0.0))
             z = np.sqrt(max(r22 + 1, 0.0))
-            scale = np.pi / np.sqrt(x * x + y * y + z * z)
+            scale = np.pi / length((x, y, z))
         scale *= rotation_weight
         error[3] = x * scale
         error[4] = y * scale
@@ -96,41 +88,30 @@ def pose_error(T, target, rows, rotation_weight, error):
 
 
 @inner_kernel()
-def _jacobian(T, axes, origins, kinds, length, rows, rotation_weight, J):
+def _jacobian(T, axes, origins, kinds, joints, rotation_weight, J):
     """Write the geometric Jacobian of the tool into J [6, dof], with the rotation rows times
     `rotation_weight`."""
-    for j in range(length):
-        ax = axes[j, 0]
-        ay = axes[j, 1]
-        az = axes[j, 2]
-        if kinds[j] == PRISMATIC:
-            J[0, j] = ax
-            J[1, j] = ay
-            J[2, j] = az
-            for i in range(3, rows):
-                J[i, j] = 0.0
-        else:
-            dx = T[0, 3] - origins[j, 0]
-            dy = T[1, 3] - origins[j, 1]
-            dz = T[2, 3] - origins[j, 2]
-            J[0, j] = ay * dz - az * dy
-            J[1, j] = az * dx - ax * dz
-            J[2, j] = ax * dy - ay * dx
-            if rows == 6:
-                J[3, j] = rotation_weight * ax
-                J[4, j] = rotation_weight * ay
-                J[5, j] = rotation_weight * az
+    for j in range(joints):
+        for i in range(3):
+            if kinds[j] == PRISMATIC:
+                J[i, j] = axes[j, i]
+                J[i + 3, j] = 0.0
+            else:
+                k = (i + 1) % 3
+                m = (i + 2) % 3
+                J[i, j] = axes[j, k] * (T[m, 3] - origins[j, m]) - axes[j, m] * (T[k, 3] - origins[j, k])
+                J[i + 3, j] = rotation_weight * axes[j, i]
 
 
 @inner_kernel()
-def damped_step(J, error, damping, rows, length, held, A, y, step):
+def damped_step(J, error, damping, rows, joints, held, A, y, step):
     """Write step = J^T (J J^T + damping I)^-1 error; the columns of J and entries of step for held joints
     count as zero."""
     # A = J J^T + damping I, its Cholesky factor, and the two triangular solves
     for i in range(rows):
         for k in range(i + 1):
             total = damping if i == k else 0.0
-            for j in range(length):
+            for j in range(joints):
                 if not held[j]:
                     total += J[i, j] * J[k, j]
             A[i, k] = total
@@ -150,7 +131,7 @@ def damped_step(J, error, damping, rows, length, held, A, y, step):
         for k in range(i + 1, rows):
             total -= A[k, i] * y[k]
         y[i] = total / A[i, i]
-    for j in range(length):
+    for j in range(joints):
         total = 0.0
         if not held[j]:
             for i in range(rows):
@@ -214,7 +195,7 @@ def solve_seeds(seeds, known, wanted, chain, target, parameters):
     the tool shall reach, and parameters are `IKParameters`. Returns the new configurations [k, dof] and the
     number of seeds that were used.
     """
-    offsets, tool, kinds, length, lower, upper = chain
+    offsets, tool, kinds, joints, lower, upper = chain
     position_only, rotation_weight, position_tolerance, rotation_tolerance, max_iterations, min_distance = (
         parameters
     )
@@ -238,16 +219,15 @@ def solve_seeds(seeds, known, wanted, chain, target, parameters):
     for s in range(len(seeds)):
         seeds_used = s + 1
         q = seeds[s].copy()
-        forward(q, offsets, tool, kinds, length, T, axes, origins)
+        forward(q, offsets, tool, kinds, joints, T, axes, origins)
         cost = pose_error(T, target, rows, rotation_weight, error)
         damping = INITIAL_DAMPING
         checked_cost = cost
         solved = False
         jacobian_outdated = True
         for iteration in range(max_iterations):
-            position = np.sqrt(error[0] ** 2 + error[1] ** 2 + error[2] ** 2)
-            rotation = np.sqrt(error[3] ** 2 + error[4] ** 2 + error[5] ** 2) / rotation_weight
-            solved = position <= position_tolerance and (position_only or rotation <= rotation_tolerance)
+            rotation = length(error[3:]) / rotation_weight
+            solved = length(error) <= position_tolerance and (position_only or rotation <= rotation_tolerance)
             if solved or damping > MAX_DAMPING:
                 break
             if iteration % CHECK_EVERY == CHECK_EVERY - 1:
@@ -255,26 +235,26 @@ def solve_seeds(seeds, known, wanted, chain, target, parameters):
                     break
                 checked_cost = cost
             if jacobian_outdated:
-                _jacobian(T, axes, origins, kinds, length, rows, rotation_weight, J)
+                _jacobian(T, axes, origins, kinds, joints, rotation_weight, J)
                 jacobian_outdated = False
             # hold joints that the step would push through a limit, and solve for the others again
             fixed[:] = False
-            damped_step(J, error, damping * cost, rows, length, fixed, A, y, step)
+            damped_step(J, error, damping * cost, rows, joints, fixed, A, y, step)
             limit_hit = False
-            for j in range(length):
+            for j in range(joints):
                 if kinds[j] != CONTINUOUS and (
                     (q[j] <= lower[j] and step[j] < 0.0) or (q[j] >= upper[j] and step[j] > 0.0)
                 ):
                     fixed[j] = limit_hit = True
             if limit_hit:
-                damped_step(J, error, damping * cost, rows, length, fixed, A, y, step)
+                damped_step(J, error, damping * cost, rows, joints, fixed, A, y, step)
             for j in range(dof):
                 trial[j] = q[j]
-                if j < length:
+                if j < joints:
                     trial[j] += step[j]
                     if kinds[j] != CONTINUOUS:
                         trial[j] = min(max(trial[j], lower[j]), upper[j])
-            forward(trial, offsets, tool, kinds, length, T, axes, origins)
+            forward(trial, offsets, tool, kinds, joints, T, axes, origins)
             trial_cost = pose_error(T, target, rows, rotation_weight, trial_error)
             if trial_cost < cost:
                 q[:] = trial

@@ -264,11 +264,10 @@ class KinematicTree(Value):
         links: dict[str, tuple[int, ndarray]] = {self.base: (0, np.eye(4))}
         offsets = np.zeros((self.dof, 4, 4))
         parents = np.zeros(self.dof, np.int64)
-        planned = {joint.name: j for j, joint in enumerate(self.planned_joints)}
         for joint in self.joints:
             frame, T_frame_parent = links[joint.parent]
-            if joint.name in planned:
-                j = planned[joint.name]
+            if joint in self.planned_joints:
+                j = self.planned_joints.index(joint)
                 T_joint_frame = transform(np.zeros(3), rotation_z_to(joint.axis))
                 offsets[j] = T_frame_parent @ joint.T_parent_joint @ T_joint_frame
                 parents[j] = frame

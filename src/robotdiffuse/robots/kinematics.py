@@ -22,7 +22,7 @@ def link_pose(robot: KinematicTree, q: Configuration, link: str) -> Pose:
 
 def _motions(robot: KinematicTree, j: int, q: Configurations) -> Poses:
     """The motion of planned joint j at each configuration: a rotation about z, or a translation along z."""
-    motion = np.broadcast_to(np.eye(4), (len(q), 4, 4)).copy()
+    motion = np.tile(np.eye(4), (len(q), 1, 1))
     if robot.prismatic[j]:
         motion[:, 2, 3] = q[:, j]
     else:
@@ -32,17 +32,17 @@ def _motions(robot: KinematicTree, j: int, q: Configurations) -> Poses:
     return motion
 
 
-def _frames(robot: KinematicTree, q: Configurations, link: str) -> list[Poses]:
-    """Poses T_base_frame [n, 4, 4] of the base and of each frame on the chain to a link."""
-    frames = [np.broadcast_to(np.eye(4), (len(q), 4, 4))]
-    for j in robot.chain(link):
-        frames.append(frames[-1] @ robot.frame_offsets[j] @ _motions(robot, j, q))
+def _frames(robot: KinematicTree, q: Configurations) -> list[Poses]:
+    """Poses T_base_frame [n, 4, 4] of all frames."""
+    frames = [np.tile(np.eye(4), (len(q), 1, 1))]
+    for j, parent in enumerate(robot.parents):
+        frames.append(frames[parent] @ robot.frame_offsets[j] @ _motions(robot, j, q))
     return frames
 
 
 def link_poses(robot: KinematicTree, q: Configurations, link: str) -> Poses:
     """T_base_link at a batch of configurations; raises InputError for an unknown link."""
-    return _frames(robot, q, link)[-1] @ robot.T_frame_link(link)
+    return _frames(robot, q)[robot.link_frame(link)] @ robot.T_frame_link(link)
 
 
 def link_jacobians(robot: KinematicTree, q: Configurations, link: str) -> Float[ndarray, "n 6 dof"]:
@@ -51,11 +51,11 @@ def link_jacobians(robot: KinematicTree, q: Configurations, link: str) -> Float[
     The first three rows are the linear velocity of the link's origin, the last three the angular velocity,
     both in the axes of the base frame and per unit of joint velocity.
     """
-    frames = _frames(robot, q, link)
-    origins = (frames[-1] @ robot.T_frame_link(link))[:, :3, 3]
+    frames = _frames(robot, q)
+    origins = (frames[robot.link_frame(link)] @ robot.T_frame_link(link))[:, :3, 3]
     chain = list(robot.chain(link))
     slides = np.array(robot.prismatic)[chain, None, None]
-    T = np.array(frames)[1:]
+    T = np.array(frames)[1:][chain]
     axes = T[..., :3, 2]
     J = np.zeros((len(q), 6, robot.dof))
     J[:, :3, chain] = np.where(slides, axes, np.cross(axes, origins - T[..., :3, 3])).transpose(1, 2, 0)
@@ -70,12 +70,10 @@ def link_origins(robot: KinematicTree, q: Configurations, link: str) -> Points:
 
 def placed_spheres(robot: KinematicTree, q: Configuration) -> Spheres:
     """All collision spheres at one configuration, x y z radius in the base frame [m]."""
-    frames = [np.eye(4)]
-    for j, parent in enumerate(robot.parents):
-        frames.append(frames[parent] @ robot.frame_offsets[j] @ _motions(robot, j, q[None])[0])
+    frames = _frames(robot, q[None])
     parts = [np.zeros((0, 4))]
     for link, spheres in robot.spheres.items():
-        T = frames[robot.link_frame(link)] @ robot.T_frame_link(link)
+        T = frames[robot.link_frame(link)][0] @ robot.T_frame_link(link)
         parts.append(moved_spheres(T, spheres))
     return np.concatenate(parts)
 

@@ -52,7 +52,6 @@ def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
     directions_by_row = np.ascontiguousarray(directions.transpose(0, 2, 1))
     support = np.full((len(links), ROWS, COLUMNS), -np.inf)
     farthest = np.zeros(len(links))
-    interpolation_of = lru_cache(_offset_interpolation)  # many offsets share a rotation
     for j in reversed(range(robot.dof)):
         for i in np.flatnonzero(frames == j + 1):
             spheres = robot.spheres[links[i]]
@@ -76,9 +75,7 @@ def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
             sagitta = ARC_SAGITTA * np.linalg.norm(directions[..., :2], axis=-1)
             h = _rotated(h, lower, upper) + sagitta * r[:, None, None]
         offset = robot.frame_offsets[j]
-        rotation = offset[:3, :3].tobytes()
-        interpolation = _cached_interpolation(rotation) if robot.attached else interpolation_of(rotation)
-        corners, weights, residual = interpolation
+        corners, weights, residual = _interpolation(offset[:3, :3].tobytes())
         values = h.reshape(len(moved), -1)
         h = values[:, corners[0]] * weights[0]
         for corner, weight in zip(corners[1:], weights[1:], strict=True):
@@ -111,19 +108,6 @@ def _directions() -> Float[ndarray, "rows columns 3"]:
     )
 
 
-_Interpolation = tuple[Int[ndarray, "4 n"], Float[ndarray, "4 n"], Float[ndarray, "n"]]
-
-
-def _offset_interpolation(rotation: bytes) -> _Interpolation:
-    """Interpolation by which a rigid offset maps support functions; its rotation matrix is given as bytes."""
-    return _interpolation(_directions() @ np.frombuffer(rotation).reshape(3, 3))
-
-
-_cached_interpolation = lru_cache(maxsize=64)(_offset_interpolation)
-"""Cache for arms with attached bodies: each new object on the same arm needs the same interpolations. An
-entry takes about 1 MB."""
-
-
 def _rotated(
     support: Float[ndarray, "n rows columns"], lower: float, upper: float
 ) -> Float[ndarray, "n rows columns"]:
@@ -142,21 +126,26 @@ def _rotated(
     return maxima
 
 
-def _interpolation(directions: Float[ndarray, "rows columns 3"]) -> _Interpolation:
-    """Indices of the four grid directions around each direction, their weights, which sum to one, and the
-    lengths |e| of the residuals."""
-    u = directions.reshape(-1, 3)
+@lru_cache(maxsize=64)
+def _interpolation(
+    rotation: bytes,
+) -> tuple[Int[ndarray, "4 n"], Float[ndarray, "4 n"], Float[ndarray, "n"]]:
+    """Interpolation by which a rigid offset with a rotation matrix, given as bytes, maps support functions.
+
+    For each direction: the indices of the four grid directions around it after the rotation, their weights,
+    which sum to one, and the length |e| of the residual. Many offsets share a rotation, and each new object
+    on an arm needs the same interpolations again. An entry takes about 1 MB.
+    """
+    grid = _directions().reshape(-1, 3)
+    u = grid @ np.frombuffer(rotation).reshape(3, 3)
     row = (np.arcsin(np.clip(u[:, 2], -1, 1)) + np.pi / 2) / STEP
     column = np.arctan2(u[:, 1], u[:, 0]) % (2 * np.pi) / STEP
     i = np.minimum(row.astype(int), ROWS - 2)
     k = column.astype(int)
     a = row - i
     b = column - k
-    k, k_next = k % COLUMNS, (k + 1) % COLUMNS
-    corners = np.stack(
-        [i * COLUMNS + k, i * COLUMNS + k_next, (i + 1) * COLUMNS + k, (i + 1) * COLUMNS + k_next]
-    )
+    below = i * COLUMNS + np.stack([k % COLUMNS, (k + 1) % COLUMNS])
+    corners = np.concatenate([below, below + COLUMNS])
     weights = np.stack([(1 - a) * (1 - b), (1 - a) * b, a * (1 - b), a * b])
-    grid = _directions().reshape(-1, 3)
     residual = np.linalg.norm(u - np.einsum("kn,knd->nd", weights, grid[corners]), axis=-1)
     return corners, weights, residual + 1e-12

@@ -20,7 +20,6 @@ from robotdiffuse.core.types import Mask, Pose, Spheres, Values
 from robotdiffuse.robots.bodies import (
     TOOL,
     AttachedBody,
-    BodyContent,
     ConvexMesh,
     Inertia,
     RigidShape,
@@ -367,7 +366,7 @@ class Robot(KinematicTree):
         for link in body.touch_links:
             if link not in self.link_names:
                 raise unknown_name(f"link in {field}.touch_links:", str(link), self.link_names)
-        return _with_body(self, BodyContent(body))
+        return _with_body(self, body)
 
     def detach(self, name: str) -> "Robot":
         """The robot without a held object or tool.
@@ -453,12 +452,11 @@ def _variant(robot: Robot, locked: tuple[tuple[str, float], ...]) -> Robot:
 
 
 @lru_cache(maxsize=ATTACHED_CACHE)
-def _with_body(robot: Robot, content: BodyContent) -> Robot:
+def _with_body(robot: Robot, body: AttachedBody) -> Robot:
     from robotdiffuse.robots.fitting.covering_spheres import (
         body_geometry,  # compiled code; few robots need it
     )
 
-    body = content.body
     joint = Joint(f"{body.link}_to_{body.name}", "fixed", body.link, body.name, body.T_link_body)
     meshes = dict(robot.meshes)
     spheres = dict(robot.spheres)

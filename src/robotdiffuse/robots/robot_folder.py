@@ -202,9 +202,9 @@ def _table_from_json(data: dict) -> LinkPairTable:
     separated = np.array([np.frombuffer(bytes.fromhex(row), np.uint8) for row in data["apart"]])
     separated = np.unpackbits(separated, axis=1).astype(bool)
     lower, upper = (tuple(map(float, data[end])) for end in ("lower", "upper"))
-    dimensions = (len(lower), len(upper), 1 if len(separated) == 1 else 2)
-    spans = [0 < high - low <= MAX_COORDINATE for low, high in zip(lower, upper, strict=False)]
-    if dimensions != (len(joints),) * 3 or not all(spans):
+    dimensions = {len(joints), len(lower), len(upper), 1 if len(separated) == 1 else 2}
+    spans = np.subtract(upper, lower)
+    if len(dimensions) > 1 or not within(spans) or not (spans > 0).all():
         raise ValueError("a table over one or two joints expected, lower below upper")
     a, b = map(str, data["links"])
     return LinkPairTable((a, b), joints, lower, upper, separated[0] if len(joints) == 1 else separated)
@@ -262,6 +262,7 @@ def _from_json(data: dict, meshes: dict[str, tuple[ConvexMesh, ...]]) -> Robot:
         name=str(data["name"]),
         base=str(data["base"]),
         tip=str(data["tip"]),
+        root=str(data["root"]),
         other_tips=tuple(map(str, data.get("other_tips", ()))),
         joints=tuple(_joint_from_json(joint) for joint in data["joints"]),
         spheres={str(link): _array(rows, 4, f"spheres of {link}") for link, rows in data["spheres"].items()},
@@ -270,7 +271,6 @@ def _from_json(data: dict, meshes: dict[str, tuple[ConvexMesh, ...]]) -> Robot:
         tables=tuple(_table_from_json(table) for table in data.get("tables", ())),
         locked={str(name): float(value) for name, value in data["locked"].items()},
         notes=tuple(map(str, data["notes"])),
-        root=str(data["root"]),
         above={str(link): _pose_from_json(pose, f"above: {link}") for link, pose in data["above"].items()},
         poses={
             str(name): {str(joint): float(value) for joint, value in pose.items()}
@@ -292,10 +292,8 @@ def _joint_from_json(data: dict) -> Joint:
     axis = _array([data["axis"]], 3, f"joint {name}: axis")[0]
     limits = {limit: float(data[limit]) for limit in LIMITS}
     lower, upper, *rates = limits.values()
-    if (
-        not -MAX_COORDINATE <= lower <= upper <= MAX_COORDINATE
-        or not min(rates) >= MIN_RATE
-        or not max(rates) < np.inf
+    if not (
+        -MAX_COORDINATE <= lower <= upper <= MAX_COORDINATE and MIN_RATE <= min(rates) <= max(rates) < np.inf
     ):
         raise ValueError(f"joint {name}: lower is above upper, or a limit is out of range")
     if not abs(np.linalg.norm(axis) - 1) < AXIS_LENGTH_TOLERANCE:
@@ -314,8 +312,7 @@ def _joint_from_json(data: dict) -> Joint:
 
 def _pose_from_json(data: dict, what: str) -> Float[ndarray, "4 4"]:
     xyz = _array([data["xyz"]], 3, f"{what}: xyz")[0]
-    wxyz = unit_quaternion(what, data["wxyz"])
-    return transform(xyz, rotation_from_quaternion(wxyz))
+    return transform(xyz, rotation_from_quaternion(unit_quaternion(what, data["wxyz"])))
 
 
 def _array(rows: object, width: int, what: str) -> Float[ndarray, "n w"]:

@@ -63,7 +63,7 @@ def _collision_geometry(robot: Robot, link: str, color: tuple[int, int, int]) ->
 
 def _plain(vertices: ndarray, faces: ndarray, color: tuple[int, int, int]) -> VisualMesh:
     colors = np.tile(np.array(color, np.uint8), (len(faces), 1))
-    return VisualMesh(np.asarray(vertices, np.float64), np.asarray(faces, np.int64), colors)
+    return VisualMesh(vertices, faces, colors)
 
 
 def _agree(visual: VisualMesh, collision: tuple[VisualMesh, ...], both_ways: bool) -> bool:

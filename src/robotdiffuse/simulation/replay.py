@@ -46,9 +46,6 @@ class ReplaySettings(Settings, name="replay"):
     """Gravity along -z of the base [m/s^2]."""
 
 
-DEFAULT = ReplaySettings()
-
-
 @dataclass(frozen=True)
 class ReplayContact:
     """A contact between two bodies during a replay."""
@@ -101,7 +98,7 @@ def replay(
     robot: Robot,
     scene: Scene,
     trajectory: Trajectory,
-    settings: ReplaySettings = DEFAULT,
+    settings: ReplaySettings = ReplaySettings(),
     moving: Sequence[MovingObstacle] = (),
 ) -> Replay:
     """Simulate a trajectory, and then REST_TIME of rest.

@@ -11,8 +11,6 @@ import numpy as np
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Configuration, Configurations, Path
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.simulation.world import World
 from robotdiffuse.validation.tolerances import sample_path
 
@@ -34,44 +32,25 @@ class OracleContact:
     row."""
 
 
-class PyBulletOracle:
+class PyBulletOracle(World):
     """A collision checker with a PyBullet world of its own, without a window.
 
     Links that no planned joint moves are checked only against moving links. Call `close`, or use it in a
-    `with` statement.
+    `with` statement. `set_scene` replaces the obstacles; the robot stays loaded, so it is a thousand times
+    faster than a new oracle.
     """
-
-    def __init__(self, robot: Robot, scene: Scene) -> None:
-        self.robot = robot
-        self._world = World(robot, scene)
-
-    def __enter__(self) -> "PyBulletOracle":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the PyBullet world."""
-        self._world.close()
-
-    def set_scene(self, scene: Scene) -> None:
-        """Replace the obstacles. The robot stays loaded, so this is a thousand times faster than a new
-        oracle."""
-        self._world.set_scene(scene)
 
     def nearest(self, q: Configuration, within: float = MAX_DISTANCE) -> OracleContact | None:
         """The closest pair of a link and an obstacle, or of two links; None if its distance exceeds `within`
         [m]."""
-        world = self._world
-        world.place(q)
+        self.place(q)
         best: OracleContact | None = None
-        for link in world.moving:
-            for name, body in world.obstacles.items():
-                if not world.scene.may_touch(link, name):
+        for link in self.moving:
+            for name, body in self.obstacles.items():
+                if not self.scene.may_touch(link, name):
                     best = self._closer(best, within, link, name, body, -1)
-        for a, b in world.pairs:
-            best = self._closer(best, within, a, b, world.body, world.links[b])
+        for a, b in self.pairs:
+            best = self._closer(best, within, a, b, self.body, self.links[b])
         return best
 
     def distance(self, q: Configuration) -> float:
@@ -92,12 +71,11 @@ class PyBulletOracle:
         """
         if tolerance < 0:
             raise InputError(f"tolerance is {tolerance}; it must not be negative")
-        world = self._world
         for i, row in enumerate(q):
-            world.place(row)
-            world.bullet.performCollisionDetection()
-            points = world.bullet.getContactPoints(world.body)
-            if points and min(map(world.gap, points)) <= -tolerance:
+            self.place(row)
+            self.bullet.performCollisionDetection()
+            points = self.bullet.getContactPoints(self.body)
+            if points and min(map(self.gap, points)) <= -tolerance:
                 contact = self.nearest(row, -tolerance)
                 if contact is not None:
                     return replace(contact, at=float(i))
@@ -118,8 +96,7 @@ class PyBulletOracle:
     ) -> OracleContact | None:
         """The closer of `best` and of a pair, if the pair is within `within` [m]. body, index: PyBullet's
         body and link of `other`."""
-        world = self._world
         nearest = within if best is None else best.distance
-        points = world.bullet.getClosestPoints(world.body, body, max(nearest, 0.0), world.links[link], index)
-        distance = min(map(world.gap, points), default=np.inf)
+        points = self.bullet.getClosestPoints(self.body, body, max(nearest, 0.0), self.links[link], index)
+        distance = min(map(self.gap, points), default=np.inf)
         return OracleContact(link, other, float(distance)) if distance <= nearest else best

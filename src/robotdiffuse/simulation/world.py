@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypeVar
 from xml.etree import ElementTree as Xml
 
 import numpy as np
@@ -43,6 +43,9 @@ class _Simulation:
 
     def __getattr__(self, name: str) -> Any:
         return partial(getattr(pybullet, name), physicsClientId=self._client)
+
+
+W = TypeVar("W", bound="World")
 
 
 class World:
@@ -107,7 +110,7 @@ class World:
         """PyBullet's collision shape of each mesh, by its vertices and faces. Shapes are reused, because
         PyBullet never frees the memory of a mesh."""
 
-    def __enter__(self) -> "World":
+    def __enter__(self: W) -> W:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -238,13 +241,13 @@ def _solid(mesh: ConvexMesh | Mesh) -> trimesh.Trimesh:
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
 
 
-def mass_and_center(meshes: tuple[ConvexMesh, ...], density: float) -> tuple[float, Vector]:
-    """Mass [kg] and center of mass [m] of solids in the link frame.
+def mass_and_center(meshes: tuple[ConvexMesh, ...]) -> tuple[float, Vector]:
+    """Mass [kg] and center of mass [m] of solids of DENSITY in the link frame.
 
     Overlapping solids count twice where they overlap.
     """
     solids = list(map(_solid, meshes))
-    masses = [density * abs(solid.volume) for solid in solids]  # negative if the faces point inwards
+    masses = [DENSITY * abs(solid.volume) for solid in solids]  # negative if the faces point inwards
     total = float(sum(masses))
     if total < MIN_MASS:
         return MIN_MASS, np.zeros(3)
@@ -253,7 +256,7 @@ def mass_and_center(meshes: tuple[ConvexMesh, ...], density: float) -> tuple[flo
 
 def _add_inertia(element: Xml.Element, meshes: tuple[ConvexMesh, ...]) -> None:
     """Add mass and center of mass. Bullet computes the inertia itself and ignores the zeros written here."""
-    mass, center = mass_and_center(meshes, DENSITY)
+    mass, center = mass_and_center(meshes)
     inertial = Xml.SubElement(element, "inertial")
     Xml.SubElement(inertial, "origin", xyz=_numbers(center))
     Xml.SubElement(inertial, "mass", value=_numbers([mass]))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.robots.fitting.convex_parts import convex_hull
 from robotdiffuse.robots.fitting.preparation import hidden_by_neighbors, neighbors
@@ -143,12 +142,6 @@ def test_nothing_is_hidden_by_a_neighbor_that_turns_away() -> None:
     robot = two_cylinders()
     swing = replace(robot.joints[0], axis=np.array([0, 1.0, 0]), lower=-1.0, upper=1.0)
     assert not hidden_by_neighbors(replace(robot, joints=(swing,)), "low")(np.array([[0.04, 0, 0.23]])).any()
-
-
-@pytest.mark.parametrize("bad", [{"finest": 0.0}, {"second_half": 0.002}, {"finest": 0.01}])
-def test_contradictory_settings(bad: dict) -> None:
-    with pytest.raises(InputError, match="tolerances"):
-        SphereSettings(**bad)
 
 
 def test_a_large_thin_plate_does_not_fill_the_memory() -> None:

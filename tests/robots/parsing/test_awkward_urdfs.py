@@ -102,7 +102,7 @@ def test_parts_are_finer_where_they_touch_in_vain(tmp_path: Path) -> None:
     ]
     trimesh.util.concatenate(walls).export(tmp_path / "trough.stl")
     mesh = '<collision><geometry><mesh filename="trough.stl"/></geometry></collision>'
-    stand = link("trough", mesh) + joint("stand", "base", "trough", "fixed", xyz="0 0 -0.1")
+    stand = link("trough", mesh) + joint("stand", "base", "trough", "fixed", xyz="-0.1 0 -0.1")
     urdf = written(tmp_path, stand, chain("base", row("j", 3)))
     settings = replace(QUICK, parts=replace(QUICK.parts, most=1), samples=400)
     refused = []

@@ -8,19 +8,21 @@ cannot be reached from outside without crossing the surface count as solid. Ther
 voxel, inner walls and overlapping triangles do no harm.
 """
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
+from itertools import combinations
+from operator import itemgetter
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy import ndimage
 from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
 
 from robotdiffuse.core.kernels import kernel
-from robotdiffuse.core.settings import Count, Positive, Settings
 from robotdiffuse.core.types import Points, Values, Vector
 from robotdiffuse.robots.bodies import ConvexMesh, Surface
+from robotdiffuse.robots.frame_kernel import dot
 
 Triangles = Float[ndarray, "_ 3 3"]
 MIN_THICKNESS = 1e-3
@@ -51,18 +53,17 @@ def thickened(points: Points) -> Points:
 
 
 def face_normals(mesh: ConvexMesh) -> Points:
-    """Outward unit normals of the faces; zero for a face without area."""
+    """Outward unit normals of the faces that have an area."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
     normals = np.cross(b - a, c - a)
     size = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.where(size > 1e-14, normals / np.maximum(size, 1e-14), 0.0)
+    return (normals / np.maximum(size, 1e-14))[size[:, 0] > 1e-14]
 
 
 def planes_of(mesh: ConvexMesh) -> tuple[Points, Values]:
     """Unit normals n and offsets d [m] of the distinct face planes of a convex mesh; points x of the mesh
     have n . x <= d."""
-    normals = face_normals(mesh)
-    normals = np.unique(np.round(normals[np.linalg.norm(normals, axis=1) > 0.5], 9), axis=0)
+    normals = np.unique(np.round(face_normals(mesh), 9), axis=0)
     # offsets from the farthest vertex, so that rounding does not put a plane inside the mesh
     return normals, (mesh.vertices @ normals.T).max(0)
 
@@ -74,8 +75,6 @@ def hull_volume(points: Points) -> float:
         return 0.0
 
 
-MAX_SPLITS = 60
-"""Largest depth of the stack of halves when a triangle is halved repeatedly."""
 TIGHT_FRACTION = 0.125
 """Parts may stick out by this fraction of `concavity` at tight places: points where two links pass close to
 each other."""
@@ -84,8 +83,7 @@ TIGHT_SLOPE = 0.3
 [m/m]."""
 
 
-@dataclass(frozen=True, eq=False)
-class DistanceGrid:
+class DistanceGrid(NamedTuple):
     """Distances of voxels from a solid, zero inside [m]."""
 
     origin: Vector
@@ -125,35 +123,35 @@ class DistanceGrid:
         allowed = allowed[allowed < concavity]
         tight_distances = np.zeros_like(self.distance)
         tight_distances[tuple(near.T)] = self.distance[tuple(near.T)] * concavity / allowed
-        return replace(self, distance=tight_distances), replace(
-            self, distance=np.maximum(tight_distances, self.distance)
-        )
+        enlarged = np.maximum(tight_distances, self.distance)
+        return self._replace(distance=tight_distances), self._replace(distance=enlarged)
 
     def concavity(self, hull: ConvexMesh) -> float:
         """How far a hull sticks out of the solid, approximately [m]."""
-        low = np.floor((hull.vertices.min(0) - self.origin) / self.pitch).astype(int)
-        high = np.ceil((hull.vertices.max(0) - self.origin) / self.pitch).astype(int) + 1
+        corners = (hull.vertices - self.origin) / self.pitch
+        low = np.maximum(np.floor(corners.min(0)).astype(int), 0)
+        high = np.minimum(np.ceil(corners.max(0)).astype(int) + 1, self.distance.shape)
         return _farthest_inside(self.distance, self.origin, self.pitch, low, high, *planes_of(hull))
 
 
 @kernel()
 def _farthest_inside(distance, origin, pitch, low, high, normals, offsets):
-    """Largest value of `distance` among voxels whose centers are within the planes."""
+    """Largest `distance` of the voxels from `low` to `high` with centers within the planes."""
     farthest = 0.0
-    for i in range(max(low[0], 0), min(high[0], distance.shape[0])):
-        x = origin[0] + (i + 0.5) * pitch
-        for j in range(max(low[1], 0), min(high[1], distance.shape[1])):
-            y = origin[1] + (j + 0.5) * pitch
-            for k in range(max(low[2], 0), min(high[2], distance.shape[2])):
+    for i in range(low[0], high[0]):
+        for j in range(low[1], high[1]):
+            for k in range(low[2], high[2]):
                 if distance[i, j, k] <= farthest:
                     continue
-                z = origin[2] + (k + 0.5) * pitch
-                inside = True
+                center = (
+                    origin[0] + (i + 0.5) * pitch,
+                    origin[1] + (j + 0.5) * pitch,
+                    origin[2] + (k + 0.5) * pitch,
+                )
                 for f in range(len(offsets)):
-                    if normals[f, 0] * x + normals[f, 1] * y + normals[f, 2] * z > offsets[f]:
-                        inside = False
+                    if dot(normals[f], center) > offsets[f]:
                         break
-                if inside:
+                else:
                     farthest = distance[i, j, k]
     return farthest
 
@@ -167,42 +165,34 @@ def split(triangles: Triangles, size: "float | Float[ndarray, 'n']") -> Triangle
 
 @kernel()
 def _split(triangles, squares):
-    out = np.empty((4 * len(triangles) + 64, 3, 3))
-    count = 0
-    stack = np.empty((MAX_SPLITS + 2, 3, 3))
-    for t in range(len(triangles)):
-        stack[0] = triangles[t]
-        stack_size = 1
-        while stack_size > 0:
-            stack_size -= 1
-            longest = -1.0
-            k = 0
-            for i in range(3):
-                j = (i + 1) % 3
-                square = 0.0
-                for d in range(3):
-                    square += (stack[stack_size, i, d] - stack[stack_size, j, d]) ** 2
-                if square > longest:
-                    longest = square
-                    k = i
-            if longest <= squares[t] or stack_size >= MAX_SPLITS:
-                if count == len(out):
-                    out = np.concatenate((out, np.empty_like(out)))
-                out[count] = stack[stack_size]
-                count += 1
-                continue
+    count = len(triangles)
+    out = np.concatenate((triangles, np.empty_like(triangles)))
+    limits = np.concatenate((squares, squares))
+    t = 0
+    while t < count:
+        longest = -1.0
+        k = 0
+        for i in range(3):
+            square = 0.0
             for d in range(3):
-                a = stack[stack_size, k, d]
-                b = stack[stack_size, (k + 1) % 3, d]
-                c = stack[stack_size, (k + 2) % 3, d]
-                middle = 0.5 * (a + b)
-                stack[stack_size, 0, d] = a
-                stack[stack_size, 1, d] = middle
-                stack[stack_size, 2, d] = c
-                stack[stack_size + 1, 0, d] = middle
-                stack[stack_size + 1, 1, d] = b
-                stack[stack_size + 1, 2, d] = c
-            stack_size += 2
+                square += (out[t, i, d] - out[t, (i + 1) % 3, d]) ** 2
+            if square > longest:
+                longest = square
+                k = i
+        if longest <= limits[t]:
+            t += 1
+            continue
+        if count == len(out):
+            out = np.concatenate((out, np.empty_like(out)))
+            limits = np.concatenate((limits, limits))
+        # one half in place of the triangle, the other one at the end
+        out[count] = out[t]
+        limits[count] = limits[t]
+        for d in range(3):
+            middle = 0.5 * (out[t, k, d] + out[t, (k + 1) % 3, d])
+            out[t, (k + 1) % 3, d] = middle
+            out[count, k, d] = middle
+        count += 1
     return out[:count].copy()
 
 
@@ -228,17 +218,17 @@ SIMPLIFIED_GROWTH = 1e-7
 
 
 @dataclass(frozen=True)
-class PartSettings(Settings, name="convex parts"):
+class PartSettings:
     """How closely convex parts follow a mesh."""
 
-    concavity: Positive = 0.007
+    concavity: float = 0.007
     """How far the hull of a part may stick out of the mesh [m]."""
-    most: Count = 16
+    most: int = 16
     """Largest number of parts of a link; at least two for each surface of the link, and TIGHT_PART_FACTOR
     times as many for a link with tight places."""
-    voxels: Count = 400_000
+    voxels: int = 400_000
     """Approximate number of voxels of the grid that measures concavity."""
-    finest: Positive = 0.0015
+    finest: float = 0.0015
     """Smallest voxel edge [m]."""
     faces: int = 400
     """Hulls with more triangles are simplified. A simplified hull contains the original one."""
@@ -259,11 +249,11 @@ def convex_parts(
     soups = [surface.vertices[surface.faces] for surface in surfaces]
     finer = 1 if tight is None else 2
     space = DistanceGrid.around(soups, finer**3 * settings.voxels, settings.finest / finer)
-    parts = [Part.of(soup, _spread(soup, space.pitch), space, settings) for soup in soups]
+    parts = [Part.of(soup, space, settings) for soup in soups]
     parts = _cut(parts, space, settings, max(settings.most, 2 * len(parts)))
     if tight is not None:
         tight_only, space = space.near_tight(tight, settings.concavity)
-        parts = [replace(part, concavity=tight_only.concavity(part.hull)) for part in parts]
+        parts = [part._replace(concavity=tight_only.concavity(part.hull)) for part in parts]
         parts = _cut(parts, tight_only, settings, TIGHT_PART_FACTOR * settings.most)
     return tuple(_without_contained(_merged([part.hull for part in parts], space, settings)))
 
@@ -293,7 +283,7 @@ def simplified(hull: ConvexMesh, settings: PartSettings = PartSettings()) -> Con
     if len(normals) > MAX_NORMALS:  # merge similar normals
         _, first = np.unique(np.round(normals * 12).astype(int) @ [1, 100, 10_000], return_index=True)
         normals = normals[first]
-    normals = np.concatenate([np.eye(3), -np.eye(3), normals[np.linalg.norm(normals, axis=1) > 0.5]])
+    normals = np.concatenate([np.eye(3), -np.eye(3), normals])
     offsets = (hull.vertices @ normals.T).max(0) + SIMPLIFIED_GROWTH
     chosen = list(range(6))
     middle = hull.vertices.mean(0)
@@ -313,28 +303,22 @@ def simplified(hull: ConvexMesh, settings: PartSettings = PartSettings()) -> Con
         return hull
 
 
-@dataclass(frozen=True, eq=False)
-class Part:
+class Part(NamedTuple):
     triangles: Triangles
-    points: Points
-    """Points spread over the triangles, for choosing cuts."""
     hull: ConvexMesh
     concavity: float
 
     @staticmethod
-    def of(triangles: ndarray, points: ndarray, space: DistanceGrid, settings: PartSettings) -> "Part":
+    def of(triangles: Triangles, space: DistanceGrid, settings: PartSettings) -> "Part":
         hull = simplified(convex_hull(triangles.reshape(-1, 3)), settings)
-        # all sampled points of a thin sheet may lie on the other side of the cut: sample this side again
-        if not len(points):
-            points = _spread(triangles, space.pitch)
-        return Part(triangles, points, hull, space.concavity(hull))
+        return Part(triangles, hull, space.concavity(hull))
 
     def halves(self, space: DistanceGrid, settings: PartSettings) -> list["Part"]:
         """The two parts on both sides of the plane that minimizes the total volume of their hulls. A part
         that is too small to cut is returned alone, with concavity 0."""
         low = self.hull.vertices.min(0)
         size = np.ptp(self.hull.vertices, axis=0)
-        points, pitch = _thinned(self.points, space.pitch)
+        points, pitch = _spread(self.triangles, space.pitch)
         best = None
         min_volume = np.inf
         for axis in sorted(np.flatnonzero(size > 6 * space.pitch), key=lambda axis: -size[axis]):
@@ -346,14 +330,12 @@ class Part:
                     edge[:, axis] = at  # approximates the intersection of surface and plane
                     volume += hull_volume(np.concatenate([side, edge]))
                 if volume < IMPROVEMENT * min_volume:
-                    best = (int(axis), float(at))
+                    best = (int(axis), at)
                     min_volume = volume
-        halves = _sides(self.triangles, *best) if best else ()
-        if best is None or not all(map(len, halves)):
-            return [replace(self, concavity=0.0)]
-        low_points = self.points[:, best[0]] <= best[1]
-        points = (self.points[low_points], self.points[~low_points])
-        return [Part.of(side, near, space, settings) for side, near in zip(halves, points, strict=True)]
+        halves = _sides(self.triangles, *best) if best else []
+        if not halves or not all(map(len, halves)):
+            return [self._replace(concavity=0.0)]
+        return [Part.of(side, space, settings) for side in halves]
 
 
 def _wall_cuts(heights: Values, pitch: float) -> list[float]:
@@ -369,71 +351,51 @@ def _wall_cuts(heights: Values, pitch: float) -> list[float]:
     return [middle + step for middle in middles for step in (-WALL_OFFSET, WALL_OFFSET)]
 
 
-def _spread(triangles: Triangles, pitch: float) -> Points:
-    """Points spread over a surface, one per cube of edge `pitch` [m]."""
-    return _one_per_cube(split(triangles, 2 * pitch).reshape(-1, 3), pitch)
-
-
-def _thinned(points: Points, size: float) -> tuple[Points, float]:
-    """At most `MAX_CUT_POINTS` points, one per cube, and the edge of the cubes [m]."""
+def _spread(triangles: Triangles, size: float) -> tuple[Points, float]:
+    """At most `MAX_CUT_POINTS` points spread over a surface, one per cube of edge `size` [m] or larger, and
+    the edge of the cubes."""
+    points = split(triangles, 2 * size).reshape(-1, 3)
+    points = points[one_per_cube(points, size)]
     while len(points) > MAX_CUT_POINTS:
         size *= 1.3
-        points = _one_per_cube(points, size)
+        points = points[one_per_cube(points, size)]
     return points, size
 
 
-def _one_per_cube(points: Points, size: float) -> Points:
-    cubes = np.floor((points - points.min(0)) / size).astype(np.int64)
-    _, first = np.unique(np.ravel_multi_index(tuple(cubes.T), cubes.max(0) + 1), return_index=True)
-    return points[first]
+def one_per_cube(points: Points, size: float) -> Int[ndarray, "n"]:
+    """Index of the first point in each cube of edge `size` [m] that has points."""
+    cubes = np.floor(points / size).astype(np.int64)
+    return np.unique(cubes @ (1, 2**21, 2**42), return_index=True)[1]
 
 
-def _sides(
-    triangles: Triangles, axis: int, at: float
-) -> tuple[Float[ndarray, "a 3 3"], Float[ndarray, "b 3 3"]]:
+def _sides(triangles: Triangles, axis: int, at: float) -> list[Triangles]:
     """Cuts triangles by an axis-aligned plane; returns the triangles below and above it."""
-    height = triangles[:, :, axis] - at
-    below = (height <= 0).all(1)
-    above = (height >= 0).all(1)
-    crossing = triangles[~below & ~above]
-    height = height[~below & ~above]
-    # reorder the corners of each crossing triangle: first the one that is alone on its side of the plane
-    negative = height < 0
-    alone = np.where(negative.sum(1) == 1, negative.argmax(1), (~negative).argmax(1))
-    turn = (alone[:, None] + np.arange(3)) % 3
-    rows = np.arange(len(crossing))[:, None]
-    (a, b, c), (x, y, z) = np.moveaxis(crossing[rows, turn], 1, 0), height[rows, turn].T[:, :, None]
-    ab = a + (b - a) * (x / (x - y))
-    ac = a + (c - a) * (x / (x - z))
-    single = np.stack([a, ab, ac], axis=1)
-    double = np.concatenate([np.stack([ab, b, c], axis=1), np.stack([ab, c, ac], axis=1)])
-    low = x[:, 0] < 0
-    return (
-        np.concatenate([triangles[below], single[low], double[np.tile(~low, 2)]]),
-        np.concatenate([triangles[above & ~below], single[~low], double[np.tile(low, 2)]]),
-    )
+    from trimesh.intersections import slice_faces_plane  # slow to import, and few robots need it
+
+    corners = triangles.reshape(-1, 3)
+    faces = np.arange(len(corners)).reshape(-1, 3)
+    upwards = np.eye(3)[axis]
+    sides = [slice_faces_plane(corners, faces, normal, at * upwards) for normal in (-upwards, upwards)]
+    return [vertices[kept] for vertices, kept, _ in sides]
 
 
 def _merged(hulls: list[ConvexMesh], space: DistanceGrid, settings: PartSettings) -> list[ConvexMesh]:
     """Merges pairs of hulls. Each step merges the pair with the common hull that sticks out least, as long as
     it sticks out by at most `settings.concavity`."""
-    hulls = list(hulls)
-    merged: dict[tuple[int, int], tuple[float, ConvexMesh]] = {}
-    while len(hulls) > 1:
-        for i, a in enumerate(hulls):
-            for b in hulls[i + 1 :]:
-                if (id(a), id(b)) not in merged:
-                    common_hull = convex_hull(np.concatenate([a.vertices, b.vertices]))
-                    common_hull = simplified(common_hull, settings)
-                    merged[id(a), id(b)] = (space.concavity(common_hull), common_hull)
-        pairs = [
-            (merged[id(a), id(b)][0], i, j) for i, a in enumerate(hulls) for j, b in enumerate(hulls) if i < j
-        ]
-        min_concavity, i, j = min(pairs)
-        if min_concavity > settings.concavity:
+
+    def candidate(a: ConvexMesh, b: ConvexMesh) -> tuple[float, ConvexMesh, set[ConvexMesh]]:
+        common_hull = simplified(convex_hull(np.concatenate([a.vertices, b.vertices])), settings)
+        return space.concavity(common_hull), common_hull, {a, b}
+
+    candidates = [candidate(*pair) for pair in combinations(hulls, 2)]
+    while candidates:
+        concavity, common_hull, pair = min(candidates, key=itemgetter(0))
+        if concavity > settings.concavity:
             break
-        common_hull = merged[id(hulls[i]), id(hulls[j])][1]
-        hulls = [hull for k, hull in enumerate(hulls) if k not in (i, j)] + [common_hull]
+        hulls = [hull for hull in hulls if hull not in pair]
+        candidates = [other for other in candidates if not other[2] & pair]
+        candidates += [candidate(hull, common_hull) for hull in hulls]
+        hulls.append(common_hull)
     return hulls
 
 

@@ -15,24 +15,17 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, unknown_name
-from robotdiffuse.core.settings import Bound, Natural, Settings
-from robotdiffuse.core.transforms import inverse
 from robotdiffuse.core.types import Mask, Points, Poses, Spheres
 from robotdiffuse.robots.bodies import Surface
 from robotdiffuse.robots.fitting.convex_parts import PartSettings, convex_parts
 from robotdiffuse.robots.fitting.sampled_links import Links, joint_table
 from robotdiffuse.robots.fitting.self_collisions import (
-    BY_SRDF,
-    CHECKED,
-    LIMITS,
-    NAMED,
-    POSE,
     FalseCollisions,
     PairFalseCollisions,
     PairReport,
@@ -94,12 +87,10 @@ def neighbors(robot: Robot, link: str) -> tuple[Neighbor, ...]:
             T_above_parent = through.T_parent_joint @ T_above_parent
         if link not in (above, joint.child) or not {above, joint.child} <= set(robot.meshes):
             continue
-        endless = joint.kind == "continuous"
-        ends = (-np.pi, np.pi) if endless else (joint.lower, joint.upper)
+        ends = (-np.pi, np.pi) if joint.kind == "continuous" else (joint.lower, joint.upper)
         values = np.linspace(*ends, JOINT_SAMPLES) if joint.kind in MOVING_KINDS else [0.0]
-        T = np.stack([T_above_parent @ joint.T_parent_joint @ joint.motion(float(q)) for q in values])
-        next_link = joint.child if link == above else above
-        adjacent.append(Neighbor(next_link, T if link == above else np.stack([inverse(t) for t in T])))
+        T = T_above_parent @ joint.T_parent_joint @ joint.motion(values)
+        adjacent.append(Neighbor(joint.child, T) if link == above else Neighbor(above, np.linalg.inv(T)))
     return tuple(adjacent)
 
 
@@ -171,18 +162,18 @@ fraction of the gap, on average over the two links."""
 
 
 @dataclass(frozen=True)
-class PreparationSettings(Settings, name="preparation"):
+class PreparationSettings:
     """Settings of `prepare`."""
 
     parts: PartSettings = PartSettings()  # noqa: RUF009  (frozen)
     spheres: SphereSettings = SphereSettings()  # noqa: RUF009
     sampling: SamplingSettings = SamplingSettings()  # noqa: RUF009
-    max_false_collisions: Annotated[float, Bound(above=0.0, below=1.0)] = 0.075
+    max_false_collisions: float = 0.075
     """Links are refined while spheres collide falsely in more than this fraction of the free
     configurations."""
-    samples: Annotated[int, Bound(least=100.0)] = 4000
+    samples: int = 4000
     """Number of random configurations at which false collisions are measured."""
-    rounds: Natural = 2
+    rounds: int = 2
     """Largest number of rounds of refinement."""
     finest: float = 0.002
     """Smallest tolerance of spheres [m]."""
@@ -199,8 +190,7 @@ class PreparationSettings(Settings, name="preparation"):
         return replace(scaled(self, "finest"), parts=parts, spheres=spheres)
 
 
-@dataclass(frozen=True)
-class LinkReport:
+class LinkReport(NamedTuple):
     """Parts and spheres of one link."""
 
     link: str
@@ -213,8 +203,7 @@ class LinkReport:
     """Whether the spheres provably cover the surface of the parts."""
 
 
-@dataclass(frozen=True)
-class Prepared:
+class Prepared(NamedTuple):
     """Result of `prepare`."""
 
     robot: Robot
@@ -234,25 +223,22 @@ class _Link:
     parts: PartSettings
     tight: Points = field(default_factory=lambda: np.zeros((0, 3)))
     """Places in the link's frame where parts should stick out less [m]."""
-    bounds: Bounds = field(default_factory=lambda: Bounds(0.0))
-    solid: Solid | None = None
+    narrow: Spheres = field(default_factory=lambda: np.zeros((0, 4)))
+    """Places in the link's frame where spheres should stick out less (see `Bounds.tight`)."""
 
     def decompose(self, robot: Robot) -> Robot:
         """The robot with this link's convex parts."""
         meshes = convex_parts(self.surfaces, self.parts, self.tight if len(self.tight) else None)
-        self.solid = None
         return replace(robot, meshes=robot.meshes | {self.name: meshes})
 
     def fit(self, robot: Robot, settings: SphereSettings, seed: int) -> Robot:
-        """The robot with this link's spheres; keeps `bounds.tight`."""
-        if self.solid is None:
-            meshes = robot.meshes[self.name]
-            frame = robot.link_frame(self.name)
-            self.solid = Solid.of(meshes, settings.tolerance(frame, robot.dof, np.inf))
-            tolerance = settings.tolerance(frame, robot.dof, self.solid.depth)
-            hidden = hidden_by_neighbors(robot, self.name)
-            self.bounds = Bounds(tolerance, hidden, self.bounds.tight, _floor(robot, self.name))
-        fit = fit_spheres(self.solid, self.bounds, np.random.default_rng(seed), settings)
+        """The robot with this link's spheres."""
+        frame = robot.link_frame(self.name)
+        solid = Solid.of(robot.meshes[self.name], settings.tolerance(frame, robot.dof, np.inf))
+        tolerance = settings.tolerance(frame, robot.dof, solid.depth)
+        hidden = hidden_by_neighbors(robot, self.name)
+        bounds = Bounds(tolerance, hidden, self.narrow, _floor(robot, self.name))
+        fit = fit_spheres(solid, bounds, np.random.default_rng(seed), settings)
         fit = np.round(fit, 6)  # as stored in the file, so that these values are checked
         return replace(robot, spheres=robot.spheres | {self.name: fit})
 
@@ -291,12 +277,12 @@ def prepare(
     sampled = find_allowed_collisions(robot, settings.sampling, np.random.default_rng(seed))
     named = allowed or {}
     pairs = tuple(
-        replace(pair, reason=named[frozenset(pair.links)])
-        if pair.reason == CHECKED and frozenset(pair.links) in named
+        pair._replace(reason=named.get(frozenset(pair.links), "checked"))
+        if pair.reason == "checked"
         else pair
         for pair in sampled
     )
-    allowed_pairs = frozenset(frozenset(pair.links) for pair in pairs if pair.reason != CHECKED)
+    allowed_pairs = frozenset(frozenset(pair.links) for pair in pairs if pair.reason != "checked")
     robot = replace(robot, allowed_collisions=allowed_pairs)
     attempts = []
     for k in range(settings.rounds + 1):
@@ -304,13 +290,12 @@ def prepare(
         false_collisions = measure_false_collisions(
             robot, surfaces, settings.samples, np.random.default_rng(seed)
         )
-        attempts.append((false_collisions.by_spheres, k, robot, false_collisions))
+        attempts.append((false_collisions, robot))
         if false_collisions.by_spheres <= settings.max_false_collisions or k == settings.rounds:
             break
         robot = _refined(robot, links, false_collisions, k, settings, seed)
-    _, _, robot, false_collisions = min(
-        attempts, key=lambda attempt: attempt[:2]
-    )  # the best attempt: refinement can also add false collisions
+    # the best attempt: refinement can also add false collisions
+    false_collisions, robot = min(attempts, key=lambda attempt: attempt[0].by_spheres)
     finer = with_finer_parts(robot, links, false_collisions, settings, seed)
     if finer is not None:
         remeasured = measure_false_collisions(finer, surfaces, settings.samples, np.random.default_rng(seed))
@@ -357,9 +342,8 @@ def _refined(
         places = [
             pair.coarse[name] for pair in worst_pairs if pair.links in table_pairs and name in pair.links
         ]
-        tight = np.concatenate([*places, np.zeros((0, 3))])
-        if len(tight):
-            link.tight = np.concatenate([link.tight, tight])
+        if any(map(len, places)):
+            link.tight = np.concatenate([link.tight, *places])
         else:
             link.parts = replace(
                 link.parts, concavity=link.parts.concavity * CONCAVITY_SHRINKAGE, most=2 * link.parts.most
@@ -370,16 +354,12 @@ def _refined(
     }
     for name in sorted(affected):
         link = links[name]
-        tight = [
-            _shared(pair, name)
-            for pair in worst_pairs
-            if name in pair.links and pair.links not in table_pairs
-        ]
-        if tight:
-            places = np.concatenate(tight)
-            gaps = GAP_FRACTION * GAP_SHRINKAGE**k * places[:, 3]
-            places[:, 3] = np.clip(gaps, settings.finest, link.bounds.tolerance)
-            link.bounds = replace(link.bounds, tight=np.concatenate([link.bounds.tight, places]))
+        for pair in worst_pairs:
+            if name in pair.links and pair.links not in table_pairs:
+                places = _shared(pair, name)
+                gaps = GAP_FRACTION * GAP_SHRINKAGE**k * places[:, 3]
+                places[:, 3] = np.maximum(gaps, settings.finest)
+                link.narrow = np.concatenate([link.narrow, places])
         robot = link.fit(robot, settings.spheres, seed)
     return _with_tables(robot, table_pairs, coarse_links, settings)
 
@@ -480,16 +460,15 @@ MAX_PROPOSED = 3
 """Largest number of pairs that the error message proposes for a robot that always collides with itself
 although no single pair always collides."""
 ASSUMED_SAFE = {
-    LIMITS: "up to a limit of one joint, and the URDF's limits allow that",
-    POSE: "also in a pose that the SRDF names",
+    "limits": "up to a limit of one joint, and the URDF's limits allow that",
+    "pose": "also in a pose that the SRDF names",
 }
 """Reasons for allowing a pair that a person should check, each with an explanation for the warning."""
 BYTES_PER_UNIT = 1 if sys.platform == "darwin" else 1024
 """Bytes per unit of `ru_maxrss`."""
 
 
-@dataclass(frozen=True)
-class PairDifference:
+class PairDifference(NamedTuple):
     """Two links that sampling and an SRDF classify differently."""
 
     links: tuple[str, str]
@@ -501,8 +480,7 @@ class PairDifference:
     """The SRDF's reason, or `checked`."""
 
 
-@dataclass(frozen=True)
-class AddReport:
+class AddReport(NamedTuple):
     """Result of `add_robot`."""
 
     robot: Robot
@@ -610,8 +588,8 @@ def add_robot(
             f"<collision> elements to its links"
         )
     srdf_allowed = {} if semantics is None else semantics.allowed
-    allowed = {pair: BY_SRDF for pair in srdf_allowed} if srdf is not None or srdf_file is None else {}
-    allowed |= {frozenset(pair): NAMED for pair in allow}
+    allowed = {pair: "srdf" for pair in srdf_allowed} if srdf is not None or srdf_file is None else {}
+    allowed |= {frozenset(pair): "named" for pair in allow}
     surfaces = {link: tree.surfaces(link) for link in robot.meshes}
     settings = settings or PreparationSettings()
     if semantics is not None and semantics is tree.semantics:
@@ -631,10 +609,10 @@ def add_robot(
         )
     differences = tuple(
         PairDifference(
-            pair.links, pair.reason, pair.colliding, srdf_allowed.get(frozenset(pair.links), CHECKED)
+            pair.links, pair.reason, pair.colliding, srdf_allowed.get(frozenset(pair.links), "checked")
         )
         for pair in prepared.sampled
-        if semantics is not None and (pair.reason == CHECKED) == (frozenset(pair.links) in srdf_allowed)
+        if semantics is not None and (pair.reason == "checked") == (frozenset(pair.links) in srdf_allowed)
     )
     folder = user_robots() / name if out is None else Path(out)
     source = {"urdf": Path(urdf).name, "sha256": tree.digest, "licence": license}

@@ -10,6 +10,7 @@ cells are split, down to a fraction of a millimeter of motion.
 # Coal's Python module has no type information.
 # pyright: reportAttributeAccessIssue=false
 
+from collections.abc import Iterable, Iterator
 from functools import cached_property
 from typing import Any
 
@@ -20,7 +21,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.transforms import ball_around
-from robotdiffuse.core.types import Configurations, Mask, Points, Poses, Spheres, Values
+from robotdiffuse.core.types import Configurations, Mask, Poses, Spheres, Values, Vector
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import ball_distances, deepest_touches
 from robotdiffuse.robots.kinematic_tree import MOVING_KINDS, TURN, Joint, with_mimics
@@ -52,8 +53,6 @@ class Links:
         self.joints = [j for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None]
         self.lower = np.array([joint.lower for joint in self.joints])
         self.upper = np.array([joint.upper for joint in self.joints])
-        self.distance_request, self.distance_result = coal.DistanceRequest(), coal.DistanceResult()
-        self._joints_between: dict[frozenset[str], tuple[str, list[Joint]]] = {}
         self.request, self.result = coal.CollisionRequest(), coal.CollisionResult()
 
     @cached_property
@@ -95,11 +94,12 @@ class Links:
             and unexplained < MAX_UNEXPLAINED * variance
         )
 
-    def poses(self, q: Configurations, wanted: frozenset[str] | None = None) -> dict[str, Poses]:
+    def poses(self, q: Configurations, wanted: Iterable[str] = ()) -> dict[str, Poses]:
         """T_base_link [n, 4, 4] by link. With `wanted` links, only the poses of these links and of the links
-        on the way to them, in the frame of their last common ancestor."""
-        start, joints = (self.robot.base, self.robot.joints) if wanted is None else self._between(wanted)
-        poses = {start: np.broadcast_to(np.eye(4), (len(q), 4, 4))}
+        on the way to them."""
+        chains = [self.robot.joints_above(link) for link in wanted or self.robot.link_names]
+        joints = dict.fromkeys(joint for chain in chains for joint in chain)
+        poses = {self.robot.base: np.broadcast_to(np.eye(4), (len(q), 4, 4))}
         values = with_mimics(self.robot.joints, {joint.name: q[:, i] for i, joint in enumerate(self.joints)})
         for joint in joints:
             T_parent_child = joint.T_parent_joint
@@ -107,16 +107,6 @@ class Links:
                 T_parent_child = T_parent_child @ joint.motion(values[joint.name])
             poses[joint.child] = poses[joint.parent] @ T_parent_child
         return poses
-
-    def _between(self, links: frozenset[str]) -> tuple[str, list[Joint]]:
-        """The last common ancestor of links, and the joints from this ancestor to the links."""
-        if links not in self._joints_between:
-            chains = [self.robot.joints_above(link) for link in links]
-            common = [first for first, *partners in zip(*chains, strict=False) if {*partners} <= {first}]
-            needed = {joint.child for chain in chains for joint in chain[len(common) :]}
-            joints = [joint for joint in self.robot.joints if joint.child in needed]
-            self._joints_between[links] = common[-1].child if common else self.robot.base, joints
-        return self._joints_between[links]
 
     def sphere_distance(self, poses: dict[str, ndarray], a: str, b: str) -> Values:
         """Signed distances [n] between the covering spheres of two links [m]: lower bounds of the distances
@@ -132,24 +122,16 @@ class Links:
 
     def collide(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> bool:
         """Whether convex parts of two links collide in configuration i."""
+        return any(True for _ in self.contacts(poses, a, b, i))
+
+    def contacts(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> Iterator[Vector]:
+        """Points where convex parts of two links overlap in configuration i, one for each overlapping pair of
+        parts [m], in the frame of `poses`."""
         T_a, T_b, ball_gaps = self._placed(poses, a, b, i)
         for m, n in zip(*np.nonzero(ball_gaps <= 0), strict=True):
             self.result.clear()
             if coal.collide(self.hulls[a][m], T_a, self.hulls[b][n], T_b, self.request, self.result):
-                return True
-        return False
-
-    def contacts(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> Points:
-        """Points where convex parts of two links overlap in configuration i, one for each overlapping pair of
-        parts [m], in the frame of `poses`."""
-        T_a, T_b, ball_gaps = self._placed(poses, a, b, i)
-        contact_points = []
-        for m, n in zip(*np.nonzero(ball_gaps <= 0), strict=True):
-            result = coal.CollisionResult()
-            request = coal.CollisionRequest(coal.CONTACT, 1)
-            if coal.collide(self.hulls[a][m], T_a, self.hulls[b][n], T_b, request, result):
-                contact_points.append(result.getContact(0).pos)
-        return np.reshape(contact_points, (-1, 3))
+                yield np.array(self.result.getContact(0).pos)
 
     def mesh_distance(self, poses: dict[str, ndarray], a: str, b: str, i: int = 0) -> float:
         """Distance between the convex parts of two links in configuration i [m]; zero or less if they
@@ -160,11 +142,7 @@ class Links:
             m, n = divmod(int(k), ball_gaps.shape[1])
             if ball_gaps[m, n] >= min_distance:
                 break
-            self.distance_result.clear()
-            distance = coal.distance(
-                self.hulls[a][m], T_a, self.hulls[b][n], T_b, self.distance_request, self.distance_result
-            )
-            min_distance = min(min_distance, distance)
+            min_distance = min(min_distance, _distance(self.hulls[a][m], T_a, self.hulls[b][n], T_b))
         return float(min_distance)
 
     def part_distances(
@@ -185,20 +163,15 @@ class Links:
             for link, ball in zip((a, b), balls, strict=True)
         ]
         part_gaps = np.linalg.norm(middles[0] - middles[1], axis=1) - balls[0][:, 3] - balls[1][:, 3]
-        near = np.flatnonzero(part_gaps <= limit)
-        places = {int(row): (coal_pose(poses[a][row]), coal_pose(poses[b][row])) for row in set(rows[near])}
-        for k in near:
-            T_a, T_b = places[int(rows[k])]
-            self.distance_result.clear()
-            part_gaps[k] = coal.distance(
-                self.hulls[a][parts[0, k]],
-                T_a,
-                self.hulls[b][parts[1, k]],
-                T_b,
-                self.distance_request,
-                self.distance_result,
-            )
+        for k in np.flatnonzero(part_gaps <= limit):
+            T_a, T_b = (coal_pose(poses[link][rows[k]]) for link in (a, b))
+            part_gaps[k] = _distance(self.hulls[a][parts[0, k]], T_a, self.hulls[b][parts[1, k]], T_b)
         return part_gaps
+
+
+def _distance(a: "coal.Convex", T_a: Any, b: "coal.Convex", T_b: Any) -> float:
+    """Signed distance of two convex parts at their poses [m]."""
+    return coal.distance(a, T_a, b, T_b, coal.DistanceRequest(), coal.DistanceResult())
 
 
 CELLS = 128
@@ -235,7 +208,7 @@ def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float
         q = np.tile(nominal, (len(cells), 1))
         q[:, columns] = lower + edge * (cells + size / 2)
         travel = float(lever @ (edge * size) / 2) + ROUNDING
-        poses = links.poses(q, frozenset(pair))
+        poses = links.poses(q, pair)
         distance = links.part_distances(poses, *pair, cell_of_row.ravel(), parts, travel)
         touch = distance <= travel
         # boxes that count as colliding: a single cell with a collision at its center, a box with a collision

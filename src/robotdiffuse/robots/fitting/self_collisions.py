@@ -7,7 +7,7 @@ configurations in which covering spheres or convex parts of two links collide al
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated
+from typing import NamedTuple
 
 import coal
 import numpy as np
@@ -15,26 +15,14 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import for_kernels
-from robotdiffuse.core.settings import Bound, Natural, Settings
 from robotdiffuse.core.types import Points, Spheres, Values
 from robotdiffuse.robots.coal_geometry import coal_pose, coal_surface
-from robotdiffuse.robots.fitting.convex_parts import Surface
+from robotdiffuse.robots.fitting.convex_parts import Surface, one_per_cube
 from robotdiffuse.robots.fitting.sampled_links import NEAR_DISTANCE, Links
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import deepest_touches
 from robotdiffuse.robots.kinematic_tree import MOVING_KINDS, Joint
 from robotdiffuse.robots.robot import Robot, moving_pairs
 
-# reasons of `PairReport`, explained in `find_allowed_collisions`
-ADJACENT = "adjacent"
-ALWAYS = "always"
-NEVER = "never"
-CHECKED = "checked"
-DEFAULT = "default"
-POSE = "pose"
-LIMITS = "limits"
-# reasons given by the user: the pair was named when the robot was added, or an SRDF allows it
-NAMED = "named"
-BY_SRDF = "srdf"
 ADJACENT_STRIDE = 10
 """Adjacent links, which may touch in any case, are tested in only 1 / ADJACENT_STRIDE of the samples."""
 MIN_LIMITS_COLLIDING = 0.2
@@ -52,12 +40,12 @@ Setup Assistant."""
 
 
 @dataclass(frozen=True)
-class SamplingSettings(Settings, name="sampling"):
+class SamplingSettings:
     """Settings of `find_allowed_collisions`."""
 
-    samples: Annotated[int, Bound(least=100.0)] = 20_000
+    samples: int = 20_000
     """Number of configurations, uniform within the limits of all joints, including gripper joints."""
-    descents: Natural = 20
+    descents: int = 20
     """For a pair without collisions in the samples: number of closest samples from which a descent searches
     for a collision."""
     assumptions: bool = True
@@ -65,13 +53,13 @@ class SamplingSettings(Settings, name="sampling"):
     MuJoCo models, which define themselves which links may touch."""
 
 
-@dataclass(frozen=True)
-class PairReport:
+class PairReport(NamedTuple):
     """How sampling classifies a pair of links."""
 
     links: tuple[str, str]
     reason: str
-    """checked, or why the pair is allowed: adjacent, always, never, default, pose, limits, named or srdf."""
+    """checked, or why the pair is allowed: adjacent, always, never, default, pose or limits, as explained in
+    `find_allowed_collisions`; named, if it was named when the robot was added; srdf, if an SRDF allows it."""
     colliding: float
     """Fraction of the configurations in which the meshes collide."""
 
@@ -107,32 +95,33 @@ def find_allowed_collisions(
     poses = links.poses(q)
     default_poses = links.poses(default)
     locked_poses = links.poses(links.named({})[None])
-    named: list[dict[str, ndarray]] = []
-    adjacent = set[frozenset[str]]()
-    if settings.assumptions:
-        named = [links.poses(links.named(pose)[None]) for pose in robot.poses.values()]
-        adjacent = _adjacent(robot)
+    named = [links.poses(links.named(pose)[None]) for pose in robot.poses.values()]
+    adjacent = _adjacent(robot) if settings.assumptions else set[frozenset[str]]()
 
     def reason(a: str, b: str, distances: ndarray, colliding: ndarray) -> str:
         if frozenset((a, b)) in adjacent:
-            return ADJACENT
+            return "adjacent"
         if colliding.mean() >= ALWAYS_FRACTION:
-            return ALWAYS
-        between = _own_between(robot, a, b, MAX_LOCKED_JOINTS) if settings.assumptions else None
-        zero_allowed = between is not None and all(joint.lower <= 0 <= joint.upper for joint in between)
-        if zero_allowed and links.collide(default_poses, a, b, 0) and links.collide(locked_poses, a, b, 0):
-            return DEFAULT
-        if any(-MAX_POSE_OVERLAP < links.mesh_distance(pose, a, b) <= 0 for pose in named):
-            return POSE
-        between = _own_between(robot, a, b) if settings.assumptions else None
-        if colliding.mean() >= MIN_LIMITS_COLLIDING and any(
-            links.stop_explains(joint, q, colliding) for joint in between or ()
-        ):
-            return LIMITS
+            return "always"
+        if settings.assumptions:
+            between = _own_between(robot, a, b, MAX_LOCKED_JOINTS)
+            zero_allowed = between is not None and all(joint.lower <= 0 <= joint.upper for joint in between)
+            if (
+                zero_allowed
+                and links.collide(default_poses, a, b, 0)
+                and links.collide(locked_poses, a, b, 0)
+            ):
+                return "default"
+            if any(-MAX_POSE_OVERLAP < links.mesh_distance(pose, a, b) <= 0 for pose in named):
+                return "pose"
+            if colliding.mean() >= MIN_LIMITS_COLLIDING and any(
+                links.stop_explains(joint, q, colliding) for joint in _own_between(robot, a, b, 0) or ()
+            ):
+                return "limits"
         descents = settings.descents if distances.min() < NEAR_DISTANCE else settings.descents // 5
         if not colliding.any() and not _descend(links, a, b, q[np.argsort(distances)[:descents]], rng):
-            return NEVER
-        return CHECKED
+            return "never"
+        return "checked"
 
     reports = []
     strided = {link: T[: max(len(q) // ADJACENT_STRIDE, 1)] for link, T in poses.items()}
@@ -147,15 +136,13 @@ def find_allowed_collisions(
 
 def _descend(links: "Links", a: str, b: str, starts: Float[ndarray, "n d"], rng: np.random.Generator) -> bool:
     """Whether random descents on the distance between the meshes find a collision of two links."""
-
-    pair = frozenset((a, b))
     for start in starts:
         q = start
         step = 0.1 * (links.upper - links.lower)
-        min_distance = links.mesh_distance(links.poses(q[None], pair), a, b)
+        min_distance = links.mesh_distance(links.poses(q[None], (a, b)), a, b)
         for _ in range(15):
             around = np.clip(q + step * rng.normal(size=(8, len(q))), links.lower, links.upper)
-            at = links.poses(around, pair)
+            at = links.poses(around, (a, b))
             distances = [links.mesh_distance(at, a, b, i) for i in range(len(around))]
             i = int(np.argmin(distances))
             if distances[i] <= 0:
@@ -168,7 +155,7 @@ def _descend(links: "Links", a: str, b: str, starts: Float[ndarray, "n d"], rng:
     return False
 
 
-def _own_between(robot: Robot, a: str, b: str, max_locked: int = 0) -> list[Joint] | None:
+def _own_between(robot: Robot, a: str, b: str, max_locked: int) -> list[Joint] | None:
     """The movable joints between two links of the arm; None if one of the links does not belong to the arm.
 
     A link belongs to the arm if at most `max_locked` locked joints connect it to a link that planned joints
@@ -213,8 +200,7 @@ NARROWEST_FRACTION = 0.003
 refined."""
 
 
-@dataclass(frozen=True)
-class PairFalseCollisions:
+class PairFalseCollisions(NamedTuple):
     """False collisions of a pair of links that is checked."""
 
     links: tuple[str, str]
@@ -236,8 +222,7 @@ class PairFalseCollisions:
     A place is listed only for the link with parts that stick out further there."""
 
 
-@dataclass(frozen=True)
-class FalseCollisions:
+class FalseCollisions(NamedTuple):
     """False self-collisions of a robot."""
 
     free: float
@@ -270,24 +255,23 @@ def measure_false_collisions(
         for link, parts in surfaces.items()
     }
     column = {joint.name: i for i, joint in enumerate(links.joints)}
-    request = coal.CollisionRequest()
-    result = coal.CollisionResult()
     collisions = []
     for a, b in robot.checked_pairs():
         first, second = (for_kernels(robot.spheres[link]) for link in (a, b))
         depth, middle = deepest_touches(poses[a], poses[b], first, second, 0.0, 0.0)
         spheres = depth > 0
-        for table in (table for table in robot.tables if {*table.links} == {a, b}):
-            spheres &= ~table.at(*(q[:, column[name]] for name in table.joints))
+        for table in robot.tables:
+            if {*table.links} == {a, b}:
+                spheres &= ~table.at(*(q[:, column[name]] for name in table.joints))
         parts = np.zeros(samples, dtype=bool)
         meshes = np.zeros(samples, dtype=bool)
         for i in np.flatnonzero(spheres):
             parts[i] = links.collide(poses, a, b, int(i))
             if parts[i]:
                 T_a, T_b = coal_pose(poses[a][i]), coal_pose(poses[b][i])
-                result.clear()
+                links.result.clear()
                 meshes[i] = any(  # surfaces: a mesh inside another one is not detected
-                    coal.collide(first_mesh, T_a, second_mesh, T_b, request, result)
+                    coal.collide(first_mesh, T_a, second_mesh, T_b, links.request, links.result)
                     for first_mesh in trees[a]
                     for second_mesh in trees[b]
                 )
@@ -315,7 +299,7 @@ def measure_false_collisions(
         T_base_b = poses[b][false_spheres]
         at = np.einsum("nij,nj->ni", T_base_a[:, :3, :3], middle[false_spheres]) + T_base_a[:, :3, 3]
         on_b = np.einsum("nji,nj->ni", T_base_b[:, :3, :3], at - T_base_b[:, :3, 3])
-        places = {a: _one_per_cube(middle[false_spheres], gaps), b: _one_per_cube(on_b, gaps)}
+        places = {a: _narrowest_per_cube(middle[false_spheres], gaps), b: _narrowest_per_cube(on_b, gaps)}
         false_parts = np.flatnonzero(parts & ~meshes & free)[:MAX_PART_CASES]
         sticking_out = _sticking_out(links, trees, poses, (a, b), false_parts)
         shares = share(parts), share(spheres)
@@ -356,9 +340,9 @@ def _sticking_out(
     return {link: np.reshape(places, (-1, 3)) for link, places in places_by_link.items()}
 
 
-def _one_per_cube(points: Points, gaps: Values) -> Spheres:
+def _narrowest_per_cube(points: Points, gaps: Values) -> Spheres:
     """The place with the narrowest gap in each cube of edge PLACE_SPACING, as rows of the point and its gap
     [m]."""
     order = np.argsort(gaps)
     rows = np.column_stack([points, gaps])[order]
-    return rows[np.unique(np.floor(rows[:, :3] / PLACE_SPACING), axis=0, return_index=True)[1]]
+    return rows[one_per_cube(rows[:, :3], PLACE_SPACING)]

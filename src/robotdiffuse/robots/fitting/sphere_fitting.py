@@ -16,7 +16,7 @@ two links. It may not contain points below the plane that the robot stands on.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,8 +26,6 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from robotdiffuse.core.bounds import for_kernels
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.settings import Positive, Settings
 from robotdiffuse.core.types import Mask, Points, Spheres, Values, Vector
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.fitting.convex_parts import planes_of, split
@@ -64,15 +62,14 @@ TOLERANCE_LEVEL = np.log(1.3)
 Planes = tuple[Points, Values, ndarray]
 
 
-@dataclass(frozen=True, eq=False)
-class Bounds:
+class Bounds(NamedTuple):
     """How far spheres may stick out of a link."""
 
     tolerance: float
     """How far a sphere may stick out of the link [m]."""
     hidden: Callable[[Points], Mask] | None = None
     """Tells which points are inside a neighboring link, so that spheres may contain them."""
-    tight: Spheres = field(default_factory=lambda: np.zeros((0, 4)))
+    tight: Spheres = np.zeros((0, 4))
     """Tight places: rows of x, y, z and how far spheres may stick out there [m]. Near these places, `hidden`
     does not apply."""
     floor: tuple[Vector, float] | None = None
@@ -100,8 +97,7 @@ class Bounds:
         return allowed
 
 
-@dataclass(frozen=True, eq=False)
-class SphereSizeGrid:
+class SphereSizeGrid(NamedTuple):
     """Largest allowed radius of a sphere at each center [m], interpolated on a grid; negative where no sphere
     may be centered."""
 
@@ -109,17 +105,12 @@ class SphereSizeGrid:
     origin: Vector
     spacing: float
 
-    @property
-    def arrays(self) -> tuple[ndarray, ndarray, float]:
-        return self.grid, self.origin, self.spacing
-
     def at(self, points: Points) -> Values:
         """Largest radius at points [m]."""
-        return max_radii_at(np.ascontiguousarray(points), *self.arrays)
+        return max_radii_at(np.ascontiguousarray(points), *self)
 
 
-@dataclass(frozen=True, eq=False)
-class Solid:
+class Solid(NamedTuple):
     """A union of convex meshes, with signed distances from its surface on a grid [m], negative inside."""
 
     meshes: tuple[ConvexMesh, ...]
@@ -217,12 +208,6 @@ def is_inside(points: Points, planes: Planes, depth: float) -> Mask:
     return plane_depths(points, *planes, depth) > depth
 
 
-def depths(meshes: tuple[ConvexMesh, ...], points: Points) -> Values:
-    """Distance from points to the nearest face plane of the mesh in which they are deepest [m]; negative for
-    points outside all meshes."""
-    return plane_depths(np.ascontiguousarray(points), *stacked_planes(meshes), -np.inf)
-
-
 def _grid_points(shape: tuple[int, ...] | ndarray, origin: Vector, spacing: float) -> Points:
     """Coordinates of all points of a grid [m]."""
     axes = [low + spacing * np.arange(count) for low, count in zip(origin, shape, strict=True)]
@@ -250,7 +235,7 @@ ADDED_SPACING = 0.02
 
 
 @dataclass(frozen=True)
-class SphereSettings(Settings, name="sphere tolerances"):
+class SphereSettings:
     """How closely covering spheres follow the meshes of a link."""
 
     first_half: float = 0.015
@@ -261,7 +246,7 @@ class SphereSettings(Settings, name="sphere tolerances"):
     fixed: float = 0.03
     """How far a sphere may stick out of a link that no planned joint moves [m]. It is larger because such a
     link is only checked against other links."""
-    finest: Positive = 0.004
+    finest: float = 0.004
     """Lower bound of these tolerances [m]."""
     candidates: int = 1000
     """Number of candidate centers of the greedy cover."""
@@ -272,14 +257,6 @@ class SphereSettings(Settings, name="sphere tolerances"):
     most: int = 200
     """Approximate largest number of spheres for each link; if they do not suffice, the spheres exceed the
     tolerance."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.finest > min(self.first_half, self.second_half):
-            raise InputError(
-                f"sphere tolerances: finest is {self.finest}; it must be at most first_half "
-                f"({self.first_half}) and second_half ({self.second_half})"
-            )
 
     def tolerance(self, frame: int, dof: int, inradius: float) -> float:
         """How far the spheres of a link may stick out [m].
@@ -297,7 +274,7 @@ def fit_spheres(
     solid: Solid,
     bounds: Bounds,
     rng: np.random.Generator,
-    settings: SphereSettings = SphereSettings(),
+    settings: SphereSettings,
 ) -> Spheres:
     """Spheres [x y z radius, m] that cover surface and interior of a solid and respect `bounds`."""
     sizes = solid.sphere_sizes(bounds)
@@ -350,8 +327,7 @@ def covered(meshes: tuple[ConvexMesh, ...], spheres: Spheres) -> bool:
     return True
 
 
-@dataclass(frozen=True, eq=False)
-class Cells:
+class Cells(NamedTuple):
     """Small triangles on the surface of the union of meshes."""
 
     points: Points
@@ -378,20 +354,12 @@ class Cells:
         vertices = []
         left_out = False
         planes = [stacked_planes((mesh,)) for mesh in solid.meshes]
-        boxes = [(mesh.vertices.min(0), mesh.vertices.max(0)) for mesh in solid.meshes]
         for k, mesh in enumerate(solid.meshes):
             triangles = mesh.vertices[mesh.faces]
             triangles = split(triangles, size)
             hidden = np.zeros(len(triangles), dtype=bool)
-            low = triangles.min(1)
-            high = triangles.max(1)
-            for mesh_index, (lowest, highest) in enumerate(boxes):
-                if mesh_index != k:
-                    queried = np.flatnonzero(((low >= lowest) & (high <= highest)).all(1) & ~hidden)
-                    corners = triangles[queried].reshape(-1, 3)
-                    hidden[queried] = (
-                        is_inside(corners, planes[mesh_index], BURIED_DEPTH).reshape(-1, 3).all(1)
-                    )
+            for other in (*planes[:k], *planes[k + 1 :]):
+                hidden |= is_inside(triangles.reshape(-1, 3), other, BURIED_DEPTH).reshape(-1, 3).all(1)
             triangles = triangles[~hidden]
             if bounds.varies:
                 tolerances = bounds.tolerances(triangles.mean(1))
@@ -414,8 +382,12 @@ class Cells:
         sharp |= left_out
         return Cells(points, index.ravel()[count:].reshape(-1, 3), sharp)
 
-    def assigned(self, sizes: SphereSizeGrid, centers: Points) -> "_Assignment":
-        return _Assignment(*assign(self.points, self.corners, centers, sizes.at(centers)))
+    def assigned(
+        self, sizes: SphereSizeGrid, centers: Points
+    ) -> tuple[Int[ndarray, "c"], Values, Int[ndarray, "c"], Values]:
+        """For each cell: the sphere that covers it with the least excess, its excess radius [m], the second
+        best sphere (-1 if there is none), and the excess radius of this one [m]."""
+        return assign(self.points, self.corners, centers, sizes.at(centers))
 
     def part(self, mine: Mask) -> "Cells":
         """The cells in the mask `mine`. Points on the border to other cells count as sharp, since their
@@ -426,25 +398,12 @@ class Cells:
         return Cells(self.points[used], index.reshape(-1, 3), (self.sharp | outside)[used])
 
 
-class _Assignment(NamedTuple):
-    """For each cell, the sphere that it is assigned to, and the second best sphere."""
-
-    owner: Int[ndarray, "c"]
-    """The sphere that covers the cell with the least excess."""
-    owner_excess: Values
-    """Excess radius of `owner` for the cell [m]."""
-    runner_up: Int[ndarray, "c"]
-    """The second best sphere; -1 if there is none."""
-    second_excess: Values
-    """Excess radius of `runner_up` for the cell [m]."""
-
-
 def _relax(
     sizes: SphereSizeGrid, cells: Cells, centers: Points, rounds: int, enough: float
 ) -> tuple[Points, float]:
     """Improved centers, and their largest excess radius [m]. Ends early when the excess is at most
     `enough`."""
-    return relax(cells.points, cells.corners, cells.sharp, centers, rounds, enough, *sizes.arrays, DIRECTIONS)
+    return relax(cells.points, cells.corners, cells.sharp, centers, rounds, enough, *sizes, DIRECTIONS)
 
 
 def _with_enough_spheres(
@@ -455,7 +414,7 @@ def _with_enough_spheres(
     max_excess = sizes.spacing * EXCESS_TOLERANCE
     centers, largest_excess = _relax(sizes, cells, centers, settings.rounds, max_excess)
     while largest_excess > max_excess and len(centers) < settings.most:
-        excess = cells.assigned(sizes, centers).owner_excess
+        _, excess, _, _ = cells.assigned(sizes, centers)
         extra = _farthest_apart(cells.points[cells.corners].mean(1), excess, len(centers) // 20 + 1)
         centers, largest_excess = _relax(
             sizes, cells, np.concatenate([centers, extra]), settings.rounds, max_excess
@@ -483,14 +442,14 @@ def _thin_out(sizes: SphereSizeGrid, cells: Cells, centers: Points, settings: Sp
     max_excess = sizes.spacing * EXCESS_TOLERANCE
     centers, required = centers.copy(), np.zeros(len(centers), dtype=bool)
     while len(centers) > 1:
-        assignment = cells.assigned(sizes, centers)
+        owner, _, runner_up, second_excess = cells.assigned(sizes, centers)
         loss = np.full(len(centers), -np.inf)
-        np.maximum.at(loss, assignment.owner, assignment.second_excess)
+        np.maximum.at(loss, owner, second_excess)
         dropped = np.zeros_like(required)
         moved = np.zeros_like(required)
         failures = 0
         for i in np.argsort(loss):
-            takers = np.unique(assignment.runner_up[assignment.owner == i])
+            takers = np.unique(runner_up[owner == i])
             if required[i] or moved[i] or moved[takers].any():
                 continue
             if not len(takers):
@@ -498,11 +457,11 @@ def _thin_out(sizes: SphereSizeGrid, cells: Cells, centers: Points, settings: Sp
                 continue
             affected = np.zeros(len(centers), dtype=bool)
             affected[i] = affected[takers] = True
-            part = cells.part(affected[assignment.owner])
+            part = cells.part(affected[owner])
             new_centers, excess = _relax(sizes, part, centers[takers], settings.rounds, max_excess)
             if excess > max_excess:
                 required[i] = True
-                failures = failures + 1
+                failures += 1
                 if failures == settings.tries:
                     break
                 continue
@@ -520,7 +479,7 @@ def _thin_out(sizes: SphereSizeGrid, cells: Cells, centers: Points, settings: Sp
 def _with_radii(sizes: SphereSizeGrid, cells: Cells, centers: Points) -> Spheres:
     """Spheres at the centers, each with the smallest radius that covers the cells assigned to it. Spheres
     without cells are dropped."""
-    owner = cells.assigned(sizes, centers).owner
+    owner, _, _, _ = cells.assigned(sizes, centers)
     radii = np.zeros(len(centers))
     corner_distances = np.linalg.norm(cells.points[cells.corners] - centers[owner][:, None], axis=2).max(1)
     np.maximum.at(radii, owner, corner_distances + MARGIN)

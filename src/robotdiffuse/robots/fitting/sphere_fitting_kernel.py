@@ -184,16 +184,6 @@ def enclosing(spheres):
 
 
 @kernel()
-def relative(A, B, T):
-    """Write the pose [3, 4] of frame B in frame A into T; A and B are poses [4, 4]."""
-    shift = rotated_back(A, minus(column(B, 3), column(A, 3)))
-    for i in range(3):
-        for j in range(3):
-            T[i, j] = dot(column(A, i), column(B, j))
-        T[i, 3] = shift[i]
-
-
-@kernel()
 def ball_distances(T_base_a, T_base_b, first, second):
     """Signed distances [a, b] between the balls of two sets, each set at its pose [4, 4] [m]."""
     gaps_between = np.empty((len(first), len(second)))
@@ -216,15 +206,14 @@ def deepest_touches(T_base_a, T_base_b, first, second, apart, least):
     middle = np.zeros((len(T_base_a), 3))
     a = enclosing(first)
     b = enclosing(second)
-    T = np.empty((3, 4))
     for n in range(len(T_base_a)):
-        relative(T_base_a[n], T_base_b[n], T)
-        distance = length(minus(placed(T, b), a)) - a[3] - b[3]
+        distance = ball_gap(T_base_a[n], a, T_base_b[n], b)
         if distance > apart:
             depth[n] = -distance
             continue
         for j in range(len(second)):
-            center = placed(T, second[j])
+            at = placed(T_base_b[n], second[j])
+            center = rotated_back(T_base_a[n], minus(at, column(T_base_a[n], 3)))
             # skip spheres too far from the first set to overlap more deeply
             reach = a[3] + second[j, 3] - depth[n]
             if reach <= 0.0 or squared_distance(a, center) >= reach * reach:

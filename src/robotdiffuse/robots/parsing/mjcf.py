@@ -16,7 +16,7 @@ import trimesh
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, shortened
+from robotdiffuse.core.errors import InputError, needs, shortened
 from robotdiffuse.core.transforms import (
     inverse,
     quaternion_from_rotation,
@@ -51,12 +51,8 @@ def compiled_model(path: Path) -> Any:
 
     Raises InputError for a damaged file, and if MuJoCo is not installed.
     """
-    try:
+    with needs("mujoco (to read MuJoCo models)", "mujoco"):
         mujoco = imported_mujoco()
-    except ImportError:
-        raise InputError(
-            f'{path} is a MuJoCo model; reading it needs mujoco: pip install "robotdiffuse[mujoco]"'
-        ) from None
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         spec.compiler.fusestatic = False  # bodies without joints are links, too
@@ -126,7 +122,6 @@ class ConvertedModel:
         geoms of types that are not converted; for slide joints without a range, if there are no others."""
         self.path = path
         self.model = model = compiled_model(path)
-        self.mujoco = imported_mujoco()
         self.folder = TemporaryDirectory(prefix="robotdiffuse-mjcf-")
         """Contains the mesh files that the URDF names."""
         self.root = ET.Element("robot", name=bytes(model.names).partition(b"\0")[0].decode() or path.stem)
@@ -144,9 +139,11 @@ class ConvertedModel:
                 "rd.Scene.from_mujoco reads obstacles"
             )
         self._link("world")
-        mimics = self._mimics()
+        self.mimics = self._mimics()
+        """The attributes of <mimic>, by index of the joint, for joints that a linear equality constraint ties
+        to another joint."""
         for body in self.bodies:
-            self._body(body, mimics)
+            self._body(body)
         self._sites()
         ET.indent(self.root)
         self.semantics = Srdf(self.path, allowed=self._excluded(), poses=self._poses())
@@ -175,7 +172,7 @@ class ConvertedModel:
         self.links.add(name)
         return ET.SubElement(self.root, "link", name=name)
 
-    def _body(self, body: int, mimics: dict[int, dict[str, str]]) -> None:
+    def _body(self, body: int) -> None:
         """Adds the link of a body and its joints to the URDF. The frame of a joint is at the joint's anchor,
         which may differ from the origin of the body's frame."""
         model = self.model
@@ -188,9 +185,8 @@ class ConvertedModel:
             label = self.joint_name(joint)
             kind = self.joint_kind(joint)
             if kind == "free" or joint in self.held:
-                joint_text = f"the free joint of {name}"
-                if kind == "slide":
-                    joint_text = f"slide joint {label}, which has no range,"
+                slide = f"slide joint {label}, which has no range,"
+                joint_text = slide if kind == "slide" else f"the free joint of {name}"
                 self.notes.append(f"{joint_text} is held where the model places it")
                 continue
             if kind == "ball":
@@ -199,8 +195,9 @@ class ConvertedModel:
             reference = self._moved(joint, -float(model.qpos0[model.jnt_qposadr[joint]]))
             last = joint == joints[-1] and np.linalg.norm(model.jnt_pos[joint]) < MIN_SHIFT
             child = name if last else f"{label}_anchor"
-            self._link(child) if not last else None
-            self._joint(joint, above, child, T @ anchor @ reference, mimics.get(joint))
+            if not last:
+                self._link(child)
+            self._joint(joint, above, child, T @ anchor @ reference)
             above = child
             T = inverse(anchor)
         if above != name:
@@ -214,7 +211,7 @@ class ConvertedModel:
             return transform(value * axis)
         return transform(np.zeros(3), rotation_about(axis, value))
 
-    def _joint(self, joint: int, parent: str, child: str, T: ndarray, mimic: dict[str, str] | None) -> None:
+    def _joint(self, joint: int, parent: str, child: str, T: ndarray) -> None:
         model = self.model
         label = self.joint_name(joint)
         slides = self.joint_kind(joint) == "slide"
@@ -226,14 +223,13 @@ class ConvertedModel:
         ET.SubElement(element, "axis", xyz=_text(model.jnt_axis[joint]))
         limits: dict[str, str] = {}
         if limited:
-            lower, upper = map(repr, model.jnt_range[joint].tolist())
-            limits |= {"lower": lower, "upper": upper}
+            limits |= zip(("lower", "upper"), map(repr, model.jnt_range[joint].tolist()), strict=True)
         effort = self._effort(joint)
         if effort > 0:
             limits["effort"] = repr(effort)
         ET.SubElement(element, "limit", limits)
-        if mimic is not None:
-            ET.SubElement(element, "mimic", mimic)
+        if joint in self.mimics:
+            ET.SubElement(element, "mimic", self.mimics[joint])
 
     def _effort(self, joint: int) -> float:
         """The largest force or torque that actuators may apply to a joint [N] or [N m]; 0 if it has no
@@ -253,8 +249,6 @@ class ConvertedModel:
         )
 
     def _mimics(self) -> dict[int, dict[str, str]]:
-        """The attributes of <mimic>, by index of the joint, for joints that a linear equality constraint ties
-        to another joint."""
         model = self.model
         mimics: dict[int, dict[str, str]] = {}
         for k in range(model.neq):
@@ -351,7 +345,8 @@ class ConvertedModel:
         collision."""
         model = self.model
         excluded = {frozenset(divmod(int(signature), 2**16)) for signature in model.exclude_signature}
-        unfiltered = bool(model.opt.disableflags & int(self.mujoco.mjtDisableBit.mjDSBL_FILTERPARENT))
+        no_filter = imported_mujoco().mjtDisableBit.mjDSBL_FILTERPARENT
+        unfiltered = bool(model.opt.disableflags & int(no_filter))
         geoms = {body: [geom for geom in _geoms_of(model, body) if self.masks[geom]] for body in self.bodies}
         solid = [body for body in self.bodies if geoms[body]]
 

@@ -3,10 +3,9 @@
 import os
 import re
 import xml.etree.ElementTree as ET
-from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import unquote
 
 from robotdiffuse.core.errors import InputError, shown
@@ -23,8 +22,7 @@ PACKAGE_NOT_FOUND = re.compile(r"Package not found: (\S+)")
 """Matches xacrodoc's error for an unknown package."""
 
 
-@dataclass(frozen=True)
-class Packages:
+class Packages(NamedTuple):
     """Finds the ROS packages of a URDF.
 
     The folder of a package is searched in `folders`, then in ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, then in

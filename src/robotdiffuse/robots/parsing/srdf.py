@@ -90,8 +90,7 @@ class Srdf:
         return {joint: value for pose in poses for joint, value in pose.items()}
 
 
-@dataclass(frozen=True)
-class Group:
+class Group(NamedTuple):
     """A planning group as defined in the file, by any combination of the fields."""
 
     joints: tuple[str, ...] = ()
@@ -210,15 +209,16 @@ class JointTree:
         """Largest number of independent movable joints in a chain below each link."""
         self.moved: set[str] = set()
         """Links with a movable joint below them, mimic joints included."""
-        depth: dict[str, int] = {}
+        self._depth: dict[str, int] = {}
+        """Number of joints in the longest chain below each link."""
         for joint in joints:
             self.below.setdefault(joint.parent, []).append(joint)
         for joint in reversed(joints):
             self.moving[joint.parent] = max(self.moving.get(joint.parent, 0), self._chain_length(joint))
-            depth[joint.parent] = max(depth.get(joint.parent, 0), depth.get(joint.child, 0) + 1)
+            below = self._depth.get(joint.child, 0) + 1
+            self._depth[joint.parent] = max(self._depth.get(joint.parent, 0), below)
             if joint.kind in MOVING_KINDS or joint.child in self.moved:
                 self.moved.add(joint.parent)
-        self._depth = depth
 
     def _chain_length(self, joint: Joint) -> int:
         """Largest number of independent movable joints in a chain that begins with a joint."""

@@ -279,12 +279,7 @@ class UrdfTree:
         digest = hashlib.sha256(self.text)
         for element in self.links.values():
             for mesh in element.findall(f"{self.kind}/geometry/mesh"):
-                file = self.packages.file(mesh.get("filename", ""))
-                digest.update(read_bytes(file, "mesh file"))
-                if file.suffix.lower() in (".dae", ".glb", ".gltf"):
-                    # earlier versions read these formats without conversion to meters and z up; robots that
-                    # they prepared must have another digest
-                    digest.update(b"in metres, z up")
+                digest.update(read_bytes(self.packages.file(mesh.get("filename", "")), "mesh file"))
         return digest.hexdigest()
 
     def _named(self, root: ET.Element, what: str) -> dict[str, ET.Element]:
@@ -393,13 +388,14 @@ class UrdfTree:
         leaders = [name]
         leader = followed
         while leader is not None:
-            leaders.append(leader.get("joint", ""))
-            if leaders[-1] not in self.elements or leaders[-1] in leaders[:-1]:
+            joint = leader.get("joint", "")
+            if joint not in self.elements or joint in leaders:
                 raise InputError(
-                    f"{self.path}: joint {leaders[-2]} mimics {shown(leaders[-1])}, which must be "
-                    f"another joint of the file and must not mimic {leaders[-2]}"
+                    f"{self.path}: joint {leaders[-1]} mimics {shown(joint)}, which must be another joint of "
+                    f"the file and must not mimic {leaders[-1]}"
                 )
-            leader = self.elements[leaders[-1]].find("mimic")
+            leaders.append(joint)
+            leader = self.elements[joint].find("mimic")
         if self.elements[leaders[-1]].get("type") == "fixed":
             self.notes.append(f"joint {name} mimics the fixed joint {leaders[-1]}; treated as independent")
             return None
@@ -410,14 +406,11 @@ class UrdfTree:
 
     def _with_limits(self, joint: Joint, limit: ET.Element | None) -> Joint:
         attributes = {} if limit is None else limit.attrib
-        limits: dict[str, float] = {}
-        for limit_name in ("lower", "upper", "velocity"):
-            if limit_name in attributes:
-                max_value = MAX_RATE if limit_name == "velocity" else MAX_COORDINATE
-                numbers = self._numbers(
-                    attributes[limit_name], 1, f"joint {joint.name}: {limit_name} limit", max_value
-                )
-                limits[limit_name] = float(numbers[0])
+        limits = {
+            name: float(self._numbers(attributes[name], 1, f"joint {joint.name}: {name} limit", most)[0])
+            for name, most in (("lower", MAX_COORDINATE), ("upper", MAX_COORDINATE), ("velocity", MAX_RATE))
+            if name in attributes
+        }
         if joint.kind == "continuous":
             limits |= {"lower": -CONTINUOUS_LIMIT, "upper": CONTINUOUS_LIMIT}
         if "lower" not in limits and "upper" not in limits:
@@ -442,17 +435,8 @@ class UrdfTree:
         effort = 0.0
         with suppress(InputError):  # only planning with a payload needs effort limits
             effort = max(float(self._numbers(attributes.get("effort", ""), 1, "effort")[0]), 0.0)
-        acceleration = ACCELERATION_PER_VELOCITY * velocity
-        jerk = JERK_PER_ACCELERATION * acceleration
-        return replace(
-            joint,
-            lower=lower,
-            upper=upper,
-            velocity=velocity,
-            acceleration=acceleration,
-            jerk=jerk,
-            effort=effort,
-        )
+        joint = replace(joint, lower=lower, upper=upper, effort=effort)
+        return _changed(joint, {"velocity": velocity})
 
     def inertias(self, links: list[str]) -> dict[str, Inertia]:
         """Inertias of the links that have a mass. Physically impossible inertias are left out, with a
@@ -468,10 +452,9 @@ class UrdfTree:
             try:
                 T = self._origin(element, link)
                 texts = (mass.get("value", ""), *(attributes.get(name, "") for name in MOMENTS))
-                value, xx, xy, xz, yy, yz, zz = (self._numbers(text, 1, link)[0] for text in texts)
-                R = T[:3, :3]
-                moments = R @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ R.T
-                inertias[link] = inertia_of([value, *T[:3, 3], *moments[np.triu_indices(3)]])
+                value, *entries = (self._numbers(text, 1, link)[0] for text in texts)
+                own = inertia_of([value, *T[:3, 3], *entries])
+                inertias[link] = own._replace(moments=T[:3, :3] @ own.moments @ T[:3, :3].T)
             except (InputError, ValueError):
                 self.notes.append(f"link {link} has a physically impossible inertia; left out")
         return inertias
@@ -491,7 +474,7 @@ class UrdfTree:
         ]
         if self.kind == "visual" and any(parts.values()):
             self.notes.append("no link has collision geometry; the visual geometry is used")
-        elif any(parts.values()):
+        else:
             without_collision = [
                 link for link in links if not parts[link] and self.links[link].find("visual") is not None
             ]
