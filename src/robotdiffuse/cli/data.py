@@ -22,9 +22,6 @@ from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.visualization.replay_page import GalleryEntry, write_gallery
 
-CLEAN = 0
-VIOLATIONS = 1
-
 
 def run_generate(arguments: Namespace) -> None:
     if arguments.cluster is not None and arguments.workers is not None:
@@ -62,7 +59,7 @@ def run_check(arguments: Namespace) -> int:
             update,
         )
     show(*check.tables)
-    return VIOLATIONS if check.findings else CLEAN
+    return 1 if check.findings else 0
 
 
 def run_view(arguments: Namespace) -> None:

@@ -20,9 +20,6 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import contact_notes
 from robotdiffuse.validation.validator import verify, violations
 
-VALID = 0
-NOT_VALID = 1
-
 
 def run_verify(arguments: Namespace) -> int:
     out = None if arguments.certificate is None else check_output(arguments.certificate, (".json",))
@@ -37,7 +34,7 @@ def run_verify(arguments: Namespace) -> int:
         certificate.save(out)
         proof = certificate.proof
         print(f"wrote {out}: {len(proof.stretches.claim)} stretches, {len(proof.planes)} planes")
-    return VALID if valid else NOT_VALID
+    return 0 if valid else 1
 
 
 def _validated(problem: Problem, what: str, motion: Waypoints | Trajectory, everything: bool) -> bool:
@@ -125,8 +122,6 @@ def _read(
     return problem, {label: converted.motion}, (*scene_notes, *converted.notes)
 
 
-HOLDS = 0
-FAILS = 1
 MAX_CHANGES = 4
 """Largest number of differences from the bundled robot that one line of output lists."""
 
@@ -152,7 +147,7 @@ def run_check(arguments: Namespace) -> int:
         print(line)
     if not differences:
         print(f"holds: {clearances(certificate)}")
-    return FAILS if differences else HOLDS
+    return 1 if differences else 0
 
 
 def described(robot: Robot) -> str:
