@@ -9,7 +9,7 @@ signed [m]: the negative penetration depth inside.
 # Coal's Python module has no type information.
 # pyright: reportAttributeAccessIssue=false
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import NamedTuple
@@ -26,7 +26,9 @@ from robotdiffuse.collision.convex_geometry import (
     Solid,
     checks_of,
     describe_contact,
+    hulls_of,
     parts_of,
+    solid_arrays,
     solids_of,
 )
 from robotdiffuse.collision.kernels import mesh_bounds as kernel
@@ -102,13 +104,10 @@ def _pieces(robot: Robot) -> dict[str, tuple[_Piece, ...]]:
     return {link: tuple(map(_piece, parts)) for link, parts in parts_of(robot).items()}
 
 
-@once_per_robot
-def _balls(robot: Robot) -> dict[str, tuple[int, ndarray, ndarray]]:
-    """For each link its frame, and the centers [k, 3] and radii [k] of balls around its parts."""
-    return {
-        link: (parts[0].frame, np.stack([p.center for p in parts]), np.array([p.radius for p in parts]))
-        for link, parts in parts_of(robot).items()
-    }
+def _balls(robot: Robot, link: str) -> tuple[int, Float[ndarray, "k 4"]]:
+    """The frame of a link, and balls around its parts."""
+    hulls, parts = hulls_of(robot)
+    return robot.link_frame(link), hulls.balls[parts[link].start : parts[link].stop]
 
 
 def _obstacle(solid: Solid) -> _Obstacle:
@@ -174,7 +173,7 @@ class ExactCollision:
     """Moving links against the scene, then the pairs of links."""
 
     def __init__(self, robot: Robot, scene: Scene) -> None:
-        self.robot, self.scene, self._solids = robot, scene, solids_of(scene)
+        self.robot, self._solids = robot, solid_arrays(robot, scene)
         self._pieces, self._obstacles = _pieces(robot), _obstacles(scene)
         self.checks = checks_of(robot)
         self.links = tuple(check.link for check in self.checks if check.other is None)
@@ -186,42 +185,26 @@ class ExactCollision:
         self._contacts.num_max_contacts = MAX_CONTACTS
         self._collide = coal.CollisionRequest()
 
-    def _boxes(self, solids: Sequence[Solid]) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-        """The boxes of obstacles: R_box_base [o,3,3], centers [o,3], half sizes [o,3] and roundings [o]."""
-        T = np.stack([solid.T_base_box for solid in solids])
-        return (
-            np.ascontiguousarray(np.swapaxes(T[:, :3, :3], 1, 2)),
-            np.ascontiguousarray(T[:, :3, 3]),
-            np.stack([solid.half + solid.disc * np.array([1.0, 1.0, 0.0]) for solid in solids]),
-            np.array([solid.rounding for solid in solids]),
-        )
-
     @cached_property
     def _candidates(self) -> tuple[_Candidates, ...]:
-        return tuple(self._candidates_of(check) for check in self.checks)
+        return tuple(map(self._candidates_of, range(len(self.checks))))
 
-    def _candidates_of(self, check: Check) -> _Candidates:
-        firsts = self._pieces[check.link]
-        balls = _balls(self.robot)[check.link]
-        if check.other is not None:
-            partners = self._pieces[check.other]
-            other_balls = _balls(self.robot)[check.other]
+    def _candidates_of(self, check: int) -> _Candidates:
+        link, other = self.checks[check]
+        firsts = self._pieces[link]
+        balls = _balls(self.robot, link)
+        if other is None:
+            solids = self._solids
             return _Candidates(
-                firsts,
-                partners,
-                lambda frames: kernel.pair_bounds(frames, *balls, *other_balls),
-                surface_pairs(self.robot).get(check),
+                firsts, self._obstacles, lambda frames: kernel.scene_bounds(frames, *balls, solids, check)
             )
-        obstacle_indices = [
-            i
-            for i, obstacle in enumerate(self._obstacles)
-            if not self.scene.may_touch(check.link, obstacle.name)
-        ]
-        if not obstacle_indices:
-            return _Candidates(firsts, (), lambda frames: np.zeros((len(frames), 0)))
-        boxes = self._boxes([self._solids[i] for i in obstacle_indices])
-        obstacles = tuple(self._obstacles[i] for i in obstacle_indices)
-        return _Candidates(firsts, obstacles, lambda frames: kernel.scene_bounds(frames, *balls, boxes))
+        others = _balls(self.robot, other)
+        return _Candidates(
+            firsts,
+            self._pieces[other],
+            lambda frames: kernel.pair_bounds(frames, *balls, *others),
+            surface_pairs(self.robot).get(self.checks[check]),
+        )
 
     def _place(self, piece: _Piece, frames: ndarray) -> coal.Transform3s:
         T = frames[piece.frame]

@@ -14,6 +14,7 @@ from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import Configuration, Configurations, Points
 from robotdiffuse.perception.depth_filter import PointErrors, filtered, grown_for_errors, point_errors
 from robotdiffuse.perception.depth_view import NEAREST, DepthView, SeenPoints
+from robotdiffuse.robots.frame_kernel import write
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -210,7 +211,8 @@ def _nearest(at, x, y, z, radii):
 def _nearest_surfaces(scene, points, limit):
     out = np.empty((len(points), 4), np.float32)
     for p in range(len(points)):
-        out[p] = scene_distance(scene, points[p, 0], points[p, 1], points[p, 2], limit)
+        out[p, 0], normal = scene_distance(scene, points[p], limit)
+        write(normal, out[p, 1:])
     return out
 
 

@@ -134,7 +134,7 @@ def sweep(robot, path, margin, low, voxel, swept):
                     continue
                 for s in range(robot.first[g], robot.first[g + 1]):
                     sphere = robot.spheres[s]
-                    x, y, z = placed(frames[robot.frame[g]], sphere[0], sphere[1], sphere[2])
+                    x, y, z = placed(frames[robot.frame[g]], sphere)
                     at = last[s]
                     if (x - at[0]) ** 2 + (y - at[1]) ** 2 + (z - at[2]) ** 2 <= still:
                         continue

@@ -20,6 +20,30 @@ def minus(a, b):
 
 
 @inlined
+def plus(a, b):
+    """The sum of two vectors."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+@inlined
+def times(s, a):
+    """The product of a number and a vector."""
+    return s * a[0], s * a[1], s * a[2]
+
+
+@inlined
+def cross(a, b):
+    """The cross product of two vectors."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@inlined
+def write(v, out):
+    """Writes a vector to out[3]."""
+    out[0], out[1], out[2] = v
+
+
+@inlined
 def length(a):
     """The norm of a vector."""
     return np.sqrt(dot(a, a))

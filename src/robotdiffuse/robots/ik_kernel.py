@@ -289,13 +289,14 @@ def follow(start, goal, steer, longest, targets, chain, parameters):
     dof = len(start)
     rows = np.empty((len(targets) + 1, dof))
     none = np.empty((0, dof))
+    one = np.int64(1)  # for a literal, Numba would compile `solve_seeds` again
     seed = np.empty((1, dof))
     rows[0] = start
     for k in range(len(targets)):
         seed[0] = rows[k]
         if steer:
             seed[0] += (goal - rows[k]) / (len(targets) - k)
-        solutions = solve_seeds(seed, none, 1, chain, targets[k], parameters)[0]
+        solutions = solve_seeds(seed, none, one, chain, targets[k], parameters)[0]
         if len(solutions) == 0:
             return rows[: k + 1].copy()
         for j in range(dof):

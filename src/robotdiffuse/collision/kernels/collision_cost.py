@@ -19,9 +19,11 @@ from robotdiffuse.collision.kernels.lane_clearance import (
     pair_clearances,
     to_solid,
 )
+from robotdiffuse.collision.kernels.lane_collision import in_axes, near_boxes
 from robotdiffuse.collision.kernels.point_grid import near_point, points_lower_bound
-from robotdiffuse.collision.kernels.simd import W, first_lane, lane, load, maximum, minimum
+from robotdiffuse.collision.kernels.simd import W, first_lane, lane, load, load_vector, minimum, vector_in
 from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
+from robotdiffuse.robots.frame_kernel import cross, dot, length, minus, plus, times, write
 
 CLEARANCE_CAP = np.float32(1.0)
 """Larger clearances are capped at this value [m]."""
@@ -46,38 +48,25 @@ def frames_of(robot, q, frames):
             s = _ZERO
             slide = q[j]
         for k in range(3):
-            r0 = parent[3 * k]
-            r1 = parent[3 * k + 1]
-            r2 = parent[3 * k + 2]
-            x = r0 * offset[0] + r1 * offset[3] + r2 * offset[6]
-            y = r0 * offset[1] + r1 * offset[4] + r2 * offset[7]
-            z = r0 * offset[2] + r1 * offset[5] + r2 * offset[8]
-            child[3 * k] = x * c + y * s
-            child[3 * k + 1] = y * c - x * s
-            child[3 * k + 2] = z
-            child[9 + k] = r0 * offset[9] + r1 * offset[10] + r2 * offset[11] + parent[9 + k] + z * slide
+            row = parent[3 * k :]
+            x = dot(row, offset[::3])
+            y = dot(row, offset[1::3])
+            z = dot(row, offset[2::3])
+            write((x * c + y * s, y * c - x * s, z), child[3 * k :])
+            child[9 + k] = dot(row, offset[9:]) + parent[9 + k] + z * slide
+
+
+@allocation_free(forceinline=True)
+def placed(frame, p):
+    """Position in the base frame of the point p of a frame[12]. The coordinates may be those of 16 points."""
+    return dot(frame, p) + frame[9], dot(frame[3:], p) + frame[10], dot(frame[6:], p) + frame[11]
 
 
 @allocation_free(fastmath=True)
-def placed(frame, x, y, z):
-    """Position in the base frame of the point (x, y, z) of a frame[12]."""
-    return (
-        frame[0] * x + frame[1] * y + frame[2] * z + frame[9],
-        frame[3] * x + frame[4] * y + frame[5] * z + frame[10],
-        frame[6] * x + frame[7] * y + frame[8] * z + frame[11],
-    )
-
-
-@allocation_free(fastmath=True)
-def solid_distance(solid, x, y, z):
+def solid_distance(solid, p):
     """Signed distance of a point to a row of `SceneArrays.solids` [m], and its gradient."""
     # the point in the solid's axes, and its distances outside the faces
-    dx = x - solid[0]
-    dy = y - solid[1]
-    dz = z - solid[2]
-    u = dx * solid[3] + dy * solid[4] + dz * solid[5]
-    v = dx * solid[6] + dy * solid[7] + dz * solid[8]
-    w = dx * solid[9] + dy * solid[10] + dz * solid[11]
+    u, v, w = in_axes(solid, minus(p, solid))
     a = abs(u) - solid[12]
     b = abs(v) - solid[13]
     c = abs(w) - solid[14]
@@ -112,54 +101,38 @@ def solid_distance(solid, x, y, z):
         na = a / d
         nb = b / d
         nc = c / d
-    u = na * ou + nb * pu
-    v = na * ov + nb * pv
-    w = np.copysign(nc, w)
-    return (
-        d - solid[15],
-        solid[3] * u + solid[6] * v + solid[9] * w,
-        solid[4] * u + solid[7] * v + solid[10] * w,
-        solid[5] * u + solid[8] * v + solid[11] * w,
-    )
+    normal = na * ou + nb * pu, na * ov + nb * pv, np.copysign(nc, w)
+    gradient = dot(solid[3::3], normal), dot(solid[4::3], normal), dot(solid[5::3], normal)
+    return d - solid[15], gradient
 
 
 @allocation_free(inline="always")
-def scene_distance(scene, x, y, z, limit):
+def scene_distance(scene, p, limit):
     """Signed distance of a point to the nearest obstacle, at most `limit` [m], and its gradient (0 at
     `limit`).
 
     Distances to point clouds may be too large by a few millimeters.
     """
     best = limit
-    bx = _ZERO
-    by = _ZERO
-    bz = _ZERO
+    gradient = _ZERO, _ZERO, _ZERO
     for k in range(len(scene.solids)):
-        d, nx, ny, nz = solid_distance(scene.solids[k], x, y, z)
+        d, towards = solid_distance(scene.solids[k], p)
         if d < best:
             best = d
-            bx = nx
-            by = ny
-            bz = nz
+            gradient = towards
     if len(scene.points):
-        d, nx, ny, nz = near_point(scene, x, y, z, best)
+        d, towards = near_point(scene, p, best)
         if d < best:
             best = d
-            bx = nx
-            by = ny
-            bz = nz
-    return best, bx, by, bz
+            gradient = towards
+    return best, gradient
 
 
 @allocation_free(forceinline=True)
-def _add_force(wrench, x, y, z, fx, fy, fz):
-    """Adds a force at the point (x, y, z), and its moment about the base's origin, to a wrench."""
-    wrench[0] += fx
-    wrench[1] += fy
-    wrench[2] += fz
-    wrench[3] += y * fz - z * fy
-    wrench[4] += z * fx - x * fz
-    wrench[5] += x * fy - y * fx
+def _add_force(wrench, p, force):
+    """Adds a force at the point p, and its moment about the base's origin, to a wrench."""
+    write(plus(wrench, force), wrench)
+    write(plus(wrench[3:], cross(p, force)), wrench[3:])
 
 
 @allocation_free(forceinline=True)
@@ -168,33 +141,12 @@ def _subtract_torques(robot, frames, frame, wrench, grad):
     the frame."""
     while frame > 0:
         j = frame - 1
-        axis = frames[j + 1]
+        moved = frames[frame]
         frame = parent_of(robot.parents, j)
-        ax = axis[2]
-        ay = axis[5]
-        az = axis[8]
-        fx = wrench[0]
-        fy = wrench[1]
-        fz = wrench[2]
         if robot.offsets[j, 12] > _ZERO:
-            grad[j] -= ax * fx + ay * fy + az * fz
+            grad[j] -= dot(moved[2::3], wrench)
         else:
-            px = axis[9]
-            py = axis[10]
-            pz = axis[11]
-            mx = wrench[3] - (py * fz - pz * fy)
-            my = wrench[4] - (pz * fx - px * fz)
-            mz = wrench[5] - (px * fy - py * fx)
-            grad[j] -= ax * mx + ay * my + az * mz
-
-
-@allocation_free(forceinline=True)
-def _close(around, part, x, y, z, reach):
-    """Mask of the obstacles in row `part` of `around` with bounding boxes within `reach` [m] of a point."""
-    dx = maximum(maximum(load(around, part, 0) - x, x - load(around, part, 3)), _ZERO)
-    dy = maximum(maximum(load(around, part, 1) - y, y - load(around, part, 4)), _ZERO)
-    dz = maximum(maximum(load(around, part, 2) - z, z - load(around, part, 5)), _ZERO)
-    return dx * dx + dy * dy + dz * dz < reach * reach
+            grad[j] -= dot(moved[2::3], minus(wrench[3:], cross(moved[9:], wrench)))
 
 
 @allocation_free(forceinline=True)
@@ -202,37 +154,31 @@ def _row_cost(robot, scene, g, row, frame, margin, nearest, wrench):
     """Cost of a row of spheres of group g towards the scene; adds the spheres' forces to `wrench`."""
     # obstacles near the row's bounding sphere
     cost = _ZERO
-    around = scene.solid_boxes
+    boxes = scene.solid_boxes
     bound = robot.row_bounds[row]
-    u, v, w = placed(frame, bound[0], bound[1], bound[2])
+    center = placed(frame, bound)
     reach = bound[3] + margin
     any_close = 0
     if reach <= _ZERO:  # a margin this negative turns the cost off
         return cost
-    for part in range(len(around)):
-        any_close |= _close(around, part, u, v, w, reach)
-    near_cloud = len(scene.points) > 0 and points_lower_bound(scene, u, v, w) < reach
+    for part in range(len(boxes)):
+        any_close |= near_boxes(boxes, part, center, center, reach)
+    near_cloud = len(scene.points) > 0 and points_lower_bound(scene, center) < reach
     if any_close == 0 and not near_cloud:
         return cost
     # nearest obstacle of each sphere within the margin; `pushed` is the mask of these spheres
-    a = load(robot.rows, row, 0)
-    b = load(robot.rows, row, 1)
-    c = load(robot.rows, row, 2)
-    x = a * frame[0] + b * frame[1] + c * frame[2] + frame[9]
-    y = a * frame[3] + b * frame[4] + c * frame[5] + frame[10]
-    z = a * frame[6] + b * frame[7] + c * frame[8] + frame[11]
+    centers = placed(frame, load_vector(robot.rows, row, 0))
     radius_and_margin = load(robot.rows, row, 3) + margin
     best = radius_and_margin
     pushed = 0
-    zero = x * _ZERO
-    for part in range(len(around)):
-        close = _close(around, part, u, v, w, reach)
+    for part in range(len(boxes)):
+        close = near_boxes(boxes, part, center, center, reach)
         while close:
             k = part * W + first_lane(close)
             close &= close - 1
             if len(scene.may_touch) and scene.may_touch[g, k]:
                 continue
-            d, _ = to_solid(x, y, z, zero, zero, zero, scene.solids[k])
+            d, _ = to_solid(centers, minus(centers, centers), scene.solids[k])
             nearer = d < best
             best = minimum(best, d)
             pushed |= nearer
@@ -242,26 +188,22 @@ def _row_cost(robot, scene, g, row, frame, margin, nearest, wrench):
     # cost of spheres that are nearest to a point of a cloud, then of spheres that are nearest to a solid
     if near_cloud:
         for i in range(robot.row_sizes[row]):
-            px = lane(x, i)
-            py = lane(y, i)
-            pz = lane(z, i)
-            d, nx, ny, nz = near_point(scene, px, py, pz, lane(best, i))
+            at = vector_in(centers, i)
+            d, gradient = near_point(scene, at, lane(best, i))
             if d < lane(best, i):
                 pushed &= ~(1 << i)
                 h = lane(radius_and_margin, i) - d
                 cost += _HALF * h * h
-                _add_force(wrench, px, py, pz, h * nx, h * ny, h * nz)
+                _add_force(wrench, at, times(h, gradient))
     pushed &= (1 << robot.row_sizes[row]) - 1
     while pushed:
         i = first_lane(pushed)
         pushed &= pushed - 1
-        px = lane(x, i)
-        py = lane(y, i)
-        pz = lane(z, i)
-        d, nx, ny, nz = solid_distance(scene.solids[nearest[i]], px, py, pz)
+        at = vector_in(centers, i)
+        d, gradient = solid_distance(scene.solids[nearest[i]], at)
         h = max(lane(radius_and_margin, i) - d, _ZERO)
         cost += _HALF * h * h
-        _add_force(wrench, px, py, pz, h * nx, h * ny, h * nz)
+        _add_force(wrench, at, times(h, gradient))
     return cost
 
 
@@ -316,31 +258,25 @@ def cost_gradient_at(robot, scene, q, pairs, margin, self_margin, work, grad):
             continue
         ia = robot.frame[a]
         ib = robot.frame[b]
-        fa = frames[ia]
-        fb = frames[ib]
-        bb = robot.bounds[b]
-        cx, cy, cz = placed(fb, bb[0], bb[1], bb[2])
+        bound = robot.bounds[b]
+        center = placed(frames[ib], bound)
         wrench[:] = _ZERO
         opposite_wrench[:] = _ZERO
         for s in range(robot.first[a], robot.first[a + 1]):
-            x, y, z = placed(fa, robot.spheres[s, 0], robot.spheres[s, 1], robot.spheres[s, 2])
-            reach = robot.spheres[s, 3] + bb[3] + self_margin
-            if (x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2 >= reach * reach:
+            sphere = robot.spheres[s]
+            at = placed(frames[ia], sphere)
+            if length(minus(at, center)) >= sphere[3] + bound[3] + self_margin:
                 continue
             for t in range(robot.first[b], robot.first[b + 1]):
-                u, v, w = placed(fb, robot.spheres[t, 0], robot.spheres[t, 1], robot.spheres[t, 2])
-                dx = x - u
-                dy = y - v
-                dz = z - w
-                d = np.sqrt(dx * dx + dy * dy + dz * dz) + _TINY
-                h = robot.spheres[s, 3] + robot.spheres[t, 3] + self_margin - d
+                other_sphere = robot.spheres[t]
+                other = placed(frames[ib], other_sphere)
+                apart = minus(at, other)
+                d = length(apart) + _TINY
+                h = sphere[3] + other_sphere[3] + self_margin - d
                 if h > _ZERO:
                     cost += _HALF * h * h
-                    fx = h * dx / d
-                    fy = h * dy / d
-                    fz = h * dz / d
-                    _add_force(wrench, x, y, z, fx, fy, fz)
-                    _add_force(opposite_wrench, u, v, w, -fx, -fy, -fz)
+                    _add_force(wrench, at, times(h / d, apart))
+                    _add_force(opposite_wrench, other, times(-h / d, apart))
         _subtract_torques(robot, frames, ia, wrench, grad)
         _subtract_torques(robot, frames, ib, opposite_wrench, grad)
     return cost

@@ -12,9 +12,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robotdiffuse.collision.kernels.frames import parent_of, placed, point_to_box
+from robotdiffuse.collision.kernels.frames import base_frames, parent_of, point_to_solid
 from robotdiffuse.core.kernels import inner_kernel, kernel
-from robotdiffuse.robots.frame_kernel import step
+from robotdiffuse.robots.frame_kernel import (
+    column,
+    cross,
+    dot,
+    length,
+    minus,
+    placed,
+    plus,
+    rotated_back,
+    step,
+    times,
+    write,
+)
 
 MAX_GJK_STEPS = 32
 """Largest number of iterations of GJK; usually it takes three to eight."""
@@ -83,14 +95,10 @@ class Posture(NamedTuple):
 @kernel()
 def make_posture(hulls, solids, dof):
     """Scratch memory of one thread."""
-    frames = np.zeros((dof + 1, 3, 4))
-    for k in range(3):
-        frames[0, k, k] = 1.0
     parts = len(hulls.frame)
     planes = np.zeros((parts, len(solids.disc) + parts, 3))
-    return Posture(
-        frames, np.zeros((dof + 1, 6)), planes, np.empty((4, 3)), np.empty((3, 3)), np.empty((3, 3))
-    )
+    edges = np.empty((3, 3))
+    return Posture(base_frames(dof), np.zeros((dof + 1, 6)), planes, np.empty((4, 3)), edges, edges.copy())
 
 
 @kernel()
@@ -105,13 +113,18 @@ def pose(offsets, parents, slides, q, dq, posture):
         before = posture.twists[parent]
         twist = posture.twists[j + 1]
         step(posture.frames[parent], offsets[j], slides[j], q[j], child)
-        for r in range(3):
-            a = (r + 1) % 3
-            b = (r + 2) % 3
-            axis = child[r, 2] * dq[j]
-            moment = (child[a, 3] * child[b, 2] - child[b, 3] * child[a, 2]) * dq[j]
-            twist[r] = before[r] + (0.0 if slides[j] else axis)
-            twist[3 + r] = before[3 + r] + (axis if slides[j] else moment)
+        axis = times(dq[j], column(child, 2))
+        write(plus(before, times(0.0 if slides[j] else 1.0, axis)), twist)
+        write(plus(before[3:], axis if slides[j] else cross(column(child, 3), axis)), twist[3:])
+
+
+@inner_kernel()
+def relative_twist(posture, frame, base):
+    """The angular velocity of a frame relative to frame `base`, and the velocity of its point at the base's
+    origin."""
+    twist = posture.twists[frame]
+    base_twist = posture.twists[base]
+    return minus(twist, base_twist), minus(twist[3:], base_twist[3:])
 
 
 @inner_kernel()
@@ -120,71 +133,31 @@ def part_travel(hulls, p, base, posture):
     motion to either of its ends [m]; the remainder r (see the module's docstring) is not included."""
     frame = hulls.frame[p]
     ball = hulls.balls[p]
-    twist = posture.twists[frame]
-    base_twist = posture.twists[base]
-    T = posture.frames[frame]
-    a = twist[0] - base_twist[0]
-    b = twist[1] - base_twist[1]
-    c = twist[2] - base_twist[2]
-    x = placed(T, ball, 0)
-    y = placed(T, ball, 1)
-    z = placed(T, ball, 2)
-    u = b * z - c * y + twist[3] - base_twist[3]
-    v = c * x - a * z + twist[4] - base_twist[4]
-    w = a * y - b * x + twist[5] - base_twist[5]
-    return np.sqrt(u * u + v * v + w * w) + ball[3] * np.sqrt(a * a + b * b + c * c)
+    turning, moving = relative_twist(posture, frame, base)
+    velocity = plus(cross(turning, placed(posture.frames[frame], ball)), moving)
+    return length(velocity) + ball[3] * length(turning)
 
 
 @inner_kernel()
 def ball_to_solid(hulls, p, solids, o, posture):
     """Lower bound of the distance of a part to an obstacle in the middle of the motion, computed from the
     ball around the part [m]."""
-    T = posture.frames[hulls.frame[p]]
     ball = hulls.balls[p]
-    x = placed(T, ball, 0)
-    y = placed(T, ball, 1)
-    z = placed(T, ball, 2)
-    gap = point_to_box(x, y, z, solids.rotation[o], solids.middle[o], solids.half[o], solids.disc[o])
+    center = placed(posture.frames[hulls.frame[p]], ball)
+    gap = point_to_solid(center, solids.rotation[o], solids.middle[o], solids.half[o], solids.disc[o])
     return gap - solids.rounding[o] - ball[3]
 
 
-@inner_kernel()
-def ball_to_ball(hulls, p, q, posture):
-    """Lower bound of the distance of two parts in the middle of the motion, computed from the balls around
-    them [m]."""
-    S = posture.frames[hulls.frame[p]]
-    T = posture.frames[hulls.frame[q]]
-    total = 0.0
-    a = hulls.balls[p]
-    b = hulls.balls[q]
-    for r in range(3):
-        total += (placed(S, a, r) - placed(T, b, r)) ** 2
-    return np.sqrt(total) - a[3] - b[3]
-
-
 @inner_kernel(fastmath=True)
-def _lowest(vertices, first, last, x, y, z, offset, u, v, w, speed):
-    """Minimum over vertices of a - |b|, plus `offset`. a is the vertex's height along a normal, b its speed
-    along the normal; both are linear in the vertex."""
+def _lowest(vertices, first, last, n, m, speed):
+    """Minimum over vertices of a - |b|. a is the vertex's height along the normal n, b its speed along the
+    normal: `speed` plus its product with m."""
     minimum = np.inf
     for i in range(first, last):
-        a = vertices[0, i] * x + vertices[1, i] * y + vertices[2, i] * z
-        b = vertices[0, i] * u + vertices[1, i] * v + vertices[2, i] * w + speed
+        a = vertices[0, i] * n[0] + vertices[1, i] * n[1] + vertices[2, i] * n[2]
+        b = vertices[0, i] * m[0] + vertices[1, i] * m[1] + vertices[2, i] * m[2] + speed
         minimum = min(minimum, a - abs(b))
-    return minimum + offset
-
-
-@inner_kernel()
-def _furthest(vertices, first, last, x, y, z):
-    """Index of the vertex that is furthest in the direction (x, y, z)."""
-    best = -np.inf
-    at = first
-    for i in range(first, last):
-        a = vertices[0, i] * x + vertices[1, i] * y + vertices[2, i] * z
-        if a > best:
-            best = a
-            at = i
-    return at
+    return minimum
 
 
 @inner_kernel()
@@ -192,19 +165,16 @@ def _support_of_part(hulls, p, posture, sign, row):
     """Writes to points[row] the vertex of a part that is furthest in the direction sign * points[0]."""
     T = posture.frames[hulls.frame[p]]
     points = posture.points
-    x = sign * points[0, 0]
-    y = sign * points[0, 1]
-    z = sign * points[0, 2]
-    i = _furthest(
-        hulls.vertices,
-        hulls.first[p],
-        hulls.first[p + 1],
-        T[0, 0] * x + T[1, 0] * y + T[2, 0] * z,
-        T[0, 1] * x + T[1, 1] * y + T[2, 1] * z,
-        T[0, 2] * x + T[1, 2] * y + T[2, 2] * z,
-    )
-    for r in range(3):
-        points[row, r] = placed(T, hulls.vertices[:, i], r)
+    vertices = hulls.vertices
+    x, y, z = rotated_back(T, points[0])
+    best = -np.inf
+    furthest = hulls.first[p]
+    for i in range(hulls.first[p], hulls.first[p + 1]):
+        a = sign * (vertices[0, i] * x + vertices[1, i] * y + vertices[2, i] * z)
+        if a > best:
+            best = a
+            furthest = i
+    write(placed(T, vertices[:, furthest]), points[row])
 
 
 @inner_kernel()
@@ -212,19 +182,14 @@ def _support_of_solid(solids, o, posture):
     """Writes to points[2] the point of an obstacle (without its rounding) that is furthest in the direction
     points[0]."""
     R = solids.rotation[o]
-    points = posture.points
-    x = points[0, 0]
-    y = points[0, 1]
-    z = points[0, 2]
-    a = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
-    b = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
-    c = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
+    half = solids.half[o]
+    n = posture.points[0]
+    a = dot(R[0], n)
+    b = dot(R[1], n)
+    c = dot(R[2], n)
     disc = solids.disc[o] / max(np.sqrt(a * a + b * b), 1e-300)
-    a = np.copysign(solids.half[o, 0], a) + disc * a
-    b = np.copysign(solids.half[o, 1], b) + disc * b
-    c = np.copysign(solids.half[o, 2], c)
-    for r in range(3):
-        points[2, r] = R[0, r] * a + R[1, r] * b + R[2, r] * c + solids.middle[o, r]
+    at = np.copysign(half[0], a) + disc * a, np.copysign(half[1], b) + disc * b, np.copysign(half[2], c)
+    write(plus(rotated_back(R, at), solids.middle[o]), posture.points[2])
 
 
 @inner_kernel()
@@ -232,24 +197,14 @@ def _lowest_along(hulls, p, base, sign, posture):
     """Minimum height of a part in the direction sign * points[0] at the start and at the end of the motion
     [m]. The remainder r is left out; velocities are relative to frame `base`."""
     n = posture.points[0]
-    T = posture.frames[hulls.frame[p]]
-    twist = posture.twists[hulls.frame[p]]
-    base_twist = posture.twists[base]
+    frame = hulls.frame[p]
+    turning, moving = relative_twist(posture, frame, base)
     at_start = np.inf
     at_stop = np.inf
     for i in range(hulls.first[p], hulls.first[p + 1]):
-        vertex = hulls.vertices[:, i]
-        x = placed(T, vertex, 0)
-        y = placed(T, vertex, 1)
-        z = placed(T, vertex, 2)
-        a = twist[0] - base_twist[0]
-        b = twist[1] - base_twist[1]
-        c = twist[2] - base_twist[2]
-        u = b * z - c * y + twist[3] - base_twist[3]
-        v = c * x - a * z + twist[4] - base_twist[4]
-        w = a * y - b * x + twist[5] - base_twist[5]
-        height = sign * (n[0] * x + n[1] * y + n[2] * z)
-        speed = sign * (n[0] * u + n[1] * v + n[2] * w)
+        at = placed(posture.frames[frame], hulls.vertices[:, i])
+        height = sign * dot(n, at)
+        speed = sign * dot(n, plus(cross(turning, at), moving))
         at_start = min(at_start, height - speed)
         at_stop = min(at_stop, height + speed)
     return at_start - hulls.rounding[p], at_stop - hulls.rounding[p]
@@ -264,43 +219,28 @@ def separation(hulls, p, solids, other, base, posture):
     `other` is the index of an obstacle or, if negative, -1 minus the index of a part. If this part is not
     fixed to frame `base`, its motion is included.
     """
-    x = posture.points[0, 0]
-    y = posture.points[0, 1]
-    z = posture.points[0, 2]
+    n = posture.points[0]
     frame = hulls.frame[p]
     T = posture.frames[frame]
-    twist = posture.twists[frame]
-    base_twist = posture.twists[base]
-    a = twist[0] - base_twist[0]
-    b = twist[1] - base_twist[1]
-    c = twist[2] - base_twist[2]
+    origin = column(T, 3)
+    turning, moving = relative_twist(posture, frame, base)
     # n . (w x p) = (n x w) . p
-    u = y * c - z * b
-    v = z * a - x * c
-    w = x * b - y * a
-    speed = u * T[0, 3] + v * T[1, 3] + w * T[2, 3]
-    speed += x * (twist[3] - base_twist[3]) + y * (twist[4] - base_twist[4]) + z * (twist[5] - base_twist[5])
+    turned = cross(n, turning)
+    speed = dot(turned, origin) + dot(n, moving)
     # height and speed along the normal as linear functions of a vertex in the part's frame
-    offset = x * T[0, 3] + y * T[1, 3] + z * T[2, 3] - hulls.rounding[p]
-    lx = T[0, 0] * x + T[1, 0] * y + T[2, 0] * z
-    ly = T[0, 1] * x + T[1, 1] * y + T[2, 1] * z
-    lz = T[0, 2] * x + T[1, 2] * y + T[2, 2] * z
-    lu = T[0, 0] * u + T[1, 0] * v + T[2, 0] * w
-    lv = T[0, 1] * u + T[1, 1] * v + T[2, 1] * w
-    lw = T[0, 2] * u + T[1, 2] * v + T[2, 2] * w
+    offset = dot(n, origin) - hulls.rounding[p]
+    heights = rotated_back(T, n)
     first = hulls.first[p]
     last = hulls.first[p + 1]
-    along = _lowest(hulls.vertices, first, last, lx, ly, lz, offset, lu, lv, lw, speed)
-    middle = _lowest(hulls.vertices, first, last, lx, ly, lz, offset, 0.0, 0.0, 0.0, 0.0)
-    reach = 0.0
+    along = _lowest(hulls.vertices, first, last, heights, rotated_back(T, turned), speed) + offset
+    middle = _lowest(hulls.vertices, first, last, heights, (0.0, 0.0, 0.0), 0.0) + offset
     if other >= 0:
         _support_of_solid(solids, other, posture)
         reach = solids.rounding[other]
     else:
         _support_of_part(hulls, -1 - other, posture, 1.0, 2)
         reach = hulls.rounding[-1 - other]
-    at = posture.points[2]
-    reach += x * at[0] + y * at[1] + z * at[2]
+    reach += dot(n, posture.points[2])
     if other < 0 and hulls.frame[-1 - other] != base:
         start, stop = _lowest_along(hulls, p, base, 1.0, posture)
         other_start, other_stop = _lowest_along(hulls, -1 - other, base, -1.0, posture)
@@ -311,25 +251,16 @@ def separation(hulls, p, solids, other, base, posture):
 
 
 @inner_kernel()
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@inner_kernel()
 def _contains_origin(e, new):
     """Whether the tetrahedron with the vertices `new`, `new` + e[0], `new` + e[1] and `new` + e[2] contains
     the origin: whether all its barycentric coordinates are positive."""
     inside = 1.0
     for k in range(3):
-        a = e[(k + 1) % 3]
-        b = e[(k + 2) % 3]
-        x = a[1] * b[2] - a[2] * b[1]
-        y = a[2] * b[0] - a[0] * b[2]
-        z = a[0] * b[1] - a[1] * b[0]
-        volume = e[k, 0] * x + e[k, 1] * y + e[k, 2] * z
+        normal = cross(e[(k + 1) % 3], e[(k + 2) % 3])
+        volume = dot(e[k], normal)
         if abs(volume) < 1e-30:
             return False
-        share = -(new[0] * x + new[1] * y + new[2] * z) / volume
+        share = -dot(new, normal) / volume
         inside -= share
         if share <= 0:
             return False
@@ -346,23 +277,22 @@ def _nearest(simplex, count, edges, nearest):
     """
     # vertex, edges (i == j) and triangles that contain the last vertex
     new = simplex[count - 1]
-    best_square = _dot(new, new)
+    best_square = dot(new, new)
     face = 0
-    for r in range(3):
-        nearest[r] = new[r]
-        for k in range(count - 1):
-            edges[k, r] = simplex[k, r] - new[r]
+    write(new, nearest)
+    for k in range(count - 1):
+        write(minus(simplex[k], new), edges[k])
     if count == 4 and _contains_origin(edges, new):
         return 0
     for i in range(count - 1):
         for j in range(i, count - 1):
             e = edges[i]
             f = edges[j]
-            a = _dot(e, e)
-            b = _dot(e, f)
-            c = _dot(f, f)
-            d = -_dot(new, e)
-            g = -_dot(new, f)
+            a = dot(e, e)
+            b = dot(e, f)
+            c = dot(f, f)
+            d = -dot(new, e)
+            g = -dot(new, f)
             x = 0.0
             y = 0.0
             if i == j:
@@ -374,19 +304,16 @@ def _nearest(simplex, count, edges, nearest):
                 y = (g * a - d * b) / area
                 inside = x > 0 and y > 0 and x + y < 1
             if inside:
-                total = 0.0
-                for r in range(3):
-                    total += (new[r] + x * e[r] + y * f[r]) ** 2
-                if total < best_square:
-                    best_square = total
+                point = plus(new, plus(times(x, e), times(y, f)))
+                square = dot(point, point)
+                if square < best_square:
+                    best_square = square
                     face = 1 << i | 1 << j
-                    for r in range(3):
-                        nearest[r] = new[r] + x * e[r] + y * f[r]
+                    write(point, nearest)
     at = 0
     for k in range(count):
         if k == count - 1 or face >> k & 1:
-            for r in range(3):
-                simplex[at, r] = simplex[k, r]
+            write(simplex[k], simplex[at])
             at += 1
     return at
 
@@ -402,26 +329,21 @@ def find_plane(hulls, p, solids, other, posture):
     best = -np.inf
     gap = np.inf
     count = 0
-    n0 = points[0, 0]
-    n1 = points[0, 1]
-    n2 = points[0, 2]
+    normal = column(points.T, 0)
     for _ in range(MAX_GJK_STEPS):
         _support_of_part(hulls, p, posture, -1.0, 1)
         if other >= 0:
             _support_of_solid(solids, other, posture)
         else:
             _support_of_part(hulls, -1 - other, posture, 1.0, 2)
-        for r in range(3):
-            simplex[count, r] = points[1, r] - points[2, r]
-        reached = _dot(simplex[count], points[0])
+        write(minus(points[1], points[2]), simplex[count])
+        reached = dot(simplex[count], points[0])
         if reached > best:
             best = reached
-            n0 = points[0, 0]
-            n1 = points[0, 1]
-            n2 = points[0, 2]
+            normal = column(points.T, 0)
         count = _nearest(simplex, count + 1, posture.edges, points[0])
         before = gap
-        gap = np.sqrt(_dot(points[0], points[0]))
+        gap = length(points[0])
         if count == 0 or gap - rounding < GJK_ABSOLUTE_TOLERANCE:
             return False
         for r in range(3):
@@ -431,9 +353,7 @@ def find_plane(hulls, p, solids, other, posture):
             or gap >= before
         ):
             break
-    points[0, 0] = n0
-    points[0, 1] = n1
-    points[0, 2] = n2
+    write(normal, points[0])
     return best > rounding
 
 
@@ -447,28 +367,23 @@ def best_plane(hulls, p, solids, other, base, enough, plane, posture):
     distance, or -inf if the bodies touch or nearly touch.
     """
     n = posture.points[0]
-    cached = False
-    for r in range(3):
-        n[r] = plane[r]
-        cached |= plane[r] != 0.0
-    if cached:
+    write(plane, n)
+    if plane.any():
         middle, along = separation(hulls, p, solids, other, base, posture)
         if along >= enough:
             return middle, along, False
     else:
-        T = posture.frames[hulls.frame[p]]
+        center = placed(posture.frames[hulls.frame[p]], hulls.balls[p])
+        if other >= 0:
+            write(minus(center, solids.middle[other]), n)
+        else:
+            q = -1 - other
+            write(minus(center, placed(posture.frames[hulls.frame[q]], hulls.balls[q])), n)
+        distance = length(n)
         for r in range(3):
-            n[r] = placed(T, hulls.balls[p], r)
-            if other >= 0:
-                n[r] -= solids.middle[other, r]
-            else:
-                n[r] -= placed(posture.frames[hulls.frame[-1 - other]], hulls.balls[-1 - other], r)
-        length = np.sqrt(_dot(n, n))
-        for r in range(3):
-            n[r] = n[r] / length if length > 0 else 1.0 / np.sqrt(3.0)
+            n[r] = n[r] / distance if distance > 0 else 1.0 / np.sqrt(3.0)
     if not find_plane(hulls, p, solids, other, posture):
         return -np.inf, -np.inf, True
-    for r in range(3):
-        plane[r] = n[r]
+    write(n, plane)
     middle, along = separation(hulls, p, solids, other, base, posture)
     return middle, along, True

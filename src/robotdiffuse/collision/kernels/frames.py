@@ -1,11 +1,11 @@
-"""Compiled kinematics in float64: frames along a chain, points of a frame, and distances of points to
-boxes."""
+"""Compiled kinematics: parents of frames, rotations of quaternions, and distances of points to solids."""
 
 import numpy as np
 from numba.core import types
 from numba.extending import overload
 
 from robotdiffuse.core.kernels import inner_kernel
+from robotdiffuse.robots.frame_kernel import dot, length, minus, write
 
 
 def parent_of(parents, j):
@@ -20,30 +20,30 @@ def _parent_of(parents, j):
 
 
 @inner_kernel()
-def placed(T, p, r):
-    """Coordinate r (0 to 2) of T @ p: the point p of a frame, seen in the base frame; T = T_base_frame."""
-    return T[r, 0] * p[0] + T[r, 1] * p[1] + T[r, 2] * p[2] + T[r, 3]
+def base_frames(dof):
+    """Memory for the frames T_base_frame[dof + 1, 3, 4] of an arm; frame 0 is the base."""
+    frames = np.zeros((dof + 1, 3, 4))
+    for k in range(3):
+        frames[0, k, k] = 1.0
+    return frames
 
 
 @inner_kernel()
-def point_to_box(x, y, z, rotation, middle, half, disc):
-    """Lower bound of the signed distance [m] from a point to the Minkowski sum of a box and a disc around the
-    box's z axis. The bound is the distance to a larger box: the first two half edges grow by the disc's
-    radius.
+def point_to_solid(p, rotation, middle, half, disc):
+    """Signed distance [m] from a point to the Minkowski sum of a box and a disc around the box's z axis; a
+    lower bound inside.
 
-    `rotation` is R_box_base[3, 3]; the result is negative inside.
+    Either the disc's radius or the box's first two half edges are zero. `rotation` is R_box_base[3, 3].
     """
-    outside = 0.0
-    deepest = -np.inf
-    x = x - middle[0]
-    y = y - middle[1]
-    z = z - middle[2]
-    for r in range(3):
-        d = rotation[r, 0] * x + rotation[r, 1] * y + rotation[r, 2] * z
-        d = abs(d) - half[r] - (disc if r < 2 else 0.0)
-        outside += max(d, 0.0) ** 2
-        deepest = max(deepest, d)
-    return np.sqrt(outside) + min(deepest, 0.0)
+    d = minus(p, middle)
+    u = abs(dot(rotation[0], d)) - half[0]
+    v = abs(dot(rotation[1], d)) - half[1]
+    w = abs(dot(rotation[2], d)) - half[2]
+    if disc > 0:
+        u = np.sqrt(u * u + v * v) - disc
+        v = u
+    outside = max(u, 0.0), 0.0 if disc > 0 else max(v, 0.0), max(w, 0.0)
+    return length(outside) + min(max(u, v, w), 0.0)
 
 
 @inner_kernel()
@@ -56,4 +56,4 @@ def write_rotation(w, x, y, z, out):
             (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
         )
     ):
-        out[r, 0], out[r, 1], out[r, 2] = row
+        write(row, out[r])

@@ -17,8 +17,9 @@ import numpy as np
 from robotdiffuse.collision.kernels.frames import parent_of
 from robotdiffuse.collision.kernels.lane_collision import (
     W,
+    centers_of,
+    in_axes,
     lanes_that_may_touch,
-    place,
     place_frames,
     take_block,
 )
@@ -28,13 +29,17 @@ from robotdiffuse.collision.kernels.simd import (
     copysign,
     lane,
     load,
+    load_vector,
     maximum,
     minimum,
     reduce_min,
     sqrt,
     store,
+    store_vector,
+    vector_in,
 )
 from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
+from robotdiffuse.robots.frame_kernel import cross, dot, minus, plus, times
 
 _ZERO, _ONE, _TINY, _FAR = np.float32(0.0), np.float32(1.0), np.float32(1e-9), np.float32(1e9)
 
@@ -89,21 +94,14 @@ def make_clearance_workspace(robot, solids):
 
 
 @allocation_free(forceinline=True)
-def to_solid(x, y, z, vx, vy, vz, solid):
-    """Signed distances of the points (x, y, z) in 16 lanes to a row of `SceneArrays.solids`, and the
-    components of the points' velocities (vx, vy, vz) along the lines to the solid's nearest points, as
-    absolute values."""
-    dx = x - solid[0]
-    dy = y - solid[1]
-    dz = z - solid[2]
-    u = dx * solid[3] + dy * solid[4] + dz * solid[5]
-    v = dx * solid[6] + dy * solid[7] + dz * solid[8]
-    w = dx * solid[9] + dy * solid[10] + dz * solid[11]
+def to_solid(points, velocities, solid):
+    """Signed distances of the points in 16 lanes to a row of `SceneArrays.solids`, and the components of the
+    points' velocities along the lines to the solid's nearest points, as absolute values."""
+    u, v, w = in_axes(solid, minus(points, solid))
     # velocity in the solid's axes; multiplied by the sign of the coordinate, it is the speed away from the
     # center
-    p = vx * solid[3] + vy * solid[4] + vz * solid[5]
-    q = vx * solid[6] + vy * solid[7] + vz * solid[8]
-    r = (vx * solid[9] + vy * solid[10] + vz * solid[11]) * copysign(_ONE, w)
+    p, q, r = in_axes(solid, velocities)
+    r = r * copysign(_ONE, w)
     if solid[16] > _ZERO:
         from_axis = sqrt(u * u + v * v)
         p = (u * p + v * q) / maximum(from_axis, _TINY)
@@ -115,43 +113,28 @@ def to_solid(x, y, z, vx, vy, vz, solid):
         v = absolute(v) - solid[13]
     w = absolute(w) - solid[14]
     inside = minimum(maximum(maximum(u, v), w), _ZERO)
-    u = maximum(u, _ZERO)
-    v = maximum(v, _ZERO)
-    w = maximum(w, _ZERO)
-    d = sqrt(u * u + v * v + w * w)
-    return d + inside - solid[15], absolute(u * p + v * q + w * r) / maximum(d, _TINY)
+    outside = maximum(u, _ZERO), maximum(v, _ZERO), maximum(w, _ZERO)
+    d = _length(outside)
+    return d + inside - solid[15], absolute(dot(outside, (p, q, r))) / maximum(d, _TINY)
 
 
 @allocation_free(forceinline=True)
-def _at(positions, s):
-    return load(positions, s, 0), load(positions, s, 1), load(positions, s, 2)
+def _velocity(twists, f, points):
+    """Velocities of points of frame f."""
+    return plus(cross(load_vector(twists, f, 0), points), load_vector(twists, f, 3))
 
 
 @allocation_free(forceinline=True)
-def _velocity(twists, f, x, y, z):
-    """Velocities of the points (x, y, z) of frame f."""
-    a, b, c = _at(twists, f)
-    return (
-        b * z - c * y + load(twists, f, 3),
-        c * x - a * z + load(twists, f, 4),
-        a * y - b * x + load(twists, f, 5),
-    )
-
-
-@allocation_free(forceinline=True)
-def _speed(twists, f, other, x, y, z, radius):
+def _speed(twists, f, other, centers, radius):
     """Upper bounds on the speed, relative to frame `other`, of any point of a ball that is fixed to frame
     f."""
-    u, v, w = _velocity(twists, f, x, y, z)
-    p, q, r = _velocity(twists, other, x, y, z)
-    a, b, c = _at(twists, f)
-    d, e, g = _at(twists, other)
-    return _length(u - p, v - q, w - r) + radius * _length(a - d, b - e, c - g)
+    moving = minus(_velocity(twists, f, centers), _velocity(twists, other, centers))
+    return _length(moving) + radius * _length(minus(load_vector(twists, f, 0), load_vector(twists, other, 0)))
 
 
 @allocation_free(forceinline=True)
-def _length(x, y, z):
-    return sqrt(x * x + y * y + z * z)
+def _length(v):
+    return sqrt(dot(v, v))
 
 
 @allocation_free()
@@ -164,22 +147,20 @@ def place_motions(robot, q, dq, work):
         parent = parent_of(robot.parents, j)
         f = j + 1
         slides = robot.offsets[j, 12]
-        for k in range(3):
-            a = (k + 1) % 3
-            b = (k + 2) % 3
-            axis = load(work.frames, f, 3 * k + 2) * load(dq, j, 0)
-            moment = load(work.frames, f, 9 + a) * load(work.frames, f, 3 * b + 2)
-            moment = moment - load(work.frames, f, 9 + b) * load(work.frames, f, 3 * a + 2)
-            moment = moment * load(dq, j, 0) * (_ONE - slides) + axis * slides
-            store(work.twists, f, k, load(work.twists, parent, k) + axis * (_ONE - slides))
-            store(work.twists, f, 3 + k, load(work.twists, parent, 3 + k) + moment)
+        z = load(work.frames, f, 2), load(work.frames, f, 5), load(work.frames, f, 8)
+        axis = times(load(dq, j, 0), z)
+        moment = cross(load_vector(work.frames, f, 9), axis)
+        moving = plus(times(_ONE - slides, moment), times(slides, axis))
+        turning = times(_ONE - slides, axis)
+        store_vector(work.twists, f, 0, plus(load_vector(work.twists, parent, 0), turning))
+        store_vector(work.twists, f, 3, plus(load_vector(work.twists, parent, 3), moving))
 
 
 @allocation_free()
 def _place_group(robot, g, work):
     if not work.placed[g]:
         for s in range(robot.first[g], robot.first[g + 1]):
-            place(work.frames, robot.frame[g], robot.spheres, s, work.positions, s)
+            store_vector(work.positions, s, 0, centers_of(work.frames, robot.frame[g], robot.spheres, s))
         work.placed[g] = True
 
 
@@ -205,23 +186,23 @@ def _mark_near(robot, scene, g, speed, work):
     radius away from the group. All points together are the last obstacle; for them only the lower bound is
     used.
     """
-    x, y, z = _at(work.centers, g)
+    centers = load_vector(work.centers, g, 0)
     radius = robot.bounds[g, 3]
     upper_bound = load(work.need, 0, 0)
-    zero = x * _ZERO
     solids = len(scene.solids)
     for k in range(solids):
-        distance, _ = to_solid(x, y, z, zero, zero, zero, scene.solids[k])
+        distance, _ = to_solid(centers, minus(centers, centers), scene.solids[k])
         if len(scene.may_touch) and scene.may_touch[g, k]:
-            distance = zero + _FAR
+            distance = distance * _ZERO + _FAR
         store(work.bounds, k, 0, distance)
         upper_bound = minimum(upper_bound, distance + radius)
     obstacles = solids
     if len(scene.points):
         obstacles += 1
         for i in range(W):
-            distance = points_lower_bound(scene, lane(x, i), lane(y, i), lane(z, i))
-            work.bounds[solids, i] = min(distance, POINT_RANGE + radius)
+            work.bounds[solids, i] = min(
+                points_lower_bound(scene, vector_in(centers, i)), POINT_RANGE + radius
+            )
     any_near = False
     for k in range(obstacles):
         work.near[k] = (load(work.bounds, k, 0) - radius - speed < upper_bound) != 0
@@ -235,28 +216,28 @@ def group_along(robot, scene, g, moving, work):
     clearances along the motions. Without `moving` the twists count as zero."""
     frame = robot.frame[g]
     solids = len(scene.solids)
-    x, y, z = _at(work.centers, g)
-    zero = x * _ZERO
-    speed = _speed(work.twists, frame, 0, x, y, z, robot.bounds[g, 3]) if moving else zero
+    centers = load_vector(work.centers, g, 0)
+    still = minus(centers, centers)
+    speed = _speed(work.twists, frame, 0, centers, robot.bounds[g, 3]) if moving else still[0]
     _reset(work)
     if not _mark_near(robot, scene, g, speed, work):
         return
     _place_group(robot, g, work)
     for s in range(robot.first[g], robot.first[g + 1]):
-        x, y, z = _at(work.positions, s)
-        u, v, w = _velocity(work.twists, frame, x, y, z) if moving else (zero, zero, zero)
+        centers = load_vector(work.positions, s, 0)
+        velocities = _velocity(work.twists, frame, centers) if moving else still
         radius = robot.spheres[s, 3]
         for k in range(solids):
             if work.near[k]:
-                distance, towards = to_solid(x, y, z, u, v, w, scene.solids[k])
+                distance, towards = to_solid(centers, velocities, scene.solids[k])
                 _lower_to(distance - radius, towards, work)
         if len(scene.points) and work.near[solids]:
             # the nearest point changes along the motion, so the bound uses the sphere's whole speed instead
             # of the component towards one point
-            speed = _length(u, v, w)
+            speed = _length(velocities)
             for i in range(W):
                 limit = min(work.clearance[0, i] + lane(speed, i), POINT_RANGE) + radius
-                distance = points_distance(scene, lane(x, i), lane(y, i), lane(z, i), limit) - radius
+                distance = points_distance(scene, vector_in(centers, i), limit) - radius
                 work.clearance[0, i] = min(work.clearance[0, i], distance)
                 work.lower[0, i] = min(work.lower[0, i], distance - lane(speed, i))
 
@@ -271,33 +252,31 @@ def pair_along(robot, p, moving, work):
     twists = work.twists
     f = robot.frame[a]
     g = robot.frame[b]
-    x, y, z = _at(work.centers, a)
-    u, v, w = _at(work.centers, b)
-    zero = x * _ZERO
-    speed = _speed(twists, f, g, x, y, z, bounds[a, 3]) if moving else zero
+    centers = load_vector(work.centers, a, 0)
+    other_center = load_vector(work.centers, b, 0)
+    still = minus(centers, centers)
+    speed = _speed(twists, f, g, centers, bounds[a, 3]) if moving else still[0]
     _reset(work)
-    gap = _length(x - u, y - v, z - w) - (bounds[a, 3] + bounds[b, 3])
+    gap = _length(minus(centers, other_center)) - (bounds[a, 3] + bounds[b, 3])
     if (gap - speed < load(work.clearance, 0, 0)) == 0:
         return
     _place_group(robot, a, work)
     _place_group(robot, b, work)
     for s in range(robot.first[a], robot.first[a + 1]):
-        x, y, z = _at(work.positions, s)
-        speed = _speed(twists, f, g, x, y, z, _ZERO) if moving else zero
-        gap = _length(x - u, y - v, z - w) - (spheres[s, 3] + bounds[b, 3])
+        centers = load_vector(work.positions, s, 0)
+        speed = _speed(twists, f, g, centers, _ZERO) if moving else still[0]
+        gap = _length(minus(centers, other_center)) - (spheres[s, 3] + bounds[b, 3])
         if (gap - speed < load(work.clearance, 0, 0)) == 0:
             continue
-        p, q, r = _velocity(twists, f, x, y, z) if moving else (zero, zero, zero)
+        velocities = _velocity(twists, f, centers) if moving else still
         for t in range(robot.first[b], robot.first[b + 1]):
-            dx, dy, dz = _at(work.positions, t)
+            others = load_vector(work.positions, t, 0)
             # only the difference of the velocities along the line between the centers matters; this
             # difference is the same in every frame of reference
-            i, j, k = _velocity(twists, g, dx, dy, dz) if moving else (zero, zero, zero)
-            dx = x - dx
-            dy = y - dy
-            dz = z - dz
-            distance = _length(dx, dy, dz)
-            towards = absolute(dx * (p - i) + dy * (q - j) + dz * (r - k)) / maximum(distance, _TINY)
+            relative = minus(velocities, _velocity(twists, g, others) if moving else still)
+            apart = minus(centers, others)
+            distance = _length(apart)
+            towards = absolute(dot(apart, relative)) / maximum(distance, _TINY)
             _lower_to(distance - (spheres[s, 3] + spheres[t, 3]), towards, work)
 
 

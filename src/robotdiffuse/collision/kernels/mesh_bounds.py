@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from robotdiffuse.collision.kernels.frames import parent_of, placed, point_to_box
+from robotdiffuse.collision.kernels.frames import parent_of, point_to_solid
 from robotdiffuse.core.kernels import kernel
-from robotdiffuse.robots.frame_kernel import step
+from robotdiffuse.robots.frame_kernel import ball_gap, placed, step
 
 
 @kernel()
@@ -23,45 +23,35 @@ def forward(offsets, parents, slides, q):
 
 
 @kernel()
-def scene_bounds(frames, frame, centers, radii, boxes):
-    """Lower bounds [n, pieces * obstacles] of the distances of a link's convex pieces to obstacles [m].
+def scene_bounds(frames, frame, balls, solids, check):
+    """Lower bounds [n, balls * obstacles] of the distances of a link's convex pieces to obstacles [m],
+    infinite for obstacles that the link may touch.
 
-    The pieces are enclosed by balls in the frame `frame`, the obstacles by `boxes`: R_box_base [o, 3, 3],
-    centers [o, 3], half edges [o, 3], and radii by which the boxes are inflated [o].
+    The pieces are enclosed by balls [k, 4] in the frame `frame`. `solids` are `convex_bounds.Solids`, and
+    `check` is the link's row of `may_touch`.
     """
-    rotation, middle, half, rounding = boxes
-    obstacles = len(middle)
-    out = np.empty((len(frames), len(radii) * obstacles))
+    obstacles = len(solids.disc)
+    out = np.empty((len(frames), len(balls) * obstacles))
     for i in range(len(frames)):
-        T = frames[i, frame]
-        for p in range(len(radii)):
-            x = placed(T, centers[p], 0)
-            y = placed(T, centers[p], 1)
-            z = placed(T, centers[p], 2)
+        for p in range(len(balls)):
+            center = placed(frames[i, frame], balls[p])
             for o in range(obstacles):
-                gap = point_to_box(x, y, z, rotation[o], middle[o], half[o], 0.0)
-                out[i, p * obstacles + o] = gap - rounding[o] - radii[p]
+                R, half = solids.rotation[o], solids.half[o]
+                gap = point_to_solid(center, R, solids.middle[o], half, solids.disc[o]) - solids.rounding[o]
+                touches = len(solids.may_touch) and solids.may_touch[check, o]
+                out[i, p * obstacles + o] = np.inf if touches else gap - balls[p, 3]
     return out
 
 
 @kernel()
-def pair_bounds(frames, frame, centers, radii, other_frame, other_centers, other_radii):
-    """Lower bounds [n, pieces * others] of the distances between the convex pieces of two links [m]. Each
+def pair_bounds(frames, frame, balls, other_frame, other_balls):
+    """Lower bounds [n, balls * others] of the distances between the convex pieces of two links [m]. Each
     piece is enclosed by a ball in the frame of its link."""
-    other_count = len(other_radii)
-    out = np.empty((len(frames), len(radii) * other_count))
+    others = len(other_balls)
+    out = np.empty((len(frames), len(balls) * others))
     for i in range(len(frames)):
-        S = frames[i, frame]
-        T = frames[i, other_frame]
-        for p in range(len(radii)):
-            x = placed(S, centers[p], 0)
-            y = placed(S, centers[p], 1)
-            z = placed(S, centers[p], 2)
-            for o in range(other_count):
-                c = other_centers[o]
-                u = x - placed(T, c, 0)
-                v = y - placed(T, c, 1)
-                w = z - placed(T, c, 2)
-                gap = np.sqrt(u * u + v * v + w * w)
-                out[i, p * other_count + o] = gap - radii[p] - other_radii[o]
+        for p in range(len(balls)):
+            for o in range(others):
+                gap = ball_gap(frames[i, frame], balls[p], frames[i, other_frame], other_balls[o])
+                out[i, p * others + o] = gap
     return out

@@ -31,6 +31,7 @@ from robotdiffuse.collision.kernels.lane_clearance import (
 from robotdiffuse.collision.kernels.lane_collision import W
 from robotdiffuse.collision.kernels.motion_pieces import Pieces, configuration, split
 from robotdiffuse.core.kernels import inner_kernel, kernel
+from robotdiffuse.robots.frame_kernel import ball_gap
 
 CLEARANCE_CAP = 1.0
 """Larger clearances are capped at this value [m]."""
@@ -107,9 +108,10 @@ class Round(NamedTuple):
 
 
 @inner_kernel()
-def _spread(motion, start, stop, q, dq, e, max_offset, scratch):
+def _spread(motion, start, stop, spread):
     """Writes q, dq, e and D (`max_offset`), as defined at the top of this file, for the piece from start to
-    stop."""
+    stop to the first rows of spread[5, dof]; the last row is scratch memory."""
+    q, dq, e, max_offset, scratch = spread
     # from the ends of the piece (the start in `dq`, the end in `scratch`), then from the waypoints between
     dof = len(q)
     configuration(motion, 0.5 * (start + stop), q)
@@ -161,17 +163,14 @@ def bound_by_spheres(arm, scene, motion, checks, pieces, best, work):
     rest = np.zeros((n, count))
     block = np.empty((dof, W), np.float32)
     moves = np.empty((dof, W), np.float32)
-    q = np.empty(dof)
-    dq = np.empty(dof)
-    e = np.empty(dof)
-    max_offset = np.empty(dof)
-    scratch = np.empty(dof)
+    spread = np.empty((5, dof))
+    q, dq, e, max_offset, _ = spread
     for first in range(0, n, W):
         last = min(first + W, n)
         for i in range(W):
             row = first + i
             if row < n:
-                _spread(motion, pieces.start[row], pieces.stop[row], q, dq, e, max_offset, scratch)
+                _spread(motion, pieces.start[row], pieces.stop[row], spread)
                 for c in range(count):
                     if pieces.undecided[row, c]:
                         rest[row, c] = _remainder(checks.motion_radii[c], checks.second[c], e, max_offset)
@@ -222,12 +221,7 @@ def bound_by_convex_parts(arm, solids, motion, checks, bounds, best, tightness, 
     Returns the number of checks that only Coal can decide; `bounds.travel` marks them.
     """
     n, count = bounds.clearance.shape
-    dof = motion.q.shape[1]
-    q = np.empty(dof)
-    dq = np.empty(dof)
-    e = np.empty(dof)
-    max_offset = np.empty(dof)
-    scratch = np.empty(dof)
+    spread = np.empty((5, motion.q.shape[1]))
     open_count = 0
     for row in range(n):
         is_posed = False
@@ -237,10 +231,8 @@ def bound_by_convex_parts(arm, solids, motion, checks, bounds, best, tightness, 
             ):
                 continue
             if not is_posed:
-                _spread(
-                    motion, bounds.pieces.start[row], bounds.pieces.stop[row], q, dq, e, max_offset, scratch
-                )
-                meshes.pose(arm.offsets, arm.parents, arm.slides, q, dq, posture)
+                _spread(motion, bounds.pieces.start[row], bounds.pieces.stop[row], spread)
+                meshes.pose(arm.offsets, arm.parents, arm.slides, spread[0], spread[1], posture)
                 is_posed = True
             rest = bounds.rest[row, c]
             kind = checks.kind[c]
@@ -290,7 +282,8 @@ def _bound_by_planes(hulls, solids, checks, c, rest, best, tightness, contact, p
             if against_scene:
                 middle = meshes.ball_to_solid(hulls, p, solids, o, posture)
             else:
-                middle = meshes.ball_to_ball(hulls, p, o, posture)
+                frame, other_frame = posture.frames[hulls.frame[p]], posture.frames[hulls.frame[o]]
+                middle = ball_gap(frame, hulls.balls[p], other_frame, hulls.balls[o])
             along = middle - part_travel
             if against_scene and solids.is_bound[o]:
                 if along - rest < tightness * best:

@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robotdiffuse.collision.kernels.frames import parent_of, placed, write_rotation
+from robotdiffuse.collision.kernels.frames import base_frames, parent_of, point_to_solid, write_rotation
 from robotdiffuse.core.kernels import inner_kernel, kernel
-from robotdiffuse.robots.frame_kernel import step
+from robotdiffuse.robots.frame_kernel import placed, plus, rotated_back, step, write
 
 CLEARANCE_CAP = 1.0
 """Larger clearances are capped at this value [m]."""
@@ -81,9 +81,9 @@ class Tasks(NamedTuple):
 
 
 @inner_kernel()
-def pose_at(tracks, o, time, rotation, xyz):
-    """Writes the pose of obstacle o at a time [s]: R_base_obstacle [3, 3] and its origin [3]. Positions are
-    interpolated linearly, orientations by slerp."""
+def pose_at(tracks, o, time, rotation, middle):
+    """Writes the pose of obstacle o at a time [s]: R_obstacle_base [3, 3] and the center of its box [3].
+    Positions of its frame are interpolated linearly, orientations by slerp."""
     low = tracks.first[o]
     high = tracks.first[o + 1] - 1
     share = 0.0
@@ -95,7 +95,7 @@ def pose_at(tracks, o, time, rotation, xyz):
     high = min(low + 1, high)
     dot = 0.0
     for k in range(3):
-        xyz[k] = tracks.xyz[low, k] + share * (tracks.xyz[high, k] - tracks.xyz[low, k])
+        middle[k] = tracks.xyz[low, k] + share * (tracks.xyz[high, k] - tracks.xyz[low, k])
     for k in range(4):
         dot += tracks.wxyz[low, k] * tracks.wxyz[high, k]
     angle = np.arccos(min(max(dot, -1.0), 1.0))
@@ -109,7 +109,8 @@ def pose_at(tracks, o, time, rotation, xyz):
     y = a * tracks.wxyz[low, 2] + b * tracks.wxyz[high, 2]
     z = a * tracks.wxyz[low, 3] + b * tracks.wxyz[high, 3]
     scale = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
-    write_rotation(w * scale, x * scale, y * scale, z * scale, rotation)
+    write_rotation(w * scale, -x * scale, -y * scale, -z * scale, rotation)
+    write(plus(rotated_back(rotation, tracks.center[o]), middle), middle)
 
 
 @kernel()
@@ -123,56 +124,30 @@ def speed_between(tracks, o, start, stop):
 
 
 @inner_kernel()
-def _obstacle_distance(tracks, o, rotation, xyz, x, y, z):
-    """Signed distance of a point to obstacle o without its growth [m]; inside, a lower bound."""
-    x = x - xyz[0]
-    y = y - xyz[1]
-    z = z - xyz[2]
-    u = abs(rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0] * z - tracks.center[o, 0])
-    v = abs(rotation[0, 1] * x + rotation[1, 1] * y + rotation[2, 1] * z - tracks.center[o, 1])
-    w = abs(rotation[0, 2] * x + rotation[1, 2] * y + rotation[2, 2] * z - tracks.center[o, 2])
-    w -= tracks.half[o, 2]
-    if tracks.disc[o] > 0:
-        a = np.sqrt(u * u + v * v) - tracks.disc[o]
-        outside = max(a, 0.0) ** 2
-        deepest = a
-    else:
-        a = u - tracks.half[o, 0]
-        b = v - tracks.half[o, 1]
-        outside = max(a, 0.0) ** 2 + max(b, 0.0) ** 2
-        deepest = max(a, b)
-    outside += max(w, 0.0) ** 2
-    return np.sqrt(outside) + min(max(deepest, w), 0.0) - tracks.rounding[o]
+def _ball_clearance(T, ball, tracks, o, rotation, middle):
+    """Signed distance of a ball of a link to obstacle o, without the obstacle's growth [m]; inside, a lower
+    bound."""
+    gap = point_to_solid(placed(T, ball), rotation, middle, tracks.half[o], tracks.disc[o])
+    return gap - tracks.rounding[o] - ball[3]
 
 
 @inner_kernel()
-def _clearance(links, frames, link, tracks, o, rotation, xyz, enough):
+def _clearance(links, frames, link, tracks, o, rotation, middle, enough):
     """Clearance of the spheres of a link to obstacle o [m]. If it exceeds `enough`, the result may be a lower
     bound that also exceeds `enough`."""
     T = frames[links.frame[link]]
-    ball = links.bounds[link]
-    ball_clearance = (
-        _obstacle_distance(
-            tracks, o, rotation, xyz, placed(T, ball, 0), placed(T, ball, 1), placed(T, ball, 2)
-        )
-        - ball[3]
-    )
-    if ball_clearance > enough:
-        return ball_clearance
+    clearance = _ball_clearance(T, links.bounds[link], tracks, o, rotation, middle)
+    if clearance > enough:
+        return clearance
     clearance = np.inf
     for s in range(links.first[link], links.first[link + 1]):
-        p = links.spheres[s]
-        gap = (
-            _obstacle_distance(tracks, o, rotation, xyz, placed(T, p, 0), placed(T, p, 1), placed(T, p, 2))
-            - p[3]
-        )
-        clearance = min(clearance, gap)
+        clearance = min(clearance, _ball_clearance(T, links.spheres[s], tracks, o, rotation, middle))
     return clearance
 
 
 @inner_kernel()
 def _pose_arm(links, q, frames):
-    """Writes the frames T_base_frame[dof + 1, 4, 4] at q[dof]."""
+    """Writes the frames T_base_frame[dof + 1, 3, 4] at q[dof]."""
     for j in range(len(q)):
         step(frames[parent_of(links.parents, j)], links.offsets[j], links.slides[j], q[j], frames[j + 1])
 
@@ -221,15 +196,11 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
     count = len(links.frame)
     obstacles = len(tracks.growth)
     joint_travel = cumulative_motion(q)
-    frames = np.zeros((dof + 1, 4, 4))
-    for i in range(dof + 1):
-        frames[i, 3, 3] = 1.0
-    for k in range(3):
-        frames[0, k, k] = 1.0
+    frames = base_frames(dof)
     middle = np.empty(dof)
     joint_motion = np.empty(dof)
     rotation = np.empty((3, 3))
-    xyz = np.empty(3)
+    place = np.empty(3)
     travel = np.empty(count)
     starts = np.empty(MAX_HALVINGS + 2)
     stops = np.empty(MAX_HALVINGS + 2)
@@ -274,14 +245,16 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
                     if not pairs[size, link, o]:
                         continue
                     if not is_posed:
-                        pose_at(tracks, o, time, rotation, xyz)
+                        pose_at(tracks, o, time, rotation, place)
                         obstacle_travel = speed_between(tracks, o, start, stop) * half_duration
                         is_posed = True
                     inflation = tracks.growth[o] * max(time, 0.0)
                     clearance_loss = travel[link] + obstacle_travel + tracks.growth[o] * half_duration
                     required = max(least, tightness * best[0])
                     cutoff = inflation + clearance_loss + max(required, best[0] if tightness > 0 else 0.0)
-                    clearance = _clearance(links, frames, link, tracks, o, rotation, xyz, cutoff) - inflation
+                    clearance = (
+                        _clearance(links, frames, link, tracks, o, rotation, place, cutoff) - inflation
+                    )
                     clearance = min(clearance, CLEARANCE_CAP + clearance_loss)
                     if clearance <= least or depth == MAX_HALVINGS:
                         remaining.append((start, stop, link, o))
@@ -312,11 +285,7 @@ def free_at_times(links, tracks, q, times, least):
     dof = q.shape[1]
     count = len(links.frame)
     obstacles = len(tracks.growth)
-    frames = np.zeros((dof + 1, 4, 4))
-    for i in range(dof + 1):
-        frames[i, 3, 3] = 1.0
-    for k in range(3):
-        frames[0, k, k] = 1.0
+    frames = base_frames(dof)
     out = np.ones((len(q), len(times)), np.bool_)
     rotations = np.empty((obstacles, len(times), 3, 3))
     places = np.empty((obstacles, len(times), 3))

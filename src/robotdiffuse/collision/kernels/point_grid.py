@@ -24,11 +24,14 @@ from robotdiffuse.collision.kernels.simd import (
     gather,
     lane,
     load,
+    load_vector,
     maximum,
     minimum,
     sqrt,
+    vector_in,
 )
 from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
+from robotdiffuse.robots.frame_kernel import dot, length, minus, plus, times, write
 
 POINT_RANGE = np.float32(0.3)
 """Points farther than this beyond the robot's reach are left out; clearances to points are capped at this
@@ -36,6 +39,7 @@ value [m]."""
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
 _HALF = np.float32(0.5)
+_MIDDLE = _HALF, _HALF, _HALF
 _TINY = np.float32(1e-9)
 _SLACK = np.float32(1e-5)
 """Upper bound on the rounding error of a distance within the grid [m]."""
@@ -95,13 +99,9 @@ def _balls(points, starts):
         ball = balls[b]
         share = _ONE / np.float32(starts[b + 1] - starts[b])
         for p in range(starts[b], starts[b + 1]):
-            for axis in range(3):
-                ball[axis] += share * points[p, axis]
+            write(plus(ball, times(share, points[p])), ball)
         for p in range(starts[b], starts[b + 1]):
-            dx = points[p, 0] - ball[0]
-            dy = points[p, 1] - ball[1]
-            dz = points[p, 2] - ball[2]
-            ball[3] = max(ball[3], np.sqrt(dx * dx + dy * dy + dz * dz) + _SLACK)
+            ball[3] = max(ball[3], length(minus(points[p], ball)) + _SLACK)
     return balls
 
 
@@ -180,66 +180,56 @@ def _closer(distances, nearest, at, n, base, z, voxel, p, band):
 
 
 @allocation_free(forceinline=True)
-def _ask_grid(x, y, z, radius, scene):
+def _ask_grid(centers, radius, scene):
     """Two masks of spheres in 16 lanes, from the grid alone: the spheres that may touch a point, and the
     spheres that certainly do."""
     frame = scene.grid_frame
     band = frame[7]
     voxel = frame[3]
-    inverse = _ONE / voxel
-    fx = (x - frame[0]) * inverse
-    fy = (y - frame[1]) * inverse
-    fz = (z - frame[2]) * inverse
-    cx = minimum(maximum(fx, _ZERO), frame[8] - _HALF)
-    cy = minimum(maximum(fy, _ZERO), frame[9] - _HALF)
-    cz = minimum(maximum(fz, _ZERO), frame[10] - _HALF)
-    ix = floor(cx)
-    iy = floor(cy)
-    iz = floor(cz)
-    g = gather(scene.grid, (ix * frame[9] + iy) * frame[10] + iz)
-    ex = cx - ix - _HALF
-    ey = cy - iy - _HALF
-    ez = cz - iz - _HALF
-    e = sqrt(ex * ex + ey * ey + ez * ez) * voxel
-    ox = fx - cx
-    oy = fy - cy
-    oz = fz - cz
-    out = (ox * ox + oy * oy + oz * oz) * (voxel * voxel)
-    grid_distance = maximum(g - e, _ZERO)
+    f = times(_ONE / voxel, minus(centers, frame))
+    c = (
+        minimum(maximum(f[0], _ZERO), frame[8] - _HALF),
+        minimum(maximum(f[1], _ZERO), frame[9] - _HALF),
+        minimum(maximum(f[2], _ZERO), frame[10] - _HALF),
+    )
+    i = floor(c[0]), floor(c[1]), floor(c[2])
+    g = gather(scene.grid, (i[0] * frame[9] + i[1]) * frame[10] + i[2])
+    e = minus(minus(c, i), _MIDDLE)
+    from_center = sqrt(dot(e, e)) * voxel
+    o = minus(f, c)
+    out = dot(o, o) * (voxel * voxel)
+    grid_distance = maximum(g - from_center, _ZERO)
     touch_distance = radius + (frame[5] + _SLACK)
     near = grid_distance * grid_distance + out < touch_distance * touch_distance
-    inside = (g + e + sqrt(out) < radius + (frame[6] - _SLACK)) & (g < band)
+    inside = (g + from_center + sqrt(out) < radius + (frame[6] - _SLACK)) & (g < band)
     return near, near & inside
 
 
 @allocation_free()
-def far_from_points(scene, x0, x1, y0, y1, z0, z1, radius):
-    """Whether no sphere with its center in a box can touch a point, according to one look-up in the middle of
-    the box."""
-    lower, _, _ = _look_up(scene, _HALF * (x0 + x1), _HALF * (y0 + y1), _HALF * (z0 + z1))
-    dx = x1 - x0
-    dy = y1 - y0
-    dz = z1 - z0
-    return lower > radius + _HALF * np.sqrt(dx * dx + dy * dy + dz * dz) + _SLACK
+def far_from_points(scene, low, high, radius):
+    """Whether no sphere with its center in the box from `low` to `high` can touch a point, according to one
+    look-up in the middle of the box."""
+    lower = points_lower_bound(scene, times(_HALF, plus(low, high)))
+    return lower > radius + _HALF * length(minus(high, low)) + _SLACK
 
 
 @allocation_free()
-def near_points(x, y, z, radius, scene):
+def near_points(centers, radius, scene):
     """Mask of the lanes whose sphere may touch a point."""
-    return _ask_grid(x, y, z, radius, scene)[0]
+    return _ask_grid(centers, radius, scene)[0]
 
 
 @allocation_free()
-def _near_by_eight(x, y, z, radius, scene):
+def _near_by_eight(centers, radius, scene):
     """Mask of the lanes whose sphere may touch a point, from the eight voxels around its center.
 
     Of the eight lower bounds, the one from the voxel on the side away from the nearest point is almost exact.
     """
     frame = scene.grid_frame
-    inverse = _ONE / frame[3]
-    fx = minimum(maximum((x - frame[0]) * inverse, _ZERO), frame[8] - _HALF)
-    fy = minimum(maximum((y - frame[1]) * inverse, _ZERO), frame[9] - _HALF)
-    fz = minimum(maximum((z - frame[2]) * inverse, _ZERO), frame[10] - _HALF)
+    x, y, z = times(_ONE / frame[3], minus(centers, frame))
+    fx = minimum(maximum(x, _ZERO), frame[8] - _HALF)
+    fy = minimum(maximum(y, _ZERO), frame[9] - _HALF)
+    fz = minimum(maximum(z, _ZERO), frame[10] - _HALF)
     lx = minimum(floor(maximum(fx - _HALF, _ZERO)), frame[8] - np.float32(2.0))
     ly = minimum(floor(maximum(fy - _HALF, _ZERO)), frame[9] - np.float32(2.0))
     lz = minimum(floor(maximum(fz - _HALF, _ZERO)), frame[10] - np.float32(2.0))
@@ -248,26 +238,24 @@ def _near_by_eight(x, y, z, radius, scene):
         ix = lx + np.float32(corner >> 2)
         iy = ly + np.float32((corner >> 1) & 1)
         iz = lz + np.float32(corner & 1)
-        ex = fx - ix - _HALF
-        ey = fy - iy - _HALF
-        ez = fz - iz - _HALF
-        e = sqrt(ex * ex + ey * ey + ez * ez) * frame[3]
-        bound = maximum(bound, gather(scene.grid, (ix * frame[9] + iy) * frame[10] + iz) - e)
+        e = minus((fx - ix, fy - iy, fz - iz), _MIDDLE)
+        from_center = sqrt(dot(e, e)) * frame[3]
+        bound = maximum(bound, gather(scene.grid, (ix * frame[9] + iy) * frame[10] + iz) - from_center)
     return bound < radius + (frame[5] + _SLACK)
 
 
 @allocation_free()
-def touch_points(x, y, z, radius, scene):
+def touch_points(centers, radius, scene):
     """Whether a sphere in any of 16 lanes touches a point."""
-    near, inside = _ask_grid(x, y, z, radius, scene)
+    near, inside = _ask_grid(centers, radius, scene)
     if inside:
         return True
     if near:
-        near &= _near_by_eight(x, y, z, radius, scene)
+        near &= _near_by_eight(centers, radius, scene)
     while near:
         i = first_lane(near)
         near &= near - 1
-        if _touches(scene, lane(x, i), lane(y, i), lane(z, i), lane(radius, i)):
+        if _touches(scene, vector_in(centers, i), lane(radius, i)):
             return True
     return False
 
@@ -308,26 +296,17 @@ def _in_column(scene, i, j, rx, ry, rz, reach):
 
 
 @allocation_free()
-def _touches(scene, x, y, z, radius):
+def _touches(scene, at, radius):
     """Whether a sphere touches a point. The point that the grid stores as the nearest is checked first, then
     the points in the cells around."""
     frame = scene.grid_frame
-    rows = scene.point_rows
-    _, _, p = _look_up(scene, x, y, z)
-    if p >= 0:
-        point = scene.points[p]
-        dx = point[0] - x
-        dy = point[1] - y
-        dz = point[2] - z
-        r = radius + point[3]
-        if dx * dx + dy * dy + dz * dz < r * r:
-            return True
+    _, p = _look_up(scene, at)
+    if p >= 0 and length(minus(scene.points[p], at)) < radius + scene.points[p, 3]:
+        return True
     reach = radius + frame[5] + _SLACK
     if reach <= _ZERO:
         return False
-    rx = x - frame[0]
-    ry = y - frame[1]
-    rz = z - frame[2]
+    rx, ry, rz = minus(at, frame)
     i0, i1, j0, j1 = _columns(frame, rx, ry, reach)
     for i in range(i0, i1):
         for j in range(j0, j1):
@@ -335,44 +314,35 @@ def _touches(scene, x, y, z, radius):
             # sixteen points at once; points of the first and last row that are outside the range are checked
             # too
             for row in range(first // W, (last + W - 1) // W if last > first else 0):
-                dx = load(rows, row, 0) - x
-                dy = load(rows, row, 1) - y
-                dz = load(rows, row, 2) - z
-                r = load(rows, row, 3) + radius
-                if dx * dx + dy * dy + dz * dz < r * r:
+                apart = minus(load_vector(scene.point_rows, row, 0), at)
+                r = load(scene.point_rows, row, 3) + radius
+                if dot(apart, apart) < r * r:
                     return True
     return False
 
 
 @allocation_free()
-def _look_up(scene, x, y, z):
-    """A lower bound of the distance to the nearest point's surface [m], the squared distance to the grid's
-    box [m²], and the index of the point stored in the voxel."""
+def _look_up(scene, at):
+    """A lower bound of the distance to the nearest point's surface [m], and the index of the point stored in
+    the voxel."""
     frame = scene.grid_frame
     voxel = frame[3]
-    fx = (x - frame[0]) / voxel
-    fy = (y - frame[1]) / voxel
-    fz = (z - frame[2]) / voxel
-    cx = min(max(fx, _ZERO), frame[8] - _HALF)
-    cy = min(max(fy, _ZERO), frame[9] - _HALF)
-    cz = min(max(fz, _ZERO), frame[10] - _HALF)
-    ix = np.int32(cx)
-    iy = np.int32(cy)
-    iz = np.int32(cz)
-    index = (ix * np.int32(frame[9]) + iy) * np.int32(frame[10]) + iz
-    ex = cx - np.float32(ix) - _HALF
-    ey = cy - np.float32(iy) - _HALF
-    ez = cz - np.float32(iz) - _HALF
-    grid_distance = max(scene.grid[index] - voxel * np.sqrt(ex * ex + ey * ey + ez * ez), _ZERO)
-    ox = fx - cx
-    oy = fy - cy
-    oz = fz - cz
-    out = voxel * voxel * (ox * ox + oy * oy + oz * oz)
-    return np.sqrt(grid_distance * grid_distance + out) - frame[5] - _SLACK, out, scene.nearest[index]
+    f = times(_ONE / voxel, minus(at, frame))
+    c = (
+        min(max(f[0], _ZERO), frame[8] - _HALF),
+        min(max(f[1], _ZERO), frame[9] - _HALF),
+        min(max(f[2], _ZERO), frame[10] - _HALF),
+    )
+    i = np.int32(c[0]), np.int32(c[1]), np.int32(c[2])
+    index = (i[0] * np.int32(frame[9]) + i[1]) * np.int32(frame[10]) + i[2]
+    e = minus(minus(c, (np.float32(i[0]), np.float32(i[1]), np.float32(i[2]))), _MIDDLE)
+    grid_distance = max(scene.grid[index] - voxel * length(e), _ZERO)
+    out = voxel * length(minus(f, c))
+    return np.sqrt(grid_distance * grid_distance + out * out) - frame[5] - _SLACK, scene.nearest[index]
 
 
 @allocation_free(fastmath=True)
-def _search(scene, x, y, z, limit):
+def _search(scene, at, limit):
     """Distance to the surface of the nearest point if it is below `limit`, else `limit` [m]."""
     points = scene.points
     frame = scene.grid_frame
@@ -380,19 +350,15 @@ def _search(scene, x, y, z, limit):
     best = limit
     if reach <= _ZERO:
         return best
-    rx = x - frame[0]
-    ry = y - frame[1]
-    rz = z - frame[2]
+    rx, ry, rz = minus(at, frame)
     i0, i1, j0, j1 = _columns(frame, rx, ry, reach)
     for i in range(i0, i1):
         for j in range(j0, j1):
             first, last = _in_column(scene, i, j, rx, ry, rz, reach)
             for p in range(first, last):
-                dx = points[p, 0] - x
-                dy = points[p, 1] - y
-                dz = points[p, 2] - z
+                apart = minus(points[p], at)
                 r = best + points[p, 3]
-                square = dx * dx + dy * dy + dz * dz
+                square = dot(apart, apart)
                 if r > _ZERO and square < r * r:
                     best = np.sqrt(square) - points[p, 3]
             reach = best + frame[5] + _SLACK
@@ -402,54 +368,47 @@ def _search(scene, x, y, z, limit):
 
 
 @allocation_free()
-def points_distance(scene, x, y, z, limit):
+def points_distance(scene, at, limit):
     """Distance to the surface of the scene's nearest point, at most `limit` [m].
 
-    It is exact if the grid stores a point for the voxel of (x, y, z): up to a clearance of about EXACT_RANGE
+    It is exact if the grid stores a point for the voxel of `at`: up to a clearance of about EXACT_RANGE
     (`point_cloud_grid.py`) for the robot's largest sphere. Else it is a lower bound.
     """
-    lower, _, p = _look_up(scene, x, y, z)
+    lower, p = _look_up(scene, at)
     if lower >= limit:
         return limit
     if p < 0:
         return lower
     point = scene.points[p]
-    dx = point[0] - x
-    dy = point[1] - y
-    dz = point[2] - z
-    best = min(np.sqrt(dx * dx + dy * dy + dz * dz) - point[3], limit)
-    return _search(scene, x, y, z, best)
+    return _search(scene, at, min(length(minus(point, at)) - point[3], limit))
 
 
 @allocation_free()
-def points_lower_bound(scene, x, y, z):
+def points_lower_bound(scene, at):
     """A lower bound of the distance to the nearest point's surface, from the grid alone [m]."""
-    return _look_up(scene, x, y, z)[0]
+    return _look_up(scene, at)[0]
 
 
 @allocation_free()
-def near_point(scene, x, y, z, limit):
+def near_point(scene, at, limit):
     """Distance to the surface of a point near the nearest one, at most `limit` [m], and its gradient.
 
-    The point is the nearest of the eight points stored in the voxels around (x, y, z). The distance is too
-    large by a few millimeters at most. It is used for gradients, where an exact search would take too long.
+    The point is the nearest of the eight points stored in the voxels around. The distance is too large by a
+    few millimeters at most. It is used for gradients, where an exact search would take too long.
     """
     best = limit
-    bx = _ZERO
-    by = _ZERO
-    bz = _ZERO
-    lower, _, _ = _look_up(scene, x, y, z)
-    if lower >= limit:
-        return best, bx, by, bz
+    gradient = _ZERO, _ZERO, _ZERO
+    if points_lower_bound(scene, at) >= limit:
+        return best, gradient
     frame = scene.grid_frame
     points = scene.points
     nx = int(frame[8])
     ny = int(frame[9])
     nz = int(frame[10])
-    voxel = frame[3]
-    i = min(max(int(np.floor((x - frame[0]) / voxel - _HALF)), 0), nx - 2)
-    j = min(max(int(np.floor((y - frame[1]) / voxel - _HALF)), 0), ny - 2)
-    k = min(max(int(np.floor((z - frame[2]) / voxel - _HALF)), 0), nz - 2)
+    fx, fy, fz = minus(times(_ONE / frame[3], minus(at, frame)), _MIDDLE)
+    i = min(max(int(np.floor(fx)), 0), nx - 2)
+    j = min(max(int(np.floor(fy)), 0), ny - 2)
+    k = min(max(int(np.floor(fz)), 0), nz - 2)
     for corner in range(8):
         a = corner >> 2
         b = (corner >> 1) & 1
@@ -457,13 +416,9 @@ def near_point(scene, x, y, z, limit):
         p = scene.nearest[((i + a) * ny + j + b) * nz + k + c]
         if p < 0:
             continue
-        dx = x - points[p, 0]
-        dy = y - points[p, 1]
-        dz = z - points[p, 2]
-        d = np.sqrt(dx * dx + dy * dy + dz * dz) + _TINY
+        apart = minus(at, points[p])
+        d = length(apart) + _TINY
         if d - points[p, 3] < best:
             best = d - points[p, 3]
-            bx = dx / d
-            by = dy / d
-            bz = dz / d
-    return best, bx, by, bz
+            gradient = times(_ONE / d, apart)
+    return best, gradient

@@ -20,7 +20,7 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 from numba.extending import intrinsic
 from numpy import ndarray
 
-from robotdiffuse.core.kernels import kernel
+from robotdiffuse.core.kernels import allocation_free, kernel
 
 W = 16
 """Number of lanes. It is also the number of configurations in a block, and of spheres or obstacles in a
@@ -246,6 +246,26 @@ def first_lane(_context: Any, mask: Any) -> Any:
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
 
     return (types.int64(mask), codegen) if mask == types.int64 else None
+
+
+@allocation_free(forceinline=True)
+def load_vector(array, row, part):
+    """The vectors of 16 lanes whose coordinates are loaded from array[row, 16 * part :]."""
+    return load(array, row, part), load(array, row, part + 1), load(array, row, part + 2)
+
+
+@allocation_free(forceinline=True)
+def store_vector(array, row, part, vector):
+    """Stores the vectors of 16 lanes to array[row, 16 * part :]."""
+    store(array, row, part, vector[0])
+    store(array, row, part + 1, vector[1])
+    store(array, row, part + 2, vector[2])
+
+
+@allocation_free(forceinline=True)
+def vector_in(vectors, i):
+    """The vector in lane i."""
+    return lane(vectors[0], i), lane(vectors[1], i), lane(vectors[2], i)
 
 
 @kernel()

@@ -164,7 +164,7 @@ def best_looks(
     the arm hides now.
     """
     robot = known.robot
-    at = np.argwhere(wanted)
+    at = np.ascontiguousarray(np.argwhere(wanted))
     if not len(at):
         return
     weights = np.full(len(at), UNSEEN_WEIGHT, np.float32)
@@ -308,7 +308,7 @@ def next_view(problem: Problem, result: PlanResult, poses: Sequence[Pose] | None
     likely = crossed.voxels.astype(np.float32)
     if crossed.probability is not None:
         likely *= crossed.probability
-    at = np.argwhere(likely > MIN_PROBABILITY)
+    at = np.ascontiguousarray(np.argwhere(likely > MIN_PROBABILITY))
     weights = likely[tuple(at.T)]
     if not len(at):
         return NextView(candidates[0], 1.0)

@@ -199,9 +199,10 @@ def extend(space, trees, targets, longest):
     """Extend the start's tree from its nearest node towards each of the targets [n, dof], by at most
     `longest` [n] [rad]. Targets to which the motion is not free are skipped."""
     scratch = make_scratch(space, trees.nodes)
+    start = np.int64(0)  # the type of `tree` in the search: for a literal, Numba compiles the functions again
     for n in range(len(targets)):
-        near = nearest(trees, 0, targets[n], INFINITE)
-        extended_straight(space, trees, 0, near, targets[n], longest[n], INFINITE, scratch)
+        near = nearest(trees, start, targets[n], INFINITE)
+        extended_straight(space, trees, start, near, targets[n], longest[n], INFINITE, scratch)
 
 
 @allocation_free(inline="always")

@@ -99,7 +99,7 @@ class Links:
         on the way to them."""
         chains = [self.robot.joints_above(link) for link in wanted or self.robot.link_names]
         joints = dict.fromkeys(joint for chain in chains for joint in chain)
-        poses = {self.robot.base: np.broadcast_to(np.eye(4), (len(q), 4, 4))}
+        poses = {self.robot.base: np.tile(np.eye(4), (len(q), 1, 1))}
         values = with_mimics(self.robot.joints, {joint.name: q[:, i] for i, joint in enumerate(self.joints)})
         for joint in joints:
             T_parent_child = joint.T_parent_joint
