@@ -4,8 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.collision.convex_geometry import checks_of
-from robotdiffuse.collision.exact_meshes import Distance, ExactCollision
+from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.kernels import motion_pieces
 from robotdiffuse.collision.kernels.motion_pieces import Motion
 from robotdiffuse.collision.motions import DEPTH_SAMPLE_TRAVEL, Contact, ContinuousCollision
@@ -39,10 +38,8 @@ def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: fl
             break
         # converts the contact's place in `remaining_q`, a row plus a fraction, to the travel along the whole
         # motion
-        row = int(first.at)
-        fraction = first.at - int(first.at)
         travel = np.concatenate([[at], motion.travel[low + 1 :]])
-        at = float(travel[row] + fraction * (travel[min(row + 1, len(travel) - 1)] - travel[row]))
+        at = float(np.interp(first.at, np.arange(len(travel)), travel))
         at = _follow(exact, motion, at, contact, first, contacts_in_order)
         if at >= end:
             break
@@ -59,35 +56,27 @@ def _follow(
 ) -> float:
     """Appends to `contact_list` the contact `first` at travel `at`, and the contacts that begin before the
     arm is free again. Returns the travel at which the arm is free, or the end of the motion."""
-    checks = {(check.link, check.other): check for check in checks_of(exact.robot)}
-    open_contacts: dict[tuple[str, str | None, str], int] = {}
-    first_place = _place(motion, at)
-    open_contacts[first.check.link, first.check.other, first.other] = len(contact_list)
-    contact_list.append(first._replace(at=first_place))
+    open_contacts = {(first.check, first.other): len(contact_list)}
+    contact_list.append(first._replace(at=_place(motion, at)))
+    count = len(exact.checks)
     end = float(motion.travel[-1])
     while at < end:
         at = min(at + DEPTH_SAMPLE_TRAVEL, end)
-        q = motion_pieces.configurations(motion, np.array([at]))[0]
-        near = [d for d in (*exact.link_distances(q), *exact.pair_distances(q)) if d.distance <= contact]
-        touching = {_key(d, checks): d for d in near}
-        for key in [key for key in open_contacts if key not in touching]:
-            del open_contacts[key]
-        for key, distance in touching.items():
-            depth = max(0.0, -distance.distance)
+        q = motion_pieces.configurations(motion, np.full(count, at))
+        distances, names = exact.nearest(q, np.arange(count), np.full(count, np.inf))
+        touching = {(exact.checks[i], str(names[i])): i for i in np.flatnonzero(distances <= contact)}
+        open_contacts = {key: k for key, k in open_contacts.items() if key in touching}
+        for key, i in touching.items():
+            depth = max(0.0, -float(distances[i]))
             if key in open_contacts:
                 k = open_contacts[key]
                 contact_list[k] = contact_list[k]._replace(depth=max(contact_list[k].depth, depth))
             else:
                 open_contacts[key] = len(contact_list)
-                contact_list.append(Contact(checks[key[:2]], key[2], _place(motion, at), depth))
+                contact_list.append(Contact(*key, _place(motion, at), depth))
         if not touching:
             return at
     return end
-
-
-def _key(distance: Distance, checks: dict) -> tuple[str, str | None, str]:
-    pair = (distance.link, distance.other)
-    return (*pair, str(distance.other)) if pair in checks else (distance.link, None, str(distance.other))
 
 
 def _place(motion: Motion, at: float) -> float:

@@ -103,7 +103,7 @@ def _arm_ahead(robot, q, T, intrinsics, margin, depth):
     for g in range(len(robot.frame)):
         for s in range(robot.first[g], robot.first[g + 1]):
             sphere = robot.spheres[s]
-            x, y, z = placed_point(frames[robot.frame[g]], sphere[0], sphere[1], sphere[2])
+            x, y, z = placed_point(frames[robot.frame[g]], sphere)
             x = x - T[0, 3]
             y = y - T[1, 3]
             z = z - T[2, 3]

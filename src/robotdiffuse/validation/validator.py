@@ -5,6 +5,7 @@ validated along the cubics that controllers execute between its rows: see trajec
 The validator does not depend on planners.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
@@ -113,51 +114,37 @@ class Verifier:
     def path(self, path: Path) -> Report:
         """See `verify`."""
         self._check_shape("path", path)
-        known_violations = []
+        known_violations: list[Violation | None] = []
         if self.dynamics is not None and within(path.positions):
             clock = np.arange(len(path.positions), dtype=float)
-            known_violations = self._torques(clock, static_pieces(path.positions), " to hold the payload")
+            known_violations = [self._torques(clock, static_pieces(path.positions), " to hold the payload")]
         return self._report(path.positions, None, known_violations)
 
     def trajectory(self, trajectory: Trajectory) -> Report:
         """See `verify_trajectory`."""
         self._check_shape("trajectory", trajectory)
-        rows = (trajectory.times, trajectory.velocities, trajectory.accelerations)
-        if not all(np.isfinite(values).all() for values in rows):
-            violation = Violation("not_finite", 0.0, "the trajectory holds values that are not finite")
+        violation = _unusable(trajectory)
+        if violation is not None:
             return Report(False, violation, None, None)
-        backwards = np.flatnonzero(np.diff(trajectory.times) <= 0)
-        if len(backwards):
-            at = float(trajectory.times[backwards[0] + 1])
-            message = f"times do not increase from row {backwards[0]} to row {backwards[0] + 1}"
-            return Report(False, Violation("time", at, message), None, None)
-        if trajectory.times[0] != 0:
-            at = float(trajectory.times[0])
-            return Report(False, Violation("time", at, f"times begin at {at:.6g} s, not at 0"), None, None)
-        if trajectory.duration > MAX_DURATION:
-            time, max_time = distinct(trajectory.duration, MAX_DURATION)
-            message = f"the motion takes {time} s; at most {max_time} s can be validated"
-            return Report(False, Violation("time", 0.0, message), None, None)
         if not within(trajectory.positions):
             return self._report(trajectory.positions, trajectory.times, [])
         cubics = Cubics(trajectory)
         begins = self.problem.start_velocity
-        known_violations = rate_violations(self.robot, trajectory, self.settings, begins, cubics)
+        wrong_rates = rate_violations(self.robot, trajectory, self.settings, begins, cubics)
         at_rest = None
         if self.problem.waypoints:
             at_rest = np.abs(trajectory.velocities).max(axis=1) <= self.settings.rest
-        if known_violations:
-            return self._report(trajectory.positions, trajectory.times, known_violations, at_rest)
-        known_violations += self._limits_between(cubics)
+        if wrong_rates:
+            return self._report(trajectory.positions, trajectory.times, wrong_rates, at_rest)
+        found = [self._limits_between(cubics)]
         if self.dynamics is not None:
-            known_violations += self._torques(
-                trajectory.times, trajectory_pieces(trajectory), ", with the payload"
-            )
+            pieces = trajectory_pieces(trajectory)
+            found.append(self._torques(trajectory.times, pieces, ", with the payload"))
         along = None
         if self.constraints is not None:
-            known_violations += self._too_fast(cubics)
-            along = cubics.sampled(self.settings.constraint_chord)[:2] if not known_violations else None
-        report = self._report_on_chords(cubics, known_violations, at_rest, along)
+            found.append(self._too_fast(cubics))
+            along = None if any(found) else cubics.sampled(self.settings.constraint_chord)[:2]
+        report = self._report_on_chords(cubics, found, at_rest, along)
         if not report.valid:
             return report
         jerks = np.maximum(trajectory.peak_jerks, cubics.extremes.jerk)
@@ -166,7 +153,7 @@ class Verifier:
     def _report_on_chords(
         self,
         cubics: Cubics,
-        found: list[Violation],
+        found: Sequence[Violation | None],
         at_rest: ndarray | None,
         along: tuple[ndarray, ndarray] | None,
     ) -> Report:
@@ -224,7 +211,7 @@ class Verifier:
         self,
         q: ndarray,
         times: ndarray | None,
-        found: list[Violation],
+        found: Sequence[Violation | None],
         at_rest: ndarray | None = None,
         along: tuple[ndarray, ndarray] | None = None,
     ) -> Report:
@@ -258,9 +245,7 @@ class Verifier:
         if times is not None and self.problem.moving:
             moving = self._moving.sweep(times[: last + 1], q[: last + 1])
         if sweep.contact is not None:
-            collision = collision_violation(
-                sweep.contact, float(np.interp(sweep.contact.at, np.arange(len(clock)), clock))
-            )
+            collision = collision_violation(sweep.contact, _time_at(sweep.contact.at, clock))
         ends = (self._waypoints(q, clock, at_rest), self._goal(q[-1], float(clock[-1])))
         hit = None if moving is None or moving.contact is None else _moving_contact_violation(moving.contact)
         every = [v for v in (first, collision, hit, *ends) if v is not None]
@@ -323,33 +308,28 @@ class Verifier:
         wrong = self.constraints.first_violation(q, chord)
         if wrong is None:
             return None
-        at = float(np.interp(wrong.at, np.arange(len(clock)), clock))
+        at = _time_at(wrong.at, clock)
         constraint = wrong.constraint
         return Violation("constraint", at, wrong.message, constraint.frame, constraint.kind, wrong.excess)
 
-    def _limits_between(self, cubics: Cubics) -> list[Violation]:
-        """A violation at the first place between rows where a cubic leaves the joint limits; no entries if
-        there is none."""
+    def _limits_between(self, cubics: Cubics) -> Violation | None:
+        """A violation at the first place between rows where a cubic leaves the joint limits."""
         robot = self.robot
         extremes = cubics.extremes
         beyond = np.maximum(robot.lower - extremes.lower, extremes.upper - robot.upper)
         beyond[robot.continuous] = 0.0
         if not (beyond > self.settings.limit_slack).any():
-            return []
+            return None
         times, turns = cubics.turns()
-        if not len(times):
-            return []
-        violation = self._limits(turns, times, "{:.3f} s")
-        return [] if violation is None else [violation]
+        return self._limits(turns, times, "{:.3f} s")
 
-    def _too_fast(self, cubics: Cubics) -> list[Violation]:
-        """A violation at the first place where a frame is not proved to keep its speed limit; no entries if
-        there is none."""
+    def _too_fast(self, cubics: Cubics) -> Violation | None:
+        """A violation at the first place where a frame is not proved to keep its speed limit."""
         assert self.constraints is not None
         limits = self.constraints.speed_limits
         trajectory = cubics.trajectory
         if not len(limits) or not len(cubics.steps):
-            return []
+            return None
         pieces = trajectory_pieces(trajectory)
         speeds = self.constraints.speeds
         bends = self.constraints.third_derivative_bounds(pieces.along.v) / cubics.steps
@@ -357,25 +337,25 @@ class Verifier:
             limits, lambda q, v, _: speeds(q, v), bends, pieces.states, self.settings.rate_slack
         )
         if beyond is None:
-            return []
-        at = float(np.interp(beyond.place, np.arange(len(trajectory.times)), trajectory.times))
+            return None
+        at = _time_at(beyond.place, trajectory.times)
         constraint = self.constraints.speed_limited[beyond.joint]
         speed_limit = limits[beyond.joint]
         speed, limit = distinct(beyond.torque, speed_limit, digits=4)
         message = f"{constraint.frame} moves at {speed} m/s; {constraint.kind} allows {limit} m/s"
-        return [Violation("speed", at, message, constraint.frame, constraint.kind, beyond.excess)]
+        return Violation("speed", at, message, constraint.frame, constraint.kind, beyond.excess)
 
-    def _torques(self, clock: ndarray, pieces: Pieces, what: str) -> list[Violation]:
+    def _torques(self, clock: ndarray, pieces: Pieces, what: str) -> Violation | None:
         """A violation at the first place where a joint's torque with the payload is not proved to be within
-        its effort limit; no entries if there is none. what: the end of the message."""
+        its effort limit. what: the end of the message."""
         assert self.dynamics is not None
         beyond = first_excess(self.dynamics, pieces, self.settings.rate_slack)
         if beyond is None:
-            return []
-        at = float(np.interp(beyond.place, np.arange(len(clock)), clock))
+            return None
+        at = _time_at(beyond.place, clock)
         name = self.robot.joint_names[beyond.joint]
         message = self.dynamics.torque_message(beyond.joint, beyond.torque) + what
-        return [Violation("torque", at, message, name, None, beyond.excess)]
+        return Violation("torque", at, message, name, None, beyond.excess)
 
     def _twitch(self, q: ndarray, clock: ndarray) -> Violation | None:
         """A violation if the motion has more than `reversals` sharp reversals, counted on rows that are at
@@ -476,6 +456,28 @@ def verifier(problem: Problem, settings: VerifySettings = DEFAULT) -> Verifier:
     return Verifier(problem, settings)
 
 
+def _time_at(place: float, clock: ndarray) -> float:
+    """The time at a place: the index of a row plus a fraction."""
+    return float(np.interp(place, np.arange(len(clock)), clock))
+
+
+def _unusable(trajectory: Trajectory) -> Violation | None:
+    """A violation if values are not finite, or if the times are not those of a motion."""
+    times = trajectory.times
+    if not all(np.isfinite(rows).all() for rows in (times, trajectory.velocities, trajectory.accelerations)):
+        return Violation("not_finite", 0.0, "the trajectory holds values that are not finite")
+    backwards = np.flatnonzero(np.diff(times) <= 0)
+    if len(backwards):
+        i = backwards[0]
+        return Violation("time", float(times[i + 1]), f"times do not increase from row {i} to row {i + 1}")
+    if times[0] != 0:
+        return Violation("time", float(times[0]), f"times begin at {times[0]:.6g} s, not at 0")
+    if trajectory.duration <= MAX_DURATION:
+        return None
+    time, max_time = distinct(trajectory.duration, MAX_DURATION)
+    return Violation("time", 0.0, f"the motion takes {time} s; at most {max_time} s can be validated")
+
+
 def _moving_contact_violation(contact: "TimedContact") -> Violation:
     link = contact.link
     obstacle = contact.obstacle
@@ -517,9 +519,7 @@ def violations(
         rates = any(wrong.kind in RATE_KINDS for wrong in all_violations)
         clock, q = (motion.times, q) if rates else Cubics(motion).sampled(settings.chord)[:2]
     for contact in contacts(problem.robot, problem.scene, q, settings.contact):
-        all_violations.append(
-            collision_violation(contact, float(np.interp(contact.at, np.arange(len(q)), clock)))
-        )
+        all_violations.append(collision_violation(contact, _time_at(contact.at, clock)))
     if timed:
         times, turns = Cubics(motion).turns()
         clock = np.concatenate([clock, times])
