@@ -184,7 +184,7 @@ def _placed_groups(robot: Robot) -> dict[str, _Group]:
     for link in links:
         link_spheres.append(moved_spheres(robot.T_frame_link(link), robot.spheres[link]))
         parts.append(_clusters(link_spheres[-1]))
-    bounds = _bounding_spheres([*link_spheres, *(part for group in parts for part in group)])
+    bounds = bounding_spheres([*link_spheres, *(part for group in parts for part in group)])
     part_bounds = iter(bounds[len(link_spheres) :])
     for link, spheres, rows, bound in zip(links, link_spheres, parts, bounds, strict=False):
         group_of_link[link] = _Group(spheres, rows, bound, list(islice(part_bounds, len(rows))))
@@ -224,7 +224,7 @@ def _clusters(spheres: ndarray) -> list[ndarray]:
     return _clusters(spheres[order[:half]]) + _clusters(spheres[order[half:]])
 
 
-def _bounding_spheres(sets: Sequence[ndarray]) -> list[ndarray]:
+def bounding_spheres(sets: Sequence[ndarray]) -> list[ndarray]:
     """A nearly minimal sphere around each set of spheres. The center repeatedly moves towards the farthest
     sphere of the set (Badoiu and Clarkson)."""
     if not sets:

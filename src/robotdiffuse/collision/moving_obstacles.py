@@ -19,14 +19,14 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision.convex_geometry import Solid, solids_of
-from robotdiffuse.collision.kernel_arrays import robot_groups
+from robotdiffuse.collision.kernel_arrays import bounding_spheres, robot_groups
 from robotdiffuse.collision.kernels import moving_obstacles as kernel
 from robotdiffuse.collision.kernels.moving_obstacles import CLEARANCE_CAP, Links, Tasks, Tracks
 from robotdiffuse.collision.motions import with_covering_spheres
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.loading import loading
 from robotdiffuse.core.transforms import inverse, moved_spheres, quaternion_from_rotation
-from robotdiffuse.core.types import interpolated
+from robotdiffuse.core.types import Values, interpolated
 from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.motion_bounds import radii_of
 from robotdiffuse.robots.robot import Robot
@@ -84,9 +84,7 @@ class MovingCollision:
         q = for_kernels(q)
         best = np.array([CLEARANCE_CAP])
         certified = CLEARANCE_CAP
-        all_pairs = np.ones((1, len(self.link_names), len(self.moving)), np.bool_)
-        ends = times[[0, -1]]
-        tasks = Tasks(ends[:1], ends[1:], all_pairs)
+        tasks = self._whole(times)
         hit = None  # time, link and obstacle of the first contact
         while len(tasks.start):
             bound, open_tasks = kernel.settle_tasks(
@@ -129,14 +127,17 @@ class MovingCollision:
         """The first time [s] at which the covering spheres do not prove a clearance of `least` [m]; None if
         they prove it for the whole motion. It never uses the exact meshes, so it is fast enough for searches
         and control loops."""
-        all_pairs = np.ones((1, len(self.link_names), len(self.moving)), np.bool_)
         times = for_kernels(times)
         q = for_kernels(q)
-        tasks = Tasks(times[:1], times[-1:], all_pairs)
-        open_tasks = kernel.settle_tasks(
-            self.links, self.tracks, times, q, tasks, least, 0.0, np.array([CLEARANCE_CAP])
-        )[1]
+        best = np.array([CLEARANCE_CAP])
+        tasks = self._whole(times)
+        _, open_tasks = kernel.settle_tasks(self.links, self.tracks, times, q, tasks, least, 0.0, best)
         return min((start for start, *_ in open_tasks), default=None)
+
+    def _whole(self, times: Values) -> Tasks:
+        """The task of the whole motion."""
+        pairs = np.ones((1, len(self.link_names), len(self.moving)), np.bool_)
+        return Tasks(times[:1], times[-1:], pairs)
 
     def _tasks(self, halves: list[tuple[float, float, int, int]]) -> Tasks:
         pairs = np.zeros((len(halves), len(self.link_names), len(self.moving)), np.bool_)
@@ -192,22 +193,13 @@ def compile_links(robot: Robot) -> tuple[tuple[str, ...], Links]:
     """Names of the moving links with geometry, and the links' arrays for compiled code."""
     covered = with_covering_spheres(robot)
     names = tuple(link for link in robot_groups(covered) if covered.link_frame(link) > 0)
-    spheres = []
-    for link in names:
-        spheres.append(moved_spheres(covered.T_frame_link(link), covered.spheres[link]))
-    bounds = np.zeros((len(names), 4))
-    for i, link_spheres in enumerate(spheres):
-        low = (link_spheres[:, :3] - link_spheres[:, 3:]).min(axis=0)
-        high = (link_spheres[:, :3] + link_spheres[:, 3:]).max(axis=0)
-        bounds[i, :3] = (low + high) / 2
-        reach = np.linalg.norm(link_spheres[:, :3] - bounds[i, :3], axis=1) + link_spheres[:, 3]
-        bounds[i, 3] = reach.max()
+    spheres = [moved_spheres(covered.T_frame_link(link), covered.spheres[link]) for link in names]
     links = Links(
         for_kernels(robot.frame_offsets),
         robot.kernel_parents,
         np.array(robot.prismatic, np.bool_),
         np.array([covered.link_frame(link) for link in names], np.int64),
-        bounds,
+        np.array(bounding_spheres(spheres)).reshape(-1, 4),
         np.cumsum([0] + [len(link_spheres) for link_spheres in spheres]),
         np.concatenate(spheres) if spheres else np.zeros((0, 4)),
         radii_of(covered, names),

@@ -105,11 +105,12 @@ def _checks(
     rest_tolerance = settings.rate_slack * np.where(robot.velocity > 0, robot.velocity, _peak(v, mean))
     """Velocity that counts as zero, for each joint."""
 
-    def limited(kind: str, what: str, rates: ndarray, limit: ndarray, allowed: ndarray) -> _Check:
-        allowed_rates = allowed if (limit > 0).all() else np.where(limit > 0, allowed, np.inf)
-        return _Check(
-            kind, what, rates, np.abs(rates), allowed_rates, lambda _, j: f"its limit {limit[j]:.6g}"
-        )
+    def limited(kind: str, what: str, rates: ndarray, error: ndarray | float = 0.0) -> _Check:
+        """Whether rates of an uncertainty `error` keep the limits."""
+        limit = robot.acceleration if kind == "acceleration" else robot.velocity
+        factor = settings.jump if kind == "jump" else limit_factor
+        allowed = np.where(limit > 0, factor * limit + error, np.inf)
+        return _Check(kind, what, rates, np.abs(rates), allowed, lambda _, j: f"its limit {limit[j]:.6g}")
 
     at_ends = np.zeros_like(v)
     at_ends[0], at_ends[-1] = np.abs(v[0] - initial_velocity), np.abs(v[-1])
@@ -118,16 +119,12 @@ def _checks(
         rule = "but the motion is to begin at the problem's start_velocity and end at rest"
     yield _Check("rest", "velocity", v, at_ends, rest_tolerance, lambda *_: rule)
 
-    limits = robot.velocity
-    rate_name = "mean velocity from here to the next row"
-    yield limited("jump", rate_name, mean, limits, settings.jump * limits + mean_error)
+    yield limited("jump", "mean velocity from here to the next row", mean, mean_error)
     # An error e of the mean velocity of a step of h seconds changes the cubic's velocities by up to 3/2 e,
     # and its accelerations by up to 6 e / h (see trajectories/cubics.py).
     rate_name = "greatest velocity of the cubic to the next row"
-    yield limited(
-        "velocity", rate_name, cubics.extremes.velocity, limits, limit_factor * limits + 1.5 * mean_error
-    )
-    yield limited("velocity", "velocity", v, limits, limit_factor * limits)
+    yield limited("velocity", rate_name, cubics.extremes.velocity, 1.5 * mean_error)
+    yield limited("velocity", "velocity", v)
 
     # Second differences of positions. The first step is mirrored before the first row, and the last step
     # after the last row, so that the mean velocity of a step and its mirror image is `initial_velocity` or 0.
@@ -137,29 +134,15 @@ def _checks(
     spacing = (durations[1:] + durations[:-1]) / 2
     second = (means[1:] - means[:-1]) / spacing
     uncertainty = (uncertainty[1:] + uncertainty[:-1]) / spacing
-    limits = robot.acceleration
-    peaks = cubics.extremes.acceleration
     cubic_error = 6 * mean_error / step
-    yield limited(
-        "acceleration",
-        "mean acceleration by its positions",
-        second,
-        limits,
-        limit_factor * limits + uncertainty,
-    )
-    yield limited(
-        "acceleration",
-        "greatest acceleration of the cubic to the next row",
-        peaks,
-        limits,
-        limit_factor * limits + cubic_error,
-    )
-    yield limited(
-        "acceleration", "mean acceleration by its velocities", change, limits, limit_factor * limits
-    )
-    yield limited("acceleration", "acceleration", a, limits, limit_factor * limits)
+    yield limited("acceleration", "mean acceleration by its positions", second, uncertainty)
+    rate_name = "greatest acceleration of the cubic to the next row"
+    yield limited("acceleration", rate_name, cubics.extremes.acceleration, cubic_error)
+    yield limited("acceleration", "mean acceleration by its velocities", change)
+    yield limited("acceleration", "acceleration", a)
 
     # The greatest acceleration between rows is assumed to be at most twice the greatest measured one.
+    limits = robot.acceleration
     measured = np.maximum(_peak(a, second, change), settings.rate_slack * robot.acceleration)
     strongest = np.where(limits > 0, np.minimum(limit_factor * limits, 2 * measured), 2 * measured)
     # With accelerations up to A, the mean velocity of a step of h seconds, in which the velocity changes by d
@@ -204,10 +187,10 @@ def _checks(
     times = trajectory.times
     resolution = settings.limit_slack
     rate_name = "mean velocity from an earlier row to here"
-    limits = robot.velocity
-    first, span = _worst_earlier_row(times, q, (times - times[0])[:, None] * limit_factor * limits)
+    farthest = (times - times[0])[:, None] * limit_factor * robot.velocity
+    first, span = _worst_earlier_row(times, q, farthest)
     moved = _change_since(q, first) / span
-    yield limited("velocity", rate_name, moved, limits, limit_factor * limits + 2 * resolution / span)
+    yield limited("velocity", rate_name, moved, 2 * resolution / span)
 
     stated_positions = _cumulative(step * (v[1:] + v[:-1]) / 2)
     allowed = _cumulative(step * possible)
@@ -223,13 +206,12 @@ def _checks(
         lambda i, j: f"but its velocities give {stated[i, j]:.6g}",
     )
 
-    limits = robot.acceleration
     for window in AVERAGING_WINDOWS:
         second, uncertainty = _second_differences(
             trajectory, initial_velocity, window, resolution, rest_tolerance
         )
         description = f"mean acceleration by its positions over {1e3 * window:g} ms and more"
-        yield limited("acceleration", description, second, limits, limit_factor * limits + uncertainty)
+        yield limited("acceleration", description, second, uncertainty)
 
 
 def _cumulative(steps: JointRows) -> JointRows:
