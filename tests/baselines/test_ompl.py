@@ -99,13 +99,14 @@ def test_range_bounds_the_extensions_which_simplifying_shortens():
 def test_a_refused_path_is_searched_again_more_closely(planner, monkeypatch):
     resolutions = []
 
-    def first_without_the_wall(checker, resolution, *rest):
+    def first_without_the_wall(start_goal, resolution, clearance):
         resolutions.append(resolution)
-        seen = checker if len(resolutions) > 1 else CollisionChecker(PANDA, rd.Scene([]))
-        return search_space(seen, resolution, *rest)
+        if len(resolutions) == 1:
+            start_goal = ompl.StartGoal(CollisionChecker(PANDA, rd.Scene([])), LEFT, RIGHT[None])
+        return space(start_goal, resolution, clearance)
 
-    search_space = ompl.search_space
-    monkeypatch.setattr(ompl, "search_space", first_without_the_wall)
+    space = ompl.StartGoal.space
+    monkeypatch.setattr(ompl.StartGoal, "space", first_without_the_wall)
     result = plan(planner, problem(RIGHT))
     assert resolutions[:2] == [0.05, 0.025]
     assert rd.verify(problem(RIGHT), result.path).valid
@@ -128,6 +129,7 @@ def test_an_error_below_ompl_comes_out(planner, monkeypatch):
 class UncheckedStartGoal(ompl.StartGoal):
     def __init__(self, *_):
         self.checker = CollisionChecker(PANDA, WALL)
+        self._robot = PANDA
         self.start = LEFT
         self.start_lead = LEFT
         self.goals = [RIGHT]

@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.baselines.straight_line import first_accepted
+from robotdiffuse.baselines.straight_line import shortest_accepted, straight_lines
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, Natural, OneOf, Settings
-from robotdiffuse.core.types import Configuration, Configurations, Path
+from robotdiffuse.core.types import Configuration, Configurations
 from robotdiffuse.datasets.rows import read_rows
 from robotdiffuse.datasets.shards import SPLITS
 from robotdiffuse.learning.guidance import CollisionGuidance, Trajectories
@@ -104,14 +104,9 @@ class Control(Planner[ControlSettings]):
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
-        start, goals = start_goal.rows()
-        names = context.problem.robot.joint_names
-        lines = np.stack([np.broadcast_to(start, goals.shape), goals], axis=1)
-        for batch in (lines, self.candidates(start, goals, start_goal.checker, context.rng)):
-            paths = [Path(names, start_goal.complete(q)) for q in batch]
-            paths.sort(key=lambda path: path.length)
-            positions = (path.positions for path in paths)
-            result = first_accepted(context, positions, self.settings.source, "solved by a control")
+        candidates = self.candidates(*start_goal.rows(), start_goal.checker, context.rng)
+        for batch in (straight_lines(start_goal), candidates):
+            result = shortest_accepted(context, start_goal, batch, self.settings.source)
             if result is not None:
                 return result
         return context.unsolved(f"the straight line and {self.settings.samples} candidates are refused")

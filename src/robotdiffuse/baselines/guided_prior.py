@@ -79,7 +79,6 @@ from math import ceil
 from typing import Annotated, ClassVar, TypeVar
 
 import numpy as np
-from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
@@ -255,21 +254,16 @@ def collision_gradient(
     margins. The cost of a trajectory is the sum of the costs of its waypoints, plus, for each segment, the
     mean cost of `between` configurations on it.
     """
-    count, waypoints, dof = q.shape
-    shares = np.arange(1, between + 1, dtype=np.float32) / (between + 1)
-    step = np.diff(q, axis=1)[:, :, None]
-    between_waypoints = q[:, :-1, None] + shares[:, None] * step
-    all_q = np.concatenate([q.reshape(-1, dof), between_waypoints.reshape(-1, dof)])
-    squares, gradients = checker.cost_gradients(all_q, margin, self_margin)
-    depth = np.sqrt(2 * squares)
-    gradients = gradients / np.maximum(depth, np.float32(1e-6))[:, None]
-    at_waypoints = count * waypoints
-    by_waypoint = gradients[:at_waypoints].reshape(q.shape)
-    if between:
-        by_configuration = gradients[at_waypoints:].reshape(between_waypoints.shape) / np.float32(between)
-        by_waypoint[:, :-1] += ((1 - shares)[:, None] * by_configuration).sum(2)
-        by_waypoint[:, 1:] += (shares[:, None] * by_configuration).sum(2)
-    return by_waypoint
+    waypoints = q.shape[1]
+    # all configurations are weighted means of waypoints: their weights [configurations, waypoints]
+    numbers = np.arange((waypoints - 1) * (between + 1) + 1)
+    offsets = numbers[:, None] / (between + 1) - np.arange(waypoints)
+    means = np.maximum(1 - np.abs(offsets), 0).astype(np.float32)
+    all_q = means @ q
+    squares, gradients = checker.cost_gradients(all_q.reshape(-1, q.shape[2]), margin, self_margin)
+    gradients /= np.maximum(np.sqrt(2 * squares), np.float32(1e-6))[:, None]
+    means[numbers % (between + 1) > 0] /= max(between, 1)
+    return means.T @ gradients.reshape(all_q.shape)
 
 
 def limited(moves: Trajectories, most: float) -> Trajectories:
@@ -347,37 +341,19 @@ class MPD(GuidedPrior[MPDSettings]):
         return q
 
 
-def state_precision(waypoints: int) -> Float[ndarray, "states states"]:
-    """Precision matrix of one joint's states, (position, velocity) of each waypoint in turn, under the
-    Gaussian process prior of constant velocity (M. Mukadam et al., IJRR 2018, section 3).
+def position_precision(waypoints: int) -> ndarray:
+    """P, the precision matrix of one joint's positions under the Gaussian process prior of constant velocity
+    (M. Mukadam et al., IJRR 2018, section 3), for waypoints one unit of time apart.
 
-    The acceleration is white noise, so that for waypoints one unit of time apart
-
-        state' = F state + noise,  F = [[1, 1], [0, 1]],  covariance Q = [[1/3, 1/2], [1/2, 1]].
-
-    The precision matrix is therefore block tri-diagonal. It is the same for every joint.
+    The acceleration is white noise, and the velocities are integrated out. Therefore the cost q P q / 2 is
+    half the least integral of squared acceleration over all curves through the waypoints, which the natural
+    cubic spline attains (P. Green and B. Silverman, "Nonparametric Regression and Generalized Linear Models",
+    1993, section 2.1). Straight lines cost nothing.
     """
-    transition = np.array([[1.0, 1.0], [0.0, 1.0]])
-    inverse = np.linalg.inv(np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]]))
-    precision = np.zeros((2 * waypoints, 2 * waypoints))
-    error = np.hstack([-transition, np.eye(2)])
-    for i in range(waypoints - 1):
-        precision[2 * i : 2 * i + 4, 2 * i : 2 * i + 4] += error.T @ inverse @ error
-    return precision
-
-
-def position_precision(waypoints: int) -> Float[ndarray, "waypoints waypoints"]:
-    """P, the precision matrix of one joint's positions: the velocities are integrated out by a Schur
-    complement.
-
-    The cost q P q / 2 is half the least integral of squared acceleration over all curves through the
-    waypoints, which the natural cubic spline attains. Straight lines cost nothing.
-    """
-    precision = state_precision(waypoints)
-    position = slice(0, None, 2)
-    velocity = slice(1, None, 2)
-    mixed = precision[position, velocity]
-    return precision[position, position] - mixed @ np.linalg.solve(precision[velocity, velocity], mixed.T)
+    second_differences = np.diff(np.eye(waypoints), 2, axis=0)
+    inner = waypoints - 2
+    spline = 2 / 3 * np.eye(inner) + (np.eye(inner, k=1) + np.eye(inner, k=-1)) / 6
+    return second_differences.T @ np.linalg.solve(spline, second_differences)
 
 
 def implicit_step(q: Trajectories, weight: float) -> Trajectories:

@@ -28,7 +28,7 @@ import numpy as np
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import make_scratch, motion_free
-from robotdiffuse.collision.motions import FINEST_RESOLUTION, search_space
+from robotdiffuse.collision.motions import FINEST_RESOLUTION
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.kernels import allocation_free, kernel
 from robotdiffuse.core.results import PlanResult
@@ -36,7 +36,7 @@ from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive, Sett
 from robotdiffuse.core.types import Configuration, Configurations, Status
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.planner import Planner, ever_finer
-from robotdiffuse.planning.start_goal import StartGoal
+from robotdiffuse.planning.start_goal import StartGoal, padded_space
 
 CLOCK_INTERVAL = 4000  # approximate number of edges between two readings of the clock
 MAX_MOVES = 100_000  # largest number of edges of a node
@@ -253,8 +253,8 @@ class LatticeSearch:
         settings: DStarLiteSettings,
         padding: float = 0.0,
     ) -> None:
-        """`padding` is the distance to obstacles that paths keep [m]. Raises InputError for a lattice that is
-        too large."""
+        """`padding` is the distance to obstacles that paths keep [m], except near a start or goal that is
+        closer to them. Raises InputError for a lattice that is too large."""
         self.checker = checker
         self.goals = goals
         self.settings = settings
@@ -316,7 +316,8 @@ class LatticeSearch:
                 raise InputError(f"start is {np.round(start, 4)}; it must be a node of the lattice")
             self._start = at.astype(np.int64) @ s.strides
         self.checker = checker
-        space = search_space(checker, self.settings.resolution, self.padding)
+        ends = np.vstack([s.q[s.values[START]] if start is None else start, self.goals])
+        space = padded_space(checker, ends, self.settings.resolution, self.padding)
         self._search = s._replace(space=space, scratch=make_scratch(space, space.lower))
         update(self._search, self._start)
 
@@ -354,9 +355,8 @@ class AStar(Planner[DStarLiteSettings]):
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
-        padding = start_goal.kept_clearance(self.settings.clearance)
         for settings, _ in ever_finer(context, self.settings):
-            search = LatticeSearch(start_goal.checker, *start_goal.rows(), settings, padding)
+            search = LatticeSearch(start_goal.checker, *start_goal.rows(), settings, settings.clearance)
             outcome = search.run(lambda: context.remaining <= 0)
             after = f"after {search.expansions} expansions"
             path = search.path()

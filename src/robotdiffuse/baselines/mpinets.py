@@ -20,14 +20,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float32
-from numpy import ndarray
 
 from robotdiffuse.collision.kernels.motions import Space, motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, NotNegative, Positive
-from robotdiffuse.core.types import Configurations
+from robotdiffuse.core.types import Configuration, Configurations
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings, scene_clouds
 from robotdiffuse.planning.start_goal import StartGoal
@@ -128,7 +126,7 @@ class MPiNets(LearnedPlanner[MPiNetsSettings]):
 class _Motion:
     """The motion of a roll-out up to its current step."""
 
-    def __init__(self, start: Float32[ndarray, "dof"], goal: Float32[ndarray, "dof"]) -> None:
+    def __init__(self, start: Configuration, goal: Configuration) -> None:
         self.waypoints = [start]
         self.goal = goal
         self.collided = self.arrived = False
@@ -140,7 +138,7 @@ class _Motion:
         """Whether the motion reaches the goal without a collision of the covering spheres."""
         return self.arrived and not self.collided
 
-    def go(self, space: Space, q: Float32[ndarray, "dof"]) -> None:
+    def go(self, space: Space, q: Configuration) -> None:
         """Adds the policy's next configuration."""
         step = np.stack([self.waypoints[-1], q])
         self.collided |= not motions_free(space, step)[0]

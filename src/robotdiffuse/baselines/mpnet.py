@@ -29,7 +29,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.kernels.random import random_state
-from robotdiffuse.collision.motions import finer_resolution, search_space
+from robotdiffuse.collision.motions import finer_resolution
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, Natural, NotNegative, Positive
 from robotdiffuse.core.types import Configurations
@@ -117,9 +117,7 @@ class NeuralPlanning:
         self.context = context
         self.network = network
         self.settings = settings
-        self.space = search_space(
-            start_goal.checker, settings.resolution, start_goal.kept_clearance(settings.clearance)
-        )
+        self.space = start_goal.space(settings.resolution, settings.clearance)
         self.generator = network.generator(int(rng.integers(2**63)))
         self.state = random_state(int(rng.integers(2**31)))
         start, goals = start_goal.rows()

@@ -28,7 +28,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from robotdiffuse.collision.kernels.motions import Space, motions_free
-from robotdiffuse.collision.motions import finer_resolution, search_space
+from robotdiffuse.collision.motions import finer_resolution
 from robotdiffuse.core.errors import InputError, needs
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import NotNegative, Positive, Settings
@@ -303,9 +303,7 @@ class _Search:
         self._context = context
         self._robot = context.problem.robot
         self._watch = Watch(context)
-        space = search_space(
-            start_goal.checker, settings.resolution, start_goal.kept_clearance(settings.clearance)
-        )
+        space = start_goal.space(settings.resolution, settings.clearance)
         # keeps objects that C++ refers to alive until the search is over
         self._states = ob.RealVectorStateSpace(self._robot.dof)
         bounds = ob.RealVectorBounds(self._robot.dof)

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
+from numpy import ndarray
 
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import OneOf, Settings
-from robotdiffuse.core.types import Configurations
+from robotdiffuse.core.types import Configurations, Path
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.planning.start_goal import StartGoal
@@ -23,15 +24,23 @@ class StraightLineSettings(Settings, name="straight_line"):
     """Goal configurations that are tried: only the nearest one, or all of them, the nearest first."""
 
 
-def first_accepted(
-    context: PlanningContext, paths: Iterable[Configurations], stage: str, reason: str
+def shortest_accepted(
+    context: PlanningContext, start_goal: StartGoal, candidates: Iterable[Configurations], stage: str
 ) -> PlanResult | None:
-    """The result of the first path that the validator accepts; None if it accepts no path in time."""
-    for path in paths:
-        result = context.finish(path, stage, reason)
+    """The result of the shortest candidate that the validator accepts; None if it accepts none in time."""
+    names = context.problem.robot.joint_names
+    paths = [Path(names, start_goal.complete(q)) for q in candidates]
+    for path in sorted(paths, key=lambda path: path.length):
+        result = context.finish(path.positions, stage)
         if result is not None or context.ended:
             return result
     return None
+
+
+def straight_lines(start_goal: StartGoal) -> ndarray:
+    """The straight lines from the start to the goals [goals, 2, dof]."""
+    start, goals = start_goal.rows()
+    return np.stack([np.broadcast_to(start, goals.shape), goals], axis=1)
 
 
 class StraightLine(Planner[StraightLineSettings]):
@@ -42,11 +51,9 @@ class StraightLine(Planner[StraightLineSettings]):
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
-        start, goals = start_goal.rows()
-        order = np.argsort(np.linalg.norm(goals - start, axis=1))
-        selected = order[:1] if self.settings.goals == NEAREST else order
-        paths = (start_goal.complete(np.stack([start, goal])) for goal in goals[selected])
-        plural = "line is" if len(selected) == 1 else f"lines to {len(selected)} goal configurations are"
-        return first_accepted(
-            context, paths, "straight_line", "solved by the straight line"
-        ) or context.unsolved(f"the straight {plural} refused")
+        lines = straight_lines(start_goal)
+        if self.settings.goals == NEAREST:
+            lines = lines[[np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).argmin()]]
+        plural = "line is" if len(lines) == 1 else f"lines to {len(lines)} goal configurations are"
+        result = shortest_accepted(context, start_goal, lines, self.name)
+        return result or context.unsolved(f"the straight {plural} refused")

@@ -14,7 +14,6 @@ from pathlib import Path as FilePath
 from typing import Annotated, Any
 
 import numpy as np
-from jaxtyping import Float32
 from numpy import ndarray
 
 from robotdiffuse import __version__
@@ -27,7 +26,7 @@ from robotdiffuse.core.interrupts import delay_interrupts
 from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.core.registry import Entry, Registry
 from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Settings, SettingsOf, Share
-from robotdiffuse.core.types import Path, interpolated
+from robotdiffuse.core.types import Configurations, Path, interpolated
 from robotdiffuse.datasets.rows import Row, resample, row_of
 from robotdiffuse.datasets.shards import (
     MANIFEST,
@@ -44,7 +43,7 @@ from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.families.family import POSE, POSITION, Family, SampledProblem
 from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.processes.ray_cluster import CLUSTERS
-from robotdiffuse.processes.workers import on_this_machine
+from robotdiffuse.processes.workers import Results, on_this_machine
 from robotdiffuse.robots import load_robot, names_a_file
 from robotdiffuse.robots.robot import Robot, robot_fingerprint
 from robotdiffuse.scenes.scene_arrays import PackedScenes
@@ -242,11 +241,12 @@ def draw(settings: GenerationSettings, robot: Robot, rng: np.random.Generator) -
 
 
 def _resampled(
-    settings: GenerationSettings, robot: Robot, path: Float32[ndarray, "n dof"], validator: Verifier
-) -> tuple[ndarray, Float32[ndarray, "waypoints dof"]] | None:
-    """Times and joint values of the waypoints; None if the validator rejects the timed motion."""
+    settings: GenerationSettings, robot: Robot, path: Configurations, validator: Verifier
+) -> tuple[ndarray | None, Configurations] | None:
+    """Times (None without timing) and joint values of the waypoints; None if the validator rejects the timed
+    motion."""
     if settings.timing == "arc":
-        return np.zeros(0), resample(path[None], settings.waypoints)[0]
+        return None, resample(path[None], settings.waypoints)[0]
     waypoints = Path(robot.joint_names, path.astype(np.float64))
     if not validator.path(waypoints).valid:
         return None
@@ -288,41 +288,32 @@ def generate(
         try:
             remove_leftovers(out)
             _claim(manifest, out)
-            return _fill(settings, out, workers, cluster, progress)
+            existing = set(shard_indices(out))
+            missing = [index for index in range(settings.shards) if index not in existing]
+            finished = settings.trajectories - sum(settings.rows(index) for index in missing)
+            progress(finished, settings.trajectories)
+            # closing the iterator stops the workers at once if this is interrupted
+            with closing(_shards(settings, missing, workers, cluster)) as shards:
+                for number, (arrays, counts) in shards:
+                    index = missing[number]
+                    # without the delay, zarr's threads could write files after the clean-up
+                    with delay_interrupts():
+                        write_shard(out, index, arrays, counts)
+                    finished += settings.rows(index)
+                    progress(finished, settings.trajectories)
         finally:
             remove_leftovers(out)
-
-
-def _fill(
-    settings: GenerationSettings,
-    out: FilePath,
-    workers: int,
-    cluster: str | None,
-    progress: Callable[[int, int], None],
-) -> int:
-    existing = set(shard_indices(out))
-    missing = [index for index in range(settings.shards) if index not in existing]
-    finished = settings.trajectories - sum(settings.rows(index) for index in missing)
-    progress(finished, settings.trajectories)
-    if not missing:
-        return settings.trajectories
-    if cluster is None:
-        shards = on_this_machine(make_shard, [(settings, index) for index in missing], workers)
-    else:
-        if names_a_file(settings.robot):  # nodes have other working folders
-            settings = replace(settings, robot=str(FilePath(settings.robot).resolve()))
-        local_record = _reproducibility_record(settings)
-        shards = CLUSTERS[cluster](_make_on_node, [(settings, index, local_record) for index in missing])
-    # closing the iterator stops the workers at once if this is interrupted
-    with closing(shards):
-        for number, (arrays, counts) in shards:
-            index = missing[number]
-            # without the delay, zarr's threads could write files after the clean-up
-            with delay_interrupts():
-                write_shard(out, index, arrays, counts)
-            finished += settings.rows(index)
-            progress(finished, settings.trajectories)
     return settings.trajectories
+
+
+def _shards(settings: GenerationSettings, indices: list[int], workers: int, cluster: str | None) -> Results:
+    """Yields the place of each index in the list, and the shard with this index as soon as it is made."""
+    if cluster is None or not indices:
+        return on_this_machine(make_shard, [(settings, index) for index in indices], workers)
+    if names_a_file(settings.robot):  # nodes have other working folders
+        settings = replace(settings, robot=str(FilePath(settings.robot).resolve()))
+    local_record = _reproducibility_record(settings)
+    return CLUSTERS[cluster](_make_on_node, [(settings, index, local_record) for index in indices])
 
 
 def _make_on_node(settings: GenerationSettings, index: int, wanted: dict[str, str]) -> tuple[Arrays, Counts]:

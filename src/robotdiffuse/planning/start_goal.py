@@ -91,13 +91,6 @@ class StartGoal:
         assert self.start_lead is not None
         return self.start_lead.astype(np.float32), np.array(self.goal_leads, np.float32)
 
-    def kept_clearance(self, wanted: float) -> float:
-        """A clearance that a path can keep [m]: `wanted`, but at most half of the smallest clearance of the
-        start and the goals."""
-        start, goals = self.rows()
-        leads = np.concatenate([start[None], goals])
-        return min(wanted, 0.5 * float(self.checker.link_clearances(leads).min(initial=np.inf)))
-
     def space(self, resolution: float, clearance: float) -> Space:
         """The space in which searches check motions, at a resolution [m] and a clearance [m].
 

@@ -19,8 +19,6 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from robotdiffuse.collision import CollisionChecker
@@ -33,7 +31,7 @@ from robotdiffuse.core.locked import locked
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, NotNegative, Settings
 from robotdiffuse.core.transforms import inverse, rotation_angle, transform
-from robotdiffuse.core.types import Configuration, Configurations, Trajectory
+from robotdiffuse.core.types import Configuration, Configurations, Trajectory, Values, Vector
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.reactive.timed_path import MIN_LENGTH, JerkFilter, SpeedProfile, TimedPath
 from robotdiffuse.planning.search.rrt import AnytimeSearch, SearchSettings
@@ -60,7 +58,7 @@ class ObservedObstacle:
     any way up to its maximum speed."""
     time: float = np.nan
     """Time of the last observation [s]; NaN: never observed."""
-    velocity: Float[ndarray, "3"] | None = None
+    velocity: Vector | None = None
     """Velocity of its origin by the last two observations, or before by the problem [m/s]; None: unknown."""
 
     def again(self, value: ArrayLike, now: float) -> "ObservedObstacle":
@@ -109,7 +107,7 @@ class PredictedObstacles:
         self._collision = MovingCollision(robot, moving, 0.0, 0.0)
         self.margin = np.zeros(len(moving))
 
-    def wider(self, margin: Float[ndarray, "obstacles"]) -> "PredictedObstacles":
+    def wider(self, margin: Values) -> "PredictedObstacles":
         """These obstacles, each inflated by its margin [m]."""
         inflated = copy(self)
         inflated.margin = self.margin + margin
@@ -127,7 +125,7 @@ class PredictedObstacles:
         return self._collision.first_unproved_time(times, motion.positions, clearance) is None
 
     def comes(
-        self, q: Float[ndarray, "*n dof"], times: float | Float[ndarray, "n"], rest_time: float
+        self, q: Configuration | Configurations, times: float | Values, rest_time: float
     ) -> float | None:
         """Time at which an obstacle first touches the arm [s], while it moves through the configurations q at
         `times` [s] and then rests for `rest_time` [s], or rests at a single configuration from a single time
@@ -268,7 +266,7 @@ class Replanner:
         Raises:
             InputError: For a goal that is not usable in the static scene; the goal is then unchanged.
         """
-        rest = self._path.at(float(self._motion.s[-1]))
+        rest = self._path.at(self._motion.s[-1])
         problem = replace(self.problem, goal=goal)  # type: ignore[arg-type]
         start_goal = usable_start_goal(
             PlanningContext("replanner", replace(problem, start=rest, moving=()), self._request)
@@ -330,7 +328,7 @@ class Replanner:
     def _at_goal(self) -> bool:
         """Whether the arm, at rest, is at a goal."""
         path = self._path
-        s = float(self._motion.s[0])
+        s = self._motion.s[0]
         if self._must_leave:
             return bool(np.linalg.norm(self._goals - path.at(s), axis=1).min() < MIN_LENGTH)
         return bool(path.to_goal and path.then is None and s >= path.end)
@@ -343,7 +341,8 @@ class Replanner:
             raise InputError(f"the replanner cannot begin: {start_goal.reason}")
         search = AnytimeSearch.of(context, start_goal, SearchSettings(), "replanner", bounded=False)
         while search.first() and search.best is not None:
-            path = self._certified(start_goal.complete(search.best), True)
+            waypoints = start_goal.complete(search.best)
+            path = TimedPath.certified(self._validator, waypoints, True, self._filter)
             if path is not None:
                 return path, np.array(start_goal.goals), search_space(start_goal.checker, COARSE_RESOLUTION)
             search.refuse(None)
@@ -368,7 +367,7 @@ class Replanner:
         at its current place."""
         moving = [observed.straight_on(self._now) for observed in self._seen.values()]
         speeds = np.array([observed.obstacle.top_speed for observed in self._seen.values()])
-        position = self._path.at(float(self._motion.s[0]))
+        position = self._path.at(self._motion.s[0])
         predicted = PredictedObstacles(self._robot, moving, self._now)
         for share in MARGIN_FRACTIONS:
             inflated = predicted.wider(share * SAFETY_MARGIN * speeds)
@@ -380,7 +379,7 @@ class Replanner:
         """Search for another path if the chosen one is predicted to be blocked or does not lead to the goal.
         Returns whether the path that was chosen before is predicted to be free."""
         rest_time = self._rest_time
-        rest = self._path.at(float(self._motion.s[-1]))
+        rest = self._path.at(self._motion.s[-1])
         next_path = self._path if self._next is None else self._next
         clear = self._path_clear(predicted, next_path, self._next is None)
         moving = not self._rests or self._motion.duration > 0
@@ -398,7 +397,7 @@ class Replanner:
         """Whether the arm is predicted to meet no obstacle on a path: within HORIZON, or until it has rested
         at the end for REST_TIME if the motion is shorter. under_way: it is on the path already; False: it
         begins the path when it rests."""
-        s, speed = (float(self._motion.s[0]), float(self._motion.speeds[0])) if under_way else (0.0, 0.0)
+        s, speed = (self._motion.s[0], self._motion.speeds[0]) if under_way else (0.0, 0.0)
         begins = self._since if under_way else self._rest_time
         motion = path.on_then_rest(s, speed)
         times = COARSE_SAMPLE_TIME * np.arange(int(np.ceil(motion.duration / COARSE_SAMPLE_TIME)) + 2)
@@ -418,7 +417,7 @@ class Replanner:
         # the end of the current path, from its first waypoint from which it is free
         old = self._goals[:0]
         if self._path.to_goal and not self._must_leave:
-            old = self._path.remaining(float(self._motion.s[-1]))
+            old = self._path.remaining(self._motion.s[-1])
             free = motions_free(search_space(checker, COARSE_RESOLUTION), old.astype(np.float32))
             old = old[1 + np.flatnonzero(~free).max(initial=0) :]
         roots = np.concatenate([self._goals, old[:-1]])
@@ -435,7 +434,8 @@ class Replanner:
         path = start_goal.complete(search.best)
         end = int(np.abs(roots - path[-1]).max(axis=1).argmin())
         after = old[end - len(self._goals) + 1 :] if end >= len(self._goals) else old[:0]
-        return self._certified(np.concatenate([path, after]), True)
+        waypoints = np.concatenate([path, after])
+        return TimedPath.certified(self._validator, waypoints, True, self._filter)
 
     def _evasion(self, predicted: PredictedObstacles, rest: Configuration, time: float) -> TimedPath | None:
         """A straight path from `rest` to the random configuration at which an obstacle is predicted to arrive
@@ -456,12 +456,7 @@ class Replanner:
                 if comes is None:
                     break
                 best_time = comes
-        return self._certified(best, False)
-
-    def _certified(self, waypoints: Configurations, to_goal: bool) -> TimedPath | None:
-        """See `TimedPath.certified`."""
-        limits = self._filter.acceleration, self._filter.displacement
-        return TimedPath.certified(self._robot, self._validator, waypoints, to_goal, *limits)
+        return TimedPath.certified(self._validator, best, False, self._filter)
 
     def _change_path(self) -> None:
         """If the arm rests, change to the next path, or to the path that follows the current one."""
@@ -481,8 +476,8 @@ class Replanner:
         is predicted, unless the path is clear or an evasion. Returns whether the motion was extended."""
         settings = self.settings
         path = self._path
-        s = float(self._motion.s[0])
-        speed = float(self._motion.speeds[0])
+        s = self._motion.s[0]
+        speed = self._motion.speeds[0]
         if s >= path.end or self._must_leave:
             return False
         for periods in DRIVING_PERIODS:

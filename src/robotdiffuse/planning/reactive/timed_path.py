@@ -14,10 +14,9 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.types import Configuration, Configurations, Path, Trajectory
+from robotdiffuse.core.types import Configuration, Configurations, Path, Trajectory, Values
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories import braking_kernel
@@ -45,8 +44,8 @@ CORNER_INTERVALS = 16
 class SpeedProfile(NamedTuple):
     """A motion along a path: values of the path parameter s, and ṡ at each; s̈ is constant between them."""
 
-    s: Float[ndarray, "m"]
-    speeds: Float[ndarray, "m"]
+    s: Values
+    speeds: Values
 
     def rest(self, time: float) -> "SpeedProfile":
         """The remaining motion from a time [s] after its beginning on."""
@@ -76,18 +75,14 @@ class TimedPath:
 
     @staticmethod
     def certified(
-        robot: Robot,
-        validator: Verifier,
-        waypoints: Configurations,
-        to_goal: bool,
-        acceleration: Configuration,
-        displacement: float,
+        validator: Verifier, waypoints: Configurations, to_goal: bool, jerk_filter: "JerkFilter"
     ) -> "TimedPath | None":
         """The path through waypoints; None if the validator refuses it, or if its length is below MIN_LENGTH.
 
-        A corner is rounded only if the arm is free at it with a clearance of `displacement` [m], since the
-        filter moves the arm off the path by up to this distance. At other corners, the arm stops.
+        A corner is rounded only if the arm is free at it with the filter's displacement as its clearance,
+        since the filter moves the arm off the path by up to this distance. At other corners, the arm stops.
         """
+        robot = validator.problem.robot
         path = Path(robot.joint_names, waypoints)
         if path.length < MIN_LENGTH or not validator.collision_free(path):
             return None
@@ -98,7 +93,8 @@ class TimedPath:
         def free_around(q: Configurations) -> bool:
             return distant.collision_free(Path(robot.joint_names, q))
 
-        distant = verifier(validator.problem, replace(DEFAULT, contact=max(displacement, DEFAULT.contact)))
+        contact = max(jerk_filter.displacement, DEFAULT.contact)
+        distant = verifier(validator.problem, replace(DEFAULT, contact=contact))
         rows, deviations, _ = time_parameterize(
             robot, path, free, validator.collision_free, keeps=free_around
         )
@@ -111,7 +107,7 @@ class TimedPath:
         timed = None
         for first, last in reversed(list(pairwise(stops))):
             part = BlendedPolyline(rows[first : last + 1], line.half_widths[first : last - 1])
-            timed = TimedPath(robot, acceleration, part, to_goal, timed)
+            timed = TimedPath(robot, jerk_filter.acceleration, part, to_goal, timed)
         return timed
 
     @cached_property
@@ -145,7 +141,7 @@ class TimedPath:
         after = self.then.remaining(0.0)[1:] if self.then is not None else waypoints[:0]
         return np.concatenate([self.at(s)[None], waypoints, after])
 
-    def positions(self, motion: SpeedProfile, times: Float[ndarray, "n"]) -> Configurations:
+    def positions(self, motion: SpeedProfile, times: Values) -> Configurations:
         """Configurations [n, dof] at times [s] after the beginning of a motion; at its end, the arm rests."""
         return self.line(states_at(*motion, times)[0], 0)
 
@@ -158,6 +154,9 @@ GRID_TOLERANCE = 1e-4
 """A time that is before a time of the grid by at most this fraction of a step counts as that time."""
 STILL = 1e-9
 """The arm rests if its last samples differ by less than this in each joint [rad]."""
+B_SPLINE = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
+"""Coefficients of the uniform cubic B-spline: a row for each power of the place, a column for each control
+point."""
 
 
 class JerkFilter:
@@ -232,16 +231,10 @@ class JerkFilter:
         before = points[1:-3]
         at = points[2:-2]
         after = points[3:-1]
-        # The first row is between two times of the grid: basis of the spline, its first and second derivative
-        # at the fraction u of a step.
-        first = np.array(
-            [
-                [(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, 1 + 3 * u + 3 * u**2 - 3 * u**3, u**3],
-                [-3 * (1 - u) ** 2, 9 * u**2 - 12 * u, 3 + 6 * u - 9 * u**2, 3 * u**2],
-                [6 - 6 * u, 18 * u - 12, 6 - 18 * u, 6 * u],
-            ]
-        )
-        q, v, a = first / 6 @ points[:4]
+        # The first row is between two times of the grid, at the fraction u of a step: powers of u, their
+        # first and second derivatives.
+        powers = np.array([[1, u, u**2, u**3], [0, 1, 2 * u, 3 * u**2], [0, 0, 2, 6 * u]])
+        q, v, a = powers @ B_SPLINE @ points[:4]
         return Trajectory(
             self.joint_names,
             np.append(0.0, times),

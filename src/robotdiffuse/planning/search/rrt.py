@@ -138,6 +138,8 @@ class AnytimeSearch:
     optimality_tolerance = 1e-4
     """The best path counts as optimal if it is longer than the straight line to the nearest goal by at most
     this fraction."""
+    line_stage = "straight_line"
+    """The stage of a straight line."""
 
     def __init__(
         self,
@@ -168,8 +170,11 @@ class AnytimeSearch:
         self.bounded = bounded
         self.start, self.goals = start_goal.rows()
         self.best: Configurations | None = None
-        """The shortest path so far, free at the resolution of the search."""
+        """The path of the lowest cost so far, free at the resolution of the search."""
         self.length = np.float32(np.inf)
+        """Its length [rad]."""
+        self.cost = np.inf
+        """Its cost, which is its length; for a subclass, that of `cost_of`."""
         self.work = 0
         """Number of iterations so far."""
         self.found = 0
@@ -271,30 +276,41 @@ class AnytimeSearch:
 
     def offer(self, path: Configurations, stage: str) -> bool:
         """Simplify a path from the start to a goal, which must be free in `space`, and make it the best path
-        if it is shorter; returns whether it is. If the objective is time, it may also become a candidate for
-        the fastest motion."""
+        if its cost is lower; returns whether it is. If the objective is time, it may also become a candidate
+        for the fastest motion."""
+        path = self.simplified(path)
+        if self.motions is not None and path_length(path) < NEAR_FACTOR * self.length:
+            self.motions.offer(self.space, path, stage)
+        if self.cost_of(path) >= self.cost:
+            return False
+        self._set_best(path)
+        self.history.append((path, stage))
+        self._lengths.append((self.work, float(self.length)))
+        self._improved(float(self.length))
+        return True
+
+    def simplified(self, path: Configurations) -> Configurations:
+        """A path from the start to a goal after simplification, and after tightening if it is about as short
+        as the best path."""
         path = for_kernels(path, np.float32)
-        settings = self.settings
         if self._shortens:
-            path = simplify(self.space, path, settings.smoothings)
-        length = path_length(path)
+            path = simplify(self.space, path, self.settings.smoothings)
         if self.best is None:
             self._untightened = self._shortens
-        elif length < TIGHTENING_FACTOR * self.length:
-            path = tighten(self.space, path, settings.tightenings, self._state)
-            length = path_length(path)
-        if self.motions is not None and length < NEAR_FACTOR * self.length:
-            self.motions.offer(self.space, path, stage)
-        return bool(length < self.length) and self._take(path, float(length), stage)
+        elif path_length(path) < TIGHTENING_FACTOR * self.length:
+            path = tighten(self.space, path, self.settings.tightenings, self._state)
+        return path
 
-    def _take(self, path: Configurations, length: float, stage: str) -> bool:
-        """Make a path the best one and end the round; returns True."""
-        self.best, self.length = path, np.float32(length)
-        self.history.append((path, stage))
-        self._lengths.append((self.work, length))
+    def cost_of(self, path: Configurations) -> float:
+        """The cost by which paths are compared: the length [rad]."""
+        return float(path_length(path))
+
+    def _set_best(self, path: Configurations | None) -> None:
+        """Make a path the best one, and end the round."""
+        self.best = path
+        self.length = np.float32(np.inf if path is None else path_length(path))
+        self.cost = np.inf if path is None else self.cost_of(path)
         self._trees = None
-        self._improved(length)
-        return True
 
     def keeps_clearance(self, q: Configurations) -> bool:
         """Whether the polyline through configurations keeps the clearance of the search."""
@@ -307,9 +323,7 @@ class AnytimeSearch:
         finer = finer_resolution(self.settings.resolution)
         self._shortens = finer < self.settings.resolution
         self.settings = replace(self.settings, resolution=finer)
-        self.best = accepted
-        self.length = np.float32(np.inf if accepted is None else path_length(accepted))
-        self._trees = None
+        self._set_best(accepted)
         self._set_level(self._level)
 
     def _set_level(self, level: int) -> None:
@@ -323,7 +337,7 @@ class AnytimeSearch:
             return
         for goal in self.goals[np.argsort(self.straight, kind="stable")]:
             path = self._line(goal)
-            if len(path) and self.offer(path, "straight_line"):
+            if len(path) and self.offer(path, self.line_stage):
                 self.found += 1
                 return
 
@@ -364,6 +378,7 @@ class ConstrainedSearch(AnytimeSearch):
 
     clock_interval = 20
     optimality_tolerance = 0.02
+    line_stage = "constrained_rrt_connect"
 
     def __init__(self, context: PlanningContext, start_goal: StartGoal, settings: SearchSettings) -> None:
         constraints = context.validator.constraints
@@ -379,13 +394,11 @@ class ConstrainedSearch(AnytimeSearch):
         tolerances = np.minimum(np.maximum(tolerances, at_ends), constraints.rows.limit)
         self.context = context
         self.limits = constrained.make_limits(constraints.rows, tolerances)
-        self.cost = np.inf
-        """Cost of the best path: estimated duration [s], or length [rad] if the objective is length."""
         self._speed_limits = scaled_limits(context.problem.robot, context.timing)
         super().__init__(
             start_goal,
             settings,
-            "constrained_rrt_connect",
+            self.line_stage,
             context.request.seed,
             usual_clearances(context.clearance),
             bounded=False,
@@ -398,28 +411,19 @@ class ConstrainedSearch(AnytimeSearch):
         """Whether the polyline through configurations keeps the clearance and the constraints."""
         return self.context.keeps_constraints(q) and super().keeps_clearance(q)
 
-    def offer(self, path: Configurations, stage: str) -> bool:
-        """Simplify a path that is free and keeps the constraints, and make it the best path if its cost is
-        lower; returns whether it is."""
-        if self._shortens:
-            path = self._code.simplify(
-                self.space, self.limits, path, self.settings.smoothings, SHORTCUTS, self._state
-            )
-        cost = self._cost_of(path)
-        if cost >= self.cost:
-            return False
-        self.cost = cost
-        return self._take(path, float(path_length(path)), self.name)
+    def simplified(self, path: Configurations) -> Configurations:
+        """A path that keeps the constraints after simplification."""
+        if not self._shortens:
+            return path
+        return self._code.simplify(
+            self.space, self.limits, path, self.settings.smoothings, SHORTCUTS, self._state
+        )
 
-    def _cost_of(self, path: Configurations) -> float:
+    def cost_of(self, path: Configurations) -> float:
+        """The estimated duration [s], or the length [rad] if the objective is length."""
         if self.context.request.objective == LENGTH:
-            return float(path_length(path))
+            return super().cost_of(path)
         return estimated_duration(path, self.context.timing.corner_deviation, self._speed_limits)
-
-    def refuse(self, accepted: Configurations | None) -> None:
-        """See `AnytimeSearch`."""
-        super().refuse(accepted)
-        self.cost = np.inf if accepted is None else self._cost_of(accepted)
 
     def _line(self, goal: Configuration) -> Configurations:
         return self._code.line(self.space, self.limits, self.start, goal)
@@ -445,7 +449,6 @@ class _Validation:
         self.context = context
         self.search = search
         self.best: PlanResult | None = None
-        self._by_time = context.request.objective == TIME
         self._path: ndarray | None = None
         self._shortest: PlanResult | None = None
         """Result of `_path`, the last best path of the search that was valid."""
@@ -459,14 +462,13 @@ class _Validation:
     def due(self) -> bool:
         """Whether to validate now: the first path at once; improvements every VALIDATION_INTERVAL iterations,
         or at once under path constraints."""
+        search = self.search
+        motions = search.motions
         interval = 0 if self.context.problem.constraints else VALIDATION_INTERVAL
-        interval_passed = self.search.work >= self._validated_at + interval
-        return self.best is None or (interval_passed and self._improved())
-
-    def _improved(self) -> bool:
-        motions = self.search.motions
+        if self.best is None or search.work < self._validated_at + interval:
+            return self.best is None
         if motions is None or motions.best is None:
-            return self.search.best is not self._path
+            return search.best is not self._path
         return motions.best.time < (1 - MIN_TIME_GAIN) * _duration(self.best)
 
     def run(self) -> bool:
@@ -568,7 +570,8 @@ class _Validation:
 
     def _keep(self, result: PlanResult | None) -> None:
         """Make a result the best one; if the objective is time, only if its motion is faster."""
-        if result is not None and (not self._by_time or _duration(result) < _duration(self.best)):
+        by_time = self.context.request.objective == TIME
+        if result is not None and (not by_time or _duration(result) < _duration(self.best)):
             self.best = result
 
 
@@ -665,7 +668,7 @@ class AORRTC(Planner[AORRTCSettings]):
         """See `planning.planner.Planner`."""
         settings = self.settings
         if context.problem.constraints:
-            return plan_constrained(context, start_goal, settings)
+            return plan_by_restarts(context, ConstrainedSearch(context, start_goal, settings))
         search = AnytimeSearch.of(context, start_goal, settings, AORRTC.name)
         return anytime(
             context,
@@ -694,19 +697,18 @@ class RRTConnect(Planner[RRTConnectSettings]):
         """See `planning.planner.Planner`."""
         settings = self.settings
         if context.problem.constraints:
-            return plan_constrained(context, start_goal, settings)
-        search = AnytimeSearch.of(context, start_goal, settings, self.name, bounded=False)
-
-        def improves() -> bool:
-            restarts_end = context.first_path_at + settings.optimize_time
-            return search.found < PATHS_TO_FIND or context.elapsed < restarts_end
-
-        return anytime(context, search, improves, lambda: search.improve(search.clock_interval))
+            search = ConstrainedSearch(context, start_goal, settings)
+        else:
+            search = AnytimeSearch.of(context, start_goal, settings, self.name, bounded=False)
+        return plan_by_restarts(context, search, settings.optimize_time)
 
 
-def plan_constrained(context: PlanningContext, start_goal: StartGoal, settings: SearchSettings) -> PlanResult:
-    """Plan for a problem with path constraints."""
-    search = ConstrainedSearch(context, start_goal, settings)
-    return anytime(
-        context, search, lambda: search.found < PATHS_TO_FIND, lambda: search.improve(search.clock_interval)
-    )
+def plan_by_restarts(
+    context: PlanningContext, search: AnytimeSearch, optimize_time: float = 0.0
+) -> PlanResult:
+    """Plan by restarts of RRT-Connect; see `RRTConnectSettings`."""
+
+    def improves() -> bool:
+        return search.found < PATHS_TO_FIND or context.elapsed < context.first_path_at + optimize_time
+
+    return anytime(context, search, improves, lambda: search.improve(search.clock_interval))

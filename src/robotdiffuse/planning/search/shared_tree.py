@@ -28,7 +28,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
@@ -43,7 +42,7 @@ from robotdiffuse.collision.kernels.random import random, random_state
 from robotdiffuse.core.kernels import allocation_free, kernel
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, NotNegative, Positive, Settings
-from robotdiffuse.core.types import Configuration, Configurations
+from robotdiffuse.core.types import Configuration, Configurations, Values
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.planner import Planner, ever_finer
 from robotdiffuse.planning.search import rrt_kernel
@@ -331,7 +330,7 @@ class SharedTreeSearch:
         self._enter_step()
 
     @property
-    def goal_costs(self) -> Float[ndarray, "k"]:
+    def goal_costs(self) -> Values:
         """The length of the best path to each goal [rad]; infinite where there is none."""
         nodes = self.targets.node
         return np.where(nodes >= 0, self.tree.costs[0, nodes], np.inf)

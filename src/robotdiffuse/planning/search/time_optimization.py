@@ -9,13 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from robotdiffuse.collision.kernels.motions import Space, make_scratch, motion_free
 from robotdiffuse.collision.kernels.random import random, random_state
 from robotdiffuse.core.kernels import inner_kernel, kernel
-from robotdiffuse.core.types import Configuration, Configurations
+from robotdiffuse.core.types import Configuration, Configurations, Values
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.speed_limits import TimingSettings, scaled_limits
 from robotdiffuse.trajectories.straight_line import straight_line_time
@@ -88,23 +86,16 @@ def _candidate(space, path, deviations, step, again, state):
     kind = np.float32(1.0) if again else random(state)
     i = again if again else 1 + min(int(random(state) * (n - 2)), n - 3)
     if kind < REMOVE_SHARE and n > 3:  # remove waypoint i
-        new = np.empty((n - 1, dof))
-        new_deviations = np.empty(n - 3)
-        new[:i] = path[:i]
-        new[i:] = path[i + 1 :]
-        new_deviations[: i - 1] = deviations[: i - 1]
-        new_deviations[i - 1 :] = deviations[i:]
+        new = np.concatenate((path[:i], path[i + 1 :]))
+        new_deviations = np.concatenate((deviations[: i - 1], deviations[i:]))
         return new, new_deviations, i - 1, i - 1
     if kind < ADD_SHARE:  # add waypoint i in the middle of a segment
         i = 1 + min(int(random(state) * (n - 1)), n - 2)
-        new = np.empty((n + 1, dof))
-        new_deviations = np.empty(n - 1)
-        new[:i] = path[:i]
-        new[i + 1 :] = path[i:]
-        new[i] = 0.5 * (path[i - 1] + path[i])
-        new_deviations[: i - 1] = deviations[: i - 1]
-        new_deviations[i:] = deviations[i - 1 :]
-        new_deviations[i - 1] = deviations[min(i - 1, n - 3)]
+        corner = min(i - 1, n - 3)
+        new = np.concatenate((path[:i], 0.5 * (path[i - 1 : i] + path[i : i + 1]), path[i:]))
+        new_deviations = np.concatenate(
+            (deviations[: i - 1], deviations[corner : corner + 1], deviations[i - 1 :])
+        )
     else:
         new = path.copy()
         new_deviations = deviations.copy()
@@ -117,8 +108,7 @@ def _candidate(space, path, deviations, step, again, state):
         for j in range(dof):
             if random(state) < share:
                 new[i, j] += size * (2.0 * random(state) - 1.0)
-    for j in range(dof):
-        new[i, j] = min(max(new[i, j], space.lower[j]), space.upper[j])
+    new[i] = np.minimum(np.maximum(new[i], space.lower), space.upper)
     # change the deviation of its corner
     if not again and kind >= ADD_SHARE and (kind < WIDEN_SHARE or random(state) < 0.5):
         change = WIDENING if random(state) < 0.75 else 1.0 / WIDENING
@@ -222,7 +212,7 @@ class Candidate:
     """A polyline with rounded corners."""
 
     path: Configurations
-    deviations: Float[ndarray, "corners"]
+    deviations: Values
     """How far the motion may leave each inner waypoint [rad, joint-space L2]."""
     time: float
     """Its estimated duration, without limits of jerk [s]."""
