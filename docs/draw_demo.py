@@ -10,12 +10,12 @@ import numpy as np
 from PIL import Image
 
 import robotdiffuse as rd
-from robotdiffuse.visualization.picture import PictureSettings, render
+from robotdiffuse.drawables import drawables
+from robotdiffuse.visualization.arm import DrawnArm
+from robotdiffuse.visualization.picture import MARGINS, PictureSettings, render, view_of_motion
 
 ROOT = Path(__file__).parents[1]
 SIZE = PictureSettings(width=720, height=450, ghosts=1)
-WHOLE_MOTION = PictureSettings(width=720, height=450, ghosts=10)
-"""Settings for the choice of the camera: these many poses along the motion must be in the picture."""
 FRAME_TIME = 0.05
 """How long a frame is shown [s]; a multiple of 10 ms, in which GIF counts."""
 SLOWDOWN = 2.0
@@ -28,13 +28,14 @@ COLORS = 256
 def frames(problem: rd.Problem, trajectory: rd.Trajectory) -> list[Image.Image]:
     """A frame for each moment: the arm, its start as a ghost, and the path of the cup so far."""
     robot, scene = problem.standing()
-    _, camera = render(robot, scene, trajectory, WHOLE_MOTION)
+    size = SIZE.width, SIZE.height
+    camera = view_of_motion(DrawnArm(robot), drawables(scene), trajectory.positions, size, MARGINS)
     count = int(np.ceil(SLOWDOWN * trajectory.times[-1] / FRAME_TIME)) + 1
     pictures = []
     for time in np.linspace(0.0, trajectory.times[-1], count):
         so_far = max(1, int(np.searchsorted(trajectory.times, time, "right")))
         path = rd.Path(trajectory.joint_names, trajectory.positions[:so_far])
-        pictures.append(Image.fromarray(render(robot, scene, path, SIZE, camera)[0]))
+        pictures.append(Image.fromarray(render(robot, scene, path, SIZE, camera)))
     return pictures
 
 

@@ -35,13 +35,11 @@ def test_a_cube_has_six_faces_around_it() -> None:
     assert len(surface.faces) == 12 and (surface.colors == [1, 0, 0]).all()
 
 
-SMALL = PictureSettings(width=240, height=150, ghosts=1)
-
-
 @pytest.mark.usefixtures("small_pictures")
-def test_each_moment_has_a_picture(tmp_path: Path) -> None:
+def test_each_moment_has_a_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     problem, explorer = recorded()
-    exploration.write_exploration_picture(explorer, problem.scene, tmp_path / "explore.png", SMALL)
+    monkeypatch.setattr(exploration, "TILE", PictureSettings(width=240, height=150, ghosts=1))
+    exploration.write_exploration_picture(explorer, problem.scene, tmp_path / "explore.png")
     count = len(exploration.moments(explorer))
     columns = min(count, 3 if count > 4 else 2)
     with Image.open(tmp_path / "explore.png") as image:

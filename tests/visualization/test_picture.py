@@ -7,17 +7,20 @@ import pytest
 from PIL import Image
 
 from robotdiffuse import InputError, Path, Scene
+from robotdiffuse.drawables import drawables
 from robotdiffuse.visualization import PictureSettings, write_comparison, write_picture
-from robotdiffuse.visualization.picture import COMPARED, render
+from robotdiffuse.visualization.arm import DrawnArm
+from robotdiffuse.visualization.picture import COMPARED, MARGINS, render, view_of_motion
 
 SMALL = PictureSettings(width=320, height=200, ghosts=2)
 
 
 def test_picture_shows_the_tip_where_kinematics_puts_it(arm, motion, tmp_path):
-    pixels, camera = render(arm, Scene(), motion, SMALL)
+    camera = view_of_motion(DrawnArm(arm), [], motion.positions, (320, 200), MARGINS)
+    pixels = render(arm, Scene(), motion, SMALL, camera)
     middle_of_tip = arm.fk(motion.positions[-1], "tip") @ [0, 0, 0.1, 1]
     column, row, _ = camera.project(middle_of_tip[None, :3])[0].astype(int)
-    away, _ = render(arm, Scene(), Path(arm.joint_names, motion.positions[:1]), replace(SMALL, ghosts=0))
+    away = render(arm, Scene(), Path(arm.joint_names, motion.positions[:1]), replace(SMALL, ghosts=0))
     assert away.shape == (200, 320, 3) and 0 < column < 320 and 0 < row < 200
     patch = pixels[row - 2 : row + 3, column - 2 : column + 3].reshape(-1, 3).astype(int)
     assert np.ptp(patch, axis=1).max() < 60, "the arm is gray; the trace ends beyond the middle of the tip"
@@ -29,7 +32,9 @@ def test_picture_shows_the_tip_where_kinematics_puts_it(arm, motion, tmp_path):
 
 
 def test_picture_shows_obstacles_in_their_color(arm, scene, motion):
-    pixels, camera = render(arm, Scene([scene.shapes[0]]), motion, SMALL)
+    ball = Scene([scene.shapes[0]])
+    camera = view_of_motion(DrawnArm(arm), drawables(ball), motion.positions, (320, 200), MARGINS)
+    pixels = render(arm, ball, motion, SMALL, camera)
     column, row, _ = camera.project(np.array([[-0.5, 0.4, 0.5]]))[0].astype(int)
     r, g, b = pixels[row, column].astype(int)
     assert r > g + 25 > b + 25
@@ -38,7 +43,7 @@ def test_picture_shows_obstacles_in_their_color(arm, scene, motion):
 def test_several_motions_have_traces_of_their_own_colors(arm, motion, tmp_path):
     back = Path(arm.joint_names, motion.positions[::-1].copy() * 0.7)
     few = replace(SMALL, ghosts=0)
-    pixels, _ = render(arm, Scene(), motion, few, others=[back])
+    pixels = render(arm, Scene(), motion, few, others=[back])
     for color in COMPARED[:2]:
         wanted = np.array(color) / np.linalg.norm(color)
         unit = pixels / np.maximum(np.linalg.norm(pixels, axis=2, keepdims=True), 1.0)

@@ -22,7 +22,7 @@ def test_replay_holds_everything(arm, scene, motion, tmp_path):
     told = Status.SOLVED, "", "robotdiffuse", arm.name, 0.0123, 0, "refinement", path, motion
     result = PlanResult(*told, min_clearance=0.042)
     file = tmp_path / "replay.html"
-    write_replay(arm, scene, motion, file, result=result, title="a < b </script> {{data}}", candidates=(path, path))
+    write_replay(arm, scene, motion, file, result=result, title="a < b </script> {{data}}")
     text = file.read_text("utf-8")
     data = page_data(file)
     assert "a &lt; b &lt;/script&gt; {{data}}" in text
@@ -31,7 +31,7 @@ def test_replay_holds_everything(arm, scene, motion, tmp_path):
     assert len(data["times"]) == len(data["positions"]) == 121, "60 rows a second and no more"
     np.testing.assert_allclose(data["positions"][0], motion.positions[0], atol=1e-5)
     np.testing.assert_allclose(data["positions"][-1], motion.positions[-1], atol=1e-5)
-    assert np.shape(data["candidates"]) == (2, 120, 3) and dict(data["facts"])["clearance"] == "42.0 mm"
+    assert dict(data["facts"])["clearance"] == "42.0 mm"
     assert dict(data["facts"])["planner"] == "robotdiffuse · refinement"
     assert data["robot"]["spheres"] == [[3, 0.0, 0.0, 0.1, 0.12]] and file.stat().st_size < 800_000
 
@@ -60,7 +60,7 @@ def test_replay_geometry_decodes_to_the_meshes(arm, scene, motion, tmp_path):
 @pytest.mark.parametrize("rows", [1, 2])
 def test_path_that_does_not_move(arm, rows, tmp_path):
     path = Path(arm.joint_names, np.tile([0.1, 0.2, 0.1], (rows, 1)))
-    write_replay(arm, Scene(), path, tmp_path / "still.html", candidates=[path])
+    write_replay(arm, Scene(), path, tmp_path / "still.html")
     write_picture(arm, Scene([PointCloud(np.zeros((0, 3)))]), path, tmp_path / "still.png", settings=SMALL)
     assert page_data(tmp_path / "still.html")["times"] == [0.0] * rows
 

@@ -21,8 +21,8 @@ from robotdiffuse.robots.visual_meshes import has_visual
 
 UNTIMED_SPEED = 0.8
 """Speed in joint space at which a path without times is played [rad/s]."""
-TRACE_POINTS = 120
-"""Default number of configurations along a motion for drawing the tool's trace and for choosing the view."""
+TRACE_POINTS = 240
+"""Number of configurations along a motion for drawing the tool's trace and for choosing the view."""
 
 
 class DrawnArm:
@@ -60,17 +60,17 @@ class DrawnArm:
         """Positions of the tool point in the base frame [m]."""
         return self.frames(q)[:, self.tool_frame, :3] @ np.append(self.tool_point, 1.0)
 
-    def trace(self, q: Configurations, count: int = TRACE_POINTS) -> Points:
-        """Positions of the tool point at `count` configurations, equally spaced along a path in joint space
-        [m]."""
-        return self.tool_points(dense(q, count))
+    def trace(self, q: Configurations) -> Points:
+        """Positions of the tool point at TRACE_POINTS configurations, equally spaced along a path in joint
+        space [m]."""
+        return self.tool_points(dense(q))
 
 
-def dense(q: Configurations, count: int) -> Configurations:
-    """`count` configurations, equally spaced along a path in joint space; one configuration if the path has
-    no length."""
+def dense(q: Configurations) -> Configurations:
+    """TRACE_POINTS configurations, equally spaced along a path in joint space; one configuration if the path
+    has no length."""
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(q, axis=0), axis=1))])
-    return q[:1] if s[-1] == 0 else interpolated(np.linspace(0, s[-1], count), s, q)
+    return q[:1] if s[-1] == 0 else interpolated(np.linspace(0, s[-1], TRACE_POINTS), s, q)
 
 
 def timed(motion: Path | Trajectory) -> tuple[Values, Configurations]:

@@ -4,7 +4,6 @@ The planner calls a step of an exploration an act (`RecordedAct`). A look is a s
 a view with its camera.
 """
 
-import base64
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path as FilePath
@@ -39,7 +38,7 @@ from robotdiffuse.visualization.picture import (
     tube,
     view_of_motion,
 )
-from robotdiffuse.visualization.replay_page import page_data, page_shapes, page_text
+from robotdiffuse.visualization.replay_page import in_base64, page_data, page_shapes, page_text
 
 LIKELY = 0.5
 """Voxels of unknown space with a larger predicted probability of being occupied are shown as predicted."""
@@ -195,25 +194,22 @@ def faces_surface(inside: Voxels, outside: Voxels, color: Color) -> Surface:
     return Surface(vertices, normals.repeat(4, axis=0), painted(color, len(vertices)), faces)
 
 
-def write_exploration_picture(
-    explorer: RecordedExplorer, scene: Scene, file: str | FilePath, settings: PictureSettings = TILE
-) -> None:
+def write_exploration_picture(explorer: RecordedExplorer, scene: Scene, file: str | FilePath) -> None:
     """Write up to MAX_MOMENTS moments of an exploration as one .png, including the first and the last two.
 
     The picture of a moment shows the arm's motion and what was known when it was chosen: voxels seen occupied
     (blue), predicted voxels (violet), the boundary of unknown space (gray, see-through), and for a look the
     camera's view pyramid at its end. `scene` is the true scene; it is used only to choose the view.
-    `settings` are those of the picture of one moment. Raises InputError for a file name with another ending,
-    or a file that cannot be written.
+    Raises InputError for a file name with another ending, or a file that cannot be written.
     """
     path = check_output(file, (".png",))
     all_moments = moments(explorer)
     chosen = _chosen(len(all_moments))
     waypoints = np.concatenate([moment.act.waypoints for moment in all_moments])
-    size = settings.width, settings.height
+    size = TILE.width, TILE.height
     camera = view_of_motion(DrawnArm(explorer.robot), drawables(scene), waypoints, size, MARGINS)
     in_scene = in_known_scene(explorer)
-    tiles = [_tile(explorer, all_moments[i], in_scene, camera, settings) for i in chosen]
+    tiles = [_tile(explorer, all_moments[i], in_scene, camera) for i in chosen]
     save_png(_joined(tiles), path)
 
 
@@ -225,13 +221,7 @@ def _chosen(count: int) -> list[int]:
     return [*np.linspace(0, count - 3, MAX_MOMENTS - 2).round().astype(int), count - 2, count - 1]
 
 
-def _tile(
-    explorer: RecordedExplorer,
-    moment: Moment,
-    known: Voxels,
-    camera: Camera,
-    settings: PictureSettings,
-) -> Image.Image:
+def _tile(explorer: RecordedExplorer, moment: Moment, known: Voxels, camera: Camera) -> Image.Image:
     robot = explorer.robot
     act = moment.act
     layers = shown_voxels(moment.known, act, known)
@@ -244,7 +234,7 @@ def _tile(
     ]
     look = [tube(edge, LOOK_COLOR, LOOK_COLOR) for edge in frustum(explorer, act)]
     motion = act.trajectory or Path(robot.joint_names, act.waypoints)
-    pixels, _ = render(robot, explorer.scene, motion, settings, camera, added=(occupied, *look), clear=clear)
+    pixels = render(robot, explorer.scene, motion, TILE, camera, added=(occupied, *look), clear=clear)
     image = Image.fromarray(faded_below(pixels, *FADE))
     legend = {
         "occupied": OBSERVED,
@@ -347,7 +337,7 @@ def _packed(numbers: Int[ndarray, "n"]) -> str:
     groups = np.stack([steps >> shift & 127 for shift in (0, 7, 14, 21)], axis=1)
     used = np.stack([np.ones(len(steps), bool), *(steps >= 1 << shift for shift in (7, 14, 21))], axis=1)
     marked = np.concatenate([used[:, 1:], np.zeros((len(steps), 1), bool)], axis=1)
-    return base64.b64encode((groups + 128 * marked)[used].astype(np.uint8).tobytes()).decode("ascii")
+    return in_base64((groups + 128 * marked)[used].astype(np.uint8))
 
 
 def _act(explorer: RecordedExplorer, moment: Moment) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.visualization.arm import TRACE_POINTS, DrawnArm, dense, facts
+from robotdiffuse.visualization.arm import DrawnArm, dense, facts
 from robotdiffuse.visualization.rasterizer import blend_ghost, draw, shade
 
 AZIMUTHS = 18
@@ -32,6 +32,8 @@ ELEVATIONS = np.radians((15.0, 25.0))
 """Elevations of candidate views [rad]."""
 VERTICAL_FIELD = np.radians(28)
 """Vertical field of view [rad]."""
+VIEW_GHOSTS = 5
+"""Number of poses along a motion, besides the last, for which a view is chosen."""
 MAX_FRAMING_DISTANCE = 1.3
 """The view is framed to include obstacles up to this distance from the middle of the motion [m]."""
 
@@ -118,20 +120,25 @@ def framed(
     return Camera(target + distance * toward, target, *size)
 
 
-def best_view(
-    arm: Surface,
-    ghosts: Surface,
-    trace: Points,
-    obstacles: Surface,
+def view_of_motion(
+    arm: DrawnArm,
+    among: Sequence[Drawable],
+    q: Configurations,
     size: tuple[int, int],
     free: tuple[float, float],
     azimuth: float | None = None,
 ) -> Camera:
-    """The framed view that shows most of the arm and its trace, among AZIMUTHS x ELEVATIONS.
+    """The framed view that shows most of the arm and its trace along a motion, among AZIMUTHS x ELEVATIONS.
 
-    `azimuth` fixes the azimuth, measured from the x axis of the base [rad]; None: the best one is chosen.
+    `among` are the obstacles. `azimuth` fixes the azimuth, measured from the x axis of the base [rad]; None:
+    the best one is chosen.
     """
-    moving = np.concatenate([arm.vertices, ghosts.vertices, trace])
+    q = dense(q)
+    goal = arm.posed(q[-1])
+    ghosts = join([arm.posed(q[i], 1) for i in _earlier(len(q), VIEW_GHOSTS)])
+    trace = arm.tool_points(q)
+    obstacles = join([obstacle.surface for obstacle in among])
+    moving = np.concatenate([goal.vertices, ghosts.vertices, trace])
     middle = 0.5 * (moving.min(0) + moving.max(0))
     near = np.linalg.norm(obstacles.vertices - middle, axis=1) < MAX_FRAMING_DISTANCE
     points = np.concatenate([moving, obstacles.vertices[near]])
@@ -141,24 +148,16 @@ def best_view(
 
     def score(toward: Vector) -> float:
         camera = framed(points, toward, thumbnail_size, free)
-        return _score(camera, arm, ghosts, trace, obstacles)
+        return _score(camera, goal, ghosts, trace, obstacles)
 
     directions = (_direction(angle, elevation) for elevation in ELEVATIONS for angle in around)
     return framed(points, max(directions, key=score), size, free)
 
 
-def view_of_motion(
-    arm: DrawnArm,
-    obstacles: Sequence[Drawable],
-    q: Configurations,
-    size: tuple[int, int],
-    free: tuple[float, float],
-) -> Camera:
-    """The best view of a motion among obstacles."""
-    q = dense(q, TRACE_POINTS)
-    ghosts = join([arm.posed(row) for row in (q[0], q[len(q) // 2])])
-    surfaces = join([obstacle.surface for obstacle in obstacles])
-    return best_view(arm.posed(q[-1]), ghosts, arm.tool_points(q), surfaces, size, free)
+def _earlier(rows: int, count: int) -> list[int]:
+    """Indices of `count` evenly spaced rows of a motion before its last one; none if the arm does not
+    move."""
+    return np.linspace(0, rows - 1, count + 1).round().astype(int).tolist()[:-1] if rows > 1 else []
 
 
 def _score(camera: Camera, arm: Surface, ghosts: Surface, trace: Points, obstacles: Surface) -> float:
@@ -202,8 +201,6 @@ COMPARED = ((0xE3, 0xA8, 0x12), (0xCF, 0x33, 0x3B), (0x2F, 0x6F, 0xD0), (0x8B, 0
 """sRGB colors of the traces of several motions in one picture."""
 MOVED_ALPHA = 0.22
 """Opacity of later poses of moving obstacles."""
-TRACE_STEPS = 240
-"""Number of configurations along a motion for drawing the tool's trace."""
 WHITE = (0xFF, 0xFF, 0xFF)
 # sRGB color and opacity of the safety shell
 SHELL_COLOR = (0x35, 0xB8, 0x5C)
@@ -259,7 +256,7 @@ def write_picture(
     """
     path = check_output(file, (".png",))
     settings = settings or PictureSettings()
-    pixels, _ = render(robot, scene, motion, settings, moving=moving)
+    pixels = render(robot, scene, motion, settings, moving=moving)
     write_captioned(pixels, path, title or robot.name, facts(motion, result, robot))
 
 
@@ -282,9 +279,7 @@ def write_comparison(
     if not 0 < len(motions) <= len(COMPARED):
         raise InputError(f"{len(motions)} motions; a picture shows 1 to {len(COMPARED)}")
     first, *other_motions = motions.values()
-    pixels, _ = render(
-        robot, scene, first, settings or PictureSettings(), others=other_motions, moving=moving
-    )
+    pixels = render(robot, scene, first, settings or PictureSettings(), others=other_motions, moving=moving)
     figures = [", ".join(v for k, v in facts(m, None) if v != "untimed") for m in motions.values()]
     captions = list(zip(motions, figures, strict=True))
     write_captioned(pixels, path, title or robot.name, captions, COMPARED)
@@ -320,7 +315,7 @@ def render(
     added: Sequence[Surface] = (),
     clear: Sequence[ClearSurface] = (),
     moving: Sequence[MovingObstacle] = (),
-) -> tuple[np.ndarray, Camera]:
+) -> np.ndarray:
     """Draws the picture of a motion without its caption.
 
     Args:
@@ -335,20 +330,16 @@ def render(
         moving: Obstacles that are solid at the pose at the start, and see-through at later poses.
 
     Returns:
-        The picture, uint8 [height, width, 3], and its camera.
+        The picture, uint8 [height, width, 3].
     """
     arm = DrawnArm(robot)
     obstacles = drawables(scene, moving)
-    q = dense(motion.positions, TRACE_STEPS)
-    surroundings = join([item.surface for item in obstacles])
-    goal = arm.posed(q[-1])
-    steps = np.linspace(0, len(q) - 1, settings.ghosts + 1).round().astype(int)[:-1] if len(q) > 1 else []
-    ghosts = [(arm.posed(q[i], 1), i / (len(q) - 1)) for i in steps]
-    traces = [arm.trace(item.positions, TRACE_STEPS) for item in (motion, *others)]
+    q = dense(motion.positions)
+    ghosts = [(arm.posed(q[i], 1), i / (len(q) - 1)) for i in _earlier(len(q), settings.ghosts)]
+    traces = [arm.trace(item.positions) for item in (motion, *others)]
     if camera is None:
         size = settings.width, settings.height
-        all_ghosts = join([ghost for ghost, _ in ghosts])
-        camera = best_view(goal, all_ghosts, traces[0], surroundings, size, MARGINS, settings.azimuth)
+        camera = view_of_motion(arm, obstacles, motion.positions, size, MARGINS, settings.azimuth)
     large_camera = Camera(
         camera.eye, camera.target, SUPERSAMPLING * settings.width, SUPERSAMPLING * settings.height
     )
@@ -368,10 +359,11 @@ def render(
         see_through.append(ClearSurface(ghost, color, 0.50 if share == 0 else 0.26))
     if settings.shell:
         see_through.append(ClearSurface(_shell(arm, q[-1], settings.shell), linear(SHELL_COLOR), SHELL_ALPHA))
-    image = _paint(large_camera, join([goal, surroundings, *tubes, *added]), [*clear, *see_through])
+    solid = join([arm.posed(q[-1]), *(item.surface for item in obstacles), *tubes, *added])
+    image = _paint(large_camera, solid, [*clear, *see_through])
     s = SUPERSAMPLING
     image = image.reshape(settings.height, s, settings.width, s, 3).mean(axis=(1, 3))
-    return _to_srgb(image), camera
+    return _to_srgb(image)
 
 
 def _shell(arm: DrawnArm, q: Configuration, thickness: float) -> Surface:
@@ -397,8 +389,8 @@ def _paint(camera: Camera, solid: Surface, clear: Sequence[ClearSurface]) -> Flo
     view = (camera.eye, camera.rays())
     height = min(0.0, float(solid.vertices[:, 2].min(initial=0.0)))
     toward = _key_direction(camera)
-    sky = _light_maps(solid, _hemisphere(SKY_LIGHTS), SKY_MAP)
-    key = _light_maps(solid, _cone(toward, KEY_LIGHTS), KEY_MAP)
+    sky = _light_maps(solid, _cone(np.array([0.0, 0.0, 1.0]), np.pi / 2, SKY_LIGHTS), SKY_MAP)
+    key = _light_maps(solid, _cone(toward, KEY_SPREAD, KEY_LIGHTS), KEY_MAP)
     visible_triangles = (ident, screen, solid.faces, solid.normals, _linear_array(solid.colors))
     shade(image, near, visible_triangles, view, height - 1e-4, sky, key)
     for surface in clear:
@@ -416,23 +408,13 @@ def _key_direction(camera: Camera) -> Vector:
     return toward / np.linalg.norm(toward)
 
 
-def _hemisphere(count: int) -> Points:
-    """Evenly spread directions over the upper hemisphere (Fibonacci lattice)."""
+def _cone(toward: Vector, radius: float, count: int) -> Points:
+    """Evenly spread directions within an angle [rad] of a direction (Fibonacci lattice)."""
     i = np.arange(count)
-    z = (i + 0.5) / count
+    z = 1 - (i + 0.5) / count * (1 - np.cos(radius))
     angle = i * np.pi * (3 - np.sqrt(5))
-    return np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
-
-
-def _cone(toward: Vector, count: int) -> Points:
-    """Evenly spread directions within KEY_SPREAD of a direction (sunflower pattern)."""
-    i = np.arange(count)
-    radius = KEY_SPREAD * np.sqrt((i + 0.5) / count)
-    angle = i * np.pi * (3 - np.sqrt(5))
-    right, up, _ = _axes(toward)
-    around = np.cos(angle)[:, None] * right + np.sin(angle)[:, None] * up
-    directions = toward + radius[:, None] * around
-    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    aside = np.sqrt(1 - z * z)
+    return np.stack([aside * np.cos(angle), aside * np.sin(angle), z], axis=1) @ _axes(toward)
 
 
 def _axes(toward: Vector) -> Rotation:

@@ -21,7 +21,7 @@ from PIL import Image
 from robotdiffuse.core.errors import InputError, check_type, shortened
 from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.results import PlanResult, ResultFile
-from robotdiffuse.core.transforms import IDENTITY, inverse, quaternion_from_rotation
+from robotdiffuse.core.transforms import IDENTITY, inverse, moved_spheres, quaternion_from_rotation
 from robotdiffuse.core.types import (
     Configuration,
     Configurations,
@@ -38,6 +38,7 @@ from robotdiffuse.drawables import (
     Color,
     Drawable,
     Surface,
+    creased,
     drawables,
     link_surfaces,
     painted,
@@ -84,20 +85,18 @@ def write_replay(
     *,
     result: PlanResult | None = None,
     title: str | None = None,
-    candidates: Sequence[Path] = (),
     moving: Sequence[MovingObstacle] = (),
 ) -> None:
     """Write a replay of a motion as a self-contained .html file.
 
-    `result` adds facts to the header. `candidates` are other paths of the same robot; only the tool's traces
-    along them are shown. `moving` obstacles move while a timed motion is played. A path without times is
-    played at constant speed in joint space. Raises InputError for a file name with another ending, or a file
-    that cannot be written.
+    `result` adds facts to the header. `moving` obstacles move while a timed motion is played. A path without
+    times is played at constant speed in joint space. Raises InputError for a file name with another ending,
+    or a file that cannot be written.
     """
     target = check_output(file, (".html", ".htm"))
     count = len(scene.shapes) + len(moving)
     title = title or f"{robot.name} · {count} obstacle{'' if count == 1 else 's'}"
-    data = page_data(robot, scene, motion, result, candidates, moving)
+    data = page_data(robot, scene, motion, result, moving)
     write_atomically(target, page_text(title, data))
 
 
@@ -124,7 +123,6 @@ def page_data(
     scene: Scene,
     motion: Path | Trajectory,
     result: PlanResult | None = None,
-    candidates: Sequence[Path] = (),
     moving: Sequence[MovingObstacle] = (),
 ) -> dict[str, Any]:
     """The data of a page, in the form that `replay.js` reads; for the arguments see `write_replay`."""
@@ -156,7 +154,6 @@ def page_data(
         "timed": isinstance(motion, Trajectory),
         "times": _rounded(times, 4),
         "positions": _rounded(positions, 5),
-        "candidates": [_rounded(arm.trace(path.positions), 4) for path in candidates],
         "start_color": START,
         "goal_color": GOAL,
         "facts": facts(motion, result, robot),
@@ -197,11 +194,8 @@ def _spheres(robot: Robot) -> list[list[float | int]]:
     """For each covering sphere: the index of its frame, and x, y, z and radius in this frame [m]."""
     rows = []
     for link, spheres in robot.spheres.items():
-        T = robot.T_frame_link(link)
-        rows += [
-            [robot.link_frame(link), *_rounded(T[:3, :3] @ s[:3] + T[:3, 3], 4), round(float(s[3]), 4)]
-            for s in spheres
-        ]
+        placed = moved_spheres(robot.T_frame_link(link), spheres)
+        rows += [[robot.link_frame(link), *sphere] for sphere in _rounded(placed, 4)]
     return rows
 
 
@@ -240,12 +234,12 @@ def _packed(surface: Surface, colored: bool = True) -> dict[str, Any]:
         "low": low,
         "step": step,
         "vertices": vertices,
-        "normals": _base64(np.round(127 * surface.normals).astype(np.int8)),
-        "faces": _base64(surface.faces.astype("<u4" if wide_indices else "<u2")),
+        "normals": in_base64(np.round(127 * surface.normals).astype(np.int8)),
+        "faces": in_base64(surface.faces.astype("<u4" if wide_indices else "<u2")),
         "wide": wide_indices,
     }
     return (
-        packed | {"colors": _base64(np.round(255 * surface.colors).astype(np.uint8))} if colored else packed
+        packed | {"colors": in_base64(np.round(255 * surface.colors).astype(np.uint8))} if colored else packed
     )
 
 
@@ -256,10 +250,11 @@ def _quantized(points: Points) -> tuple[list[float], float, str]:
         return [0.0, 0.0, 0.0], 1.0, ""
     low = points.min(0)
     step = max(float(np.ptp(points, axis=0).max()), 1e-6) / 65535
-    return low.tolist(), step, _base64(np.round((points - low) / step).astype("<u2"))
+    return low.tolist(), step, in_base64(np.round((points - low) / step).astype("<u2"))
 
 
-def _base64(array: np.ndarray) -> str:
+def in_base64(array: np.ndarray) -> str:
+    """The bytes of an array as text."""
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")
 
 
@@ -315,7 +310,7 @@ def write_problem(problem: Problem, file: str | FilePath, result: PlanResult | N
         ghost = [start] if len(states) > 1 else []
         end = Path(robot.joint_names, states[-1:])
         surfaces = [surface for surface, _ in marks]
-        pixels, _ = render(robot, scene, end, settings, camera, added=surfaces, clear=ghost)
+        pixels = render(robot, scene, end, settings, camera, added=surfaces, clear=ghost)
         return write_captioned(pixels, target, title, facts)
     data = page_data(robot, framed, Path(robot.joint_names, states))
     data["scene"] = [*page_shapes(scene), *(page_surface("mark", *mark) for mark in marks)]
@@ -362,13 +357,12 @@ def _colliding_links(
 
 def _raised(surface: Surface) -> Surface:
     """The surface in the color of collisions, moved outwards by OFFSET."""
-    # move all vertices at one point alike, by their mean normal: sharp edges have a vertex for each face
-    _, corner = np.unique(surface.vertices, axis=0, return_inverse=True)
-    corner = corner.reshape(-1)
-    normals = np.stack([np.bincount(corner, column) for column in surface.normals.T], axis=1)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-    vertices = surface.vertices + OFFSET * normals[corner]
-    return replace(surface, vertices=vertices, colors=painted(COLLIDING, len(vertices)))
+    import trimesh
+
+    # sharp edges have a vertex for each face; trimesh merges those at one point
+    merged = trimesh.Trimesh(surface.vertices, surface.faces)
+    vertices = np.array(merged.vertices) + OFFSET * merged.vertex_normals
+    return creased(vertices, np.array(merged.faces), painted(COLLIDING, len(merged.faces)))
 
 
 def _axes(poses: list[Pose]) -> list[tuple[Surface, Color]]:
@@ -497,7 +491,7 @@ def _shared(pages: list[str]) -> dict[str, list]:
 
 def _thumbnail(robot: Robot, entry: GalleryEntry) -> str:
     """A small JPEG picture of a motion, in base64."""
-    pixels, _ = render(robot, entry.scene, entry.motion, THUMBNAIL, moving=entry.moving)
+    pixels = render(robot, entry.scene, entry.motion, THUMBNAIL, moving=entry.moving)
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, "JPEG", quality=88)
     return base64.b64encode(buffer.getvalue()).decode("ascii")

@@ -119,15 +119,15 @@ def test_what_is_wrong_leaves_the_session_as_it_was(session: live.Session) -> No
 
 
 def test_obstacles_are_added_resized_and_deleted(session: live.Session) -> None:
-    name = session.add_obstacle("box", np.array([0.5, -0.5, 0.2]))
-    assert session.add_obstacle("box", np.array([0.5, -0.6, 0.2])) == "box_2"
+    name = session.add_obstacle("box")
+    assert session.add_obstacle("box") == "box_2"
     session.change_obstacle(name, lambda shape: live.resized(shape, "size y", 0.5))
     box = session.state.obstacles[name]
     assert isinstance(box, rd.Box) and box.size.tolist() == [0.16, 0.5, 0.16]
     session.change_obstacle(name, lambda _: None)
     assert [shape.name for shape in session.state.problem.scene.shapes] == ["lamp", "box_2"]
     refuses("unknown obstacle 'box'; known: box_2, lamp", session.change_obstacle, name, lambda _: None)
-    refuses("known: box, capsule, cylinder, sphere", session.add_obstacle, "torus", np.zeros(3))
+    refuses("known: box, capsule, cylinder, sphere", session.add_obstacle, "torus")
 
 
 @pytest.fixture
@@ -217,4 +217,4 @@ def test_shapes_go_where_their_handles_are_put(shape) -> None:
     np.testing.assert_allclose(at, T if turned else transform(T[:3, 3]), atol=1e-12)
     for name, value in live.dimensions(shape).items():
         assert live.dimensions(live.resized(shape, name, value + 0.1)) == {**live.dimensions(shape), name: value + 0.1}
-        refuses(f"{name} of {shape.name} is 0 m; it must be 0.01 to 2 m", live.resized, shape, name, 0.0)
+        refuses(r"must be", live.resized, shape, name, 0.0)

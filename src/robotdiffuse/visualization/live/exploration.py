@@ -425,11 +425,10 @@ def exploration_badge(state: ExplorationState) -> Validity:
     if not state.acts or state.phase == CHOOSING:
         first = "a new machine compiles first, for about a minute"
         lines = () if state.acts else (first,)
-        title = f"choosing step {len(state.acts) + 1}" if state.phase == CHOOSING else "not begun"
-        return Validity(PENDING, title, (*lines, *_shares(state)))
+        doing = f"choosing step {len(state.acts) + 1}" if state.phase == CHOOSING else "not begun"
+        return Validity(PENDING, doing, (*lines, *_shares(state)))
     act = state.acts[-1]
-    number = len(state.acts)
-    headline = _title(number, act)
+    headline = f"{len(state.acts)}. {title(act)}"
     if state.phase == ENDED and state.violation:
         return Validity(INVALID, f"collides in the true scene: {state.violation}", (headline,))
     kind = PENDING
@@ -451,12 +450,8 @@ def _shares(state: ExplorationState) -> tuple[str, ...]:
     return ("of the map " + ", ".join(f"{value} {name}" for name, value in shares(state.known)),)
 
 
-def _title(number: int, act: RecordedAct) -> str:
-    return f"{number}. {title(act)}"
-
-
 def _steps_html(acts: tuple[RecordedAct, ...]) -> str:
-    rows = "".join(f"<div>{html.escape(_title(i, act))}</div>" for i, act in enumerate(acts, 1))
+    rows = "".join(f"<div>{i}. {html.escape(title(act))}</div>" for i, act in enumerate(acts, 1))
     return f'<div style="margin: 0.4em 1em; font-size: 0.85em">{rows}</div>'
 
 

@@ -293,23 +293,20 @@ class Panel:
             self._joints: list[viser.GuiInputHandle[float]] = []
         with tabs.add_tab("Files"):
             self._files_tab()
-        self._on(self._slider, lambda event: page.seek(event.target.value))
+        self._on(self._slider.on_update, lambda event: page.seek(event.target.value))
         self._play.on_click(lambda _event: page.set_playing(self._play.label == "Play"))
 
-    def _on(self, widget: Any, do: Callable[[Any], object]) -> None:
-        """Call `do` when a visitor changes a widget. An InputError of `do` is shown as a notification."""
+    def _on(self, connect: Callable[[Any], object], do: Callable[[Any], object]) -> None:
+        """Call `do` when a visitor uses a widget; `connect` is the widget's `on_update`, `on_click` or
+        `on_upload`. An InputError of `do` is shown to the visitor as a notification."""
 
-        @widget.on_update
+        @connect
         def _(event: viser.GuiEvent) -> None:
-            if event.client is not None:
-                self._guarded(event, lambda: do(event))
-
-    def _guarded(self, event: viser.GuiEvent, do: Callable[[], object]) -> None:
-        """Call `do`. An InputError of `do` is shown to the visitor as a notification."""
-        try:
-            do()
-        except InputError as error:
-            if event.client is not None:
+            if event.client is None:  # the page itself set the widget
+                return
+            try:
+                do(event)
+            except InputError as error:
                 event.client.add_notification(
                     "Not possible", str(error), auto_close_seconds=NOTIFICATION_TIME, color="red"
                 )
@@ -334,15 +331,17 @@ class Panel:
         )
         for name, label, hint in boxes:
             self._options[name] = gui.add_checkbox(label, getattr(options, name), hint=hint)
-        self._now = gui.add_button("Plan now", icon=viser.Icon.ROUTE)
+        now = gui.add_button("Plan now", icon=viser.Icon.ROUTE)
         self._stages = gui.add_html("")
         self._kind = gui.add_dropdown("Plot", PLOTS, initial_value=PLOTS[0])
         self._plot_box = gui.add_folder("Joint values relative to limits")
         self._plot: viser.GuiUplotHandle | None = None
         for name, widget in {**self._options, "time_limit": limit}.items():
-            self._on(widget, lambda event, name=name: session.set_options(**{name: event.target.value}))
-        self._on(self._kind, lambda _event: self._show_plot(session.state))
-        self._now.on_click(lambda event: self._guarded(event, session.plan_now))
+            self._on(
+                widget.on_update, lambda event, name=name: session.set_options(**{name: event.target.value})
+            )
+        self._on(self._kind.on_update, lambda _event: self._show_plot(session.state))
+        self._on(now.on_click, lambda _event: session.plan_now())
 
     def _obstacles_tab(self) -> None:
         gui = self._server.gui
@@ -351,18 +350,15 @@ class Panel:
         self._sizes_box = gui.add_folder("Size [m]", visible=False)
         self._sizes: dict[str, Any] = {}
         self._delete = gui.add_button("Delete", icon=viser.Icon.TRASH, visible=False)
-        self._new = gui.add_dropdown("New obstacle", tuple(NEW_OBSTACLES), initial_value="sphere")
-        self._add = gui.add_button("Add", icon=viser.Icon.PLUS)
-        self._on(self._selected, lambda event: self._page.select(event.target.value))
-        self._delete.on_click(
-            lambda event: self._guarded(
-                event, lambda: self._session.change_obstacle(self._selected.value, lambda _: None)
-            )
+        new = gui.add_dropdown("New obstacle", tuple(NEW_OBSTACLES), initial_value="sphere")
+        add = gui.add_button("Add", icon=viser.Icon.PLUS)
+        session = self._session
+        self._on(self._selected.on_update, lambda event: self._page.select(event.target.value))
+        self._on(
+            self._delete.on_click,
+            lambda _event: session.change_obstacle(self._selected.value, lambda _shape: None),
         )
-        add = self._session.add_obstacle
-        self._add.on_click(
-            lambda event: self._guarded(event, lambda: self._page.select(add(self._new.value)))
-        )
+        self._on(add.on_click, lambda _event: self._page.select(session.add_obstacle(new.value)))
 
     def _files_tab(self) -> None:
         gui = self._server.gui
@@ -371,20 +367,15 @@ class Panel:
         save = gui.add_button("Save problem", icon=viser.Icon.DOWNLOAD)
         share = gui.add_button("Save replay", icon=viser.Icon.SHARE)
 
-        @load.on_upload
-        def _(event: viser.GuiEvent) -> None:
+        def opened(_event: viser.GuiEvent) -> None:
             file = load.value
-            robot = session.state.problem.robot
-            self._guarded(event, lambda: session.open(uploaded_problem(file.content, file.name, robot)))
+            session.open(uploaded_problem(file.content, file.name, session.state.problem.robot))
 
-        save.on_click(
-            lambda event: self._guarded(
-                event, lambda: _send(event, "problem.yaml", problem_text(session.state.problem))
-            )
+        self._on(load.on_upload, opened)
+        self._on(
+            save.on_click, lambda event: _send(event, "problem.yaml", problem_text(session.state.problem))
         )
-        share.on_click(
-            lambda event: self._guarded(event, lambda: _send(event, "replay.html", self._replay()))
-        )
+        self._on(share.on_click, lambda event: _send(event, "replay.html", self._replay()))
 
     def _replay(self) -> bytes:
         state = self._session.state
@@ -439,7 +430,7 @@ class Panel:
         )
         resize = self._session.change_obstacle
         self._on(
-            slider,
+            slider.on_update,
             lambda event: resize(name, lambda shape: resized(shape, dimension, event.target.value)),
         )
         return slider
@@ -456,7 +447,7 @@ class Panel:
                 low = np.floor(100 * low) / 100
                 high = np.ceil(100 * high) / 100
                 widget = self._server.gui.add_slider(name, min=low, max=high, step=0.001, initial_value=low)
-                self._on(widget, partial(self._move_joint, len(self._joints)))
+                self._on(widget.on_update, partial(self._move_joint, len(self._joints)))
                 self._joints.append(widget)
 
     def _move_joint(self, index: int, event: Any) -> None:
@@ -529,9 +520,8 @@ def set_value(widget: Any, value: object) -> None:
         widget.value = value
 
 
-def _send(event: viser.GuiEvent, name: str, content: bytes) -> None:
-    if event.client is not None:
-        event.client.send_file_download(name, content, save_immediately=True)
+def _send(event: Any, name: str, content: bytes) -> None:
+    event.client.send_file_download(name, content, save_immediately=True)
 
 
 def badge_html(validity: Validity, planning: bool = False) -> str:

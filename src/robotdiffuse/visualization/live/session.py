@@ -17,7 +17,7 @@ from typing import Annotated, Any, Generic, TypeVar
 import numpy as np
 
 from robotdiffuse.collision.kernels.collision_cost import CLEARANCE_CAP
-from robotdiffuse.core.errors import InputError, distinct, shortened, shown, unknown_name
+from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
 from robotdiffuse.core.input_files import parse_json, parse_yaml
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, OneOf, Settings
@@ -218,15 +218,13 @@ class Session:
         found."""
         self._start_task.submit(T_base_tip)
 
-    def add_obstacle(self, kind: str, center: Vector | None = None) -> str:
-        """Add an obstacle and return its name. The default center [m] is in front of the arm, at half the
-        arm's reach."""
+    def add_obstacle(self, kind: str) -> str:
+        """Add an obstacle in front of the arm, at half the arm's reach, and return its name."""
         with self._lock:
             if kind not in NEW_OBSTACLES:
                 raise unknown_name("kind of obstacle", kind, NEW_OBSTACLES)
             length = reach(self.state.problem.robot)
-            center = length * NEW_POSITION if center is None else center
-            obstacle = NEW_OBSTACLES[kind](center, round(NEW_RADIUS * length, 2))
+            obstacle = NEW_OBSTACLES[kind](length * NEW_POSITION, round(NEW_RADIUS * length, 2))
             self._set_scene([*self.state.obstacles.values(), obstacle])
             return [*self.state.obstacles][-1]
 
@@ -415,14 +413,11 @@ def dimensions(shape: Shape) -> dict[str, float]:
 
 
 def resized(shape: Shape, dimension: str, value: float) -> Shape:
-    """The shape with one of its `dimensions` changed. Raises InputError for another name and values out of
-    bounds."""
+    """The shape with one of its `dimensions` changed. Raises InputError for another name, and for values that
+    no shape may have."""
     sizes = dimensions(shape)
     if dimension not in sizes:
         raise unknown_name(f"dimension of {shape.name}:", dimension, sizes)
-    if not MIN_DIMENSION <= value <= MAX_DIMENSION:
-        size, min_text, max_text = distinct(value, MIN_DIMENSION, MAX_DIMENSION)
-        raise InputError(f"{dimension} of {shape.name} is {size} m; it must be {min_text} to {max_text} m")
     if isinstance(shape, Box):
         size = np.array([value if name == dimension else old for name, old in sizes.items()])
         return replace(shape, size=size)

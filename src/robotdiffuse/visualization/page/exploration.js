@@ -80,7 +80,7 @@ layers.forEach((layer, l) => {
 const LOOK = color(recording.look_color);
 const looks = recording.acts.map((act) => {
   const group = new THREE.Group();
-  for (const edge of act.look) group.add(trace(edge, 0.004, () => LOOK, 1));
+  for (const edge of act.look) group.add(trace(edge, 0.004, () => LOOK));
   group.visible = false;
   scene.add(group);
   return group;

@@ -267,7 +267,7 @@ scene.add(obstacles);
 
 // --- Traces
 
-function trace(points, radius, paint, opacity) {
+function trace(points, radius, paint) {
   const sides = 8, n = points.length;
   const p = points.map((v) => new THREE.Vector3(...v));
   const position = [], normal = [], colors = [], index = [];
@@ -294,8 +294,7 @@ function trace(points, radius, paint, opacity) {
   g.setAttribute("normal", new THREE.BufferAttribute(new Float32Array(normal), 3));
   g.setAttribute("color", new THREE.BufferAttribute(new Float32Array(colors), 3));
   g.setIndex(index);
-  const material = new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.5, side: THREE.DoubleSide,
-    transparent: opacity < 1, opacity });
+  const material = new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.5, side: THREE.DoubleSide });
   return new THREE.Mesh(g, material);
 }
 
@@ -307,7 +306,7 @@ const traces = new THREE.Group();
   const steps = duration > 0 ? Math.min(400, Math.max(60, 4 * data.times.length)) : 0;
   const points = [];
   for (let i = 0; i <= steps; i++) points.push(toolAt(configuration((duration * i) / Math.max(1, steps))).toArray());
-  if (steps > 0) traces.add(trace(points, 0.005, (s) => startColor.clone().lerp(goalColor, s), 1));
+  if (steps > 0) traces.add(trace(points, 0.005, (s) => startColor.clone().lerp(goalColor, s)));
   const last = toolAt(data.positions[data.positions.length - 1]).toArray();
   for (const [at, c] of [[points[0], startColor], [last, goalColor]]) {
     const dot = new THREE.Mesh(ball, new THREE.MeshStandardMaterial({ color: c, roughness: 0.5 }));
@@ -317,10 +316,6 @@ const traces = new THREE.Group();
   }
 }
 scene.add(traces);
-const candidates = new THREE.Group();
-const faint = new THREE.Color(0x98a2b4);
-for (const points of data.candidates) candidates.add(trace(points, 0.0022, () => faint, 0.5));
-scene.add(candidates);
 
 // --- Panels
 
@@ -343,7 +338,6 @@ let dirty = true;
 toggle("Start", [startArm.group]);
 toggle("Goal", [goalArm.group]);
 toggle("Trace", [traces]);
-if (data.candidates.length) toggle("Candidates", [candidates]);
 if (data.robot.spheres.length) toggle("Spheres", [spheres]);
 if (obstacles.children.length) toggle("Obstacles", [obstacles]);
 {
