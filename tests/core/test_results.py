@@ -116,11 +116,11 @@ DAMAGE = [
     ({"waypoints": None}, "waypoints is None; it must be n x 2 finite numbers, a column for each"),
     ({"waypoints": [[0.0, None]]}, r"waypoints is \[\[0.0, None\]\]; it must be n x 2"),
     ({"joint_names": [1, 2]}, r"joint_names is \[1, 2\]; it must be a list of names"),
-    ({"planning_time": "soon"}, "planning_time is 'soon'; it takes float"),
-    ({"progress": [[0.1]]}, r"progress is \[0.1\]; it must have 2 entries"),
+    ({"planning_time": "soon"}, "planning_time is 'soon'; it takes a number"),
+    ({"progress": [[0.1]]}, r"progress\[0\] is \[0.1\]; it must have 2 entries"),
     ({"goal_index": -1}, "goal_index is -1; it must be at least 0"),
-    ({"goal_index": True}, "goal_index is True; it takes int"),
-    ({"reason": 7}, "reason is 7; it takes str"),
+    ({"goal_index": True}, "goal_index is True; it takes an integer"),
+    ({"reason": 7}, "reason is 7; it takes a text"),
     ({"problem": [1]}, r"problem is \[1\]; it must be an object"),
 ]
 

@@ -57,16 +57,16 @@ class Search(Settings, name="search"):
         ({"clearance": -1e-9}, "search.clearance is -1e-09; it must be at least 0"),
         ({"bias": 1.5}, "search.bias is 1.5; it must be between 0 and 1"),
         ({"decay": 1.0}, "search.decay is 1.0; it must be at least 0 and below 1"),
-        ({"levels": (0.1, 0.0)}, "search.levels is 0.0; it must be positive"),
+        ({"levels": (0.1, 0.0)}, "search.levels[1] is 0.0; it must be positive"),
         ({"step": np.float32(-1)}, "search.step is -1.0; it must be positive"),
         ({"order": "worst"}, "unknown search.order 'worst'; known: best, first; did you mean first?"),
         ({"grid": "round"}, "unknown search.grid 'round'; known: coarse, fine"),
         ({"grid_settings": Fine()}, "grid is coarse, but its settings are Fine; they must be Coarse"),
-        ({"step": "1"}, "search.step is '1'; it takes float positive"),
-        ({"step": True}, "search.step is True; it takes float positive"),
+        ({"step": "1"}, "search.step is '1'; it takes a number above 0"),
+        ({"step": True}, "search.step is True; it takes a number above 0"),
         ({"order": 1}, "search.order is 1; it takes first, best"),
         ({"inner": 3}, "search.inner is 3; it takes Coarse"),
-        ({"levels": ["a"]}, "search.levels is 'a'; it takes float positive"),
+        ({"levels": ["a"]}, "search.levels[0] is 'a'; it takes a number above 0"),
     ],
 )
 def test_values_out_of_bounds_or_of_another_type_are_refused(values: dict[str, Any], message: str) -> None:
@@ -84,9 +84,9 @@ def test_json_and_back() -> None:
     ("values", "message"),
     [
         ({"stp": 1}, "file.stp is not a setting; known: step, clearance"),
-        ({"step": "far"}, "file.step is 'far'; it takes float positive"),
+        ({"step": "far"}, "file.step is 'far'; it takes a number above 0"),
         ({"inner": {"cells": 0}}, "cells is 0; it must be at least 1"),
-        ({"inner": {"cells": 1.5}}, "file.inner.cells is 1.5; it takes int"),
+        ({"inner": {"cells": 1.5}}, "file.inner.cells is 1.5; it takes an integer"),
         ({"grid": "fine", "grid_settings": {"cells": 2}}, "file.grid_settings.cells is not a setting"),
         ({"s" * 1000: 1}, f"file.{'s' * 57}... is not a setting"),
         ([], "must be a table of settings"),
@@ -108,8 +108,8 @@ def test_assignments() -> None:
     [
         ("reach=1", "search has no setting 'reach'; it has step=1.0, .*range=none, .*inner.cells=3"),
         ("step", "'step' is not NAME=VALUE"),
-        ("step=big", "search.step is 'big'; it takes float positive"),
-        ("greedy=1", "search.greedy is 1; it takes bool"),
+        ("step=big", "search.step is 'big'; it takes a number above 0"),
+        ("greedy=1", "search.greedy is 1; it takes true or false"),
     ],
 )
 def test_assignments_that_are_wrong(text: str, message: str) -> None:
@@ -124,8 +124,8 @@ def test_tuples_of_a_fixed_length_have_it() -> None:
 def test_descriptions() -> None:
     found = {setting.name: setting for setting in Search().describe()}
     assert found["step"].description == "Longest extension of a tree [rad]."
-    assert (found["step"].default, found["step"].rule) == (1.0, "float positive")
-    assert found["range"].rule == "float positive or none"
+    assert (found["step"].default, found["step"].rule) == (1.0, "a number above 0")
+    assert found["range"].rule == "a number above 0 or none"
     assert (found["inner.cells"].default, found["inner.cells"].description) == (3, "How many.")
     assert found["order"].rule == "first, best"
 

@@ -50,7 +50,7 @@ class Bound:
             and (self.most is None or value <= self.most)
         )
         if not within or value != value:
-            return self.rule
+            return "positive" if self.rule == "above 0" else self.rule or "finite"
         return "finite" if math.isinf(value) and not self.infinite else None
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
@@ -70,9 +70,7 @@ class Bound:
         high = f"below {self.below:g}" if self.below is not None else high
         if self.least is not None and self.most is not None:
             return f"between {self.least:g} and {self.most:g}"
-        if not high and self.above == 0:
-            return "positive"
-        return " and ".join(part for part in (low, high) if part) or "finite"
+        return " and ".join(part for part in (low, high) if part)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +109,18 @@ Count = Annotated[int, Bound(least=1.0)]
 Natural = Annotated[int, Bound(least=0.0)]
 Sizes = Annotated[tuple[Count, ...], Filled()]
 """Layer sizes; at least one."""
+
+
+KINDS = {
+    type(None): "none",
+    bool: "true or false",
+    int: "an integer",
+    float: "a number",
+    str: "a text",
+    tuple: "a list",
+    dict: "values by name",
+}
+"""Types of settings in messages."""
 
 
 class Setting(NamedTuple):
@@ -222,7 +232,7 @@ class Settings:
         Raises InputError as `changed` does.
         """
         assignments = [setting.assignment for setting in self.describe()]
-        return self._replaced(values, self.settings_name or type(self).__name__, assignments)
+        return self._replaced(values, self.settings_name, assignments)
 
     def _replaced(self: Given, values: Mapping[str, Any], where: str, known: list[str]) -> Given:
         hints = _hints(type(self))
@@ -235,11 +245,13 @@ class Settings:
                 within.setdefault(first, {}).update({rest: value} if dot else value)
             elif nested or name not in hints:
                 root, _, path = f"{where}.{name}".partition(".")
-                raise InputError(f"{root} has no setting {shown(path)}; it has {', '.join(known)}")
+                owner = root or type(self).__name__
+                raise InputError(f"{owner} has no setting {shown(path)}; it has {', '.join(known)}")
             else:
-                replaced[name] = converted(f"{where}.{name}", hints[name], value)
+                replaced[name] = converted(f"{where}.{name}".removeprefix("."), hints[name], value)
         for name, changes in within.items():
-            replaced[name] = getattr(self, name)._replaced(changes, f"{where}.{name}", known)
+            group = f"{where}.{name}".removeprefix(".")
+            replaced[name] = getattr(self, name)._replaced(changes, group, known)
         return dataclasses.replace(self, **replaced)  # type: ignore[type-var]
 
     def describe(self) -> list[Setting]:
@@ -309,9 +321,10 @@ def converted(where: str, hint: Any, value: Any, owner: object = None) -> Any:
     elif kind is tuple:
         if kinds[-1] is not Ellipsis and len(value) != len(kinds):
             raise InputError(f"{where} is {shown(value)}; it must have {len(kinds)} entries")
-        value = tuple(converted(where, kinds[0], entry, owner) for entry in value)
+        value = tuple(converted(f"{where}[{i}]", kinds[0], entry, owner) for i, entry in enumerate(value))
     elif kind is dict:
-        value = {str(key): converted(where, kinds[1], entry, owner) for key, entry in value.items()}
+        named = {str(key): entry for key, entry in value.items()}
+        value = {key: converted(f"{where}.{key}", kinds[1], entry, owner) for key, entry in named.items()}
     elif bare in (int, float):
         value = bare(value)
     for mark in marks:
@@ -369,8 +382,7 @@ def _rule(hint: Any) -> str:
                 continue
             rules = [mark.rule for mark in marks if isinstance(mark, Bound)]
             names = [", ".join(mark.names) for mark in marks if isinstance(mark, OneOf)]
-            kind = "none" if bare is type(None) else getattr(bare, "__name__", str(bare))
-            yield " ".join(names or [kind, *rules])
+            yield " ".join(names or [KINDS.get(get_origin(bare) or bare) or bare.__name__, *rules]).strip()
 
     return " or ".join(parts(hint))
 
