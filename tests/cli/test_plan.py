@@ -3,7 +3,6 @@
 import json
 import os
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ from robotdiffuse.cli.demo import shelf_problem
 from robotdiffuse.planning import load_planner, planner_settings
 from robotdiffuse.problems.files import load_problem, problem_record
 from robotdiffuse.problems.problem import JointGoal
-from robotdiffuse.visualization.exploration import write_exploration_picture
 from robotdiffuse.visualization.picture import PictureSettings
 
 ROOT = Path(__file__).parents[2]
@@ -189,8 +187,7 @@ NEAR = {"joints": [-0.95, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]}
 def test_explore_writes_a_replay_a_strip_and_a_recording(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    small = partial(write_exploration_picture, settings=PictureSettings(width=240, height=150, ghosts=1))
-    monkeypatch.setattr("robotdiffuse.cli.explore.write_exploration_picture", small)
+    monkeypatch.setattr("robotdiffuse.visualization.exploration.TILE", PictureSettings(width=240, height=150, ghosts=1))
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     problem = write_problem(tmp_path, goal=NEAR)

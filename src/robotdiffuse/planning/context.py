@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -73,6 +73,17 @@ class PlanRequest(Settings):
     acceleration_scaling: Scaling = 1.0
     jerk: Jerk | None = None
     objective: Annotated[str, OneOf(OBJECTIVES)] = TIME
+
+
+@runtime_checkable
+class Solver(Protocol):
+    """What `planning/pipeline` needs of a planner; `Planner` has it."""
+
+    name: ClassVar[str]
+
+    def attempt(self, problem: Problem, request: PlanRequest) -> PlanResult:
+        """Plan from the problem's start to its goal, without its other fields."""
+        ...
 
 
 def clock() -> float:

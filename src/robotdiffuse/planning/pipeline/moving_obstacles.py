@@ -26,9 +26,8 @@ from robotdiffuse.core.deadline import OutOfTimeError, check_timing
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path, Status, Trajectory
-from robotdiffuse.planning.context import PlanningContext, PlanRequest, least_clearances
+from robotdiffuse.planning.context import PlanningContext, PlanRequest, Solver, least_clearances
 from robotdiffuse.planning.pipeline.waypoints import plan_through_waypoints
-from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.trajectories.timing import MIN_DISTANCE, SPEED_FACTORS, StopGraph, time_parameterize
 from robotdiffuse.validation.tolerances import goal_error
@@ -134,7 +133,7 @@ PATH_TIME_FRACTION = 0.5
 """Time limit for planning a path, as a fraction of the remaining time."""
 
 
-def plan_among_moving_obstacles(planner: Planner, problem: Problem, request: PlanRequest) -> PlanResult:
+def plan_among_moving_obstacles(planner: Solver, problem: Problem, request: PlanRequest) -> PlanResult:
     """A motion among the problem's moving obstacles, certified at every time until it ends."""
     context = PlanningContext(planner.name, problem, request)
     robot = problem.robot

@@ -43,8 +43,7 @@ from robotdiffuse.perception.unknown_space import (
     lost_regions,
 )
 from robotdiffuse.perception.voxel_grid import Probabilities, refined
-from robotdiffuse.planning.context import PlanningContext, PlanRequest
-from robotdiffuse.planning.planner import Planner
+from robotdiffuse.planning.context import PlanningContext, PlanRequest, Solver
 from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.problem import OCCUPIED, OPTIMISTIC, PADDED, PREDICTED, JointGoal, Problem
 from robotdiffuse.robots.kinematics import placed_spheres
@@ -79,7 +78,7 @@ AS_SEEN = "as seen"
 
 
 def plan_with_unknown_space(
-    planner: Planner,
+    planner: Solver,
     problem: Problem,
     request: PlanRequest,
     predicted: Probabilities | None = None,
@@ -255,7 +254,7 @@ def with_assumption(problem: Problem, assumption: Assumption, goals: Configurati
 class _Attempts:
     """Calls a planner for problems under assumptions, within one planning call."""
 
-    planner: Planner
+    planner: Solver
     context: PlanningContext
     unknown: UnknownSpace
 

@@ -27,8 +27,13 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import ROWS, Path, Status, Trajectory
-from robotdiffuse.planning.context import MIN_TIME_LIMIT, PlanningContext, PlanRequest, least_clearances
-from robotdiffuse.planning.planner import Planner
+from robotdiffuse.planning.context import (
+    MIN_TIME_LIMIT,
+    PlanningContext,
+    PlanRequest,
+    Solver,
+    least_clearances,
+)
 from robotdiffuse.problems.constraints import CartesianLine
 from robotdiffuse.problems.goals import Goal, JointGoal
 from robotdiffuse.problems.problem import Problem
@@ -49,7 +54,7 @@ DEVIATION_FACTOR = 0.9
 MAX_DEVIATIONS = 80
 
 
-def plan_through_waypoints(planner: Planner, problem: Problem, request: PlanRequest) -> PlanResult:
+def plan_through_waypoints(planner: Solver, problem: Problem, request: PlanRequest) -> PlanResult:
     """A motion that visits the problem's waypoints in order and ends at its goal. It stops at each waypoint,
     or passes it within its blend.
 
@@ -275,7 +280,7 @@ def join(
     return replace(_joined(context, results, _motions(context, results)), problem=problem)
 
 
-def plan_from_start_velocity(planner: Planner, problem: Problem, request: PlanRequest) -> PlanResult:
+def plan_from_start_velocity(planner: Solver, problem: Problem, request: PlanRequest) -> PlanResult:
     """A motion from the problem's start velocity to rest at its goal.
 
     Raises InputError for a velocity beyond the scaled velocity limits of the request.
