@@ -389,7 +389,7 @@ def _motion(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
         file.write_bytes(text_of(rng, json.loads(file.read_text()), ending))
     elif ending in (".json", ".yaml"):
         forms = (lambda r: r, lambda r: {"joint_trajectory": r}, lambda r: {"trajectory": [{"joint_trajectory": r}]})
-        record = forms[rng.integers(3)](joint_trajectory(trajectory.joint_names, trajectory))
+        record = forms[rng.integers(3)](joint_trajectory(trajectory))
         file.write_bytes(text_of(rng, record, ending))
     else:
         write_motion(problem, trajectory, file)

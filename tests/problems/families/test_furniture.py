@@ -99,8 +99,8 @@ def test_targets_have_the_fingers_in_the_region() -> None:
 @pytest.mark.parametrize(
     ("settings", "change", "message"),
     [
-        (furniture.SHELF, {"boards": (1, 3)}, "boards is 1; it must be at least 2"),
-        (furniture.CRATE, {"thickness": (0.0, 0.02)}, "thickness is 0.0; it must be positive"),
+        (furniture.SHELF, {"boards": (1, 3)}, r"boards\[0\] is 1; it must be at least 2"),
+        (furniture.CRATE, {"thickness": (0.0, 0.02)}, r"thickness\[0\] is 0.0; it must be positive"),
         (furniture.TABLE, {"wall_share": 0.8}, "wall_share is 0.8 and pillar_share 0.3"),
     ],
 )
