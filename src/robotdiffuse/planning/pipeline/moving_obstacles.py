@@ -138,7 +138,6 @@ def plan_among_moving_obstacles(planner: Solver, problem: Problem, request: Plan
     context = PlanningContext(planner.name, problem, request)
     robot = problem.robot
     still = replace(problem, moving=())
-    plan_path = plan_through_waypoints if problem.waypoints else Planner.attempt
     contact = context.validator.settings.contact
     collision = MovingCollision(robot, problem.moving, contact, 0.0)
     first = collision.sweep(np.zeros(1), problem.start[None]).contact
@@ -160,7 +159,11 @@ def plan_among_moving_obstacles(planner: Solver, problem: Problem, request: Plan
             scene = scene.with_shapes([*scene.shapes, *standing])
         limit = max(PATH_TIME_FRACTION * (request.time_limit - context.elapsed), 1e-3)
         path_request = replace(request, time_limit=limit, seed=request.seed + attempts // 2)
-        result = plan_path(planner, replace(still, scene=scene), path_request)
+        at_rest = replace(still, scene=scene)
+        if problem.waypoints:
+            result = plan_through_waypoints(planner, at_rest, path_request)
+        else:
+            result = planner.attempt(at_rest, path_request)
         attempts += 1
         if result.path is None or result.trajectory is None:
             if attempted_paths == 0 and scene is problem.scene:
