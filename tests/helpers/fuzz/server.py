@@ -389,9 +389,9 @@ def running_server() -> Server:
 def main() -> None:
     """Serve with one worker and CLIENT_TIMEOUT; exit when standard input closes."""
     from robotdiffuse.cli import main as command
-    from robotdiffuse.server import settings
+    from robotdiffuse.server import connection, server
 
-    settings.READ_TIMEOUT = settings.KEEP_ALIVE_TIMEOUT = CLIENT_TIMEOUT
+    connection.READ_TIMEOUT = server.KEEP_ALIVE_TIMEOUT = CLIENT_TIMEOUT
 
     def ended() -> None:
         sys.stdin.read()
