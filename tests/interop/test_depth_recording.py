@@ -238,7 +238,7 @@ def test_an_image_without_a_joint_state_leaves_the_rest(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda of: of["/camera/camera_info"].clear(), "no CameraInfo on /camera/camera_info"),
+        (lambda of: of["/camera/camera_info"].clear(), "no CameraInfo in the folder /camera"),
         (lambda of: of["/camera/image_rect"].clear(), "holds no depth images"),
         (lambda of: of["/tf"].clear(), "no transforms connect camera_optical.*with panda_link0.*panda_hand"),
         (

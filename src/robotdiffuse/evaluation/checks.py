@@ -1,8 +1,9 @@
 """Checks the motions of data sets and benches.
 
 In a data set, every shard must be complete, and motions must pass the validator and PyBullet's collision
-check of meshes. Problems are rebuilt from the stored rows, and results that the generation of data stored are
-measured again. In a bench, motions must pass PyBullet, a second validator with its own kinematics.
+check of meshes. Problems are rebuilt from the stored rows; the lengths and clearances that were stored when
+the data were generated are measured again. In a bench, motions must pass PyBullet, a second validator with
+its own kinematics.
 """
 
 import sys
@@ -59,8 +60,8 @@ EXAMPLES_PER_KIND = 5
 LIMIT_SLACK = 1e-6
 """Tolerance of joint limits [rad], since waypoints have single precision."""
 CLEARANCE_TOLERANCE = 1e-4
-"""Largest difference between the recorded and the measured clearance of a motion [m]. This clearance is the
-smallest one of the covering spheres over the waypoints."""
+"""Largest difference between the recorded and the measured clearance of a motion [m]. The clearance
+of a motion is the smallest distance between covering spheres and obstacles at any of its waypoints."""
 COST_TOLERANCE = 0.05
 """Largest fraction by which the path through the stored waypoints, which cuts corners, may be shorter than
 the recorded length."""
@@ -275,7 +276,7 @@ def _defects(task: _Task, shard: Shard, row: int) -> Defects:
     try:
         problem = problem_of(task.manifest, robot, shard, row)
     except InputError as error:
-        yield "motion", f"makes no problem: {error}"
+        yield "motion", f"no problem can be built from this row: {error}"
         return
     violation = Verifier(problem, VerifySettings()).path(path).violation
     if violation is not None and violation.kind.endswith("collision"):

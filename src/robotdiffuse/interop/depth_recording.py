@@ -230,7 +230,7 @@ def _seconds(message: Any, logged: int) -> float:
 
 def _intrinsics(topic: str, info: Any, image: Any) -> tuple[float, float, float, float]:
     if info is None:
-        raise InputError(f"there is no CameraInfo on {_folder(topic)}/camera_info for {topic}")
+        raise InputError(f"there is no CameraInfo in the folder {_folder(topic)} for {topic}")
     if (info["width"], info["height"]) != (image.width, image.height):
         raise InputError(
             f"images of {topic} have {image.width} x {image.height} pixels; their CameraInfo has "

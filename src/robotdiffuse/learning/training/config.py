@@ -31,8 +31,8 @@ from robotdiffuse.learning.training.losses import LossSettings
 from robotdiffuse.learning.weight_files import NETWORKS
 
 STAGES = ((0.72, 9), (0.90, 4), (1.0, 1))
-"""The stages of a progressive training: the share of the training after which each ends, and its number of
-waypoints in a block; the mean of a block is a token."""
+"""Stages of a progressive training (`PlannerTraining.progressive`). Each has the share of the training at
+which it ends, and a number of waypoints: in this stage, each token is the mean of a block of so many."""
 
 
 def block_at(fraction: float) -> int:
@@ -44,7 +44,8 @@ ShareBelowOne = Annotated[float, Bound(least=0.0, below=1.0)]
 
 
 def one_length(given: dict[str, Any]) -> dict[str, Any]:
-    """Changes of settings in which the given length of a run, `minutes` or `samples`, replaces the other."""
+    """The given settings. If they set the length of the run, by `minutes` or `samples`, the other one becomes
+    None, since it may have a default; `minutes` wins if both are given."""
     if given.get("minutes") is not None:
         return given | {"samples": None}
     return given if given.get("samples") is None else given | {"minutes": None}
@@ -143,10 +144,9 @@ class PlannerTraining(MotionTraining, ModelParts):
     """Training of the diffusion model."""
 
     encoder: str | None
-    """Folder with a trained encoder, which stays frozen; or the name of an encoder that is trained jointly,
-    by the planner's loss, on new clouds for every batch: pointnet or dgcnn; or, for the denoiser
-    cross_attention, points, an encoder without weights. None for a prior, whose inputs do not include the
-    scene."""
+    """One of: a folder with a trained encoder, which stays frozen; `pointnet` or `dgcnn`, which are trained
+    jointly, by the planner's loss, on new clouds for every batch; `points`, an encoder without weights, for
+    the denoiser `cross_attention`; None for a prior, whose inputs do not include the scene."""
     minutes: Positive | None = 70.0
     learning_rate: Positive = 6e-4
     """Peak learning rate of AdamW (paper: 3e-4)."""
@@ -160,8 +160,8 @@ class PlannerTraining(MotionTraining, ModelParts):
     """Share of trivial trajectories in each batch: the straight line from start to goal is free. From them
     the network learns to keep straight lines."""
     smooth_noise: bool = True
-    """Whether the noise has the covariance of the trajectories over the waypoints; otherwise it is white (the
-    paper's)."""
+    """Whether the noise is correlated between waypoints as the trajectories are; otherwise it is white, as in
+    the paper."""
     progressive: bool = False
     """Whether the denoiser's tokens are means of blocks of waypoints in most of the training, and single
     waypoints only at its end; see `STAGES`. Steps with fewer tokens take a fraction of the time."""

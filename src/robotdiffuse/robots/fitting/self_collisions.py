@@ -28,8 +28,8 @@ ADJACENT_STRIDE = 10
 MIN_LIMITS_COLLIDING = 0.2
 """Smallest fraction of colliding samples for the reason `limits`."""
 MAX_LOCKED_JOINTS = 1
-"""A link belongs to the arm if at most this many locked joints connect it to the arm, such as the bellows of
-a lift. Links after more locked joints belong to a head or another arm."""
+"""A link, such as the bellows of a lift, belongs to the arm if at most this many locked joints connect it to
+the arm. Links after more locked joints belong to a head or another arm."""
 MAX_POSE_OVERLAP = 0.03
 """If links overlap in a named pose by less than this [m], the pair is allowed for the reason `pose`."""
 
@@ -61,7 +61,7 @@ class PairReport(NamedTuple):
     """checked, or why the pair is allowed: adjacent, always, never, default, pose or limits, as explained in
     `find_allowed_collisions`; named, if it was named when the robot was added; srdf, if an SRDF allows it."""
     colliding: float
-    """Fraction of the configurations in which the meshes collide."""
+    """Fraction of the configurations in which convex parts of the two links collide."""
 
 
 def find_allowed_collisions(
@@ -196,8 +196,8 @@ MAX_SPHERE_CASES = 2000
 MAX_PART_CASES = 60
 """Largest number of false collisions of convex parts per pair of links that are examined."""
 NARROWEST_FRACTION = 0.003
-"""The false collisions with the narrowest gaps, up to this fraction of the configurations, are not
-refined."""
+"""For each pair, the false collisions of spheres with the narrowest gaps, up to this fraction of the
+configurations, are left out of `PairFalseCollisions.places`: spheres need not become finer there."""
 
 
 class PairFalseCollisions(NamedTuple):

@@ -118,8 +118,8 @@ class ConvertedModel:
     """The robot of an MJCF file as a URDF whose root link is the world."""
 
     def __init__(self, path: Path) -> None:
-        """Raises InputError for a model without hinge or slide joints, for ball joints, and for colliding
-        geoms of types that are not converted; for slide joints without a range, if there are no others."""
+        """Raises InputError for a model without hinge or slide joints, for ball joints, for colliding
+        geoms of types that are not converted, and if all joints are slide joints without a range."""
         self.path = path
         self.model = model = compiled_model(path)
         self.folder = TemporaryDirectory(prefix="robotdiffuse-mjcf-")
