@@ -149,7 +149,8 @@ class VerifyAnswer(BaseModel):
 
 
 class JointInfo(BaseModel):
-    """A planned joint: limits in rad, m, rad/s and so on; null for the limits of a continuous joint."""
+    """A planned joint: limits in rad, m, rad/s and so on; `lower` and `upper` of a continuous joint are
+    null."""
 
     name: str
     kind: str

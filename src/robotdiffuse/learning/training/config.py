@@ -166,7 +166,8 @@ class PlannerTraining(MotionTraining, ModelParts):
     """Whether the denoiser's tokens are means of blocks of waypoints in most of the training, and single
     waypoints only at its end; see `STAGES`. Steps with fewer tokens take a fraction of the time."""
     validation_problems: Natural = 32
-    """Number of held-out problems that are sampled without guidance at every checkpoint."""
+    """Number of held-out problems that are sampled at every checkpoint: without guidance, except for a prior,
+    which is sampled with it."""
     encoder_settings: Annotated[EncoderSettings | None, SettingsOf("encoder", ENCODERS)] = None
     """Settings of an encoder that is trained jointly; None: its defaults."""
     denoiser_settings: Annotated[DenoiserSettings | None, SettingsOf("denoiser", DENOISERS)] = None
@@ -263,7 +264,7 @@ CONFIGS: dict[str, Config] = {
         },
     ),
     "points": Config(
-        "no clearances: waypoints attend to 32 points of the obstacles, in place of one code",
+        "no clearances: waypoints attend to 32 points of the obstacles, not to one embedding of the scene",
         {
             **_TABLE2_ROW,
             "minutes": None,
