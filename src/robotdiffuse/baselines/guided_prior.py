@@ -351,8 +351,8 @@ def position_precision(waypoints: int) -> ndarray:
     1993, section 2.1). Straight lines cost nothing.
     """
     second_differences = np.diff(np.eye(waypoints), 2, axis=0)
-    inner = waypoints - 2
-    spline = 2 / 3 * np.eye(inner) + (np.eye(inner, k=1) + np.eye(inner, k=-1)) / 6
+    count = waypoints - 2
+    spline = 2 / 3 * np.eye(count) + (np.eye(count, k=1) + np.eye(count, k=-1)) / 6
     return second_differences.T @ np.linalg.solve(spline, second_differences)
 
 

@@ -436,14 +436,14 @@ class Prover:
         self, claim: ndarray, posture: ndarray, postures: Postures, spans: ndarray
     ) -> tuple[ndarray, ndarray]:
         """Clearances and displacements by the covering spheres."""
-        links, others = np.array([self._links_of(c) for c in self.claims], int).reshape(-1, 2)[claim].T
+        links, partners = np.array([self._links_of(c) for c in self.claims], int).reshape(-1, 2)[claim].T
         moved = self._moved[links]
-        moves_other_only = self._moved[others] & ~moved
+        moves_other_only = self._moved[partners] & ~moved
         other_displacement = np.zeros(len(claim))
         some = np.flatnonzero(moves_other_only.any(axis=1))
         if len(some):
             other_displacement[some] = self._ball_bounds(
-                others[some], moves_other_only[some], posture[some], postures, spans
+                partners[some], moves_other_only[some], posture[some], postures, spans
             )[1]
         against_scene = np.array([c.against == SCENE for c in self.claims], bool)[claim]
 
@@ -453,10 +453,10 @@ class Prover:
             gaps = self.obstacles.distances(centers[scene])
             gaps[self.may_touch[links[row[scene]]]] = CLEARANCE_CAP
             to_other[scene] = gaps.min(axis=1, initial=CLEARANCE_CAP)
-            to_other[~scene] = self._to_links(postures, at[~scene], centers[~scene], others[row[~scene]])
+            to_other[~scene] = self._to_links(postures, at[~scene], centers[~scene], partners[row[~scene]])
             return to_other
 
-        moved_alone = moved & ~self._moved[others]
+        moved_alone = moved & ~self._moved[partners]
         clearance, displacement = self._ball_bounds(links, moved_alone, posture, postures, spans, distances)
         return clearance, displacement + other_displacement
 
@@ -493,10 +493,10 @@ class Prover:
         posture: in the middle of the stretch. steps, off: the `_steps` of the joints and their `deviations`.
         displacement: by the covering spheres.
         """
-        link, other = self._links_of(claim)
+        link, against = self._links_of(claim)
         # joints that move only the link, and joints that move only the other link
-        mine = np.flatnonzero(self._moved[link] & ~self._moved[other])
-        theirs = np.flatnonzero(self._moved[other] & ~self._moved[link])
+        mine = np.flatnonzero(self._moved[link] & ~self._moved[against])
+        theirs = np.flatnonzero(self._moved[against] & ~self._moved[link])
         axes = posture.origins, posture.axes
         clearance = margin = CLEARANCE_CAP
         for p, (part, bodies, ball_gaps) in enumerate(self.pairs(claim, posture.T)):
@@ -530,17 +530,17 @@ class Prover:
 
         T: poses of all links. Surfaces are reduced to their near elements.
         """
-        link, other = self._links_of(claim)
-        others = placed(self.parts.get(claim.against, ()), T[other])
+        link, against = self._links_of(claim)
+        bodies = placed(self.parts.get(claim.against, ()), T[against])
         for part in placed(self.parts[claim.link], T[link]):
             if claim.against == SCENE:
                 distances = self.obstacles.distances(part.center[None])[0] - part.radius
                 distances[self.may_touch[link]] = CLEARANCE_CAP
                 yield part, self.obstacles.near(part.center, part.radius), distances
             else:
-                between = part.center - np.array([body.center for body in others])
-                radii = np.array([body.radius for body in others])
-                yield part, others, np.sqrt((between**2).sum(axis=1)) - part.radius - radii
+                between = part.center - np.array([body.center for body in bodies])
+                radii = np.array([body.radius for body in bodies])
+                yield part, bodies, np.sqrt((between**2).sum(axis=1)) - part.radius - radii
 
 
 def _steps(prover: Prover, start: float, stop: float) -> JointRows:

@@ -190,19 +190,19 @@ class ExactCollision:
         return tuple(map(self._candidates_of, range(len(self.checks))))
 
     def _candidates_of(self, check: int) -> _Candidates:
-        link, other = self.checks[check]
+        link, against = self.checks[check]
         firsts = self._pieces[link]
         balls = _balls(self.robot, link)
-        if other is None:
+        if against is None:
             solids = self._solids
             return _Candidates(
                 firsts, self._obstacles, lambda frames: kernel.scene_bounds(frames, *balls, solids, check)
             )
-        others = _balls(self.robot, other)
+        balls_against = _balls(self.robot, against)
         return _Candidates(
             firsts,
-            self._pieces[other],
-            lambda frames: kernel.pair_bounds(frames, *balls, *others),
+            self._pieces[against],
+            lambda frames: kernel.pair_bounds(frames, *balls, *balls_against),
             surface_pairs(self.robot).get(self.checks[check]),
         )
 

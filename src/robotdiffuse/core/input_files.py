@@ -138,8 +138,8 @@ def read_arrays(file: str | Path) -> dict[str, ndarray]:
         with zipfile.ZipFile(path) as archive:
             size = sum(member.file_size for member in archive.infolist())
         if size > MAX_FILE_SIZE:
-            most = MAX_FILE_SIZE // MEGABYTE
-            raise InputError(f"{file} unpacks to {size // MEGABYTE} MB; at most {most} MB are read")
+            limit = MAX_FILE_SIZE // MEGABYTE
+            raise InputError(f"{file} unpacks to {size // MEGABYTE} MB; at most {limit} MB are read")
         with np.load(path, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
 

@@ -66,9 +66,9 @@ class VoxelGrid:
     def hold(self, marked: Voxels, points: Points) -> Bool[ndarray, "n"]:
         """Whether each point is in one of the marked voxels."""
         at = self.indices(points)
-        held = self.contains(at)
-        held[held] = marked[tuple(at[held].T)]
-        return held
+        marks = self.contains(at)
+        marks[marks] = marked[tuple(at[marks].T)]
+        return marks
 
     def filled(self, robot: Robot, configurations: Iterable[Configuration], margin: float = 0.0) -> Voxels:
         """Voxels with their centers in the arm's covering spheres, inflated by `margin` [m], at any of these

@@ -364,8 +364,8 @@ def moving_entry(obstacle: MovingObstacle, folder: Path | None) -> dict[str, Any
 
 def payload_entry(payload: Payload) -> dict[str, object]:
     """The entry of a payload in a problem file."""
-    given = {"link": payload.link is not None, "moments": payload.moments.any()}
-    return plain_fields(payload, *(name for name in given if not given[name]))
+    is_set = {"link": payload.link is not None, "moments": payload.moments.any()}
+    return plain_fields(payload, *(name for name in is_set if not is_set[name]))
 
 
 def _views(data: object, setting: Setting) -> Any:

@@ -180,8 +180,8 @@ def moveit_frames(data: object, robot: Robot) -> MoveItFrames:
         frames.unknown_reason = f"a joint moves {robot.base} relative to {robot.root}"
     else:
         T_base_own = robot.T_base_root @ inverse(T_own_root)
-        own = "world" if named in ("", robot.root or robot.base) else named
-        frames.update({name: T_base_own for name in ("", own) if name not in frames.links})
+        scene_frame = "world" if named in ("", robot.root or robot.base) else named
+        frames.update({name: T_base_own for name in ("", scene_frame) if name not in frames.links})
     for location, entry in mappings_of("", mapping_of(SCENE, data), "fixed_frame_transforms"):
         child = str(entry.get("child_frame_id", "")).removeprefix("/")
         T = pose_of(f"{location}.transform", entry.get("transform"), "translation", "rotation")

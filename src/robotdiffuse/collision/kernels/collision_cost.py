@@ -269,14 +269,14 @@ def cost_gradient_at(robot, scene, q, pairs, margin, self_margin, work, grad):
                 continue
             for t in range(robot.first[b], robot.first[b + 1]):
                 other_sphere = robot.spheres[t]
-                other = placed(frames[ib], other_sphere)
-                apart = minus(at, other)
-                d = length(apart) + _TINY
+                partner = placed(frames[ib], other_sphere)
+                offset = minus(at, partner)
+                d = length(offset) + _TINY
                 h = sphere[3] + other_sphere[3] + self_margin - d
                 if h > _ZERO:
                     cost += _HALF * h * h
-                    _add_force(wrench, at, times(h / d, apart))
-                    _add_force(opposite_wrench, other, times(-h / d, apart))
+                    _add_force(wrench, at, times(h / d, offset))
+                    _add_force(opposite_wrench, partner, times(-h / d, offset))
         _subtract_torques(robot, frames, ia, wrench, grad)
         _subtract_torques(robot, frames, ib, opposite_wrench, grad)
     return cost

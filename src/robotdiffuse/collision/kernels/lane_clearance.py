@@ -270,13 +270,13 @@ def pair_along(robot, p, moving, work):
             continue
         velocities = _velocity(twists, f, centers) if moving else still
         for t in range(robot.first[b], robot.first[b + 1]):
-            others = load_vector(work.positions, t, 0)
+            partners = load_vector(work.positions, t, 0)
             # only the difference of the velocities along the line between the centers matters; this
             # difference is the same in every frame of reference
-            relative = minus(velocities, _velocity(twists, g, others) if moving else still)
-            apart = minus(centers, others)
-            distance = _length(apart)
-            towards = absolute(dot(apart, relative)) / maximum(distance, _TINY)
+            relative = minus(velocities, _velocity(twists, g, partners) if moving else still)
+            offset = minus(centers, partners)
+            distance = _length(offset)
+            towards = absolute(dot(offset, relative)) / maximum(distance, _TINY)
             _lower_to(distance - (spheres[s, 3] + spheres[t, 3]), towards, work)
 
 

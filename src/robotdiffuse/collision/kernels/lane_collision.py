@@ -210,14 +210,14 @@ def _touching_each_other(robot, a, b, near, stop_at_first, work):
     bounds = robot.row_bounds
     for row in range(robot.first_row[a], robot.first_row[a + 1]):
         centers = centers_of(frames, robot.frame[a], bounds, row)
-        others = load_vector(work.centers, b, 0)
-        near_row = near & ~hits & _touching_balls(centers, bounds[row, 3], others, robot.bounds[b, 3])
+        partners = load_vector(work.centers, b, 0)
+        near_row = near & ~hits & _touching_balls(centers, bounds[row, 3], partners, robot.bounds[b, 3])
         if near_row == 0:
             continue
         for other_row in range(robot.first_row[b], robot.first_row[b + 1]):
-            others = centers_of(frames, robot.frame[b], bounds, other_row)
+            partners = centers_of(frames, robot.frame[b], bounds, other_row)
             may_touch = near_row & ~hits
-            may_touch &= _touching_balls(centers, bounds[row, 3], others, bounds[other_row, 3])
+            may_touch &= _touching_balls(centers, bounds[row, 3], partners, bounds[other_row, 3])
             while may_touch:
                 i = first_lane(may_touch)
                 may_touch &= may_touch - 1
@@ -312,8 +312,8 @@ def _hits_itself(robot, q, hits, stop_at_first, work):
     for p in range(len(robot.pairs)):
         a, b, table, bit = robot.pairs[p]
         centers = load_vector(work.centers, a, 0)
-        others = load_vector(work.centers, b, 0)
-        near = _touching_balls(centers, bounds[a, 3], others, bounds[b, 3]) & ~hits
+        partners = load_vector(work.centers, b, 0)
+        near = _touching_balls(centers, bounds[a, 3], partners, bounds[b, 3]) & ~hits
         if table >= 0:
             near &= lanes_that_may_touch(robot, table, bit, q)
         if near:

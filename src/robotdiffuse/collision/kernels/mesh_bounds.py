@@ -47,11 +47,11 @@ def scene_bounds(frames, frame, balls, solids, check):
 def pair_bounds(frames, frame, balls, other_frame, other_balls):
     """Lower bounds [n, balls * others] of the distances between the convex pieces of two links [m]. Each
     piece is enclosed by a ball in the frame of its link."""
-    others = len(other_balls)
-    out = np.empty((len(frames), len(balls) * others))
+    columns = len(other_balls)
+    out = np.empty((len(frames), len(balls) * columns))
     for i in range(len(frames)):
         for p in range(len(balls)):
-            for o in range(others):
+            for o in range(columns):
                 gap = ball_gap(frames[i, frame], balls[p], frames[i, other_frame], other_balls[o])
-                out[i, p * others + o] = gap
+                out[i, p * columns + o] = gap
     return out

@@ -314,9 +314,9 @@ def _touches(scene, at, radius):
             # sixteen points at once; points of the first and last row that are outside the range are checked
             # too
             for row in range(first // W, (last + W - 1) // W if last > first else 0):
-                apart = minus(load_vector(scene.point_rows, row, 0), at)
+                offset = minus(load_vector(scene.point_rows, row, 0), at)
                 r = load(scene.point_rows, row, 3) + radius
-                if dot(apart, apart) < r * r:
+                if dot(offset, offset) < r * r:
                     return True
     return False
 
@@ -356,9 +356,9 @@ def _search(scene, at, limit):
         for j in range(j0, j1):
             first, last = _in_column(scene, i, j, rx, ry, rz, reach)
             for p in range(first, last):
-                apart = minus(points[p], at)
+                offset = minus(points[p], at)
                 r = best + points[p, 3]
-                square = dot(apart, apart)
+                square = dot(offset, offset)
                 if r > _ZERO and square < r * r:
                     best = np.sqrt(square) - points[p, 3]
             reach = best + frame[5] + _SLACK
@@ -416,9 +416,9 @@ def near_point(scene, at, limit):
         p = scene.nearest[((i + a) * ny + j + b) * nz + k + c]
         if p < 0:
             continue
-        apart = minus(at, points[p])
-        d = length(apart) + _TINY
+        offset = minus(at, points[p])
+        d = length(offset) + _TINY
         if d - points[p, 3] < best:
             best = d - points[p, 3]
-            gradient = times(_ONE / d, apart)
+            gradient = times(_ONE / d, offset)
     return best, gradient

@@ -493,9 +493,9 @@ def train(task: TrainingTask, out: str) -> dict[str, float]:
         report = task.finish() | {"samples": float(run.at.samples)}
         minutes = round(run.at.seconds / 60, 2)
         about = {"settings": task.settings.to_json(), **task.about(), "minutes": minutes, **report}
-        made = f"{datetime.now(UTC):%Y-%m-%d}"
+        today = f"{datetime.now(UTC):%Y-%m-%d}"
         versions = {"robotdiffuse": __version__, "torch": torch.__version__}
-        task.save(FilePath(out), about | versions | {"made": made})
+        task.save(FilePath(out), about | versions | {"made": today})
     return task.processes.share(report)
 
 

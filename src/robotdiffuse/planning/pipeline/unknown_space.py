@@ -283,8 +283,8 @@ class _Attempts:
         if request.until != FIRST and self.context.elapsed < until:
             result = self._attempt(problem, assumption, until, request)
             motions += [result] if result.solved else []
-        least = max(motion.confidence or 0.0 for motion in motions) - CONFIDENCE_TOLERANCE
-        best = [motion for motion in motions if (motion.confidence or 0.0) >= least]
+        min_confidence = max(motion.confidence or 0.0 for motion in motions) - CONFIDENCE_TOLERANCE
+        best = [motion for motion in motions if (motion.confidence or 0.0) >= min_confidence]
         return replace(min(best, key=lambda motion: motion.path_length), planning_time=self.context.elapsed)
 
     def _attempt(self, problem: Problem, assumption: str, until: float, request: PlanRequest) -> PlanResult:

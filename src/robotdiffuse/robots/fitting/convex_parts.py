@@ -249,7 +249,7 @@ def convex_parts(
     soups = [surface.vertices[surface.faces] for surface in surfaces]
     finer = 1 if tight is None else 2
     space = DistanceGrid.around(soups, finer**3 * settings.voxels, settings.finest / finer)
-    parts = [Part.of(soup, space, settings) for soup in soups]
+    parts = [Part.of(soup, _spread(soup, space.pitch), space, settings) for soup in soups]
     parts = _cut(parts, space, settings, max(settings.most, 2 * len(parts)))
     if tight is not None:
         tight_only, space = space.near_tight(tight, settings.concavity)
@@ -305,20 +305,25 @@ def simplified(hull: ConvexMesh, settings: PartSettings = PartSettings()) -> Con
 
 class Part(NamedTuple):
     triangles: Triangles
+    points: Points
+    """Points spread over the triangles, for choosing cuts."""
     hull: ConvexMesh
     concavity: float
 
     @staticmethod
-    def of(triangles: Triangles, space: DistanceGrid, settings: PartSettings) -> "Part":
+    def of(triangles: Triangles, points: Points, space: DistanceGrid, settings: PartSettings) -> "Part":
         hull = simplified(convex_hull(triangles.reshape(-1, 3)), settings)
-        return Part(triangles, hull, space.concavity(hull))
+        # all sampled points of a thin sheet may lie on the other side of the cut: sample this side again
+        if not len(points):
+            points = _spread(triangles, space.pitch)
+        return Part(triangles, points, hull, space.concavity(hull))
 
     def halves(self, space: DistanceGrid, settings: PartSettings) -> list["Part"]:
         """The two parts on both sides of the plane that minimizes the total volume of their hulls. A part
         that is too small to cut is returned alone, with concavity 0."""
         low = self.hull.vertices.min(0)
         size = np.ptp(self.hull.vertices, axis=0)
-        points, pitch = _spread(self.triangles, space.pitch)
+        points, pitch = _thinned(self.points, space.pitch)
         best = None
         min_volume = np.inf
         for axis in sorted(np.flatnonzero(size > 6 * space.pitch), key=lambda axis: -size[axis]):
@@ -333,9 +338,11 @@ class Part(NamedTuple):
                     best = (int(axis), at)
                     min_volume = volume
         halves = _sides(self.triangles, *best) if best else []
-        if not halves or not all(map(len, halves)):
+        if best is None or not all(map(len, halves)):
             return [self._replace(concavity=0.0)]
-        return [Part.of(side, space, settings) for side in halves]
+        is_low = self.points[:, best[0]] <= best[1]
+        points = self.points[is_low], self.points[~is_low]
+        return [Part.of(side, near, space, settings) for side, near in zip(halves, points, strict=True)]
 
 
 def _wall_cuts(heights: Values, pitch: float) -> list[float]:
@@ -351,11 +358,14 @@ def _wall_cuts(heights: Values, pitch: float) -> list[float]:
     return [middle + step for middle in middles for step in (-WALL_OFFSET, WALL_OFFSET)]
 
 
-def _spread(triangles: Triangles, size: float) -> tuple[Points, float]:
-    """At most `MAX_CUT_POINTS` points spread over a surface, one per cube of edge `size` [m] or larger, and
-    the edge of the cubes."""
+def _spread(triangles: Triangles, size: float) -> Points:
+    """Points spread over a surface, one per cube of edge `size` [m]."""
     points = split(triangles, 2 * size).reshape(-1, 3)
-    points = points[one_per_cube(points, size)]
+    return points[one_per_cube(points, size)]
+
+
+def _thinned(points: Points, size: float) -> tuple[Points, float]:
+    """At most `MAX_CUT_POINTS` of the points, one per cube, and the edge of the cubes [m]."""
     while len(points) > MAX_CUT_POINTS:
         size *= 1.3
         points = points[one_per_cube(points, size)]
@@ -376,7 +386,7 @@ def _sides(triangles: Triangles, axis: int, at: float) -> list[Triangles]:
     faces = np.arange(len(corners)).reshape(-1, 3)
     upwards = np.eye(3)[axis]
     sides = [slice_faces_plane(corners, faces, normal, at * upwards) for normal in (-upwards, upwards)]
-    return [vertices[kept] for vertices, kept, _ in sides]
+    return [vertices[face_corners] for vertices, face_corners, _ in sides]
 
 
 def _merged(hulls: list[ConvexMesh], space: DistanceGrid, settings: PartSettings) -> list[ConvexMesh]:
@@ -393,7 +403,7 @@ def _merged(hulls: list[ConvexMesh], space: DistanceGrid, settings: PartSettings
         if concavity > settings.concavity:
             break
         hulls = [hull for hull in hulls if hull not in pair]
-        candidates = [other for other in candidates if not other[2] & pair]
+        candidates = [entry for entry in candidates if not entry[2] & pair]
         candidates += [candidate(hull, common_hull) for hull in hulls]
         hulls.append(common_hull)
     return hulls

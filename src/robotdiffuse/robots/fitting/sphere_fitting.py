@@ -358,8 +358,8 @@ class Cells(NamedTuple):
             triangles = mesh.vertices[mesh.faces]
             triangles = split(triangles, size)
             hidden = np.zeros(len(triangles), dtype=bool)
-            for other in (*planes[:k], *planes[k + 1 :]):
-                hidden |= is_inside(triangles.reshape(-1, 3), other, BURIED_DEPTH).reshape(-1, 3).all(1)
+            for mesh_planes in (*planes[:k], *planes[k + 1 :]):
+                hidden |= is_inside(triangles.reshape(-1, 3), mesh_planes, BURIED_DEPTH).reshape(-1, 3).all(1)
             triangles = triangles[~hidden]
             if bounds.varies:
                 tolerances = bounds.tolerances(triangles.mean(1))
