@@ -83,9 +83,9 @@ class PlanResult:
     fraction: float | None = None
     """Problems with a Cartesian line: the fraction of the line that the arm can follow from the start, 1 if
     there is a motion. If it is below 1, `reason` says what stops the arm."""
-    corner_deviations: tuple[float, ...] | Any = field(default=None, repr=False)
+    corner_deviations: tuple[float, ...] = field(default=(), repr=False)
     """For each waypoint of the path, the largest distance at which the motion may pass it, rounding the
-    corner [rad, joint-space L2]; None: `TimingSettings.corner_deviation`. Result files omit this field."""
+    corner [rad, joint-space L2]. Empty without a path, and in results that were read from a file."""
     trees: tuple[Tree, ...] = field(default=(), repr=False)
     """Search trees from the start and from the goals, when the shortest path was found or time ran out. Empty
     unless the planner's setting `keep_trees` is true; result files omit them."""

@@ -145,8 +145,7 @@ def _corners(segments: Sequence[PlanResult]) -> tuple[Int[ndarray, "waypoints"],
     ends = np.cumsum([len(segment.path.positions) - 1 for segment in segments])
     deviations = np.full(ends[-1] + 1, TIMING.corner_deviation)
     for row, segment in zip((0, *ends), segments, strict=False):
-        if segment.corner_deviations is not None:
-            deviations[row : row + len(segment.corner_deviations)] = segment.corner_deviations
+        deviations[row : row + len(segment.corner_deviations)] = segment.corner_deviations
     deviations[ends[:-1]] = 0.0
     return ends[:-1], deviations
 
