@@ -61,7 +61,8 @@ def _bench_settings(arguments: Namespace) -> list[BenchSettings]:
 
 
 def _changes(arguments: Namespace, settings: Any) -> dict[str, Any]:
-    """The fields of settings that options set; one planner for two cores by default."""
+    """The settings that the command's options set. Unless an option says otherwise, one planner runs for
+    every two cores."""
     options = chosen(arguments, settings.__dataclass_fields__)
     return {"workers": HALF_OF_CORES} | options | {"out": Path(arguments.out)}
 

@@ -389,8 +389,8 @@ def table1(settings: Table1Settings, bench: Bench) -> Report:
 
 
 def scores(rows: Sequence[Row], indicators: dict[str, Indicators]) -> dict[str, float]:
-    """ComScores of the rows, normalized over the five rows of the paper. The score of any further row is
-    computed with this row in place of the paper's method."""
+    """ComScores of the rows. The five rows of the paper are normalized together. For the score of any
+    further row, this row takes the place of the paper's method among the five."""
     ours = next(row.name for row in rows if row.paper == PAPER_METHOD)
     other_rows = [row.name for row in rows if row.paper and row.paper != PAPER_METHOD]
     scores_with = {
@@ -456,12 +456,12 @@ def notes(settings: Table1Settings) -> list[str]:
         "refused the planner's last path because it collides. RRT*, MPNet, MPiNets, MPD and diffusion with "
         "default settings try again until time runs out. The rows of a single sample have one motion per "
         "problem, as in the paper. The paper's network was trained on 1.6 M samples.",
-        "Means are over the problems that a row solves, with 95 % intervals. So rows that solve only easy "
-        "problems have short motions. length of links 1 to 7: path lengths of the origins of the links that "
+        "Means are over the problems that a row solves, with 95 % intervals. A row that solves only easy "
+        "problems therefore has short motions. length of links 1 to 7: path lengths of the origins of the links that "
         "joints move, which the paper calls path length (its arm has no hand; it gives no unit). log jerk: "
         "logarithm of the dimensionless jerk; turning: sum of the angles between segments.",
-        "ComScore: normalized as in the paper, over the paper's five rows as measured here. The score of any "
-        "further row is computed with this row in place of the paper's method.",
+        "ComScore: normalized as in the paper, over the paper's five rows as measured here. For the score of "
+        "any further row, this row takes the place of the paper's method among the five.",
         "robotdiffuse minimizes the duration, its default. time: mean until the planner returns"
         f"{' (CPU time of its process)' * settings.cpu_time}; the machine may do other work.",
     ]
@@ -473,9 +473,9 @@ def notes(settings: Table1Settings) -> list[str]:
 STEPS = (1, 2, 5, 10, 50, 200)
 """Numbers of denoising steps in the plot of success."""
 SHOWN_STEPS = 20
+"""Number of denoising steps of the drawn motion."""
 SHOWN = (0, 10, 15, 18)
-"""SHOWN_STEPS: number of denoising steps of the drawn motion. SHOWN: indices of the denoising steps before
-which the motion is drawn."""
+"""Indices of denoising steps; the motion is drawn as it is before each of them."""
 COMPARED = ("diffusion", "mpinets")
 """Planners of figure 3b, as in the paper."""
 

@@ -321,7 +321,8 @@ def _errors(*codes: int) -> dict[int | str, dict[str, Any]]:
 
 
 def _body(model: type[BaseModel] | None, description: str) -> dict[str, Any]:
-    """`openapi_extra` of an endpoint that reads its body itself; None: one PlanBody a line."""
+    """The OpenAPI description of a request whose body the endpoint reads itself. `model` is the type of the
+    body; None: JSON lines, each a PlanBody."""
     schema = {"type": "string"} if model is None else {"$ref": REF_TEMPLATE.format(model=model.__name__)}
     content = {LINES if model is None else JSON: {"schema": schema}}
     return {"requestBody": {"required": True, "description": description, "content": content}}
@@ -422,7 +423,7 @@ def _add_lists(app: FastAPI, pool: WorkerPool, robots: dict[str, Robot]) -> None
         "/health",
         summary="Whether the server accepts requests",
         response_model=Health,
-        responses=errors | {503: {"model": Health, "description": "no worker is ready, or it is stopping"}},
+        responses=errors | {503: {"model": Health, "description": "no worker is ready, or the server is stopping"}},
     )
     async def health() -> Response:
         status = "stopping" if pool.stopping else "ok" if pool.ready else "starting"
@@ -476,8 +477,9 @@ def _cancellable(
 
 
 async def read_body(request: Request, pool: WorkerPool, kind: str) -> bytes:
-    """The body of a request. Raises RequestError if it is too large or not of Content-Type `kind`, or if too
-    much data of other requests is arriving. `Connection` ends requests that arrive slowly."""
+    """The body of a request. Raises RequestError if the body is too large or not of Content-Type `kind`, or
+    if the server is receiving too much data of other requests. `Connection` ends requests that arrive
+    slowly."""
     max_size = pool.settings.max_request_size
     content_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if content_type != kind:

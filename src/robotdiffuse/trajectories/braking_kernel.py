@@ -38,8 +38,8 @@ def _acceleration_bounds(first_derivative, second_derivative, grid, i, s, x, gre
 
 @kernel()
 def advance_then_brake(first_derivative, second_derivative, grid, greatest, s, speed, time, acceleration):
-    """Values of s and of ṡ there, in two arrays of one length, of a motion that is as fast as possible for
-    `time` [s] and then brakes to rest. Between two values, s̈ is constant.
+    """A motion that is as fast as possible for `time` [s] and then brakes to rest: an array of values of s,
+    and an array of ṡ at each of them. Between two values, s̈ is constant.
 
     first_derivative, second_derivative: q' and q'' at the grid points, of shape (n, dof). grid: n values of
     s. greatest: the greatest ṡ² at each grid point from which the end can be reached within the limits. s,

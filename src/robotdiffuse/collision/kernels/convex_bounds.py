@@ -2,8 +2,8 @@
 
 A plane that separates two convex bodies proves that they do not touch, no matter how the plane was found.
 The algorithm of Gilbert, Johnson and Keerthi (GJK, 1988) finds the best plane for the poses in the middle of
-the motion, starting from the plane of the previous motion. The bound needs only this plane: the bound is the
-smallest gap, along the plane's normal, between the vertices of one body and the other body during the motion.
+the motion, starting from the plane of the previous motion. The bound is the smallest gap along the plane's
+normal, during the motion, between the vertices of one body and the other body.
 Each vertex moves from its position in the middle by t v + r with t in [-1, 1], where v is the vertex's
 velocity and r a small remainder of second order (see `lane_clearance.py`). All computations are in float64.
 """
@@ -65,8 +65,8 @@ class Solids(NamedTuple):
     rounding: np.ndarray
     """[n] radius of the ball."""
     is_bound: np.ndarray
-    """[n] whether the solid is only the bounding box of a surface or a point cloud. Only Coal computes
-    exact distances to such obstacles."""
+    """[n] whether the solid is only the bounding box of a surface or a point cloud. Exact distances to such
+    obstacles are left to Coal."""
     may_touch: np.ndarray
     """[checks, n] whether the link of a check may touch the obstacle; shape [0, 0] without allowed
     contacts."""
@@ -120,8 +120,8 @@ def pose(offsets, parents, slides, q, dq, posture):
 
 @inner_kernel()
 def relative_twist(posture, frame, base):
-    """The angular velocity of a frame relative to frame `base`, and the velocity of its point at the base's
-    origin."""
+    """The motion of one frame relative to the frame `base`: its angular velocity, and the velocity of its
+    point that is at the origin. All vectors are in the robot's base frame."""
     twist = posture.twists[frame]
     base_twist = posture.twists[base]
     return minus(twist, base_twist), minus(twist[3:], base_twist[3:])

@@ -1,10 +1,11 @@
 """The compiled part of the motion certificate among moving obstacles; see `collision/moving_obstacles.py`.
 
 A task is an interval of a timed motion, with the pairs of a link and an obstacle that are undecided there.
-The clearance of a pair is computed in the middle of the interval, from the covering spheres, less the
-distances that points of the link and of the obstacle can move from the middle to either end. The pair is
-settled if the result is at least the required clearance; otherwise the interval is halved. If the spheres
-touch, the pair is left to the exact meshes.
+The clearance of a pair in the middle of the interval is computed from the covering spheres. The distances
+that points of the link and of the obstacle can move from the middle to either end are subtracted. The pair
+is settled if the result is at least the required clearance; otherwise the interval is halved. A pair is left
+to the exact meshes if its clearance in the middle is no larger than the required one, or if the interval has
+been halved MAX_HALVINGS times.
 """
 
 from typing import NamedTuple
@@ -53,8 +54,8 @@ class Tracks(NamedTuple):
     xyz: np.ndarray
     """[k, 3] origins of the obstacle's frame in the base frame at these times [m]."""
     wxyz: np.ndarray
-    """[k, 4] orientations at these times. The sign of each quaternion is chosen for a nonnegative dot product
-    with the one before."""
+    """[k, 4] orientations at these times, as quaternions. The dot product of each quaternion with the one
+    before is not negative."""
     speeds: np.ndarray
     """[k] bound on the speed of the obstacle's points until the next pose [m/s]; 0 at its last pose."""
     growth: np.ndarray

@@ -3,10 +3,10 @@ distances to points.
 
 A point is a sphere: its center and a radius. For the center of each voxel, the grid stores the index of the
 nearest point and the distance to that point's center. Both are exact within a band around the points. Beyond
-the band, the distance is a lower bound, and the index is that of a point near the nearest one or -1. At
-distance e from the center of its voxel, a query knows the distance to within e. If this is not precise
-enough, it computes the distances to the points in the cells around. `point_cloud_grid.py` builds the arrays,
-which are fields of SceneArrays.
+the band, the distance is a lower bound. The index there is that of a nearby point, which need not be the
+nearest one, or -1. A query at distance e from the center of its voxel knows its own distance to within e. If
+this is not precise enough, the query computes the distances to the points in the cells around.
+`point_cloud_grid.py` builds the arrays, which are fields of SceneArrays.
 
 Coordinates called f are in voxels from the grid's origin; c is f clamped to the grid. i is the
 voxel, e the offset from the voxel's center, and o = f - c the offset of a query outside the grid. Entries of
@@ -50,7 +50,7 @@ def make_grid(points, starts, run, low, voxel, shape, band, known):
     """For every voxel center the distance to the nearest point's center [m], and the index of that point.
 
     Both are exact below `band` [m]. Beyond the band, the distance is a lower bound, and the index is that of
-    a point near the nearest one, or -1 if no point is within `known` [m]. `low` is the grid's lower corner
+    a nearby point, or -1 if no point is within `known` [m]. `low` is the grid's lower corner
     [m], `voxel` the edge of a voxel [m]. run[nx * ny * nz] has the value b for the voxel that contains the
     points starts[b] to starts[b + 1], exclusive, and -1 for voxels without points.
     """
@@ -371,8 +371,8 @@ def _search(scene, at, limit):
 def points_distance(scene, at, limit):
     """Distance to the surface of the scene's nearest point, at most `limit` [m].
 
-    It is exact if the grid stores a point for the voxel of `at`: up to a clearance of about EXACT_RANGE
-    (`point_cloud_grid.py`) for the robot's largest sphere. Else it is a lower bound.
+    It is exact if the grid stores a point for the voxel of `at`; otherwise it is a lower bound. It is exact
+    for every sphere of the robot whose clearance is below about EXACT_RANGE (`point_cloud_grid.py`).
     """
     lower, p = _look_up(scene, at)
     if lower >= limit:

@@ -62,7 +62,7 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 
 STANDARDIZATION_SCENES = 2048
-"""Number of scenes over which the numbers of z are standardized."""
+"""Number of scenes over which the components of the embedding z are standardized."""
 REGULARIZATION = 1e-7
 """The paper's lambda: factor of the sum of the network's squared weights, which is added to the loss."""
 
@@ -145,9 +145,8 @@ def planning_success(
     candidates: int,
     rng: Generator,
 ) -> float:
-    """Share of free trajectories among `candidates` samples for each of the first `problems` non-trivial
-    problems; nan if the data hold no such problem.
-    """
+    """Share of collision-free motions among the network's samples: `candidates` samples for each of the first
+    `problems` problems of the data that are not trivial. It is nan if there is no such problem."""
     settings = SamplingSettings(samples=candidates, sampling_steps=min(SAMPLING_STEPS, model.schedule.steps))
     free = []
     for row in np.flatnonzero(~data.trivial)[:problems].tolist():

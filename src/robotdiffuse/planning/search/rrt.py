@@ -139,7 +139,7 @@ class AnytimeSearch:
     """The best path counts as optimal if it is longer than the straight line to the nearest goal by at most
     this fraction."""
     line_stage = "straight_line"
-    """The stage of a straight line."""
+    """The name of the stage (see `history`) for a straight line."""
 
     def __init__(
         self,
@@ -275,9 +275,9 @@ class AnytimeSearch:
         return still_improves(self._lengths, self.work, float(self.length), gain, patience)
 
     def offer(self, path: Configurations, stage: str) -> bool:
-        """Simplify a path from the start to a goal, which must be free in `space`, and make it the best path
-        if its cost is lower; returns whether it is. If the objective is time, it may also become a candidate
-        for the fastest motion."""
+        """Simplify a path from the start to a goal, and make it the best path if its cost is lower; returns
+        whether it is lower. The path must be free in `space`. If the objective is time, the path may also
+        become a candidate for the fastest motion."""
         path = self.simplified(path)
         if self.motions is not None and path_length(path) < NEAR_FACTOR * self.length:
             self.motions.offer(self.space, path, stage)
@@ -495,11 +495,12 @@ class _Validation:
         return False
 
     def run_last(self) -> None:
-        """Choose the final result: the fastest of the best candidates' motions and the motion along the
-        shortest path.
+        """Choose the final result. If the objective is time, it is the fastest of the best candidates' motions
+        and of the motion along the shortest path; otherwise, paths under constraints that were not validated
+        yet are tried.
 
-        Earlier results count only if time ran out. Which paths were validated earlier depends on the clock,
-        and the same seed must give the same result.
+        If the objective is time, earlier results count only if time ran out: which paths were validated
+        earlier depends on the clock, and the same seed must give the same result.
         """
         search = self.search
         motions = search.motions

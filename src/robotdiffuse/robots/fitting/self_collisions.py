@@ -78,14 +78,14 @@ def find_allowed_collisions(
     - default: the links collide in the default pose, with the joints between them at zero. If the limits
       include this pose, the manufacturer considers it safe, so the meshes are taken to be too coarse there.
       Both links must belong to the arm, since the limits do not account for a tool on the last link or for
-      another arm. A link after one locked joint also counts as part of the arm. The pair must then also
-      collide at the joint's locked value, which planning does not change.
+      another arm. A link behind one locked joint also counts as part of the arm if the pair also collides at
+      the joint's locked value, which planning does not change.
     - limits: the links collide in at least a fifth of the samples. The value of one joint between the links
       determines whether they collide, and they collide at a stop of this joint: joints often have their stops
       where the links on both sides meet.
     - pose: the links overlap slightly in a named pose of the SRDF, such as a tucked one.
 
-    Coal tests the meshes unless the covering spheres show that they are apart. For pairs without collisions
+    Coal tests the convex parts unless the covering spheres show that they are apart. For pairs without collisions
     in the samples, random descents from the closest samples search for a collision; if they find one, the
     pair is checked.
     """
@@ -318,8 +318,8 @@ def _sticking_out(
     pair: tuple[str, str],
     rows: Int[ndarray, "n"],
 ) -> dict[str, Points]:
-    """Places where parts of two links overlap in the configurations `rows`, by link and in the link's frame
-    [m]. A place is listed only for the link with the true meshes that are further away from the place."""
+    """Places where convex parts of two links overlap in the configurations `rows`, by link and in the link's
+    frame [m]. Each place is listed for one of the links: the one whose true surface is farther from it."""
     places_by_link: dict[str, list[ndarray]] = {link: [] for link in pair}
     request = coal.DistanceRequest()
     point = coal.Sphere(1e-6)
