@@ -423,7 +423,8 @@ def _add_lists(app: FastAPI, pool: WorkerPool, robots: dict[str, Robot]) -> None
         "/health",
         summary="Whether the server accepts requests",
         response_model=Health,
-        responses=errors | {503: {"model": Health, "description": "no worker is ready, or the server is stopping"}},
+        responses=errors
+        | {503: {"model": Health, "description": "no worker is ready, or the server is stopping"}},
     )
     async def health() -> Response:
         status = "stopping" if pool.stopping else "ok" if pool.ready else "starting"
