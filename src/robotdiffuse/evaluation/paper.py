@@ -457,9 +457,9 @@ def notes(settings: Table1Settings) -> list[str]:
         "default settings try again until time runs out. The rows of a single sample have one motion per "
         "problem, as in the paper. The paper's network was trained on 1.6 M samples.",
         "Means are over the problems that a row solves, with 95 % intervals. A row that solves only easy "
-        "problems therefore has short motions. length of links 1 to 7: path lengths of the origins of the links that "
-        "joints move, which the paper calls path length (its arm has no hand; it gives no unit). log jerk: "
-        "logarithm of the dimensionless jerk; turning: sum of the angles between segments.",
+        "problems therefore has short motions. length of links 1 to 7: path lengths of the origins of the "
+        "links that joints move, which the paper calls path length (its arm has no hand; it gives no unit). "
+        "log jerk: logarithm of the dimensionless jerk; turning: sum of the angles between segments.",
         "ComScore: normalized as in the paper, over the paper's five rows as measured here. For the score of "
         "any further row, this row takes the place of the paper's method among the five.",
         "robotdiffuse minimizes the duration, its default. time: mean until the planner returns"

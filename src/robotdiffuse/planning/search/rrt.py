@@ -495,9 +495,9 @@ class _Validation:
         return False
 
     def run_last(self) -> None:
-        """Choose the final result. If the objective is time, it is the fastest of the best candidates' motions
-        and of the motion along the shortest path; otherwise, paths under constraints that were not validated
-        yet are tried.
+        """Choose the final result. If the objective is time, it is the fastest of the best candidates'
+        motions and of the motion along the shortest path; otherwise, paths under constraints that were not
+        validated yet are tried.
 
         If the objective is time, earlier results count only if time ran out: which paths were validated
         earlier depends on the clock, and the same seed must give the same result.

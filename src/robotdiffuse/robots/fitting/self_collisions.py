@@ -85,9 +85,9 @@ def find_allowed_collisions(
       where the links on both sides meet.
     - pose: the links overlap slightly in a named pose of the SRDF, such as a tucked one.
 
-    Coal tests the convex parts unless the covering spheres show that they are apart. For pairs without collisions
-    in the samples, random descents from the closest samples search for a collision; if they find one, the
-    pair is checked.
+    Coal tests the convex parts unless the covering spheres show that they are apart. For pairs without
+    collisions in the samples, random descents from the closest samples search for a collision; if they find
+    one, the pair is checked.
     """
     links = Links(robot)
     default = np.clip(np.zeros((1, len(links.joints))), links.lower, links.upper)
