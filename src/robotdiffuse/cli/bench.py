@@ -47,7 +47,7 @@ def _say(text: str) -> None:
 def _bench_settings(arguments: Namespace) -> list[BenchSettings]:
     """The settings of each run of the bench: those of the preset, or a single one from the options."""
     if arguments.cluster is not None and arguments.workers is not None:
-        raise InputError("--workers sets the processes on this machine; --cluster always uses all its cores")
+        raise InputError("--workers cannot be combined with --cluster, which uses all cores of the cluster")
     changes = _changes(arguments, BenchSettings)
     if arguments.preset is not None:
         fixed = ("planners", "time_limit", "seeds", "equal_time")
@@ -61,8 +61,8 @@ def _bench_settings(arguments: Namespace) -> list[BenchSettings]:
 
 
 def _changes(arguments: Namespace, settings: Any) -> dict[str, Any]:
-    """The settings that the command's options set. Unless an option says otherwise, one planner runs for
-    every two cores."""
+    """The settings that the command's options set. By default, there is one worker process for every two
+    cores."""
     options = chosen(arguments, settings.__dataclass_fields__)
     return {"workers": HALF_OF_CORES} | options | {"out": Path(arguments.out)}
 

@@ -219,8 +219,8 @@ def _image_topics(kinds: Mapping[str, str], requested: Sequence[str] | None) -> 
 
 
 def _folder(topic: str) -> str:
-    """The part of a topic's name that images and CameraInfo of one camera have in common. Recordings of
-    librealsense end it with a folder of their own: image or info."""
+    """The part of a topic's name that images and CameraInfo of one camera have in common. librealsense puts
+    each of the two into one more folder, `image` or `info`, which is left out."""
     folder, _, last = topic.rpartition("/")[0].rpartition("/")
     return folder if last in ("image", "info") else f"{folder}/{last}"
 

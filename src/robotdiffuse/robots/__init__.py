@@ -28,21 +28,22 @@ ROBOTS = tuple(sorted(file.parent.name for file in DATA.glob(f"*/{ROBOT_FILE}"))
 
 
 def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robot:
-    """Load a robot by its bundled name, a name given to `robotdiffuse robot add`, its folder, or its URDF.
+    """Load a robot by its bundled name, a name given to `robotdiffuse robot add`, its folder, or its URDF or
+    MuJoCo model.
 
-    A URDF is looked up by content among the added robots. If none was made from it, the robot is prepared,
-    which takes about a minute, and stored. If several robots that differ were made from it, an InputError
-    asks for a name. Calls return the same object as long as the robot's files are unchanged.
+    A URDF or MuJoCo model is looked up by content among the added robots. If none was made from it, the robot
+    is prepared, which takes about a minute, and stored. If several robots that differ were made from it, an
+    InputError asks for a name. Calls return the same object as long as the robot's files are unchanged.
 
     Args:
-        name: Name, robot folder, or URDF. Only `robot add` reads xacro files, since compiling a file runs the
-            code in it.
+        name: Name, robot folder, URDF, or MuJoCo model (.xml). Only `robot add` reads xacro files, since
+            compiling a file runs the code in it.
         locked: Values at which joints are locked [rad] or [m] (see `Robot.with_locked`).
 
     Raises:
         InputError: For an unknown name or bad input.
     """
-    check_type("robot", name, (str, PathLike), "its name, or the path of its folder or URDF")
+    check_type("robot", name, (str, PathLike), "its name, or the path of its folder, URDF or MuJoCo model")
     text = str(name)
     if locked is not None:
         check_type("locked", locked, dict, "a mapping of joints to values")
@@ -107,7 +108,8 @@ def _added() -> dict[str, Path]:
 
 
 def _from_urdf(urdf: Path) -> Robot:
-    """The added robot with the content of a URDF; if there is none, the URDF is prepared and added."""
+    """The added robot with the content of a URDF or MuJoCo model; if there is none, the file is prepared and
+    added."""
     from robotdiffuse.robots.fitting.preparation import add_robot
     from robotdiffuse.robots.parsing.urdf import UrdfTree
 

@@ -2,8 +2,8 @@
 to rest. It begins at the arm's current place on the path, with its current speed.
 
 The path is q(s), with the derivatives q' and q'' by s; s̈ is constant in each interval of a grid over s.
-Limits are applied at both ends of an interval, even if the motion covers only a part of it. So an s̈ that is
-allowed at the beginning of an interval is allowed in all of it.
+The limits of s̈ are evaluated at both ends of an interval, even if the motion covers only a part of it. So an
+s̈ that is within the limits when the motion enters the interval is within them until the motion leaves it.
 """
 
 import numpy as np
@@ -64,7 +64,8 @@ def advance_then_brake(first_derivative, second_derivative, grid, greatest, s, s
         next_speed_squared = max(x + 2 * path_acceleration * width, 0.0)
         speed_sum = np.sqrt(x) + np.sqrt(next_speed_squared)
         duration = 2 * width / speed_sum if speed_sum > 0 else np.inf
-        # The interval is left early when the time for acceleration runs out or when the motion comes to rest.
+        # The step ends inside the interval when the time for acceleration runs out (the next step brakes from
+        # there) or when the motion comes to rest.
         if 0 < time_left < duration:
             travel = (np.sqrt(x) + 0.5 * path_acceleration * time_left) * time_left
             s = min(s + travel, grid[i + 1] - MIN_INTERVAL)

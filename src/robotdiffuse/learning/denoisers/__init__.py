@@ -93,7 +93,7 @@ class EncoderDecoderSettings(AttentionSettings, name="encoder_decoder"):
 
 @dataclass(frozen=True)
 class DecoderOnlySettings(AttentionSettings, name="decoder_only"):
-    """Waypoints of one patch attend to each other."""
+    """Waypoints attend to z_tk, to all waypoints of their own patch, and to those of earlier patches."""
 
     causal = True
 

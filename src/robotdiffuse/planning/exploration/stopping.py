@@ -134,7 +134,8 @@ def _rows(motion: Trajectory, time: float, delay: float, braking: float, ramp: f
 
 @lru_cache
 def _braking(ramp: float) -> tuple[BSpline, BSpline, BSpline]:
-    """The negative deceleration over the share of the braking time, its integral and its second integral."""
+    """The acceleration of the motion's time (negative) as a function of the fraction of the braking time that
+    has passed, its integral and its second integral."""
     peak = 1 / (1 - ramp)
     slowing = BSpline([0, 0, ramp, 1 - ramp, 1, 1], np.array([0, -peak, -peak, 0]), 1)
     loss = slowing.antiderivative()

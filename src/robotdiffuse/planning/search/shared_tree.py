@@ -19,8 +19,8 @@ The parts of the paper's section on data sets, their implementation here, and ho
 
 In addition to the paper's method, two steps lower the cost within milliseconds, so that the hyperspheroids
 shrink early. In each round, RRT-Connect searches for one path, which is shortened and added to the tree if it
-is the shortest to its goal; and the best path is shortened. Both steps only add branches, so the tree remains
-a tree of RRT*.
+is the shortest to its goal; and the best path is shortened. Both steps add the shorter path as a new branch
+and attach the goal's node to it. All other nodes stay as they are, so the tree remains a tree of RRT*.
 """
 
 from collections.abc import Callable
@@ -62,8 +62,8 @@ NEIGHBORS = 64
 REMAINING_EXCESS = np.float32(0.5)
 """Expected final excess of a goal's cost over the straight line, as a fraction of the current excess."""
 MIN_PROMISE = np.float32(0.03)
-"""Smallest weight in `draw_goal` of a goal that may still have the shortest path, so that every such goal is
-drawn at times."""
+"""Is added to the promise of each goal in `draw_goal` when a path is known, so that every goal that may still
+have the shortest path is drawn at times."""
 TIGHTENINGS = 200
 """Number of attempts to shorten a path."""
 
@@ -78,7 +78,7 @@ class Goals(NamedTuple):
     bound: np.ndarray
     """[k] straight distance from the start, a lower bound of the path length [rad]."""
     failures: np.ndarray
-    """[k] number of failed searches of RRT-Connect for each goal alone."""
+    """[k] number of failed searches of RRT-Connect in which this goal was the only target."""
 
 
 def make_goals(start: Configuration, goals: Configurations) -> Goals:
@@ -115,7 +115,8 @@ def draw_goal(trees, goals, state):
 
     The promise of a goal is the expected reduction of the best cost: how far the goal's path would be below
     the best cost if only REMAINING_EXCESS of its excess over the straight line remained. While no goal is
-    reached, nearer goals have more promise. Failed searches for a goal alone lower its promise.
+    reached, nearer goals have more promise. Failed searches in which a goal was the only target lower its
+    promise.
     """
     best = _best_cost(trees, goals)
     total = _ZERO
@@ -210,8 +211,8 @@ def add_node(space, trees, goals, q, scratch, index, gaps):
 
 @allocation_free()
 def _reach(trees, goals, g, node, cost):
-    """Make a node the parent of the goal's node, with `cost` as the goal's cost; add this node if the goal is
-    not reached yet."""
+    """Make a node the parent of the goal's node, with `cost` as the goal's cost. If the goal is not reached
+    yet, its node is added to the tree."""
     if goals.node[g] < 0:
         goals.node[g] = add(trees, 0, goals.at[g], cost, node)
     else:
@@ -296,8 +297,8 @@ class SharedTreeSettings(Settings, name="shared_tree_rrt_star"):
     rounds: Count = 100_000
     """Largest number of rounds."""
     improvement: NotNegative = 0.005
-    """The search ends when the best cost fell by less than this fraction in the last `patience` rounds; 0:
-    this rule is off."""
+    """The search ends when the best cost fell by less than this fraction in the last `patience` rounds. 0:
+    only `rounds` and the caller end a search, even if there is no path."""
     patience: Count = 20
     """Number of rounds for `improvement`."""
 
@@ -347,7 +348,7 @@ class SharedTreeSearch:
 
     def path(self) -> Configurations | None:
         """Waypoints of the best path; None if there is none."""
-        # without a path, no goal has a node
+        # without a path, `best_goal` is -1, the last goal; it has no node, and its branch is empty
         path = rrt_kernel.branch(self.tree, 0, self.targets.node[self.best_goal])
         return path if len(path) else None
 
@@ -364,9 +365,13 @@ class SharedTreeSearch:
                 before = costs[-1 - settings.patience]
                 if before < np.inf and before - costs[-1] < settings.improvement * before:
                     return True
-        elif self._step == len(self._distances) - 1 and self._rounds_at_step >= 3 * settings.step_rounds:
+        elif (
+            settings.improvement > 0
+            and self._step == len(self._distances) - 1
+            and self._rounds_at_step >= 3 * settings.step_rounds
+        ):
             # no path at any distance: give up after three times the usual number of rounds
-            return settings.improvement > 0
+            return True
         return len(costs) >= settings.rounds
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> None:
