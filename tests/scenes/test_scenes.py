@@ -312,7 +312,7 @@ PACKED = PCD.format(n=10**9, data="binary_compressed").encode() + struct.pack("<
         ("cloud.csv", b"1,2\n3,4\n", "an array of 2 x 2; it must be n x 3"),
         ("cloud.xyz", b"1 2 3\n4 five 6\n", "cannot be read"),
         ("cloud.pcd", PCD.format(n=1, data="zipped").encode(), "stored as 'zipped'"),
-        ("cloud.pcd", PACKED, "unpacks to 40 bytes, not to 1,000,000,000 points"),
+        ("cloud.pcd", PACKED, "unpacks to 40 bytes; its 1,000,000,000 points take"),
         ("cloud.pcd", PCD.replace("x y z", "i j k").format(n=1, data="ascii").encode(), "must have x, y and z"),
     ],
 )

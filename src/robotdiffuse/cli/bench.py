@@ -160,13 +160,17 @@ def run_figures(arguments: Namespace) -> int:
     for number, state in enumerate(paper.denoising(problem)):
         file = f"figure1_{number}.png"
         size = PictureSettings(width=960, height=600, ghosts=8, azimuth=FIGURE_AZIMUTH)
-        title = f"{state.level:.2f} T"
+        title = f"{state.level:.2f} of the largest noise level"
         write_picture(problem.robot, problem.scene, state.path, out / file, title=title, settings=size)
-        report.picture(file, f"A motion at noise level {title}")
+        report.picture(file, f"A motion at {title}")
     by_steps = paper.plot_success_by_steps(paper.success_by_steps(out, count))
-    report.plot("figure1_steps.svg", f"Success against T, {count} problems, 95 % intervals", by_steps)
+    report.plot(
+        "figure1_steps.svg",
+        f"Success against T, the number of denoising steps; {count} problems, 95 % intervals",
+        by_steps,
+    )
     report.add("## Figure 3")
-    caption = "a: success over time, goals are poses, problems that are not trivial"
+    caption = "a: success over time; goals are poses; problems that the straight line does not solve"
     report.plot("figure3a.svg", caption, paper.plot_success_over_time(bench))
     compared = paper.compared_motions(bench)
     if compared is not None:

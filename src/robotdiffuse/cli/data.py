@@ -25,9 +25,7 @@ from robotdiffuse.visualization.replay_page import GalleryEntry, write_gallery
 
 def run_generate(arguments: Namespace) -> None:
     if arguments.cluster is not None and arguments.workers is not None:
-        raise InputError(
-            "--workers cannot be combined with --cluster, which uses all cores of the cluster"
-        )
+        raise InputError("--workers cannot be combined with --cluster, which uses all cores of the cluster")
     options = chosen(arguments, GenerationSettings.__dataclass_fields__)
     if arguments.planner is not None and arguments.planner != GenerationSettings.planner:
         options["search"] = SEARCHES.defaults(arguments.planner)

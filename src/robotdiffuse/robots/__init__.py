@@ -131,5 +131,5 @@ def _from_urdf(urdf: Path) -> Robot:
     if robots:
         return next(iter(robots.values()))
     report = add_robot(urdf, out=user_robots() / f"{tree.name}-{digest[:8]}")
-    note = f"spheres were fitted to {urdf.name} ({report.sphere_count}) and stored in {report.folder}"
+    note = f"{report.sphere_count} spheres were fitted to {urdf.name} and stored in {report.folder}"
     return replace(report.robot, notes=(*report.robot.notes, note), source=source)

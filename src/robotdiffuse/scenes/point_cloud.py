@@ -152,9 +152,10 @@ def crop(points: Points, center: Vector, reach: float) -> Points:
 def read_points(file: str | Path) -> tuple[Points, tuple[str, ...]]:
     """The points of a .ply, .pcd, .xyz, .csv, .npy, .npz or .bt file [m], and notes on removed points.
 
-    Points that are not finite (missing returns of a depth camera) are removed, with a note. Columns after the
-    third are ignored. A file without points gives an empty array and a note. Raises InputError if the file is
-    missing, has no bytes, or is not a point cloud.
+    Points that are not finite (missing returns of a depth camera) are removed, with a note. Columns are found
+    by the names x, y and z if the file names them; otherwise, the first three are read. A file without points
+    gives an empty array and a note. Raises InputError if the file is missing, has no bytes, or is not a point
+    cloud.
     """
     file = Path(file)
     reader = READERS.get(file.suffix.lower())
@@ -248,7 +249,8 @@ def _read_pcd(file: Path) -> ndarray:
     else:  # all values of one field, then all of the next
         packed, size = struct.unpack_from("<II", content, at)
         if size != total * record.itemsize:
-            raise InputError(f"point cloud file {file} unpacks to {size:,} bytes, not to {total:,} points")
+            needed = f"{total:,} points take {total * record.itemsize:,}"
+            raise InputError(f"point cloud file {file} unpacks to {size:,} bytes; its {needed}")
         unpacked = lzf_unpacked(content[at + 8 : at + 8 + packed], size)
         columns = []
         for i in places:

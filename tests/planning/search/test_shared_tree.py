@@ -238,8 +238,8 @@ def test_no_way_ends_at_the_time_limit_or_when_it_was_searched_for_at_every_dist
 
 
 def test_the_number_of_rounds_ends_a_search_without_a_path_and_without_patience():
-    settings = replace(ENDLESS, growth=1, connect_iterations=1, step_rounds=1, rounds=40)
+    settings = replace(TOUCHING, growth=1, connect_iterations=1, step_rounds=1, rounds=5)
     search = SharedTreeSearch(CollisionChecker(PANDA, WALL), LEFT, RIGHT[None], settings, random_state(0))
     search.run()
     assert search.best_goal == -1
-    assert len(search.costs) == 40
+    assert len(search.costs) == 5

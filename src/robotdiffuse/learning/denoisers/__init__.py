@@ -2,10 +2,10 @@
 
 Nothing here loads PyTorch, so that planning can read the settings. The networks are in `denoisers.networks`.
 
-The table gives the millions of parameters for a Panda, of the default settings (48 waypoints) and of
-`PAPER_SIZES` (254 waypoints). The last two columns are the time of a forward pass with the default settings,
-relative to the transformer, which takes 5.8 ms in bf16 and 10.7 ms in fp32 (batch of 16, one thread, torch
-2.13, CPU with AVX-512 BF16). Other processes were running, so times are accurate to about 20 %.
+The second and third column of the table are the millions of parameters for a Panda, with the default settings
+(48 waypoints) and with `PAPER_SIZES` (254 waypoints). The last two columns are the time of a forward pass with
+the default settings, relative to the transformer, which takes 5.8 ms in bf16 and 10.7 ms in fp32 (batch of
+16, one thread, torch 2.13, CPU with AVX-512 BF16). Other processes were running, so times are accurate to about 20 %.
 
 | denoiser        | default | paper's size | bf16 | fp32 |
 |-----------------|---------|--------------|------|------|
@@ -40,8 +40,8 @@ class AttentionSettings(DenoiserSettings):
     causal: ClassVar[bool] = False
     """Whether waypoints attend only to z_tk and the waypoints before them."""
     points: ClassVar[bool] = False
-    """Whether waypoints also attend to points of the scene, which replace the embedding z (encoder
-    `points`)."""
+    """Whether waypoints also attend to points of the scene (encoder `points`). The points replace z, the
+    vector in which other encoders describe the scene."""
     width: Count = 160
     """Size of a token; even (paper: 512)."""
     layers: Count = 6
@@ -73,7 +73,7 @@ class AttentionSettings(DenoiserSettings):
 @dataclass(frozen=True)
 class TransformerSettings(AttentionSettings, name="transformer"):
     add_z_tk: bool = True
-    """Whether z_tk is also added to every other token, so that the first layer need not distribute it. If
+    """Whether z_tk is also added to all other tokens, so that the first layer need not distribute it. If
     not, z_tk is only a token, as in the paper."""
 
 
@@ -147,7 +147,7 @@ DENOISERS = Registry(
         ),
         "cross_attention": Entry(
             f"{_NETWORKS}:TrajectoryTransformer",
-            "transformer whose waypoints attend to points of the scene; needs the encoder points",
+            "transformer whose waypoints attend to points of the scene; needs the encoder named points",
             f"{__name__}:CrossAttentionSettings",
         ),
         "unet": Entry(f"{_NETWORKS}:UNet", "temporal U-Net", f"{__name__}:UNetSettings"),
