@@ -25,10 +25,10 @@ def test_bad_input_is_one_line(said: Said, monkeypatch: pytest.MonkeyPatch) -> N
     assert "time_limit is 61" in wrong("--time-limit", "61")
     assert "unknown robot 'r2d2'; known: " in wrong("--robot", "r2d2", "--port", "0")
     assert "nowhere.yaml" in wrong("nowhere.yaml", "--port", "0")
-    assert "--host is 'no such host'" in wrong("--host", "no such host")
+    assert "cannot listen on no such host" in wrong("--host", "no such host")
     with socket.create_server(("127.0.0.1", 0)) as taken:
         number = taken.getsockname()[1]
-        assert f"port {number} of 127.0.0.1 cannot be used" in wrong("--port", str(number))
+        assert f"cannot listen on 127.0.0.1, port {number}" in wrong("--port", str(number))
     loaded = ("robotdiffuse.cli.live", "robotdiffuse.visualization.live", "viser")
     for module in [name for name in sys.modules if name.startswith(loaded)]:
         monkeypatch.delitem(sys.modules, module)

@@ -7,9 +7,7 @@ import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields
-from ipaddress import ip_address
 from typing import Annotated, Any, Literal, get_type_hints
-from urllib.parse import urlsplit
 
 from fastapi import FastAPI, Header, Request, Response
 from fastapi.openapi.constants import REF_TEMPLATE
@@ -23,6 +21,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import shown
+from robotdiffuse.core.network import is_loopback, named_host
 from robotdiffuse.core.types import SampleRate, Status
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, described_arguments
 from robotdiffuse.planning.context import PlanRequest
@@ -258,7 +257,7 @@ class Access:
 
     def _refusal(self, request: Request) -> Response | None:
         host = request.headers.get("host", "")
-        if self.settings.on_loopback and not _is_local(host):
+        if is_loopback(self.settings.host) and not is_loopback(named_host(host)):
             return _error(421, f"the host is {shown(host)}; this server is known as localhost")
         authorization = request.headers.get("authorization", "")
         token = self.settings.token
@@ -266,15 +265,6 @@ class Access:
             text = "the header Authorization must be: Bearer TOKEN"
             return _error(401, text, {"WWW-Authenticate": "Bearer"})
         return None
-
-
-def _is_local(host: str) -> bool:
-    """Whether a Host header, with or without a port, names this machine."""
-    try:
-        name = urlsplit(f"//{host}").hostname or ""
-        return name == "localhost" or ip_address(name).is_loopback
-    except ValueError:
-        return False
 
 
 def make_app(pool: WorkerPool, robots: dict[str, Robot]) -> FastAPI:

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 import uvicorn
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.network import listening
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.server.app import make_app
 from robotdiffuse.server.connection import LOG, Connection
@@ -18,8 +18,6 @@ from robotdiffuse.server.worker_pool import WorkerPool
 
 KEEP_ALIVE_TIMEOUT = 5
 """Time that an idle connection stays open [s]."""
-BACKLOG = 128
-"""Number of connections that may wait to be accepted."""
 SIGNALS = signal.SIGINT, signal.SIGTERM
 
 
@@ -58,16 +56,7 @@ def serve(robots: dict[str, Robot], settings: ServeSettings, say: Callable[[str]
     handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
     LOG.addHandler(handler)
     LOG.setLevel(logging.INFO)
-    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
-    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
-    with listener:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            listener.bind((settings.host, settings.port))
-            listener.listen(BACKLOG)
-        except (OSError, OverflowError) as error:
-            why = getattr(error, "strerror", None) or str(error)
-            raise InputError(f"cannot listen on {settings.host}, port {settings.port}: {why}") from None
+    with listening(settings.host, settings.port) as listener:
         asyncio.run(_serve(robots, settings, listener, say))
 
 

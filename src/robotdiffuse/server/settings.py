@@ -2,7 +2,6 @@
 
 import os
 from dataclasses import dataclass
-from ipaddress import ip_address
 from typing import Annotated
 
 from robotdiffuse.core.settings import Bound, Count, Natural, Positive, Settings
@@ -35,11 +34,3 @@ class ServeSettings(Settings):
     than half of it after an answer is replaced before its next request."""
     token: str = ""
     """Bearer token that requests must carry; "" for none."""
-
-    @property
-    def on_loopback(self) -> bool:
-        """Whether only programs on this machine can connect."""
-        try:
-            return ip_address(self.host).is_loopback
-        except ValueError:
-            return self.host == "localhost"

@@ -11,8 +11,9 @@ pytest.importorskip("viser", reason="live needs viser: pip install 'robotdiffuse
 import viser
 
 from helpers.refusals import refuses
+from robotdiffuse.core.network import is_loopback
 from robotdiffuse.visualization.live import server as module
-from robotdiffuse.visualization.live.server import free_port, is_loopback, may_connect
+from robotdiffuse.visualization.live.server import free_port, may_connect
 
 
 def test_viser_is_silent_and_other_threads_print(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -64,7 +65,7 @@ def test_elsewhere_the_path_is_the_token() -> None:
 def test_loopback_ports_that_are_taken_and_hosts_that_are_none() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         number = taken.getsockname()[1]
-        refuses(f"port {number} of 127.0.0.1 cannot be used: .*--port", free_port, "127.0.0.1", number)
-    refuses("--host is 'no such host'", free_port, "no such host", 0)
+        refuses(f"cannot listen on 127.0.0.1, port {number}: .*--port", free_port, "127.0.0.1", number)
+    refuses("cannot listen on no such host", free_port, "no such host", 0)
     assert all(is_loopback(host) for host in ("127.0.0.1", "::1", "localhost"))
     assert not any(is_loopback(host) for host in ("0.0.0.0", "", "localhost.example"))

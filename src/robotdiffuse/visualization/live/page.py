@@ -234,7 +234,7 @@ class Page(LivePage):
 
     def set_playing(self, playing: bool) -> None:
         """Play the motion, or stop playing."""
-        self.player.set_playing(playing)
+        self.player.playing = playing
         self._panel.show_playing(playing)
 
 

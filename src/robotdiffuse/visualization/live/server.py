@@ -7,17 +7,15 @@ must name this machine, which prevents DNS rebinding. Pages of other origins are
 """
 
 import hmac
-import ipaddress
 import secrets
 import socket
-from urllib.parse import urlsplit
 
 import numpy as np
 import rich
 import viser
 from viser import infra
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.network import is_loopback, listening, named_host, url_part
 from robotdiffuse.core.types import Configurations
 from robotdiffuse.drawables import drawables
 from robotdiffuse.problems.problem import Problem
@@ -39,49 +37,19 @@ POLICY_VIOLATION = 1008
 """WebSocket close code for refused clients."""
 
 
-def is_loopback(host: str) -> bool:
-    """Whether a host name or address is a loopback address, which only this machine can reach."""
-    try:
-        return host == "localhost" or ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return False
-
-
 def free_port(host: str, port: int) -> int:
     """The port, or a free port for 0. Raises InputError if the server cannot listen on it."""
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )[0]
-    except (OSError, UnicodeError):
-        raise InputError(f"--host is {host!r}; it must be an address of this machine") from None
-    with socket.socket(family, kind, protocol) as listening:
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            listening.bind(address)
-        except OSError as error:
-            why = error.strerror or str(error)
-            raise InputError(
-                f"port {port} of {host} cannot be used: {why}; choose another with --port, or 0 for any"
-            ) from None
-        return listening.getsockname()[1]
+    with listening(host, port) as listener:
+        return listener.getsockname()[1]
 
 
 def may_connect(path: str, host: str, origin: str | None, token: str) -> bool:
     """Whether a browser may connect, by the path and the headers Host and Origin of its request."""
-    if origin is not None and _part(origin, "netloc") != host:
+    if origin is not None and url_part(origin, "netloc") != host:
         return False
     if token:
         return hmac.compare_digest(path.partition("?")[0].strip("/").encode(), token.encode())
-    return is_loopback(_part(f"//{host}", "hostname"))
-
-
-def _part(url: str, name: str) -> str:
-    """A part of a URL, such as "netloc"; an empty string for an invalid URL."""
-    try:
-        return getattr(urlsplit(url), name) or ""
-    except ValueError:
-        return ""
+    return is_loopback(named_host(host))
 
 
 class PageServer(viser.ViserServer):

@@ -16,14 +16,14 @@ from typing import Annotated, Any, Generic, TypeVar
 
 import numpy as np
 
+from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.collision_cost import CLEARANCE_CAP
-from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
+from robotdiffuse.core.errors import InputError, shortened, unknown_name
 from robotdiffuse.core.input_files import parse_json, parse_yaml
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, OneOf, Settings
 from robotdiffuse.core.transforms import inverse, transform
 from robotdiffuse.core.types import Configuration, Pose, Vector
-from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.drawables import own_frame
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, load_planner
 from robotdiffuse.planning.planner import Planner
@@ -38,7 +38,7 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
 from robotdiffuse.validation.report import Report
-from robotdiffuse.validation.validator import verify, verify_trajectory
+from robotdiffuse.validation.validator import verify_trajectory
 
 NEW_OBSTACLES: dict[str, Callable[[Vector, float], Shape]] = {
     "sphere": lambda center, size: Sphere(center, size),
@@ -67,11 +67,8 @@ DEMO_FILE = "shelf.yaml"
 FAMILY = "shelf"
 MAX_UPLOAD_SIZE = 5_000_000
 """Largest size of an uploaded problem file [bytes]."""
-FILE_FIELDS = ("file", "request", "views")
-"""Fields of a problem that refer to files, which uploads may not contain."""
 MAX_SAMPLES = 1000
 """Largest number of random configurations that are tried for a free start and goal."""
-NO_FILES = "the page reads no other files; open this problem with `robotdiffuse live PROBLEM`"
 # kinds of badges: valid motion, invalid motion, no motion, not validated yet
 VALID = "valid"
 INVALID = "invalid"
@@ -496,13 +493,10 @@ def problem_for(robot: Robot) -> Problem:
     except InputError:
         pass
     lower, upper = (np.clip(limit, -np.pi, np.pi) for limit in (robot.lower, robot.upper))
-    free: list[np.ndarray] = []
-    for q in rng.uniform(lower, upper, (MAX_SAMPLES, robot.dof)):
-        alone = Problem(robot, Scene(), q, JointGoal(q))
-        if verify(alone, JointPath(robot.joint_names, q[None])).valid:
-            free.append(q)
-        if len(free) == 2:
-            return Problem(robot, Scene(), free[0], JointGoal(free[1]))
+    q = rng.uniform(lower, upper, (MAX_SAMPLES, robot.dof))
+    q = q[CollisionChecker(robot, Scene()).free(q)]
+    if len(q) > 1:
+        return Problem(robot, Scene(), q[0], JointGoal(q[1]))
     raise InputError(f"of {MAX_SAMPLES} random configurations of {robot.name} fewer than 2 are free")
 
 
@@ -519,33 +513,17 @@ def uploaded_problem(content: bytes, name: str, robot: Robot) -> Problem:
     except UnicodeDecodeError:
         raise InputError(f"{name} is not UTF-8 text") from None
     data = parse_json(text, name) if name.lower().endswith(".json") else parse_yaml(text, name)
+    named_robot = data.get("robot") if isinstance(data, dict) else None
+    robots: dict[Any, Robot] = {}
     try:
-        _check_contained(data, robot)
-        return problem_from_record(data)
+        if named_robot is not None:
+            known = known_robots()
+            if named_robot not in (*known, robot.source):
+                raise unknown_name("robot", named_robot, known)
+            robots[named_robot] = load_robot(str(named_robot))
+        return problem_from_record(data, robots)
     except InputError as error:
         raise InputError(f"{name}: {str(error).removeprefix('problem: ')}") from None
-
-
-def _check_contained(data: object, robot: Robot) -> None:
-    """Raises InputError if the data of a problem file refers to other files or unknown robots."""
-    if not isinstance(data, dict):
-        return  # the problem reader rejects it
-    robot_name = data.get("robot")
-    robot_names = known_robots()
-    if isinstance(robot_name, str) and robot_name not in robot_names and robot_name != robot.source:
-        raise unknown_name("robot", robot_name, robot_names)
-    if isinstance(data.get("scene"), str):
-        raise InputError(f"scene is {shown(data['scene'])}; {NO_FILES}")
-    parts: list[object] = [data]
-    while parts:
-        part = parts.pop()
-        if isinstance(part, dict):
-            for field in FILE_FIELDS:
-                if field in part:
-                    raise InputError(f"{field} is {shown(part[field])}; {NO_FILES}")
-            parts += part.values()
-        elif isinstance(part, list):
-            parts += part
 
 
 def problem_text(problem: Problem) -> bytes:
@@ -629,22 +607,12 @@ class Player:
     def __init__(self, show: Callable[[float], None]) -> None:
         self._show = show
         self._lock = threading.RLock()
-        self._playing = threading.Event()
-        self._ended = False
+        self._ended = threading.Event()
+        self.playing = False
+        """Whether the motion is playing."""
         self.duration = 0.0
         self.time = 0.0
-        self._thread = threading.Thread(target=self._run, name="player", daemon=True)
-        self._thread.start()
-
-    @property
-    def playing(self) -> bool:
-        """Whether the motion is playing."""
-        return self._playing.is_set()
-
-    def set_playing(self, playing: bool) -> None:
-        """Start or resume playing, or stop at the current time."""
-        with self._lock:
-            (self._playing.set if playing else self._playing.clear)()
+        threading.Thread(target=self._run, name="player", daemon=True).start()
 
     def load(self, duration: float) -> None:
         """Switch to a motion of this duration [s]; the time is set to the same fraction of the motion as
@@ -662,20 +630,15 @@ class Player:
 
     def close(self) -> None:
         """End the thread."""
-        self._ended = True
-        self._playing.set()
+        self._ended.set()
 
     def _run(self) -> None:
         last = time.perf_counter()
-        while not self._ended:
-            if not self._playing.wait(0.0):
-                self._playing.wait()
-                last = time.perf_counter()
+        while not self._ended.wait(1 / FRAME_RATE):
             now = time.perf_counter()
             with self._lock:
-                if self._playing.is_set():
+                if self.playing:
                     at = self.time + now - last
                     self.time = at if at <= self.duration + END_PAUSE else 0.0
                     self._show(min(self.time, self.duration))
             last = now
-            time.sleep(1 / FRAME_RATE)
