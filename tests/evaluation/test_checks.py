@@ -63,7 +63,7 @@ UNSOUND = {
         {"collision": 1, "pybullet": 1},
     ),
     "self-collision": (rd.Scene(), line(0 * AWAY, np.array([0.0, 2.7, 2.7])), {"collision": 1, "pybullet": 1}),
-    "a start out of limits": (rd.Scene(), line(np.array([2.9, 0, 0]), -2 * AWAY), {"limits": 1, "motion": 1}),
+    "a start out of limits": (rd.Scene(), line(np.array([2.9, 0, 0]), -2 * AWAY), {"motion": 1}),
     "twitching": (rd.Scene(), line(AWAY, BACK)[[*(i * (i % 2 == 0) for i in range(19)), 19]], {"motion": 1}),
 }
 

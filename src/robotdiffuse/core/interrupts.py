@@ -6,28 +6,35 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from typing import NoReturn
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from typing import Any, NoReturn
+
+
+@contextmanager
+def handled(handler: Callable[[int, Any], None], *signals: int) -> Iterator[None]:
+    """Within the block, signals call the handler. Threads other than the main thread, which signals do not
+    reach, change nothing."""
+    if threading.current_thread() is not threading.main_thread():
+        signals = ()
+    before = {number: signal.signal(number, handler) for number in signals}
+    try:
+        yield
+    finally:
+        for number, previous_handler in before.items():
+            signal.signal(number, previous_handler)
 
 
 @contextmanager
 def delay_interrupts() -> Iterator[None]:
     """Delay Ctrl-C until the end of the block."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     caught: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _frame: caught.append(number))
-    try:
+    with handled(lambda number, _frame: caught.append(number), signal.SIGINT):
         yield
-    finally:
-        signal.signal(signal.SIGINT, before)
     if caught:
         signal.raise_signal(signal.SIGINT)
 
 
-@contextmanager
-def exit_on_interrupt(tidy: Callable[[], None] = lambda: None) -> Iterator[None]:
+def exit_on_interrupt(tidy: Callable[[], None] = lambda: None) -> AbstractContextManager[None]:
     """Within the block, Ctrl-C calls `tidy` and exits with status 130 at once; for work that can stop
     anywhere.
 
@@ -42,14 +49,7 @@ def exit_on_interrupt(tidy: Callable[[], None] = lambda: None) -> Iterator[None]
         os._exit(130)
 
     ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-    if ignored or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
+    return nullcontext() if ignored else handled(stop, signal.SIGINT)
 
 
 def exit_fast(run: Callable[[], int]) -> NoReturn:

@@ -19,9 +19,9 @@ from jaxtyping import Int
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.core.errors import InputError, distinct
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.tables import Column, Table
-from robotdiffuse.core.types import Configurations, Path
+from robotdiffuse.core.types import Path
 from robotdiffuse.datasets.rows import path_of, problem_of, scenes_of
 from robotdiffuse.datasets.shards import (
     Manifest,
@@ -38,7 +38,7 @@ from robotdiffuse.processes.workers import Workers, in_order
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.validation.validator import Verifier, VerifySettings
+from robotdiffuse.validation.validator import Verifier
 
 if TYPE_CHECKING:
     from robotdiffuse.simulation.validator import OracleContact
@@ -57,8 +57,6 @@ KINDS: dict[str, str] = {
 EXAMPLES_PER_KIND = 5
 """Number of findings of each kind that are listed."""
 
-LIMIT_SLACK = 1e-6
-"""Tolerance of joint limits [rad], since waypoints have single precision."""
 CLEARANCE_TOLERANCE = 1e-4
 """Largest difference between the recorded and the measured clearance of a motion [m]. The clearance
 of a motion is the smallest distance between covering spheres and obstacles at any of its waypoints."""
@@ -271,18 +269,16 @@ def _defects(task: _Task, shard: Shard, row: int) -> Defects:
     robot = task.robot
     path = path_of(robot, shard, row)
     yield from _ends(shard, row)
-    yield from _limits(robot, path.positions)
     yield from _lengths(shard, row, path)
     try:
         problem = problem_of(task.manifest, robot, shard, row)
     except InputError as error:
         yield "motion", f"no problem can be built from this row: {error}"
         return
-    violation = Verifier(problem, VerifySettings()).path(path).violation
-    if violation is not None and violation.kind.endswith("collision"):
-        yield "collision", f"{violation.message} at waypoint {violation.time:.2f}"
-    elif violation is not None and violation.kind not in ("limits", "start"):
-        yield "motion", violation.message
+    for violation in Verifier(problem).path(path).found:
+        kind = "collision" if violation.kind.endswith("collision") else violation.kind
+        if kind != "start":  # `_ends` compares exactly
+            yield kind if kind in KINDS else "motion", violation.line
     clearances = CollisionChecker(robot, problem.scene).link_clearances(path.positions)
     clearances = clearances.min(axis=1, initial=1.0)
     recorded = {"clearance": shard["clearance"][row, None], "end_clearance": shard["end_clearance"][row]}
@@ -308,15 +304,6 @@ def _ends(shard: Shard, row: int) -> Defects:
     difference = np.abs(q[-1] - goals[goal]).max()
     if difference:
         yield "ends", f"the last waypoint differs from goal {goal} by {difference:.3g}"
-
-
-def _limits(robot: Robot, q: Configurations) -> Defects:
-    excess = robot.limit_excess(q)
-    if excess.max() > LIMIT_SLACK:
-        i, j = np.unravel_index(excess.argmax(), excess.shape)
-        value, low, high = distinct(q[i, j], robot.lower[j], robot.upper[j])
-        name = robot.joint_names[j]
-        yield "limits", f"{name} is {value} at waypoint {i}; its limits are {low} to {high}"
 
 
 def _lengths(shard: Shard, row: int, path: Path) -> Defects:

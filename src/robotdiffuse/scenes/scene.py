@@ -205,7 +205,7 @@ def _contacts(
         raise InputError(
             f"allowed_contacts is {shown(allowed)}; it must map obstacles to lists of links or to {ALL_LINKS}"
         ) from None
-    allowed_links: dict[str, dict[str | None, None]] = {}  # None stands for all links
+    by_name: dict[str, dict[str | None, None]] = {}  # None stands for all links
     for obstacle, links in entries:
         if not isinstance(obstacle, str) or (obstacle not in names_of and obstacle not in names):
             raise unknown_name("obstacle in allowed_contacts:", obstacle, names)
@@ -214,16 +214,13 @@ def _contacts(
             raise InputError(
                 f"allowed_contacts: {obstacle} has {shown(links)}; it must be a list of links, or {ALL_LINKS}"
             )
-        touching = allowed_links.setdefault(obstacle, {})
-        touching.update(dict.fromkeys((None,) if links == ALL_LINKS else links))
-        if len(touching) > MAX_CONTACT_LINKS:
-            raise InputError(
-                f"allowed_contacts: {shown(obstacle)} has over {MAX_CONTACT_LINKS} links; write {ALL_LINKS}"
-            )
-    by_name: dict[str, dict[str | None, None]] = {}
-    for obstacle, touching in allowed_links.items():
         for name in names_of.get(obstacle, [obstacle]):
-            by_name[name] = by_name[name] | touching if name in by_name else touching
+            touching = by_name.setdefault(name, {})
+            touching.update(dict.fromkeys((None,) if links == ALL_LINKS else links))
+            if len(touching) > MAX_CONTACT_LINKS:
+                raise InputError(
+                    f"allowed_contacts: {shown(name)} has over {MAX_CONTACT_LINKS} links; write {ALL_LINKS}"
+                )
     return tuple(
         (name, ALL_LINKS if None in touching else tuple(touching))  # type: ignore[arg-type]
         for name, touching in by_name.items()

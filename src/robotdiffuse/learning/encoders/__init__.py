@@ -23,9 +23,7 @@ class EncoderSettings(Settings, name="encoder"):
     any_size: ClassVar[bool] = True
     """Whether clouds of any size work well; otherwise they should have about `cloud` points."""
     ordered: ClassVar[bool] = False
-    """Whether clouds must have exactly `cloud` points, sorted as by `in_order`."""
-    along_curve: ClassVar[bool] = False
-    """Whether the points are sorted along a space-filling curve; otherwise by x, then y, then z."""
+    """Whether clouds must have exactly `cloud` points, in the order of `in_order`."""
     code: Count = 96
     """Size of the scene embedding z (paper: 60, for two obstacles)."""
     cloud: Count = 512
@@ -36,16 +34,11 @@ class EncoderSettings(Settings, name="encoder"):
     def prepared(self, points: Float32[ndarray, "n 3"]) -> Float32[ndarray, "m 3"]:
         """Points within the region in the form that the exported encoder takes [m]."""
         if self.ordered:
-            return in_order(points, self.cloud, self.along_curve)
+            return in_order(points, self.cloud)
         # padding points of zeros have no effect; the exported network needs at least one point, and without
         # `any_size` it needs `cloud` points
         needed = 1 if self.any_size else self.cloud
         return np.pad(points, ((0, max(needed - len(points), 0)), (0, 0)))
-
-
-ORDER_STEPS = 2**20 - 1
-"""Coordinates are rounded to this many steps between zero and the cloud's largest coordinate before
-sorting."""
 
 
 CURVE_STEP = 2.0**-16
@@ -71,22 +64,16 @@ def curve_keys(points: Any) -> Any:
     return key
 
 
-def in_order(points: Float32[ndarray, "n 3"], count: int, along_curve: bool) -> Float32[ndarray, "{count} 3"]:
-    """`count` points of a cloud, sorted by x, then y, then z, or along the Z-order curve. A larger cloud is
-    thinned evenly; points of a smaller cloud are repeated; an empty cloud gives zeros.
+def in_order(points: Float32[ndarray, "n 3"], count: int) -> Float32[ndarray, "{count} 3"]:
+    """`count` points of a cloud, sorted along the Z-order curve. A larger cloud is thinned evenly; points of
+    a smaller cloud are repeated; an empty cloud gives zeros.
 
-    Before sorting by x, y and z, coordinates are rounded to a millionth of the largest coordinate.
     `Encoder.arrange` orders batches of tensors in this way.
     """
     if not len(points):
         return np.zeros((count, 3), np.float32)
     thinned = (2 * np.arange(count) + 1) * len(points) // (2 * count)
-    if along_curve:
-        return points[np.argsort(curve_keys(points), kind="stable")[thinned]]
-    scale = np.float32(ORDER_STEPS) / np.float32(max(np.abs(points).max(), 1e-12))
-    steps = np.rint(points * scale)
-    ordered = steps[np.lexsort(steps.T[::-1])] / scale
-    return ordered[thinned].astype(np.float32)
+    return points[np.argsort(curve_keys(points), kind="stable")[thinned]]
 
 
 @dataclass(frozen=True)
@@ -105,7 +92,6 @@ class CompressionAutoencoderSettings(EncoderSettings):
 
     any_size = False
     ordered = True
-    along_curve = True
     code: Count = 60
     """Size of z."""
     cloud: Count = 1400

@@ -30,6 +30,7 @@ from torch.optim.swa_utils import AveragedModel
 
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError, needs
+from robotdiffuse.core.interrupts import handled
 from robotdiffuse.core.output_files import lock_folder, write_atomically
 from robotdiffuse.learning import need_packages
 from robotdiffuse.learning.checkpoint import read_tensors, save_network, write_tensors
@@ -254,7 +255,9 @@ class TrainingRun:
         torch.set_num_threads(self.settings.threads)
         try:
             lock = lock_folder(self.out) if self.processes.first else nullcontext()
-            with lock, _stop_requested() as stop, _progress(self.processes.first) as progress:
+            stop = threading.Event()  # set by SIGINT and SIGTERM, so that the current step is finished first
+            stopping = handled(lambda *_: stop.set(), signal.SIGINT, signal.SIGTERM)
+            with lock, stopping, _progress(self.processes.first) as progress:
                 bar = progress.add_task(self.task.title, total=1.0, rate="", loss="")
                 last = saved = time.monotonic()
                 stopped = 0.0
@@ -452,21 +455,6 @@ class TrainingRun:
                     f"{self.out} holds a run with {name} = {before.get(name)!r}, now it is {value!r}; "
                     "use another folder, or the same settings"
                 )
-
-
-@contextmanager
-def _stop_requested() -> Iterator[threading.Event]:
-    """An event that SIGINT and SIGTERM set, so that the current step is finished first."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    before = {s: signal.signal(s, lambda *_: stop.set()) for s in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for s, handler in before.items():
-            signal.signal(s, handler)
 
 
 def _progress(shown: bool) -> Progress:

@@ -15,9 +15,11 @@ from torch import Tensor
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Count, NotNegative, Settings, Share
-from robotdiffuse.core.transforms import rotation_from_quaternion
+from robotdiffuse.core.transforms import placed, rotation_from_quaternion
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
+from robotdiffuse.scenes.shapes import Mesh
+from robotdiffuse.scenes.surface_points import draw
 
 
 class ForwardKinematics:
@@ -123,10 +125,9 @@ class SurfacePoints:
         for link, meshes in robot.meshes.items():
             if robot.link_frame(link) == 0 or not meshes:
                 continue
-            corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
-            local = _on_triangles(corners, per_link, rng)
-            T = robot.T_frame_link(link)
-            points.append(local @ T[:3, :3].T + T[:3, 3])
+            corners = np.concatenate([mesh.vertices[mesh.faces].reshape(-1, 3) for mesh in meshes])
+            triangles = Mesh(corners, np.arange(len(corners)).reshape(-1, 3))
+            points.append(placed(robot.T_frame_link(link), draw(triangles, per_link, rng)))
             frames.append(np.full(per_link, robot.link_frame(link)))
         if not points:
             raise InputError(f"robot {robot.name} has no meshes on its moving links, which L_point needs")
@@ -138,15 +139,6 @@ class SurfacePoints:
         """Positions of the points in the base frame [m]; q in [rad]."""
         T = self._kinematics(q)[..., self._frame, :3, :]
         return (T @ self._local[..., None])[..., 0]
-
-
-def _on_triangles(corners: Float[ndarray, "n 3 3"], count: int, rng: np.random.Generator) -> ndarray:
-    a, b, c = np.moveaxis(corners, 1, 0)
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    face = rng.choice(len(area), count, p=area / area.sum())
-    u, v = rng.random((2, count, 1))
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    return a[face] + u * (b - a)[face] + v * (c - a)[face]
 
 
 class ArmDistance:
