@@ -19,6 +19,7 @@ from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Natural, NotNegative, Settings
 from robotdiffuse.core.types import Configuration, Configurations, Path, Points, Rotation, Trajectory, Vector
 from robotdiffuse.drawables import GOAL, START, Color, Drawable, Surface, drawables, join, painted
+from robotdiffuse.perception.ray_caster import looking_at
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
@@ -55,10 +56,7 @@ class Camera:
     @property
     def rotation(self) -> Rotation:
         """R_camera_base; its rows are the directions right, down and forward."""
-        forward = (self.target - self.eye) / np.linalg.norm(self.target - self.eye)
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        right /= np.linalg.norm(right)
-        return np.stack([right, np.cross(forward, right), forward])
+        return looking_at(self.eye, self.target)[:3, :3].T
 
     def project(self, points: Points) -> Points:
         """Pixel x and y, and 1 / depth (0 behind the camera)."""
