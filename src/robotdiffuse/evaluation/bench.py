@@ -340,8 +340,8 @@ class BenchSettings(Settings):
     planners: Annotated[tuple[str, ...], Filled()]
     """Planners, each as text for `PlannerSpec.parse`; or only `all`."""
     problems: Annotated[tuple[str, ...], Filled()]
-    """Problem sets: families (rop, rop_dense, ...), FAMILY_nontrivial for a family without trivial problems,
-    files or folders."""
+    """Problem sets: families (rop, rop_dense, ...), FAMILY_nontrivial for a family without the problems
+    that a straight line solves, files or folders."""
     out: FilePath
     """Folder for problems and results."""
     time_limit: Positive = 1.0
@@ -394,10 +394,10 @@ Done = Callable[[int, int], None]
 def run_bench(settings: BenchSettings, report: Progress, done: Done) -> int:
     """Make the calls that have no record in the folder; returns how many were made.
 
-    A call that has a record with a shorter time limit is not repeated if it ended before that limit, since
-    more time would not change its result; with `equal_time` it is, if another seed could change it. Raises
-    InputError, before any call, for bad settings or a planner that cannot be loaded, and KeyboardInterrupt on
-    Ctrl-C. Running again with the same settings then continues.
+    A call is not repeated if a record with a shorter time limit shows that it ended before that limit, since
+    more time would not change its result. With `equal_time`, such a call is repeated if another seed could
+    change its result. Raises InputError, before any call, for bad settings or a planner that cannot be
+    loaded, and KeyboardInterrupt on Ctrl-C. Running again with the same settings then continues.
     """
     with lock_folder(settings.out):
         specs = settings.specs

@@ -112,8 +112,8 @@ class CameraPlaces(Settings, name="cameras"):
     """Share of the cameras that stand opposite to the obstacles, as seen from the base. All other cameras may
     be in any direction from the base."""
     front: float = 2.0
-    """Largest angle, at the base, between a camera of `front_share` and the direction exactly opposite to the
-    obstacles."""
+    """Largest angle, at the base, between the direction of a camera that `front_share` counts and the
+    direction exactly opposite to the obstacles."""
     target_spread: float = 0.2
     """Standard deviation, along each axis, of the point that a camera looks at. The mean of this point is
     0.3 m high, halfway between the base and the middle of the obstacles."""
@@ -236,8 +236,8 @@ def predict(volume: ObservedVolume, network: Completion | None = None) -> Float3
     """The probability that each voxel of 2 cm holds an obstacle.
 
     It is 0 in voxels that were seen free. It is also 0 farther than 1 m from a Panda's shoulder, since
-    training did not cover these voxels. The lower corner of the grid is LOW. network: None: the network that
-    comes with the package.
+    training did not cover these voxels. The lower corner of the grid is `voxel_grid.LOW`, in the base frame.
+    network: None: the network that comes with the package.
     """
     return (network or exported_completion())(*pack(volume))
 

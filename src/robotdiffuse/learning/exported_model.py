@@ -117,7 +117,7 @@ class ExportedModel(MotionModel):
 
 
 def exported_model(name: str, folder: str | FilePath | None, robot: Robot) -> MotionModel:
-    """The model of a folder, loaded once; None: with the weights that `weights_for` finds.
+    """The model of a folder, loaded once; None: the user's own or the bundled weights for the robot.
 
     name: "model" or "trajectory_prior". Raises InputError if there is no model, naming the command that
     trains it, and for files that are damaged or made for another robot.

@@ -7,7 +7,8 @@ itself. If no new motion can be certified, the arm continues its last motion, wh
 may still hit an arm at rest. The replanner evades if it predicts this, but obstacles can corner any arm.
 
 **Limits.** Velocity, acceleration and jerk are within the robot's limits at every time, also while the arm
-stops (`timed_path.JerkFilter`). Joints without a jerk limit of their own have no jerk limit here.
+stops (`timed_path.JerkFilter`). A joint for which neither the robot nor `ReplannerSettings.jerk` gives a jerk
+limit has none.
 
 **Prediction.** The replanner chooses its way by a prediction: each obstacle keeps the velocity that was last
 observed. The guarantee does not depend on the prediction.
@@ -54,12 +55,13 @@ class ObservedObstacle:
     """An obstacle as it was last seen."""
 
     obstacle: MovingObstacle
-    """The obstacle at the pose where it was last seen, or before at that of the problem, as one that moves in
-    any way up to its maximum speed."""
+    """The obstacle, which may move in any way up to its maximum speed, at the pose where it was last seen.
+    Until the first observation, this is its pose in the problem."""
     time: float = np.nan
     """Time of the last observation [s]; NaN: never observed."""
     velocity: Vector | None = None
-    """Velocity of its origin by the last two observations, or before by the problem [m/s]; None: unknown."""
+    """Velocity of its origin, from the last two observations [m/s]. Until there are two, it is the velocity
+    in the problem; None: unknown."""
 
     def again(self, value: ArrayLike, now: float) -> "ObservedObstacle":
         """The obstacle after a new observation at the time `now` [s]. value: T_base_obstacle [4, 4], or the
@@ -127,9 +129,9 @@ class PredictedObstacles:
     def comes(
         self, q: Configuration | Configurations, times: float | Values, rest_time: float
     ) -> float | None:
-        """Time at which an obstacle first touches the arm [s], while it moves through the configurations q at
-        `times` [s] and then rests for `rest_time` [s], or rests at a single configuration from a single time
-        on; None if no obstacle does."""
+        """Time at which an obstacle first touches the arm [s]; None if none does. The arm moves through the
+        configurations q at `times` [s] and then rests for `rest_time` [s]. With a single configuration and
+        time, it only rests, from this time on."""
         times = np.append(times, np.max(times) + rest_time) - self._since
         q = np.atleast_2d(q)
         first = self._collision.first_unproved_time(times, np.concatenate([q, q[-1:]]), 0.0)
@@ -414,7 +416,7 @@ class Replanner:
         still = self._still.scene
         scene = still.with_shapes([*still.shapes, *predicted.shapes(later)])
         checker = CollisionChecker(self._robot, scene)
-        # the end of the current path, from its first waypoint from which it is free
+        # the last part of the current path that is free: the waypoints after its last blocked segment
         old = self._goals[:0]
         if self._path.to_goal and not self._must_leave:
             old = self._path.remaining(self._motion.s[-1])

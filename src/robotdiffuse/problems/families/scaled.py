@@ -1,9 +1,9 @@
-"""Scales families, which are designed for a Panda's reach, to the size of another arm.
+"""Scales families of random problems, which are designed for a Panda's reach, to the size of another arm.
 
 A problem is sampled for a copy of the arm that is scaled to a Panda's reach; then scene and targets are
 scaled to the arm's own size. The joint angles of the copy are those of the arm; values of prismatic joints
-are scaled. Problems are thus equally
-hard for small and large arms, and families do not depend on the size of the arm.
+are scaled. Problems are thus equally hard for small and large arms, and families do not depend on the size of
+the arm.
 """
 
 from dataclasses import dataclass, replace

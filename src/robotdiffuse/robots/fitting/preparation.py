@@ -152,13 +152,14 @@ Progress = Callable[[str, int, int], None]
 CONCAVITY_SHRINKAGE = 0.5
 """Factor per round on the concavity of convex parts with many false collisions."""
 UNREFINED_FRACTION = 0.6
-"""Pairs of links are not refined as long as together they have at most this fraction of the allowed false
-collisions."""
+"""The pairs of links with the fewest false collisions are not refined: as many pairs as together have at most
+this fraction of `max_false_collisions`."""
 GAP_SHRINKAGE = 0.6
 """Factor per round on `GAP_FRACTION`."""
 GAP_FRACTION = 1.2
-"""Refinement limits how far spheres that touch across a gap between two links stick out into it: to this
-fraction of the gap, on average over the two links."""
+"""Refinement limits how far spheres of two links stick out into a gap between the links: to this multiple of
+the gap, on average over the two links. Spheres on both sides may still overlap; further rounds lower the
+multiple."""
 
 
 @dataclass(frozen=True)
@@ -411,7 +412,8 @@ def _beyond_spheres(robot: Robot, pair: PairFalseCollisions, settings: Preparati
 
 
 def _shared(pair: PairFalseCollisions, link: str) -> Spheres:
-    """Places x, y, z on one of two links, and twice the link's share of the gap there [m].
+    """Places x, y, z on one of two links, and twice the link's share of the gap there [m]: the average of the
+    two links' values is the gap.
 
     Covering an area A takes about A / t spheres that stick out by t. Together the two links need the fewest
     spheres if they share the gap in proportion to the square roots of their areas.
@@ -460,8 +462,8 @@ MAX_PROPOSED = 3
 """Largest number of pairs that the error message proposes for a robot that always collides with itself
 although no single pair always collides."""
 ASSUMED_SAFE = {
-    "limits": "up to a limit of one joint, and the URDF's limits allow that",
-    "pose": "also in a pose that the SRDF names",
+    "limits": "which reach up to a limit of one joint: the limit is assumed to be where the links meet",
+    "pose": "also in a pose that the SRDF names: the meshes are assumed to be too large",
 }
 """Reasons for allowing a pair that a person should check, each with an explanation for the warning."""
 BYTES_PER_UNIT = 1 if sys.platform == "darwin" else 1024
@@ -518,7 +520,8 @@ class AddReport(NamedTuple):
         if rates.by_spheres > MAX_FALSE_COLLISIONS:
             warnings.append(
                 f"covering spheres collide falsely in {rates.by_spheres:.1%} of the free configurations, "
-                f"more than {MAX_FALSE_COLLISIONS:.0%} ({worst_text}); planning cannot use these"
+                f"more than {MAX_FALSE_COLLISIONS:.0%} ({worst_text}); planning cannot use these "
+                "configurations"
             )
         warnings += [
             f"{' against '.join(pair.links)} is not checked, though the URDF's meshes collide in "

@@ -53,7 +53,8 @@ class Srdf:
     def joints(self, group: str, joints: tuple[Joint, ...]) -> list[Joint]:
         """The movable joints of a group and of its subgroups, parents before children.
 
-        Raises InputError for an unknown group, joint or link.
+        Raises InputError for an unknown group or joint, and for a chain whose links no joints connect. Single
+        links without a joint above them are ignored.
         """
         named = self._named(group, {joint.child: joint for joint in joints}, ())
         return [joint for joint in joints if joint.name in named and joint.kind in MOVING_KINDS]
