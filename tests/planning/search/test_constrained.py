@@ -140,3 +140,13 @@ def test_more_iterations_give_no_slower_motion(case: int, monkeypatch: pytest.Mo
         durations.append(result.duration)
     assert durations == sorted(durations, reverse=True)
     assert durations[-1] < 0.95 * durations[0]
+
+
+def test_optimize_time_counts_under_constraints(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: RRT-Connect ended under path constraints as soon as it had found PATHS_TO_FIND paths."""
+    monkeypatch.setattr(rrt, "PATHS_TO_FIND", 1)
+    made = problem(*CASES[0])
+    settings = (rrt.RRTConnectSettings(optimize_time=seconds) for seconds in (0.0, 1.0))
+    first, more = (rrt.RRTConnect(one).plan(made, 60.0, seed=1, objective="time") for one in settings)
+    assert rd.verify(made, more.trajectory).valid
+    assert more.duration < 0.95 * first.duration
