@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from helpers.browsers import CHROMIUM
+from helpers.browsers import CHROMIUM, opened
 
 ROOT = Path(__file__).parents[2]
 LOADED = re.compile(r'<(?:script|img|iframe|source)[^>]*\ssrc="(?:https?:)?//|<link[^>]*stylesheet[^>]*//')
@@ -35,15 +35,11 @@ def test_pages_load_nothing_from_the_network(site: Path) -> None:
 @pytest.mark.browser
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
 def test_the_search_works_without_a_server(site: Path) -> None:
-    playwright = pytest.importorskip("playwright.sync_api", reason="browsers are driven by playwright")
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, headless=True, args=["--no-sandbox"])
-        page = browser.new_context(offline=True).new_page()
+    with opened("about:blank") as page:
+        page.context.set_offline(True)
         page.goto((site / "index.html").as_uri())
         page.locator("input.md-search__input").fill("upright cup", force=True)
-        found = page.locator(".md-search-result__link", has_text="Gallery")
-        found.first.wait_for(state="attached", timeout=60_000)
-        browser.close()
+        page.locator(".md-search-result__link", has_text="Gallery").first.wait_for(state="attached", timeout=60_000)
 
 
 def test_the_command_reference_has_every_option_and_the_readme_is_short(site: Path) -> None:

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 
 import robotdiffuse as rd
-from robotdiffuse.planning.exploration.simulated import RecordedExplorer, camera_beside, explore, wrist_camera
+from robotdiffuse.planning.exploration.simulated import Event, RecordedExplorer, camera_beside, explore, wrist_camera
 from robotdiffuse.planning.exploration.steps import ExplorerSettings
 
 HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
@@ -16,13 +16,11 @@ ZONE = ((-0.36, -0.36, 0.0), (0.36, 0.36, 0.7))
 
 
 @cache
-def recorded() -> tuple[rd.Problem, RecordedExplorer]:
+def recorded() -> tuple[rd.Problem, RecordedExplorer, list[Event]]:
     """A Panda explores its way from one side of a wall to the other, with at most two looks."""
     panda = rd.load_robot("panda")
     problem = rd.Problem(panda, rd.Scene([FLOOR, WALL]), HOME, BEYOND)
     settings = ExplorerSettings(time_limit=1.0, look_attempts=2, max_looks=2)
     explorer = RecordedExplorer(panda, [wrist_camera(panda)], rd.Scene([FLOOR]), ZONE, settings)
     explorer.observe(camera_beside(problem, None, 0))
-    for _ in explore(problem, explorer):
-        pass
-    return problem, explorer
+    return problem, explorer, list(explore(problem, explorer))

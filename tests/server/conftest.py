@@ -10,5 +10,6 @@ from helpers.serving import serving
 
 @pytest.fixture(scope="session")
 def server() -> Iterator[httpx.Client]:
-    with serving("--workers", "1", "--queue", "2", "--max-time-limit", "60", "--max-request-size", "2") as (client, _):
+    limits = ("--max-time-limit", "60", "--max-request-size", "2", "--max-worker-memory", "1400")
+    with serving("--workers", "1", "--queue", "2", *limits) as (client, _):
         yield client

@@ -37,7 +37,7 @@ def test_a_cube_has_six_faces_around_it() -> None:
 
 @pytest.mark.usefixtures("small_pictures")
 def test_each_moment_has_a_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    problem, explorer = recorded()
+    problem, explorer, _ = recorded()
     monkeypatch.setattr(exploration, "TILE", PictureSettings(width=240, height=150, ghosts=1))
     exploration.write_exploration_picture(explorer, problem.scene, tmp_path / "explore.png")
     count = len(exploration.moments(explorer))
@@ -56,7 +56,7 @@ def test_each_moment_has_a_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    problem, explorer = recorded()
+    problem, explorer, _ = recorded()
     file = tmp_path_factory.mktemp("page") / "explore.html"
     exploration.write_exploration(explorer, problem.scene, file)
     return file
@@ -79,7 +79,7 @@ def numbers(text: str) -> list[int]:
 
 
 def test_the_page_holds_what_was_known_at_each_time(page: Path) -> None:
-    _, explorer = recorded()
+    _, explorer, _ = recorded()
     data = page_data(page)
     told = data["exploration"]
     assert [shape["name"] for shape in data["scene"]] == [FLOOR.name]
@@ -104,7 +104,7 @@ def test_the_page_holds_what_was_known_at_each_time(page: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
 def test_a_browser_shows_the_steps(page: Path) -> None:
-    _, explorer = recorded()
+    _, explorer, _ = recorded()
     errors: list[str] = []
     with opened("about:blank", 480, 300) as shown:
         shown.on("pageerror", lambda error: errors.append(str(error)))

@@ -46,6 +46,7 @@ def planner_settings(data, **changes) -> PlannerTraining:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_export")
 def test_two_processes_are_one_run(tmp_path, data, monkeypatch):
     """A step of two processes equals one on both batches together. The processes resume together, and skip bad
     steps together."""

@@ -168,8 +168,7 @@ def test_files_are_loaded_and_saved_and_broken_ones_are_a_note(view: Any, page: 
 
 def test_it_comes_back_after_the_server_restarts(view: Any, page: Page) -> None:
     problem = page.session.state.problem
-    view = view.context.browser.new_page(viewport={"width": 500, "height": 400})
-    view.set_default_timeout(1000 * PATIENCE)
+    view.set_viewport_size({"width": 500, "height": 400})
     number = 0
     for planner in ("aorrtc", "rrt_connect"):
         server = PageServer("127.0.0.1", free_port("127.0.0.1", number))
@@ -180,4 +179,3 @@ def test_it_comes_back_after_the_server_restarts(view: Any, page: Page) -> None:
         until(lambda: beside(view, "Planner").input_value() == planner)  # noqa: B023
         until(lambda: view.locator(VALID).is_visible())
         page.close()
-    view.close()
