@@ -266,14 +266,11 @@ def test_failure_says_what_was_wrong(planner, monkeypatch):
     assert result.refused == "scene_collision" and "samples" in result.reason
 
 
-@pytest.mark.parametrize(
-    "make, message",
-    [
+def test_bad_settings() -> None:
+    for make, message in (
         (lambda: replace(SMALL, encoder="pointnet"), r"model.encoder is pointnet and encoder_settings are"),
         (lambda: replace(SMALL, denoiser="encoder_decoder"), r"denoiser is encoder_decoder"),
         (lambda: replace(TRAINING, smooth_noise=True), r"target is limits and smooth_noise is True"),
         (lambda: guided_prior.EDMPSettings(samples=11), r"edmp.samples is 11 and guides are 12"),
-    ],
-)
-def test_bad_settings(make, message: str) -> None:
-    refuses(message, make)
+    ):
+        refuses(message, make)

@@ -79,20 +79,17 @@ def test_help_and_version(said: Said) -> None:
     assert "\n  plan         plan a motion" in printed
 
 
-@pytest.mark.parametrize(
-    ("command", "status", "said"),
-    [
+def test_output_that_leads_nowhere() -> None:
+    """There is no traceback, and the exit status differs from that of a problem without a motion."""
+    for command, status, said in (
         ("{} > /dev/full", 3, "the output could not be written: No space left on device"),
         ("{} | true; exit ${{PIPESTATUS[0]}}", 3, ""),
         ("{} >&-", 0, ""),
         ("PYTHONIOENCODING=ascii {} > /dev/null", 0, ""),
-    ],
-)
-def test_output_that_leads_nowhere(command: str, status: int, said: str) -> None:
-    """There is no traceback, and the exit status differs from that of a problem without a motion."""
-    line = command.format(f"{sys.executable} -m robotdiffuse robot info panda")
-    ended = subprocess.run(["bash", "-c", line], capture_output=True, text=True)
-    assert (ended.returncode, ended.stderr.strip()) == (status, f"robotdiffuse: {said}" if said else "")
+    ):
+        line = command.format(f"{sys.executable} -m robotdiffuse robot info panda")
+        ended = subprocess.run(["bash", "-c", line], capture_output=True, text=True)
+        assert (ended.returncode, ended.stderr.strip()) == (status, f"robotdiffuse: {said}" if said else "")
 
 
 def test_ctrl_c_while_the_command_line_is_imported_is_one_line() -> None:
@@ -201,20 +198,17 @@ def test_the_schema_accepts_the_problems_of_the_documentation(said: Said) -> Non
     assert json.loads(said(0, "schema")) == problem_schema()
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
+def test_the_schema_refuses_what_files_may_not_hold() -> None:
+    for changes in (
         {"gaol": []},
         {"scene": [{"ball": {}}]},
         {"scene": [{"box": {"center": [0, 0, 0]}}]},
         {"unknown": "free"},
         {"clearance": 5},
         {"goal": {"pose": {"xyz": [0, 0, 0]}}},
-    ],
-)
-def test_the_schema_refuses_what_files_may_not_hold(changes: dict[str, object]) -> None:
-    jsonschema = pytest.importorskip("jsonschema")
-    assert not jsonschema.Draft202012Validator(problem_schema()).is_valid(PROBLEM | changes)
+    ):
+        jsonschema = pytest.importorskip("jsonschema")
+        assert not jsonschema.Draft202012Validator(problem_schema()).is_valid(PROBLEM | changes)
 
 
 def completed(script: str, *words: str) -> list[str]:

@@ -111,9 +111,8 @@ STANDS = transform(BALL.center)
 AWAY = transform(BALL.center + 2)
 
 
-@pytest.mark.parametrize(
-    ("motion", "message"),
-    [
+def test_motions_that_are_none() -> None:
+    for motion, message in (
         ({}, "it must have exactly one of velocity"),
         ({"velocity": [0, 1, 0], "max_speed": 1.0}, "it must have exactly one of velocity"),
         ({"velocity": [0, np.nan, 0]}, r"sphere.velocity is .* it must be 3 finite numbers"),
@@ -127,11 +126,9 @@ AWAY = transform(BALL.center + 2)
         ({"times": [0, 0.01], "poses": [STANDS, AWAY]}, r"sphere.poses\[1\] is a jump: from .* at 346 m/s"),
         ({"times": [0, 1], "poses": [AWAY] * 2}, r"sphere.poses\[0\] is at .*; it must be the pose of"),
         ({"times": [0.0, 1.0], "poses": [STANDS, 2 * STANDS]}, r"sphere.poses\[1\] is .*must be a rotation"),
-    ],
-)
-def test_motions_that_are_none(motion: dict, message: str) -> None:
-    refuses(message, rd.MovingObstacle, BALL, **motion)
-    refuses("point_cloud", rd.MovingObstacle, rd.PointCloud([[0.5, 0, 0.5]]), velocity=[0, 1, 0])
+    ):
+        refuses(message, rd.MovingObstacle, BALL, **motion)
+        refuses("point_cloud", rd.MovingObstacle, rd.PointCloud([[0.5, 0, 0.5]]), velocity=[0, 1, 0])
 
 
 @pytest.mark.parametrize("base", [None, transform(np.array([0, 0, 0.7]), rotation_about(AXIS, 0.5))])
@@ -155,19 +152,16 @@ def test_files_hold_every_motion(tmp_path: Path, base: np.ndarray | None) -> Non
 SPHERE = {"sphere": {"center": [0, 0, 1], "radius": 0.1}}
 
 
-@pytest.mark.parametrize(
-    ("entry", "message"),
-    [
+def test_files_name_the_field() -> None:
+    for entry, message in (
         ({}, r"moving is .*; it must be a list"),
         ([3], r"moving\[0\] is 3; it must be a shape and its motion"),
         ([SPHERE | {"speed": 1}], r"moving\[0\] has the fields .* max_speed"),
         ([SPHERE], r"moving\[0\]: .* has no motion"),
         ([{"sphere": {"center": [0, 0, 1], "radius": -1}, "max_speed": 1}], r"moving\[0\].*radius"),
-    ],
-)
-def test_files_name_the_field(entry: object, message: str) -> None:
-    record = problem_record(rd.Problem(PANDA, rd.Scene(), START, END))
-    refuses(message, problem_from_record, record | {"moving": entry})
+    ):
+        record = problem_record(rd.Problem(PANDA, rd.Scene(), START, END))
+        refuses(message, problem_from_record, record | {"moving": entry})
 
 
 def test_moving_obstacles_stand_beside_neither_blends_nor_start_velocities() -> None:

@@ -1,6 +1,5 @@
 """Bounds on the numbers that users give; `rd.pose`."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -18,9 +17,8 @@ TRIANGLE = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]
 FAR = [1e20, 0, 0]
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
+def test_numbers_out_of_bounds() -> None:
+    for make, message in (
         (lambda: rd.Sphere([0, 0, 0], 1e7), "sphere.radius is 10000000.0; it must be a number from 1e-09"),
         (lambda: rd.Sphere([0, 0, 0], 1e-300), "sphere.radius is 1e-300"),
         (lambda: rd.Sphere(FAR, 1), r"sphere.center is \[1e\+20, 0, 0\]; it must be 3 finite numbers within ±10000"),
@@ -36,10 +34,8 @@ FAR = [1e20, 0, 0]
         (lambda: rd.Sphere([False, 0.5, 0], 1), r"sphere.center is \[False, 0.5, 0\]; it must be 3 finite"),
         (lambda: rd.PointCloud([[0, 0, 1], [0, True, 0]]), r"points is \[\[.*; it must be n x 3"),
         (lambda: rd.Problem(box_arm(), rd.Scene(), [0, 0, 0], [0, 0, 0], clearance=1e39), "clearance"),
-    ],
-)
-def test_numbers_out_of_bounds(make: Callable[[], object], message: str) -> None:
-    refuses(message, make)
+    ):
+        refuses(message, make)
 
 
 @pytest.mark.parametrize("distance", [10.0, 1e3, 9e3])
@@ -95,14 +91,11 @@ def test_a_pose_by_quaternion_and_by_rpy_is_scipys() -> None:
     np.testing.assert_array_equal(rd.pose([1, 2, 3])[:3, :3], np.eye(3))
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
+def test_wrong_poses_are_refused() -> None:
+    for fields, message in (
         ({"wxyz": [1, 0, 0, 0], "rpy": [0, 0, 0]}, "pose has wxyz and rpy; give one of them"),
         ({"rpy": [0, 0]}, r"pose.rpy is \[0, 0\]; it must be 3 finite numbers"),
         ({"wxyz": [0, 0, 0, 0]}, "a quaternion must not be zero"),
         ({"xyz": [0, 0, np.nan]}, "pose.xyz is .*; it must be 3 finite numbers"),
-    ],
-)
-def test_wrong_poses_are_refused(fields: dict, message: str) -> None:
-    refuses(message, rd.pose, **{"xyz": [0, 0, 0]} | fields)
+    ):
+        refuses(message, rd.pose, **{"xyz": [0, 0, 0]} | fields)

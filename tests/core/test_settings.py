@@ -3,7 +3,7 @@
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import pytest
@@ -49,9 +49,8 @@ class Search(Settings, name="search"):
     greedy: bool = False
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
+def test_values_out_of_bounds_or_of_another_type_are_refused() -> None:
+    for values, message in (
         ({"step": 0.0}, "search.step is 0.0; it must be positive"),
         ({"step": float("nan")}, "search.step is nan; it must be positive"),
         ({"clearance": -1e-9}, "search.clearance is -1e-09; it must be at least 0"),
@@ -67,11 +66,9 @@ class Search(Settings, name="search"):
         ({"order": 1}, "search.order is 1; it takes first, best"),
         ({"inner": 3}, "search.inner is 3; it takes Coarse"),
         ({"levels": ["a"]}, "search.levels[0] is 'a'; it takes a number above 0"),
-    ],
-)
-def test_values_out_of_bounds_or_of_another_type_are_refused(values: dict[str, Any], message: str) -> None:
-    refuses(f"^{re.escape(message)}", Search, **values)
-    assert Search(step=np.float32(0.5), range=2).step == 0.5  # type: ignore[arg-type]
+    ):
+        refuses(f"^{re.escape(message)}", Search, **values)
+        assert Search(step=np.float32(0.5), range=2).step == 0.5  # type: ignore[arg-type]
 
 
 def test_json_and_back() -> None:
@@ -80,9 +77,8 @@ def test_json_and_back() -> None:
     assert Search.from_json({"step": 2}, "file") == Search(step=2.0)
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
+def test_json_that_is_wrong() -> None:
+    for values, message in (
         ({"stp": 1}, "file.stp is not a setting; known: step, clearance"),
         ({"step": "far"}, "file.step is 'far'; it takes a number above 0"),
         ({"inner": {"cells": 0}}, "cells is 0; it must be at least 1"),
@@ -90,10 +86,8 @@ def test_json_and_back() -> None:
         ({"grid": "fine", "grid_settings": {"cells": 2}}, "file.grid_settings.cells is not a setting"),
         ({"s" * 1000: 1}, f"file.{'s' * 57}... is not a setting"),
         ([], "must be a table of settings"),
-    ],
-)
-def test_json_that_is_wrong(values: object, message: str) -> None:
-    refuses(re.escape(message), Search.from_json, values, "file")
+    ):
+        refuses(re.escape(message), Search.from_json, values, "file")
 
 
 def test_assignments() -> None:
@@ -103,17 +97,14 @@ def test_assignments() -> None:
     assert Search().changed(["levels=[1, 2]"]).levels == (1.0, 2.0)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
+def test_assignments_that_are_wrong() -> None:
+    for text, message in (
         ("reach=1", "search has no setting 'reach'; it has step=1.0, .*range=none, .*inner.cells=3"),
         ("step", "'step' is not NAME=VALUE"),
         ("step=big", "search.step is 'big'; it takes a number above 0"),
         ("greedy=1", "search.greedy is 1; it takes true or false"),
-    ],
-)
-def test_assignments_that_are_wrong(text: str, message: str) -> None:
-    refuses(message, Search().changed, [text])
+    ):
+        refuses(message, Search().changed, [text])
 
 
 def test_tuples_of_a_fixed_length_have_it() -> None:

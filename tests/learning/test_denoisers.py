@@ -124,18 +124,15 @@ def test_unet_pads_and_crops():
         torch.testing.assert_close(network(features, level, condition), longer(added, level, condition)[:, :waypoints])
 
 
-@pytest.mark.parametrize(
-    ("kind", "values", "message"),
-    [
+def test_bad_settings():
+    for kind, values, message in (
         (denoisers.TransformerSettings, {"width": 30, "heads": 4}, "transformer.heads is 4"),
         (denoisers.TransformerSettings, {"width": 15, "heads": 5}, "transformer.width is 15"),
         (denoisers.UNetSettings, {"kernel": 4}, "unet.kernel is 4"),
         (denoisers.UNetSettings, {"width": 7}, "unet.width is 7"),
         (denoiser, {"name": "decoder_only", "settings": UNEVEN}, r"decoder_only\.patch is 5; it must divide the 12 waypoints"),
-    ],
-)
-def test_bad_settings(kind, values, message):
-    refuses(message, kind, **values)
+    ):
+        refuses(message, kind, **values)
 
 
 def encoder_for(name: str) -> str:

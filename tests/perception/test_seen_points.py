@@ -4,10 +4,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 from numpy import ndarray
 
 import robotdiffuse as rd
+from helpers.refusals import refuses
 from helpers.sphere_oracles import depth_of_balls
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.transforms import transform
@@ -97,17 +97,13 @@ def test_files_keep_views_and_policy(tmp_path: Path) -> None:
     assert "views" not in problem_record(rd.Problem(PANDA, rd.Scene(), START, GOAL))
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
+def test_what_is_refused() -> None:
+    for fields, message in (
         ({"unknown": "hopeful"}, "unknown policy in unknown: 'hopeful'; known: occupied, optimistic, pad"),
         ({"views": 3}, "views is 3"),
         ({"views": [view(BALL_ROW, np.zeros(3))]}, r"views\[0\].configuration has 3 values; panda has 7"),
-    ],
-)
-def test_what_is_refused(fields: dict, message: str) -> None:
-    with pytest.raises(rd.InputError, match=message):
-        rd.Problem(PANDA, rd.Scene(), START, GOAL, **fields)
+    ):
+        refuses(message, rd.Problem, PANDA, rd.Scene(), START, GOAL, **fields)
 
 
 def test_what_the_arm_holds_is_not_seen_as_an_obstacle() -> None:

@@ -140,18 +140,15 @@ def asked(*links: str) -> rd.Problem:
     return rd.Problem(baxter(), rd.Scene(), free()[0], goal)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
+def test_what_makes_no_sense_is_one_line() -> None:
+    for make, message in (
         (lambda: rd.PosesGoal([rd.PoseGoal("a", np.eye(4))] * 2), "goal.poses names 'a' twice"),
         (lambda: rd.PosesGoal([]), r"goal.poses is \[\]; it must be a list of rd.PoseGoal"),
         (lambda: asked("left_gripper", "middle"), "unknown link in goal.poses: 'middle'"),
         (lambda: asked("left_gripper", "torso"), "goal.poses: no planned joint moves 'torso'"),
         (lambda: asked("left_gripper", "left_gripper_base_link"), "one rigid part; give the pose of one"),
-    ],
-)
-def test_what_makes_no_sense_is_one_line(make: Any, message: str) -> None:
-    refuses(message, make)
+    ):
+        refuses(message, make)
 
 
 ARMS = ("iiwa14", "gen3", "panda", "ur5e")

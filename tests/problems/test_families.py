@@ -150,13 +150,10 @@ def test_obstacles_stay_clear_of_the_base() -> None:
     refuses("widen", replace(ROP, x=(0.0, 0.0), y=(0.0, 0.0), z=(0.1, 0.1)).scene, rng, keep_out)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_wrong_settings() -> None:
+    for change, message in (
         ({"kinds": ("sphere", "cone")}, "'cone'; known: box, sphere"),
         ({"obstacles": (3, 2)}, "obstacles is from 3 to 2"),
         ({"kinds": ()}, "must not be empty"),
-    ],
-)
-def test_wrong_settings(change: dict[str, object], message: str) -> None:
-    refuses(message, replace, ROP, **change)
+    ):
+        refuses(message, replace, ROP, **change)

@@ -120,9 +120,8 @@ def test_surface_of_nothing_visible() -> None:
         assert sample_surface(rd.Scene(shapes), 64, np.random.default_rng(5)).shape == (0, 3)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
+def test_wrong_shapes() -> None:
+    for make, message in (
         (lambda: rd.Sphere([0, 0], 1), r"sphere.center is \[0, 0\]; it must be 3 finite numbers"),
         (lambda: rd.Sphere([0, 0, np.nan], 1), "sphere.center"),
         (lambda: rd.Sphere(["a", 0, 0], 1), "sphere.center"),
@@ -141,10 +140,8 @@ def test_surface_of_nothing_visible() -> None:
         (lambda: rd.Scene(None), "scene is None; it must be a list of shapes"),  # type: ignore[arg-type]
         (lambda: rd.Scene(5), "scene is 5; it must be a list of shapes"),  # type: ignore[arg-type]
         (lambda: VisibleRegion(floor=2.0), "floor is 2"),
-    ],
-)
-def test_wrong_shapes(make: Callable[[], object], message: str) -> None:
-    refuses(message, make)
+    ):
+        refuses(message, make)
 
 
 @given(arrays(np.float64, st.tuples(st.integers(0, 30), st.just(3)), elements=st.sampled_from([-0.0, 0.0, 1.5])))

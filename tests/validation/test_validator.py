@@ -1,6 +1,5 @@
 """The validator: motions that it must reject, motions that it must accept, and its certified clearances."""
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -283,20 +282,17 @@ def test_trajectories_that_jump_or_run_backwards() -> None:
     refused(verified(trajectory(3e9)), "time")
 
 
-@pytest.mark.parametrize(
-    ("name", "cut"),
-    [
+def test_wrong_shapes_of_a_trajectory_raise() -> None:
+    for name, cut in (
         ("times", lambda times: times[0]),
         ("velocities", lambda rates: rates[1:]),
         ("velocities", lambda rates: rates[:, 0]),
         ("accelerations", lambda rates: rates[:, :1]),
         ("positions", lambda q: q[:, :2]),
-    ],
-)
-def test_wrong_shapes_of_a_trajectory_raise(name: str, cut: Callable[[np.ndarray], np.ndarray]) -> None:
-    good = trajectory(2.0)
-    object.__setattr__(good, name, np.asarray(cut(getattr(good, name))))
-    refuses(rf"trajectory\.{name} has shape .*; it must be", verify_trajectory, problem_and_path(SWING)[0], good)
+    ):
+        good = trajectory(2.0)
+        object.__setattr__(good, name, np.asarray(cut(getattr(good, name))))
+        refuses(rf"trajectory\.{name} has shape .*; it must be", verify_trajectory, problem_and_path(SWING)[0], good)
 
 
 @pytest.mark.parametrize(("factor", "jumps"), [(1.0, False), (1.02, False), (1.49, False), (1.6, True)])

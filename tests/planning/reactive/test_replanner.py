@@ -147,36 +147,30 @@ def test_the_arm_waits_for_an_obstacle_at_the_goal() -> None:
     assert command.arrived
 
 
-@pytest.mark.parametrize(
-    ("observation", "now", "message"),
-    [
+def test_invalid_steps_are_refused() -> None:
+    for observation, now, message in (
         ({"sphere": [0.5, 1.6, 0.5]}, 0.0, "now is 0 s after 0 s; time must go on"),
         ({"sphere": [0.5, 1.6, 0.5]}, np.nan, "now is nan; it must be a finite number of seconds"),
         ({"ball": [0.5, 1.6, 0.5]}, 0.1, "unknown obstacle in observation: 'ball'"),
         ({"sphere": [0.5, np.nan, 0.5]}, 0.1, r"observation\['sphere'\] is"),
         ({"sphere": [0.5, 1.0, 0.5]}, 0.1, r"observation\['sphere'\] is 0.6 m from where it was 0.1 s ago"),
-    ],
-)
-def test_invalid_steps_are_refused(observation: object, now: float, message: str) -> None:
-    replanner = loop(np.array([[0.5, 1.6, 0.5]]))
-    replanner.step({"sphere": [0.5, 1.6, 0.5]}, 0.0)
-    refuses(message, replanner.step, observation, now)
+    ):
+        replanner = loop(np.array([[0.5, 1.6, 0.5]]))
+        replanner.step({"sphere": [0.5, 1.6, 0.5]}, 0.0)
+        refuses(message, replanner.step, observation, now)
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
+def test_replanners_that_cannot_begin() -> None:
+    for fields, message in (
         ({"moving": []}, r"problem\.moving is empty"),
         ({"start": [0, 1.5, 0, -0.5, 0, 2.1, 0.8]}, "the replanner cannot begin: the start is in collision"),
         ({"waypoints": [END]}, r"problem\.waypoints: the replanner does not support it"),
         ({"constraints": [UPRIGHT]}, r"problem\.constraints: the replanner does not support it"),
         ({"payload": rd.Payload(0.5, link="panda_hand")}, r"problem\.payload: the replanner does not"),
-    ],
-)
-def test_replanners_that_cannot_begin(fields: dict[str, Any], message: str) -> None:
-    moving = [rd.MovingObstacle(rd.Sphere([3, 0, 0], 0.1), max_speed=0.1)]
-    problem = rd.Problem(PANDA, rd.Scene([FLOOR]), START, END, moving=moving)
-    refuses(message, rd.Replanner, replace(problem, **fields))
+    ):
+        moving = [rd.MovingObstacle(rd.Sphere([3, 0, 0], 0.1), max_speed=0.1)]
+        problem = rd.Problem(PANDA, rd.Scene([FLOOR]), START, END, moving=moving)
+        refuses(message, rd.Replanner, replace(problem, **fields))
 
 
 @pytest.mark.parametrize("goal", ["start", "pose", "here"])

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from helpers.refusals import refuses
 from robotdiffuse import Box, InputError, Sphere
 from robotdiffuse.problems.families import furniture
 from robotdiffuse.scenes.scene_arrays import BOX, PackedScenes
@@ -96,17 +97,13 @@ def test_targets_have_the_fingers_in_the_region() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("settings", "change", "message"),
-    [
+def test_wrong_settings() -> None:
+    for settings, change, message in (
         (furniture.SHELF, {"boards": (1, 3)}, r"boards\[0\] is 1; it must be at least 2"),
         (furniture.CRATE, {"thickness": (0.0, 0.02)}, r"thickness\[0\] is 0.0; it must be positive"),
         (furniture.TABLE, {"wall_share": 0.8}, "wall_share is 0.8 and pillar_share 0.3"),
-    ],
-)
-def test_wrong_settings(settings: object, change: dict[str, object], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        replace(settings, **change)  # type: ignore[type-var]
+    ):
+        refuses(message, replace, settings, **change)
 
 
 @every_family

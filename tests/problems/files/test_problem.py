@@ -2,7 +2,6 @@
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -73,9 +72,8 @@ def test_values_of_continuous_joints_are_kept(angle: float) -> None:
 MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
+def test_wrong_problems() -> None:
+    for make, message in (
         (lambda: problem([0, 0]), "start has 2 values; crane has 3 planned joints: swing, spin, lift"),
         (lambda: problem(goal=[[0, 0], [1, 1]]), r"goal\[0\] has 2 values"),
         (lambda: problem([0, np.nan, 0]), r"start: spin is nan; it must be a finite number .* \[rad\]"),
@@ -86,10 +84,8 @@ MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
         (lambda: problem(goal=rd.PoseGoal("plinth", np.eye(4))), "no planned joint moves 'plinth'"),
         (lambda: rd.PoseGoal("hook", MIRROR), "it must be a rotation and a translation"),
         (lambda: rd.Problem(crane(), [], [0], [0]), "scene is .*; it must be a Scene"),  # type: ignore[arg-type]
-    ],
-)
-def test_wrong_problems(make: Callable[[], object], message: str) -> None:
-    refuses(message, make)
+    ):
+        refuses(message, make)
 
 
 GOOD: dict[str, Any] = {
@@ -258,9 +254,8 @@ def test_moveit_files_in_a_problem(tmp_path: Path) -> None:
 CAMERA = {"xyz": [0] * 3, "wxyz": [1, 0, 0, 0]}
 
 
-@pytest.mark.parametrize(
-    "changed",
-    [
+def test_records_of_others_name_no_files_that_are_read() -> None:
+    for changed in (
         {"scene": "scene.yaml"},
         {"scene": [{"mesh": {"file": "shelf.stl"}}]},
         {"scene": [{"point_cloud": {"file": "/etc/passwd.csv"}}]},
@@ -268,13 +263,13 @@ CAMERA = {"xyz": [0] * 3, "wxyz": [1, 0, 0, 0]}
         {"attached": [{"link": "panda_hand", "mesh": {"file": "cup.stl"}}]},
         {"views": [{"depth": "a.png", "intrinsics": [1, 1, 0, 0], "camera": CAMERA}]},
         {"views": [{"cloud": "a.ply", "camera": CAMERA}]},
-    ],
-)
-def test_records_of_others_name_no_files_that_are_read(changed: dict[str, Any]) -> None:
-    record = {"robot": "panda", "scene": [], "start": READY, "goal": {"joints": READY}} | changed
-    robots = {"panda": rd.load_robot("panda")}
-    refuses("is a file, and files are not read here", problem_from_record, record, robots)
-    refuses("files are not read here", problem_from_record, {"robot": "panda", "scene": [], "request": "/etc/passwd"}, robots)
+    ):
+        record = {"robot": "panda", "scene": [], "start": READY, "goal": {"joints": READY}} | changed
+        robots = {"panda": rd.load_robot("panda")}
+        refuses("is a file, and files are not read here", problem_from_record, record, robots)
+        refuses(
+            "files are not read here", problem_from_record, {"robot": "panda", "scene": [], "request": "/etc/passwd"}, robots
+        )
 
 
 @pytest.mark.parametrize("robot", ["ur5", "panda/robot.json", "../panda", "/etc/passwd", "a.urdf", 1, None])
@@ -298,9 +293,8 @@ def test_goals_are_given_as_in_python(goal: object, rows: list[list[float]]) -> 
     assert np.array_equal(rd.Problem(problem.robot, rd.Scene(), "ready", "ready").start, problem.start)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
+def test_wrong_names_and_angles() -> None:
+    for changes, message in (
         ({"goal": {"joints": "home"}}, "unknown pose in goal.joints: 'home'"),
         ({"robot": "iiwa14", "start": "home"}, "(iiwa14 has no named pose with values for all planned joints)"),
         (
@@ -308,10 +302,8 @@ def test_goals_are_given_as_in_python(goal: object, rows: list[list[float]]) -> 
             "scene[0].box has both wxyz and rpy; give one of them",
         ),
         ({"base": {"rpy": [0, 0]}}, "base.rpy is [0, 0]; it must be 3 finite numbers"),
-    ],
-)
-def test_wrong_names_and_angles(changes: dict[str, object], message: str) -> None:
-    refuses(re.escape(message), problem_from_record, BASIC | changes)
+    ):
+        refuses(re.escape(message), problem_from_record, BASIC | changes)
 
 
 def test_roll_pitch_yaw_are_in_the_order_of_urdfs() -> None:

@@ -152,17 +152,14 @@ FIELD = '<asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset>'
 CLOTH = '<flexcomp name="cloth" type="grid" count="3 3 1" spacing="1 1 1" radius="0.1" dim="2"/>'
 
 
-@pytest.mark.parametrize(
-    ("assets", "world", "message"),
-    [
+def test_obstacles_that_are_no_solids_are_refused() -> None:
+    """Regression: soft bodies were left out without a note."""
+    for assets, world, message in (
         (FIELD, '<geom name="hill" type="hfield" hfield="h"/>', "geom hill is of type hfield; obstacles may"),
         ("", CLOTH, "flex cloth is soft; obstacles must be rigid"),
-    ],
-)
-def test_obstacles_that_are_no_solids_are_refused(assets: str, world: str, message: str) -> None:
-    """Regression: soft bodies were left out without a note."""
-    model = mujoco.MjModel.from_xml_string(f"<mujoco>{assets}<worldbody>{world}</worldbody></mujoco>")
-    refuses(message, rd.Scene.from_mujoco, model)
+    ):
+        model = mujoco.MjModel.from_xml_string(f"<mujoco>{assets}<worldbody>{world}</worldbody></mujoco>")
+        refuses(message, rd.Scene.from_mujoco, model)
 
 
 def test_obstacles_without_names_have_numbers() -> None:
