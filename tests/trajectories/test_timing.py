@@ -16,9 +16,9 @@ from helpers.refusals import refuses
 from robotdiffuse.planning.reactive.timed_path import TimedPath
 from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.trajectories import speed_limits, timing_kernel
-from robotdiffuse.trajectories.corner_rounding import BLEND_DEVIATION, BlendedPolyline, half_widths
 from robotdiffuse.trajectories.speed_limits import MIN_JERK, TimingSettings, symmetric_bounds, timing_grid
 from robotdiffuse.trajectories.timing import SAME_WAYPOINT_DISTANCE, time_parameterize
+from robotdiffuse.trajectories.timing_kernel import BLEND_DEVIATION, RoundedLine, rounded_line
 from robotdiffuse.validation.rates import rate_violations
 from robotdiffuse.validation.validator import VerifySettings
 
@@ -168,10 +168,9 @@ def test_only_the_corner_that_fails_is_tightened() -> None:
 
 def test_blend_reaches_the_deviation_and_is_twice_differentiable() -> None:
     waypoints = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0]])
-    d = half_widths(waypoints, np.array([0.05]))
-    line = BlendedPolyline(waypoints, d)
+    line = rounded_line(waypoints, np.array([0.05]))
     assert np.linalg.norm(line(np.array([1.0]), 0) - waypoints[1]) == pytest.approx(0.05)
-    assert d[0] * BLEND_DEVIATION * np.sqrt(2) == pytest.approx(0.05)
+    assert line.half_widths[0] * BLEND_DEVIATION * np.sqrt(2) == pytest.approx(0.05)
     s = np.linspace(0, line.length, 20001)
     for order in (0, 1):
         slope = np.gradient(line(s, order), s, axis=0)[1:-1]
@@ -248,7 +247,7 @@ def test_a_limit_of_jerk_costs_what_it_must() -> None:
     assert slight == pytest.approx(free, abs=0.004)
 
 
-def toppra_speeds(line: BlendedPolyline, grid: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray) -> np.ndarray | None:
+def toppra_speeds(line: RoundedLine, grid: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray) -> np.ndarray | None:
     """toppra's fastest speeds at the grid points of a line; None if it finds none."""
 
     class Geometry(toppra.interpolator.AbstractGeometricPath):
@@ -273,12 +272,12 @@ def toppra_speeds(line: BlendedPolyline, grid: np.ndarray, velocity: np.ndarray,
     return algorithm.compute_parameterization(0.0, 0.0)[1]
 
 
-def toppra_duration(robot: rd.Robot, line: BlendedPolyline, settings: TimingSettings) -> float:
+def toppra_duration(robot: rd.Robot, line: RoundedLine, settings: TimingSettings) -> float:
     """Duration [s] of the motion along a line with toppra's speeds, reduced in the same way as ours."""
     grid = timing_grid(line, settings)
     speeds = toppra_speeds(line, grid, robot.velocity, robot.acceleration)
     assert speeds is not None
-    slower = timing_kernel.slowdown(line.arrays, grid, speeds, robot.velocity, robot.acceleration)
+    slower = timing_kernel.slowdown(line, grid, speeds, robot.velocity, robot.acceleration)
     return slower * float((2 * np.diff(grid) / (speeds[1:] + speeds[:-1])).sum())
 
 
@@ -290,7 +289,7 @@ def test_durations_are_those_of_toppra(seed: int, deviation: float) -> None:
     settings = replace(NO_JERK_LIMIT, corner_deviation=deviation)
     ours = timed(q, settings=settings).duration
     parts = [q] if deviation else [q[i : i + 2] for i in range(len(q) - 1)]
-    lines = [BlendedPolyline(w, half_widths(w, np.full(len(w) - 2, deviation))) for w in parts]
+    lines = [rounded_line(w, np.full(len(w) - 2, deviation)) for w in parts]
     theirs = sum(toppra_duration(robot, line, settings) for line in lines)
     assert ours == pytest.approx(theirs + len(lines) * 2 * settings.sample_time, rel=1e-3)
 
@@ -301,14 +300,13 @@ def test_the_estimated_time_is_near_the_exact_one(seed: int, narrow: float) -> N
     rng = np.random.default_rng(seed)
     q = np.cumsum(rng.normal(0, 0.4, (rng.integers(3, 8), 7)), axis=0)
     deviations = 10 ** rng.uniform(-2, 0, len(q) - 2)
-    line = timing_kernel.rounded_line(q, deviations)
-    line[3][0] *= 1 - narrow
+    line = rounded_line(q, deviations)
+    line.half_widths[0] *= 1 - narrow
     velocity = rng.uniform(1, 3, 7)
     acceleration = rng.uniform(5, 20, 7)
-    ratio = timing_kernel.estimated_time(line, velocity, acceleration) / timing_kernel.least_time(
-        line, velocity, acceleration, 16, 128
-    )
-    assert 0.97 < ratio < 1.1
+    settings = TimingSettings(corner_intervals=16, line_intervals=128)
+    exact = speed_limits.least_time(line, velocity, acceleration, settings)
+    assert 0.97 < timing_kernel.estimated_time(line, velocity, acceleration) / exact < 1.1
 
 
 def test_a_slow_torso_has_a_timing() -> None:
@@ -342,7 +340,7 @@ def test_every_path_has_a_timing(seed: int, dof: int, count: int, scale: float, 
         q[:, 2:] = q[:1, 2:]
     elif kind == "steps of all sizes":
         q = np.cumsum(10 ** rng.uniform(-4, 0, (count, 1)) * rng.normal(0, 1, (count, dof)), axis=0)
-    line = BlendedPolyline(q, half_widths(q, 10 ** rng.uniform(-4, 0, count - 2)))
+    line = rounded_line(q, 10 ** rng.uniform(-4, 0, count - 2))
     grid = timing_grid(line, TimingSettings())
     first = line(grid, 1)
     second = line(grid, 2)
@@ -453,7 +451,7 @@ def test_a_timed_path_is_as_fast_as_its_timing() -> None:
     """Except for the margin that it leaves to the limits, about 4 % of accelerations."""
     robot = rd.load_robot("panda")
     waypoints = np.array([np.zeros(7), np.full(7, 0.8), np.linspace(0, 1, 7)])
-    line = BlendedPolyline(waypoints, half_widths(waypoints, np.array([0.1])))
+    line = rounded_line(waypoints, np.array([0.1]))
     fastest = speed_limits.time_line(robot, line, TimingSettings())[0][-1]
     found = TimedPath(robot, 0.96 * robot.acceleration, line, True).on_then_rest(0.0, 0.0).duration
     assert found == pytest.approx(fastest, rel=0.05)

@@ -13,8 +13,13 @@ from robotdiffuse.core.types import Configurations, JointRows, JointValues, Rows
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories import timing_kernel
-from robotdiffuse.trajectories.corner_rounding import BlendedPolyline
-from robotdiffuse.trajectories.timing_kernel import fastest_speeds, slowdown, states_at
+from robotdiffuse.trajectories.timing_kernel import (
+    RoundedLine,
+    fastest_speeds,
+    rounded_line,
+    slowdown,
+    states_at,
+)
 
 MAX_ROWS = 200_000
 """Largest number of rows of a motion between two stops; averaging for jerk limits adds further rows. Longer
@@ -110,7 +115,7 @@ class ExtraLimits(NamedTuple):
 NO_EXTRA_LIMITS = ExtraLimits()
 
 
-def timing_grid(line: BlendedPolyline, settings: TimingSettings) -> Values:
+def timing_grid(line: RoundedLine, settings: TimingSettings) -> Values:
     """Values of s at which the limits of a motion along a line are applied; see
     `timing_kernel.timing_grid`."""
     counts = settings.corner_intervals, settings.line_intervals
@@ -119,7 +124,7 @@ def timing_grid(line: BlendedPolyline, settings: TimingSettings) -> Values:
 
 def time_line(
     robot: Robot,
-    line: BlendedPolyline,
+    line: RoundedLine,
     settings: TimingSettings,
     start_speed: float = 0.0,
     extra: ExtraLimits = NO_EXTRA_LIMITS,
@@ -174,7 +179,7 @@ def jerk_limits(robot: Robot, settings: TimingSettings = DEFAULT) -> JointValues
     return np.where(robot.jerk > 0, robot.jerk, DEFAULT_JERK_RATIO * robot.acceleration)
 
 
-def _moving_start(robot: Robot, line: BlendedPolyline, settings: TimingSettings, start_speed: float) -> Rows:
+def _moving_start(robot: Robot, line: RoundedLine, settings: TimingSettings, start_speed: float) -> Rows:
     """`time_line` for a motion with a start speed. Before the averaging, the motion gets a lead: a part of
     the first straight line at constant speed. The averaged motion then begins at the start with this speed
     and without acceleration."""
@@ -194,7 +199,7 @@ def _moving_start(robot: Robot, line: BlendedPolyline, settings: TimingSettings,
             widths = line.half_widths.copy()
             widths[:1] = np.minimum(widths[:1], first - lead)
             waypoints = np.concatenate([line.waypoints[:1] + lead * direction, line.waypoints[1:]])
-            after_lead = BlendedPolyline(waypoints, widths)
+            after_lead = rounded_line(waypoints, widths)._replace(half_widths=widths)
             grid = timing_grid(after_lead, settings)
             try:
                 speeds = _fastest_speeds(after_lead, grid, velocity, share * acceleration, start_speed)
@@ -257,6 +262,14 @@ def duration_of(grid: Values, speeds: Values) -> float:
     return float((2 * np.diff(grid) / (speeds[1:] + speeds[:-1])).sum())
 
 
+def least_time(
+    line: RoundedLine, velocity: JointValues, acceleration: JointValues, settings: TimingSettings
+) -> float:
+    """Duration of the fastest motion along a line from rest to rest, without jerk limits [s]."""
+    grid = timing_grid(line, settings)
+    return duration_of(grid, _fastest_speeds(line, grid, velocity, acceleration))
+
+
 def symmetric_bounds(acceleration: JointValues, rows: int) -> tuple[JointRows, JointRows]:
     """Lowest and highest accelerations [rows, dof] at each of the grid's points."""
     highest = np.tile(acceleration, (rows, 1))
@@ -264,7 +277,7 @@ def symmetric_bounds(acceleration: JointValues, rows: int) -> tuple[JointRows, J
 
 
 def _fastest_speeds(
-    line: BlendedPolyline,
+    line: RoundedLine,
     grid: Values,
     velocity: JointValues,
     acceleration: JointValues,
@@ -283,7 +296,7 @@ def _fastest_speeds(
         speeds = fastest_speeds(*derivatives_and_limits(line, grid, *limits, extra), start_speed)
         if start_speed and np.isnan(speeds).any():
             break
-        slower = slowdown(line.arrays, grid, speeds, velocity, acceleration)
+        slower = slowdown(line, grid, speeds, velocity, acceleration)
         if start_speed == 0:
             return speeds / slower
         if slower <= 1 + LIMIT_TOLERANCE:
@@ -335,7 +348,7 @@ def derivatives_and_limits(
     return first, second, grid, velocity, lowest, highest
 
 
-def _slow_to_extra_limits(line: BlendedPolyline, grid: Values, speeds: Values, extra: ExtraLimits) -> Values:
+def _slow_to_extra_limits(line: RoundedLine, grid: Values, speeds: Values, extra: ExtraLimits) -> Values:
     """The speeds, slowed down so that frame speeds and torques keep their limits between grid points as
     well."""
     if extra == NO_EXTRA_LIMITS:

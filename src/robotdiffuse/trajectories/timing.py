@@ -14,7 +14,6 @@ from robotdiffuse.core.bounds import MIN_RATE
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Configurations, JointValues, Path, Trajectory, Values, interpolated
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.trajectories.corner_rounding import BlendedPolyline, half_widths
 from robotdiffuse.trajectories.speed_limits import (
     DEFAULT,
     MIN_SCALING,
@@ -25,7 +24,7 @@ from robotdiffuse.trajectories.speed_limits import (
     TooFastError,
     time_line,
 )
-from robotdiffuse.trajectories.timing_kernel import evaluate, rounded_line
+from robotdiffuse.trajectories.timing_kernel import rounded_line
 
 SHRINK_FACTOR = 0.5
 """Factor by which the deviation of a corner, how far its rounding may leave the path, shrinks each time the
@@ -161,12 +160,12 @@ def _shrunk(
     while True:
         # Two corners share a segment: if one shrinks, the other becomes wider and must be checked again.
         line = rounded_line(waypoints, deviations)
-        widths = line[3]
+        widths = line.half_widths
         unchecked = np.flatnonzero((deviations > 0) & (widths > accepted_widths * (1 + 1e-9)))
         if not len(unchecked):
             return deviations
-        s = line[1][1 + unchecked, None] + widths[unchecked, None] * CORNER_PLACES
-        corners = evaluate(line, s.ravel(), 0).reshape(len(unchecked), CORNER_SAMPLES, -1)
+        s = line.knots[1 + unchecked, None] + widths[unchecked, None] * CORNER_PLACES
+        corners = line(s.ravel(), 0).reshape(len(unchecked), CORNER_SAMPLES, -1)
         smaller = np.maximum(_smaller(deviations), np.minimum(deviations, least))
         for i, corner in zip(unchecked.tolist(), corners, strict=True):
             if accepts(corner):
@@ -215,7 +214,7 @@ def _time_segments(
     segments = []
     for a, b in pairwise(stops):
         part = waypoints[a : b + 1]
-        line = BlendedPolyline(part, half_widths(part, deviations[a : b - 1]))
+        line = rounded_line(part, deviations[a : b - 1])
         segments.append(time_line(robot, line, settings, 0.0 if segments else start_speed, extra))
     return Trajectory(path.joint_names, *joined_rows(segments))
 
@@ -271,7 +270,7 @@ class StopGraph:
         self.step = step
         self._extra = extra
         rounded = timing.deviations
-        self.line = BlendedPolyline(timing.waypoints, half_widths(timing.waypoints, rounded))
+        self.line = rounded_line(timing.waypoints, rounded)
         self.stops = self._find_stops(rounded)
         """The values of s along the path at which motions may stop, in order."""
         sharp = self.line.knots[1:-1][rounded == 0]
@@ -301,9 +300,9 @@ class StopGraph:
         line, (low, high) = self.line, self.stops[[i, j]]
         interior = np.flatnonzero((line.knots > low + MIN_DISTANCE) & (line.knots < high - MIN_DISTANCE))
         ends = line(np.array([low, high]), 0)
-        part = BlendedPolyline(
-            np.concatenate([ends[:1], line.waypoints[interior], ends[1:]]), line.half_widths[interior - 1]
-        )
+        waypoints = np.concatenate([ends[:1], line.waypoints[interior], ends[1:]])
+        widths = line.half_widths[interior - 1]
+        part = rounded_line(waypoints, widths)._replace(half_widths=widths)
         times, q, v, a = time_line(robot, part, settings, extra=self._extra)
         q = q.copy()
         q[[0, -1]] = ends

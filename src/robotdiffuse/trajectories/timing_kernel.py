@@ -11,9 +11,12 @@ greatest x at each grid point from which the end can be reached within all limit
 the greatest u in each interval. Limits are applied at both ends of each interval.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from robotdiffuse.core.kernels import inner_kernel, kernel
+from robotdiffuse.core.types import Configurations, JointRows, Values
 
 SLOWDOWN_CHECKS_PER_INTERVAL = 16
 """Number of equal parts of a grid interval at the ends of which `slowdown` checks limits. With 4 parts, one
@@ -28,7 +31,7 @@ NEGLIGIBLE_DERIVATIVE = 1e-7
 NEGLIGIBLE_SHARE = 1e-8
 """The next ṡ² is ignored in a limit if it contributes less than this fraction of an acceleration limit."""
 BLEND_DEVIATION = 3.0 / 16.0
-"""b(0) of `BlendedPolyline`: the distance from the corner to the middle of its blend, divided by the half
+"""b(0) of `RoundedLine`: the distance from the corner to the middle of its blend, divided by the half
 width times the norm of the change of direction."""
 # Numbers of grid intervals of `estimated_time`; see `TimingSettings`.
 CORNER_INTERVALS = 8
@@ -39,12 +42,40 @@ there. Where a joint's q' changes sign, the limits would otherwise allow a speed
 stop."""
 
 
-@inner_kernel()
-def evaluate_at(waypoints, knots, directions, half_widths, s, order, out):
-    """Writes q (order 0), q' (1) or q'' (2) at s to out[dof].
+class RoundedLine(NamedTuple):
+    """Straight lines between waypoints, with each corner rounded (blended) within a half width before and
+    after it: twice continuously differentiable, within a known distance of the polyline.
 
-    The arguments and symbols are those of `BlendedPolyline`.
+    The parameter s is the arc length of the polyline. Corner i is the waypoint w_i at s_i, with the half
+    width d_i and the unit directions e before and f behind it. The blend is w_i + d_i (e u + (f - e) b(u)),
+    with u = (s - s_i) / d_i in [-1, 1]. Here b(u) is a C2 replacement of max(u, 0) with the second derivative
+    3/4 (1 - u²). The blend leaves the polyline by at most 3/16 d_i |f - e|, at u = 0.
     """
+
+    waypoints: Configurations
+    """At least two rows [n, dof]."""
+    knots: Values
+    """[n] s at the waypoints."""
+    directions: JointRows
+    """[n - 1, dof] unit directions of the straight lines."""
+    half_widths: Values
+    """[n - 2] one for each inner waypoint. Rounded corners do not overlap or reach beyond the path's ends."""
+
+    @property
+    def length(self) -> float:
+        """Arc length of the polyline: the end of the parameter s."""
+        return float(self.knots[-1])
+
+    def __call__(self, s: Values, order: int) -> JointRows:
+        """The path (order 0) or its first or second derivative by s, at each s."""
+        return evaluate(self, s, order)
+
+
+@inner_kernel()
+def evaluate_at(line, s, order, out):
+    """Writes q (order 0), q' (1) or q'' (2) of a `RoundedLine` at s to out[dof]. Symbols are those of
+    `RoundedLine`."""
+    waypoints, knots, directions, half_widths = line
     # the segment that contains s, by bisection
     segments = len(directions)
     low = 0
@@ -93,21 +124,20 @@ def evaluate_at(waypoints, knots, directions, half_widths, s, order, out):
 
 @kernel()
 def evaluate(line, s, order):
-    """q, q' or q'' (order 0, 1, 2) at values of s [m], as an array [m, dof]. `line` is the tuple (waypoints,
-    knots, directions, half_widths). At its end, q is exactly the last waypoint."""
-    waypoints, knots, directions, half_widths = line
-    out = np.empty((len(s), waypoints.shape[1]))
+    """q, q' or q'' (order 0, 1, 2) of a `RoundedLine` at values of s [m], as an array [m, dof]. At its end, q
+    is exactly the last waypoint."""
+    out = np.empty((len(s), line.waypoints.shape[1]))
     for i in range(len(s)):
-        evaluate_at(waypoints, knots, directions, half_widths, s[i], order, out[i])
-        if order == 0 and s[i] == knots[-1]:
-            out[i] = waypoints[-1]
+        evaluate_at(line, s[i], order, out[i])
+        if order == 0 and s[i] == line.knots[-1]:
+            out[i] = line.waypoints[-1]
     return out
 
 
 @kernel()
 def rounded_line(waypoints, deviations):
-    """The `line` of `evaluate` for a polyline through waypoints [n, dof]. Its corners have the widest blends
-    that do not overlap and leave the polyline by at most the deviations [n - 2]."""
+    """The `RoundedLine` through waypoints [n, dof]. Its corners have the widest blends that do not overlap
+    and leave the polyline by at most the deviations [n - 2] [rad, joint-space L2]."""
     n, dof = waypoints.shape
     lengths = np.empty(n - 1)
     knots = np.zeros(n)
@@ -115,7 +145,7 @@ def rounded_line(waypoints, deviations):
     for i in range(n - 1):
         directions[i] = waypoints[i + 1] - waypoints[i]
         lengths[i] = np.sqrt((directions[i] ** 2).sum())
-        directions[i] /= lengths[i]
+        directions[i] /= max(lengths[i], 1e-300)  # 0 between equal waypoints
         knots[i + 1] = knots[i] + lengths[i]
     blend_widths = np.empty(n - 2)
     widths = np.empty(n - 2)
@@ -132,7 +162,7 @@ def rounded_line(waypoints, deviations):
         if i < n - 3:
             after = max(0.5 * after, after - blend_widths[i + 1])
         widths[i] = min(min(before, after), blend_widths[i])
-    return waypoints, knots, directions, widths
+    return RoundedLine(waypoints, knots, directions, widths)
 
 
 @kernel()
@@ -165,30 +195,16 @@ def timing_grid(knots, half_widths, corner_intervals, line_intervals):
 
 
 @kernel()
-def least_time(line, velocity, acceleration, corner_intervals, line_intervals):
-    """Duration of the fastest motion along a line from rest to rest, without jerk limits [s]."""
-    grid = timing_grid(line[1], line[3], corner_intervals, line_intervals)
-    first = evaluate(line, grid, 1)
-    second = evaluate(line, grid, 2)
-    highest = np.empty_like(first)
-    highest[:] = acceleration
-    speeds = fastest_speeds(first, second, grid, velocity, -highest, highest)
-    duration = 0.0
-    for i in range(len(grid) - 1):
-        duration += 2 * (grid[i + 1] - grid[i]) / (speeds[i] + speeds[i + 1])
-    return duration * slowdown(line, grid, speeds, velocity, acceleration)
-
-
-@kernel()
 def estimated_time(line, velocity, acceleration):
-    """Estimate of `least_time` with a tenth of its work [s]. On random lines, the estimate is 0.7 % too long
-    on average, with a standard deviation of 0.5 %.
+    """Estimate of the duration of the fastest motion along a line from rest to rest, without jerk limits [s],
+    with a tenth of the work of `speed_limits.least_time`. On random lines, the estimate is 0.7 % too long on
+    average, with a standard deviation of 0.5 %.
 
     A backward pass and a forward pass limit s̈ in each interval by the acceleration limits at one end only,
     the end from which the pass comes. If the limits at either end are exceeded then, the interval's duration
     is scaled up.
     """
-    grid = timing_grid(line[1], line[3], CORNER_INTERVALS, LINE_INTERVALS)
+    grid = timing_grid(line.knots, line.half_widths, CORNER_INTERVALS, LINE_INTERVALS)
     first = evaluate(line, grid, 1)
     second = evaluate(line, grid, 2)
     n, dof = first.shape
@@ -339,8 +355,7 @@ def fastest_speeds(first, second, grid, velocity, lowest, highest, start_speed=0
 def slowdown(line, grid, speeds, velocity, acceleration):
     """The factor, at least 1, by which the motion's duration must grow so that velocity and acceleration
     limits [dof] hold between grid points as well. `speeds`: ṡ at the grid points."""
-    waypoints, knots, directions, half_widths = line
-    dof = waypoints.shape[1]
+    dof = line.waypoints.shape[1]
     factor = 1.0
     first = np.empty(dof)
     second = np.empty(dof)
@@ -348,13 +363,13 @@ def slowdown(line, grid, speeds, velocity, acceleration):
         width = grid[i + 1] - grid[i]
         u = (speeds[i + 1] ** 2 - speeds[i] ** 2) / (2 * width)
         # on a straight part, velocities and accelerations are greatest at the interval's ends
-        evaluate_at(waypoints, knots, directions, half_widths, grid[i] + 0.5 * width, 2, second)
+        evaluate_at(line, grid[i] + 0.5 * width, 2, second)
         curved = np.abs(second).max() > 0
         margin = CURVE_MARGIN if curved else ROUNDING_MARGIN
         for k in range(0, SLOWDOWN_CHECKS_PER_INTERVAL + 1, 1 if curved else SLOWDOWN_CHECKS_PER_INTERVAL):
             ds = k / SLOWDOWN_CHECKS_PER_INTERVAL * width
-            evaluate_at(waypoints, knots, directions, half_widths, grid[i] + ds, 1, first)
-            evaluate_at(waypoints, knots, directions, half_widths, grid[i] + ds, 2, second)
+            evaluate_at(line, grid[i] + ds, 1, first)
+            evaluate_at(line, grid[i] + ds, 2, second)
             x = max(speeds[i] ** 2 + 2 * u * ds, 0.0)
             speed = np.sqrt(x)
             for j in range(dof):

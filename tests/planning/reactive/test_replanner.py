@@ -16,8 +16,8 @@ from helpers.refusals import refuses
 from robotdiffuse.collision.moving_obstacles import MovingCollision
 from robotdiffuse.planning.reactive.timed_path import JerkFilter, SpeedProfile, TimedPath
 from robotdiffuse.robots.motion_bounds import motion_radii
-from robotdiffuse.trajectories.corner_rounding import BlendedPolyline, half_widths
 from robotdiffuse.trajectories.speed_limits import jerk_limits
+from robotdiffuse.trajectories.timing_kernel import rounded_line
 
 PANDA = rd.load_robot("panda")
 START, END = np.array([-1.0, 0.3, 0, -1.8, 0, 2.1, 0.8]), np.array([1.0, 0.3, 0, -1.8, 0, 2.1, 0.8])
@@ -207,7 +207,7 @@ def test_limits_hold_at_every_time_however_often_the_arm_brakes(seed: int) -> No
     step = rng.choice([0.001, 0.005, 0.01])
     period = rng.choice([0.02, 0.0137])
     waypoints = np.cumsum(rng.normal(size=(5, 7)) * 0.3, axis=0)
-    line = BlendedPolyline(waypoints, half_widths(waypoints, np.full(3, 0.1)))
+    line = rounded_line(waypoints, np.full(3, 0.1))
     filtered = JerkFilter(PANDA, jerk, step, waypoints[0])
     path = TimedPath(PANDA, filtered.acceleration, line, True)
     given = SpeedProfile(np.zeros(2), np.zeros(2))

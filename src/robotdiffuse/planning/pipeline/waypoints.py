@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import ROWS, Path, Status, Trajectory
@@ -37,10 +38,10 @@ from robotdiffuse.planning.context import (
 from robotdiffuse.problems.constraints import CartesianLine
 from robotdiffuse.problems.goals import Goal, JointGoal
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.trajectories.corner_rounding import corner_middle
 from robotdiffuse.trajectories.speed_limits import DEFAULT as TIMING
 from robotdiffuse.trajectories.speed_limits import stopping_distance
 from robotdiffuse.trajectories.timing import joined_rows
+from robotdiffuse.trajectories.timing_kernel import rounded_line
 from robotdiffuse.validation.tolerances import DEFAULT, goal_error
 from robotdiffuse.validation.validator import verifier
 
@@ -153,10 +154,11 @@ def _corners(segments: Sequence[PlanResult]) -> tuple[Int[ndarray, "waypoints"],
 def _deviation(problem: Problem, path: Path, row: int, goal: Goal, blend: float) -> float:
     """How far from the path's corner at a row the motion may pass, so that it still comes within the blend of
     a goal [rad, joint-space L2]; 0 if no tried deviation is small enough."""
-    q = path.positions
+    corner = for_kernels(path.positions[row - 1 : row + 2])
     deviation = MAX_DEVIATION_PER_BLEND * blend
     for _ in range(MAX_DEVIATIONS):
-        middle = corner_middle(q, row, deviation)
+        line = rounded_line(corner, np.array([deviation]))
+        middle = line(line.knots[1:2], 0)[0]
         if goal_error(problem.robot, goal, middle, blend=BLEND_FRACTION * blend) is None:
             return deviation
         deviation *= DEVIATION_FACTOR

@@ -20,10 +20,9 @@ from robotdiffuse.core.types import Configuration, Configurations, Path, Traject
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories import braking_kernel
-from robotdiffuse.trajectories.corner_rounding import BlendedPolyline, half_widths
 from robotdiffuse.trajectories.speed_limits import TimingSettings, symmetric_bounds, timing_grid
 from robotdiffuse.trajectories.timing import time_parameterize
-from robotdiffuse.trajectories.timing_kernel import controllable, states_at
+from robotdiffuse.trajectories.timing_kernel import RoundedLine, controllable, rounded_line, states_at
 from robotdiffuse.validation.tolerances import DEFAULT
 from robotdiffuse.validation.validator import Verifier, verifier
 
@@ -67,7 +66,7 @@ class TimedPath:
     robot: Robot
     acceleration: Configuration
     """Acceleration limits of motions along the path [dof]."""
-    line: BlendedPolyline
+    line: RoundedLine
     to_goal: bool
     """Whether this path, or the last path that follows it, ends at the goal."""
     then: "TimedPath | None" = None
@@ -98,7 +97,7 @@ class TimedPath:
         rows, deviations, _ = time_parameterize(
             robot, path, free, validator.collision_free, keeps=free_around
         )
-        line = BlendedPolyline(rows, half_widths(rows, deviations))
+        line = rounded_line(rows, deviations)
         for i in np.flatnonzero(deviations):
             width = line.half_widths[i]
             if not free_around(line(line.knots[i + 1] + width * np.linspace(-1, 1, CORNER_SAMPLES), 0)):
@@ -106,7 +105,8 @@ class TimedPath:
         stops = [0, *(np.flatnonzero(deviations == 0) + 1).tolist(), len(rows) - 1]
         timed = None
         for first, last in reversed(list(pairwise(stops))):
-            part = BlendedPolyline(rows[first : last + 1], line.half_widths[first : last - 1])
+            widths = line.half_widths[first : last - 1]
+            part = rounded_line(rows[first : last + 1], widths)._replace(half_widths=widths)
             timed = TimedPath(robot, jerk_filter.acceleration, part, to_goal, timed)
         return timed
 

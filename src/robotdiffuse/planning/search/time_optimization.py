@@ -15,9 +15,9 @@ from robotdiffuse.collision.kernels.random import random, random_state
 from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.core.types import Configuration, Configurations, Values
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.trajectories.speed_limits import TimingSettings, scaled_limits
+from robotdiffuse.trajectories.speed_limits import TimingSettings, least_time, scaled_limits
 from robotdiffuse.trajectories.straight_line import straight_line_time
-from robotdiffuse.trajectories.timing_kernel import estimated_time, evaluate_at, least_time, rounded_line
+from robotdiffuse.trajectories.timing_kernel import estimated_time, evaluate_at, rounded_line
 
 # An attempt draws a number from 0 to 1. Below REMOVE_SHARE, it removes a waypoint, unless it is the only
 # inner one; below ADD_SHARE, it adds a waypoint in the middle of a segment and moves it; below WIDEN_SHARE,
@@ -64,7 +64,7 @@ def reduce_time(space, path, deviations, time, velocity, acceleration, longest, 
         if len(new) == 0:
             continue
         line = rounded_line(new, new_deviations)
-        if line[1][-1] > longest:
+        if line.knots[-1] > longest:
             continue
         new_time = estimated_time(line, velocity, acceleration)
         if new_time < time and _is_free(space, line, first, last, scratch):
@@ -123,14 +123,12 @@ def _candidate(space, path, deviations, step, again, state):
 def _is_free(space, line, first, last, scratch):
     """Whether these parts of the polyline are free: segments `first` to `last`, the rounded corners at their
     ends, and one more corner on each side, whose width may have changed."""
-    waypoints = line[0]
-    widths = line[3]
     for i in range(first, last + 1):
-        scratch.a[:] = waypoints[i]
-        scratch.b[:] = waypoints[i + 1]
+        scratch.a[:] = line.waypoints[i]
+        scratch.b[:] = line.waypoints[i + 1]
         if not motion_free(space, scratch.a, scratch.b, scratch):
             return False
-    for corner in range(max(first - 2, 0), min(last + 2, len(widths))):
+    for corner in range(max(first - 2, 0), min(last + 2, len(line.half_widths))):
         if not _corner_is_free(space, line, corner, scratch):
             return False
     return True
@@ -138,12 +136,11 @@ def _is_free(space, line, first, last, scratch):
 
 @inner_kernel()
 def _corner_is_free(space, line, corner, scratch):
-    waypoints, knots, directions, widths = line
-    width = widths[corner]
+    width = line.half_widths[corner]
     chords = min(max(int(np.ceil(2 * width / MAX_CHORD)), 2), MAX_CHORDS)
     for k in range(chords + 1):
-        s = knots[corner + 1] + width * (2 * k / chords - 1)
-        evaluate_at(waypoints, knots, directions, widths, s, 0, scratch.b)
+        s = line.knots[corner + 1] + width * (2 * k / chords - 1)
+        evaluate_at(line, s, 0, scratch.b)
         if k > 0 and not motion_free(space, scratch.a, scratch.b, scratch):
             return False
         scratch.a[:] = scratch.b
@@ -246,8 +243,7 @@ class TimeOptimization:
             for j in range(len(start))
         ]
         self._bound = float(np.max(alone, axis=0).min())
-        self._deviation = settings.corner_deviation
-        self._intervals = settings.corner_intervals, settings.line_intervals
+        self._settings = settings
         self._state = random_state(seed, 1)
         self._longest = longest
         self._turn = 0
@@ -277,7 +273,7 @@ class TimeOptimization:
     def offer(self, space: Space, path: Configurations, stage: str) -> None:
         """Make a path whose polyline is free in `space` a candidate, if it is among the fastest."""
         path = with_corner(path)
-        deviations = free_deviations(space, path, self._deviation)
+        deviations = free_deviations(space, path, self._settings.corner_deviation)
         time = float(estimated_time(rounded_line(path, deviations), *self._limits))
         candidate = Candidate(path, deviations, time, stage)
         self._improve(space, candidate, FIRST_ATTEMPTS)
@@ -300,7 +296,7 @@ class TimeOptimization:
     def least_time(self, candidate: Candidate) -> float:
         """The exact time of the fastest motion without limits of jerk [s]."""
         line = rounded_line(candidate.path, candidate.deviations)
-        return least_time(line, *self._limits, *self._intervals)
+        return least_time(line, *self._limits, self._settings)
 
     def _improve(self, space: Space, candidate: Candidate, attempts: int) -> None:
         candidate.path, candidate.deviations, candidate.time = reduce_time(
