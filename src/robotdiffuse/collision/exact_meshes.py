@@ -255,28 +255,38 @@ class ExactCollision:
         frames = forward_frames(self.robot, q)
         distances = np.full(len(q), np.nan)
         names: list[str | None] = [None] * len(q)
-        for i, (check, best) in enumerate(zip(checks.tolist(), cutoffs.tolist(), strict=True)):
+        depth = stop == -np.inf
+        for i, (check, cutoff) in enumerate(zip(checks.tolist(), cutoffs.tolist(), strict=True)):
             candidates = self._candidates[check]
-            if candidates.surfaces is not None:
-                best = distances[i] = self._grazing_distance(candidates, frames[i], best, stop == -np.inf)
-                if best < cutoffs[i]:
-                    names[i] = self.checks[check].other
-                if best <= stop:
-                    break
-                continue
-            lower = candidates.lower(frames[i : i + 1])[0]
-            for candidate in lower.argsort().tolist():
-                if lower[candidate] >= best or best <= stop:
-                    break
-                piece, partner = candidates.pair(candidate)
-                distance = self._signed(piece, partner, frames[i], best, depth=stop == -np.inf)
-                if distance < best:
-                    best = distance
-                    names[i] = partner.name if isinstance(partner, _Obstacle) else self.checks[check].other
-            distances[i] = best
-            if best <= stop:
+            obstacle = None
+            if candidates.surfaces is None:
+                distances[i], obstacle = self._closest(candidates, frames[i], cutoff, stop, depth)
+            else:
+                distances[i] = self._grazing_distance(candidates, frames[i], cutoff, depth)
+            if distances[i] < cutoff:
+                names[i] = self.checks[check].other or obstacle
+            if distances[i] <= stop:
                 break
         return distances, names
+
+    def _closest(
+        self, candidates: _Candidates, frames: ndarray, cutoff: float, stop: float, depth: bool
+    ) -> tuple[float, str | None]:
+        """Smallest signed distance of a check's pairs of geometries [m], at most `cutoff`, and the name of
+        the nearest obstacle, None for two links. The search ends at the first distance of at most `stop`.
+        Without `depth`, the penetration of a surface may be too small, but the sign is right."""
+        best = cutoff
+        obstacle = None
+        lower = candidates.lower(frames[None])[0]
+        for candidate in lower.argsort().tolist():
+            if lower[candidate] >= best or best <= stop:
+                break
+            piece, partner = candidates.pair(candidate)
+            distance = self._signed(piece, partner, frames, best, depth)
+            if distance < best:
+                best = distance
+                obstacle = partner.name if isinstance(partner, _Obstacle) else None
+        return best, obstacle
 
     def _grazing_distance(
         self, candidates: _Candidates, frames: ndarray, cutoff: float, depth: bool
@@ -289,13 +299,8 @@ class ExactCollision:
         may be too small, but the sign is right.
         """
         assert candidates.surfaces is not None
-        best = cutoff
-        lower = candidates.lower(frames[None])[0]
-        for candidate in lower.argsort().tolist():
-            if lower[candidate] >= best or (best < -MAX_OVERLAP and not depth):
-                break
-            best = min(best, self._signed(*candidates.pair(candidate), frames, best, depth=True))
-        if not -MAX_OVERLAP <= best < SURFACES_BELOW:
+        best, _ = self._closest(candidates, frames, cutoff, -np.inf if depth else -MAX_OVERLAP, depth=True)
+        if not -MAX_OVERLAP < best < SURFACES_BELOW:
             return best
         surface_distance = candidates.surfaces.distance(frames, cutoff)
         return best if surface_distance is None else min(max(best, surface_distance), cutoff)

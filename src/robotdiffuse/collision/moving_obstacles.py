@@ -92,12 +92,11 @@ class MovingCollision:
             )
             certified = min(certified, bound)
             halves = list[tuple[float, float, int, int]]()
-            for start, stop, link, o in open_tasks:
+            for start, stop, link, o, loss in open_tasks:
                 if hit is not None and start >= hit[0]:
                     continue
                 time = (start + stop) / 2
                 distance = self._distance(link, o, times, q, time)
-                loss = self._clearance_loss(link, o, times, q, start, stop)
                 if distance <= self.contact or stop - start < MIN_INTERVAL:
                     if hit is None or time < hit[0]:
                         hit = time, link, o
@@ -156,16 +155,6 @@ class MovingCollision:
             self.link_names[link], interpolated(time, times, q), T_base_moved
         )
         return distance - self.tracks.growth[o] * max(time, 0.0)
-
-    def _clearance_loss(
-        self, link: int, o: int, times: ndarray, q: ndarray, start: float, stop: float
-    ) -> float:
-        """Upper bound on how much clearance is lost from the middle of an interval to either end [m]: how far
-        points of the link move, plus how far points of the obstacle move."""
-        travel = kernel.cumulative_motion(q)
-        a, m, b = (interpolated(time, times, travel) for time in (start, (start + stop) / 2, stop))
-        speed = kernel.speed_between(self.tracks, o, start, stop) + self.tracks.growth[o]
-        return float(self.links.motion_radii[link] @ np.maximum(m - a, b - m)) + speed * (stop - start) / 2
 
     @cached_property
     def _exact(self) -> "tuple[ExactCollision, ...]":

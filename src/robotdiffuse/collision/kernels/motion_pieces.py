@@ -54,7 +54,7 @@ def segment_at(travel, at):
     low = min(max(np.searchsorted(travel, at, side="right") - 1, 0), max(len(travel) - 2, 0))
     if low + 1 >= len(travel) or travel[low + 1] <= travel[low]:
         return low, 0.0
-    return low, min((at - travel[low]) / (travel[low + 1] - travel[low]), 1.0)
+    return low, min(max((at - travel[low]) / (travel[low + 1] - travel[low]), 0.0), 1.0)
 
 
 @inner_kernel()

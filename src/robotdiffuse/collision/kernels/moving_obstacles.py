@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from robotdiffuse.collision.kernels.frames import base_frames, parent_of, point_to_solid, write_rotation
+from robotdiffuse.collision.kernels.motion_pieces import Motion, configuration
 from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.robots.frame_kernel import placed, plus, rotated_back, step, write
 
@@ -114,7 +115,7 @@ def pose_at(tracks, o, time, rotation, middle):
     write(plus(rotated_back(rotation, tracks.center[o]), middle), middle)
 
 
-@kernel()
+@inner_kernel()
 def speed_between(tracks, o, start, stop):
     """Upper bound on the speed of any point of obstacle o between two times [m/s], without its growth."""
     max_speed = 0.0
@@ -154,22 +155,6 @@ def _pose_arm(links, q, frames):
 
 
 @inner_kernel()
-def _row_at(times, time):
-    """The last row at or before a time, and the fraction of the interval from this row to the next."""
-    low = min(max(np.searchsorted(times, time, side="right") - 1, 0), max(len(times) - 2, 0))
-    if low + 1 >= len(times):
-        return low, 0.0
-    return low, min(max((time - times[low]) / (times[low + 1] - times[low]), 0.0), 1.0)
-
-
-@inner_kernel()
-def _interpolated(rows, low, share, j):
-    """Column j of rows, interpolated between row `low` and the next."""
-    high = min(low + 1, len(rows) - 1)
-    return rows[low, j] + share * (rows[high, j] - rows[low, j])
-
-
-@kernel()
 def cumulative_motion(q):
     """Total motion of each joint from the first row to each row [n, dof]; motion in both directions adds
     up."""
@@ -190,16 +175,21 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
 
     Returns:
         The smallest bound that settled a pair [m]. The tasks that are left to the exact meshes, one pair
-        each, as (start, stop, link, obstacle). In the middle of such an interval the link's spheres are at
-        most `least` from the obstacle, or the interval was halved MAX_HALVINGS times.
+        each, as (start, stop, link, obstacle, loss): `loss` bounds how much clearance is lost from the middle
+        of the interval to either end [m]. In the middle the link's spheres are at most `least` from the
+        obstacle, or the interval was halved MAX_HALVINGS times.
     """
     dof = q.shape[1]
     count = len(links.frame)
     obstacles = len(tracks.growth)
-    joint_travel = cumulative_motion(q)
+    # the motion and the travel of its joints; a place on both is a time
+    motion = Motion(q, times)
+    joint_travel = Motion(cumulative_motion(q), times)
     frames = base_frames(dof)
     middle = np.empty(dof)
-    joint_motion = np.empty(dof)
+    travel_at_start = np.empty(dof)
+    travel_in_middle = np.empty(dof)
+    travel_at_stop = np.empty(dof)
     rotation = np.empty((3, 3))
     place = np.empty(3)
     travel = np.empty(count)
@@ -207,7 +197,7 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
     stops = np.empty(MAX_HALVINGS + 2)
     depths = np.empty(MAX_HALVINGS + 2, np.int64)
     pairs = np.empty((MAX_HALVINGS + 2, count, obstacles), np.bool_)
-    remaining = [(0.0, 0.0, 0, 0) for _ in range(0)]
+    remaining = [(0.0, 0.0, 0, 0, 0.0) for _ in range(0)]
     certified = CLEARANCE_CAP
     for task in range(len(tasks.start)):
         starts[0] = tasks.start[task]
@@ -222,22 +212,18 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
             depth = depths[size]
             time = 0.5 * (start + stop)
             half_duration = 0.5 * (stop - start)
-            row, share = _row_at(times, time)
-            first, first_share = _row_at(times, start)
-            last, last_share = _row_at(times, stop)
-            # largest motion of each joint, then of each link, from the middle to either end
-            for j in range(dof):
-                middle[j] = _interpolated(q, row, share, j)
-                joint_travel_middle = _interpolated(joint_travel, row, share, j)
-                before = joint_travel_middle - _interpolated(joint_travel, first, first_share, j)
-                joint_motion[j] = max(
-                    before, _interpolated(joint_travel, last, last_share, j) - joint_travel_middle
-                )
+            configuration(motion, time, middle)
+            configuration(joint_travel, start, travel_at_start)
+            configuration(joint_travel, time, travel_in_middle)
+            configuration(joint_travel, stop, travel_at_stop)
             _pose_arm(links, middle, frames)
-            for link in range(count):
-                travel[link] = 0.0
-                for j in range(dof):
-                    travel[link] += links.motion_radii[link, j] * joint_motion[j]
+            # largest motion of each link from the middle to either end
+            travel[:] = 0.0
+            for j in range(dof):
+                before = travel_in_middle[j] - travel_at_start[j]
+                joint_motion = max(before, travel_at_stop[j] - travel_in_middle[j])
+                for link in range(count):
+                    travel[link] += links.motion_radii[link, j] * joint_motion
             split_needed = False
             for o in range(obstacles):
                 is_posed = False
@@ -258,7 +244,7 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
                     )
                     clearance = min(clearance, CLEARANCE_CAP + clearance_loss)
                     if clearance <= least or depth == MAX_HALVINGS:
-                        remaining.append((start, stop, link, o))
+                        remaining.append((start, stop, link, o, clearance_loss))
                         pairs[size, link, o] = False
                         continue
                     best[0] = min(best[0], clearance)
