@@ -10,6 +10,7 @@ import hashlib
 import io
 import json
 import os
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -228,24 +229,9 @@ def _joint_to_json(joint: Joint) -> dict:
 
 
 def _dump(data: dict) -> str:
-    """JSON text with one joint, sphere or pair per line."""
-    lines = []
-    for key, value in data.items():
-        levels = 2 if key == "spheres" else int(isinstance(value, list) or key == "inertias")
-        lines.append(f"  {json.dumps(key)}: {_dump_value(value, levels, '  ')}")
-    return "{\n" + ",\n".join(lines) + "\n}"
-
-
-def _dump_value(value: Any, levels: int, pad: str) -> str:
-    """JSON text of a value. In the outer `levels` levels of nesting, each entry is on its own line."""
-    if not levels or not value:
-        return json.dumps(value, allow_nan=False)
-    named = isinstance(value, dict)
-    items = (
-        [(f"{json.dumps(key)}: ", value[key]) for key in value] if named else [("", item) for item in value]
-    )
-    rows = ",\n".join(f"{pad}  {name}{_dump_value(item, levels - 1, pad + '  ')}" for name, item in items)
-    return f"{'{' if named else '['}\n{rows}\n{pad}{'}' if named else ']'}"
+    """Indented JSON text in which innermost lists, such as spheres and pairs of links, are on one line."""
+    text = json.dumps(data, indent=1, allow_nan=False)
+    return re.sub(r"\[[^\[\]{}]+\]", lambda innermost: " ".join(innermost[0].split()), text)
 
 
 def _read_json(file: Path) -> dict:

@@ -36,6 +36,7 @@ from robotdiffuse.robots.bodies import ConvexMesh, Inertia, inertia_of, polygon_
 from robotdiffuse.robots.fitting.convex_parts import MIN_THICKNESS, Surface, convex_hull, thickened
 from robotdiffuse.robots.kinematic_tree import CONTINUOUS_LIMIT, MOVING_KINDS, Joint, Mimic, with_mimics
 from robotdiffuse.robots.kinematics import reach
+from robotdiffuse.robots.parsing.mjcf import ConvertedModel, ellipsoid
 from robotdiffuse.robots.parsing.packages import Packages, compiled_xacro, is_xacro, with_prefixes
 from robotdiffuse.robots.parsing.srdf import Srdf, planned_joints, refuse_linkages
 from robotdiffuse.robots.robot import Robot
@@ -61,13 +62,6 @@ def moves_in_a_plane(joints: Sequence[Joint]) -> bool:
 
 
 PRIMITIVES = ("box", "capsule", "cylinder", "sphere")
-
-
-def _ball() -> Points:
-    """Vertices of a polyhedron around the unit ball."""
-    ball = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
-    inradius = np.einsum("fd,fd->f", ball.face_normals, ball.triangles[:, 0]).min()
-    return np.array(ball.vertices) / inradius
 
 
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -119,8 +113,6 @@ class UrdfTree:
             )
             root = parse_xml(self.text, str(self.path))
         if root.tag == "mujoco":
-            from robotdiffuse.robots.parsing.mjcf import ConvertedModel
-
             model = ConvertedModel(self.path)
             self.text = model.urdf
             self.semantics = model.semantics
@@ -523,12 +515,12 @@ class UrdfTree:
         if shape.tag == "box":
             return np.array(trimesh.creation.box(positive("size", 3)).vertices)
         radius = positive("radius", 1)
-        if shape.tag == "sphere":
-            return _ball() * radius
-        if shape.tag == "capsule":
-            end_points = _ball() * radius
-        else:
+        if shape.tag == "cylinder":
             end_points = np.insert(polygon_around_circle(float(radius[0])), 2, 0.0, axis=1)
+        else:
+            end_points = np.array(ellipsoid(np.repeat(radius, 3)).vertices)
+        if shape.tag == "sphere":
+            return end_points
         half = float(positive("length", 1)[0]) / 2
         return np.concatenate([end_points + np.array([0, 0, z]) for z in (-half, half)])
 
