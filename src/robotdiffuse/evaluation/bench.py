@@ -420,7 +420,8 @@ def run_bench(settings: BenchSettings, report: Progress, done: Done) -> int:
 def open_runs(
     records: Mapping[str, Sequence[Record]], cases: Sequence[Case], settings: BenchSettings
 ) -> list[Run]:
-    """The runs that have no record yet. `records` are the existing records by planner."""
+    """The runs that are still to be made: those that no record answers (see `run_bench`). `records` are the
+    existing records by planner."""
     answered: set[tuple[str, str, str, int]] = set()
     for label in settings.specs:
         restarted = {record.key for record in records.get(label + RESTARTED, ())}
@@ -534,7 +535,7 @@ PRESETS: dict[str, Preset] = {
         equal_time=False,
     ),
     "anytime": Preset(
-        "anytime search against OMPL's: Shared-Tree Informed RRT*, AORRTC, Informed RRT*",
+        "Shared-Tree Informed RRT* and AORRTC against OMPL's AORRTC and Informed RRT*",
         ("shared_tree_rrt_star", AORRTC, "ompl_aorrtc", "ompl_informed_rrt_star"),
         ROP,
         (1.0,),

@@ -63,7 +63,8 @@ class ExportedModel(MotionModel):
     """The model of a folder with weights."""
 
     def __init__(self, name: str, folder: FilePath) -> None:
-        """name: a name in NETWORKS. Raises InputError, naming the file, for a missing or damaged file."""
+        """name: "model" or "trajectory_prior". Raises InputError, naming the file, for a missing or damaged
+        file."""
         about = read_description(folder, name)
         location = str(folder / f"{name}.json")
         robot = RobotIdentity.from_json(about.get("robot"), f"{location}: robot")

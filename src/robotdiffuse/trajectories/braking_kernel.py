@@ -1,7 +1,8 @@
 """Compiled code for the speeds along a path: the motion is as fast as possible for a given time, then brakes
 to rest. It begins at the arm's current place on the path, with its current speed.
 
-The path is q(s), with the derivatives q' and q'' by s; s̈ is constant in each interval of a grid over s.
+The path is q(s), with the derivatives q' and q'' by s; s̈ is constant in each interval of a grid over s, and
+changes within an interval only where braking begins.
 The limits of s̈ are evaluated at both ends of an interval, even if the motion covers only a part of it. So an
 s̈ that is within the limits when the motion enters the interval is within them until the motion leaves it.
 """

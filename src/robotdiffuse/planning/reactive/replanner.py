@@ -85,8 +85,8 @@ class ObservedObstacle:
             if moved > max_speed * passed + OBSERVATION_ERROR:
                 distance, allowed = distinct(float(moved), max_speed * passed, digits=3)
                 raise InputError(
-                    f"observation[{name!r}] is {distance} m from where it was {passed:.3g} s ago; its "
-                    f"maximum speed {max_speed:g} m/s allows {allowed} m"
+                    f"observation[{name!r}]: a point of it can have moved {distance} m in {passed:.3g} s; its
+                    " f"maximum speed {max_speed:g} m/s allows {allowed} m"
                 )
             velocity = (T[:3, 3] - T_before[:3, 3]) / passed
         shape = self.obstacle.shape.moved(T @ inverse(T_before))
@@ -298,7 +298,9 @@ class Replanner:
             raise InputError(f"now is {shown(now)}; it must be a finite number of seconds")
         if now <= self._now:
             time, last = distinct(float(clock), self._now)
-            raise InputError(f"now is {time} s after {last} s; time must go on from step to step")
+            raise InputError(
+                f"now is {time} s, but the last step was at {last} s; it must grow from step to step"
+            )
         self._observe(observation, float(now))
         begins = self._now + self.settings.period
         self._filter.advance(self._path, self._motion, self._since, begins)
@@ -461,7 +463,8 @@ class Replanner:
         return TimedPath.certified(self._validator, best, False, self._filter)
 
     def _change_path(self) -> None:
-        """If the arm rests, change to the next path, or to the path that follows the current one."""
+        """If the arm rests, change to `_next`, the path that was found in place of the current one, or at the
+        end of the current path to its continuation."""
         if not self._rests:
             return
         following = self._next

@@ -73,8 +73,8 @@ class Neighbor(NamedTuple):
 
 
 def neighbors(robot: Robot, link: str) -> tuple[Neighbor, ...]:
-    """Links with geometry that a joint connects to the given link. Links without geometry that fixed
-    joints connect between the two are skipped."""
+    """Links with geometry that a joint connects to the given link. If the joint's parent has no geometry, the
+    nearest link with geometry above it counts, as long as only fixed joints lead to it."""
     adjacent = []
     for joint in robot.joints:
         above = joint.parent
@@ -457,7 +457,8 @@ def _floor(robot: Robot, link: str) -> tuple[ndarray, float] | None:
 MIN_FREE = 0.2
 """A warning is given if a smaller fraction of the configurations is free."""
 MAX_FALSE_COLLISIONS = 0.08
-"""A warning is given if spheres collide falsely in a larger fraction of the free configurations."""
+"""A warning is given if spheres collide falsely in a larger fraction of the free configurations. It is a
+little above the fraction at which refinement ends, `PreparationSettings.max_false_collisions`."""
 MAX_PROPOSED = 3
 """Largest number of pairs that the error message proposes for a robot that always collides with itself
 although no single pair always collides."""
