@@ -85,8 +85,8 @@ class ObservedObstacle:
             if moved > max_speed * passed + OBSERVATION_ERROR:
                 distance, allowed = distinct(float(moved), max_speed * passed, digits=3)
                 raise InputError(
-                    f"observation[{name!r}]: a point of it can have moved {distance} m in {passed:.3g} s; its
-                    " f"maximum speed {max_speed:g} m/s allows {allowed} m"
+                    f"observation[{name!r}]: a point of it can have moved {distance} m in {passed:.3g} s; "
+                    f"its maximum speed {max_speed:g} m/s allows {allowed} m"
                 )
             velocity = (T[:3, 3] - T_before[:3, 3]) / passed
         shape = self.obstacle.shape.moved(T @ inverse(T_before))
