@@ -172,10 +172,12 @@ def repairs(robot: Robot, runs: int) -> Iterator[float]:
         [ball] = scene(robot, 1, seed)
         times = np.arange(0.0, ball.track[0][1], PERIOD)
         checkers = [CollisionChecker(robot, rd.Scene([FLOOR, ball.at(t)])) for t in times]
-        search = LatticeSearch(checkers[0], np.array(START), np.array([GOAL]), DStarLiteSettings())
+        start = np.array(START)
+        settings = DStarLiteSettings(clearance=0.0)
+        search = LatticeSearch(checkers[0], start, np.array([GOAL]), settings)
         for checker in checkers[:: max(len(times) // 20, 1)]:
             began = time.process_time()
-            search.update(checker)
+            search.update(checker, np.array(START))
             search.run(partial(late, began + LATTICE_LIMIT))
             yield 1e3 * (time.process_time() - began)
 

@@ -32,10 +32,10 @@ from robotdiffuse.collision.motions import FINEST_RESOLUTION
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.kernels import allocation_free, kernel
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive, Settings
+from robotdiffuse.core.settings import Bound, Count, Positive
 from robotdiffuse.core.types import Configuration, Configurations, Status
 from robotdiffuse.planning.context import PlanningContext
-from robotdiffuse.planning.planner import Planner, ever_finer
+from robotdiffuse.planning.planner import CheckedSettings, Planner, ever_finer
 from robotdiffuse.planning.start_goal import StartGoal, padded_space
 
 CLOCK_INTERVAL = 4000  # approximate number of edges between two readings of the clock
@@ -48,21 +48,15 @@ Outcome = IntEnum("Outcome", "GOING FOUND EXHAUSTED FULL", start=0)  # result of
 # goals as of its last expansion [steps]. rhs: its cost from the goals by the neighbors' g [steps]. parent:
 # the neighbor that gives rhs.
 NODE = np.dtype([("at", "i8"), ("g", "f8"), ("rhs", "f8"), ("parent", "i8")])
-# The arrays of a search.
-# - origin[dof]: the node with the lowest coordinates [rad].
-# - counts[dof]: number of nodes along each joint; the first and the last are outside the limits.
-# - strides[dof]: change of `at` per step of each joint.
-# - moves, costs: what each edge adds to `at`, and its cost [steps].
-# - goals: number of goals.
-# - corners: `at` of the nodes around the goals.
-# - inflation: factor on the heuristic; above 1, nodes are expanded only once, as in ARA* (M. Likhachev et
-#   al., NIPS 2003).
-# - slots: hash table from `at` to the index of a node.
-# - nodes, q: the nodes and their configurations. Index 0 stands for no node; then come the goals, then the
-#   nodes of the lattice.
-# - queue: priority queue as a binary tree of maxima; its leaves are 1 / (1 + key), or 0 if not queued.
-# - values: counters, see below.
-# - offers: costs of one node through each of its neighbors and goals [steps].
+# The arrays of a search. origin[dof]: the node with the lowest coordinates [rad]. counts[dof]: number of
+# nodes along each joint; the first and the last are outside the limits. strides[dof]: change of `at` per step
+# of each joint. moves, costs: what each edge adds to `at`, and its cost [steps]. goals: number of goals.
+# corners: `at` of the nodes around them. inflation: factor on the heuristic; above 1, nodes are expanded only
+# once, as in ARA* (M. Likhachev et al., NIPS 2003). slots: hash table from `at` to the index of a node.
+# nodes, q: the nodes and their configurations; index 0 stands for no node; then come the goals, then the
+# nodes of the lattice. queue: priority queue as a binary tree of maxima; its leaves are 1 / (1 + key), or 0
+# if not queued. values: counters, see below. offers: costs of one node through each of its neighbors and
+# goals [steps].
 FIELDS = "origin spacing counts strides moves costs goals corners inflation slots nodes q queue "
 Search = namedtuple("Search", FIELDS + "values offers space scratch", defaults=(None, ()))
 NODES, EXPANSIONS, START = range(3)  # in `values`: number of nodes, number of expansions, index of the start
@@ -211,21 +205,15 @@ def update(s, start):
 
 
 @dataclass(frozen=True)
-class DStarLiteSettings(Settings, name="d_star_lite"):
+class DStarLiteSettings(CheckedSettings, name="d_star_lite"):
     spacing: Positive = 0.4
     """Step of the lattice [rad], or [m] for prismatic joints."""
     joints_per_move: Count = 1
-    """Largest number of joints that an edge moves, each by one step. Larger numbers make paths shorter and
-    the search slower: with 1, 2, 3 and 7 joints, paths are 2.1, 1.6, 1.35 and 1.2 times as long as the
-    straight line on problems of the family rop."""
+    """Largest number of joints that an edge moves, each by one step. With 1, 2, 3 and 7 joints, paths are
+    2.1, 1.6, 1.35 and 1.2 times as long as the straight line on problems of the family rop, and the search is
+    slower each time."""
     max_nodes: Annotated[int, Bound(least=1.0, most=2e9)] = 2_000_000
-    """Largest number of nodes in memory, in addition to the nodes around the goals. A node takes about 100
-    bytes."""
-    resolution: Positive = 0.05
-    """No point of the arm moves further than this between neighboring checked configurations [m]. It is
-    halved after the validator refused a path."""
-    clearance: NotNegative = 0.002
-    """Distance to obstacles that paths keep where start and goal allow it [m]."""
+    """Largest number of nodes in memory, besides those around the goals; a node takes about 100 bytes."""
 
 
 @dataclass(frozen=True)
@@ -237,8 +225,7 @@ class AStarSettings(DStarLiteSettings, name="a_star"):
 
 
 class LatticeSearch:
-    """A search on the lattice: weighted A* with `AStarSettings`; D* Lite, which can be repaired, with
-    `DStarLiteSettings`."""
+    """Weighted A* with `AStarSettings`; D* Lite, which can be repaired, with `DStarLiteSettings`."""
 
     expansions = 0
     """Number of expanded nodes so far."""
@@ -251,14 +238,10 @@ class LatticeSearch:
         start: Configuration,
         goals: Configurations,
         settings: DStarLiteSettings,
-        padding: float = 0.0,
     ) -> None:
-        """`padding` is the distance to obstacles that paths keep [m], except near a start or goal that is
-        closer to them. Raises InputError for a lattice that is too large."""
-        self.checker = checker
+        """Raises InputError for a lattice that is too large."""
         self.goals = goals
-        self.settings = settings
-        self.padding = padding
+        self._checks = settings.resolution, settings.clearance
         robot = checker.robot
         name = settings.settings_name
         spacing = settings.spacing
@@ -268,18 +251,15 @@ class LatticeSearch:
         nodes = counts.prod(dtype=float)
         if nodes >= MAX_NODES:
             least = 1.1 * spacing * (nodes / MAX_NODES) ** (1 / robot.dof)
-            raise InputError(
-                f"{name}.spacing is {spacing:g}, too fine for {robot.name}: use at least {least:.2g}"
-            )
-        edges = np.cumsum([comb(robot.dof, k) * 2**k for k in range(1, robot.dof + 1)])
-        most = edges[: settings.joints_per_move].max()
-        if most > MAX_MOVES:
+            raise InputError(f"{name}.spacing is {spacing:g}; use at least {least:.2g} for {robot.name}")
+        sizes = range(1, min(settings.joints_per_move, robot.dof) + 1)
+        edges = sum(comb(robot.dof, size) * 2**size for size in sizes)
+        if edges > MAX_MOVES:
             raise InputError(
                 f"{name}.joints_per_move is {settings.joints_per_move}; on {robot.name} a node then has "
-                f"{most} edges; use at most {sum(edges <= MAX_MOVES)}"
+                f"{edges} edges; at most {MAX_MOVES} are possible"
             )
         # edges: all combinations of joints and signs
-        sizes = range(1, min(settings.joints_per_move, robot.dof) + 1)
         moving = [joints for size in sizes for joints in combinations(range(robot.dof), size)]
         signed = [(joints, signs) for joints in moving for signs in product((1, -1), repeat=len(joints))]
         moves = np.array([np.bincount(*move, robot.dof) for move in signed], np.int64)
@@ -303,23 +283,14 @@ class LatticeSearch:
         s.q[1:first] = goals
         self.update(checker, start)
 
-    def update(self, checker: CollisionChecker, start: Configuration | None = None) -> None:
-        """Take over a changed scene, and a new start at a node of the lattice. For D* Lite, `run` then
-        repairs the search. Raises InputError for another robot, and for a start that is not a node."""
+    def update(self, checker: CollisionChecker, start: Configuration) -> None:
+        """Take over a changed scene and a new start, which is a node of the lattice. For D* Lite, `run` then
+        repairs the search."""
         s = self._search
-        if checker.robot is not self.checker.robot:
-            raise InputError(f"the robot is {checker.robot.name}; it must be that of the search")
-        if start is not None:
-            steps = (start - s.origin) / s.spacing
-            at = np.round(steps).clip(1, s.counts - 2)
-            if np.abs(steps - at).max() > 1e-3:
-                raise InputError(f"start is {np.round(start, 4)}; it must be a node of the lattice")
-            self._start = at.astype(np.int64) @ s.strides
-        self.checker = checker
-        ends = np.vstack([s.q[s.values[START]] if start is None else start, self.goals])
-        space = padded_space(checker, ends, self.settings.resolution, self.padding)
+        at = np.round((start - s.origin) / s.spacing).astype(np.int64) @ s.strides
+        space = padded_space(checker, np.vstack([start, self.goals]), *self._checks)
         self._search = s._replace(space=space, scratch=make_scratch(space, space.lower))
-        update(self._search, self._start)
+        update(self._search, at)
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> Outcome:
         """Search until a path is found (FOUND), it is certain that there is none (EXHAUSTED), memory is full
@@ -334,8 +305,7 @@ class LatticeSearch:
                 return outcome
 
     def path(self) -> Configurations | None:
-        """The path that `run` found: the start, the nodes at which its direction changes, and the goal. None
-        if `run` found no path."""
+        """The start, the nodes at which the path that `run` found turns, and the goal; None without one."""
         s = self._search
         if self.cost == np.inf:
             return None
@@ -347,8 +317,7 @@ class LatticeSearch:
 
 
 class AStar(Planner[DStarLiteSettings]):
-    """Weighted A* on a lattice. The path depends on the seed only through the goal configurations of a goal
-    pose."""
+    """Weighted A* on a lattice. Its path depends on the seed only if the goal is a pose."""
 
     name = "a_star"
     settings_class = AStarSettings
@@ -356,7 +325,7 @@ class AStar(Planner[DStarLiteSettings]):
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
         for settings, _ in ever_finer(context, self.settings):
-            search = LatticeSearch(start_goal.checker, *start_goal.rows(), settings, settings.clearance)
+            search = LatticeSearch(start_goal.checker, *start_goal.rows(), settings)
             outcome = search.run(lambda: context.remaining <= 0)
             after = f"after {search.expansions} expansions"
             path = search.path()
@@ -368,8 +337,7 @@ class AStar(Planner[DStarLiteSettings]):
                     Outcome.GOING: f"time ran out {after}; a coarser {spacing} searches faster",
                 }[outcome]
                 return context.fail(Status.NO_PATH if outcome > Outcome.FOUND else Status.TIMEOUT, reason)
-            path = start_goal.complete(path)
-            result = context.finish(path, self.name, reason=f"solved by {self.name} {after}")
+            result = context.finish(start_goal.complete(path), self.name, f"solved by {self.name} {after}")
             if result is not None:
                 return result
             if settings.resolution <= FINEST_RESOLUTION:

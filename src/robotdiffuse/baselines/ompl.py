@@ -31,10 +31,10 @@ from robotdiffuse.collision.kernels.motions import Space, motions_free
 from robotdiffuse.collision.motions import finer_resolution
 from robotdiffuse.core.errors import InputError, needs
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.settings import NotNegative, Positive, Settings
+from robotdiffuse.core.settings import Positive
 from robotdiffuse.core.types import Configuration, Configurations, Path
 from robotdiffuse.planning.context import PlanningContext
-from robotdiffuse.planning.planner import Planner, ever_finer
+from robotdiffuse.planning.planner import CheckedSettings, Planner, ever_finer
 from robotdiffuse.planning.start_goal import StartGoal
 
 with needs("OMPL's Python bindings", "baselines"):
@@ -52,13 +52,7 @@ SAME_STATE_DISTANCE = 1e-6
 
 
 @dataclass(frozen=True)
-class OmplSettings(Settings, name="ompl"):
-    resolution: Positive = 0.05
-    """No point of the arm moves further than this between neighboring checked configurations [m]; the
-    validator certifies the motion in between. After a path that the validator refuses, the search starts
-    again with half the resolution."""
-    clearance: NotNegative = 0.002
-    """Distance to obstacles that paths keep where start and goal allow it [m], as for `rrt_connect`."""
+class OmplSettings(CheckedSettings, name="ompl"):
     range: Positive | None = None
     """Longest extension of a tree [rad, joint-space L2]; None: OMPL's default, 0.2 of the space's diameter.
     PRM and BIT* have no such setting."""

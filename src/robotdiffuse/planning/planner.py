@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Generic, TypeVar
 
 from robotdiffuse.collision.motions import finer_resolution
@@ -10,7 +10,7 @@ from robotdiffuse.core.deadline import OutOfTimeError
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.loading import compile_note, loading
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.settings import Settings
+from robotdiffuse.core.settings import NotNegative, Positive, Settings
 from robotdiffuse.core.types import CONVERGED
 from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS, planners_that_support
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
@@ -180,6 +180,18 @@ def pipeline_for(problem: Problem) -> Callable[[Planner, Problem, PlanRequest], 
 
         return plan_with_unknown_space
     return Planner.attempt
+
+
+@dataclass(frozen=True)
+class CheckedSettings(Settings):
+    """How a planner without a clearance of its own checks motions for collision; see `ever_finer`."""
+
+    resolution: Positive = 0.05
+    """No point of the arm moves further than this between neighboring checked configurations [m]; the
+    validator certifies the motion in between. After a path that the validator refuses, the search starts
+    again with half the resolution."""
+    clearance: NotNegative = 0.002
+    """Distance to obstacles that paths keep where start and goal allow it [m], as for `rrt_connect`."""
 
 
 def ever_finer(context: PlanningContext, settings: PlannerSettings) -> Iterator[tuple[PlannerSettings, int]]:
