@@ -17,7 +17,7 @@ from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import Configuration
 from robotdiffuse.perception.depth_filter import empty_regions, filtered, grown_for_errors, open_depth
 from robotdiffuse.perception.depth_view import NEAREST, DepthView
-from robotdiffuse.perception.ray_caster import in_camera, rectangle
+from robotdiffuse.perception.ray_caster import balls, in_camera, rectangle, render_depth
 from robotdiffuse.perception.voxel_grid import COARSE, SHAPE, VoxelGrid
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
@@ -110,27 +110,6 @@ def _arm_pixels(depth, intrinsics, spheres):
     return mask
 
 
-@kernel(fastmath=FASTMATH)
-def _hide_arm(depth, empty, intrinsics, spheres):
-    """Set empty pixels whose rays meet one of the spheres to -NEAREST: nothing is known beyond that depth.
-    Spheres that contain the camera are ignored."""
-    h, w = depth.shape
-    fx, fy, cx, cy = intrinsics
-    for s in range(len(spheres)):
-        x, y, z, r = spheres[s]
-        square = x * x + y * y + z * z - r * r
-        if square <= _ZERO:
-            continue
-        v0, v1, u0, u1 = rectangle(x, y, z, r, intrinsics, h, w)
-        for v in range(v0, v1 + 1):
-            b = (np.float32(v) - cy) / fy
-            for u in range(u0, u1 + 1):
-                a = (np.float32(u) - cx) / fx
-                along = a * x + b * y + z
-                if empty[v, u] and along > _ZERO and square * (a * a + b * b + _ONE) < along * along:
-                    depth[v, u] = -_NEAREST
-
-
 def usable_image(
     view: DepthView, robot: Robot, q: Configuration, margin: float
 ) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "n 4"]]:
@@ -158,8 +137,10 @@ def usable_image(
         depth = np.where(empty, opening, depth)
         # Only the error of the camera's position is added here. `carve` accounts for the error of its angle:
         # it enlarges the rectangles of pixels that must all be free.
-        outline = np.column_stack([spheres[:, :3], arm[:, 3] + view.pose_deviation[0]]).astype(np.float32)
-        _hide_arm(depth, empty, intrinsics, outline)
+        outline = balls(arm + np.array([0, 0, 0, view.pose_deviation[0]]))
+        arm_depth = np.full(depth.shape, np.inf, np.float32)
+        render_depth(outline, intrinsics, T.astype(np.float32), arm_depth)
+        depth[empty & np.isfinite(arm_depth)] = -_NEAREST
     return depth, spheres
 
 

@@ -237,15 +237,19 @@ def ray_cast(
     """
     solids = _solids(scene)
     if robot is not None and configuration is not None:
-        spheres = placed_spheres(robot, configuration)
-        balls = np.zeros((len(spheres), solids.shape[1]), np.float32)
-        balls[:, [0, 1, 2, 15]] = spheres
-        balls[:, [3, 7, 11]] = _ONE
-        solids = np.concatenate([solids, balls])
+        solids = np.concatenate([solids, balls(placed_spheres(robot, configuration))])
     depth = np.full((size[1], size[0]), MAX_RANGE, np.float32)
     render_depth(solids, np.array(intrinsics, np.float32), np.asarray(T_base_camera, np.float32), depth)
     depth[depth >= MAX_RANGE] = np.inf
     return DepthView(depth, intrinsics, T_base_camera, configuration)
+
+
+def balls(spheres: Float[ndarray, "n 4"]) -> Float32[ndarray, "n 17"]:
+    """Spheres (x, y, z, radius [m]) as rows of `SceneArrays.solids`."""
+    rows = np.zeros((len(spheres), 17), np.float32)
+    rows[:, [0, 1, 2, 15]] = spheres
+    rows[:, [3, 7, 11]] = _ONE
+    return rows
 
 
 def voxels_within(

@@ -4,19 +4,20 @@ the small balls that cover the arm's surface are seen to be empty."""
 from itertools import product
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray
 
 from robotdiffuse.collision.convex_geometry import Part, parts_of
 from robotdiffuse.collision.exact_meshes import forward_frames
+from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.collision.kernels.collision_cost import frames_of
 from robotdiffuse.collision.kernels.collision_cost import placed as placed_point
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.transforms import placed
-from robotdiffuse.core.types import Configuration, Points
+from robotdiffuse.core.types import Configuration, Configurations, Points
 from robotdiffuse.perception.observed_volume import MAX_DEPTH, usable_depth
-from robotdiffuse.perception.ray_caster import in_camera
-from robotdiffuse.perception.voxel_grid import VoxelGrid, Voxels
+from robotdiffuse.perception.ray_caster import in_camera, render_depth
+from robotdiffuse.perception.voxel_grid import Probabilities, VoxelGrid, Voxels
 from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot
 
@@ -45,10 +46,18 @@ def seen_weights(robot, configurations, poses, intrinsics, size, reach, voxels, 
     one = np.float32(1.0)
     nx, ny, nz = filled.shape
     out = np.zeros(len(poses))
-    arm = np.empty((-(-size[0] // ARM_CELL), -(-size[1] // ARM_CELL)), np.float32)
+    frames = np.zeros((configurations.shape[1] + 1, 12), np.float32)
+    arm = np.zeros((len(robot.spheres), 17), np.float32)
+    arm[:, 3:12:4] = one  # no rotation
+    # the depth of the arm's spheres in the middle of each cell of pixels
+    arm_depth = np.empty((-(-size[0] // ARM_CELL), -(-size[1] // ARM_CELL)), np.float32)
+    cells = intrinsics / np.float32(ARM_CELL)
+    cells[2:] -= half
     for c in range(len(poses)):
         T = poses[c]
-        _arm_ahead(robot, configurations[c], T, intrinsics, half * edge, arm)
+        _place(robot, configurations[c], half * edge, frames, arm)
+        arm_depth[:] = np.inf
+        render_depth(arm, cells, T, arm_depth)
         ox = (T[0, 3] - low[0]) / edge
         oy = (T[1, 3] - low[1]) / edge
         oz = (T[2, 3] - low[2]) / edge
@@ -68,7 +77,7 @@ def seen_weights(robot, configurations, poses, intrinsics, size, reach, voxels, 
             v = -fy * y_away / forward + cy
             if not (-half <= u < size[1] - half and -half <= v < size[0] - half):
                 continue
-            if arm[int(v + half) // ARM_CELL, int(u + half) // ARM_CELL] < forward * edge:
+            if arm_depth[int(v + half) // ARM_CELL, int(u + half) // ARM_CELL] < forward * edge:
                 continue
             far = np.sqrt(dx * dx + dy * dy + dz * dz)
             dx = dx / far
@@ -89,36 +98,44 @@ def seen_weights(robot, configurations, poses, intrinsics, size, reach, voxels, 
     return out
 
 
-@kernel(nogil=True)
-def _arm_ahead(robot, q, T, intrinsics, margin, depth):
-    """Writes the arm's depth in each cell of an image [m]: the depth of the nearest covering sphere that the
-    ray through the middle of the cell meets; infinite if it meets none.
+def seen_share(
+    robot: Robot,
+    configurations: Configurations,
+    poses: Float[ndarray, "n 4 4"],
+    intrinsics: tuple[float, float, float, float],
+    size: tuple[int, ...],
+    reach: float,
+    voxels: Int[ndarray, "m 3"],
+    weights: Float32[ndarray, "m"],
+    filled: Probabilities,
+    grid: VoxelGrid,
+) -> Float[ndarray, "n"]:
+    """The fraction of the voxels' total weight that a camera sees from each pose, with the arm at the
+    configuration of the same row; the other arguments are those of `seen_weights`."""
+    sums = seen_weights(
+        compile_robot(robot),
+        configurations.astype(np.float32),
+        poses.astype(np.float32),
+        np.array(intrinsics, np.float32),
+        size,
+        np.float32(reach),
+        voxels,
+        weights,
+        filled,
+        *grid.frame,
+    )
+    return sums / weights.sum()
 
-    The spheres are inflated by `margin`; spheres that contain the camera are left out.
-    """
-    fx, fy, cx, cy = intrinsics
-    depth[:] = np.inf
-    frames = np.zeros((len(q) + 1, 12), np.float32)
+
+@kernel(nogil=True)
+def _place(robot, q, margin, frames, arm):
+    """Writes the arm's covering spheres at a configuration, inflated by `margin`, to `arm`, rows of
+    `SceneArrays.solids`. frames: working memory."""
     frames_of(robot, q, frames)
     for g in range(len(robot.frame)):
         for s in range(robot.first[g], robot.first[g + 1]):
-            sphere = robot.spheres[s]
-            x, y, z = placed_point(frames[robot.frame[g]], sphere)
-            x = x - T[0, 3]
-            y = y - T[1, 3]
-            z = z - T[2, 3]
-            r = sphere[3] + margin
-            square = x * x + y * y + z * z - r * r
-            u, v, w = in_camera(T, x, y, z)
-            if square <= 0 or w <= -r:
-                continue
-            for i in range(len(depth)):
-                b = ((i + np.float32(0.5)) * ARM_CELL - cy) / fy
-                for j in range(depth.shape[1]):
-                    a = ((j + np.float32(0.5)) * ARM_CELL - cx) / fx
-                    along = a * u + b * v + w
-                    if along > 0 and square * (a * a + b * b + np.float32(1.0)) < along * along:
-                        depth[i, j] = min(depth[i, j], max(w - r, np.float32(0.0)))
+            arm[s, 0], arm[s, 1], arm[s, 2] = placed_point(frames[robot.frame[g]], robot.spheres[s])
+            arm[s, 15] = robot.spheres[s, 3] + margin
 
 
 MAX_LOST_FRACTION = 0.2

@@ -11,7 +11,6 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.bounds import Value, rigid_transform
 from robotdiffuse.core.errors import InputError, check_type
@@ -22,12 +21,12 @@ from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.occupancy_map import COVER_RADIUS, OccupancyMap
 from robotdiffuse.perception.ray_caster import looking_at
 from robotdiffuse.perception.unknown_space import CARVING_MARGIN
-from robotdiffuse.perception.visibility import seen_weights
+from robotdiffuse.perception.visibility import seen_share
 from robotdiffuse.perception.voxel_grid import FINE, MAP, Probabilities, Voxels, refined
 from robotdiffuse.planning.exploration.seen_free import near_ends
 from robotdiffuse.planning.exploration.steps import ArmCamera
 from robotdiffuse.planning.pipeline.unknown_space import policy_for, unknown_space_of
-from robotdiffuse.planning.search.rrt_kernel import extend, make_trees
+from robotdiffuse.planning.search.rrt_kernel import branch, extend, make_trees
 from robotdiffuse.problems.problem import PREDICTED, Problem, check_problem
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
@@ -72,12 +71,7 @@ class ReachableTree:
 
     def way(self, number: int) -> Configurations:
         """Waypoints from the start to the configuration with this index."""
-        nodes = self._trees.nodes[0]
-        parents = self._trees.parents[0]
-        path = [number]
-        while parents[path[-1]] >= 0:
-            path.append(parents[path[-1]])
-        waypoints = simplify(self._space, nodes[path[::-1]], 1).astype(np.float64)
+        waypoints = simplify(self._space, branch(self._trees, 0, number), 1).astype(np.float64)
         waypoints[0] = self._start
         return waypoints
 
@@ -176,42 +170,21 @@ def best_looks(
         chosen = rng.choice(len(at), MAX_VOXELS, replace=False)
         at = at[chosen]
         weights = weights[chosen]
+    space = at, weights, filled, MAP
     start, (width, height) = tree.configurations[0], camera.size
-
-    def seen_by(
-        intrinsics: tuple[float, float, float, float],
-        size: tuple[int, ...],
-        reach: float,
-        q: Configurations,
-        poses: Float[ndarray, "n 4 4"],
-    ) -> Float[ndarray, "n"]:
-        """The part of the total weight that a camera sees from each pose, with the arm at the configuration
-        of the same row."""
-        sums = seen_weights(
-            compile_robot(robot),
-            q.astype(np.float32),
-            poses.astype(np.float32),
-            np.array(intrinsics, np.float32),
-            size,
-            np.float32(reach),
-            at,
-            weights,
-            filled,
-            *MAP.frame,
-        )
-        return sums / weights.sum()
-
     seen_at_start = 0.0
     if beside is not None:
-        pose = beside.T_base_camera[None]
-        [seen_at_start] = seen_by(beside.intrinsics, beside.depth.shape, np.inf, start[None], pose)
+        image = beside.intrinsics, beside.depth.shape, np.inf
+        [seen_at_start] = seen_share(robot, start[None], beside.T_base_camera[None], *image, *space)
 
     def scored(q: Configurations) -> Float[ndarray, "n"]:
         """The scores of configurations; 0 for configurations that see less than MIN_SEEN."""
-        seen = seen_by(camera.intrinsics, (height, width), camera.range, q, camera.poses(robot, q))
+        on_arm = camera.intrinsics, (height, width), camera.range
+        seen = seen_share(robot, q, camera.poses(robot, q), *on_arm, *space)
         if beside is not None:
             poses = np.tile(beside.T_base_camera, (len(q), 1, 1))
-            from_beside = seen_by(beside.intrinsics, beside.depth.shape, np.inf, q, poses)
+            image = beside.intrinsics, beside.depth.shape, np.inf
+            from_beside = seen_share(robot, q, poses, *image, *space)
             seen = seen + np.maximum(from_beside - seen_at_start, 0.0)
         score = seen / (1 + np.linalg.norm(q - start, axis=1) / FULL_COST_LENGTH)
         for earlier in taken:
@@ -316,18 +289,10 @@ def next_view(problem: Problem, result: PlanResult, poses: Sequence[Pose] | None
     if predicted is not None:
         np.maximum(filled, predicted, out=filled)
     image = problem.views[0]
-    start = problem.start.astype(np.float32)
-    seen = seen_weights(
-        compile_robot(problem.robot),
-        np.tile(start, (len(candidates), 1)),
-        np.stack(candidates).astype(np.float32),
-        np.array(image.intrinsics, np.float32),
-        image.depth.shape,
-        np.float32(np.inf),
-        at,
-        weights,
-        filled,
-        *FINE.frame,
+    q = np.tile(problem.start, (len(candidates), 1))
+    size = image.depth.shape
+    seen = seen_share(
+        problem.robot, q, np.stack(candidates), image.intrinsics, size, np.inf, at, weights, filled, FINE
     )
     best = int(seen.argmax())
-    return NextView(candidates[best], float(seen[best] / weights.sum()))
+    return NextView(candidates[best], float(seen[best]))
