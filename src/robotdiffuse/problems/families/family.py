@@ -1,6 +1,6 @@
 """Family: the protocol of random problem generators, and how they sample starts and goals."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
@@ -16,7 +16,7 @@ from robotdiffuse.core.transforms import moved_spheres
 from robotdiffuse.core.types import Configuration, Configurations, JointRows, Pose
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
-from robotdiffuse.robots.kinematics import link_origins
+from robotdiffuse.robots.kinematics import link_origins, link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
@@ -168,6 +168,30 @@ def reaching_configurations(
     settings = replace(settings, position_only=True) if robot.dof < MIN_POSE_DOF else settings
     q = inverse_kinematics(robot, robot.tip, T_base_tip, count, rng=rng, accept=accept, settings=settings)
     return robot.unwound(q).astype(np.float32)
+
+
+def between_targets(
+    robot: Robot,
+    scene: Scene,
+    checker: CollisionChecker,
+    targets: Iterable[Pose],
+    goals: int,
+    rng: Generator,
+    settings: InverseKinematicsSettings = POSE_IK,
+) -> SampledProblem | None:
+    """A problem from a configuration that reaches the first of two targets to up to `goals` that reach the
+    second; None if one of the targets is out of reach. The second target is drawn only once the first is
+    reached."""
+    reached = []
+    T_base_tip = np.eye(4)
+    for T_base_tip, count in zip(targets, (1, goals), strict=True):
+        reached.append(reaching_configurations(robot, T_base_tip, count, checker, rng, settings))
+        if not len(reached[-1]):
+            return None
+    (start,), q = reached
+    if settings.position_only or robot.dof < MIN_POSE_DOF:
+        T_base_tip = link_pose(robot, q[0].astype(np.float64), robot.tip)
+    return SampledProblem(scene, start, q, T_base_tip)
 
 
 def base_spheres(robot: Robot) -> Spheres:

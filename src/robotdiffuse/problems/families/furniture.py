@@ -22,18 +22,16 @@ from robotdiffuse.core.transforms import rotation_about, rotation_z_to, transfor
 from robotdiffuse.core.types import Pose, Values, Vector
 from robotdiffuse.problems.families.family import (
     CONFIGURATION,
-    MIN_POSE_DOF,
     PositiveRange,
     Range,
     Ranges,
     SampledProblem,
     Spheres,
     base_spheres,
+    between_targets,
     is_clear_of,
-    reaching_configurations,
     sample_until_found,
 )
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
@@ -186,15 +184,9 @@ class Furniture(Ranges, ABC):
         def attempt() -> SampledProblem | None:
             furnished = self.furnish(rng, keep_out)
             checker = CollisionChecker(robot, furnished.scene)
-            first, second = (furnished.regions[i] for i in rng.choice(len(furnished.regions), 2, False))
-            start = reaching_configurations(robot, sample_target(first, rng), 1, checker, rng)
-            if not len(start):
-                return None
-            T_base_tip = sample_target(second, rng)
-            reached = reaching_configurations(robot, T_base_tip, goals, checker, rng)
-            if len(reached) and robot.dof < MIN_POSE_DOF:
-                T_base_tip = link_pose(robot, reached[0].astype(np.float64), robot.tip)
-            return SampledProblem(furnished.scene, start[0], reached, T_base_tip) if len(reached) else None
+            numbers = rng.choice(len(furnished.regions), 2, False)
+            targets = (sample_target(furnished.regions[i], rng) for i in numbers)
+            return between_targets(robot, furnished.scene, checker, targets, goals, rng)
 
         return sample_until_found(attempt, self, robot)
 

@@ -11,6 +11,7 @@ from numpy.random import Generator
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Natural, OneOf
+from robotdiffuse.core.transforms import transform
 from robotdiffuse.problems.families.family import (
     CONFIGURATION,
     POSITION,
@@ -21,6 +22,7 @@ from robotdiffuse.problems.families.family import (
     SampledProblem,
     Spheres,
     base_spheres,
+    between_targets,
     is_clear_of,
     reaching_configurations,
     sample_until_found,
@@ -121,27 +123,12 @@ class Rop(Ranges):
         def attempt() -> SampledProblem | None:
             scene = self.scene(rng, keep_out)
             checker = CollisionChecker(robot, scene)
-            sample = self._by_position if target == POSITION else self._by_configuration
-            return sample(robot, scene, checker, goals, target, rng)
+            if target != POSITION:
+                return self._by_configuration(robot, scene, checker, goals, target, rng)
+            targets = (transform(rng.uniform(*self.region)) for _ in range(2))
+            return between_targets(robot, scene, checker, targets, goals, rng, POSITION_IK)
 
         return sample_until_found(attempt, self, robot)
-
-    def _by_position(
-        self, robot: Robot, scene: Scene, checker: CollisionChecker, goals: int, _: str, rng: Generator
-    ) -> SampledProblem | None:
-        start_and_goals = []
-        for count in (1, goals):
-            T_base_tip = np.eye(4)
-            T_base_tip[:3, 3] = rng.uniform(*self.region)
-            start_and_goals.append(
-                reaching_configurations(robot, T_base_tip, count, checker, rng, POSITION_IK)
-            )
-            if not len(start_and_goals[-1]):
-                return None
-        (start,), reached = start_and_goals
-        return SampledProblem(
-            scene, start, reached, link_pose(robot, reached[0].astype(np.float64), robot.tip)
-        )
 
     def _by_configuration(
         self,
