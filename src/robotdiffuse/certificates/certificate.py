@@ -168,13 +168,6 @@ def _vector(name: str, value: object) -> ndarray:
     return array
 
 
-def _tolerances(_: str, value: object) -> Tolerances:
-    names = {f.name for f in fields(Tolerances)}
-    if not isinstance(value, dict) or set(value) != names:
-        raise InputError(f"tolerances must have the fields {', '.join(sorted(names))}")
-    return Tolerances(**{name: converted(name, Number, entry) for name, entry in value.items()})
-
-
 class Field(NamedTuple):
     """A field of a certificate file."""
 
@@ -198,7 +191,7 @@ FIELDS = {
     "robot_parts": HASHES,
     "scene_parts": HASHES,
     "motion_hash": _typed(str),
-    "tolerances": Field(_tolerances, asdict),
+    "tolerances": Field(lambda name, value: Tolerances.from_json(value, name), asdict),
     "scene_clearance": _typed(Number),
     "self_clearance": _typed(Number),
     "problem": _typed(dict | None),

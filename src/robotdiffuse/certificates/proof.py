@@ -13,6 +13,7 @@ from numpy import ndarray
 
 from robotdiffuse.certificates.bounds import Claim, Plane, Stretches
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.settings import Number, Settings
 from robotdiffuse.core.types import Path, Trajectory, Values
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot, hashed_content
@@ -27,26 +28,26 @@ DECIMALS = 7
 
 
 @dataclass(frozen=True)
-class Tolerances:
+class Tolerances(Settings):
     """The tolerances of a validation; names, meanings and defaults are those of `VerifySettings`."""
 
-    limit_slack: float = 1e-6
+    limit_slack: Number = 1e-6
     """[rad] or [m]"""
-    start_tolerance: float = 1e-6
+    start_tolerance: Number = 1e-6
     """[rad] or [m]"""
-    goal_tolerance: float = 1e-4
+    goal_tolerance: Number = 1e-4
     """[rad] or [m]"""
-    goal_distance: float = 0.01
+    goal_distance: Number = 0.01
     """[m]"""
-    goal_angle: float = float(np.radians(15))
+    goal_angle: Number = float(np.radians(15))
     """[rad]"""
-    goal_slack: float = 1e-5
+    goal_slack: Number = 1e-5
     """[m] or [rad]"""
-    rest: float = 1e-6
+    rest: Number = 1e-6
     """[rad/s]"""
-    rate_slack: float = 0.01
+    rate_slack: Number = 0.01
     """Fraction of the robot's limits."""
-    chord: float = 1e-3
+    chord: Number = 1e-3
     """How far the cubic of a joint between two rows may leave the straight line that is certified [rad] or
     [m]."""
 

@@ -65,16 +65,6 @@ SAME_POSE = 1e-3
 end of a Cartesian line."""
 
 
-class ConstraintBound(NamedTuple):
-    """Upper bounds on a quantity that a constraint limits, such as a distance or an angle."""
-
-    name: str
-    limit: float
-    """Largest allowed value of the quantity [m] or [rad]."""
-    bounds: Values
-    """Upper bound of the quantity from each configuration to the next."""
-
-
 class _FrameMotion(NamedTuple):
     """Motion of a frame from each of n + 1 configurations to the next."""
 
@@ -94,18 +84,21 @@ class _FrameMotion(NamedTuple):
     """Number of joints that move the frame."""
 
 
-def constraint_bounds(problem: Problem, q: Configurations, chord: float) -> list[ConstraintBound]:
-    """Bounds of the quantities that path constraints limit, from each configuration to the next. They hold
-    for every motion that stays within `chord` [rad] or [m] of the straight lines in each joint.
+def constraint_bounds(
+    problem: Problem, q: Configurations, chord: float
+) -> tuple[Sequence[str], Float[ndarray, "n b"], Sequence[float]]:
+    """The quantities that path constraints limit, such as a distance or an angle: the name of each, upper
+    bounds from each configuration to the next, and its largest allowed value [m] or [rad].
 
-    Raises InputError for a Cartesian line if the goal is not a single pose.
+    The bounds hold for every motion that stays within `chord` [rad] or [m] of the straight lines in each
+    joint. Raises InputError for a Cartesian line if the goal is not a single pose.
     """
     linkage = Linkage(problem.robot)
     q = q if len(q) > 1 else np.repeat(q, 2, axis=0)
     placed = {
         frame: linkage.place(q, frame) for frame in {constraint.frame for constraint in problem.constraints}
     }
-    bounds_of_constraints = []
+    quantities = list[tuple[str, Values, float]]()
     for constraint in problem.constraints:
         along = _frame_motion(linkage, placed[constraint.frame], q, constraint.frame)
         name = f"{constraint.kind} of {constraint.frame}"
@@ -113,7 +106,7 @@ def constraint_bounds(problem: Problem, q: Configurations, chord: float) -> list
             cosines = along.R @ constraint.axis @ constraint.direction
             min_cosine = np.minimum(cosines[1:], cosines[:-1]) - along.turn**2 / 8
             bounds = np.arccos(np.clip(min_cosine, -1.0, 1.0)) + chord * along.joints
-            bounds_of_constraints.append(ConstraintBound(name, constraint.angle, bounds))
+            quantities.append((name, bounds, constraint.angle))
             continue
         ends = _line_poses(problem, linkage, constraint) if isinstance(constraint, CartesianLine) else ()
         distances_to_box = _distances(along.p, *_allowed_box(constraint, *ends))
@@ -123,11 +116,12 @@ def constraint_bounds(problem: Problem, q: Configurations, chord: float) -> list
             + chord * along.sensitivity
         )
         limit = 0.0 if isinstance(constraint, PositionBox) else constraint.tolerance
-        bounds_of_constraints.append(ConstraintBound(name, limit, bounds))
+        quantities.append((name, bounds, limit))
         if isinstance(constraint, CartesianLine) and constraint.angle is not None:
             bounds = _angle_bounds(along, chord, *ends)
-            bounds_of_constraints.append(ConstraintBound(f"{name}, its angle", constraint.angle, bounds))
-    return bounds_of_constraints
+            quantities.append((f"{name}, its angle", bounds, constraint.angle))
+    names, columns, limits = zip(*quantities, strict=True)
+    return names, np.column_stack(columns), limits
 
 
 def frame_speed_errors(problem: Problem, motion: Trajectory, slack: float) -> Iterator[str]:
@@ -636,13 +630,11 @@ def _torque_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
 def _constraint_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
     """A message for each bound that differs from the bound in the proof, and for each path constraint that is
     not proved to be kept."""
-    if not problem.constraints and not certificate.constraints:
-        return
-    q = configurations(certificate.motion, certificate.between)
-    bounds = constraint_bounds(problem, q, certificate.tolerances.chord)
-    names, limits, each = zip(*bounds, strict=True) if bounds else ((), (), ())
-    max_values = [float(values.max()) for values in each]
-    yield from _stated_errors("constraints", certificate.constraints, names, max_values, limits)
+    names, bounds, limits = (), np.zeros((1, 0)), ()
+    if problem.constraints:
+        q = configurations(certificate.motion, certificate.between)
+        names, bounds, limits = constraint_bounds(problem, q, certificate.tolerances.chord)
+    yield from _stated_errors("constraints", certificate.constraints, names, bounds.max(axis=0), limits)
 
 
 def _stated_errors(

@@ -220,13 +220,12 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
     bounds = torques = ()
     samples = np.zeros(0)
     if problem.constraints:
-
-        def of_constraints(places: Values) -> tuple[Any, ...]:
-            bounds = constraint_bounds(problem, configurations(motion, places), tolerances.chord)
-            names, limits, each = zip(*bounds, strict=True)
-            return names, np.column_stack(each), limits
-
-        between, bounds = _refined(motion, between, of_constraints, "path constraints")
+        between, bounds = _refined(
+            motion,
+            between,
+            lambda places: constraint_bounds(problem, configurations(motion, places), tolerances.chord),
+            "path constraints",
+        )
     if problem.payload is not None:
         allowed = problem.robot.effort * (1 + tolerances.rate_slack)
         samples, torques = _refined(

@@ -17,7 +17,6 @@ from robotdiffuse.core.input_files import read_json
 from robotdiffuse.core.output_files import check_output
 from robotdiffuse.core.results import PROBLEM_ENDINGS, PlanResult
 from robotdiffuse.core.tables import Column, Table, show
-from robotdiffuse.core.types import Path as PathOfJoints
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.planning.pipeline.unknown_space import policy_for, predicted_obstacles
 from robotdiffuse.problems.files import load_problem, problem_record
@@ -38,7 +37,7 @@ def draw(problem: Problem, result: PlanResult | None, file: Path) -> None:
         return write_problem(problem, file, result)
     robot, scene = _shown(problem)
     write = write_replay if file.suffix.lower() == ".html" else write_picture
-    write(robot, scene, _motion(result), file, result=result, moving=problem.moving_in_world)
+    write(robot, scene, result.trajectory or result.path, file, result=result, moving=problem.moving_in_world)
 
 
 def draw_several(problem: Problem, results: Mapping[str, PlanResult], file: Path, shell: float) -> None:
@@ -48,7 +47,7 @@ def draw_several(problem: Problem, results: Mapping[str, PlanResult], file: Path
     shell: thickness of the layer that pictures show around the arm as a safety distance [m]; 0: none.
     """
     robot, scene = _shown(problem)
-    motions = {name: _motion(result) for name, result in results.items()}
+    motions = {name: result.trajectory or result.path for name, result in results.items()}
     if file.suffix.lower() == ".html":
         entries = [
             GalleryEntry(name, results[name].planner, scene, motion, problem.moving_in_world)
@@ -58,12 +57,6 @@ def draw_several(problem: Problem, results: Mapping[str, PlanResult], file: Path
     else:
         settings = PictureSettings(shell=shell)
         write_comparison(robot, scene, motions, file, settings=settings, moving=problem.moving_in_world)
-
-
-def _motion(result: PlanResult) -> PathOfJoints | Trajectory:
-    motion = result.trajectory or result.path
-    assert motion is not None, "only a solved result has a motion"
-    return motion
 
 
 def _shown(problem: Problem) -> tuple[Robot, Scene]:

@@ -121,6 +121,9 @@ KINDS = {
     dict: "values by name",
 }
 """Types of settings in messages."""
+CLASSES = {int: Integral, float: Real, tuple: (list, tuple), Any: object}
+"""Classes of the values that a type takes, if others than the type itself."""
+UNIONS = (Union, UnionType)
 
 
 class Setting(NamedTuple):
@@ -274,11 +277,6 @@ def _hints(kind: type) -> dict[str, Any]:
     return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
 
 
-def _options(hint: Any) -> tuple[Any, ...]:
-    """The members of a union; a one-element tuple for any other type."""
-    return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-
-
 def _split(hint: Any) -> tuple[Any, tuple[Any, ...]]:
     """A type and its Annotated metadata."""
     if get_origin(hint) is Annotated:
@@ -287,21 +285,23 @@ def _split(hint: Any) -> tuple[Any, tuple[Any, ...]]:
     return hint, ()
 
 
+def _members(hint: Any) -> Iterator[tuple[Any, tuple[Any, ...]]]:
+    """The types of which a value may be, each with its Annotated metadata: the members of a union, or the
+    type itself."""
+    bare, marks = _split(hint)
+    if get_origin(bare) not in UNIONS:
+        yield bare, marks
+        return
+    for option in get_args(bare):
+        yield from _members(option)
+
+
 def _fits(hint: Any, value: Any) -> bool:
     """Whether a value is of a type; the entries of a tuple are not checked."""
-    for option in _options(_split(hint)[0]):
-        bare = _split(option)[0]
-        kind = get_origin(bare) or bare
-        if kind in (Union, UnionType):
-            fits = _fits(bare, value)
-        elif kind in (int, float):
-            fits = isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
-        else:
-            kind = list | tuple if kind is tuple else kind
-            fits = kind is Any or isinstance(value, kind)
-        if fits:
-            return True
-    return False
+    kinds = [get_origin(bare) or bare for bare, _ in _members(hint)]
+    if isinstance(value, bool):
+        kinds = [kind for kind in kinds if kind not in (int, float)]
+    return isinstance(value, tuple(CLASSES.get(kind, kind) for kind in kinds))
 
 
 def converted(where: str, hint: Any, value: Any, owner: object = None) -> Any:
@@ -315,7 +315,7 @@ def converted(where: str, hint: Any, value: Any, owner: object = None) -> Any:
     bare, marks = _split(hint)
     kind = get_origin(bare)
     kinds = get_args(bare)
-    if kind in (Union, UnionType):
+    if kind in UNIONS:
         fitting = next(option for option in kinds if _fits(option, value))
         value = converted(where, fitting, value, owner)
     elif kind is tuple:
@@ -359,9 +359,9 @@ def _settings_class(
     for mark in marks:
         if isinstance(mark, SettingsOf):
             return mark.table.settings(values.get(mark.field, fields[mark.field].default))
-    for option in _options(bare):
-        if isinstance(option, type) and issubclass(option, Settings):
-            return option
+    for member, _ in _members(bare):
+        if isinstance(member, type) and issubclass(member, Settings):
+            return member
     return None
 
 
@@ -374,17 +374,14 @@ def _number(text: str) -> float | str:
 
 
 def _rule(hint: Any) -> str:
-    def parts(hint: Any) -> Iterator[str]:
-        for option in _options(hint):
-            bare, marks = _split(option)
-            if get_origin(bare) in (Union, UnionType):
-                yield from parts(bare)
-                continue
-            rules = [mark.rule for mark in marks if isinstance(mark, Bound)]
-            names = [", ".join(mark.names) for mark in marks if isinstance(mark, OneOf)]
-            yield " ".join(names or [KINDS.get(get_origin(bare) or bare) or bare.__name__, *rules]).strip()
-
-    return " or ".join(parts(hint))
+    texts = []
+    for bare, marks in _members(hint):
+        rules = [mark.rule for mark in marks if isinstance(mark, Bound)]
+        names = [", ".join(mark.names) for mark in marks if isinstance(mark, OneOf)]
+        texts.append(
+            " ".join(names or [KINDS.get(get_origin(bare) or bare) or bare.__name__, *rules]).strip()
+        )
+    return " or ".join(texts)
 
 
 def field_docstrings(kind: type) -> dict[str, str]:
