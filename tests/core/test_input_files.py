@@ -163,7 +163,7 @@ def test_files_that_are_none(tmp_path: Path) -> None:
         (large, "is too large: it has 1048576 MB"),
         (tmp_path / "none", "does not exist"),
         (tmp_path / "latin" / "below", "cannot be read: Not a directory"),
-        (tmp_path / "latin", "byte 2 is not UTF-8"),
+        (tmp_path / "latin", "is not UTF-8 text: byte 2"),
         ("a\0b", "no file can have this name"),
         ("\ud800", "no file can have this name"),
         ("x" * 1000, "File name too long"),

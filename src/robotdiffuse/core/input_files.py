@@ -117,11 +117,15 @@ def read_bytes(file: str | Path, what: str = "", largest: int = MAX_FILE_SIZE) -
 
 def read_text(file: str | Path, what: str = "", largest: int = MAX_FILE_SIZE) -> str:
     """The content of a UTF-8 text file. Raises InputError as `input_file` does, and if it is not UTF-8."""
+    return decoded(read_bytes(file, what, largest), f"{what} {file}".strip()).replace("\r\n", "\n")
+
+
+def decoded(content: bytes, where: str) -> str:
+    """UTF-8 text. Raises InputError, naming `where`, for other bytes."""
     try:
-        return read_bytes(file, what, largest).decode("utf-8-sig").replace("\r\n", "\n")
+        return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        why = f"byte {error.start} is not UTF-8 text"
-        raise InputError(f"{what} {file} cannot be read: {why}".strip()) from None
+        raise InputError(f"{where} is not UTF-8 text: byte {error.start}") from None
 
 
 def read_arrays(file: str | Path) -> dict[str, ndarray]:
@@ -142,6 +146,17 @@ def read_arrays(file: str | Path) -> dict[str, ndarray]:
             raise InputError(f"{file} unpacks to {size // MEGABYTE} MB; at most {limit} MB are read")
         with np.load(path, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
+
+
+def read_array(file: str | Path, name: str) -> ndarray:
+    """The array of an .npy file; of an .npz file the array with this name, or its only array.
+
+    Raises InputError as `read_arrays` does, and if there are several arrays, but none with this name.
+    """
+    arrays = read_arrays(file)
+    if name not in arrays and len(arrays) != 1:
+        raise InputError(f"{file} holds {shown([*arrays])}; one must be named {name}")
+    return arrays.get(name, next(iter(arrays.values())))
 
 
 def read_json(file: str | Path) -> Any:

@@ -8,6 +8,7 @@ import secrets
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, BinaryIO
 
 from robotdiffuse.core.errors import InputError, OutputError, shown
@@ -52,6 +53,33 @@ def write_atomically(
             raise
     except OSError as error:
         raise write_error(file, error) from None
+
+
+@contextmanager
+def replaced_folder(target: Path) -> Iterator[Path]:
+    """Yields a path in a temporary folder. At the end of the block, what was written there replaces `target`.
+    If the block or the replacement fails, an existing `target` stays.
+
+    Raises InputError as `write_atomically` does.
+    """
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(
+            prefix=f".{target.name}.", dir=target.parent, ignore_cleanup_errors=True
+        ) as scratch:
+            new = Path(scratch, target.name)
+            old = Path(scratch, f"{target.name}.old")
+            yield new
+            try:
+                with suppress(FileNotFoundError):
+                    target.replace(old)
+                new.replace(target)
+            except BaseException:
+                with suppress(OSError):
+                    old.replace(target)
+                raise
+    except OSError as error:
+        raise write_error(target, error) from None
 
 
 def check_output(file: str | Path, endings: tuple[str, ...]) -> Path:

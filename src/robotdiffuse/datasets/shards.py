@@ -18,7 +18,6 @@ import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path as FilePath
-from tempfile import TemporaryDirectory
 from types import ModuleType
 from typing import Any
 
@@ -28,7 +27,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, located, needs, reading, shown
 from robotdiffuse.core.input_files import file_name, input_file, read_json
-from robotdiffuse.core.output_files import write_atomically, write_error
+from robotdiffuse.core.output_files import replaced_folder, write_atomically
 from robotdiffuse.core.settings import Count, Natural, Settings
 from robotdiffuse.robots.robot import Robot, robot_fingerprint
 from robotdiffuse.scenes.scene_arrays import PackedScenes
@@ -273,28 +272,20 @@ def write_shard(
         "fingerprint": _fingerprint(converted),
         "counts": dict(sorted(counts.items())),
     }
-    try:
-        FilePath(folder).mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(prefix=f".{target.name}.", dir=folder, ignore_cleanup_errors=True) as scratch:
-            new_folder = FilePath(scratch, "new")
-            group = zarr.open_group(new_folder, mode="w", zarr_format=3, attributes=attributes)
-            for name, array in converted.items():
-                group.create_array(
-                    name,
-                    data=array,
-                    chunks=tuple(max(1, size) for size in array.shape),
-                    compressors=None
-                    if name == "trajectories"
-                    else zarr.codecs.ZstdCodec(level=COMPRESSION_LEVEL),
-                    filters=None,
-                    # write chunks of zeros too, so that a missing file means damage
-                    config={"write_empty_chunks": True},
-                )
-            if target.exists():
-                target.rename(FilePath(scratch, "old"))
-            new_folder.rename(target)
-    except OSError as error:
-        raise write_error(target, error) from None
+    with replaced_folder(target) as new_folder:
+        group = zarr.open_group(new_folder, mode="w", zarr_format=3, attributes=attributes)
+        for name, array in converted.items():
+            group.create_array(
+                name,
+                data=array,
+                chunks=tuple(max(1, size) for size in array.shape),
+                compressors=None
+                if name == "trajectories"
+                else zarr.codecs.ZstdCodec(level=COMPRESSION_LEVEL),
+                filters=None,
+                # write chunks of zeros too, so that a missing file means damage
+                config={"write_empty_chunks": True},
+            )
 
 
 def _fingerprint(arrays: dict[str, ndarray]) -> str:

@@ -14,18 +14,17 @@ import sqlite3
 import struct
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from robotdiffuse.core.errors import InputError, OutputError, needs, reading, shown
 from robotdiffuse.core.input_files import MAX_FILE_SIZE, MEGABYTE, input_file, parse_json, read_yaml
-from robotdiffuse.core.output_files import write_atomically, write_error
+from robotdiffuse.core.output_files import replaced_folder, write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.core.types import Configuration, Pose, Trajectory
 from robotdiffuse.drawables import Color, Drawable, Surface, drawables, link_surfaces
@@ -458,33 +457,13 @@ def write_bag(problem: Problem, trajectory: Trajectory, file: Path) -> None:
         "/display_planned_path": (DISPLAY_TRAJECTORY, display_trajectory(problem, trajectory, record)),
     }
     try:
-        with TemporaryDirectory(
-            prefix=f".{file.name}.", dir=file.parent, ignore_cleanup_errors=True
-        ) as folder:
-            new = Path(folder, file.name)
-            old = Path(folder, "old")
-            with BagWriter(new, version=VERSION) as writer:  # it names the database after the folder
-                for topic, (kind, content) in topics.items():
-                    connection = writer.add_connection(topic, kind, typestore=typestore())
-                    writer.write(connection, 0, typestore().serialize_cdr(to_message(kind, content), kind))
-            _replace(file, new, old)
+        # the writer names the database after the folder
+        with replaced_folder(file) as new, BagWriter(new, version=VERSION) as writer:
+            for topic, (kind, content) in topics.items():
+                connection = writer.add_connection(topic, kind, typestore=typestore())
+                writer.write(connection, 0, typestore().serialize_cdr(to_message(kind, content), kind))
     except sqlite3.Error as error:
         raise OutputError(f"{file} cannot be written: {error}") from None
-    except OSError as error:
-        raise write_error(file, error) from None
-
-
-def _replace(file: Path, new: Path, old: Path) -> None:
-    """Move an existing bag, or a link to one, to `old`, and `new` to its place; if that fails, move it
-    back."""
-    try:
-        with suppress(FileNotFoundError):
-            file.replace(old)
-        new.replace(file)
-    except BaseException:
-        with suppress(OSError):
-            old.replace(file)
-        raise
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.bounds import numbers, positive, unit_quaternion, vector
 from robotdiffuse.core.errors import InputError, needs, reading, shortened, shown, unknown_name
-from robotdiffuse.core.input_files import input_file, read_arrays, read_json, read_yaml
+from robotdiffuse.core.input_files import input_file, read_array, read_arrays, read_json, read_yaml
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
 from robotdiffuse.core.types import Points
 from robotdiffuse.perception.depth_view import INTRINSICS, DepthNoise, DepthView
@@ -81,11 +81,8 @@ def _check_size(file: Path, pixels: int) -> None:
         raise InputError(f"depth image {file} has {pixels:,} pixels; it must have at most {MAX_PIXELS:,}")
 
 
-def _read_npz(file: Path) -> ndarray:
-    arrays = read_arrays(file)
-    if "depth" not in arrays and len(arrays) != 1:
-        raise InputError(f"depth image {file} holds {shown([*arrays])}; one must be named depth")
-    return arrays.get("depth", next(iter(arrays.values())))
+def _read_array(file: Path) -> ndarray:
+    return read_array(file, "depth")
 
 
 def _read_exr(file: Path) -> ndarray:
@@ -137,8 +134,8 @@ def _area(first: ndarray, last: ndarray) -> int:
 
 _READERS = {
     ".png": _read_png,
-    ".npy": lambda file: read_arrays(file)[""],
-    ".npz": _read_npz,
+    ".npy": _read_array,
+    ".npz": _read_array,
     ".exr": _read_exr,
 }
 

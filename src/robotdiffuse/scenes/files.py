@@ -10,7 +10,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.errors import InputError, shown, unknown_name
-from robotdiffuse.core.input_files import read_arrays
+from robotdiffuse.core.input_files import read_array
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_rpy
 from robotdiffuse.scenes.point_cloud import default_radius, read_points
@@ -132,7 +132,7 @@ def _content(kind: type[Shape], file: str, notes: list[str]) -> tuple[ndarray, .
     if kind is HeightMap:
         if Path(file).suffix.lower() not in (".npy", ".npz"):
             raise unknown_name(f"height map format of {file}:", Path(file).suffix, (".npy", ".npz"))
-        return (next(iter(read_arrays(file).values())),)
+        return (read_array(file, "heights"),)
     points, new_notes = read_points(file)
     notes.extend(new_notes)
     return (points,)

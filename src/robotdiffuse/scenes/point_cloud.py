@@ -14,7 +14,7 @@ import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
-from robotdiffuse.core.input_files import input_file, read_arrays, read_bytes
+from robotdiffuse.core.input_files import input_file, read_array, read_bytes
 from robotdiffuse.core.types import Points, Vector
 
 FIRST_LINE = b"# Octomap OcTree binary file"
@@ -208,11 +208,8 @@ def _read_text(file: Path) -> ndarray:
     return np.loadtxt(file, delimiter=delimiter, skiprows=int(header), usecols=columns, ndmin=2, comments="#")
 
 
-def _read_npz(file: Path) -> ndarray:
-    arrays = read_arrays(file)
-    if "points" not in arrays and len(arrays) != 1:
-        raise InputError(f"point cloud file {file} holds {shown([*arrays])}; one must be named points")
-    return arrays.get("points", next(iter(arrays.values())))
+def _read_array(file: Path) -> ndarray:
+    return read_array(file, "points")
 
 
 def _read_pcd(file: Path) -> ndarray:
@@ -297,8 +294,8 @@ READERS: dict[str, Callable[[Path], ndarray]] = {
     ".pcd": _read_pcd,
     ".xyz": _read_text,
     ".csv": _read_text,
-    ".npy": lambda file: read_arrays(file)[""],
-    ".npz": _read_npz,
+    ".npy": _read_array,
+    ".npz": _read_array,
     ".bt": lambda file: read_octomap(file)[0],
 }
 

@@ -17,7 +17,7 @@ import orjson
 from robotdiffuse.core import loading
 from robotdiffuse.core.deadline import cancel_check, check_cancelled
 from robotdiffuse.core.errors import InputError, shortened, shown
-from robotdiffuse.core.input_files import MEGABYTE, parse_json
+from robotdiffuse.core.input_files import MEGABYTE, decoded, parse_json
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import converted
 from robotdiffuse.core.types import RATES, Path, SampleRate, Trajectory, check_motion_arrays
@@ -162,11 +162,7 @@ def failed(code: int, message: str) -> Answer:
 
 def _record(body: bytes) -> object:
     """The JSON value of a body."""
-    try:
-        text = body.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"the request is not UTF-8 text: byte {error.start}") from None
-    return parse_json(text, "the request")
+    return parse_json(decoded(body, "the request"), "the request")
 
 
 def _problem(record: Any) -> Problem:

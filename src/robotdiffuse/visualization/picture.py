@@ -1,7 +1,6 @@
 """Draws a motion as a PNG picture, in software: without GPU, window or browser. The view is chosen so that
 most of the arm and its trace are visible."""
 
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
@@ -298,9 +297,7 @@ def write_captioned(
 
 def save_png(image: Image.Image, path: FilePath) -> None:
     """Write an image as PNG; the file is written atomically."""
-    buffer = io.BytesIO()
-    image.save(buffer, "PNG", optimize=False)
-    write_atomically(path, buffer.getvalue())
+    write_atomically(path, lambda stream: image.save(stream, "PNG"))
 
 
 def render(

@@ -19,7 +19,7 @@ import numpy as np
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.collision_cost import CLEARANCE_CAP
 from robotdiffuse.core.errors import InputError, shortened, unknown_name
-from robotdiffuse.core.input_files import parse_json, parse_yaml
+from robotdiffuse.core.input_files import decoded, parse_json, parse_yaml
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, OneOf, Settings
 from robotdiffuse.core.transforms import inverse, transform
@@ -385,7 +385,6 @@ def _posed(goal: Goal, frame: str, T_base_frame: Pose) -> PoseGoal | PosesGoal:
 
 
 def _validated(problem: Problem, motion: PlanResult, version: int) -> Validation:
-    assert motion.trajectory is not None
     began = time.perf_counter()
     report = verify_trajectory(problem, motion.trajectory)
     return Validation(version, report, time.perf_counter() - began)
@@ -449,7 +448,6 @@ def validity(state: State) -> Validity:
         return Validity(PENDING, "validating")
     report = validation.report
     trajectory = state.motion.trajectory
-    assert trajectory is not None
     violation = report.violation
     if violation is None:
         obstacles = state.problem.scene.shapes or state.problem.moving
@@ -508,10 +506,7 @@ def uploaded_problem(content: bytes, name: str, robot: Robot) -> Problem:
     """
     if len(content) > MAX_UPLOAD_SIZE:
         raise InputError(f"{name} has {len(content)} bytes; at most {MAX_UPLOAD_SIZE} are read")
-    try:
-        text = content.decode("utf-8")
-    except UnicodeDecodeError:
-        raise InputError(f"{name} is not UTF-8 text") from None
+    text = decoded(content, name)
     data = parse_json(text, name) if name.lower().endswith(".json") else parse_yaml(text, name)
     named_robot = data.get("robot") if isinstance(data, dict) else None
     robots: dict[Any, Robot] = {}
