@@ -9,6 +9,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernels.point_grid import POINT_RANGE, make_grid
 from robotdiffuse.collision.kernels.simd import by_sixteen
+from robotdiffuse.robots.fitting.triangles import split
 
 MESH_SPACING = 0.02
 """Triangles of mesh obstacles are divided until no edge is longer than this [m]; each piece is covered by one
@@ -91,38 +92,15 @@ def join_to_few(spheres: Float[ndarray, "n 4"]) -> Float[ndarray, "m 4"]:
 def cover_triangles(triangles: Float[ndarray, "n 3 3"], reach: float) -> Float[ndarray, "m 4"]:
     """Spheres, one around each piece of the triangles, that cover the surface up to POINT_RANGE beyond the
     arm's `reach` [m]."""
-    near = _divide(triangles, reach / 4 if np.isfinite(reach) else np.inf, reach)
+    within = reach + float(POINT_RANGE)
+    near = split(triangles, reach / 4, within)
     # bisected triangles have an area of about spacing² / 4
     spacing = max(MESH_SPACING, float(np.sqrt(4 * _area(near) / MAX_POINTS)))
-    triangle_parts = _divide(near, spacing, reach)
+    triangle_parts = split(near, spacing, within)
     centers = triangle_parts.mean(axis=1)
     radii = np.linalg.norm(triangle_parts - centers[:, None], axis=2).max(axis=1, initial=0.0)
     spheres = np.column_stack([centers, radii + 1e-4])
     return _join(spheres, spacing) if len(spheres) > MAX_POINTS else spheres
-
-
-def _divide(triangles: Float[ndarray, "n 3 3"], spacing: float, reach: float) -> Float[ndarray, "m 3 3"]:
-    """Divides the triangles near the robot until no edge is longer than `spacing` [m], by halving the longest
-    edges."""
-    finished = [np.zeros((0, 3, 3))]
-    while len(triangles):
-        edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2)
-        near = np.linalg.norm(triangles.mean(axis=1), axis=1) <= reach + POINT_RANGE + edges.max(axis=1)
-        triangles = triangles[near]
-        edges = edges[near]
-        short_enough = edges.max(axis=1) <= spacing
-        finished.append(triangles[short_enough])
-        triangles = triangles[~short_enough]
-        edges = edges[~short_enough]
-        # edge i joins corners i - 1 and i; split the longest one
-        longest = edges.argmax(axis=1)
-        rows = np.arange(len(triangles))
-        a = triangles[rows, longest - 1]
-        b = triangles[rows, longest]
-        c = triangles[rows, (longest + 1) % 3]
-        middle = (a + b) / 2
-        triangles = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
-    return np.concatenate(finished)
 
 
 def _area(triangles: Float[ndarray, "n 3 3"]) -> float:

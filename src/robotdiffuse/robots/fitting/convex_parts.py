@@ -22,9 +22,9 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import Points, Values, Vector
 from robotdiffuse.robots.bodies import ConvexMesh, Surface
+from robotdiffuse.robots.fitting.triangles import Triangles, split
 from robotdiffuse.robots.frame_kernel import dot
 
-Triangles = Float[ndarray, "_ 3 3"]
 MIN_THICKNESS = 1e-3
 """Smallest thickness of a hull [m]: fitting spheres and computing distances need a volume, also for thin
 sheets."""
@@ -154,46 +154,6 @@ def _farthest_inside(distance, origin, pitch, low, high, normals, offsets):
                 else:
                     farthest = distance[i, j, k]
     return farthest
-
-
-def split(triangles: Triangles, size: "float | Float[ndarray, 'n']") -> Triangles:
-    """Halve triangles at their longest edge until no edge is longer than `size` [m], a number or one per
-    triangle."""
-    sizes = np.broadcast_to(np.asarray(size, np.float64), len(triangles))
-    return _split(np.ascontiguousarray(triangles, np.float64), sizes**2)
-
-
-@kernel()
-def _split(triangles, squares):
-    count = len(triangles)
-    out = np.concatenate((triangles, np.empty_like(triangles)))
-    limits = np.concatenate((squares, squares))
-    t = 0
-    while t < count:
-        longest = -1.0
-        k = 0
-        for i in range(3):
-            square = 0.0
-            for d in range(3):
-                square += (out[t, i, d] - out[t, (i + 1) % 3, d]) ** 2
-            if square > longest:
-                longest = square
-                k = i
-        if longest <= limits[t]:
-            t += 1
-            continue
-        if count == len(out):
-            out = np.concatenate((out, np.empty_like(out)))
-            limits = np.concatenate((limits, limits))
-        # one half in place of the triangle, the other one at the end
-        out[count] = out[t]
-        limits[count] = limits[t]
-        for d in range(3):
-            middle = 0.5 * (out[t, k, d] + out[t, (k + 1) % 3, d])
-            out[t, (k + 1) % 3, d] = middle
-            out[count, k, d] = middle
-        count += 1
-    return out[:count].copy()
 
 
 CUT_FRACTIONS = np.arange(1, 10) / 10
@@ -359,8 +319,8 @@ def _wall_cuts(heights: Values, pitch: float) -> list[float]:
 
 
 def _spread(triangles: Triangles, size: float) -> Points:
-    """Points spread over a surface, one per cube of edge `size` [m]."""
-    points = split(triangles, 2 * size).reshape(-1, 3)
+    """Points spread over a surface, one per cube of edge `size` [m], whatever the order of the triangles."""
+    points = np.unique(split(triangles, 2 * size).reshape(-1, 3), axis=0)
     return points[one_per_cube(points, size)]
 
 

@@ -156,10 +156,10 @@ UNREFINED_FRACTION = 0.6
 this fraction of `max_false_collisions`."""
 GAP_SHRINKAGE = 0.6
 """Factor per round on `GAP_FRACTION`."""
-GAP_FRACTION = 1.2
+GAP_FRACTION = 1.0
 """Refinement limits how far spheres of two links stick out into a gap between the links: to this multiple of
 the gap, on average over the two links. Spheres on both sides may still overlap; further rounds lower the
-multiple."""
+multiple. With 1.2, a UR5 needed a second round: 284 spheres instead of 278, with as many false collisions."""
 
 
 @dataclass(frozen=True)

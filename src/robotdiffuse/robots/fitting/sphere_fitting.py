@@ -28,7 +28,7 @@ from scipy.spatial import KDTree
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.types import Mask, Points, Spheres, Values, Vector
 from robotdiffuse.robots.bodies import ConvexMesh
-from robotdiffuse.robots.fitting.convex_parts import planes_of, split
+from robotdiffuse.robots.fitting.convex_parts import planes_of
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import (
     DIRECTIONS,
     assign,
@@ -39,6 +39,7 @@ from robotdiffuse.robots.fitting.sphere_fitting_kernel import (
     plane_depths,
     relax,
 )
+from robotdiffuse.robots.fitting.triangles import split
 
 GRID_POINTS = 200_000
 """Approximate number of points of the grid around a link."""
