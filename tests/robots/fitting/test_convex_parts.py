@@ -115,3 +115,15 @@ def test_most_parts_are_a_bound() -> None:
     parts = convex_parts((surface(comb),), PartSettings(most=5))
     assert len(parts) <= 5
     assert beyond(parts, trimesh.sample.sample_surface(comb, 5000, seed=1)[0]).max() < 1e-9
+
+
+def test_the_order_of_triangles_does_not_matter() -> None:
+    """Regression: with another order, a UR5 needed a second round of refinement."""
+    bowl = surface(BOWL)
+    shuffled = Surface(bowl.vertices, np.random.default_rng(0).permutation(bowl.faces))
+    coarse = PartSettings(concavity=0.02, voxels=20_000)
+    found, other = (
+        sorted(tuple(part.vertices.min(axis=0).round(9)) for part in convex_parts((shape,), coarse))
+        for shape in (bowl, shuffled)
+    )
+    assert len(found) > 1 and np.allclose(found, other, atol=1e-6)
