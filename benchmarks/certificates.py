@@ -26,7 +26,7 @@ from ompl import geometric as og
 from ompl import util as ou
 
 import robotdiffuse as rd
-from common import dense, header, parse, print_table, progress
+from common import dense, header, parse, parts_of, print_table, progress
 from robotdiffuse.certificates.search import certify
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError
@@ -209,7 +209,9 @@ def main() -> None:
         "--resolution", type=float, default=0.01, help="resolution of the checks of OMPL's planners (0.01)"
     )
     parser.add_argument("--commands", type=int, default=3, help="number of calls of each command (3)")
-    arguments = parse(parser, motions=2, commands=1)
+    parser.add_argument("--requests", default=",".join(REQUESTS), help="kinds of requests (all)")
+    arguments = parse(parser, motions=2, commands=1, requests="moving obstacle")
+    kinds = parts_of(arguments.requests, REQUESTS)
     ou.setLogLevel(ou.LOG_NONE)
     print(header("numpy", "coal", "ompl", "numba"))
     drawn = list(progress(list(motions(arguments.motions, arguments.resolution)), "motions"))
@@ -249,6 +251,7 @@ def main() -> None:
         ],
     )
     with tempfile.TemporaryDirectory() as name:
+        measure_requests(kinds, Path(name), arguments.commands)
         measure(drawn, validated, Path(name), arguments.commands)
 
 
@@ -265,12 +268,12 @@ REQUESTS: dict[str, dict[str, Any]] = {
 }
 
 
-def measure_requests(folder: Path, count: int) -> None:
-    """Print what the certificate of one motion over a table costs, for each kind of request."""
+def measure_requests(kinds: list[str], folder: Path, count: int) -> None:
+    """Print what the certificate of one motion over a table costs, for these kinds of requests."""
     robot = rd.load_robot("panda")
     rows = []
-    for name, fields in REQUESTS.items():
-        problem = Problem(robot, rd.Scene([TABLE]), LOW, FAR, **fields)
+    for name in kinds:
+        problem = Problem(robot, rd.Scene([TABLE]), LOW, FAR, **REQUESTS[name])
         result = rd.load_planner("aorrtc").plan(problem, time_limit=20.0)
         assert result.trajectory is not None, result.reason
         costs = cost(problem, result.trajectory, folder)
@@ -298,7 +301,6 @@ def measure(drawn: list[Motion], validated: list[Checked], folder: Path, count: 
     failed = 0
     verified = list[float]()
     checked = list[float]()
-    measure_requests(folder, count)
     problems = list({id(motion.problem): motion.problem for motion in drawn}.values())
     for motion, checks in progress(list(zip(drawn, validated, strict=True)), "certifying"):
         if checks.report.valid:

@@ -15,6 +15,7 @@ not move relative to each other.
 # pyright: reportAttributeAccessIssue=false
 
 import argparse
+import sys
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -31,6 +32,9 @@ from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.robots.fitting.preparation import add_robot
 from robotdiffuse.robots.kinematics import link_pose, reach
 from robotdiffuse.robots.robot import Robot
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from helpers.quick_preparation import QUICK
 
 DEPTH = 0.001
 """Contacts deeper than this count as disagreements [m]."""
@@ -214,7 +218,7 @@ def main() -> None:
             robot = (
                 rd.load_robot(robot_folder)
                 if robot_folder.exists()
-                else add_robot(file, out=robot_folder).robot
+                else add_robot(file, out=robot_folder, settings=QUICK if arguments.smoke else None).robot
             )
             rng = np.random.default_rng(SEED)
             world = world_of(file, robot, rng)

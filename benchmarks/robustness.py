@@ -226,7 +226,7 @@ def main() -> None:
     parser.add_argument("--shard", type=int, default=10, help="number of trajectories in a file (10)")
     parser.add_argument("--kills", type=int, default=10, help="number of kills (10)")
     parser.add_argument("--workers", type=int, default=2, help="number of worker processes (2)")
-    small = {"seconds": 10.0, "only": "head,cloud", "trajectories": 6, "shard": 2, "kills": 1, "workers": 1}
+    small = {"seconds": 3.0, "only": "head,cloud", "trajectories": 6, "shard": 2, "kills": 1, "workers": 1}
     arguments = parse(parser, **small)
     if arguments.part == "fuzz" or arguments.smoke:
         fuzz(arguments)

@@ -524,7 +524,7 @@ def main() -> None:
     )
     parser.add_argument("--problems", type=int, default=300)
     parser.add_argument("--plot", type=Path, default=Path("scene_code.png"))
-    arguments = parse(parser, trajectories=40, samples=128, encoder_samples=64, problems=2)
+    arguments = parse(parser, rows="oracle,cae", trajectories=16, samples=64, encoder_samples=64, problems=1)
     use_processor_time()
     parts = parts_of(arguments.parts, PARTS)
     rows = parts_of(arguments.rows, ROWS)

@@ -36,8 +36,6 @@ FAMILIES = ("rop", "shelf", "crate", "table")
 SEEDS = (0, 1)
 TIME_LIMIT = 10.0
 """Time limit of requests, long enough that no answer depends on the clock [s]."""
-ROUNDS = 3
-"""How often the planner alone plans all requests, before and after the load."""
 
 
 @dataclass
@@ -82,7 +80,7 @@ def requests(planner: str, count: int) -> list[PlanRequest]:
     return plan_requests
 
 
-def plan_alone(plan_requests: list[PlanRequest], planner: str) -> tuple[float, float]:
+def plan_alone(plan_requests: list[PlanRequest], planner: str, rounds: int) -> tuple[float, float]:
     """Wall and CPU time of the planner alone for all requests [s]; sets the expected answer of each
     request."""
     loaded = rd.load_planner(planner)
@@ -94,10 +92,10 @@ def plan_alone(plan_requests: list[PlanRequest], planner: str) -> tuple[float, f
         request.expected = waypoints
     wall = time.perf_counter()
     spent = time.process_time()
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         for request in plan_requests:
             loaded.plan(request.problem, TIME_LIMIT, request.seed)
-    return (time.perf_counter() - wall) / ROUNDS, (time.process_time() - spent) / ROUNDS
+    return (time.perf_counter() - wall) / rounds, (time.process_time() - spent) / rounds
 
 
 def run_client(
@@ -183,12 +181,17 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=5, help="number of workers that are killed (5)")
     parser.add_argument("--problems", type=int, default=10, help="number of problems of each family (10)")
     parser.add_argument("--planner", default="robotdiffuse", help="planner to use (robotdiffuse)")
+    parser.add_argument(
+        "--rounds", type=int, default=3, help="plans of the planner alone, before and after (3)"
+    )
+    parser.add_argument("--pause", type=float, default=4.0, help="time between kills [s] (4)")
     small = {"seconds": 2.0, "clients": 2, "workers": 1, "kills": 1, "problems": 1, "planner": "aorrtc"}
+    small |= {"rounds": 1, "pause": 1.0}
     arguments = parse(parser, **small)
     print(header("numpy", "numba", "fastapi", "uvicorn"), "\n")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     plan_requests = requests(arguments.planner, arguments.problems)
-    before = plan_alone(plan_requests, arguments.planner)
+    before = plan_alone(plan_requests, arguments.planner, arguments.rounds)
     command = ["serve", "--port", "0", "--workers", str(arguments.workers), "--queue", str(arguments.clients)]
     with subprocess.Popen(
         [sys.executable, "-m", "robotdiffuse", *command], stdout=subprocess.PIPE, text=True
@@ -212,16 +215,18 @@ def main() -> None:
         kills: list[float] = []
 
         def kill(since: float) -> None:
-            if len(kills) < arguments.kills and since > 4.0 * (len(kills) + 1):
+            if len(kills) < arguments.kills and since > arguments.pause * (len(kills) + 1):
                 ready = httpx.get(f"{url}/health").json()["workers_ready"]
                 if ready == arguments.workers:
                     os.kill(random.choice(workers_of(server.pid)), signal.SIGKILL)
                     kills.append(since)
 
-        killed = load(url, plan_requests, arguments.clients, 6.0 * arguments.kills + 10.0, kill)
+        killed = load(
+            url, plan_requests, arguments.clients, arguments.pause * (1.5 * arguments.kills + 2.5), kill
+        )
         server.send_signal(signal.SIGTERM)
         status = server.wait(30)
-    after = plan_alone(plan_requests, arguments.planner)
+    after = plan_alone(plan_requests, arguments.planner, arguments.rounds)
     alone = len(plan_requests) / min(before[0], after[0]), len(plan_requests) / min(before[1], after[1])
     count = sum(counts.answers.values())
     worked = sum(used[process] for process in workers)

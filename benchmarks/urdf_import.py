@@ -37,7 +37,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots.fitting.preparation import AddReport, add_robot
+from robotdiffuse.robots.fitting.preparation import AddReport, PreparationSettings, add_robot
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import gaps
 from robotdiffuse.robots.kinematics import link_origins
 from robotdiffuse.robots.parsing.urdf import UrdfTree
@@ -47,6 +47,7 @@ from robotdiffuse.scenes.shapes import Box
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from helpers.awkward_urdfs import REFUSED, WORKS
+from helpers.quick_preparation import QUICK
 
 MADE = {name: make for name, (make, _) in (WORKS | REFUSED).items()}
 # CPU time [s] and memory [MiB] for the preparation of an arm; the report names URDFs that need more.
@@ -156,15 +157,18 @@ class Outcome:
     """Problems, and how many are solved within 1 and 10 s; None if none can be drawn."""
 
 
-def outcome(urdf: Path, options: Urdf | None, samples: int, problems: int) -> Outcome:
+def outcome(
+    urdf: Path, options: Urdf | None, settings: PreparationSettings, samples: int, problems: int
+) -> Outcome:
     """Prepare one URDF in this process and plan with the robot.
 
-    options: the base and group to prepare; None: defaults.
+    options: the base and group to prepare; None: defaults. settings: of the preparation.
     """
     how = options or Urdf("")
     with TemporaryDirectory() as folder:
         try:
-            report = add_robot(urdf, base=how.base, group=how.group, out=Path(folder) / "arm")
+            out = Path(folder) / "arm"
+            report = add_robot(urdf, base=how.base, group=how.group, out=out, settings=settings)
         except InputError as error:
             seconds = time.process_time()
             mebibytes = _peak_mebibytes()
@@ -264,10 +268,10 @@ def in_furniture(robot: Robot, problems: int) -> tuple[int, int, int] | None:
     return len(drawn), counts[0], counts[1]
 
 
-def in_own_process(name: str, urdf: Path, samples: int, problems: int) -> Outcome:
+def in_own_process(name: str, urdf: Path, samples: int, problems: int, smoke: bool) -> Outcome:
     """The outcome of a URDF that is prepared in a process of its own."""
     command = [sys.executable, __file__, "--one", name, str(urdf)]
-    command += ["--samples", str(samples), "--problems", str(problems)]
+    command += ["--samples", str(samples), "--problems", str(problems), *["--smoke"] * smoke]
     done = subprocess.run(
         command,
         capture_output=True,
@@ -346,7 +350,8 @@ def main() -> None:
     arguments = parse(parser, cases=[next(iter(WORKS)), next(iter(REFUSED))], samples=100, problems=3)
     if arguments.one:
         name, urdf = arguments.one
-        result = outcome(Path(urdf), FOUND.get(name), arguments.samples, arguments.problems)
+        settings = QUICK if arguments.smoke else PreparationSettings()
+        result = outcome(Path(urdf), FOUND.get(name), settings, arguments.samples, arguments.problems)
         print(json.dumps(asdict(result)))
         return
     print(header("numpy", "numba", "coal", "example-robot-data"))
@@ -358,7 +363,8 @@ def main() -> None:
             if urdf is None:
                 missing.append(name)
             else:
-                outcomes[name] = in_own_process(name, urdf, arguments.samples, arguments.problems)
+                sizes = arguments.samples, arguments.problems
+                outcomes[name] = in_own_process(name, urdf, *sizes, arguments.smoke)
                 print(name, outcomes[name], file=sys.stderr)
     if missing:
         print(f"Left out, as their packages are not installed: {', '.join(missing)}")

@@ -210,11 +210,11 @@ def inputs(row: Row, motion: Row) -> list[float]:
     ]
 
 
-def scores(rows: list[Row], hidden: int, columns: int | None) -> Scores:
+def scores(rows: list[Row], hidden: int, columns: int | None, steps: int) -> Scores:
     """Scores of motions by models that were not trained on their problem.
 
     hidden: units of the two hidden layers; 0: a linear model. columns: number of inputs that the model uses;
-    None: all.
+    None: all. steps: of each training.
     """
     x = [np.array([inputs(row, m)[:columns] for m in row["motions"]], np.float32) for row in rows]
     y = [np.array([m["free"] for m in row["motions"]], np.float32) for row in rows]
@@ -227,12 +227,14 @@ def scores(rows: list[Row], hidden: int, columns: int | None) -> Scores:
         if part and learned:
             weights = np.concatenate([np.full(len(y[i]), 1 / len(y[i])) for i in learned])
             training = np.concatenate([x[i] for i in learned]), np.concatenate([y[i] for i in learned])
-            model = trained(*training, weights, hidden)
+            model = trained(*training, weights, hidden, steps)
             out |= {i: model(x[i]) for i in part}
     return out
 
 
-def trained(x: ndarray, y: ndarray, weights: ndarray, hidden: int) -> Callable[[ndarray], ndarray]:
+def trained(
+    x: ndarray, y: ndarray, weights: ndarray, hidden: int, steps: int
+) -> Callable[[ndarray], ndarray]:
     """Train a model of the probability that a motion is free; returns the function from inputs to it."""
     import torch
     from torch import nn
@@ -251,7 +253,7 @@ def trained(x: ndarray, y: ndarray, weights: ndarray, hidden: int) -> Callable[[
     net = nn.Sequential(*layers, nn.Linear(hidden or x.shape[1], 1))
     optimizer = torch.optim.AdamW(net.parameters(), RATE if hidden else 10 * RATE, weight_decay=DECAY)
     normalized, labels, weight = normal(x), torch.tensor(y), torch.tensor(weights / weights.mean())
-    for _ in range(STEPS):
+    for _ in range(steps):
         i = torch.randint(len(x), (BATCH,))
         loss = nn.functional.binary_cross_entropy_with_logits(net(normalized[i])[:, 0], labels[i], weight[i])
         optimizer.zero_grad()
@@ -298,15 +300,15 @@ def _of_kind(row: Row, kind: str) -> list[Row]:
     return [motion for motion in row["motions"] if motion["kind"] == kind]
 
 
-def report(rows: list[Row]) -> None:
+def report(rows: list[Row], steps: int) -> None:
     """Print how well each score orders the motions of a problem, and how often the motions chosen by it are
     free."""
     solved = [row for row in rows if row["motions"]]
     print(f"{len(rows)} problems, of them {len(rows) - len(solved)} without a motion, left out")
     models = {
-        "refitted confidence": scores(solved, 0, 1),
-        "linear model": scores(solved, 0, LINEAR_INPUTS),
-        "network": scores(solved, HIDDEN, None),
+        "refitted confidence": scores(solved, 0, 1, steps),
+        "linear model": scores(solved, 0, LINEAR_INPUTS, steps),
+        "network": scores(solved, HIDDEN, None, steps),
     }
     for i, row in enumerate(solved):
         for k, motion in enumerate(row["motions"]):
@@ -391,7 +393,10 @@ def main() -> None:
         "--records", default="view_ranking.jsonl", help="file of the records (view_ranking.jsonl)"
     )
     parser.add_argument("--report", action="store_true", help="print the tables of the records")
-    arguments = parse(parser, rounds=2, families=["rop"])
+    parser.add_argument(
+        "--steps", type=int, default=STEPS, help=f"number of steps of each training ({STEPS})"
+    )
+    arguments = parse(parser, rounds=2, families=["rop"], steps=4)
     print(header("numba", "numpy", "onnxruntime", "torch"))
     with TemporaryDirectory() as folder:
         if arguments.smoke:
@@ -400,7 +405,7 @@ def main() -> None:
             use_processor_time()
             run(arguments)
         if arguments.report or arguments.smoke:
-            report(JsonLines(Path(arguments.records)).rows)
+            report(JsonLines(Path(arguments.records)).rows, arguments.steps)
 
 
 if __name__ == "__main__":
