@@ -30,11 +30,13 @@ import torch
 from jaxtyping import Float, Float32
 from matplotlib.figure import Figure
 from numpy import ndarray
+from safetensors import safe_open
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from common import FIRST, header, parse, parts_of, print_table, progress, use_processor_time
 from robotdiffuse.baselines.controls import smooth_noise
-from robotdiffuse.core.output_files import JsonLines
+from robotdiffuse.core.output_files import JsonLines, write_atomically
 from robotdiffuse.datasets.rows import read_rows
 from robotdiffuse.datasets.shards import SPLITS, read_shard, shard_indices
 from robotdiffuse.evaluation.methods import validated
@@ -42,7 +44,7 @@ from robotdiffuse.evaluation.problem_sets import case_file, validator
 from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
 from robotdiffuse.generation.factory import GenerationSettings, generate
-from robotdiffuse.learning.checkpoint import load_encoder, read_tensors, write_tensors
+from robotdiffuse.learning.checkpoint import load_encoder
 from robotdiffuse.learning.denoisers import (
     CrossAttentionSettings,
     DenoiserSettings,
@@ -248,9 +250,9 @@ class Study:
         model = MotionNetwork(RobotIdentity.of(PANDA), model_settings(settings, encoder))
         model.encoder = encoder
         model = with_parts_of(row, model)
-        tensors, notes = read_tensors(self.folder(row) / "averaged.safetensors")
-        model.load_state_dict(tensors)
-        return model.requires_grad_(False).eval(), notes["samples"]
+        with safe_open(self.folder(row) / "averaged.safetensors", "pt") as stored:
+            model.load_state_dict({name: stored.get_tensor(name) for name in stored.keys()})  # noqa: SIM118
+            return model.requires_grad_(False).eval(), int(stored.metadata()["samples"])
 
 
 def first_length(problem: Problem) -> float | None:
@@ -285,7 +287,9 @@ class SceneTask(PlannerTask):
         samples = round(fraction * (self.settings.samples or 0))
         folder = self.study.folder(self.row)
         notes = {"samples": samples, "motions": len(self.train_data)}
-        write_tensors(folder / "averaged.safetensors", self.model.state_dict(), notes)
+        weights = {name: tensor.contiguous() for name, tensor in self.model.state_dict().items()}
+        content = save(weights, metadata={"samples": str(samples)})
+        write_atomically(folder / "averaged.safetensors", content, make_folder=True)
         passed_by_code = tried(self.row, self.model, self.cases, ("own", "hidden"), CURVE_SAMPLES)
         shares = {name: float(passed.mean()) for name, passed in passed_by_code.items()}
         JsonLines(folder / "curve.jsonl").append(notes | shares)

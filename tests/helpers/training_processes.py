@@ -6,10 +6,11 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from safetensors.torch import save_file
+
 from helpers.box_arm import box_arm
 from helpers.toy_task import ToyTask
 from robotdiffuse.core.interrupts import exit_fast
-from robotdiffuse.learning.checkpoint import write_tensors
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.training import tasks as training
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
@@ -27,7 +28,7 @@ def two(settings: PlannerTraining, out: Path) -> None:
         original(self)
         if self.at.step == 1 and self.processes.first:
             gradients = {str(i): p.grad for i, p in enumerate(self.parameters) if p.grad is not None}
-            write_tensors(out / "first_step.safetensors", gradients, {})
+            save_file(gradients, out / "first_step.safetensors")
 
     def cut(self):
         original(self)

@@ -8,18 +8,16 @@ written atomically.
 import copy
 import hashlib
 import json
-import struct
 from pathlib import Path as FilePath
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
-from torch import Tensor, nn
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from torch import nn
 
 from robotdiffuse.core.errors import InputError, shortened
 from robotdiffuse.core.output_files import write_atomically
-from robotdiffuse.learning.completion import CompletionSettings
 from robotdiffuse.learning.completion_network import CompletionNetwork
 from robotdiffuse.learning.encoders import ENCODERS, encoder_name
 from robotdiffuse.learning.encoders.networks import Encoder
@@ -27,34 +25,14 @@ from robotdiffuse.learning.network import Network, SavedModule
 from robotdiffuse.learning.weight_files import (
     FORMAT,
     NETWORKS,
-    RobotIdentity,
     checked_bytes,
     completion_folder,
+    identity,
     kept_by_stamp,
     read_description,
     weights_folder,
 )
 from robotdiffuse.robots.robot import Robot
-
-
-def write_tensors(file: FilePath, tensors: dict[str, Tensor], notes: dict[str, Any]) -> str:
-    """Write tensors and JSON notes into one safetensors file. Returns its SHA-256."""
-    contiguous = {name: tensor.detach().contiguous() for name, tensor in tensors.items()}
-    data = save(contiguous, metadata={"notes": json.dumps(notes)})
-    write_atomically(file, data, make_folder=True)
-    return hashlib.sha256(data).hexdigest()
-
-
-def read_tensors(file: FilePath) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and notes of a file of `write_tensors`. Raises InputError if it is missing or damaged."""
-    try:
-        with safe_open(str(file), framework="pt") as opened:
-            notes = json.loads((opened.metadata() or {}).get("notes", "{}"))
-            return {name: opened.get_tensor(name) for name in opened.keys()}, notes  # noqa: SIM118
-    except FileNotFoundError:
-        raise InputError(f"{file} does not exist") from None
-    except (SafetensorError, OSError, ValueError, RecursionError, struct.error) as error:
-        raise InputError(f"{file} is damaged or no safetensors file: {str(error).splitlines()[0]}") from None
 
 
 def fingerprint(module: nn.Module) -> str:
@@ -67,7 +45,7 @@ def fingerprint(module: nn.Module) -> str:
 
 
 def save_network(name: str, network: Any, folder: str | FilePath, training: dict[str, Any]) -> None:
-    """Write NAME.safetensors and NAME.json; `name` as in NETWORKS, or encoder or completion.
+    """Write NAME.safetensors and NAME.json; `name` as in NETWORKS, or encoder.
 
     training: information for people, such as the data's fingerprint and the number of samples.
     """
@@ -84,7 +62,9 @@ def _save(module: SavedModule, folder: FilePath, stem: str, about: dict[str, Any
     kinds = (nn.Linear, nn.Conv3d)
     half = {f"{name}.weight" for name, part in module.named_modules() if isinstance(part, kinds)}
     packed = {name: t.half() if name in half else t for name, t in module.state_dict().items()}
-    digest = write_tensors(folder / f"{stem}.safetensors", packed, {})
+    weights = save({name: tensor.detach().contiguous() for name, tensor in packed.items()})
+    digest = hashlib.sha256(weights).hexdigest()
+    write_atomically(folder / f"{stem}.safetensors", weights, make_folder=True)
     stored = copy.deepcopy(module).cpu()
     stored.load_state_dict(packed)  # export the rounded weights, which a reader of the file gets
     parts = stored.exports()
@@ -100,16 +80,13 @@ def _load(name: str, folder: FilePath) -> Any:
     about = read_description(folder, name)
     location = f"{folder / name}.json"
     weights = folder / f"{name}.safetensors"
-    checked_bytes(weights, about.get("weights_sha256"), f"{name}.json")
-    kind: Any = CompletionNetwork
-    settings: Any = CompletionSettings
-    if name != "completion":
-        table, entry = (ENCODERS, about.get("network", "")) if name == "encoder" else (NETWORKS, name)
-        kind = table.load(entry)
-        settings = table.settings(entry)
+    data = checked_bytes(weights, about.get("weights_sha256"), f"{name}.json")
+    table, entry = (ENCODERS, about.get("network", "")) if name == "encoder" else (NETWORKS, name)
+    kind = table.load(entry)
+    settings: Any = table.settings(entry)
     parts = [settings.from_json(about.get("settings"), f"{location}: settings")]
-    if name in NETWORKS:
-        parts.insert(0, RobotIdentity.from_json(about.get("robot"), f"{location}: robot"))
+    if issubclass(kind, Network):
+        parts.insert(0, identity(name, folder))
     try:
         network = kind(*parts)
     except (RuntimeError, TypeError, MemoryError, OverflowError) as error:
@@ -118,8 +95,8 @@ def _load(name: str, folder: FilePath) -> Any:
             f"{location}: no network can be made from these settings: {shortened(str(error))}"
         ) from None
     try:
-        network.load_state_dict(read_tensors(weights)[0])
-    except RuntimeError as error:
+        network.load_state_dict(load(data))
+    except (RuntimeError, SafetensorError) as error:
         raise InputError(f"{weights} does not fit its description: {str(error)[:200]}") from None
     return network.requires_grad_(False).eval()
 
@@ -159,7 +136,7 @@ def export_weights(folder: str | FilePath) -> list[str]:
     """
     place = FilePath(folder)
     written = list[str]()
-    for name in ("completion", *NETWORKS):
+    for name in NETWORKS:
         if not (place / f"{name}.json").is_file():
             continue
         about = read_description(place, name)

@@ -20,8 +20,8 @@ from robotdiffuse.learning.motion_model import (
     Statistics,
 )
 from robotdiffuse.learning.weight_files import (
-    RobotIdentity,
     exported_files,
+    identity,
     kept_by_stamp,
     read_arrays,
     read_description,
@@ -67,8 +67,8 @@ class ExportedModel(MotionModel):
         file."""
         about = read_description(folder, name)
         location = str(folder / f"{name}.json")
-        robot = RobotIdentity.from_json(about.get("robot"), f"{location}: robot")
-        super().__init__(robot, MotionModelSettings.from_json(about.get("settings"), f"{location}: settings"))
+        settings = MotionModelSettings.from_json(about.get("settings"), f"{location}: settings")
+        super().__init__(identity(name, folder), settings)
         parts = exported_files(folder, name, about)
         needed = {".onnx"} if self.settings.encoder is None else {".onnx", ".encoder.onnx"}
         if parts.keys() != needed:

@@ -125,6 +125,12 @@ NETWORKS = Registry(
             "robotdiffuse.learning.motion_model:MotionModelSettings",
             "planner --config trajectory_prior --data FOLDER --out FOLDER",
         ),
+        "completion": Entry(
+            "robotdiffuse.learning.completion_network:CompletionNetwork",
+            "the occupancy of space that no camera saw",
+            "robotdiffuse.learning.completion:CompletionSettings",
+            "completion --out FOLDER",
+        ),
     },
 )
 """The last value of an entry, its kind, is what follows `robotdiffuse train` in the command that trains the
@@ -226,13 +232,14 @@ def weights_for(name: str, robot: Robot) -> FilePath | None:
     damaged description.
     """
     for place in (user_weights(robot), BUNDLED / robot.name):
-        if stamp(place, name) and not _identity(name, place).difference(robot):
+        if stamp(place, name) and not identity(name, place).difference(robot):
             return place
     return None
 
 
 @kept_by_stamp
-def _identity(name: str, folder: FilePath) -> RobotIdentity:
+def identity(name: str, folder: FilePath) -> RobotIdentity:
+    """The robot that weights were trained for. Raises InputError for a damaged description."""
     about = read_description(folder, name)
     return RobotIdentity.from_json(about.get("robot"), f"{folder / name}.json: robot")
 
@@ -269,16 +276,13 @@ def weights_folder(name: str, folder: str | FilePath | None, robot: Robot) -> Fi
 
 
 def completion_folder(folder: str | FilePath | None) -> FilePath:
-    """The folder with weights of the completion network: the given folder, or the package's.
+    """The folder with weights of the completion network, which belong to no robot: the given folder, or the
+    package's.
 
     Raises InputError if it holds no such weights, naming the command that trains them.
     """
-    place = BUNDLED / "completion" if folder is None else FilePath(folder)
-    if not (place / "completion.json").is_file():
-        raise InputError(
-            f"{place} holds no weights of the completion network; train them: robotdiffuse train completion "
-            "--out FOLDER"
-        )
+    place = BUNDLED / "completion" if folder is None else folder_of(folder)
+    check_weights("completion", place)
     return place
 
 

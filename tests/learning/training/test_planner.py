@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 
 import robotdiffuse as rd
 from helpers.refusals import refuses
@@ -17,7 +18,7 @@ from helpers.small_model import SMALL_ENCODER
 from helpers.training_log import read_log
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.output_files import lock_folder
-from robotdiffuse.learning.checkpoint import load_encoder, load_network, read_tensors
+from robotdiffuse.learning.checkpoint import load_encoder, load_network
 from robotdiffuse.learning.denoisers import DENOISERS, TransformerSettings, UNetSettings
 from robotdiffuse.learning.diffusion import OBJECTIVES
 from robotdiffuse.learning.encoders import make_encoder
@@ -86,7 +87,7 @@ def test_two_processes_are_one_run(tmp_path, data, monkeypatch):
     monkeypatch.setattr(Batches, "draw", both)
     monkeypatch.setattr(TrainingRun, "step", step)
     train_planner(replace(settings, samples=32, batch=32), str(tmp_path / "one"))
-    averaged, _ = read_tensors(out / "first_step.safetensors")
+    averaged = load_file(out / "first_step.safetensors")
     assert averaged.keys() == gradients.keys()
     wanted, found = (torch.cat([g[name].flatten() for name in averaged]) for g in (gradients, averaged))
     # products in bf16 have 8 digits, and are rounded for each batch
@@ -247,7 +248,7 @@ def test_other_settings_and_a_damaged_checkpoint_are_refused(tmp_path, data):
         train_planner(planner_settings(data), str(tmp_path / "out"))
     file = tmp_path / "out" / "training.safetensors"
     file.write_bytes(file.read_bytes()[:1000])
-    refuses(r"training\.safetensors is (damaged|no checkpoint)", train_planner, planner_settings(data), str(tmp_path / "out"))
+    refuses(r"training\.safetensors is damaged", train_planner, planner_settings(data), str(tmp_path / "out"))
 
 
 @pytest.mark.usefixtures("no_export")

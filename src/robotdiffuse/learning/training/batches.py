@@ -3,9 +3,9 @@ drawn from both."""
 
 import hashlib
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from io import BytesIO
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -171,20 +171,13 @@ def _codes(
     if encoder is None:
         return np.zeros((len(scenes), 0), np.float16)
     cache = folder / "codes" / f"{key}.npy"
-    if cache.is_file():
-        try:
-            codes = np.load(cache)
-            if len(codes) == len(scenes):
-                return codes
-        except (OSError, ValueError, EOFError):
-            pass  # damaged: computed again below
+    with suppress(OSError, ValueError, EOFError):  # if it is missing or damaged, the codes are computed below
+        codes = np.load(cache)
+        if len(codes) == len(scenes):
+            return codes
     codes = encode_scenes(encoder, scenes, np.random.default_rng(int(key[:8], 16)))
-    try:
-        buffer = BytesIO()
-        np.save(buffer, codes)
-        write_atomically(cache, buffer.getvalue(), make_folder=True)
-    except InputError:
-        pass  # a read-only data folder: the codes are computed again next time
+    with suppress(InputError):  # in a read-only data folder, the codes are computed again next time
+        write_atomically(cache, lambda stream: np.save(stream, codes), make_folder=True)
     return codes
 
 

@@ -12,9 +12,10 @@ import sys
 import threading
 import time
 from abc import ABC, abstractmethod
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple, TypeVar
@@ -24,16 +25,18 @@ import torch
 from numpy.random import Generator
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from safetensors import safe_open
+from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_, parameters_to_vector, vector_to_parameters
 from torch.optim.swa_utils import AveragedModel
 
 from robotdiffuse import __version__
-from robotdiffuse.core.errors import InputError, needs
+from robotdiffuse.core.errors import InputError, needs, reading
 from robotdiffuse.core.interrupts import handled
 from robotdiffuse.core.output_files import lock_folder, write_atomically
 from robotdiffuse.learning import need_packages
-from robotdiffuse.learning.checkpoint import read_tensors, save_network, write_tensors
+from robotdiffuse.learning.checkpoint import save_network
 from robotdiffuse.learning.encoders.networks import Encoder
 from robotdiffuse.learning.network import EXPORT_PACKAGES, Scalar
 from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16, load_data
@@ -394,11 +397,15 @@ class TrainingRun:
             "losses": self._losses,
             "rows": self.rows,
         }
-        tensors = {f"module.{name}": tensor for name, tensor in self.module.state_dict().items()}
-        tensors |= {f"average.{name}": tensor for name, tensor in self.average.state_dict().items()}
-        for place, moments in self.optimizer.state_dict()["state"].items():
-            tensors |= {f"optimizer.{place}.{name}": tensor for name, tensor in moments.items()}
-        write_tensors(self._file, tensors, notes)
+        states = {"module": self.module.state_dict(), "average": self.average.state_dict()}
+        states |= self.optimizer.state_dict()["state"]  # the moments, by the place of their parameter
+        tensors = {
+            f"{part}.{name}": tensor.detach().contiguous()
+            for part, state in states.items()
+            for name, tensor in state.items()
+        }
+        content = save(tensors, metadata={"notes": json.dumps(notes)})
+        write_atomically(self._file, content, make_folder=True)
         text = io.StringIO()
         writer: csv.DictWriter[str] = csv.DictWriter(text, self.rows[0] if self.rows else ())
         writer.writeheader()
@@ -422,37 +429,31 @@ class TrainingRun:
                         writer.add_scalar(name, float(row[name]), int(row["samples"]))
 
     def _restore(self) -> None:
-        tensors, notes = read_tensors(self._file)
-
-        def state(part: str) -> dict[str, Tensor]:
-            return {name.removeprefix(part): t for name, t in tensors.items() if name.startswith(part)}
-
-        try:
-            self._check_same(notes)
-            self.module.load_state_dict(state("module."))
-            self.average.load_state_dict(state("average."))
-            moments: dict[int, dict[str, Tensor]] = {}
-            for key, tensor in state("optimizer.").items():
-                place, _, name = key.partition(".")
-                moments.setdefault(int(place), {})[name] = tensor
+        states = defaultdict[str, dict[str, Tensor]](dict)
+        with reading(self._file):
+            with safe_open(self._file, "pt") as stored:
+                notes = json.loads(stored.metadata()["notes"])
+                for key in stored.keys():  # noqa: SIM118
+                    part, _, name = key.partition(".")
+                    states[part][name] = stored.get_tensor(key)
+            self._check_same(notes["settings"] | notes["identity"])
+            self.module.load_state_dict(states.pop("module"))
+            self.average.load_state_dict(states.pop("average"))
+            moments = {int(place): state for place, state in states.items()}
             self.optimizer.load_state_dict(self.optimizer.state_dict() | {"state": moments})
-            self.at = Position(**{field.name: notes["at"][field.name] for field in fields(Position)})
+            self.at = Position(**notes["at"])
             self.rng.bit_generator.state = notes["random"][self.processes.index]
             self._losses = notes["losses"]
             self.rows = notes["rows"]
-        except (LookupError, TypeError, ValueError, RuntimeError) as error:
-            raise InputError(f"{self._file} is no checkpoint of this run: {str(error)[:200]}") from None
 
-    def _check_same(self, notes: dict) -> None:
-        now = json.loads(json.dumps(self.settings.to_json()))
-        before = notes["settings"]
+    def _check_same(self, before: dict[str, Any]) -> None:
         default = {"processes": "1"}
-        now = now | default | self.identity
-        before = before | default | notes["identity"]
+        now = default | json.loads(json.dumps(self.settings.to_json())) | self.identity
+        before = default | before
         for name, value in now.items():
             if name not in FREE_SETTINGS and before.get(name) != value:
                 raise InputError(
-                    f"{self.out} holds a run with {name} = {before.get(name)!r}, now it is {value!r}; "
+                    f"{self._file} is of a run with {name} = {before.get(name)!r}, now it is {value!r}; "
                     "use another folder, or the same settings"
                 )
 
