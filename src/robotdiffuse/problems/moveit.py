@@ -29,6 +29,7 @@ from robotdiffuse.core.types import Pose, Vector
 from robotdiffuse.robots.bodies import AttachedBody, polygon_around_circle
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import MIMIC_SLACK, MOVING_KINDS, Robot
+from robotdiffuse.scenes.files import check_fields
 from robotdiffuse.scenes.point_cloud import cover_radius, occupied_voxels
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, PointCloud, Shape, Sphere
@@ -38,6 +39,14 @@ REQUEST = "a motion plan request"
 # Names in planning scenes: the field of the matrix, and the octomap's name in the matrix.
 MATRIX = "allowed_collision_matrix"
 OCTOMAP = "<octomap>"
+SCENE_FIELDS = (
+    *("name", "robot_state", "robot_model_name", "fixed_frame_transforms", MATRIX, "link_padding"),
+    *("link_scale", "object_colors", "world", "is_diff"),
+)
+OBJECT_FIELDS = (
+    *("header", "pose", "id", "type", "primitives", "primitive_poses", "meshes", "mesh_poses", "planes"),
+    *("plane_poses", "subframe_names", "subframe_poses", "operation"),
+)
 
 # Edge length and thickness of the box that stands for a plane [m].
 PLANE_EXTENT = 20.0
@@ -198,7 +207,8 @@ def moveit_scene(
     links: names of the robot's links and held objects. contacts: allowed contacts in addition to those of the
     file, in the form that `Scene` accepts.
     """
-    world = mapping_of(SCENE, data, "world")
+    check_fields(SCENE, data, (), SCENE_FIELDS)
+    world = check_fields("world", mapping_of(SCENE, data, "world"), (), ("collision_objects", "octomap"))
     shapes = _octomap(mapping_of("world", world, "octomap"), frames)
     for i, entry in enumerate(list_of("world.", world, "collision_objects")):
         object_entry = mapping_of(f"collision object {i}", entry)
@@ -274,6 +284,7 @@ def object_shapes(entry: dict[str, Any], frames: MoveItFrames, folder: Path) -> 
 
     folder: names of mesh files are relative to it.
     """
+    check_fields("the object", entry, (), OBJECT_FIELDS)
     T_base_object = frames.of_header("header", entry) @ pose_of("pose", entry.get("pose") or NO_POSE)
     name = str(entry.get("id") or "object")
     shapes: list[Shape] = []

@@ -184,6 +184,10 @@ WRONG_SCENES: dict[str, tuple[object, str]] = {
     ),
     "objects": ({"world": {"collision_objects": {}, "octomap": {"octomap": {"data": [1]}}}}, "not binary"),
     "octomap": (octomap([3, 0]), "world.octomap: the tree ends too soon"),
+    "a problem": ({"robot": "panda", "scene": []}, "unknown field of a planning scene: 'robot'"),
+    "misspelled world": ({"world": {"objects": []}}, "unknown field of world: 'objects'"),
+    "misspelled object": (scene_data(primitive=[]), "unknown field of the object: 'primitive'; .* mean primitives"),
+    "empty": (None, "a planning scene is None"),
     "attached": ({"robot_state": {"attached_collision_objects": [1]}}, "attached_collision_objects"),
 }
 
