@@ -11,7 +11,7 @@ from robotdiffuse.validation.validator import verify_trajectory
 
 
 def run_export(arguments: Namespace) -> None:
-    outputs = [check_export(file) for file in arguments.out]
+    outputs = [check_export(file, arguments.result) for file in arguments.out]
     problem, trajectory = validated_motion(arguments.result, arguments.rate)
     for file in outputs:
         write_motion(problem, trajectory, file)

@@ -54,12 +54,15 @@ def _request(arguments: Namespace) -> PlanRequest:
 
 def _outputs(arguments: Namespace) -> list[Path]:
     """All files to write. Raises InputError for one that cannot be written."""
+    problem = arguments.problem
     files = [
-        check_export(file) if Path(file).suffix.lower() in WRITERS else check_output(file, RESULT_ENDINGS)
+        check_export(file, problem)
+        if Path(file).suffix.lower() in WRITERS
+        else check_output(file, RESULT_ENDINGS, problem)
         for file in arguments.out
     ]
     if arguments.view:
-        files.append(check_output(f"{Path(arguments.problem).stem}.html", ENDINGS))
+        files.append(check_output(f"{Path(problem).stem}.html", ENDINGS))
     return files
 
 

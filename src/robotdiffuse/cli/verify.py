@@ -22,7 +22,9 @@ from robotdiffuse.validation.validator import verify, violations
 
 
 def run_verify(arguments: Namespace) -> int:
-    out = None if arguments.certificate is None else check_output(arguments.certificate, (".json",))
+    out = arguments.certificate
+    if out is not None:
+        out = check_output(out, (".json",), arguments.motion, arguments.problem)
     problem, motions, notes = _read(arguments)
     for note in (*problem.notes, *notes, *contact_notes(problem.scene)):
         print(f"note: {note}")

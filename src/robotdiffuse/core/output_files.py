@@ -82,12 +82,15 @@ def replaced_folder(target: Path) -> Iterator[Path]:
         raise write_error(target, error) from None
 
 
-def check_output(file: str | Path, endings: tuple[str, ...]) -> Path:
+def check_output(file: str | Path, endings: tuple[str, ...], *inputs: str | None) -> Path:
     """The file as a path, after checking that it can be written.
 
-    Raises InputError for an ending that is not in `endings` and for a folder that is missing or read-only.
+    Raises InputError for an ending that is not in `endings`, for a folder that is missing or read-only, and
+    for one of the files `inputs`, which it would replace.
     """
     path = file_name(file)
+    if any(name is not None and os.path.realpath(path) == os.path.realpath(name) for name in inputs):
+        raise InputError(f"{path} is an input of this command; name another file")
     if path.suffix.lower() not in endings:
         raise InputError(f"{path}: unknown ending {shown(path.suffix)}; known: {', '.join(endings)}")
     if path.is_dir():

@@ -49,18 +49,20 @@ TRAJECTORY_ENDINGS = (".json", ".csv")
 """Endings that `Trajectory.save` writes."""
 
 
-def check_export(file: str | Path) -> Path:
+def check_export(file: str | Path, *inputs: str) -> Path:
     """The file as a path, after checking that its format is known, its package installed, and it can be
     written.
 
     Raises InputError for an ending that is not in WRITERS or TRAJECTORY_ENDINGS, for a package that is not
-    installed, and for a folder that is missing or read-only.
+    installed, for a folder that is missing or read-only, and for one of the files `inputs`.
     """
     path = file_name(file)
     ending = path.suffix.lower()
     if ending in WRITERS:
         WRITERS.load(ending)
-    return path if path.is_dir() and ending == BAG else check_output(path, (*TRAJECTORY_ENDINGS, *WRITERS))
+    if path.is_dir() and ending == BAG:
+        return path
+    return check_output(path, (*TRAJECTORY_ENDINGS, *WRITERS), *inputs)
 
 
 def write_motion(problem: "Problem", trajectory: "Trajectory", file: str | Path) -> None:
