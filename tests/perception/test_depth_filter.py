@@ -10,7 +10,7 @@ import robotdiffuse as rd
 from helpers.refusals import refuses
 from robotdiffuse.perception.depth_filter import empty_regions, filtered, measured_share, median_filter, patch_noise
 from robotdiffuse.perception.depth_view import DepthNoise
-from robotdiffuse.perception.observed_volume import ARM_MARGIN, FREE, carve_view, observe
+from robotdiffuse.perception.observed_volume import FREE, carve_view, observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
 from robotdiffuse.perception.seen_points import seen_points
 from robotdiffuse.perception.voxel_grid import FINE
@@ -125,7 +125,7 @@ def test_a_board_seen_almost_edge_on_is_not_empty(height: float) -> None:
     T = looking_at(np.array([1.6, 0.1, height]), np.array([0.5, 0.0, 0.5]), roll=0.1)
     clean = ray_cast(board, T, (FOCAL, FOCAL, 159.5, 119.5), (320, 240))
     noisy = DepthNoise(spread=0.004, correlation=1.5, zeros=True).applied(clean, np.random.default_rng(0))
-    state, _, _ = carve_view(replace(noisy, range=4.0), PANDA, HOME, ARM_MARGIN, FINE)
+    state, _, _ = carve_view(replace(noisy, range=4.0), PANDA, HOME, FINE)
     free = state == FREE
     assert free.mean() > 0.4 and not free[voxels_within(board, FINE, 0.0)].any()
 

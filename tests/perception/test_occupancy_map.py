@@ -61,7 +61,7 @@ def test_what_obstacles_may_reach_is_free_only_by_a_margin_of_the_own_error() ->
     doubted = before & ~known.free
     assert 0 < doubted.sum() < 0.2 * before.sum()
     assert (doubted <= MAP.within(np.column_stack([points, errors + 0.03]))).all()
-    narrow = carve_view(far, PANDA, HOME, 0.015, MAP, narrowed=1.0)[0] == FREE
+    narrow = carve_view(far, PANDA, HOME, MAP, narrowed=1.0)[0] == FREE
     assert (known.free & reached <= narrow).all() and known.unknown[doubted].all()
     declared = OccupancyMap(PANDA)
     declared.declare_free(((-1.0, -1.0, -0.4), (1.0, 1.0, 1.1)))
@@ -90,7 +90,7 @@ def test_a_voxel_is_the_same_wherever_its_block_begins() -> None:
     states = []
     for shift in (0.0, MAP.edge):
         x, y, z = (side + shift for side in MAP.low)
-        states.append(carve_view(view_from(0.3), PANDA, HOME, 0.015, replace(MAP, low=(x, y, z)))[0])
+        states.append(carve_view(view_from(0.3), PANDA, HOME, replace(MAP, low=(x, y, z)))[0])
     assert {FREE, OUT} < set(np.unique(states[0]))
     assert (states[0][1:, 1:, 1:] != states[1][:-1, :-1, :-1]).mean() < 1e-4
 

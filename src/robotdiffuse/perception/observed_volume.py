@@ -138,9 +138,9 @@ def usable_image(
         # Only the error of the camera's position is added here. `carve` accounts for the error of its angle:
         # it enlarges the rectangles of pixels that must all be free.
         outline = balls(arm + np.array([0, 0, 0, view.pose_deviation[0]]))
-        arm_depth = np.full(depth.shape, np.inf, np.float32)
+        arm_depth = np.full(depth.shape, MAX_DEPTH)
         render_depth(outline, intrinsics, T.astype(np.float32), arm_depth)
-        depth[empty & np.isfinite(arm_depth)] = -_NEAREST
+        depth[empty & (arm_depth < MAX_DEPTH)] = -_NEAREST
     return depth, spheres
 
 
@@ -543,7 +543,7 @@ def _observed(view: DepthView, robot: Robot, start: Configuration) -> ObservedVo
     q = start if view.configuration is None else view.configuration
     if len(q) != robot.dof:
         raise InputError(f"view.configuration has {len(q)} numbers; {robot.name} plans {robot.dof} joints")
-    state, behind, counts = carve_view(view, robot, q, ARM_MARGIN, COARSE)
+    state, behind, counts = carve_view(view, robot, q, COARSE)
     occupied = counts > 0
     behind[(state != BEHIND) | occupied] = 0.0
     free, shadow, lost = ((state == kind) & ~occupied for kind in (FREE, SHADOW, LOST))
@@ -554,18 +554,16 @@ def carve_view(
     view: DepthView,
     robot: Robot,
     q: Configuration,
-    arm_margin: float,
     grid: VoxelGrid,
     narrowed: float = NARROWED_SHARE,
 ) -> tuple[UInt8[ndarray, "nx ny nz"], Float32[ndarray, "nx ny nz"], Int32[ndarray, "nx ny nz"]]:
     """The state of each voxel in the filtered image of one view, its depth behind a surface [m], and its
     number of points; see `carve`.
 
-    q: the arm's configuration in the view. arm_margin: points within this distance of its covering spheres
-    are points of the arm, plus an allowance for noise [m]. narrowed: free space is narrowed by this fraction
-    of the largest error of the camera's pose.
+    q: the arm's configuration in the view. narrowed: free space is narrowed by this fraction of the largest
+    error of the camera's pose.
     """
-    depth, spheres = usable_image(view, robot, q, arm_margin)
+    depth, spheres = usable_image(view, robot, q, ARM_MARGIN)
     position, angle = narrowed * np.array(view.pose_deviation)
     farthest = MAX_DEPTH if view.range is None else view.range
     state = np.empty(grid.shape, np.uint8)

@@ -17,7 +17,6 @@ from robotdiffuse.core.types import Configuration, Points, Values
 from robotdiffuse.perception.depth_filter import PointErrors, filtered, point_errors
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import (
-    ARM_MARGIN,
     FREE,
     HIDDEN,
     ObservedVolume,
@@ -86,10 +85,10 @@ class OccupancyMap:
                 f"view.configuration is {shown(q)}; a map needs the {self.robot.dof} joint positions of"
                 f" {self.robot.name} when the view was taken"
             )
-        state, _, counts = carve_view(view, self.robot, q, ARM_MARGIN, MAP)
+        state, _, counts = carve_view(view, self.robot, q, MAP)
         new_voxels = self._update(state, counts, stamp)
         if any(view.pose_deviation):
-            state, _, _ = carve_view(view, self.robot, q, ARM_MARGIN, MAP, narrowed=1.0)
+            state, _, _ = carve_view(view, self.robot, q, MAP, narrowed=1.0)
         self._surely_free |= state == FREE
         return new_voxels
 

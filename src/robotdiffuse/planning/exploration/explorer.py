@@ -189,7 +189,7 @@ class Explorer:
         if self._goal is None:
             raise InputError("there is no goal; call set_goal first")
         q = vector("explorer", "configuration", configuration, self.robot.dof)
-        beside = [view for view in self._news if not self._is_on_arm(view)]
+        beside = [view for view in self._news if self._camera_of(view) is None]
         self._beside = beside[-1] if beside else None
         self._news = []
         if goal_error(self.robot, self._goal, q, ARRIVED) is None:
@@ -376,13 +376,14 @@ class Explorer:
                     return motion
         return None
 
-    def _is_on_arm(self, view: DepthView) -> bool:
+    def _camera_of(self, view: DepthView) -> int | None:
+        """The index of the arm's camera that took a view; None for a camera that is not on the arm."""
         q = view.configuration
         assert q is not None  # the map takes no other views
-        return any(
-            is_on(self.robot, camera.link, camera.T_link_camera, view.T_base_camera, q)
-            for camera in self.cameras
-        )
+        for number, camera in enumerate(self.cameras):
+            if is_on(self.robot, camera.link, camera.T_link_camera, view.T_base_camera, q):
+                return number
+        return None
 
     def _way_in_to(self, q: Configuration) -> Configurations | None:
         """Waypoints of the latest motion that was returned, if it ended at this configuration."""

@@ -25,9 +25,6 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.validator import verify, verify_trajectory
 
-SAME_POSE = 1e-9
-"""Two poses count as equal if their entries differ by less than this."""
-
 
 @dataclass(frozen=True, eq=False)
 class RecordedView:
@@ -121,14 +118,6 @@ class RecordedExplorer(Explorer):
         distances = np.abs(trajectory.positions - view.configuration).max(axis=1)
         nearest = int(len(distances) - 1 - np.argmin(distances[::-1]))
         return self.acts[-1].begins + float(trajectory.times[nearest])
-
-    def _camera_of(self, view: DepthView) -> int | None:
-        if view.configuration is not None:
-            for number, camera in enumerate(self.cameras):
-                T = camera.poses(self.robot, view.configuration[None])[0]
-                if np.abs(T - view.T_base_camera).max() < SAME_POSE:
-                    return number
-        return None
 
 
 def _waypoints(step: Step, q: Configuration) -> Configurations:
