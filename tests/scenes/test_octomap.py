@@ -67,6 +67,7 @@ def test_an_octomap_is_a_cloud_of_a_problem_file(tmp_path: Path) -> None:
         (HEAD + b"id \nres 0.1\ndata\n", r"octomap .*map\.bt (holds|is damaged)"),
         (HEAD + b"id\nres 0.1\ndata\n", r"octomap .*map\.bt (holds|is damaged)"),
         (HEAD + b"id OcTree\nres\ndata\n", r"octomap .*map\.bt (holds|is damaged)"),
+        (HEAD + b"id OcTree\nsize 9\nres 0.1\ndata\n", "the tree ends too soon"),
     ],
 )
 def test_damaged_octomaps(content: bytes, message: str, tmp_path: Path) -> None:

@@ -311,6 +311,7 @@ PACKED = PCD.format(n=10**9, data="binary_compressed").encode() + struct.pack("<
         ("cloud.pcd", PCD.format(n=1, data="zipped").encode(), "stored as 'zipped'"),
         ("cloud.pcd", PACKED, "unpacks to 40 bytes; its 1,000,000,000 points take"),
         ("cloud.pcd", PCD.replace("x y z", "i j k").format(n=1, data="ascii").encode(), "must have x, y and z"),
+        ("cloud.pcd", PCD.format(n=3, data="ascii").encode() + b"1 2 3\n1 2 3\n", "holds 2 of its 3 points"),
     ],
 )
 def test_wrong_point_files(name: str, content: bytes | None, message: str, tmp_path: Path) -> None:

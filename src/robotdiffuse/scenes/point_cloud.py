@@ -45,6 +45,8 @@ def read_octomap(file: str | Path) -> tuple[Points, float]:
     if fields.get("id") != "OcTree":
         raise InputError(f"octomap {file} holds {shown(fields.get('id'))}; it must be an OcTree")
     try:
+        if not data and fields.get("size", "0") != "0":
+            raise InputError("the tree ends too soon")
         edge = float(fields.get("res", ""))
         return occupied_voxels(data, edge), edge
     except ValueError as error:
@@ -231,8 +233,10 @@ def _read_pcd(file: Path) -> ndarray:
     total = int(header["POINTS"][0])
     if storage == "ascii":
         columns = [sum(counts[: names.index(axis)]) for axis in "xyz"]
-        rows = content[at:].decode("ascii").splitlines()
-        return np.loadtxt(rows, usecols=columns, ndmin=2, max_rows=total) if total else np.zeros((0, 3))
+        rows = content[at:].decode("ascii").splitlines()[:total]
+        if len(rows) != total:
+            raise InputError(f"point cloud file {file} holds {len(rows)} of its {total} points")
+        return np.loadtxt(rows, usecols=columns, ndmin=2) if total else np.zeros((0, 3))
     if storage not in ("binary", "binary_compressed"):
         advice = "it must be ascii, binary or binary_compressed"
         raise InputError(f"point cloud file {file} is stored as {shown(storage)}; {advice}")
