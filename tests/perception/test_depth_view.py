@@ -55,6 +55,8 @@ def test_what_is_refused() -> None:
         ({"intrinsics": [[460.0, 1, 319.5], [0, 461.0, 239.5], [0, 0, 1]]}, "without skew"),
         ({"T_base_camera": 2 * np.eye(4)}, "it must be a rotation"),
         ({"configuration": [np.nan]}, "view.configuration"),
+        ({"range": "far"}, "view.range is 'far'; it must be a number"),
+        ({"pose_deviation": (0.0, 1.0)}, "view.pose_deviation is .* angle up to 0.5"),
     ):
         refuses(message, rd.DepthView, **{"depth": np.ones((4, 4)), "intrinsics": K, "T_base_camera": T} | change)
 

@@ -296,6 +296,11 @@ def test_fields_that_exploring_would_ignore_are_refused(name: str) -> None:
         simulated.simulated_explorer(replace(PROBLEM, **{name: fields[name]}), rd.ExplorerSettings(), None, 0)
 
 
+@pytest.mark.parametrize("far", [0.0, np.nan, np.inf])
+def test_the_range_of_a_camera_is_a_positive_number(far: float) -> None:
+    refuses("camera.range is .* it must be a number", rd.ArmCamera, "panda_hand", np.eye(4), (1.0,) * 4, (2, 2), far)
+
+
 def test_steps_and_views_are_kept_with_their_times() -> None:
     problem, explorer, _ = recorded()
     acts = explorer.acts

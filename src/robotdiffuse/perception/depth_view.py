@@ -15,7 +15,7 @@ from numpy import ndarray
 from numpy.random import Generator
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import MAX_RATE, Value, numbers, rigid_transform, vector
+from robotdiffuse.core.bounds import MAX_RATE, Value, numbers, positive, rigid_transform, vector
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.settings import Bound, NotNegative, Positive, Settings
 from robotdiffuse.core.transforms import placed
@@ -82,12 +82,13 @@ class DepthView(Value):
             array = numbers(configuration)
             configuration = vector("view", "configuration", configuration, 1 if array is None else array.size)
         deviation = vector("view", "pose_deviation", self.pose_deviation, 2)
-        if min(deviation) < 0 or deviation[1] > MAX_ANGLE or (self.range is not None and not self.range > 0):
+        if min(deviation) < 0 or deviation[1] > MAX_ANGLE:
             raise InputError(
-                f"view.pose_deviation is {shown(self.pose_deviation)} and view.range {shown(self.range)}; the"
-                f" deviation must be a position [m] and an angle up to {MAX_ANGLE:g} [rad]; the range,"
-                " positive"
+                f"view.pose_deviation is {shown(self.pose_deviation)}; it must be a position [m] and an angle"
+                f" up to {MAX_ANGLE:g} [rad]"
             )
+        if self.range is not None:
+            positive("view", "range", self.range)
         with np.errstate(over="ignore"):  # values beyond float32 become +inf
             depth = np.ascontiguousarray(depth, np.float32)
         for key, value in {

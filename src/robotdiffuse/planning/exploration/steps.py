@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import Value, rigid_transform
+from robotdiffuse.core.bounds import Value, positive, rigid_transform
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Positive, Settings
@@ -33,8 +33,7 @@ class ArmCamera(Value):
     """Farther surfaces are not seen [m]."""
 
     def __post_init__(self) -> None:
-        if not self.range > 0:
-            raise InputError(f"camera.range is {self.range}; it must be positive [m]")
+        object.__setattr__(self, "range", positive("camera", "range", self.range))
         pose = rigid_transform("camera.T_link_camera", self.T_link_camera)
         object.__setattr__(self, "T_link_camera", pose)
         super().__post_init__()
