@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+import robotdiffuse as rd
 from helpers.quick_preparation import QUICK, coarse_grids
 from robotdiffuse.robots.fitting.preparation import add_robot
 
@@ -40,3 +41,9 @@ def test_the_gallery_has_thirteen_short_examples_with_pictures() -> None:
     for file in numbered:
         assert len(file.read_text(encoding="utf-8").splitlines()) < 40, file.name
         assert (ROOT / "docs" / "images" / "gallery" / f"{file.stem}.png").is_file(), file.name
+
+
+def test_the_first_motion_of_the_readme_keeps_the_asked_clearance() -> None:
+    assert "plan examples/ball.yaml --until first" in (ROOT / "README.md").read_text()
+    result = rd.plan(rd.Problem.load(ROOT / "examples" / "ball.yaml"), until="first")
+    assert result.scene_clearance >= 0.01
