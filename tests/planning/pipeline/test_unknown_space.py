@@ -13,7 +13,7 @@ from robotdiffuse.perception.depth_view import SeenPoints
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
 from robotdiffuse.perception.unknown_space import CARVING_MARGIN, PADDINGS, RATES, OccupiedVoxels, Padded
-from robotdiffuse.perception.voxel_grid import COARSE, FINE
+from robotdiffuse.perception.voxel_grid import COARSE, FINE, heaviest_part
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.pipeline import unknown_space
 from robotdiffuse.planning.planner import Planner
@@ -82,6 +82,20 @@ def test_of_several_motions_the_one_that_sweeps_least_probability(planner: Plann
     crossed = FINE.swept(PANDA, first.path) & unknown & ~FINE.filled(PANDA, (START, GOAL))
     assert chosen.swept_probability is not None
     assert chosen.swept_probability <= 0.01 * crossed.sum() * (1 + 1e-3)
+
+
+def test_the_unknown_region_is_found_for_the_chosen_motion_only(planner: Planner, monkeypatch: pytest.MonkeyPatch) -> None:
+    regions = []
+
+    def counted(*arguments: ndarray) -> ndarray:
+        regions.append(heaviest_part(*arguments))
+        return regions[-1]
+
+    monkeypatch.setattr("robotdiffuse.perception.unknown_space.heaviest_part", counted)
+    everywhere = np.full(FINE.shape, np.float32(0.01))
+    request = PlanRequest(20.0, until=FIRST)
+    result = unknown_space.plan_with_unknown_space(planner, partial("predicted"), request, everywhere)
+    assert result.unknown_region is not None and len(regions) == 1
 
 
 def test_occupied_crosses_nothing_unknown_but_at_the_ends(planner: Planner) -> None:

@@ -265,11 +265,10 @@ class _Attempts:
         remaining time. Among those with about the highest confidence, the shortest is returned.
         """
         request = self.context.request
-        if self.unknown.probability is None:
-            return self._attempt(problem, assumption, until, request)
+        predicted = self.unknown.probability is not None
         motions = list[PlanResult]()
         while len(motions) < MAX_FIRST_MOTIONS:
-            quick = replace(request, until=FIRST, seed=request.seed + len(motions))
+            quick = replace(request, until=FIRST, seed=request.seed + len(motions)) if predicted else request
             result = self._attempt(problem, assumption, until, quick)
             if not result.solved and not motions:
                 return result
@@ -280,16 +279,17 @@ class _Attempts:
             acceptable = ACCEPTABLE_RISK if len(motions) >= MIN_FIRST_MOTIONS else NEGLIGIBLE_RISK
             if self.context.elapsed >= until or lowest_risk <= acceptable:
                 break
-        if request.until != FIRST and self.context.elapsed < until:
+        if predicted and request.until != FIRST and self.context.elapsed < until:
             result = self._attempt(problem, assumption, until, request)
             motions += [result] if result.solved else []
         min_confidence = max(motion.confidence or 0.0 for motion in motions) - CONFIDENCE_TOLERANCE
         best = [motion for motion in motions if (motion.confidence or 0.0) >= min_confidence]
-        return replace(min(best, key=lambda motion: motion.path_length), planning_time=self.context.elapsed)
+        chosen = min(best, key=lambda motion: motion.path_length)
+        region = self.unknown.crossed(chosen.path).region
+        return replace(chosen, planning_time=self.context.elapsed, unknown_region=region)
 
     def _attempt(self, problem: Problem, assumption: str, until: float, request: PlanRequest) -> PlanResult:
-        """The planner's result; a motion with the confidence under the assumption and with the unknown space
-        that it crosses."""
+        """The planner's result; a motion with the confidence under the assumption."""
         context_request = self.context.request
         began = self.context.elapsed
         limit = max(until - began, MIN_TIME_FRACTION * context_request.time_limit)
@@ -308,5 +308,4 @@ class _Attempts:
             assumption=assumption,
             confidence=confidence(assumption, crossed),
             swept_probability=crossed.risk,
-            unknown_region=crossed.region,
         )
