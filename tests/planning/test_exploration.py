@@ -1,6 +1,7 @@
 """Explorer: its motions keep its policy in scenes that it knows only by simulated cameras."""
 
 from dataclasses import replace
+from inspect import unwrap
 from itertools import islice, pairwise
 from threading import Thread
 
@@ -294,6 +295,20 @@ def test_fields_that_exploring_would_ignore_are_refused(name: str) -> None:
     fields = {"waypoints": [PROBLEM.start], "moving": [ball]}
     with pytest.raises(rd.InputError, match=f"the problem has {name}, which explore does not support"):
         simulated.simulated_explorer(replace(PROBLEM, **{name: fields[name]}), rd.ExplorerSettings(), None, 0)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"robot": "panda"}, "robot is 'panda'; it must be a Robot"),
+        ({"cameras": ["wrist"]}, r"cameras\[0\] is 'wrist'; it must be an ArmCamera"),
+        ({"scene": []}, r"scene is \[\]; it must be a Scene"),
+    ],
+)
+def test_an_explorer_of_wrong_parts_is_refused(wrong: dict[str, object], message: str) -> None:
+    # past the type checks of the tests, which users do not have
+    make = unwrap(rd.Explorer.__init__)
+    refuses(message, make, object.__new__(rd.Explorer), **{"robot": rd.load_robot("panda"), **wrong})
 
 
 @pytest.mark.parametrize("far", [0.0, np.nan, np.inf])

@@ -117,8 +117,16 @@ class Explorer:
         free_zone: low and high corner of a box [m] that counts as free unless a view finds something there,
             such as the space around the arm's base.
         """
+        check_type("robot", robot, Robot, "a Robot, e.g. rd.load_robot('panda')")
+        check_type("cameras", cameras, (list, tuple), "a list of ArmCamera")
+        for i, camera in enumerate(cameras):
+            check_type(f"cameras[{i}]", camera, ArmCamera, "an ArmCamera")
+        check_type("scene", scene, Scene, "a Scene")
         check_type("settings", settings, ExplorerSettings, "ExplorerSettings")
-        self.robot, self.cameras, self.scene, self.settings = robot, tuple(cameras), scene, settings
+        self.robot = robot
+        self.cameras = tuple(cameras)
+        self.scene = scene
+        self.settings = settings
         self.map = OccupancyMap(robot, settings.max_age)
         if free_zone is not None:
             self.map.declare_free(free_zone)
