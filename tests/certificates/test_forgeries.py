@@ -223,6 +223,7 @@ FORGED: dict[str, tuple[Callable[[Record], object], str]] = {
     ),
     "nothing about what moves": (set_to("moving", to=None), "the part on moving obstacles is missing"),
     # tolerances
+    "a missing tolerance": (lambda record: record["tolerances"].pop("chord"), "tolerances has no chord"),
     "a negative tolerance": (set_to("tolerances", "limit_slack", to=-1.0), "must not be negative"),
     "a narrower chord": (set_to("tolerances", "chord", to=1e-9), "its cubics leave the straight lines"),
     "a wide chord": (set_to("tolerances", "chord", to=1.0), "looser than"),

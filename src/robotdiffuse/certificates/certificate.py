@@ -168,6 +168,15 @@ def _vector(name: str, value: object) -> ndarray:
     return array
 
 
+def _tolerances(name: str, value: Any) -> Tolerances:
+    """All tolerances must be in the file: none is taken from the defaults."""
+    tolerances = Tolerances.from_json(value, name)
+    missing = [field.name for field in fields(Tolerances) if field.name not in value]
+    if missing:
+        raise InputError(f"{name} has no {', '.join(missing)}")
+    return tolerances
+
+
 class Field(NamedTuple):
     """A field of a certificate file."""
 
@@ -191,7 +200,7 @@ FIELDS = {
     "robot_parts": HASHES,
     "scene_parts": HASHES,
     "motion_hash": _typed(str),
-    "tolerances": Field(lambda name, value: Tolerances.from_json(value, name), asdict),
+    "tolerances": Field(_tolerances, asdict),
     "scene_clearance": _typed(Number),
     "self_clearance": _typed(Number),
     "problem": _typed(dict | None),

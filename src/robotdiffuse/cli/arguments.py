@@ -6,6 +6,7 @@ from argparse import _ActionsContainer as ActionsContainer
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.input_files import MEGABYTE
 
 # Exit statuses: done; no valid motion; bad input; the output could not be written; stopped by the user.
@@ -46,6 +47,12 @@ def option(parser: ActionsContainer, spec: str, help: str, *more: Any) -> None:
 def chosen(arguments: Namespace, names: Iterable[str]) -> dict[str, Any]:
     """The options of these names that the user gave; for all others, the settings keep their defaults."""
     return {name: value for name, value in vars(arguments).items() if name in names and value is not None}
+
+
+def check_workers(arguments: Namespace) -> None:
+    """Refuses --workers together with --cluster."""
+    if arguments.cluster is not None and arguments.workers is not None:
+        raise InputError("--workers cannot be combined with --cluster, which uses all cores of the cluster")
 
 
 def number(kind: type, fits: Callable[[Any], bool], what: str) -> Callable[[str], Any]:

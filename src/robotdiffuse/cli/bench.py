@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from robotdiffuse.cli.arguments import Namespace, chosen
+from robotdiffuse.cli.arguments import Namespace, check_workers, chosen
 from robotdiffuse.cli.console import progress
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import write_atomically
@@ -46,8 +46,7 @@ def _say(text: str) -> None:
 
 def _bench_settings(arguments: Namespace) -> list[BenchSettings]:
     """The settings of each run of the bench: those of the preset, or a single one from the options."""
-    if arguments.cluster is not None and arguments.workers is not None:
-        raise InputError("--workers cannot be combined with --cluster, which uses all cores of the cluster")
+    check_workers(arguments)
     changes = _changes(arguments, BenchSettings)
     if arguments.preset is not None:
         fixed = ("planners", "time_limit", "seeds", "equal_time")

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from robotdiffuse.cli.arguments import Namespace, chosen
+from robotdiffuse.cli.arguments import Namespace, check_workers, chosen
 from robotdiffuse.cli.console import progress
 from robotdiffuse.cli.view import open_in_browser
 from robotdiffuse.core.errors import InputError
@@ -24,8 +24,7 @@ from robotdiffuse.visualization.replay_page import GalleryEntry, write_gallery
 
 
 def run_generate(arguments: Namespace) -> None:
-    if arguments.cluster is not None and arguments.workers is not None:
-        raise InputError("--workers cannot be combined with --cluster, which uses all cores of the cluster")
+    check_workers(arguments)
     options = chosen(arguments, GenerationSettings.__dataclass_fields__)
     if arguments.planner is not None and arguments.planner != GenerationSettings.planner:
         options["search"] = SEARCHES.defaults(arguments.planner)

@@ -16,7 +16,7 @@ from robotdiffuse.trajectories import timing_kernel
 from robotdiffuse.trajectories.timing_kernel import (
     RoundedLine,
     fastest_speeds,
-    rounded_line,
+    line_with_widths,
     slowdown,
     states_at,
 )
@@ -199,7 +199,7 @@ def _moving_start(robot: Robot, line: RoundedLine, settings: TimingSettings, sta
             widths = line.half_widths.copy()
             widths[:1] = np.minimum(widths[:1], first - lead)
             waypoints = np.concatenate([line.waypoints[:1] + lead * direction, line.waypoints[1:]])
-            after_lead = rounded_line(waypoints, widths)._replace(half_widths=widths)
+            after_lead = line_with_widths(waypoints, widths)
             grid = timing_grid(after_lead, settings)
             try:
                 speeds = _fastest_speeds(after_lead, grid, velocity, share * acceleration, start_speed)

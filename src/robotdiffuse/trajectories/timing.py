@@ -24,7 +24,7 @@ from robotdiffuse.trajectories.speed_limits import (
     TooFastError,
     time_line,
 )
-from robotdiffuse.trajectories.timing_kernel import rounded_line
+from robotdiffuse.trajectories.timing_kernel import line_with_widths, rounded_line
 
 SHRINK_FACTOR = 0.5
 """Factor by which the deviation of a corner, how far its rounding may leave the path, shrinks each time the
@@ -301,8 +301,7 @@ class StopGraph:
         interior = np.flatnonzero((line.knots > low + MIN_DISTANCE) & (line.knots < high - MIN_DISTANCE))
         ends = line(np.array([low, high]), 0)
         waypoints = np.concatenate([ends[:1], line.waypoints[interior], ends[1:]])
-        widths = line.half_widths[interior - 1]
-        part = rounded_line(waypoints, widths)._replace(half_widths=widths)
+        part = line_with_widths(waypoints, line.half_widths[interior - 1])
         times, q, v, a = time_line(robot, part, settings, extra=self._extra)
         q = q.copy()
         q[[0, -1]] = ends

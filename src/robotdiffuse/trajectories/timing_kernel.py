@@ -165,6 +165,12 @@ def rounded_line(waypoints, deviations):
     return RoundedLine(waypoints, knots, directions, widths)
 
 
+def line_with_widths(waypoints: Configurations, half_widths: Values) -> RoundedLine:
+    """The `RoundedLine` through waypoints with known half widths, for a part of another line."""
+    straight = rounded_line(waypoints, np.zeros(len(waypoints) - 2))
+    return straight._replace(half_widths=half_widths)
+
+
 @kernel()
 def timing_grid(knots, half_widths, corner_intervals, line_intervals):
     """Grid of increasing values of s, with equal intervals in every straight part and every rounded corner.

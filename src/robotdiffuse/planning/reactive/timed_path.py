@@ -22,7 +22,13 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories import braking_kernel
 from robotdiffuse.trajectories.speed_limits import TimingSettings, symmetric_bounds, timing_grid
 from robotdiffuse.trajectories.timing import time_parameterize
-from robotdiffuse.trajectories.timing_kernel import RoundedLine, controllable, rounded_line, states_at
+from robotdiffuse.trajectories.timing_kernel import (
+    RoundedLine,
+    controllable,
+    line_with_widths,
+    rounded_line,
+    states_at,
+)
 from robotdiffuse.validation.tolerances import DEFAULT
 from robotdiffuse.validation.validator import Verifier, verifier
 
@@ -105,8 +111,7 @@ class TimedPath:
         stops = [0, *(np.flatnonzero(deviations == 0) + 1).tolist(), len(rows) - 1]
         timed = None
         for first, last in reversed(list(pairwise(stops))):
-            widths = line.half_widths[first : last - 1]
-            part = rounded_line(rows[first : last + 1], widths)._replace(half_widths=widths)
+            part = line_with_widths(rows[first : last + 1], line.half_widths[first : last - 1])
             timed = TimedPath(robot, jerk_filter.acceleration, part, to_goal, timed)
         return timed
 
