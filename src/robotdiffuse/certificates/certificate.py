@@ -142,7 +142,7 @@ def _claim_proof(k: int, entry: dict[str, Any]) -> StretchProof:
     start, stop, clearance, displacement = (_vector(name, entry[name]) for name in STRETCH_FIELDS)
     count = len(start)
     if not len(stop) == len(clearance) == len(displacement) == count:
-        raise InputError(f"proof of {claim.link}: its columns must have equal lengths")
+        raise InputError(f"proof of {claim.link}: start, stop, clearance and displacement need equal lengths")
     by_planes = np.zeros(count, bool)
     by_planes[[int(i) for i in entry["by_planes"]]] = True
     planes = []
@@ -210,7 +210,7 @@ FIELDS = {
     "request_parts": HASHES,
     "moving": Field(_proof, _proof_record),
     "constraints": Field(_named_bounds),
-    "looks": NUMBERS._replace(attribute="torque_samples"),  # the name in files of this version
+    "looks": NUMBERS._replace(attribute="torque_samples"),  # the name of torque_samples in these files
     "torques": Field(_named_bounds),
     "jerks": Field(_named_bounds),
 }

@@ -66,9 +66,10 @@ def check(
     `at_most`.
 
     Robot, scene and motion must have the content that was certified. The motion must keep the limits along
-    its cubics, begin at the start, stop at each waypoint or pass it within its blend, and end at the goal.
-    Every stretch must be proved free. `requirements.not_checked` lists what only the validator checks. Raises
-    InputError if there is no problem, and for shapes that certificates do not support.
+    the cubics that join its rows, begin at the start, stop at each waypoint or pass it within its blend, and
+    end at the goal. Every stretch must be proved free. `requirements.not_checked` lists what only the
+    validator checks. Raises InputError if there is no problem, and for shapes that certificates do not
+    support.
     """
     if problem is None:
         if certificate.problem is None:
@@ -102,8 +103,9 @@ def check(
 
 
 def _cover_errors(robot: Robot) -> Iterator[str]:
-    """A message for each link with corners of meshes outside its spheres, since spheres prove most stretches.
-    The preparation of a robot proves that the spheres cover all of the meshes."""
+    """A message for each link whose spheres do not contain all corners of its meshes: most stretches are
+    proved for the spheres. Only corners are checked here; that spheres contain whole meshes is proved when a
+    robot is prepared."""
     for link, meshes in robot.meshes.items():
         spheres = robot.spheres.get(link)
         if spheres is None or not len(spheres) or not meshes:
@@ -205,7 +207,7 @@ def _gaps(proof: StretchProof, last: float) -> Iterator[str]:
         start = stretches.start[rows]
         stop = stretches.stop[rows]
         edges = np.concatenate([[0.0], stop]), np.concatenate([start, [last]])
-        # A motion of one row has no gap without stretches, but a stretch must prove its row.
+        # Even a motion of one row needs a stretch; that it is missing leaves no gap between edges.
         empty = not len(rows)
         broken = np.flatnonzero((edges[0] != edges[1]) | np.append(stop < start, empty))
         if len(broken):

@@ -47,7 +47,7 @@ class CollisionChecker:
     def link_clearances(self, q: Float[ndarray, "n dof"], limit: float = 1.0) -> Float[ndarray, "n links"]:
         """Signed distance of each moving link to the scene [m], at most `limit`; a smaller `limit` is faster.
 
-        Distances to point clouds and meshes are capped at 0.3 m; values above 0.1 m are lower bounds.
+        Distances to point clouds and meshes are at most 0.3 m; above 0.1 m, they are only lower bounds.
         """
         arrays = self.robot_arrays, self.scene_arrays
         return lane_clearance.link_clearances(*arrays, self._rows(q), np.float32(limit)) - self.padding

@@ -66,8 +66,8 @@ class TimedSweep(NamedTuple):
 
 
 class MovingCollision:
-    """Certifies timed motions of a robot among moving obstacles. Threads may share an object of this class,
-    since calls do not change it."""
+    """Certifies timed motions of a robot among moving obstacles. Threads may share an object of this class:
+    calls change nothing but a cache."""
 
     def __init__(
         self, robot: Robot, moving: Sequence[MovingObstacle], contact: float, tightness: float
@@ -92,7 +92,8 @@ class MovingCollision:
             )
             certified = min(certified, bound)
             halves = list[tuple[float, float, int, int]]()
-            for start, stop, link, o, loss in open_tasks:
+            # movement: how far the link and the obstacle can approach each other in half of the interval
+            for start, stop, link, o, movement in open_tasks:
                 if hit is not None and start >= hit[0]:
                     continue
                 time = (start + stop) / 2
@@ -104,8 +105,8 @@ class MovingCollision:
                         halves.append((start, time, link, o))
                     continue
                 best[0] = min(best[0], distance)
-                if distance - loss >= max(self.contact, self.tightness * best[0]):
-                    certified = min(certified, distance - loss)
+                if distance - movement >= max(self.contact, self.tightness * best[0]):
+                    certified = min(certified, distance - movement)
                 else:
                     halves += [(start, time, link, o), (time, stop, link, o)]
             tasks = self._tasks([half for half in halves if hit is None or half[0] < hit[0]])
@@ -134,7 +135,7 @@ class MovingCollision:
         return min((start for start, *_ in open_tasks), default=None)
 
     def _whole(self, times: Values) -> Tasks:
-        """The task of the whole motion."""
+        """One task: the time interval of the whole motion, for all pairs of a link and an obstacle."""
         pairs = np.ones((1, len(self.link_names), len(self.moving)), np.bool_)
         return Tasks(times[:1], times[-1:], pairs)
 
@@ -146,8 +147,8 @@ class MovingCollision:
         return Tasks(starts, np.array([half[1] for half in halves]), pairs)
 
     def _distance(self, link: int, o: int, times: ndarray, q: ndarray, time: float) -> float:
-        """Signed distance of a link's meshes to obstacle o at a time [m], less the obstacle's growth until
-        then."""
+        """Signed distance [m] of a link's meshes to obstacle o at `time` [s], minus how far an obstacle of
+        which only the maximum speed is known can have moved by then."""
         obstacle = self.moving[o]
         # instead of the obstacle, the robot moves
         T_base_moved = obstacle.shape.T_base_shape @ inverse(obstacle.pose(time))
@@ -217,8 +218,8 @@ def compile_tracks(moving: Sequence[MovingObstacle]) -> Tracks:
         inverse(obstacle.shape.T_base_shape) @ solid.T_base_box
         for obstacle, solid in zip(moving, solids, strict=True)
     ]
-    # The bounding box of a surface is aligned with the base frame, so in the obstacle's frame it is rotated;
-    # the extents are those of a box around it.
+    # The bounding box of a mesh is aligned with the base frame, so it is rotated in the obstacle's frame;
+    # the extents are those of a larger box, aligned with the obstacle's frame, that contains it.
     extents = [np.abs(T[:3, :3]) @ solid.half for T, solid in zip(boxes, solids, strict=True)]
     return Tracks(
         np.cumsum([0] + [len(at) for at in times]),

@@ -184,12 +184,12 @@ def pipeline_for(problem: Problem) -> Callable[[Planner, Problem, PlanRequest], 
 
 @dataclass(frozen=True)
 class CheckedSettings(Settings):
-    """How a planner without a clearance of its own checks motions for collision; see `ever_finer`."""
+    """Collision checks of planners that check motions at a finite resolution; see `ever_finer`."""
 
     resolution: Positive = 0.05
     """No point of the arm moves further than this between neighboring checked configurations [m]; the
     validator certifies the motion in between. After a path that the validator refuses, the search starts
-    again with half the resolution."""
+    again with half this distance."""
     clearance: NotNegative = 0.002
     """Distance to obstacles that paths keep where start and goal allow it [m], as for `rrt_connect`."""
 

@@ -317,8 +317,8 @@ class PointCloud(Shape):
         Args:
             file: A .ply, .pcd, .xyz, .csv, .npy or .npz file, or the occupied voxels of an octomap (.bt), in
                 the frame of the base.
-            point_radius: Radius of the sphere around each point [m]; None: 1 cm, or for an octomap the radius
-                of the sphere around a voxel, which is scaled.
+            point_radius: Radius of the sphere around each point [m]; None: 1 cm; for an octomap, the radius
+                of the sphere around a voxel, multiplied by `scale`.
             scale: Meters for each unit of the file: 0.001 for millimeters.
             name: Name of the obstacle, for messages and allowed contacts.
 
@@ -500,7 +500,7 @@ class HeightMap(_Posed, Triangulated):
         object.__setattr__(self, "heights", heights)
         super().__post_init__()
         if not len(self._faces):
-            raise InputError("height_map.heights has no cell of four heights")
+            raise InputError("height_map.heights has no cell with heights at all four corners")
 
     @property
     def _faces(self) -> ndarray:

@@ -109,15 +109,15 @@ REFINED = 12
 NEIGHBORS = 15
 MAX_VOXELS = 1500
 """Maximum number of swept voxels by which viewpoints are scored."""
-FULL_COST_LENGTH = 8.0
-"""The score of a viewpoint at this distance is halved [rad, joint-space L2]."""
+HALVING_DISTANCE = 8.0
+"""The score of a viewpoint at this distance from the start is halved [rad, joint-space L2]."""
 UNSEEN_WEIGHT = 0.05
 """Weight of a swept voxel, to which its predicted probability of being occupied is added."""
 MIN_SEEN = 0.02
 """Viewpoints that see a smaller part of the total weight are not used."""
 CONFINED = 0.1
-"""An arm that cannot move farther than this [m] is confined by space that it hides from the cameras beside
-it. It first moves as far as it can, so that these cameras see this space."""
+"""An arm that can move no farther than this [m] is confined by unseen space, which the arm itself hides from
+the fixed cameras. The arm first moves as far as it can, so that these cameras see that space."""
 SIMILAR_LOOK = 0.2
 """A viewpoint nearer than this to an earlier one that did not show the wanted voxels counts less [rad]."""
 
@@ -144,18 +144,21 @@ def best_looks(
 ) -> Iterator[Configurations]:
     """Yields paths to viewpoints from which the camera sees wanted voxels, the best first.
 
-    The score of a viewpoint is the weight of the wanted voxels that it sees, reduced for a long path. A voxel
-    counts with the probability that nothing hides it: neither the arm, nor occupied or predicted voxels.
+    The score of a viewpoint is the weight of the wanted voxels that it sees, reduced for viewpoints far from
+    the start. A voxel counts with the probability that nothing hides it: neither the arm, nor occupied or
+    predicted voxels.
 
     tree: configurations that the arm can reach; it grows here.
     probability: the predicted probability that each voxel is occupied, which adds to its weight; None without
     a prediction.
     taken: configurations of earlier images that did not show the wanted voxels. Each of them lowers the score
     of viewpoints nearby.
-    hemmed_in: whether the arm cannot go back. If so, the last path leads to the configuration in which the
-    arm is farthest from where it was in all images; for a CONFINED arm, this is also the first path. beside:
-    the latest image of a fixed camera. With the arm at a viewpoint, this camera may see wanted voxels that
-    the arm hides now.
+    hemmed_in: whether the arm cannot go back far enough along its latest motion. If so, the last path leads
+    to the configuration in which the arm is farthest from the start and from all of `taken`. If even that
+    one is nearer than CONFINED, its path also comes first.
+
+    beside: the latest image of a fixed camera. With the arm at a viewpoint, this camera may see wanted voxels
+    that the arm hides now.
     """
     robot = known.robot
     at = np.ascontiguousarray(np.argwhere(wanted))
@@ -186,7 +189,7 @@ def best_looks(
             image = beside.intrinsics, beside.depth.shape, np.inf
             from_beside = seen_share(robot, q, poses, *image, *space)
             seen = seen + np.maximum(from_beside - seen_at_start, 0.0)
-        score = seen / (1 + np.linalg.norm(q - start, axis=1) / FULL_COST_LENGTH)
+        score = seen / (1 + np.linalg.norm(q - start, axis=1) / HALVING_DISTANCE)
         for earlier in taken:
             score *= np.minimum(np.abs(q - earlier).max(axis=1) / SIMILAR_LOOK, 1.0)
         return np.where(seen < MIN_SEEN, 0.0, score)
@@ -201,7 +204,7 @@ def best_looks(
         best = tree.configurations[np.argsort(-score, kind="stable")[:REFINED]].repeat(NEIGHBORS, axis=0)
         tree.grow(best + spread * rng.standard_normal(best.shape), np.full(len(best), np.inf))
         score = np.concatenate([score, scored(tree.configurations[len(score) :])])
-    # the configuration in which the arm is farthest from where it was in all images
+    # the configuration in which the arm is farthest from the start and from where it was in `taken`
     distances = moved(robot, tree.configurations, [start, *taken])
     farthest = int(distances.argmax())
     if hemmed_in and distances[farthest] < CONFINED:
@@ -245,12 +248,13 @@ def poses_around() -> list[Pose]:
 
 
 def next_view(problem: Problem, result: PlanResult, poses: Sequence[Pose] | None = None) -> NextView:
-    """The camera pose that shows most of what a motion may collide with.
+    """The camera pose that shows the most of what a motion may collide with.
 
-    A camera with the intrinsics of the first view shall see most of the unknown voxels that the motion
-    sweeps. Each voxel counts with the predicted probability that it is occupied, times the probability that
-    nothing hides it: neither seen or predicted obstacles nor the arm at the start. With a policy other than
-    "predicted", the first factor is the same for all voxels.
+    Of the given poses, it is the one from which a camera with the intrinsics of the first view sees the
+    largest share of the unknown voxels that the motion sweeps. Each voxel counts with the predicted
+    probability that it is occupied, times the probability that nothing hides it: neither seen or predicted
+    obstacles nor the arm at the start. With a policy other than "predicted", the first factor is the same for
+    all voxels.
 
     Args:
         problem: A problem with views.
@@ -258,7 +262,7 @@ def next_view(problem: Problem, result: PlanResult, poses: Sequence[Pose] | None
         poses: Camera poses T_base_camera [4, 4] to choose from; None: `poses_around`.
 
     Raises:
-        InputError: Without views, without a motion and without poses.
+        InputError: The problem has no views, the result has no motion, or `poses` is empty.
     """
     check_problem(problem)
     check_type("result", result, PlanResult, "a PlanResult, as of rd.plan")

@@ -144,7 +144,7 @@ def plan_with_unknown_space(
             until = limit if occupied_only else context.elapsed + share
             result = attempts.best(assumed, assumption.name, until)
             if occupied_only and not result.solved:
-                why = "no motion keeps out of all space that no view saw"
+                why = "every motion that was found crosses space that no view saw"
                 return _with_notes(context, replace(result, reason=f"{why}: {result.reason}"))
             if occupied_only or result.solved:
                 return _with_notes(context, result, policy_note, _failed_note(failed, assumption.name))
