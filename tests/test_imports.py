@@ -2,12 +2,12 @@
 
 import ast
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
+
+from helpers.commands import python
 
 SOURCE = Path(__file__).parents[1] / "src" / "robotdiffuse"
 MODULES = sorted(SOURCE.rglob("*.py"))
@@ -153,15 +153,9 @@ def test_tests_benchmarks_and_examples_use_no_private_names() -> None:
         assert not used, f"{file.relative_to(root)} uses {', '.join(sorted(used))}"
 
 
-def run(code: str) -> str:
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.strip()
-
-
 def test_import_loads_nothing_heavy() -> None:
     code = "import sys, robotdiffuse, robotdiffuse.cli; print([m for m in {} if m in sys.modules])"
-    assert run(code.format(("torch", "onnxruntime", "numba", "coal", "toppra", "matplotlib"))) == "[]"
+    assert python(code.format(("torch", "onnxruntime", "numba", "coal", "toppra", "matplotlib"))).stdout == "[]\n"
 
 
 def test_a_plan_by_search_loads_what_it_needs_and_no_more(tmp_path: Path) -> None:
@@ -180,7 +174,7 @@ def test_a_plan_by_search_loads_what_it_needs_and_no_more(tmp_path: Path) -> Non
         "unwanted += tuple(f'robotdiffuse.{name}' for name in own)\n"
         "print([name for name in unwanted if name in sys.modules])"
     )
-    assert run(code).splitlines()[-1] == "[]"
+    assert python(code).stdout.splitlines()[-1] == "[]"
 
 
 def test_public_names_resolve_and_verify_is_the_function() -> None:
@@ -188,4 +182,4 @@ def test_public_names_resolve_and_verify_is_the_function() -> None:
         "import robotdiffuse as rd, robotdiffuse.validation.validator\n"
         "print(callable(rd.verify), all(hasattr(rd, name) for name in dir(rd)))"
     )
-    assert run(code) == "True True"
+    assert python(code).stdout == "True True\n"

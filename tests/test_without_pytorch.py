@@ -1,7 +1,6 @@
 """Planning without PyTorch: every planner but MPNet and MPiNets, views, certificates."""
 
-import subprocess
-import sys
+from helpers.commands import python
 
 BLOCKED = """
 import sys, time
@@ -18,12 +17,6 @@ problem = rd.Problem(robot, scene, start, rd.JointGoal(goal[None]))
 """
 
 
-def run(code: str) -> list[str]:
-    done = subprocess.run([sys.executable, "-c", BLOCKED + code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.split("\n")
-
-
 def test_plans_and_certifies_and_the_default_planner_loads_no_network() -> None:
     code = """
 print(rd.plan(problem, time_limit=10.0).solved, "onnxruntime" in sys.modules)
@@ -33,7 +26,7 @@ for name in ("robotdiffuse", "diffusion", "mpd", "edmp"):
     assert result.solved, result.reason
 print("certified", rd.certify(problem, result.trajectory) is not None)
 """
-    said = run(code)
+    said = python(BLOCKED + code).stdout.splitlines()
     assert said[0] == "True False"
     assert said[1:5] == [f"{name} True True" for name in ("robotdiffuse", "diffusion", "mpd", "edmp")]
 
@@ -46,7 +39,7 @@ seen = rd.Problem(robot, rd.Scene(), start, rd.JointGoal(goal[None]), views=[vie
 result = rd.plan(seen, time_limit=60.0)
 print(result.solved, result.assumption != "", 0 < result.confidence <= 1)
 """
-    assert run(code)[0] == "True True True"
+    assert python(BLOCKED + code).stdout == "True True True\n"
 
 
 def test_what_needs_pytorch_says_how_to_install_it() -> None:
@@ -59,7 +52,7 @@ for name in ("mpnet", "mpinets"):
         print(error)
 print(main(["train", "encoder", "--out", "nowhere"]))
 """
-    said = run(code)
+    said = python(BLOCKED + code).stdout.splitlines()
     for name, line in zip(("mpnet", "mpinets"), said, strict=False):
         assert line == f'the planner {name} needs torch, not installed: pip install "robotdiffuse[train]"'
     assert said[2] == "2"

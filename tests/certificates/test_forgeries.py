@@ -65,70 +65,54 @@ def entry(record: Record, planes: bool = True) -> Record:
     return max(record["proof"], key=lambda one: len(one["planes"] if planes else one["start"]))
 
 
-def set_to(*path: str | int, to: Any) -> Callable[[Record], None]:
-    """Makes a forgery that sets one value."""
-
-    def forge(record: Record) -> None:
-        place: Any = record
-        for key in path[:-1]:
-            place = place[key]
-        place[path[-1]] = to
-
-    return forge
+def forgery(change: Callable[..., object]) -> Callable[..., Callable[[Record], object]]:
+    """A function that makes a forgery: called without the record, its first argument, it returns a change of a record."""
+    return lambda *of, **how: lambda record: change(record, *of, **how)
 
 
-def scaled_rows(name: str, factor: float) -> Callable[[Record], None]:
-    def forge(record: Record) -> None:
-        record["motion"][name] = (factor * np.array(record["motion"][name])).tolist()
+@forgery
+def set_to(record: Any, *path: str | int, to: Any) -> None:
+    """Sets one value."""
+    for key in path[:-1]:
+        record = record[key]
+    record[path[-1]] = to
 
-    return forge
+
+@forgery
+def scaled_rows(record: Record, name: str, factor: float) -> None:
+    record["motion"][name] = (factor * np.array(record["motion"][name])).tolist()
 
 
-def scaled_time(factor: float) -> Callable[[Record], None]:
+@forgery
+def scaled_time(record: Record, factor: float) -> None:
     """Scales times, velocities and accelerations so that they agree with each other."""
-
-    def forge(record: Record) -> None:
-        for name, power in (("times", 1), ("velocities", -1), ("accelerations", -2)):
-            scaled_rows(name, factor**power)(record)
-        for name in ("between", "looks"):
-            record[name] = (factor * np.array(record[name])).tolist()
-
-    return forge
+    for name, power in (("times", 1), ("velocities", -1), ("accelerations", -2)):
+        scaled_rows(name, factor**power)(record)
+    for name in ("between", "looks"):
+        record[name] = (factor * np.array(record[name])).tolist()
 
 
-def shifted_time(by: float) -> Callable[[Record], None]:
-    def forge(record: Record) -> None:
-        for part, name in ((record["motion"], "times"), (record, "between"), (record, "looks")):
-            part[name] = (np.array(part[name]) + by).tolist()
-
-    return forge
+@forgery
+def shifted_time(record: Record, by: float) -> None:
+    for part, name in ((record["motion"], "times"), (record, "between"), (record, "looks")):
+        part[name] = (np.array(part[name]) + by).tolist()
 
 
-def normals(factor: float) -> Callable[[Record], None]:
-    return of_claims(planes=lambda one: [[*p[:3], *(factor * x for x in p[3:])] for p in one["planes"]])
+@forgery
+def of_widest(record: Record, name: str, change: Callable[[Any], Any], planes: bool = False) -> None:
+    claim = entry(record, planes)
+    claim[name] = change(claim[name])
 
 
-def of_widest(name: str, change: Callable[[Any], Any], planes: bool = False) -> Callable[[Record], None]:
-    def forge(record: Record) -> None:
-        claim = entry(record, planes)
-        claim[name] = change(claim[name])
-
-    return forge
-
-
-def each_row(change: Callable[[list[Any]], object]) -> Callable[[Record], None]:
-    """Makes a forgery that changes positions, velocities and times of each row."""
-
-    def forge(record: Record) -> None:
-        for name in ("positions", "velocities", "accelerations", "times"):
-            change(record["motion"][name])
-
-    return forge
+def without_rows(record: Record, rows: int | slice) -> None:
+    """Leaves out rows of the motion."""
+    for name in ("positions", "velocities", "accelerations", "times"):
+        del record["motion"][name][rows]
 
 
 def sparse(record: Record) -> None:
     """Keeps only two rows at rest, far apart, and nothing between them."""
-    each_row(lambda rows: rows.__delitem__(slice(1, -1)))(record)
+    without_rows(record, slice(1, -1))
     record.update(between=[], looks=[], jerks=[])
 
 
@@ -141,8 +125,7 @@ def without_rates(record: Record) -> None:
 
 def without_stop(record: Record) -> None:
     """Leaves out the row in the middle, at which the motion stops."""
-    middle = record["motion"]["positions"].index(MIDDLE)
-    each_row(lambda rows: rows.__delitem__(middle))(record)
+    without_rows(record, record["motion"]["positions"].index(MIDDLE))
 
 
 def bulge(record: Record) -> None:
@@ -157,27 +140,26 @@ def reversed_proof(record: Record) -> None:
         entry(record, planes=False)[name].reverse()
 
 
-def of_claims(**changes: Callable[[Record], Any]) -> Callable[[Record], None]:
-    """Makes a forgery that sets fields of every claim, each computed by a function from the claim."""
+@forgery
+def of_claims(record: Record, **changes: Callable[[Record], Any]) -> None:
+    """Sets fields of every claim, each computed by a function from the claim."""
+    for claim in record["proof"]:
+        claim.update({name: change(claim) for name, change in changes.items()})
 
-    def forge(record: Record) -> None:
-        for claim in record["proof"]:
-            claim.update({name: change(claim) for name, change in changes.items()})
 
-    return forge
+@forgery
+def normals(record: Record, factor: float) -> None:
+    of_claims(planes=lambda one: [[*p[:3], *(factor * x for x in p[3:])] for p in one["planes"]])(record)
 
 
 FIELDS = ("start", "stop", "clearance", "displacement", "by_planes", "planes")
 
 
-def without(name: str, **rest: Any) -> Callable[[Record], None]:
-    """Makes a forgery that removes a field of the problem; `rest` are fields of the certificate that it sets."""
-
-    def forge(record: Record) -> None:
-        del record["problem"][name]
-        record.update(rest)
-
-    return forge
+@forgery
+def without(record: Record, name: str, **rest: Any) -> None:
+    """Removes a field of the problem; `rest` are fields of the certificate that it sets."""
+    del record["problem"][name]
+    record.update(rest)
 
 
 CLOSED = {"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0}

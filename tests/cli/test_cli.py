@@ -12,7 +12,7 @@ import rich.console
 import yaml
 
 from helpers.code_blocks import PAGES, code_blocks
-from helpers.commands import PROBLEM, Said, run, write_problem
+from helpers.commands import PROBLEM, Said, python, run, write_problem
 from helpers.made_arms import chain, row, written
 from helpers.quick_preparation import QUICK, coarse_grids
 from robotdiffuse.cli import COMMANDS, console
@@ -106,15 +106,14 @@ sys.meta_path.insert(0, Interrupted())
 from robotdiffuse.__main__ import main
 sys.exit(main())
 """
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "robotdiffuse: stopped\n")
+    ended = python(code, 130)
+    assert (ended.stdout, ended.stderr) == ("", "robotdiffuse: stopped\n")
 
 
 def test_planners_are_listed_without_loading_them_and_so_are_their_settings(said: Said) -> None:
     code = "from robotdiffuse.cli import *; main(['planner', 'list']); sys.exit('torch' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert all(name in done.stdout for name in PLANNERS)
+    listed = python(code).stdout
+    assert all(name in listed for name in PLANNERS)
     printed = said(0, "planner", "info", "rrt_connect")
     assert "range" in printed and "0.7" in printed and "Longest extension of a tree" in printed
     assert "unknown planner 'teleport'" in said(2, "planner", "info", "teleport")

@@ -9,7 +9,7 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.commands import Said, run
-from helpers.motion_stores import line, random_motions, record, write_motions
+from helpers.stores import line, random_motions, record, write_motions
 
 PANDA = rd.load_robot("panda")
 START = np.array([-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])

@@ -2,7 +2,6 @@
 
 import io
 import os
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
@@ -14,6 +13,7 @@ import numba
 import pytest
 from numba.core.errors import TypingError
 
+from helpers.commands import python
 from robotdiffuse.core import kernels
 from robotdiffuse.core.kernels import kernel
 
@@ -60,8 +60,7 @@ def test_a_user_without_a_home_has_no_writable_cache(tmp_path: Path, monkeypatch
 
 def test_importing_the_package_touches_no_file(tmp_path: Path) -> None:
     """Regression: the import removed files of the user's cache, also those of other packages."""
-    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache"), "NUMBA_CACHE_DIR": ""}
-    subprocess.run([sys.executable, "-c", "import robotdiffuse"], env=environment, check=True)
+    python("import robotdiffuse", XDG_CACHE_HOME=str(tmp_path / "cache"), NUMBA_CACHE_DIR="")
     assert not list(tmp_path.iterdir())
 
 
@@ -105,7 +104,7 @@ print(first(Pair(a=1, b=2)), sum(first.stats.cache_hits.values()))
 """
 
 
-def test_what_compiled_code_depends_on_makes_it_compile_anew(tmp_path: Path) -> None:
+def test_what_compiled_code_depends_on_makes_it_compile_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Regression: Numba raised ModuleNotFoundError after modules had moved, and kept the old layout of a
     changed class and old code and constants of other modules."""
     package = tmp_path / "here" / "arm"
@@ -116,11 +115,8 @@ def test_what_compiled_code_depends_on_makes_it_compile_anew(tmp_path: Path) -> 
             (package / f"{name}.py").write_text(text)
 
     def answer(module: str = "pairs") -> str:
-        environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-        command = [sys.executable, "-c", CALL.format(module=module)]
-        ended = subprocess.run(command, cwd=package.parent, env=environment, capture_output=True, text=True)
-        assert ended.returncode == 0, ended.stderr
-        return ended.stdout.strip()
+        monkeypatch.chdir(package.parent)
+        return python(CALL.format(module=module), NUMBA_CACHE_DIR=str(tmp_path / "cache")).stdout.strip()
 
     write(**FILES)
     assert [answer(), answer()] == ["1 0", "1 1"]

@@ -1,7 +1,5 @@
 """Loading does not count as time of a call, but preparing a scene does; Ctrl-C ends programs."""
 
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +8,8 @@ from numba import njit
 from numba.core.compiler_lock import global_compiler_lock
 
 import robotdiffuse as rd
-from helpers.clock import Clock, stop_clock
+from helpers.clock import stop_clock
+from helpers.commands import python
 from robotdiffuse.collision import exact_meshes, kernel_arrays
 from robotdiffuse.core.deadline import LONG, OutOfTimeError, check_time, check_timing, deadline
 from robotdiffuse.core.kernels import inner_kernel, kernel
@@ -84,16 +83,13 @@ def test_loading_takes_no_time_of_the_call(monkeypatch: pytest.MonkeyPatch) -> N
         assert context.elapsed - before == pytest.approx(1.0)
     with global_compiler_lock:  # which Numba holds while it compiles or reads its cache
         clock.now += 5.0
-    _built(clock)(context.problem.robot)
-    assert context.elapsed - before == pytest.approx(1.0)
 
-
-def _built(clock: Clock):
     @once_per_robot
-    def build(robot: rd.Robot) -> None:
+    def build(_: rd.Robot) -> None:
         clock.now += 5.0
 
-    return build
+    build(robot)
+    assert context.elapsed - before == pytest.approx(1.0)
 
 
 def test_compile_time_is_all_of_the_block_that_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,9 +114,8 @@ def test_compile_time_is_all_of_the_block_that_compiles(monkeypatch: pytest.Monk
 def test_first_calls_load_outside_their_time() -> None:
     """Regression: `rd.plan` in a fresh process timed out while it loaded. Here each load takes far longer than
     the limit."""
-    done = subprocess.run([sys.executable, "-c", FIRST_CALLS], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert [line.split()[0] for line in done.stdout.splitlines()] == ["solved"] * 7, done.stdout
+    printed = python(FIRST_CALLS).stdout
+    assert [line.split()[0] for line in printed.splitlines()] == ["solved"] * 7, printed
 
 
 def test_python_cannot_call_an_inner_kernel() -> None:
@@ -242,8 +237,8 @@ exit_fast(run)
 
 @pytest.mark.parametrize(("end", "status"), [("return 3", 3), ("sys.exit(4)", 4), ("raise ValueError", 1), ("sys.exit()", 0)])
 def test_an_exit_waits_for_threads_and_handlers(end: str, status: int) -> None:
-    ended = subprocess.run([sys.executable, "-c", EXITS.format(end)], capture_output=True, text=True)
-    assert (ended.returncode, ended.stdout.split()) == (status, ["thread", "handler"])
+    ended = python(EXITS.format(end), status)
+    assert ended.stdout.split() == ["thread", "handler"]
     assert ("ValueError" in ended.stderr) == (status == 1)
 
 
@@ -264,11 +259,9 @@ def test_ctrl_c_is_not_lost_in_callbacks() -> None:
     """Regression: `robot add` ran on for minutes after Ctrl-C was pressed while compiled code was loaded."""
     # background jobs of a shell ignore SIGINT
     heard = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
-    ended = subprocess.run([sys.executable, "-c", heard + SWALLOWING], capture_output=True, text=True)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "tidy\n", "robotdiffuse: stopped\n")
+    ended = python(heard + SWALLOWING, 130)
+    assert (ended.stdout, ended.stderr) == ("tidy\n", "robotdiffuse: stopped\n")
 
 
 def test_ctrl_c_that_is_ignored_stays_ignored() -> None:
-    code = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)" + SWALLOWING
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert (ended.returncode, ended.stdout) == (0, "lives\n")
+    assert python("import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)" + SWALLOWING).stdout == "lives\n"

@@ -2,8 +2,6 @@
 
 import copy
 import pickle
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass
 
@@ -13,6 +11,7 @@ from numpy import ndarray
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
+from helpers.commands import python
 from robotdiffuse.core.bounds import Value, read_only
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
 from robotdiffuse.problems.constraints import FrameConstraint
@@ -201,5 +200,4 @@ print(len(signatures) > 0, read_only)
 def test_nothing_is_compiled_for_read_only_arrays() -> None:
     """Otherwise all kernels of a plan and its validation would be compiled twice. In a separate process, since
     tests call kernels with arrays of their own."""
-    done = subprocess.run([sys.executable, "-c", SIGNATURES], capture_output=True, text=True, timeout=300)
-    assert done.stdout == "True []\n", done.stdout + done.stderr
+    assert python(SIGNATURES).stdout == "True []\n"

@@ -3,8 +3,7 @@
 The calls run in a separate process: in this one, beartype, which the tests enable, would raise an error first.
 """
 
-import subprocess
-import sys
+from helpers.commands import python
 
 CALLS = """
 import os, sys
@@ -66,7 +65,7 @@ except rd.InputError as error:
 
 
 def test_arguments_of_the_wrong_type_are_one_line() -> None:
-    ended = subprocess.run([sys.executable, "-c", CALLS], capture_output=True, text=True, timeout=300)
+    ended = python(CALLS)
     rightly = ["plan_many []", *(f"load_planner: {what} None" for what in ("settings", "weights"))]
     at = "trajectory.at []", "trajectory.at array([0., 0.])"
     taken = [f"{call} is taken" for call in (*rightly, "load_robot: locked -1.5", *at)]

@@ -8,9 +8,8 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
-from helpers.motion_stores import line, record, write_motions
 from helpers.refusals import refuses
-from helpers.stores import random_arrays, write_store
+from helpers.stores import line, random_arrays, record, write_motions, write_store
 from robotdiffuse.datasets import external as robot_npz
 from robotdiffuse.datasets.external import export_npz, import_npz
 from robotdiffuse.datasets.rows import problem_of

@@ -4,7 +4,6 @@ import errno
 import json
 import os
 import shutil
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ import pytest
 import zarr
 
 from helpers.box_arm import box_arm
+from helpers.commands import python
 from helpers.refusals import refuses
 from helpers.stores import manifest_of, random_arrays, write_store
 from robotdiffuse.core.errors import InputError, OutputError
@@ -212,10 +212,9 @@ def test_values_of_the_wrong_type_in_a_manifest_are_damage(tmp_path, value):
 
 def test_the_robot_must_be_that_of_the_data_by_its_fingerprint():
     code = "import robotdiffuse.robots as r\nprint(r.robot.robot_fingerprint(r.load_robot('panda')))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     panda = load_robot("panda")
     mine = robot_fingerprint(panda)
-    assert done.stdout.strip() == mine and len(mine) == 16
+    assert python(code).stdout.strip() == mine and len(mine) == 16
     slower = tuple(replace(joint, velocity=1.0) for joint in panda.joints)
     others = [replace(panda, joints=slower), replace(panda, meshes={}), load_robot("panda").with_locked({})]
     assert [robot_fingerprint(other) == mine for other in others] == [False, False, True]

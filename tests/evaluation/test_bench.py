@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
-from helpers import faulty_planner, waiting
+from helpers import planners, waiting
 from helpers.refusals import refuses
 from robotdiffuse.cli import main
 from robotdiffuse.core import registry
@@ -76,7 +76,7 @@ def test_records_hold_what_was_measured_and_are_not_made_twice(tmp_path: Path) -
 
 @pytest.fixture
 def faulty(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(PLANNERS, "faulty", faulty_planner.ENTRY)
+    monkeypatch.setitem(PLANNERS, "faulty", planners.ENTRY)
 
 
 @pytest.mark.slow
@@ -86,12 +86,12 @@ def test_failures_of_every_kind_are_records_and_the_run_goes_on(tmp_path: Path, 
     asked = replace(settings(tmp_path, "faulty", count=1), seeds=7, time_limit=0.5)
     assert bench.run_bench(asked, quiet, quiet) == 7
     found = {record.seed: record for record in read_records(tmp_path)["faulty"]}
-    assert found[faulty_planner.SOLVES].solved and found[faulty_planner.TALKS].solved
-    assert found[faulty_planner.RAISES].status == "exception"
-    assert found[faulty_planner.RAISES].reason == "ValueError: no such thing"
-    assert found[faulty_planner.EXITS].reason == "SystemExit: no license"
-    assert found[faulty_planner.DIES].status == "crashed" and "SIGKILL" in found[faulty_planner.DIES].reason
-    assert found[faulty_planner.HANGS].status == "overran"
+    assert found[planners.SOLVES].solved and found[planners.TALKS].solved
+    assert found[planners.RAISES].status == "exception"
+    assert found[planners.RAISES].reason == "ValueError: no such thing"
+    assert found[planners.EXITS].reason == "SystemExit: no license"
+    assert found[planners.DIES].status == "crashed" and "SIGKILL" in found[planners.DIES].reason
+    assert found[planners.HANGS].status == "overran"
     log = (tmp_path / "logs" / "faulty.log").read_text()
     assert "about to die" in log and "this is no answer" in log and "ValueError" in log
     assert bench.run_bench(asked, quiet, quiet) == 0

@@ -9,8 +9,8 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
-from helpers.motion_stores import line, random_motions, record, write_motions
 from helpers.refusals import refuses
+from helpers.stores import line, random_motions, record, write_motions
 from robotdiffuse.datasets.rows import motion_of, problem_of
 from robotdiffuse.datasets.shards import pick_rows, read_shard, shard_path, write_shard
 from robotdiffuse.evaluation.checks import check_data

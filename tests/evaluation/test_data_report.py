@@ -9,7 +9,7 @@ pytest.importorskip("matplotlib")
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
-from helpers.motion_stores import random_motions, write_motions
+from helpers.stores import random_motions, write_motions
 from robotdiffuse.evaluation import data_report
 
 ARM = box_arm()

@@ -8,7 +8,6 @@ from numpy import ndarray
 from scipy.spatial import ConvexHull
 
 from helpers.example_robots import planar_arm
-from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.robots.robot import ConvexMesh, Robot
 
 HALF_WIDTH = 0.03
@@ -22,11 +21,6 @@ def box_mesh(low: ndarray, high: ndarray) -> ConvexMesh:
     return ConvexMesh(corners, faces.astype(np.int64))
 
 
-def _with_limits(joint: Joint) -> Joint:
-    rates = {"velocity": 2.0, "acceleration": 8.0, "jerk": 80.0}
-    return joint if joint.kind == "fixed" else replace(joint, lower=-2.8, upper=2.8, **rates)
-
-
 @cache
 def box_arm(spheres: bool = True) -> Robot:
     """Three boxes of 0.5, 0.4 and 0.3 m that turn about z, 6 cm wide and high, covered by spheres.
@@ -38,6 +32,7 @@ def box_arm(spheres: bool = True) -> Robot:
     meshes = {}
     covers = {}
     w = HALF_WIDTH
+    limits = {"lower": -2.8, "upper": 2.8, "velocity": 2.0, "acceleration": 8.0, "jerk": 80.0}
     for i, length in enumerate(lengths, 1):
         low = np.array([0.0, -w, -w])
         high = np.array([length, w, w])
@@ -48,7 +43,7 @@ def box_arm(spheres: bool = True) -> Robot:
         covers[f"l{i}"] = np.column_stack([xs, np.zeros((cells, 2)), np.full(cells, radius)])
     return replace(
         robot,
-        joints=tuple(map(_with_limits, robot.joints)),
+        joints=(*(replace(joint, **limits) for joint in robot.joints[:-1]), robot.joints[-1]),
         meshes=meshes,
         spheres=covers if spheres else {},
         allowed_collisions=frozenset({frozenset(("l1", "l2")), frozenset(("l2", "l3"))}),

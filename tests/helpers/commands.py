@@ -1,6 +1,9 @@
-"""Runs commands in this process, and the problem of their tests."""
+"""Runs commands in this process and code in others, and the problem of their tests."""
 
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,6 +24,14 @@ def run(*argv: object) -> int:
     except SystemExit as end:
         assert isinstance(end.code, int)
         return end.code
+
+
+def python(code: str, status: int = 0, **environment: str) -> subprocess.CompletedProcess[str]:
+    """What a new Python process printed for this code; it must end with this exit status."""
+    command = [sys.executable, "-c", code]
+    ended = subprocess.run(command, capture_output=True, text=True, env=os.environ | environment, timeout=1500)
+    assert ended.returncode == status, ended.stderr
+    return ended
 
 
 def write_problem(folder: Path, name: str = "problem.json", **changes: object) -> Path:

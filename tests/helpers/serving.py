@@ -41,7 +41,7 @@ def serving(
 
 
 if __name__ == "__main__":
-    from helpers.faulty_planner import ENTRY
+    from helpers.planners import ENTRY
     from robotdiffuse.cli import main
     from robotdiffuse.planning import PLANNERS
     from robotdiffuse.server import connection

@@ -7,7 +7,7 @@ import numpy as np
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from helpers.box_arm import box_arm
+from helpers.box_arm import box_arm, box_mesh
 from helpers.example_robots import example_robot
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import forward_frames
@@ -93,12 +93,9 @@ def with_spheres(name: str) -> Robot:
     rng = np.random.default_rng(0)
     links = [link for link in robot.link_names if robot.link_frame(link) > 0 or link == robot.base]
     spheres = {link: np.column_stack([rng.uniform(-0.1, 0.1, (4, 3)), rng.uniform(0.01, 0.06, 4)]) for link in links}
-    near = [pair for pair in combinations(links, 2) if _nearby(robot, *pair)]
+    moved = {link: robot.moved_by[robot.link_frame(link)] for link in links}
+    near = [pair for pair in combinations(links, 2) if (moved[pair[0]] != moved[pair[1]]).sum() < 2]
     return replace(robot, spheres=spheres, meshes={}, allowed_collisions=frozenset(map(frozenset, near)))
-
-
-def _nearby(robot: Robot, a: str, b: str) -> bool:
-    return (robot.moved_by[robot.link_frame(a)] != robot.moved_by[robot.link_frame(b)]).sum() < 2
 
 
 ROBOTS = ("panda", "box_arm", "awkward", "ur5", "two_arms")
@@ -119,13 +116,9 @@ def solids() -> Scene:
     )
 
 
-def poses(rng: np.random.Generator) -> tuple[ndarray, ndarray]:
-    wxyz = rng.normal(size=4)
-    return rng.uniform([-0.9, -0.9, -0.2], [0.9, 0.9, 1.0]), wxyz / np.linalg.norm(wxyz)
-
-
 def random_shape(kind: str, rng: np.random.Generator) -> Shape:
-    center, wxyz = poses(rng)
+    wxyz = rng.normal(size=4)
+    center = rng.uniform([-0.9, -0.9, -0.2], [0.9, 0.9, 1.0])
     a, b, c = rng.uniform(0.02, 0.4, 3)
     if kind == "sphere":
         return Sphere(center, a)
@@ -139,10 +132,9 @@ def random_shape(kind: str, rng: np.random.Generator) -> Shape:
 
 
 def box_triangles(size: tuple[float, float, float]) -> tuple[ndarray, ndarray]:
-    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * size
-    faces = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)]
-    faces += [(2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
-    return corners, np.array(faces)
+    half = np.array(size) / 2
+    mesh = box_mesh(-half, half)
+    return mesh.vertices, mesh.faces
 
 
 def depth_of_balls(balls: ndarray, T: ndarray, intrinsics: tuple[float, ...], size: tuple[int, int]) -> ndarray:

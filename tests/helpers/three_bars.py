@@ -2,18 +2,18 @@
 
 import numpy as np
 
+from helpers.box_arm import box_mesh
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.robots.robot import ConvexMesh, Robot
 
-CORNERS = np.array([[x, y, z] for x in (-1.0, 1) for y in (-1, 1) for z in (-1, 1)])
-FACES = "013 032 467 475 045 051 237 276 026 064 157 173"
-CUBE = np.array([[int(corner) for corner in face] for face in FACES.split()])
+cube = box_mesh(-np.ones(3), np.ones(3))
+CORNERS, CUBE = cube.vertices, cube.faces
 
 
 def bar(length: float) -> ConvexMesh:
     """A square bar of 8 cm along z, from the origin."""
-    return ConvexMesh(CORNERS * [0.04, 0.04, length / 2] + [0, 0, length / 2], CUBE)
+    return box_mesh(np.array([-0.04, -0.04, 0]), np.array([0.04, 0.04, length]))
 
 
 def three_bars() -> Robot:

@@ -51,7 +51,7 @@ def test_a_process_that_dies_costs_one_problem(monkeypatch: pytest.MonkeyPatch) 
     deadly = rd.Scene([rd.Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.4], name="deadly")])
     asked.insert(1, rd.Problem(PANDA, deadly, LEFT, RIGHT))
     asked.insert(3, replace(asked[0], robot=replace(PANDA, name="unknown")))
-    entry = Entry("helpers.deadly_planner:Deadly", "dies of it", "RRTConnectSettings", SEARCH)
+    entry = Entry("helpers.planners:Deadly", "dies of it", "RRTConnectSettings", SEARCH)
     monkeypatch.setitem(PLANNERS, "deadly", entry)
     results = list(rd.plan_many(asked, "deadly", workers=1, time_limit=300.0))
     ends = [result.status for result in results]

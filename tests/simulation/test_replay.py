@@ -1,6 +1,5 @@
 """Replay of motions in PyBullet, and the command `simulate`."""
 
-import subprocess
 import sys
 from pathlib import Path as FilePath
 
@@ -13,6 +12,7 @@ from dataclasses import replace
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm, box_mesh
+from helpers.commands import python
 from helpers.example_robots import example_robot
 from robotdiffuse.cli import main
 from robotdiffuse.problems.files import problem_record
@@ -119,8 +119,7 @@ def result_file(folder: FilePath, scene: rd.Scene) -> str:
 
 
 def test_importing_pybullet_without_standard_output() -> None:
-    code = "import os; os.close(1); import robotdiffuse.simulation"
-    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+    python("import os; os.close(1); import robotdiffuse.simulation")
 
 
 def test_a_world_that_fails_to_load_leaves_no_simulation(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -202,7 +201,5 @@ for stream in (1, 2):
 
 def test_only_the_build_time_is_left_out(tmp_path: FilePath) -> None:
     (tmp_path / "pybullet.py").write_text(PYBULLET)
-    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import robotdiffuse.simulation"
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert ended.returncode == 0, ended.stderr
+    ended = python(f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import robotdiffuse.simulation")
     assert ended.stdout == "printed by another thread\n" and ended.stderr == ""

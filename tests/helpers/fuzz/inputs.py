@@ -12,7 +12,7 @@ import tempfile
 import traceback
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,27 +20,21 @@ import trimesh
 import yaml
 from PIL import Image
 
+import robotdiffuse as rd
 from helpers.fuzz import examples, server
-from robotdiffuse.certificates.certificate import load_certificate
-from robotdiffuse.certificates.search import certify
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.results import load_result
-from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.interop import read_motion, write_motion
 from robotdiffuse.interop.recorded_motion import joint_trajectory, motion_of_robot
 from robotdiffuse.problems.files import load_motion_bench_maker, load_problem, problem_from_record, problem_record
-from robotdiffuse.problems.problem import JointGoal
 from robotdiffuse.robots import DATA, load_robot, read_robot_folder
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.parsing.srdf import read_srdf
 from robotdiffuse.robots.parsing.urdf import UrdfTree, read_limits, with_limits
 from robotdiffuse.scenes.point_cloud import read_points
-from robotdiffuse.scenes.shapes import PointCloud
 from robotdiffuse.validation.validator import Verifier
 
 MAX_MESSAGE_LENGTH = 1000
 """Characters of an error message; names of files and lists of known names make some long."""
-Make = Callable[[np.random.Generator, FilePath], Callable[[], object]]
+Make = Callable[[np.random.Generator, Path], Callable[[], object]]
 """Writes the files of an input to a folder and returns the call that reads them."""
 NASTY: tuple[Any, ...] = (
     *(None, True, False, 0, -1, 1, 2**31, 2**63, 10**25, -0.0, 0.5, 1e-300, 1e-9, 1e4, 1e5, 1e20, 1e39),
@@ -140,7 +134,7 @@ def outcome(call: Callable[[], object]) -> tuple[str, str]:
     """The outcome of an input, `answer`, `error` or `fault`, and the error message."""
     try:
         call()
-    except InputError as error:
+    except rd.InputError as error:
         text = str(error)
         good = text and "\n" not in text and len(text) <= MAX_MESSAGE_LENGTH
         return ("error" if good else "fault"), text[: 2 * MAX_MESSAGE_LENGTH]
@@ -150,13 +144,13 @@ def outcome(call: Callable[[], object]) -> tuple[str, str]:
     return "answer", ""
 
 
-def outcome_of(kind: str, seed: int, folder: FilePath) -> tuple[str, str]:
+def outcome_of(kind: str, seed: int, folder: Path) -> tuple[str, str]:
     """Make an input, whose files are written to the folder, and return its outcome."""
     rng = np.random.default_rng([seed, *kind.encode()])
     return outcome(KINDS[kind](rng, folder))
 
 
-def _problem(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+def _problem(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
     data = dict(examples.PROBLEM)
     if rng.random() < 0.2:
         data["goal"] = {"pose": examples.POSE}
@@ -171,16 +165,16 @@ def _problem(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]
     return lambda: _validated(file)
 
 
-def _validated(file: FilePath) -> None:
+def _validated(file: Path) -> None:
     """Read a problem and, if its goal is a configuration, validate the straight line to it."""
     problem = load_problem(file)
     problem_from_record(problem_record(problem))
-    if isinstance(problem.goal, JointGoal):
+    if isinstance(problem.goal, rd.JointGoal):
         rows = np.stack([problem.start, problem.goal.positions[0]])
-        Verifier(problem).path(Path(problem.robot.joint_names, rows))
+        Verifier(problem).path(rd.Path(problem.robot.joint_names, rows))
 
 
-def _moveit(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+def _moveit(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
     asked = copy.deepcopy(examples.REQUEST)
     if rng.random() < 0.3:
         asked["start_state"]["attached_collision_objects"] = [examples.HELD]
@@ -199,7 +193,7 @@ def yaml_text(rng: np.random.Generator, data: Any, other: int) -> bytes:
     return text_of(rng, data, ".yaml") if rng.random() < 0.6 + 0.1 * other else json.dumps(data).encode()
 
 
-def _cloud(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+def _cloud(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
     ending = examples.CLOUDS[rng.integers(len(examples.CLOUDS))]
     points = rng.normal(size=(5, 3)).astype(np.float32)
     if rng.random() < 0.2:
@@ -221,10 +215,10 @@ def _cloud(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
         stream.write(trimesh.PointCloud(points).export(file_type="ply"))  # type: ignore[arg-type]
     file = folder / f"cloud.{ending}"
     file.write_bytes(damaged(rng, stream.getvalue()))
-    return lambda: PointCloud(read_points(file)[0])
+    return lambda: rd.PointCloud(read_points(file)[0])
 
 
-def mesh_file(rng: np.random.Generator, folder: FilePath, name: str, ending: str) -> FilePath:
+def mesh_file(rng: np.random.Generator, folder: Path, name: str, ending: str) -> Path:
     """A small mesh with its bytes damaged."""
     content = trimesh.creation.box((0.1, 0.2, 0.3)).export(file_type=ending)
     content = content.encode() if isinstance(content, str) else bytes(content)
@@ -233,14 +227,14 @@ def mesh_file(rng: np.random.Generator, folder: FilePath, name: str, ending: str
     return file
 
 
-def _mesh(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+def _mesh(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
     file = mesh_file(rng, folder, "part", examples.MESHES[rng.integers(len(examples.MESHES))])
     problem = examples.PROBLEM | {"scene": [{"mesh": {"file": file.name, "xyz": [2, 2, 2]}}]}
     (folder / "problem.json").write_text(json.dumps(problem))
     return lambda: _validated(folder / "problem.json")
 
 
-def _urdf(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+def _urdf(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
     part = bytes(trimesh.creation.box((0.1, 0.05, 0.3)).export(file_type="stl"))  # type: ignore[arg-type]
     (folder / "part.stl").write_bytes(damaged(rng, part) if rng.random() < 0.2 else part)
     files = {name: folder / name for name in ("two.urdf", "two.srdf", "limits.yaml")}
@@ -261,7 +255,7 @@ def _urdf(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     return read
 
 
-def _result(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+def _result(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
     rows = np.linspace(examples.PROBLEM["start"], examples.PROBLEM["goal"]["joints"], 3).tolist()
     record = {
         "status": "solved",
@@ -284,7 +278,7 @@ def _result(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     file.write_bytes(text_of(rng, record, ".json"))
 
     def read() -> None:
-        saved = load_result(file)
+        saved = rd.load_result(file)
         if saved.problem is not None and saved.result.path is not None:
             validator = Verifier(problem_from_record(saved.problem))
             validator.path(saved.result.path)
@@ -294,7 +288,7 @@ def _result(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     return read
 
 
-def _bundle(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+def _bundle(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
     source = DATA / "panda"
     text = (source / "robot.json").read_text()
     meshes = (source / "meshes.npz").read_bytes()
@@ -342,7 +336,7 @@ def asked(rng: np.random.Generator, right: float = 0.0) -> tuple[str, bytes]:
     return what, text_of(rng, body, ".json")
 
 
-def _http(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+def _http(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
     """Request bodies, answered as a worker of `robotdiffuse serve` answers them."""
     from robotdiffuse.server import worker
     from robotdiffuse.server.settings import ServeSettings
@@ -353,13 +347,13 @@ def _http(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
         worker.accept({"panda": load_robot("panda")}, ServeSettings(max_time_limit=0.1))
         answer = worker.respond(what, body)
         if answer.code == 400:
-            raise InputError(json.loads(answer.body)["error"])
+            raise rd.InputError(json.loads(answer.body)["error"])
         assert answer.code == 200, answer.body.decode()
 
     return ask
 
 
-def _socket(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+def _socket(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
     """Requests to a running `robotdiffuse serve`. From time to time, the server itself is checked."""
     (what, body), (_, other) = asked(rng, 0.5), asked(rng, 0.5)
     sent = server.sent(rng, server.draft(rng, what, body, other), damaged)
@@ -371,17 +365,17 @@ def _socket(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
         if looks:
             running.check()
         if said:
-            raise InputError(said)
+            raise rd.InputError(said)
 
     return ask
 
 
-def _motion(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+def _motion(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
     problem = problem_from_record(examples.PROBLEM | {"scene": examples.PROBLEM["scene"][:1]})
     rows = np.linspace(examples.PROBLEM["start"], examples.PROBLEM["goal"]["joints"], 3)
     times = np.array([0.0, 10.0, 20.0])
     still = np.zeros_like(rows)
-    trajectory = Trajectory(problem.robot.joint_names, times, rows, still, still)
+    trajectory = rd.Trajectory(problem.robot.joint_names, times, rows, still, still)
     ending = (".json", ".yaml", ".csv", ".mcap", ".rosbag2")[rng.integers(5)]
     file = folder / f"motion{ending}"
     if ending == ".json" and rng.random() < 0.3:
@@ -399,7 +393,7 @@ def _motion(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     def read() -> None:
         motion = motion_of_robot(read_motion(file), problem.robot).motion
         validator = Verifier(problem)
-        validator.trajectory(motion) if isinstance(motion, Trajectory) else validator.path(motion)
+        validator.trajectory(motion) if isinstance(motion, rd.Trajectory) else validator.path(motion)
 
     return read
 
@@ -411,17 +405,17 @@ def _certificate_record() -> dict[str, Any]:
     rows[1, 0] += 0.05
     problem = problem_from_record(examples.PROBLEM | {"scene": [], "goal": {"joints": rows[1].tolist()}})
     with tempfile.TemporaryDirectory() as folder:
-        certify(problem, Path(problem.robot.joint_names, rows)).save(f"{folder}/c.json")
-        return json.loads(FilePath(f"{folder}/c.json").read_text())
+        rd.certify(problem, rd.Path(problem.robot.joint_names, rows)).save(f"{folder}/c.json")
+        return json.loads(Path(f"{folder}/c.json").read_text())
 
 
-def _certificate(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+def _certificate(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
     file = folder / "certificate.json"
     file.write_bytes(text_of(rng, _certificate_record(), ".json"))
-    return lambda: load_certificate(file).check()
+    return lambda: rd.load_certificate(file).check()
 
 
-def _depth(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+def _depth(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
     """Depth images, and the views that name them."""
     ending = (".png", ".npy", ".npz")[rng.integers(3)]
     image = rng.integers(0, 3000, (6, 8)).astype(np.uint16)
@@ -441,7 +435,7 @@ def _depth(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     return lambda: _validated(folder / "problem.json")
 
 
-def _upload(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+def _upload(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
     """Problem files that browsers send to the live page."""
     from robotdiffuse.visualization.live.session import Session, problem_text, uploaded_problem
 
@@ -457,7 +451,7 @@ def _upload(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     return read
 
 
-def _head(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+def _head(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
     """Headers of requests to the live page, which accepts or refuses them and never raises an error."""
     from robotdiffuse.visualization.live.server import may_connect
 
@@ -468,7 +462,7 @@ def _head(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     return lambda: may_connect(path, host, origin, token)
 
 
-def _settings(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+def _settings(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
     """Values of `--set` for planners, and settings of training runs."""
     from robotdiffuse.learning.training.config import PlannerTraining
     from robotdiffuse.planning import PLANNERS, planner_settings
@@ -484,7 +478,7 @@ def _settings(rng: np.random.Generator, folder: FilePath) -> Callable[[], object
     return lambda: planner_settings(name, [said])
 
 
-def _weights(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+def _weights(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
     """Folders with the weights of a network."""
     from robotdiffuse.learning.checkpoint import load_network
     from robotdiffuse.learning.weight_files import BUNDLED
@@ -500,7 +494,7 @@ def _weights(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]
     return lambda: load_network("mpinets", folder, load_robot("panda"))
 
 
-def _npz(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+def _npz(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
     """Data sets in the file layout of the paper's authors."""
     from robotdiffuse.datasets.external import import_npz
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 import robotdiffuse as rd
-from helpers.motion_stores import random_motions, write_motions
+from helpers.stores import random_motions, write_motions
 from robotdiffuse.cli import main
 from robotdiffuse.core.registry import Entry
 from robotdiffuse.core.settings import Settings

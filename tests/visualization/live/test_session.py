@@ -11,8 +11,8 @@ import pytest
 
 import robotdiffuse as rd
 from helpers import waiting
+from helpers.planners import SlowPlanner
 from helpers.refusals import refuses
-from helpers.slow_planner import SlowPlanner
 from robotdiffuse.core.registry import Entry
 from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.drawables import own_frame
@@ -133,7 +133,7 @@ def test_obstacles_are_added_resized_and_deleted(session: live.Session) -> None:
 @pytest.fixture
 def slow(monkeypatch: pytest.MonkeyPatch) -> Iterator[live.Session]:
     """A session whose planner has been called and waits for the test."""
-    monkeypatch.setitem(PLANNERS, "slow", Entry("helpers.slow_planner:SlowPlanner", "waits"))
+    monkeypatch.setitem(PLANNERS, "slow", Entry("helpers.planners:SlowPlanner", "waits"))
     SlowPlanner.calls.clear()
     with started("slow") as session:
         waiting.until(lambda: SlowPlanner.calls, PATIENCE)
@@ -175,7 +175,7 @@ def test_a_plan_for_a_robot_that_has_gone_is_dropped(slow: live.Session) -> None
 
 
 def test_a_planner_that_breaks_costs_one_plan(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(PLANNERS, "slow", Entry("helpers.slow_planner:SlowPlanner", "waits"))
+    monkeypatch.setitem(PLANNERS, "slow", Entry("helpers.planners:SlowPlanner", "waits"))
     with started("slow", "broken") as session:
         shown = live.validity(until(session, settled))
         assert shown.kind == live.NO_MOTION and shown.lines == ("slow failed: RuntimeError: no such luck",)
