@@ -82,10 +82,22 @@ def apart_from_the_users_robots(tmp_path_factory: pytest.TempPathFactory) -> Ite
 
 @pytest.fixture(autouse=True)
 def cpu_clock(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Planners' time limits are CPU time, so that a loaded machine changes no result; pages play motions in
-    real time."""
+    """Planners' time limits are CPU time, so that a loaded machine changes no result; pages play motions in real time."""
     if request.path.parent.name != "live":
         monkeypatch.setattr(time, "perf_counter", time.process_time)
+
+
+@pytest.fixture
+def said(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """What a command prints; see `helpers.commands.Said`."""
+    from helpers.commands import run
+
+    def of(status: int, *argv: object) -> str:
+        assert run(*argv) == status
+        printed = capsys.readouterr()
+        return printed.err if status > 1 else printed.out
+
+    return of
 
 
 @pytest.fixture

@@ -125,8 +125,7 @@ def defined_names(tree: ast.AST) -> Iterator[str]:
 
 
 def used_names(tree: ast.AST) -> Iterator[str]:
-    """Names that a module uses from other modules: imported names, attributes, and strings that `setattr`
-    takes."""
+    """Names that a module uses from other modules: imported names, attributes, and strings that `setattr` takes."""
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom):
             yield from (alias.name for alias in node.names)

@@ -5,6 +5,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 import robotdiffuse as rd
 from helpers.refusals import refuses
@@ -23,6 +24,11 @@ def planner(**options: object) -> Planner:
     return Planner("panda", HAND, **values)  # type: ignore[arg-type]
 
 
+@pytest.fixture
+def made() -> Planner:
+    return planner()
+
+
 def test_a_pose_is_reached_by_rows_of_one_time_step_within_the_limits_given() -> None:
     made = planner(joint_vel_limits=np.full(7, 0.9), joint_acc_limits=np.full(7, 0.9))
     goal = np.array([0.5, 0.2, 0.4, *DOWN])
@@ -36,20 +42,16 @@ def test_a_pose_is_reached_by_rows_of_one_time_step_within_the_limits_given() ->
 
 
 def test_rows_begin_after_the_start_and_last_until_controllers_have_settled() -> None:
-    """ManiSkill lets go of a sphere right after the last row; without a pause, the arm was still 5 mm from its
-    goal."""
-    made = planner()
-    result = made.plan_qpos([QPOS + 0.2], QPOS, time_step=0.05, planning_time=10.0)
+    """ManiSkill lets go of a sphere right after the last row; without a pause, the arm was still 5 mm from its goal."""
+    result = planner().plan_qpos([QPOS + 0.2], QPOS, time_step=0.05, planning_time=10.0)
     off = np.abs(result["position"] - QPOS[:7] - 0.2).max(axis=1)
     assert off[0] < 0.2 and off[-7] > 1e-6
     assert off[-5:].max() < 1e-9 and not result["velocity"][-5:].any()
     assert result["time"][-1] >= result["duration"] + 0.24 - 1e-9
 
 
-def test_fingers_need_not_be_equally_far_open() -> None:
-    """Regression: the second finger mimics the first. In a grasp they differ by a millimeter, and the call was
-    refused."""
-    made = planner()
+def test_fingers_need_not_be_equally_far_open(made: Planner) -> None:
+    """Regression: the second finger mimics the first. In a grasp they differ by a millimeter, and the call was refused."""
     first, second = FINGERS
     follows = Mimic(first, 1.0, 0.0)
     joints = [replace(joint, mimic=follows if joint.name == second else None) for joint in made.robot.joints]
@@ -58,8 +60,7 @@ def test_fingers_need_not_be_equally_far_open() -> None:
     assert made.workspace.robot.locked == {first: 0.02, second: 0.02}
 
 
-def test_limits_can_be_set_later() -> None:
-    made = planner()
+def test_limits_can_be_set_later(made: Planner) -> None:
     assert np.array_equal(made.joint_vel_limits, np.ones(7))
     made.joint_vel_limits = np.full(7, 0.5)
     made.joint_acc_limits = np.full(7, 2.0)
@@ -68,19 +69,15 @@ def test_limits_can_be_set_later() -> None:
     assert np.abs(result["acceleration"]).max() <= 2.0 + 1e-6
 
 
-def test_both_versions_and_objects_with_p_and_q() -> None:
-    made = planner()
+def test_both_versions_and_objects_with_p_and_q(made: Planner) -> None:
     goal = SimpleNamespace(p=[0.5, 0.2, 0.4], q=DOWN)
-    by_pose = made.plan_pose(goal, QPOS, planning_time=10.0)
-    assert by_pose["status"] == "Success"
+    assert made.plan_pose(goal, QPOS, planning_time=10.0)["status"] == "Success"
     status, ends = made.IK(goal, QPOS)
     assert status == "Success" and ends is not None and len(ends[0]) == 9
-    by_qpos = made.plan_qpos([ends[0]], QPOS, planning_time=10.0)
-    assert np.allclose(by_qpos["position"][-1], ends[0][:7], atol=1e-6)
+    assert np.allclose(made.plan_qpos([ends[0]], QPOS, planning_time=10.0)["position"][-1], ends[0][:7], atol=1e-6)
 
 
-def test_a_screw_is_a_straight_line() -> None:
-    made = planner()
+def test_a_screw_is_a_straight_line(made: Planner) -> None:
     start = made.workspace.pose(QPOS[:7])
     end = start.copy()
     end[2, 3] -= 0.15
@@ -91,8 +88,7 @@ def test_a_screw_is_a_straight_line() -> None:
     assert np.allclose(places[-1], end[:3, 3], atol=1e-4)
 
 
-def test_obstacles_and_held_objects_count() -> None:
-    made = planner()
+def test_obstacles_and_held_objects_count(made: Planner) -> None:
     goal = np.array([0.5, 0.2, 0.4, *DOWN])
     grid = np.mgrid[-0.1:0.1:5j, -0.1:0.1:5j, -0.1:0.1:5j].reshape(3, -1).T
     made.update_point_cloud(grid + goal[:3], resolution=0.03)
@@ -107,8 +103,7 @@ def test_obstacles_and_held_objects_count() -> None:
     assert made.detach_object() and not made.detach_object()
 
 
-def test_the_base_stands_in_the_world() -> None:
-    made = planner()
+def test_the_base_stands_in_the_world(made: Planner) -> None:
     made.set_base_pose([0.3, -0.2, 0.7, 1, 0, 0, 0])
     goal = np.array([0.8, 0.0, 1.1, *DOWN])
     assert made.plan_pose(goal, QPOS, planning_time=10.0)["status"] == "Success"
@@ -116,8 +111,7 @@ def test_the_base_stands_in_the_world() -> None:
     assert np.allclose(made.workspace.pose(relative["position"][-1]), matrix(goal), atol=1e-3)
 
 
-def test_failures_say_why() -> None:
-    made = planner()
+def test_failures_say_why(made: Planner) -> None:
     far = [2.0, 0.0, 0.5, *DOWN]
     assert "no configuration" in made.plan_pose(far, QPOS)["status"]
     assert "can be followed for" in made.plan_screw(far, QPOS, planning_time=0.2)["status"]
@@ -135,8 +129,7 @@ def test_bad_input() -> None:
         refuses(message, call, planner())
 
 
-def test_a_moved_base_keeps_obstacles_held_objects_and_allowed_contacts() -> None:
-    made = planner()
+def test_a_moved_base_keeps_obstacles_held_objects_and_allowed_contacts(made: Planner) -> None:
     made.workspace.add(rd.Box([0.5, 0.0, 0.1], [0.2, 0.2, 0.2], name="block"))
     made.workspace.allow("block", [HAND])
     made.update_attached_sphere(0.02, [0.0, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0])
@@ -159,8 +152,7 @@ def test_where_no_motion_turns_evenly_one_that_turns_otherwise_has_a_note() -> N
     assert np.allclose(line, pose[:3], atol=8e-3) and np.allclose(line[-1], pose[:3], atol=1e-3)
 
 
-def test_a_line_to_the_edge_of_reach_ends_tilted_with_a_note() -> None:
-    made = planner()
+def test_a_line_to_the_edge_of_reach_ends_tilted_with_a_note(made: Planner) -> None:
     q = np.array([-0.23, 0.58, 0.0, -1.27, 0.0, 1.84, 0.56])
     far = made.workspace.pose(q)
     far[:3] = rd.pose([0.777, -0.226, 0.122], rpy=[np.pi, 0.0, 0.0])[:3]

@@ -65,8 +65,7 @@ def _triangle(corners: np.ndarray) -> coal.Convex:
 def test_distances_are_those_of_coal() -> None:
     rng = np.random.default_rng(1)
     points = rng.uniform(-1, 1, (60, 3))
-    scene = rd.Scene(shapes())
-    obstacles = proofs.Obstacles(scene)
+    obstacles = proofs.Obstacles(rd.Scene(shapes()))
     found = obstacles.distances(points)
     for k, body in enumerate(obstacles.bodies):
         if isinstance(body, proofs.Surface):
@@ -132,8 +131,7 @@ def test_nothing_moves_further_than_its_displacement(seed: int) -> None:
         link = linkage.links.index(claim.link)
         base = 0 if claim.against == proofs.SCENE else linkage.links.index(claim.against)
         seen = np.linalg.inv(places[:, base]) @ places[:, link]
-        balls = robot.spheres[claim.link]
-        centers = balls[:, :3] @ np.swapaxes(seen[:, :3, :3], 1, 2) + seen[:, None, :3, 3]
+        centers = robot.spheres[claim.link][:, :3] @ np.swapaxes(seen[:, :3, :3], 1, 2) + seen[:, None, :3, 3]
         # a point of a ball goes at least as far as its center, at most by the turning of its radius more
         assert np.linalg.norm(centers[1:] - centers[0], axis=-1).max() <= displacement + 1e-12
 
@@ -176,15 +174,13 @@ def test_unknown_shapes_are_refused_by_name() -> None:
 
 
 def test_a_link_that_is_called_like_the_scene_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Regression: claims about a link with this name were taken for claims about the scene, so the pair was not
-    proved."""
+    """Regression: claims about a link with this name were taken for claims about the scene, so the pair was not proved."""
     monkeypatch.setattr(proofs, "SCENE", "l2")
     refuses("a link called 'l2'", proofs.Prover, box_arm(), rd.Scene(), np.zeros((2, 3)), np.zeros((1, 3)))
 
 
 def test_bounds_hold_for_cubics_that_leave_the_straight_lines() -> None:
-    """Along the cubics, the clearance is at least the clearance in the middle of the straight line minus the
-    displacement."""
+    """Along the cubics, the clearance is at least the clearance in the middle of the straight line minus the displacement."""
     rng = np.random.default_rng(0)
     robot = box_arm()
     for _ in range(12):

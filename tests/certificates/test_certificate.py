@@ -44,8 +44,7 @@ def near_things() -> dict[str, tuple[Shape, ...]]:
 
 @pytest.mark.parametrize("name", near_things())
 def test_what_is_valid_can_be_certified_and_what_is_certified_is_free(name: str) -> None:
-    shapes = near_things()[name]
-    problem, path = problem_of(SWING, *shapes)
+    problem, path = problem_of(SWING, *near_things()[name])
     report = rd.verify(problem, path)
     certificate = rd.certify(problem, path)
     assert certificate.check(problem).differences == ()
@@ -63,8 +62,7 @@ def test_motions_that_are_not_valid_and_certificates_without_their_problem_are_r
     with pytest.raises(NotValidError, match=r"the motion is not valid: l\d is .* inside sphere"):
         rd.certify(problem, path)
     problem, path = problem_of(SWING)
-    certificate = rd.certify(problem, path)
-    refuses("holds no problem; give the problem that it is for", certificate.check)
+    refuses("holds no problem; give the problem that it is for", rd.certify(problem, path).check)
 
 
 def test_the_checker_loads_neither_compiled_code_nor_coal() -> None:

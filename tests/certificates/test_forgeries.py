@@ -42,8 +42,7 @@ def true(tmp_path_factory: pytest.TempPathFactory) -> tuple[FilePath, rd.Problem
     positions = np.concatenate([half.positions, half.positions[1:] + np.subtract(GOAL, MIDDLE)])
     rates = [np.concatenate([of, of[1:]]) for of in (half.velocities, half.accelerations)]
     times = np.append(half.times, half.duration + half.times[1:])
-    motion = rd.Trajectory(robot.joint_names, times, positions, *rates)
-    certificate = rd.certify(problem, motion)
+    certificate = rd.certify(problem, rd.Trajectory(robot.joint_names, times, positions, *rates))
     assert certificate.check(problem).differences == () and certificate.proof.planes
     file = tmp_path_factory.mktemp("certificates") / "true.json"
     certificate.save(file)
@@ -129,8 +128,7 @@ def without_stop(record: Record) -> None:
 
 
 def bulge(record: Record) -> None:
-    """Adds velocities, opposite at two neighboring rows, to a joint at rest. The positions do not have these
-    velocities."""
+    """Adds velocities, opposite at two neighboring rows, to a joint at rest. The positions do not have these velocities."""
     for row, speed in ((40, 0.5), (41, -0.5)):
         record["motion"]["velocities"][row][6] = speed
 
@@ -304,8 +302,7 @@ def test_thin_spheres_are_refused() -> None:
     panda = rd.load_robot("panda")
     thin = {link: spheres * [1, 1, 1, 0.5] for link, spheres in panda.spheres.items()}
     problem = rd.Problem(replace(panda, spheres=thin), rd.Scene(), START, GOAL)
-    certificate = rd.certify(problem, rd.Path(panda.joint_names, np.array([START, GOAL])))
-    found = certificate.check(problem).differences
+    found = rd.certify(problem, rd.Path(panda.joint_names, np.array([START, GOAL]))).check(problem).differences
     assert any(re.match("robot: the meshes of panda_link5 stick out of its spheres by 0.0", line) for line in found)
 
 

@@ -20,13 +20,11 @@ HAND = "panda_hand"
 START = [-0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]
 GOAL = [0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]
 TABLE = rd.Box([0.55, 0.0, 0.0], [0.5, 1.0, 0.2], name="table")
-POST = rd.Cylinder([0.42, 0.35, 0.4], 0.06, 0.6, name="post")
-ACROSS = rd.MovingObstacle(POST, velocity=[0.25, -0.1, 0.0])
+ACROSS = rd.MovingObstacle(rd.Cylinder([0.42, 0.35, 0.4], 0.06, 0.6, name="post"), velocity=[0.25, -0.1, 0.0])
 CONE = rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], 0.1745)
 NARROWER = rd.AxisCone(HAND, [0, 0, 1], [0, 0.3, -1], 0.1)
-LINE = rd.CartesianLine(HAND, 0.002, 0.02, 0.2)
 ASKED: dict[str, dict[str, Any]] = {
-    "line": {"constraints": [LINE]},
+    "line": {"constraints": [rd.CartesianLine(HAND, 0.002, 0.02, 0.2)]},
     "greatest speed": {"moving": [rd.MovingObstacle(rd.Sphere([0.6, 1.8, 0.5], 0.1, "ball"), max_speed=0.3)]},
     "start velocity": {"start_velocity": [0.5, 0, 0, 0, 0, 0, 0]},
 }
@@ -76,8 +74,7 @@ def test_bounds_of_constraints_are_bounds() -> None:
 
 
 def test_bounds_in_time_are_bounds() -> None:
-    """At every time of a stretch, the distance of all spheres to a rotating box is at least clearance minus
-    displacement."""
+    """At every time of a stretch, the distance of all spheres to a rotating box is at least clearance minus displacement."""
     rng = np.random.default_rng(1)
     times = np.linspace(0.0, 1.0, 6)
     poses = np.tile(np.eye(4), (3, 1, 1))
@@ -116,8 +113,7 @@ def test_another_line_and_a_slower_one_need_another_proof() -> None:
     problem, certificate = certified("line")
     other = rd.CartesianLine("panda_link5", 0.0005, 0.02, 0.2)
     refused(certificate, replace(problem, constraints=[other]), "they are not those of the problem")
-    slower = rd.CartesianLine(HAND, 0.002, 0.02, 0.1)
-    refused(certificate, replace(problem, constraints=[slower]), "moves at 0.2")
+    refused(certificate, replace(problem, constraints=[rd.CartesianLine(HAND, 0.002, 0.02, 0.1)]), "moves at 0.2")
 
 
 def test_paths_with_constraints_are_certified_and_with_moving_obstacles_refused(tmp_path: FilePath) -> None:

@@ -23,8 +23,7 @@ PAYLOAD = rd.Payload(1.5, [0.05, 0.0, 0.1], None, [0.01, 0.02, 0.03])
 @cache
 def certified() -> tuple[rd.Problem, rd.Certificate]:
     """A certified motion at the torque limit of a joint."""
-    payload = rd.Payload(3.0, [0.0, 0.0, 0.1])
-    problem = rd.Problem(rd.load_robot("panda"), rd.Scene(), LOW, FAR, payload=payload)
+    problem = rd.Problem(rd.load_robot("panda"), rd.Scene(), LOW, FAR, payload=rd.Payload(3.0, [0.0, 0.0, 0.1]))
     motion = rd.plan(problem, time_limit=20.0).trajectory
     assert motion is not None
     return problem, rd.certify(problem, motion)
@@ -48,8 +47,7 @@ def test_dynamics_are_pinocchios(name: str) -> None:
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("step", [0.2, 0.02])
 def test_bounds_are_bounds(name: str, step: float) -> None:
-    """Compares with torques at many samples, made by adding a row at each sample, which does not change the
-    motion."""
+    """Compares with torques at many samples, made by adding a row at each sample, which does not change the motion."""
     problem = loaded(name)
     rng = np.random.default_rng(1)
     for _ in range(5):
@@ -76,8 +74,7 @@ def test_a_payload_is_proved_and_its_file_holds_without_pinocchio(tmp_path: File
 
 def test_paths_are_proved_to_be_held() -> None:
     problem, certificate = certified()
-    path = rd.Path(problem.robot.joint_names, certificate.motion.positions[[0, -1]])
-    held = rd.certify(problem, path)
+    held = rd.certify(problem, rd.Path(problem.robot.joint_names, certificate.motion.positions[[0, -1]]))
     assert held.check(problem).valid and len(held.torques) == 7
 
 
@@ -106,5 +103,4 @@ def test_a_motion_of_one_row() -> None:
     row = np.array([LOW])
     still = np.zeros((1, 7))
     there = replace(problem, goal=rd.JointGoal([LOW]))
-    motion = rd.Trajectory(problem.robot.joint_names, np.zeros(1), row, still, still)
-    assert rd.certify(there, motion).check(there).valid
+    assert rd.certify(there, rd.Trajectory(problem.robot.joint_names, np.zeros(1), row, still, still)).check(there).valid

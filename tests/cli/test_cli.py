@@ -11,7 +11,7 @@ import pytest
 import rich.console
 import yaml
 
-from helpers.code_blocks import PAGES, code_blocks
+from helpers.code_blocks import PAGES, ROOT, code_blocks
 from helpers.commands import PROBLEM, Said, python, run, write_problem
 from helpers.made_arms import chain, row, written
 from helpers.quick_preparation import QUICK, coarse_grids
@@ -111,8 +111,7 @@ sys.exit(main())
 
 
 def test_planners_are_listed_without_loading_them_and_so_are_their_settings(said: Said) -> None:
-    code = "from robotdiffuse.cli import *; main(['planner', 'list']); sys.exit('torch' in sys.modules)"
-    listed = python(code).stdout
+    listed = python("from robotdiffuse.cli import *; main(['planner', 'list']); sys.exit('torch' in sys.modules)").stdout
     assert all(name in listed for name in PLANNERS)
     printed = said(0, "planner", "info", "rrt_connect")
     assert "range" in printed and "0.7" in printed and "Longest extension of a tree" in printed
@@ -152,8 +151,7 @@ def test_a_log_says_what_is_compiled(monkeypatch: pytest.MonkeyPatch, capsys: py
 
 
 def test_a_spinner_that_ends_as_it_appears_gives_stdout_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Regression: a plan of two seconds printed its result to standard error, since rich had replaced
-    sys.stdout for good."""
+    """Regression: a plan of two seconds printed its result to standard error, since rich had replaced sys.stdout for good."""
     ending = threading.Event()
     stop = console.Spinner.stop
 
@@ -184,12 +182,8 @@ def test_progress_without_a_terminal_is_a_line_at_once(capsys: pytest.CaptureFix
     assert capsys.readouterr().err == ""
 
 
-ROOT = Path(__file__).parents[2]
-
-
 def test_the_schema_accepts_the_problems_of_the_documentation(said: Said) -> None:
-    jsonschema = pytest.importorskip("jsonschema")
-    validator = jsonschema.Draft202012Validator(problem_schema())
+    validator = pytest.importorskip("jsonschema").Draft202012Validator(problem_schema())
     blocks = [block for page in PAGES for block in code_blocks(page) if block.language == "yaml"]
     documented = [yaml.safe_load(block.code) for block in blocks]
     problems = [one for one in documented if isinstance(one, dict) and {"robot", "scene"} <= one.keys()]
@@ -218,8 +212,7 @@ def completed(script: str, *words: str) -> list[str]:
     line = " ".join(f'"{word}"' for word in words)
     asks = f"COMP_WORDS=({line}); COMP_CWORD={len(words) - 1}; _robotdiffuse"
     asks += "; printf '%s\\n' \"${COMPREPLY[@]}\""
-    ended = subprocess.run(["bash", "-c", f"{script}\n{asks}"], capture_output=True, text=True, check=True)
-    return ended.stdout.split()
+    return subprocess.run(["bash", "-c", f"{script}\n{asks}"], capture_output=True, text=True, check=True).stdout.split()
 
 
 def test_bash_completes_commands_and_options(said: Said) -> None:

@@ -47,8 +47,7 @@ def test_check_finds_a_collision(folder, said: Said):
 
 def test_view_shows_samples_in_one_page(folder, said: Said):
     out = folder.parent / "samples.html"
-    printed = said(0, "data", "view", folder, "--count", 2, "--seed", 3, "--out", out)
-    assert f"wrote {out}" in printed.replace("\n", "")
+    assert f"wrote {out}" in said(0, "data", "view", folder, "--count", 2, "--seed", 3, "--out", out).replace("\n", "")
     page = out.read_text("utf-8")
     titles = re.findall("<b>(.*?)</b>", page)
     assert len(titles) == 2 and all(re.fullmatch(r"rop(_dense)? · shard \d, row \d", title) for title in titles)
@@ -74,8 +73,7 @@ def test_export(folder, said: Said):
 
 
 def test_info_on_motions_that_are_all_straight_warns_of_nothing(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
-    start = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
-    line = start + np.linspace(0, 0.3, 5)[:, None]
+    line = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]) + np.linspace(0, 0.3, 5)[:, None]
     rd.write_dataset([line] * 20, [rd.Scene([rd.Sphere([-2, 0.1 * i, 1], 0.1)]) for i in range(20)], tmp_path / "d")
     assert run("data", "info", tmp_path / "d", "--page", tmp_path / "page.html") == 0
     assert (tmp_path / "page.html").is_file() and not (tmp_path / "d" / "report.html").exists()

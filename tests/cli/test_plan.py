@@ -5,6 +5,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -94,33 +95,22 @@ def test_a_result_saved_from_python_holds_its_problem(tmp_path: Path, said: Said
 
 def test_problem_of_a_jsonl_file(tmp_path: Path, said: Said) -> None:
     file = tmp_path / "problems.jsonl"
-    blocked = PROBLEM | melon(-0.45)
-    file.write_text(f"{json.dumps(PROBLEM)}\n{json.dumps(blocked)}\n")
+    file.write_text(f"{json.dumps(PROBLEM)}\n{json.dumps(PROBLEM | melon(-0.45))}\n")
     assert run("plan", file, "--planner", "rrt_connect", "--time-limit", 5, "--until", "first") == 0
     assert "invalid_start" in said(1, "plan", file, "--planner", "rrt_connect", "--index", 1)
 
 
 def test_ctrl_c(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, said: Said) -> None:
-    def interrupted(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("robotdiffuse.cli.plan.load_and_plan", interrupted)
-    asked = ("plan", write_problem(tmp_path), "--planner", "rrt_connect")
-    assert said(130, *asked) == "robotdiffuse: stopped\n"
+    monkeypatch.setattr("robotdiffuse.cli.plan.load_and_plan", Mock(side_effect=KeyboardInterrupt))
+    assert said(130, "plan", write_problem(tmp_path), "--planner", "rrt_connect") == "robotdiffuse: stopped\n"
 
 
 def test_plan_takes_settings_of_the_planner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    given: list[object] = []
-
-    def solve(_problem: object, planner: str, *rest: object, **_request: object) -> rd.PlanResult:
-        given.extend(rest)
-        return rd.PlanResult(rd.Status.NO_PATH, "none", planner, "panda", 0.1, 0)
-
+    solve = Mock(return_value=rd.PlanResult(rd.Status.NO_PATH, "none", "robotdiffuse", "panda", 0.1, 0))
     monkeypatch.setattr("robotdiffuse.cli.plan.load_and_plan", solve)
-    sets = ("--set", "range=0.5", "--set", "smoothings=4")
-    assert run("plan", write_problem(tmp_path), *sets) == 1
+    assert run("plan", write_problem(tmp_path), "--set", "range=0.5", "--set", "smoothings=4") == 1
     settings = planner_settings("robotdiffuse", ["smoothings=4", "range=0.5"])
-    assert settings in given and settings != planner_settings("robotdiffuse", [])
+    assert settings in solve.call_args.args and settings != planner_settings("robotdiffuse", [])
 
 
 def test_demo(tmp_path: Path, said: Said) -> None:
@@ -159,8 +149,7 @@ def test_the_demo_of_another_arm_is_not_solved_by_the_straight_line() -> None:
 
 def test_plan_ignores_joints_where_it_is_told_to(tmp_path: Path, said: Said) -> None:
     """Regression: `plan --ignore-joints` was accepted, but had no effect."""
-    state = "robot_state: {joint_state: {name: [gripper], position: [0.1]}}"
-    Path("stranger.yaml").write_text(state)
+    Path("stranger.yaml").write_text("robot_state: {joint_state: {name: [gripper], position: [0.1]}}")
     Path("problem.json").write_text(json.dumps(PROBLEM | {"scene": "stranger.yaml"}))
     asked = ("plan", "problem.json", "--planner", "rrt_connect")
     assert "has values of gripper, movable joints that panda lacks" in said(2, *asked)
@@ -190,8 +179,7 @@ def test_explore_writes_a_replay_a_strip_and_a_recording(
     monkeypatch.setattr("robotdiffuse.visualization.exploration.TILE", PictureSettings(width=240, height=150, ghosts=1))
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    problem = write_problem(tmp_path, goal=NEAR)
-    status = run("explore", problem, "--out", "seen.png", "--record", "seen.mcap", "--view")
+    status = run("explore", write_problem(tmp_path, goal=NEAR), "--out", "seen.png", "--record", "seen.mcap", "--view")
     printed = capsys.readouterr().out
     assert status in (0, 1) and printed.startswith("1. ") and "of the map" in printed
     assert (status == 0) == ("done: the arm is at the goal" in printed)

@@ -1,13 +1,24 @@
-"""The command `train`: options, and data that are generated during the training."""
+"""`train`: options, data that are generated during the training, and weights for an arm, also after interruptions."""
 
+import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
 
+import robotdiffuse as rd
 from helpers.commands import Said, run
-from robotdiffuse.learning.denoisers import PAPER_SIZES
-from robotdiffuse.learning.training.config import CONFIGS, PlannerTraining
+from helpers.factory_runs import in_this_process
+from helpers.refusals import refuses
+from robotdiffuse.cli import train as train_command
+from robotdiffuse.cli.train import data_settings, train_for_robot
+from robotdiffuse.generation import factory
+from robotdiffuse.generation.factory import GenerationSettings
+from robotdiffuse.learning.denoisers import PAPER_SIZES, TransformerSettings
+from robotdiffuse.learning.training.config import CONFIGS, PlannerTraining, planner_training
+from robotdiffuse.learning.weight_files import user_weights, weights_for
+from robotdiffuse.planning.diffusion import Diffusion
 
 TRAIN = ["train", "planner", "--data", "d", "--encoder", "dgcnn", "--out", "o"]
 
@@ -70,3 +81,59 @@ def test_the_encoder_of_the_config_is_that_of_an_arm_too(
     monkeypatch.setattr("robotdiffuse.cli.train.generate", lambda *_, **__: None)
     assert run("train", "planner", "--robot", "panda", "--out", "o", "--config", config) == 0
     assert trained[0].encoder == encoder and not Path("o", "encoder").exists()
+
+
+SMALL = TransformerSettings(width=16, layers=1, heads=2, hidden=24, patch=8)
+TINY = {"samples": 160, "batch": 8, "denoiser_settings": SMALL, "validation_problems": 2}
+
+
+@pytest.fixture(autouse=True)
+def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
+    monkeypatch.setattr(factory, "on_this_machine", in_this_process)
+
+    def few(*asked: object) -> GenerationSettings:
+        return replace(data_settings(*asked), mix={"rop": 1.0}, shard=4)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(train_command, "data_settings", few)
+
+
+@pytest.mark.slow
+def test_an_arm_of_five_joints_plans_with_its_trained_network(tmp_path: Path) -> None:
+    robot = rd.load_robot("so101")
+    assert weights_for("model", robot) is None
+    report, kept = train_for_robot("so101", TINY, partial(planner_training, "compact"), None, motions=12)
+    assert report["samples"] == TINY["samples"] and kept == weights_for("model", robot)
+    assert kept == tmp_path / "robots" / "so101" / "weights"
+    planner = Diffusion()
+    assert planner.network(robot).dof == 5
+    start = 0.5 * (robot.lower + robot.upper)
+    result = planner.plan(rd.Problem(robot, rd.Scene(), start, rd.JointGoal(start + 0.2)), 20.0)
+    assert result.solved and result.stage == "network"
+    assert weights_for("model", replace(rd.load_robot("ur5e"), name="so101")) is None
+
+
+def test_data_are_in_the_size_of_the_arm() -> None:
+    large, small = (data_settings(name, rd.load_robot(name), None, None) for name in ("ur5e", "so101"))
+    assert large.search.safety_distance == 0.05 and small.search.safety_distance == pytest.approx(0.02)
+
+
+def test_bad_input_is_a_clear_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: Said) -> None:
+    error = partial(said, 2, "train", "planner")
+    assert "unknown robot 'ur5x'; known: " in error("--robot", "ur5x")
+    assert "give --robot to generate data" in error()
+    assert "--data needs --out" in error("--data", str(tmp_path))
+    assert "--trajectories is for data to be generated" in error(
+        *("--data", str(tmp_path), "--out", "x", "--trajectories", "3")
+    )
+    full = type("Usage", (), {"free": 1_000_000})
+    with monkeypatch.context() as patch:
+        patch.setattr(train_command.shutil, "disk_usage", lambda folder: full)
+        assert "free some space, or name another folder with --out" in error("--robot", "ur5e")
+    (tmp_path / "half" / "data").mkdir(parents=True)
+    (tmp_path / "half" / "data" / "manifest.json").write_text("{")
+    assert "manifest.json is damaged" in error("--robot", "ur5e", "--out", str(tmp_path / "half"))
+    file = user_weights(rd.load_robot("ur5e")) / "model.json"
+    file.parent.mkdir(parents=True)
+    file.write_text(json.dumps({"format": 2}))
+    refuses(r"weights/model\.json: robot is None", weights_for, "model", rd.load_robot("ur5e"))

@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -63,24 +63,15 @@ def one_line(call: Callable[[], object]) -> str:
     return message
 
 
-def test_json_that_is_no_json() -> None:
-    for text, message in (
+MALFORMED: dict[Callable[[Any, str], object], tuple[tuple[str | bytes, str], ...]] = {
+    parse_json: (
         ("[" * DEEP, "more than 64 levels deep"),
         ('"' + "[" * DEEP, "is not valid JSON"),
         ("9" * 5000, "integer 9999"),
         ("[1, 2", "line 1, column 6"),
         ('{"a": {"b": 1, "b": 2}}', "b appears twice"),
-    ):
-        assert message in one_line(lambda text=text: parse_json(text, "it"))
-
-
-def test_brackets_in_texts_are_no_nesting() -> None:
-    value = ["[" * 500, '\\"{' * 500, {"a": [[1]]}]
-    assert parse_json(json.dumps(value), "it") == value
-
-
-def test_yaml_that_is_no_yaml() -> None:
-    for text, message in (
+    ),
+    parse_yaml: (
         ("[" * DEEP, "more than 64 levels deep"),
         ("- " * DEEP, "more than 64 levels deep"),
         ("? " * DEEP, "a key is not a plain string"),
@@ -94,8 +85,28 @@ def test_yaml_that_is_no_yaml() -> None:
         ("a: 0x_", "'0x_' is not a number in line 1"),
         ("\0", "is not valid YAML"),
         ("\ud800", "surrogate"),
-    ):
-        assert message in one_line(lambda text=text: parse_yaml(text, "it"))
+    ),
+    parse_xml: (
+        (b"<a>" * DEEP + b"</a>" * DEEP, "more than 64 levels deep"),
+        (b'<?xml version="1.0" encoding="klingon"?><robot/>', "unknown encoding"),
+        (b"", "no element found"),
+        (f'<!DOCTYPE r [<!ENTITY a "lol">{NESTED}]><r>&j;</r>'.encode(), "not well-formed XML"),
+        (f'<!DOCTYPE r [<!ENTITY a "{50_000 * "x"}">]><r>{2000 * "&a;"}</r>'.encode(), "not well-formed XML"),
+        (b'<!DOCTYPE r [<!ENTITY a SYSTEM "file:///etc/passwd">]><r n="&a;"/>', "not well-formed XML"),
+        (b'<!DOCTYPE r [<!ENTITY a SYSTEM "file:///etc/passwd">]><r>&a;</r>', "not well-formed XML"),
+    ),
+}
+
+
+@pytest.mark.parametrize("parse", MALFORMED, ids=lambda parse: parse.__name__)
+def test_text_that_is_malformed_nested_too_deep_or_a_bomb(parse: Callable[[Any, str], object]) -> None:
+    for text, message in MALFORMED[parse]:
+        assert message in one_line(lambda text=text: parse(text, "it"))
+
+
+def test_brackets_in_texts_are_no_nesting() -> None:
+    value = ["[" * 500, '\\"{' * 500, {"a": [[1]]}]
+    assert parse_json(json.dumps(value), "it") == value
 
 
 def test_what_yaml_means() -> None:
@@ -121,8 +132,7 @@ values = st.recursive(
 @given(values)
 def test_what_is_written_is_read_back(value: object) -> None:
     assert parse_json(json.dumps(value), "it") == value
-    text = yaml.dump(value, Dumper=yaml.CSafeDumper)
-    assert parse_yaml(text, "it") == value
+    assert parse_yaml(yaml.dump(value, Dumper=yaml.CSafeDumper), "it") == value
 
 
 @given(st.binary(max_size=200))
@@ -133,19 +143,6 @@ def test_any_bytes_are_a_value_or_one_line(content: bytes) -> None:
             parse(text, "it")
         except InputError as error:
             assert "\n" not in str(error)
-
-
-def test_xml_that_is_no_xml_or_a_bomb() -> None:
-    for text, message in (
-        (b"<a>" * DEEP + b"</a>" * DEEP, "more than 64 levels deep"),
-        (b'<?xml version="1.0" encoding="klingon"?><robot/>', "unknown encoding"),
-        (b"", "no element found"),
-        (f'<!DOCTYPE r [<!ENTITY a "lol">{NESTED}]><r>&j;</r>'.encode(), "not well-formed XML"),
-        (f'<!DOCTYPE r [<!ENTITY a "{50_000 * "x"}">]><r>{2000 * "&a;"}</r>'.encode(), "not well-formed XML"),
-        (b'<!DOCTYPE r [<!ENTITY a SYSTEM "file:///etc/passwd">]><r n="&a;"/>', "not well-formed XML"),
-        (b'<!DOCTYPE r [<!ENTITY a SYSTEM "file:///etc/passwd">]><r>&a;</r>', "not well-formed XML"),
-    ):
-        assert message in one_line(lambda text=text: parse_xml(text, "it"))
 
 
 def test_files_that_are_none(tmp_path: Path) -> None:
@@ -197,8 +194,7 @@ def test_messages_quote_sixty_characters() -> None:
     for _ in range(10**5):
         inside = [inside]
     assert shown(inside) == "a very long list"
-    error = unknown_name("joint", "j" * 10**4, [f"joint_{i}" for i in range(10**4)])
-    assert "and 9900 more" in str(error)
+    assert "and 9900 more" in str(unknown_name("joint", "j" * 10**4, [f"joint_{i}" for i in range(10**4)]))
     spaced = "{a: " * 1000  # no word of it is long
     assert joined([spaced, "b"]) == f"{spaced[:57]}..., b"
     assert len(str(InputError("x" * 10**4))) == 60
@@ -210,8 +206,7 @@ def test_a_pipe_that_a_mesh_file_names_is_not_waited_for(kind: str, tmp_path: Pa
     for name, content in NAMED[kind].items():
         (tmp_path / name).write_bytes(content)
     assert len(read_triangles(tmp_path / f"model.{kind}")[1]) == 12
-    beside = [*tmp_path.glob("*.bin"), tmp_path / "beside.bin"]
-    for file in beside:
+    for file in [*tmp_path.glob("*.bin"), tmp_path / "beside.bin"]:
         file.unlink(missing_ok=True)
         os.mkfifo(file)
     if kind == "gltf":
@@ -226,8 +221,7 @@ def test_arrays_of_python_objects_are_refused(tmp_path: Path) -> None:
         refuses("is damaged", read_arrays, tmp_path / name)
     # an archive called .npy was returned unread and open
     np.savez(tmp_path / "points.npz", points=np.zeros(3))
-    file = (tmp_path / "points.npz").rename(tmp_path / "points.npy")
-    refuses("is damaged", read_arrays, file)
+    refuses("is damaged", read_arrays, (tmp_path / "points.npz").rename(tmp_path / "points.npy"))
 
 
 def test_errors_keep_their_kind_and_their_lines_where_they_are_copied_or_located() -> None:
@@ -237,9 +231,6 @@ def test_errors_keep_their_kind_and_their_lines_where_they_are_copied_or_located
     with pytest.raises(OutputError) as caught, located("a.json"):
         raise OutputError("is full", ["first", "second"])
     assert str(caught.value) == "a.json: is full\n  first\n  second"
-
-
-PICKLING = {"pickle", "dill", "joblib", "shelve", "marshal"}
 
 
 def test_nothing_unpickles_files() -> None:
@@ -254,7 +245,7 @@ def test_nothing_unpickles_files() -> None:
         for node in ast.walk(ast.parse(text)):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
-            found = PICKLING.intersection(name.partition(".")[0] for name in names)
+            found = {"pickle", "dill", "joblib", "shelve", "marshal"}.intersection(name.partition(".")[0] for name in names)
             assert not found, f"{file}: {found}"
             call = isinstance(node, ast.Call) and ast.unparse(node.func)
             assert call != "torch.load", f"{file}: {call}"
@@ -265,8 +256,7 @@ def test_nothing_unpickles_files() -> None:
 
 @given(st.lists(st.floats(allow_nan=False), min_size=1, max_size=3), st.integers(2, 6))
 def test_different_numbers_are_told_apart(values: list[float], digits: int) -> None:
-    texts = distinct(*values, digits=digits)
-    assert len(set(texts)) >= len(set(values))
+    assert len(set(distinct(*values, digits=digits))) >= len(set(values))
 
 
 def test_as_few_digits_as_needed() -> None:

@@ -112,8 +112,7 @@ def test_compile_time_is_all_of_the_block_that_compiles(monkeypatch: pytest.Monk
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_first_calls_load_outside_their_time() -> None:
-    """Regression: `rd.plan` in a fresh process timed out while it loaded. Here each load takes far longer than
-    the limit."""
+    """Regression: `rd.plan` in a fresh process timed out while it loaded. Here each load takes far longer than the limit."""
     printed = python(FIRST_CALLS).stdout
     assert [line.split()[0] for line in printed.splitlines()] == ["solved"] * 7, printed
 
@@ -187,8 +186,7 @@ def test_a_motion_whose_timing_takes_too_long_is_a_time_out(more: dict, monkeypa
 def test_a_motion_too_long_to_be_validated_ends_the_search() -> None:
     """Regression: the search used up its time limit, and the reason did not name the validation."""
     joints = tuple(replace(joint, velocity=1e-6) for joint in PANDA.joints)
-    slow = rd.Problem(replace(PANDA, joints=joints), rd.Scene(), LEFT, RIGHT)
-    result = RRTConnect().plan(slow, 600.0)
+    result = RRTConnect().plan(rd.Problem(replace(PANDA, joints=joints), rd.Scene(), LEFT, RIGHT), 600.0)
     assert result.status is rd.Status.NO_PATH
     assert "the motion takes 1.8" in result.reason
 
@@ -210,8 +208,7 @@ def test_meshes_end_with_the_time() -> None:
 @pytest.mark.parametrize("cloud", [False, True])
 def test_a_tree_of_the_validator_that_takes_too_long_is_refused(cloud: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """The start collides, so the exact meshes are needed to say where."""
-    tip = link_pose(PANDA, LEFT, PANDA.tip)[:3, 3]
-    vertices = wall().vertices - wall().vertices.mean(axis=0) + tip
+    vertices = wall().vertices - wall().vertices.mean(axis=0) + link_pose(PANDA, LEFT, PANDA.tip)[:3, 3]
     asked = problem(rd.PointCloud(vertices, 0.01) if cloud else rd.Mesh(vertices, wall().faces))
     monkeypatch.setattr(exact_meshes, "TREE_SECONDS_PER_ELEMENT", 1e3)
     refused = RRTConnect().plan(asked, time_limit=20.0)
@@ -258,8 +255,7 @@ with exit_on_interrupt(lambda: print("tidy", flush=True)):
 def test_ctrl_c_is_not_lost_in_callbacks() -> None:
     """Regression: `robot add` ran on for minutes after Ctrl-C was pressed while compiled code was loaded."""
     # background jobs of a shell ignore SIGINT
-    heard = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
-    ended = python(heard + SWALLOWING, 130)
+    ended = python("import signal; signal.signal(signal.SIGINT, signal.default_int_handler)" + SWALLOWING, 130)
     assert (ended.stdout, ended.stderr) == ("tidy\n", "robotdiffuse: stopped\n")
 
 

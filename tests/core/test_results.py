@@ -6,6 +6,7 @@ import re
 import threading
 from dataclasses import fields, replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from robotdiffuse.core.errors import OutputError
 from robotdiffuse.core.output_files import JsonLines, write_atomically
 
 NAMES = ("shoulder", "elbow")
+FULL = OSError(28, "No space left on device")
 
 
 @pytest.fixture
@@ -95,11 +97,7 @@ def test_what_cannot_be_written_is_refused(solved: rd.PlanResult, tmp_path: Path
 def test_a_failed_write_keeps_the_old_file(solved: rd.PlanResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "r.json"
     file.write_text("old")
-
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Path, "replace", full)
+    monkeypatch.setattr(Path, "replace", Mock(side_effect=FULL))
     with pytest.raises(OutputError, match="No space left on device"):
         solved.save(file)
     assert file.read_text() == "old" and list(tmp_path.iterdir()) == [file]
@@ -164,10 +162,7 @@ def test_threads_that_write_one_file_leave_one_of_their_texts(tmp_path: Path) ->
 
 
 def test_an_interrupted_write_leaves_no_temporary_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Path, "replace", interrupted)
+    monkeypatch.setattr(Path, "replace", Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         write_atomically(tmp_path / "a.json", "a")
     assert not list(tmp_path.iterdir())
@@ -177,12 +172,8 @@ def test_a_row_that_is_not_written_whole_is_dropped(tmp_path: Path, monkeypatch:
     """Regression: the next row was appended to the incomplete line, and no reader understood the line."""
     lines = JsonLines(tmp_path / "a.jsonl")
     lines.append({"a": 1})
-
-    def full(_: int) -> None:
-        raise OSError(28, "No space left on device")
-
     with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", full)
+        patch.setattr(os, "fsync", Mock(side_effect=FULL))
         with pytest.raises(OSError, match="No space"):
             lines.append({"a": 2})
     lines.append({"a": 3})

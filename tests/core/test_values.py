@@ -36,8 +36,7 @@ def pose_goal() -> rd.PoseGoal:
 
 
 def problem() -> rd.Problem:
-    more = {"T_world_base": POSE, "start_velocity": HALF}
-    return rd.Problem(box_arm(), rd.Scene([sphere()]), ROWS[0], ROWS, **more)
+    return rd.Problem(box_arm(), rd.Scene([sphere()]), ROWS[0], ROWS, T_world_base=POSE, start_velocity=HALF)
 
 
 def robot() -> rd.Robot:

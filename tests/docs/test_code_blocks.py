@@ -30,8 +30,7 @@ def test_code_blocks_of_a_page(page: Path, tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_a_page_that_starts_processes_runs_as_one_script(tmp_path: Path) -> None:
-    """Each process imports the script again; without a guard in the script, processes would start processes
-    without end."""
+    """Each process imports the script again; without a guard in the script, processes would start processes without end."""
     scripts = {page: script(page) for page in PAGES}
     guarded = {page: text for page, text in scripts.items() if '"__main__"' in text}
     assert [page.name for page in guarded] == ["plan.md"]

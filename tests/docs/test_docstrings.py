@@ -52,5 +52,4 @@ def test_examples_run(name: str) -> None:
     finder = doctest.DocTestFinder(recurse=False)
     for function in public_functions(name):
         for example in finder.find(function, function.__qualname__, globs={"rd": rd, "np": np}):
-            outcome = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example)
-            assert outcome.failed == 0, function.__qualname__
+            assert doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example).failed == 0, function.__qualname__

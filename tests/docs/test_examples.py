@@ -15,12 +15,8 @@ SLOW = {"01_own_robot", "05_depth_camera", "09_two_arms", "12_train_on_own_data"
 """They prepare a robot, load networks, compile the code for several arms, or train."""
 
 
-def cases() -> list[object]:
-    return [pytest.param(file, id=file.stem, marks=[pytest.mark.slow] if file.stem in SLOW else []) for file in EXAMPLES]
-
-
 @pytest.mark.usefixtures("small_pictures")
-@pytest.mark.parametrize("example", cases())
+@pytest.mark.parametrize("example", [pytest.param(e, id=e.stem, marks=[pytest.mark.slow] * (e.stem in SLOW)) for e in EXAMPLES])
 def test_an_example_runs(
     example: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -45,5 +41,4 @@ def test_the_gallery_has_thirteen_short_examples_with_pictures() -> None:
 
 def test_the_first_motion_of_the_readme_keeps_the_asked_clearance() -> None:
     assert "plan examples/ball.yaml --until first" in (ROOT / "README.md").read_text()
-    result = rd.plan(rd.Problem.load(ROOT / "examples" / "ball.yaml"), until="first")
-    assert result.scene_clearance >= 0.01
+    assert rd.plan(rd.Problem.load(ROOT / "examples" / "ball.yaml"), until="first").scene_clearance >= 0.01

@@ -1,10 +1,12 @@
-"""The documentation builds without a warning, and its pages load nothing from the network."""
+"""The documentation builds without a warning and loads nothing from the network; its files exist, texts of drawings fit."""
 
 import os
 import re
 import subprocess
 import sys
+from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,26 +14,26 @@ from helpers.browsers import CHROMIUM, opened
 
 ROOT = Path(__file__).parents[2]
 LOADED = re.compile(r'<(?:script|img|iframe|source)[^>]*\ssrc="(?:https?:)?//|<link[^>]*stylesheet[^>]*//')
-pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site")
     build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
-    silent = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
-    done = subprocess.run(build, cwd=ROOT, env=silent, capture_output=True, text=True)
+    done = subprocess.run(build, cwd=ROOT, env={**os.environ, "NO_MKDOCS_2_WARNING": "1"}, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stderr + done.stdout == ""
     return folder
 
 
+@pytest.mark.slow
 def test_pages_load_nothing_from_the_network(site: Path) -> None:
     pages = sorted(site.rglob("*.html"))
     assert len(pages) > 20
     assert [page.name for page in pages if LOADED.search(page.read_text(encoding="utf-8"))] == []
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
 def test_the_search_works_without_a_server(site: Path) -> None:
@@ -42,6 +44,7 @@ def test_the_search_works_without_a_server(site: Path) -> None:
         page.locator(".md-search-result__link", has_text="Gallery").first.wait_for(state="attached", timeout=60_000)
 
 
+@pytest.mark.slow
 def test_the_command_reference_has_every_option_and_the_readme_is_short(site: Path) -> None:
     page = (site / "reference" / "commands.html").read_text(encoding="utf-8")
     options = ("data generate", "--safety-distance", "robotdiffuse bench report", "--no-replays")
@@ -49,9 +52,60 @@ def test_the_command_reference_has_every_option_and_the_readme_is_short(site: Pa
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 130
 
 
+@pytest.mark.slow
 def test_the_python_reference_has_every_public_name(site: Path) -> None:
     import robotdiffuse as rd
 
     page = (site / "reference" / "python.html").read_text(encoding="utf-8")
     for name in dir(rd):
         assert f'.{name}"' in page, name
+
+
+DRAWINGS = sorted((ROOT / "docs").rglob("*.svg"))
+BOXES = """[...document.querySelectorAll("text")].map(text => {
+    const box = text.getBoundingClientRect();
+    return [text.textContent, box.left, box.top, box.right, box.bottom];
+})"""
+LEADING = 3.0
+"""Boxes of lines reach further up and down than their letters [pixels]."""
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
+@pytest.mark.parametrize("drawing", DRAWINGS, ids=lambda file: file.name)
+def test_texts_do_not_overlap(drawing: Path, tmp_path: Path) -> None:
+    source = drawing.read_text(encoding="utf-8")
+    assert 'font-family="Helvetica, Arial, sans-serif"' in source
+    file = tmp_path / drawing.name
+    with opened("about:blank", 1040, 500) as page:
+        for font in ("Helvetica, Arial, sans-serif", "DejaVu Sans"):
+            file.write_text(source.replace("Helvetica, Arial, sans-serif", font), encoding="utf-8")
+            page.goto(file.as_uri())
+            check(page.evaluate(BOXES))
+
+
+def check(boxes: list[Any]) -> None:
+    assert len(boxes) > 10
+    for text, left, top, right, bottom in boxes:
+        assert left >= 0 and right <= 1040 and top >= 0 and bottom <= 500, f"{text!r} leaves the drawing"
+    for (a, *one), (b, *other) in combinations(boxes, 2):
+        beside = one[2] <= other[0] or other[2] <= one[0]
+        apart = one[3] - LEADING <= other[1] + LEADING or other[3] - LEADING <= one[1] + LEADING
+        assert beside or apart, f"{a!r} overlaps {b!r}"
+
+
+SOURCE = ROOT / "src" / "robotdiffuse"
+PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+FILES = sorted(set(re.findall(r"`([\w/]+\.py)`", PAGE)))
+
+
+def test_every_named_file_exists() -> None:
+    """A row of the page names a folder once; further files of the row have shorter paths."""
+    missing = [name for name in FILES if not (ROOT / name).is_file() and not any(SOURCE.rglob(name))]
+    assert not missing, f"docs/architecture.md names {missing}"
+
+
+def test_every_package_is_described() -> None:
+    packages = {folder.name for folder in SOURCE.iterdir() if (folder / "__init__.py").is_file()}
+    described = set(re.findall(r"^\| `(\w+)` \|", PAGE, re.MULTILINE))
+    assert packages <= described, f"docs/architecture.md lacks {', '.join(sorted(packages - described))}"

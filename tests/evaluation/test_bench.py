@@ -1,4 +1,5 @@
-"""bench run: every call makes a record; crashes, overruns and exceptions are failures; killed runs can be continued."""
+"""bench run: every call makes a record; crashes, overruns and exceptions are failures; killed runs can be continued.
+bench confirm: PyBullet accepts solved motions, and finds a motion that was tampered with."""
 
 import json
 import os
@@ -15,6 +16,7 @@ import pytest
 
 import robotdiffuse as rd
 from helpers import planners, waiting
+from helpers.commands import Said
 from helpers.refusals import refuses
 from robotdiffuse.cli import main
 from robotdiffuse.core import registry
@@ -23,7 +25,7 @@ from robotdiffuse.evaluation import bench
 from robotdiffuse.evaluation.bench_comparisons import LATE_SECONDS
 from robotdiffuse.evaluation.metrics import METRICS
 from robotdiffuse.evaluation.problem_sets import gather_cases, problem_set_name, validator
-from robotdiffuse.evaluation.runs import Record, RecordFile, Run, read_records
+from robotdiffuse.evaluation.runs import Record, RecordFile, Run, read_records, record_path
 from robotdiffuse.learning.weight_files import BUNDLED
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.planning.diffusion import Diffusion
@@ -104,8 +106,7 @@ def test_a_planner_of_the_program_itself_is_refused(tmp_path: Path, monkeypatch:
 
 
 def test_a_metric_of_an_imported_module_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Regression: the processes of planners did not import the module of `bench run --import`, so the metric
-    was missing."""
+    """Regression: the processes of planners did not import the module of `bench run --import`, so the metric was missing."""
     (tmp_path / "counted.py").write_text(
         "from robotdiffuse.evaluation.metrics import METRICS, Metric\n"
         'METRICS["legs"] = Metric("legs", "", "less", ".0f", lambda motion: len(motion.path.positions) - 1)\n'
@@ -188,8 +189,7 @@ def test_a_planner_is_restarted_until_its_time_is_used_up(tmp_path: Path) -> Non
 
 
 def test_planners_take_turns_with_each_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Other work on the machine then affects all planners alike. The number of simultaneous calls stays
-    constant."""
+    """Other work on the machine then affects all planners alike. The number of simultaneous calls stays constant."""
     calls = []
     at_once = [0]
     most = [0]
@@ -298,8 +298,7 @@ def test_other_weights_of_the_same_name_are_refused(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(bench, "keep_records", lambda *_: 0)
     for parent, digest in (("a", "1"), ("b", "2")):
         (tmp_path / parent / "best").mkdir(parents=True)
-        about = {"format": 2, "weights_sha256": digest}
-        (tmp_path / parent / "best" / "mpnet.json").write_text(json.dumps(about))
+        (tmp_path / parent / "best" / "mpnet.json").write_text(json.dumps({"format": 2, "weights_sha256": digest}))
     first, other = (settings(tmp_path / "out", f"mpnet@{tmp_path / at}/best", count=1) for at in "ab")
     for _ in range(2):
         bench.run_bench(first, quiet, quiet)
@@ -347,10 +346,43 @@ def test_the_command_runs_every_stage_of_a_preset(tmp_path: Path, monkeypatch: p
     assert 0.001 in limits and len({record.name for record in found["rrt_connect"]}) == 2
 
 
-def test_a_preset_in_place_of_planners_and_limits(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_preset_in_place_of_planners_and_limits(tmp_path: Path, said: Said) -> None:
     refuses("unknown preset 'table2'; known: anytime", bench.preset_settings, "table2", tmp_path)
-    asked = ["bench", "run", "--out", str(tmp_path)]
-    assert main([*asked, "--planners", "rrt_connect"]) == 2
-    assert "name --planners and --problems, or a --preset" in capfd.readouterr().err
-    assert main([*asked, "--preset", "anytime", "--planners", "rrt_connect"]) == 2
-    assert "--preset cannot be combined with --planners" in capfd.readouterr().err
+    asked = ("bench", "run", "--out", tmp_path, "--planners", "rrt_connect")
+    assert "name --planners and --problems, or a --preset" in said(2, *asked)
+    assert "--preset cannot be combined with --planners" in said(2, *asked, "--preset", "anytime")
+
+
+@pytest.fixture
+def with_records(tmp_path: Path) -> Path:
+    pytest.importorskip("pybullet", reason="the extra `sim` (pybullet) is not installed")
+    case = gather_cases(["rop_nontrivial"], 1, tmp_path, lambda _: None)[0]
+    problem = case.problem
+    path = RRTConnect().plan(problem, 10.0).path
+    assert isinstance(problem.goal, rd.JointGoal)
+    about = Record("good", *case.key, case.family, case.trivial, 0, 1.0, "solved", "", 0.01)
+    line = [problem.start.tolist(), problem.goal.positions[0].tolist()]
+    for record in (
+        replace(about, positions=tuple(map(tuple, path.positions.tolist()))),
+        replace(about, planner="bad", positions=tuple(map(tuple, line))),
+        replace(about, planner="none", status="timeout"),
+    ):
+        RecordFile(record_path(tmp_path, record.planner)).append(record)
+    return tmp_path
+
+
+@pytest.mark.sim
+def test_motions_are_looked_at_again(with_records: Path, said: Said) -> None:
+    lines = said(1, "bench", "confirm", with_records).splitlines()
+    rows = {line.split()[0]: line.split()[1:] for line in lines[1:4]}
+    assert rows == {"bad": ["1", "1"], "good": ["1", "0"], "none": ["0", "0"]}
+    assert lines[4].startswith("bad, rop_nontrivial rop/") and "mm deep" in lines[4]
+    (with_records / "records" / "bad.jsonl").unlink()
+    said(0, "bench", "confirm", with_records, "--count", 1)
+
+
+@pytest.mark.sim
+def test_folder_without_results_or_problems(with_records: Path, said: Said) -> None:
+    assert "holds no records" in said(2, "bench", "confirm", with_records / "nothing")
+    (with_records / "problems" / "rop.jsonl").unlink()
+    assert "of rop_nontrivial, which has results" in said(2, "bench", "confirm", with_records, "--count", 1)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.commands import Said
 from helpers.refusals import refuses
-from robotdiffuse.cli import main
 from robotdiffuse.core.tables import Table
 from robotdiffuse.evaluation import bench_comparisons, bench_report
 from robotdiffuse.evaluation.metrics import METRICS, Metric, measured
@@ -35,8 +35,7 @@ def record(planner: str, name: str, limit: float, **fields: object) -> Record:
 def solved(
     planner: str, name: str, limit: float, progress: list[tuple[float, float]], time: float | None = None, **fields: object
 ) -> Record:
-    """A record of a motion for which the paths of the links are three times as long [m] as the path in joint
-    space [rad]."""
+    """A record of a motion for which the paths of the links are three times as long [m] as the path in joint space [rad]."""
     length = progress[-1][1]
     values = {
         "status": "solved",
@@ -55,8 +54,7 @@ def failed(planner: str, name: str, limit: float, time: float, **fields: object)
 
 
 def write(folder: Path, records: list[Record], counts: dict[float, int | None] | None = None) -> Path:
-    """Writes a run for each time limit, with all of its planners. `counts`: the numbers of problems of the
-    runs, if not all."""
+    """Writes a run for each time limit, with all of its planners. `counts`: the numbers of problems of the runs, if not all."""
     (folder / "records").mkdir(parents=True)
     for record in records:
         with record_path(folder, record.planner).open("a") as stream:
@@ -81,8 +79,7 @@ def small(tmp_path: Path) -> Path:
     records = [solved("robotdiffuse", n, 1.0, [(0.05, 2.0)], trivial=t) for n, t in zip(names, trivial, strict=True)]
     # the first path after 0.05, 0.5 and 5 s; the last problem beyond the limit of 10 s
     for name, t, first in zip(names[:3], trivial, (0.05, 0.5, 5.0), strict=False):
-        progress = [(first, 4.0), (first * 1.5, 3.0)]
-        records.append(solved("ompl_rrt_star", name, 10.0, progress, time=10.0, trivial=t))
+        records.append(solved("ompl_rrt_star", name, 10.0, [(first, 4.0), (first * 1.5, 3.0)], time=10.0, trivial=t))
     records.append(failed("ompl_rrt_star", names[3], 10.0, 10.0, trivial=True))
     records += [
         solved("mpnet", names[0], 1.0, [(0.02, 2.4)]),
@@ -153,8 +150,7 @@ def test_figures_of_a_small_run(small: Path) -> None:
     for name, success, collision in (("robotdiffuse", 1, 1), ("mpnet", 0, 0), ("ompl_rrt_star", 0, 1)):
         length = (9.0 - lengths[name]) / 3.0
         time = (1.0 - times[name]) / 0.95
-        comscore = rows(whole, 1.0)[name].comscore
-        assert comscore == pytest.approx((success + collision + length + time) / 4)
+        assert rows(whole, 1.0)[name].comscore == pytest.approx((success + collision + length + time) / 4)
 
 
 def test_compared_are_problems_that_all_planners_were_given_this_time_for(tmp_path: Path) -> None:
@@ -235,8 +231,7 @@ def test_lengths_are_compared_at_equal_time(tmp_path: Path) -> None:
     }
     assert cells(table, "ComScore")["rrt_connect, restarted"] == "–"
     tenth = bench_report.main_table(section, section.comparisons[0], bench.reference)
-    lengths = cells(tenth, "joint length / robotdiffuse, restarted")
-    assert lengths["rrt_connect, restarted"].startswith("1.200 ")
+    assert cells(tenth, "joint length / robotdiffuse, restarted")["rrt_connect, restarted"].startswith("1.200 ")
     plain = bench_comparisons.read_bench(bench.folder, ["robotdiffuse", "rrt_connect"])
     assert len(plain.records) == 4
     alone = replace(plain, records={n: r for n, r in plain.records.items() if RESTARTED not in n})
@@ -282,8 +277,7 @@ def test_a_metric_is_declared_in_one_place(small, tmp_path, monkeypatch):
     assert record.row()["waypoint_count"] == 3
     assert record_of_row(json.loads(json.dumps(record.row()))) == record
     bench = bench_comparisons.read_bench(write(tmp_path / "run", [record]))
-    parts = bench_comparisons.sections(bench, [1.0])
-    report = bench_report.bench_report(bench, parts)
+    report = bench_report.bench_report(bench, bench_comparisons.sections(bench, [1.0]))
     assert re.search(r"waypoint count kilo .*\n.*\n.* 0.0030 ", report.markdown)
     page = report.page
     assert re.search(r"<th[^>]*>waypoint count kilo</th>", page)
@@ -291,13 +285,12 @@ def test_a_metric_is_declared_in_one_place(small, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_command_writes_everything(small, tmp_path, capsys):
+def test_the_command_writes_everything(small, tmp_path, said: Said):
     pytest.importorskip("matplotlib")
     keep_problems(small, ["rop/0", "rop/1"])
     out = tmp_path / "out"
-    assert main(["bench", "report", str(small), "--out", str(out), "--limits", "1,10", "--no-replays"]) == 0
-    said = capsys.readouterr().out
-    assert "rop, non-trivial, 10 s: 3 problems" in said and "ompl_rrt_star" in said
+    printed = said(0, "bench", "report", small, "--out", out, "--limits", "1,10", "--no-replays")
+    assert "rop, non-trivial, 10 s: 3 problems" in printed and "ompl_rrt_star" in printed
     page = (out / "index.html").read_text()
     for name in ("robotdiffuse", "mpnet", "ompl_rrt_star"):
         assert page.count(f">{name}<") >= 4, name
@@ -327,28 +320,22 @@ def test_what_is_shown_is_hard_or_failed(small: Path) -> None:
     titles = [motion.title for motion in shown]
     assert titles[0] == "robotdiffuse · rop/0"  # solved by all; made up as one and the same
     assert "ompl_rrt_star · rop/0" in titles
-    failing = {title for title in titles if "fails" in title}
-    assert failing == {"mpnet fails · rop/2", "ompl_rrt_star fails · rop/3"}
+    assert {title for title in titles if "fails" in title} == {"mpnet fails · rop/2", "ompl_rrt_star fails · rop/3"}
     captions = {motion.title: motion.caption for motion in shown}
     assert captions["mpnet fails · rop/2"].startswith("gave up before; shown: robotdiffuse")
     assert not any("Figure(" in caption for caption in captions.values())
     assert len(shown) <= bench_report.MAX_REPLAYS
 
 
-def test_bad_input_is_one_clear_line(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_is_one_clear_line(small: Path, said: Said) -> None:
     (small / "new" / "records").mkdir(parents=True)
     (small / "new" / "records" / "mpnet.jsonl").touch()
     refuses("no records yet", bench_comparisons.read_bench, small / "new")
     refuses(r"no records of foo; it has .*mpnet, ", bench_comparisons.read_bench, small, ["foo"])
-    refuses(
-        "no planner was run that long",
-        bench_comparisons.sections,
-        bench_comparisons.read_bench(small, ["ompl_rrt_star"]),
-        [60.0],
-    )
+    alone = bench_comparisons.read_bench(small, ["ompl_rrt_star"])
+    refuses("no planner was run that long", bench_comparisons.sections, alone, [60.0])
     (small / "runs.jsonl").write_text('{"date": 1}\n')
     refuses(r"runs\.jsonl is damaged", bench_comparisons.read_bench, small)
     with (small / "records" / "mpnet.jsonl").open("a") as stream:
         stream.write("{broken\n")
-    assert main(["bench", "report", str(small)]) == 2
-    assert re.search(r"mpnet\.jsonl, line 5 is not a JSON object", capsys.readouterr().err)
+    assert "mpnet.jsonl, line 5 is not a JSON object" in said(2, "bench", "report", small)

@@ -27,12 +27,7 @@ def minimum_jerk(duration: float, start: np.ndarray, end: np.ndarray, rows: int 
     s = np.linspace(0, 1, rows)
     way = np.asarray(end) - start
     p, v, a = (MINIMUM_JERK.deriv(k)(s)[:, None] * way / duration**k for k in range(3))
-    names = tuple(f"j{i}" for i in range(len(way)))
-    return rd.Trajectory(names, s * duration, start + p, v, a)
-
-
-def path_of(trajectory: rd.Trajectory) -> rd.Path:
-    return rd.Path(trajectory.joint_names, trajectory.positions[[0, -1]])
+    return rd.Trajectory(tuple(f"j{i}" for i in range(len(way))), s * duration, start + p, v, a)
 
 
 @pytest.mark.parametrize(
@@ -58,8 +53,7 @@ def test_lengths_of_an_arm_of_two_links(rows, joint, link, tip, turned):
 
 
 def test_bending_of_a_sine_by_hand() -> None:
-    """q = (u, a sin(pi k u)), in units of the path's length; since the amplitude is small, the speed is nearly
-    constant."""
+    """q = (u, a sin(pi k u)), in units of the path's length; since the amplitude is small, the speed is nearly constant."""
     u = np.linspace(0, 1, 4001)
     a = 0.003
     k = 3
@@ -107,7 +101,7 @@ def test_interrupted_and_shaking_motions_are_less_smooth() -> None:
         np.concatenate([half.velocities, half.velocities[1:]]),
         np.concatenate([half.accelerations, half.accelerations[1:]]),
     )
-    smooth, stops = (metrics.measured(ARM, path_of(m), m) for m in (straight, stopping))
+    smooth, stops = (metrics.measured(ARM, rd.Path(m.joint_names, m.positions[[0, -1]]), m) for m in (straight, stopping))
     assert stops["sparc_joint"] < smooth["sparc_joint"] - 0.1
     assert stops["sparc_tip"] < smooth["sparc_tip"] - 0.1
     # Two motions of half the length in half the time: 2 * (1/2)^2 * 2^5.
@@ -126,8 +120,7 @@ def test_a_motion_that_stands_still_has_figures(rows: np.ndarray) -> None:
 
 def test_clearance_to_the_scene_and_to_itself_apart() -> None:
     rows = np.stack([START, START + 0.01])
-    top = PANDA.fk(START, "panda_link4")[:3, 3]
-    ball = rd.Sphere(top + np.array([0, 0, 0.4]), 0.1)
+    ball = rd.Sphere(PANDA.fk(START, "panda_link4")[:3, 3] + np.array([0, 0, 0.4]), 0.1)
     problem = rd.Problem(PANDA, rd.Scene([ball]), START, rows[1])
     path = rd.Path(PANDA.joint_names, rows)
     verdict = rd.verify(problem, path)
@@ -209,11 +202,8 @@ def test_paired_without_common_solutions() -> None:
     assert (still.ratio, still.p_length) == (1.0, 1.0)
 
 
-PAPER = [row.indicators for row in PAPER_TABLE_1]
-
-
 def test_comscore_of_the_papers_table() -> None:
-    scores = statistics.comscores(PAPER)
+    scores = statistics.comscores([row.indicators for row in PAPER_TABLE_1])
     by_hand = [
         (0 + 1 + (18.492 - 15.037) / 4.35 + 0) / 4,
         (11.2 / 14.1 + 0 + 0 + 0) / 4,

@@ -70,8 +70,7 @@ def test_samples_are_validated_as_they_are_and_the_shortest_that_passes_is_measu
         middle = (START + GOAL) / 2
         bent = [np.stack([START, middle + np.array([0, 0, bend, 0, 0, 0, 0.0]), GOAL]) for bend in (0.4, 0.2)]
         bent[1][[0, -1]] += 0.01
-        past = np.stack([START, START + 20.0, GOAL])
-        return np.stack([bent[0], bent[1], past]).astype(np.float32)
+        return np.stack([bent[0], bent[1], np.stack([START, START + 20.0, GOAL])]).astype(np.float32)
 
     free, blocked = run_all(CASES, {"x": sampled(draw)}, bar=False)["x"]
     assert free.solved and free.passed == pytest.approx(2 / 3)
@@ -93,6 +92,5 @@ def test_a_motion_that_stands_still_is_not_planned_again() -> None:
     """Regression: a path of length 0 was taken for no path."""
     problem = rd.Problem(PANDA, rd.Scene(), START, rd.JointGoal(START[None]))
     found = RRTConnect().plan(problem, time_limit=2.0, seed=0)
-    first = replace(found, path=rd.Path(PANDA.joint_names, START[None]))
-    again, best = restarted(RRTConnect(), problem, 0, 2.0, first, {})
+    again, best = restarted(RRTConnect(), problem, 0, 2.0, replace(found, path=rd.Path(PANDA.joint_names, START[None])), {})
     assert (again, best.path_length) == (0, 0.0)

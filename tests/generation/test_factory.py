@@ -51,8 +51,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_folder_called_like_a_robot_does_not_hide_it_from_nodes(tmp_path, monkeypatch):
-    """Regression: if the working folder contained a folder with the robot's name, nodes got its path instead of
-    the robot."""
+    """Regression: if the working folder contained a folder with the robot's name, nodes got its path instead of the robot."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "panda").mkdir()
     assert not names_a_file("panda") and names_a_file("./panda") and rd.load_robot("panda") is PANDA
@@ -65,8 +64,7 @@ def rows(folder: Path) -> dict[str, ndarray]:
 
 
 def test_the_same_data_with_more_workers_and_after_an_interruption(folder: Path, tmp_path: Path) -> None:
-    """A killed run leaves a manifest, a finished shard, and incomplete files of another shard and of a
-    manifest."""
+    """A killed run leaves a manifest, a finished shard, and incomplete files of another shard and of a manifest."""
     shutil.copy(folder / "manifest.json", tmp_path)
     shutil.copytree(folder / "shard_00001.zarr", tmp_path / "shard_00001.zarr")
     kept = (tmp_path / "shard_00001.zarr").stat().st_mtime_ns
@@ -251,8 +249,7 @@ def test_unusable_folders_workers_and_clusters_are_refused(folder: Path, tmp_pat
 
 
 def test_furniture_among_the_families(tmp_path: Path) -> None:
-    settings = replace(SETTINGS, mix={"shelf": 1.0, "crate": 1.0, "table": 1.0}, trajectories=6, shard=6)
-    generate(settings, tmp_path, 1)
+    generate(replace(SETTINGS, mix={"shelf": 1.0, "crate": 1.0, "table": 1.0}, trajectories=6, shard=6), tmp_path, 1)
     manifest = read_manifest(tmp_path)
     shard = check_shard(tmp_path, 0, manifest)
     assert manifest.slots == 16 and len(set(shard["family"].tolist())) > 1
@@ -388,8 +385,7 @@ def test_a_worker_killed_from_outside_is_one_line_and_the_next_call_goes_on(
 ) -> None:
     def kill(done: int, _total: int) -> None:
         if done == SHARD:
-            worker = multiprocessing.active_children()[0]
-            os.kill(worker.pid or 0, signal.SIGKILL)
+            os.kill(multiprocessing.active_children()[0].pid or 0, signal.SIGKILL)
 
     refuses(r"worker process was killed.*run the same command again$", generate, MANY, tmp_path, workers=2, progress=kill)
     assert 0 < factory_runs.shards(tmp_path) < SHARDS

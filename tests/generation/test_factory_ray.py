@@ -84,8 +84,7 @@ def test_a_node_killed_midway_changes_nothing(cluster, tmp_path, monkeypatch):
 def test_clusters_that_nobody_listens_at_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
-        closed = f"127.0.0.1:{taken.getsockname()[1]}"
-        for address in (closed, "nonsense", "127.0.0.1:70000"):
+        for address in (f"127.0.0.1:{taken.getsockname()[1]}", "nonsense", "127.0.0.1:70000"):
             monkeypatch.setenv("RAY_ADDRESS", address)
             refuses(f"no Ray cluster.*{address}", generate, SETTINGS, tmp_path, cluster="ray")
 

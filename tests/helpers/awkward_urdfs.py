@@ -31,8 +31,7 @@ def arm(*parts: str, **how: str) -> Callable[[Path], Path]:
 
 def text(content: str | bytes, file: str = "made.urdf") -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
-        data = content if isinstance(content, bytes) else content.encode()
-        (folder / file).write_bytes(data)
+        (folder / file).write_bytes(content if isinstance(content, bytes) else content.encode())
         return folder / file
 
     return make

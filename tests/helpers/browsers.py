@@ -20,8 +20,7 @@ PATIENCE = 300.0
 @contextmanager
 def opened(url: str, width: int = 900, height: int = 600) -> Iterator[Any]:
     """A page of the browser at this address."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="browsers are driven by playwright")
-    with playwright.sync_playwright() as driver:
+    with pytest.importorskip("playwright.sync_api", reason="browsers are driven by playwright").sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, headless=True, args=FLAGS)
         view = browser.new_page(viewport={"width": width, "height": height})
         view.set_default_timeout(1000 * PATIENCE)

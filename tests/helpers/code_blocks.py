@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 import yaml
 
 from helpers.quick_preparation import QUICK, coarse_grids
@@ -66,8 +67,7 @@ def code_blocks(page: Path) -> list[Block]:
         elif opened is not None and fence:
             begin, language, indent = opened
             code = "".join(line[indent:] + "\n" for line in lines[begin:i])
-            where = f"{page.relative_to(ROOT)}:{begin + 1}"
-            blocks.append(Block(where, begin + 1, language, code, marks, tuple(needs)))
+            blocks.append(Block(f"{page.relative_to(ROOT)}:{begin + 1}", begin + 1, language, code, marks, tuple(needs)))
             opened = None
             marks = {}
             needs = []
@@ -83,8 +83,6 @@ def code_blocks(page: Path) -> list[Block]:
 
 def a_cloud(folder: Path) -> None:
     """Writes cloud.ply: the points of a wall beside the arm."""
-    import trimesh
-
     side = np.linspace(-0.3, 0.3, 30)
     points = np.stack(np.meshgrid([0.8], side, side + 0.4), axis=-1).reshape(-1, 3)
     trimesh.PointCloud(points).export(folder / "cloud.ply")
@@ -116,8 +114,6 @@ def example_arm(folder: Path) -> None:
 
 def shelf(folder: Path) -> None:
     """Writes shelf.stl: a board."""
-    import trimesh
-
     trimesh.creation.box((0.3, 0.8, 0.02)).export(folder / "shelf.stl")
 
 
@@ -211,9 +207,5 @@ def _pip(words: list[str]) -> None:
             assert not missing, f"{word}: there is no extra {', '.join(missing)}"
 
 
-def _toml(page: Notebook, block: Block) -> None:
-    tomllib.loads(block.code)
-
-
-TRIED: dict[str, Callable[[Notebook, Block], None]] = {"python": _python, "yaml": _yaml, "sh": _sh, "xml": _content}
-TRIED |= {"text": lambda page, block: None, "toml": _toml}
+TRIED: dict[str, Callable[[Notebook, Block], object]] = {"python": _python, "yaml": _yaml, "sh": _sh, "xml": _content}
+TRIED |= {"text": lambda page, block: None, "toml": lambda page, block: tomllib.loads(block.code)}

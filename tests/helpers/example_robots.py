@@ -111,6 +111,5 @@ def planar_arm(*lengths: float) -> Robot:
         Joint(f"j{i}", "revolute", f"l{i}", f"l{i + 1}", transform(np.array([x, 0, 0])), np.array([0, 0, 1.0]))
         for i, x in enumerate(xs[:-1])
     ]
-    last = len(lengths)
-    tip = Joint("tip", "fixed", f"l{last}", "tip", transform(np.array([xs[-1], 0, 0])), np.array([0, 0, 1.0]))
+    tip = Joint("tip", "fixed", f"l{len(lengths)}", "tip", transform(np.array([xs[-1], 0, 0])), np.array([0, 0, 1.0]))
     return Robot("planar", "l0", "tip", (*joints, tip))

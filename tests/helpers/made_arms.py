@@ -31,8 +31,7 @@ def joint(
 
 
 def chain(base: str, names: Iterable[str], **how: str) -> str:
-    """Joints in a row, beginning at an existing base; the link of each joint is named after the joint, with
-    `_link`."""
+    """Joints in a row, beginning at an existing base; the link of each joint is named after the joint, with `_link`."""
     parts = []
     parent = base
     for i, name in enumerate(names):

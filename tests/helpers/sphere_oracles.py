@@ -44,8 +44,7 @@ def sphere_centers(robot: Robot, q: ndarray) -> tuple[list[ndarray], list[ndarra
 def distance(shape: Shape, points: ndarray) -> ndarray:
     """Signed distance of points [..., 3] to a shape."""
     if isinstance(shape, PointCloud):
-        found = [np.linalg.norm(points - p, axis=-1) - shape.point_radius for p in shape.points]
-        return np.min(found, axis=0)
+        return np.min([np.linalg.norm(points - p, axis=-1) - shape.point_radius for p in shape.points], axis=0)
     if isinstance(shape, Sphere):
         return np.linalg.norm(points - shape.center, axis=-1) - shape.radius
     assert isinstance(shape, Box | Cylinder | Capsule)

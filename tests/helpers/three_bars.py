@@ -28,5 +28,4 @@ def three_bars() -> Robot:
         Joint("slide", "prismatic", "arm", "tip", transform(np.array([0, 0, 0.3])), z, *limits),
     )
     meshes = {"base": (bar(0.1),), "pillar": (bar(0.4),), "arm": (bar(0.3),), "tip": (bar(0.2),)}
-    spheres = {"tip": np.array([[0, 0, 0.1, 0.12]])}
-    return Robot("three_bars", "base", "tip", joints, spheres, meshes)
+    return Robot("three_bars", "base", "tip", joints, {"tip": np.array([[0, 0, 0.1, 0.12]])}, meshes)

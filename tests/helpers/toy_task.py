@@ -13,8 +13,7 @@ from robotdiffuse.learning.training.loop import Processes, TrainingTask, Validat
 
 
 class ToyTask(TrainingTask):
-    """A linear layer. The loss is the sum of its squared weights times a factor, which depends on the number of
-    the call."""
+    """A linear layer. The loss is the sum of its squared weights times a factor, which depends on the number of the call."""
 
     title = "toy"
 

@@ -56,8 +56,7 @@ def bad_step_in_one(out: str) -> dict[str, float]:
     index = Processes("cpu").index
     run = TrainingRun(ToyTask(settings, lambda call: float("nan") if call == 2 and index else 1.0 + index), out)
     run.loop()
-    weight = run.module.get_parameter("weight").sum().item()
-    return {"skipped": run.at.skipped, "samples": run.at.samples, "weight": weight}
+    return {"skipped": run.at.skipped, "samples": run.at.samples, "weight": run.module.get_parameter("weight").sum().item()}
 
 
 if __name__ == "__main__":

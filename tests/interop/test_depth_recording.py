@@ -32,8 +32,7 @@ def test_a_recorded_exploration_is_read_again_and_gives_the_same_voxels(tmp_path
         pass
     views: dict[str, list[depth_recording.StampedView]] = {"wrist": [], "beside": []}
     for one in explorer.views:
-        name = "beside" if one.camera is None else "wrist"
-        views[name].append(depth_recording.StampedView(one.time, one.view))
+        views["beside" if one.camera is None else "wrist"].append(depth_recording.StampedView(one.time, one.view))
     assert all(views.values())
     depth_recording.write_depth_views(PANDA, views, tmp_path / "seen.mcap")
     again = OccupancyMap(PANDA)
@@ -73,8 +72,7 @@ def camera(frame: str, at: float, encoding: str, unit: float, zeros: int = 0) ->
     size = {"header": {"stamp": stamp(at), "frame_id": frame}, "height": 2, "width": 2}
     pixels = np.round(np.array([[0.5, 0.0], [1.5, 2.0]]) / unit).astype("<u2")
     data = np.frombuffer(pixels.tobytes() + bytes(zeros), np.uint8)
-    k = [300.0, 0.0, 0.5, 0.0, 310.0, 0.4, 0.0, 0.0, 1.0]
-    info = size | {"k": k, "r": np.zeros(9), "p": np.zeros(12)}
+    info = size | {"k": [300.0, 0.0, 0.5, 0.0, 310.0, 0.4, 0.0, 0.0, 1.0], "r": np.zeros(9), "p": np.zeros(12)}
     info |= {name.upper(): info[name] for name in "krp"}  # as ROS 1 has them
     return info, size | {"encoding": encoding, "step": 4, "data": data}
 
@@ -213,13 +211,11 @@ def test_continuous_joints_are_interpolated_the_short_way(tmp_path: Path) -> Non
 
     def of_gen3(messages: dict[str, Any]) -> None:
         for state, angle in zip(messages["/joint_states"], (3.13, -3.13), strict=True):
-            positions = np.where(gen3.continuous, angle, 0.5).tolist()
-            state |= {"name": list(gen3.joint_names), "position": positions}
+            state |= {"name": list(gen3.joint_names), "position": np.where(gen3.continuous, angle, 0.5).tolist()}
 
     [(_, view)] = rd.read_depth_views(recording(tmp_path / "r.mcap", of_gen3), gen3, base="panda_link0")
     assert view.configuration is not None
-    halfway = np.where(gen3.continuous, -1.0, np.cos(0.5))
-    np.testing.assert_allclose(np.cos(view.configuration), halfway, atol=1e-9)
+    np.testing.assert_allclose(np.cos(view.configuration), np.where(gen3.continuous, -1.0, np.cos(0.5)), atol=1e-9)
 
 
 def test_an_image_without_a_joint_state_leaves_the_rest(tmp_path: Path) -> None:
@@ -264,8 +260,7 @@ def test_other_files_and_topics_are_refused(tmp_path: Path) -> None:
 
 
 def history() -> depth_recording.TransformHistory:
-    """Transforms of a link that turns by 1 rad in 0.1 s, logged in the wrong order, and of a camera fixed to
-    it."""
+    """Transforms of a link that turns by 1 rad in 0.1 s, logged in the wrong order, and of a camera fixed to it."""
     out = depth_recording.TransformHistory()
     out.add(pose("base", "link", 5.1, 1.0), static=False)
     out.add(pose("base", "link", 5.0, 0.0), static=False)

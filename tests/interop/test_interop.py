@@ -115,8 +115,7 @@ def test_mcap_holds_scene_urdf_frames_and_joint_states(planned: Planned, tmp_pat
     assert "panda_finger_joint1, panda_finger_joint2 stay at their locked values" in found.notes
     np.testing.assert_array_equal(found.motion.positions, trajectory.positions)
     refuse(tmp_path / "m.mcap", r"topic '/tf' holds no motion; topics: .*/joint_trajectory", "/tf")
-    raised = replace(problem, T_world_base=transform(np.array([1.0, 2.0, 3.0])))
-    write_motion(raised, trajectory, tmp_path / "m.mcap")
+    write_motion(replace(problem, T_world_base=transform(np.array([1.0, 2.0, 3.0]))), trajectory, tmp_path / "m.mcap")
     again = ros2.problem_in(tmp_path / "m.mcap")
     assert again is not None and rd.verify(again, trajectory).valid
 
@@ -170,8 +169,7 @@ def test_a_recording_that_unpacks_to_gigabytes_is_refused(
         writer = Writer(stream, chunk_size=200_000, compression=CompressionType[compression])
         writer.start()
         schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
-        channel = writer.register_channel("/joint_trajectory", "cdr", schema)
-        writer.add_message(channel, 0, bytes(150_000), 0)
+        writer.add_message(writer.register_channel("/joint_trajectory", "cdr", schema), 0, bytes(150_000), 0)
         writer.finish()
     assert (folder / "m.mcap").stat().st_size < 5_000
     (tmp_path / "m.mcap").write_bytes((folder / "m.mcap").read_bytes())
@@ -239,8 +237,7 @@ def test_times_that_begin_later_and_no_times() -> None:
 def test_positions_and_times_alone_are_validated_on_the_smoothest_curve() -> None:
     robot = box_arm()
     t = np.linspace(0, 2, 41)
-    s = 10 * (t / 2) ** 3 - 15 * (t / 2) ** 4 + 6 * (t / 2) ** 5
-    q = np.outer(s, [0.5, -0.4, 0.3])
+    q = np.outer(10 * (t / 2) ** 3 - 15 * (t / 2) ** 4 + 6 * (t / 2) ** 5, [0.5, -0.4, 0.3])
     found = motion_of_robot(checked_motion(robot.joint_names, q, t), robot)
     assert isinstance(found.motion, Trajectory)
     report = rd.verify(Problem(robot, Scene(), q[0], q[-1]), found.motion)

@@ -1,4 +1,5 @@
-"""The check of a camera by the arm in its image; the images of the arm are drawn by balls on its meshes."""
+"""The check of a camera by the arm in its image, drawn by balls on its meshes; poses refined by the images: errors that were
+added to true poses are found."""
 
 from dataclasses import replace
 from functools import cache
@@ -11,9 +12,12 @@ from scipy.spatial.transform import Rotation
 import robotdiffuse as rd
 from helpers.refusals import refuses
 from robotdiffuse.perception.camera_check import OPTICAL, agreement, camera_note
+from robotdiffuse.perception.depth_filter import pose_error
 from robotdiffuse.perception.depth_view import DepthNoise
+from robotdiffuse.perception.pose_refinement import PoseRefinement
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, render_depth
 from robotdiffuse.perception.visibility import surface_balls
+from robotdiffuse.planning.exploration.simulated import measured, taken, wrist_camera
 
 PANDA = rd.load_robot("panda")
 HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
@@ -31,8 +35,7 @@ def seen(q: ndarray, seed: int = 0) -> rd.DepthView:
     rows[:, [3, 7, 11]] = 1.0
     rows[:, 15] = 0.0035
     depth = np.where(np.isfinite(view.depth), view.depth, 9.0).astype(np.float32)
-    intrinsics = np.array(K, np.float32)
-    render_depth(rows, intrinsics, T.astype(np.float32), depth)
+    render_depth(rows, np.array(K, np.float32), T.astype(np.float32), depth)
     clean = replace(view, depth=np.where(depth < 4.0, depth, np.inf), configuration=q)
     return DepthNoise(0.003, correlation=1.5, zeros=True).applied(clean, np.random.default_rng(seed))
 
@@ -64,8 +67,7 @@ MISTAKES = {
 
 @pytest.mark.parametrize("name", MISTAKES)
 def test_mistakes_in_poses_are_named(name: str) -> None:
-    """Regression: problems with such poses were planned without a note, with points of walls and arm at wrong
-    places."""
+    """Regression: problems with such poses were planned without a note, with points of walls and arm at wrong places."""
     wrong = replace(at_home(), T_base_camera=MISTAKES[name](T))
     assert name in camera_note(wrong, PANDA, HOME)
     result = rd.load_planner("aorrtc").plan(rd.Problem(PANDA, rd.Scene([]), HOME, HOME + 0.1, views=[wrong]))
@@ -94,7 +96,67 @@ def test_the_pose_is_estimated_from_views_of_the_arm() -> None:
     stated = found.pose_deviation
     assert position < 2 * stated[0] and angle < 2 * stated[1] and stated[0] < 0.04
     refuses("configuration", rd.calibrate_camera, [replace(at_home(), configuration=None)], PANDA)
-    moved = replace(views[0], T_base_camera=T)
-    refuses("views differ in T_base_camera", rd.calibrate_camera, [*views, moved], PANDA)
+    refuses("views differ in T_base_camera", rd.calibrate_camera, [*views, replace(views[0], T_base_camera=T)], PANDA)
     elsewhere = replace(at_home(), depth=np.full_like(at_home().depth, 3.0))
     refuses(r"hardly seen|agrees with the images", rd.calibrate_camera, [elsewhere], PANDA)
+
+
+FLOOR = rd.Box((0, 0, -0.05), (4, 4, 0.1), name="floor")
+TABLES = rd.Scene([FLOOR, rd.Box((0.6, 0.1, 0.1), (0.2, 0.3, 0.2)), rd.Box((0.2, -0.6, 0.2), (0.3, 0.1, 0.4))])
+PROBLEM = rd.Problem(PANDA, TABLES, HOME, HOME)
+NOISE = DepthNoise(spread=0.004, correlation=1.5, missing=0.01, zeros=True)
+STATED = (0.005, float(np.radians(1.0)))
+WIDE = (460.0, 460.0, 319.5, 239.5)
+BESIDE = looking_at(np.array([1.2, 1.0, 0.9]), np.array([0.2, 0.0, 0.4]))
+CAMERA = wrist_camera(PANDA)
+TURNS = [[0.0] * 7, [0.3, 0.2, 0, 0, 0, 0.3, 0], [-0.4, 0.3, 0.2, 0.2, 0, -0.3, 0.5], [0, 0.4, 0, 0.3, 0.4, 0.2, 0]]
+POINTS = np.stack(np.meshgrid((-0.5, 0.0, 0.5), (-0.5, 0.0, 0.5), (0.1, 0.8)), axis=-1).reshape(-1, 3)
+
+
+def misplaced(view: rd.DepthView, seed: int) -> rd.DepthView:
+    """The view with a pose error as large as stated."""
+    rng = np.random.default_rng(seed)
+    shift, axis = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
+    error = np.eye(4)
+    error[:3, 3] = STATED[0] * shift
+    error[:3, :3] = Rotation.from_rotvec(STATED[1] * axis).as_matrix()
+    return replace(view, T_base_camera=view.T_base_camera @ error, pose_deviation=STATED, noise=NOISE)
+
+
+def seen_beside(q: np.ndarray, seed: int = 0) -> rd.DepthView:
+    return measured(ray_cast(TABLES, BESIDE, WIDE, (640, 480), PANDA, q), np.inf, NOISE, np.random.default_rng(seed))
+
+
+def displaced(view: rd.DepthView, true: rd.DepthView) -> tuple[np.ndarray, np.ndarray]:
+    """How far the pose error of a view displaces points around the arm, and the stated bound of the displacement [m]."""
+    T = true.T_base_camera
+    in_camera = (POINTS - T[:3, 3]) @ T[:3, :3]
+    x = in_camera[(in_camera[:, 2] > 0.1) & (np.linalg.norm(in_camera, axis=1) < 2)]
+    moved = x @ (view.T_base_camera[:3, :3] - T[:3, :3]).T + view.T_base_camera[:3, 3] - T[:3, 3]
+    return np.linalg.norm(moved, axis=1), pose_error(view, np.linalg.norm(x, axis=1))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_errors_of_poses_are_found_again(seed: int) -> None:
+    poses = PoseRefinement(PANDA, rd.Scene([FLOOR]), [(CAMERA.link, CAMERA.T_link_camera)])
+    rng = np.random.default_rng(seed)
+    standing = seen_beside(HOME, seed)
+    first = poses.observe(misplaced(standing, 10 + seed))
+    error, stated = displaced(first, standing)
+    before = displaced(misplaced(standing, 10 + seed), standing)[1]
+    assert (error < stated).all() and stated.max() < 0.7 * before.max(), "by the arm and the floor in one image"
+    for turn in TURNS:
+        true = taken(PROBLEM, CAMERA, HOME + turn, NOISE, rng)
+        error, stated = displaced(poses.observe(misplaced(true, 20 + seed)), true)
+        assert (error < stated).all()
+    assert error.max() < 0.005 and stated.max() < 0.012, "of the camera on the arm"
+    error, now = displaced(poses.refined(misplaced(standing, 10 + seed)), standing)
+    assert (error < now).all() and now.max() < 1.05 * displaced(first, standing)[1].max()
+
+
+def test_views_that_state_no_error_stay_as_they_are() -> None:
+    poses = PoseRefinement(PANDA, rd.Scene([FLOOR]), [])
+    view = seen_beside(HOME)
+    assert poses.observe(view) is view
+    without_arm = replace(misplaced(view, 0), configuration=None)
+    assert poses.observe(without_arm) is without_arm

@@ -35,8 +35,7 @@ def test_the_estimated_noise_is_that_of_the_sensor(spread: float, distance: floa
     """Regression: the differences of neighboring pixels, which have correlated errors, showed only an eighth of
     recorded noise."""
     noise = DepthNoise(spread=spread, correlation=correlation)
-    noisy = noise.applied(view_from(distance), np.random.default_rng(0))
-    found, neighbors = patch_noise(noisy.depth)
+    found, neighbors = patch_noise(noise.applied(view_from(distance), np.random.default_rng(0)).depth)
     assert 0.75 < found / spread < 1.2, "planes take away what goes together over a patch"
     by_hand = np.exp(-0.5 / correlation**2) if correlation else 0.0
     assert neighbors == pytest.approx(by_hand, abs=0.12)
@@ -50,8 +49,7 @@ def test_noise_is_measured_on_images_of_a_still_scene() -> None:
     assert found.spread == pytest.approx(0.004, rel=0.15) and found.correlation == pytest.approx(1.5, rel=0.4)
     assert 0.04 < found.missing < 0.12
     stated = replace(noise.applied(view, np.random.default_rng(9)), noise=found)
-    margin = filtered(stated).spread
-    assert margin == pytest.approx(filtered(replace(stated, noise=None)).spread, rel=0.5)
+    assert filtered(stated).spread == pytest.approx(filtered(replace(stated, noise=None)).spread, rel=0.5)
     refuses("at least two", rd.measure_noise, images[:1])
 
 
@@ -89,17 +87,14 @@ def test_small_objects_are_not_smoothed_away(correlation: float) -> None:
     noise = DepthNoise(spread=0.004, stray=0.0, flying=0.0, edge_missing=0.0, correlation=correlation)
     view = rd.DepthView(clean, (400, 400, 160, 120), np.eye(4))
     smooth = filtered(replace(noise.applied(view, np.random.default_rng(1)), noise=noise)).depth
-    height = 1.5 - smooth[tops].mean()
-    assert 0.02 < height < 0.035
+    assert 0.02 < 1.5 - smooth[tops].mean() < 0.035
 
 
 def test_zeros_are_told_from_nothing_in_range() -> None:
-    """Regression: an open space was never seen free by a sensor that gives 0 both for no return and for nothing
-    in range."""
+    """Regression: an open space was never seen free by a sensor that gives 0 both for no return and for nothing in range."""
     clean = view_from(1.2)
     clean = replace(clean, depth=np.where(clean.depth < 2.0, clean.depth, np.inf), range=2.0)
-    noisy = DepthNoise(spread=0.003, correlation=1.5, missing=0.02, zeros=True)
-    view = noisy.applied(clean, np.random.default_rng(0))
+    view = DepthNoise(spread=0.003, correlation=1.5, missing=0.02, zeros=True).applied(clean, np.random.default_rng(0))
     nothing = np.isinf(clean.depth)
     found = empty_regions(view.depth, 2.0)
     assert nothing.mean() > 0.2 and found is not None
@@ -110,8 +105,7 @@ def test_zeros_are_told_from_nothing_in_range() -> None:
     assert empty is not None
     assert not (empty & (clean.depth < 1.9))[150:190, 100:160].any(), "surrounded: a hole"
     assert empty_regions(np.where(np.arange(320) < 160, view.depth, 0.0), 2.0) is None, "half an image is lost"
-    near = np.where(nothing, 0.0, 0.2 * clean.depth)
-    assert empty_regions(near, 2.0) is None, "a surface too near to be measured"
+    assert empty_regions(np.where(nothing, 0.0, 0.2 * clean.depth), 2.0) is None, "a surface too near to be measured"
     stated, silent = view, replace(view, range=None)
     free = [observe([one], PANDA, HOME).free for one in (clean, stated, silent)]
     assert free[1].sum() > 0.8 * free[0].sum() > 2 * free[2].sum()
@@ -136,10 +130,8 @@ def test_rays_through_the_arm_are_not_empty() -> None:
     view = ray_cast(rd.Scene([]), T, (FOCAL, FOCAL, 159.5, 119.5), (320, 240), PANDA, HOME)
     few = np.zeros((240, 320))
     few[:20, :20] = 3.0
-    blank = rd.DepthView(few, view.intrinsics, T, range=4.0)
-    freed = observe([blank], PANDA, HOME)
-    behind_arm = observe([view], PANDA, HOME).shadow
-    assert freed.free.any() and not (freed.free & behind_arm).any()
+    freed = observe([rd.DepthView(few, view.intrinsics, T, range=4.0)], PANDA, HOME)
+    assert freed.free.any() and not (freed.free & observe([view], PANDA, HOME).shadow).any()
 
 
 def test_the_arm_beside_its_own_camera_leaves_open_space_open() -> None:
@@ -147,14 +139,12 @@ def test_the_arm_beside_its_own_camera_leaves_open_space_open() -> None:
     beside the camera and enlarged by 15 mm, hid half of the image, so looks showed nothing."""
     camera = wrist_camera(PANDA)
     q = np.array([-0.9, -1.6, -1.4, -2.3, 0.1, 1.1, -1.1])
-    T = camera.poses(PANDA, q[None])[0]
-    view = ray_cast(rd.Scene([FLOOR]), T, camera.intrinsics, camera.size, PANDA, q)
+    view = ray_cast(rd.Scene([FLOOR]), camera.poses(PANDA, q[None])[0], camera.intrinsics, camera.size, PANDA, q)
     ideal = replace(view, depth=np.where(view.depth < 0.15, 0.0, view.depth), range=4.0)
     zeros = replace(ideal, depth=np.where(np.isinf(ideal.depth), 0.0, ideal.depth))
     free, with_zeros = (observe([one], PANDA, q).free for one in (ideal, zeros))
     assert with_zeros.sum() > 0.9 * free.sum() > 10_000
-    off = observe([replace(zeros, pose_deviation=(0.005, 0.0175))], PANDA, q).free
-    assert off.sum() > 0.7 * free.sum()
+    assert observe([replace(zeros, pose_deviation=(0.005, 0.0175))], PANDA, q).free.sum() > 0.7 * free.sum()
 
 
 def test_a_straight_edge_is_not_the_end_of_the_image() -> None:
@@ -190,10 +180,8 @@ def test_the_filter_takes_the_median_of_the_returns_and_adds_none_but_in_single_
 def test_points_of_the_arm_are_taken_away_with_noise_too(distance: float) -> None:
     """Regression: a fixed margin of 2 cm left points of the arm at three deviations of the noise, so starts
     were in collision."""
-    view = DepthNoise().applied(view_from(distance), np.random.default_rng(1))
-    points = seen_points([view], PANDA, HOME)
-    above = points[(np.abs(points[:, 1]) < 0.12) & (points[:, 2] > 0.25)]
-    assert len(above) <= 2, "only the arm is there"
+    points = seen_points([DepthNoise().applied(view_from(distance), np.random.default_rng(1))], PANDA, HOME)
+    assert len(points[(np.abs(points[:, 1]) < 0.12) & (points[:, 2] > 0.25)]) <= 2, "only the arm is there"
 
 
 def test_a_pose_that_may_be_off_narrows_free_space() -> None:
@@ -221,17 +209,14 @@ def test_noise_is_as_its_settings_say() -> None:
     flying = replace(none, flying=0.4).applied(view, rng).depth[20:]
     between = (flying > 1.001) & (flying < 1.999)
     assert not np.delete(between, 149, axis=1).any() and 0.3 < between[:, 149].mean() < 0.5
-    stray = replace(none, stray=0.1).applied(view, rng).depth[20:] < depth[20:]
-    assert abs(stray.mean() - 0.1) < 0.01
-    same = none.applied(view, rng).depth
-    np.testing.assert_array_equal(same, depth)
+    assert abs((replace(none, stray=0.1).applied(view, rng).depth[20:] < depth[20:]).mean() - 0.1) < 0.01
+    np.testing.assert_array_equal(none.applied(view, rng).depth, depth)
     refuses("missing is 1", DepthNoise, missing=1.0)
 
 
 @pytest.mark.parametrize("angle", (0.1, 0.25))
 def test_a_floor_at_a_grazing_angle_gives_no_return(angle: float) -> None:
-    """A floor 1 m below a horizontal camera: each row of pixels sees the floor at the row's angle below the
-    horizon."""
+    """A floor 1 m below a horizontal camera: each row of pixels sees the floor at the row's angle below the horizon."""
     focal = 200.0
     rows = np.arange(1, 150)
     depth = np.broadcast_to((focal / rows)[:, None], (len(rows), 40))

@@ -92,8 +92,7 @@ def test_openexr_depth(tmp_path: Path) -> None:
 
 
 def test_views_survive_their_files(tmp_path: Path) -> None:
-    image = np.full((6, 8), 1500, np.uint16)
-    Image.fromarray(image).save(tmp_path / "a.png")
+    Image.fromarray(np.full((6, 8), 1500, np.uint16)).save(tmp_path / "a.png")
     points = np.random.default_rng(0).random((50, 3)) + T[:3, 3] + 3 * T[:3, 2]
     np.save(tmp_path / "cloud.npy", points)
     camera = {"xyz": T[:3, 3].tolist(), "wxyz": quaternion_from_rotation(T[:3, :3]).tolist()}

@@ -17,6 +17,7 @@ AWAY = np.array([3.0, 0.0, 0.0, -0.1, 0.0, 1.571, 0.785])
 WIDTH = 320
 HEIGHT = 240
 FOCAL = 262.0
+INTRINSICS = (FOCAL, FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
 WALL = 0.83
 """Where the wall stands: x = 1.6 - WALL in the base frame [m]."""
 
@@ -31,8 +32,7 @@ def camera(x: float = 1.6, y: float = 0.0, z: float = 0.5, back: bool = False) -
 
 
 def view(depth: np.ndarray, T: np.ndarray | None = None, q: np.ndarray = AWAY) -> rd.DepthView:
-    intrinsics = (FOCAL, FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
-    return rd.DepthView(depth, intrinsics, camera() if T is None else T, q)
+    return rd.DepthView(depth, INTRINSICS, camera() if T is None else T, q)
 
 
 def flat(depth: float) -> np.ndarray:
@@ -82,13 +82,11 @@ def test_free_voxels_hold_no_point_of_any_pixel(seed: int) -> None:
         r = rng.uniform(3, 40)
         depth[(u - a) ** 2 + (v - b) ** 2 < r * r] = rng.uniform(0.6, 2.4)
     seen = observe([view(depth)], PANDA, AWAY)
-    points = view(depth).points()
-    index = np.floor((points - LOW) / VOXEL).astype(int)
+    index = np.floor((view(depth).points() - LOW) / VOXEL).astype(int)
     inside = ((index >= 0) & (index < SHAPE)).all(axis=1)
     assert not seen.free[tuple(index[inside].T)].any()
     corners = np.stack(np.meshgrid(*[[-0.499, 0.499]] * 3, indexing="ij"), -1).reshape(-1, 3) * VOXEL
-    places = (centers()[seen.free][:, None] + corners).reshape(-1, 3)
-    away = places - (1.6, 0.0, 0.5)
+    away = (centers()[seen.free][:, None] + corners).reshape(-1, 3) - (1.6, 0.0, 0.5)
     at = np.rint(np.stack([away[:, 1], -away[:, 2]], 1) / -away[:, :1] * FOCAL + [159.5, 119.5]).astype(int)
     at = at.clip(0, (WIDTH - 1, HEIGHT - 1))
     hidden = depth[at[:, 1], at[:, 0]] <= -away[:, 0]
@@ -104,23 +102,19 @@ def test_several_views_add_up() -> None:
     x, occupied, free, behind = ahead(both)
     assert occupied.sum() == 2 and free[x > 0.8].all() and free[x < -0.81].all()
     between = ~occupied & ~free
-    least = np.minimum(x + 0.78, 0.77 - x)
-    np.testing.assert_allclose(behind[between], least[between], atol=1e-5)
+    np.testing.assert_allclose(behind[between], np.minimum(x + 0.78, 0.77 - x)[between], atol=1e-5)
 
 
 def test_the_arm_is_no_obstacle_and_casts_a_shadow() -> None:
     spheres = placed_spheres(PANDA, HOME)
     T = camera()
-    intrinsics = (FOCAL, FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
-    depth = np.minimum(depth_of_balls(spheres, T, intrinsics, (WIDTH, HEIGHT)), 2.2)
-    arm = depth < 2.19
-    assert arm.any()
+    depth = np.minimum(depth_of_balls(spheres, T, INTRINSICS, (WIDTH, HEIGHT)), 2.2)
+    assert (depth < 2.19).any()
     seen = observe([view(depth.astype(np.float32), q=HOME)], PANDA, AWAY)
     assert {*np.nonzero(seen.occupied)[0]} == {int((1.6 - 2.2 - LOW[0]) / VOXEL)}, "the wall behind alone"
     elsewhere = observe([view(depth.astype(np.float32), q=AWAY)], PANDA, AWAY)
     assert elsewhere.occupied.sum() > 50, "with the arm elsewhere, the points are an obstacle's"
-    hand = PANDA.fk(HOME, "panda_hand")[:3, 3]
-    along = (hand - T[:3, 3]) * 1.4 + T[:3, 3]
+    along = (PANDA.fk(HOME, "panda_hand")[:3, 3] - T[:3, 3]) * 1.4 + T[:3, 3]
     assert seen.shadow[tuple(((along - LOW) / VOXEL).astype(int))]
     assert not (seen.shadow & (seen.free | seen.occupied)).any()
 

@@ -22,8 +22,7 @@ SCENE = rd.Scene([FLOOR, CRATE])
 
 @cache
 def view_from(bearing: float, scene: rd.Scene = SCENE) -> rd.DepthView:
-    position = np.array([1.5 * np.cos(bearing), 1.5 * np.sin(bearing), 0.8])
-    T = looking_at(position, np.array([0.2, 0.0, 0.3]))
+    T = looking_at(np.array([1.5 * np.cos(bearing), 1.5 * np.sin(bearing), 0.8]), np.array([0.2, 0.0, 0.3]))
     return ray_cast(scene, T, (290.0, 290.0, 159.5, 119.5), (320, 240), PANDA, HOME)
 
 
@@ -40,16 +39,13 @@ def test_free_voxels_hold_no_obstacle_and_most_of_the_space_is_seen(noisy: bool)
         known.add(DepthNoise().applied(view, rng) if noisy else view)
         clean.add(view)
     assert not (known.free & known.occupied).any()
-    wrong = known.free & true(-0.0)
-    assert wrong.sum() <= (1e-3 if noisy else 1e-4) * known.free.sum()
+    assert (known.free & true(-0.0)).sum() <= (1e-3 if noisy else 1e-4) * known.free.sum()
     assert (known.free & clean.free).sum() > 0.9 * clean.free.sum()
-    far = ~true(0.06)
-    assert (known.occupied & far).sum() <= 0.02 * known.occupied.sum(), "neither speckles nor the arm"
+    assert (known.occupied & ~true(0.06)).sum() <= 0.02 * known.occupied.sum(), "neither speckles nor the arm"
 
 
 def test_what_obstacles_may_reach_is_free_only_by_a_margin_of_the_own_error() -> None:
-    """Regression: points enlarged by the pose error of a far camera closed gaps, even if a near camera saw the
-    gaps free."""
+    """Regression: points enlarged by the pose error of a far camera closed gaps, even if a near camera saw the gaps free."""
     known = OccupancyMap(PANDA)
     far = replace(view_from(0.3), pose_deviation=(0.005, 0.0175))
     known.add(far)

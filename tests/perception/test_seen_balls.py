@@ -29,8 +29,7 @@ def seen_in(depth: np.ndarray, noise: float = 0.0, border: int = 0, radius: floa
 
 
 def returns(depth: np.ndarray, ball: np.ndarray, radius: float, more: int) -> np.ndarray | None:
-    """The pixels that a ball projects to, computed from points on its surface; None if some are outside of the
-    image."""
+    """The pixels that a ball projects to, computed from points on its surface; None if some are outside of the image."""
     ways = RNG.standard_normal((400, 3))
     points = (ball + radius * ways / np.linalg.norm(ways, axis=1)[:, None] - T[:3, 3]) @ T[:3, :3]
     fx, fy, cx, cy = INTRINSICS
@@ -112,8 +111,7 @@ def test_balls_cover_the_spheres_of_a_link_without_meshes() -> None:
     ways = RNG.standard_normal((200, 3))
     ways /= np.linalg.norm(ways, axis=1)[:, None]
     spheres = bare.spheres["panda_hand"]
-    points = spheres[:, None, :3] + spheres[:, None, 3:] * ways
-    check_covered(bare, {"panda_hand": points.reshape(-1, 3)})
+    check_covered(bare, {"panda_hand": (spheres[:, None, :3] + spheres[:, None, 3:] * ways).reshape(-1, 3)})
 
 
 def check_covered(robot: rd.Robot, points: dict[str, np.ndarray]) -> None:

@@ -72,13 +72,11 @@ def test_the_scene_is_what_is_known_and_what_was_seen() -> None:
     assert [shape.name for shape in problem.scene.shapes] == ["floor", "seen"]
     assert problem.known_scene.shapes == (floor,)
     assert len(replace(problem, unknown="occupied").scene.shapes) == 2
-    known = rd.Problem(PANDA, rd.Scene([BALL]), START, GOAL, views=[view(BALL_ROW)])
-    assert known.scene.shapes == (BALL,)
+    assert rd.Problem(PANDA, rd.Scene([BALL]), START, GOAL, views=[view(BALL_ROW)]).scene.shapes == (BALL,)
 
 
 def test_points_that_an_end_is_near_are_bare() -> None:
-    """A goal close to an obstacle stays valid: the radius that is added to points for safety must not make it
-    invalid."""
+    """A goal close to an obstacle stays valid: the radius that is added to points for safety must not make it invalid."""
     sphere = placed_spheres(PANDA, GOAL)[-1]
     near = np.array([[sphere[0] + sphere[3] + 0.105, *sphere[1:3], 0.1]])
     problem = rd.Problem(PANDA, rd.Scene(), START, GOAL, views=[view(near)])
@@ -108,15 +106,13 @@ def test_what_is_refused() -> None:
 
 def test_what_the_arm_holds_is_not_seen_as_an_obstacle() -> None:
     held = PANDA.attach(rd.Box([0, 0, 0.2], [0.1, 0.1, 0.15], name="parcel"), "panda_hand")
-    spheres = placed_spheres(held, START)
-    alone = rd.DepthView(picture(spheres), K, T)
+    alone = rd.DepthView(picture(placed_spheres(held, START)), K, T)
     assert not len(shown.seen_points([alone], held, START))
     assert len(shown.seen_points([alone], PANDA, START)), "the bare arm sees the parcel"
 
 
 def test_points_of_a_pose_that_may_be_off_are_larger_and_leave_start_and_goals_free() -> None:
-    """Regression: checks enlarge large points further, so starts were in collision with points that do not
-    touch the arm."""
+    """Regression: checks enlarge large points further, so starts were in collision with points that do not touch the arm."""
     error = 0.04
     spheres = placed_spheres(PANDA, START)
     rng = np.random.default_rng(0)
@@ -130,8 +126,7 @@ def test_points_of_a_pose_that_may_be_off_are_larger_and_leave_start_and_goals_f
     apart = points[distances.min(axis=1) > 0]
     outside = shown.point_shapes(apart, PANDA, rd.Scene([]), START, START[None], errors[: len(apart)])
     assert CollisionChecker(PANDA, rd.Scene(outside)).free(START[None])[0]
-    noise = errors[:, ::-1] / shown.END_SPREADS
-    noisy = shown.point_shapes(points, PANDA, rd.Scene([]), START, START[None], noise)
+    noisy = shown.point_shapes(points, PANDA, rd.Scene([]), START, START[None], errors[:, ::-1] / shown.END_SPREADS)
     assert {shape.point_radius for shape in noisy} == {shown.POINT_RADIUS, shown.MIN_POINT_RADIUS}
     assert sum(len(shape.points) for shape in noisy) == len(kept), "noise may put points of the arm this deep"
 
@@ -145,8 +140,7 @@ def test_each_point_is_larger_by_what_its_own_view_may_be_off() -> None:
     shapes = shown.point_shapes(points, PANDA, rd.Scene([]), START, START[None], errors)
     single = points.astype(np.float32)
     for shape in shapes:
-        of_shape = np.isin(single, shape.points.astype(np.float32)).all(axis=1)
-        own = errors[of_shape, 0]
+        own = errors[np.isin(single, shape.points.astype(np.float32)).all(axis=1), 0]
         grown = shape.point_radius - shown.POINT_RADIUS
         assert len(own) == len(shape.points)
         assert grown - shown.ERROR_STEP < own.min() and own.max() <= grown + 1e-9

@@ -39,8 +39,7 @@ def test_confidence_follows_from_the_risk_or_is_the_rate_of_the_assumption() -> 
     likely = np.full(FINE_SHAPE, 0.01, np.float32)
     stated = confidence("predicted, p > 0.1", CrossedSpace(VOXELS, likely))
     assert np.isclose(stated, probability_free(0.01 * VOXELS.sum(), ONE_VIEW), rtol=1e-4)
-    half_lost = CrossedSpace(VOXELS, likely, lost_share=0.5)
-    assert confidence("predicted, p > 0.1", half_lost) == stated / 2
+    assert confidence("predicted, p > 0.1", CrossedSpace(VOXELS, likely, lost_share=0.5)) == stated / 2
     assert all(confidence(name, CrossedSpace(VOXELS, None)) == rate for name, rate in RATES.items())
 
 

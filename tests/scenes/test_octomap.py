@@ -81,8 +81,7 @@ def test_a_height_map_is_an_obstacle_with_holes(tmp_path: Path) -> None:
     heights[0, 0] = np.nan
     np.save(tmp_path / "terrain.npy", heights)
     entry = {"height_map": {"file": str(tmp_path / "terrain.npy"), "cell": 0.1, "xyz": [-1, -1, -0.1]}}
-    record = {"robot": "panda", "scene": [entry], "start": "ready", "goal": "ready"}
-    problem = problem_from_record(record)
+    problem = problem_from_record({"robot": "panda", "scene": [entry], "start": "ready", "goal": "ready"})
     [terrain] = problem.scene.shapes
     assert isinstance(terrain, rd.HeightMap) and len(terrain.mesh.faces) == 2 * (20 * 20 - 1)
     np.testing.assert_allclose(terrain.bounds, [[-1, -1, -0.1], [1, 1, 0.2]])

@@ -1,17 +1,25 @@
-"""Scenes packed in arrays: round trips, floors stored separately."""
+"""Scenes packed in arrays: round trips, floors stored separately; clouds made of them in batches lie on the surfaces and are
+uniform by area."""
 
 import numpy as np
 import pytest
+import torch
+from numpy import ndarray
 
+import robotdiffuse as rd
 from helpers.refusals import refuses
 from robotdiffuse import Box, Capsule, Cylinder, Scene
+from robotdiffuse.core.transforms import rotation_from_quaternion
+from robotdiffuse.datasets.surface_clouds import surface_clouds
+from robotdiffuse.learning.training.batches import random_scenes
 from robotdiffuse.problems.families.rop import ROP_DENSE
-from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
+from robotdiffuse.scenes.surface_points import PANDA_REGION
 
 FLOOR = Box([0, 0, -0.05], [2, 2, 0.1], name="floor")
 
 
-def some_scenes(n: int, seed: int = 5) -> list[Scene]:
+def dense_scenes(n: int, seed: int = 5) -> list[Scene]:
     """Dense scenes with a floor, with all boxes turned at random."""
     rng = np.random.default_rng(seed)
     scenes = []
@@ -24,7 +32,7 @@ def some_scenes(n: int, seed: int = 5) -> list[Scene]:
 
 @pytest.mark.parametrize("floor", [True, False])
 def test_scenes_come_back(floor: bool) -> None:
-    scenes = some_scenes(4)
+    scenes = dense_scenes(4)
     packed = PackedScenes.pack(scenes, 13, floor)
     assert packed.kinds.shape == (4, 13) and packed.params.shape == (4, 13, 10)
     back = [packed.scene(i) for i in range(4)]
@@ -40,7 +48,7 @@ def test_scenes_come_back(floor: bool) -> None:
 
 
 def test_rows_and_parts() -> None:
-    scenes = some_scenes(5)
+    scenes = dense_scenes(5)
     packed = PackedScenes.pack(scenes, 12, floor=True)
     parts = PackedScenes.joined([packed[3:], packed[np.array([0, 2, 1])]])
     assert len(parts) == 5
@@ -56,8 +64,88 @@ def test_rows_and_parts() -> None:
 
 
 def test_what_cannot_be_packed() -> None:
-    (scene,) = some_scenes(1)
+    (scene,) = dense_scenes(1)
     refuses("2 slots", PackedScenes.pack, [scene], 2)
     refuses("cylinder", PackedScenes.pack, [Scene([Cylinder([0, 0, 0], 1, 1)])], 2)
     for floor in (Capsule([0, 0, 0], 1, 1), Box([0, 0, 0], [1, 1, 1], [1, 1, 0, 0])):
         refuses(f"is a {floor.kind}; it must be a box without rotation", PackedScenes.pack, [Scene([floor])], 2, floor=True)
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def some_scenes(n: int, k: int, seed: int = 0):
+    rng = np.random.default_rng(seed)
+    drawn = random_scenes(n, k, rng)
+    return PackedScenes(np.pad(drawn.kinds, [(0, 0), (1, 1)]), np.pad(drawn.params, [(0, 0), (1, 1), (0, 0)]))
+
+
+def depths(kinds: ndarray, params: ndarray, points: ndarray) -> ndarray:
+    """Depth [m, 3] of each point inside each shape [k] of a scene [m], negative outside, computed by hand."""
+    out = np.full((len(kinds), len(points)), -np.inf)
+    for i, (kind, row) in enumerate(zip(kinds, params.astype(np.float64), strict=True)):
+        local = points - row[:3]
+        if kind == SPHERE:
+            out[i] = row[3] - np.linalg.norm(local, axis=1)
+        elif kind == BOX:
+            local = local @ rotation_from_quaternion(row[6:])
+            out[i] = (row[3:6] / 2 - np.abs(local)).min(1)
+    return out
+
+
+def test_points_lie_on_surfaces():
+    scenes = some_scenes(60, 6)
+    clouds, again, other = (surface_clouds(scenes, 200, seeded(seed)) for seed in (0, 0, 1))
+    assert clouds.shape == (60, 200, 3) and torch.equal(clouds, again) and not torch.equal(clouds, other)
+    for scene in zip(scenes.kinds, scenes.params, clouds.double().numpy(), strict=True):
+        if not scene[0].any():
+            assert not scene[2].any()
+        else:
+            # float32 of coordinates of up to 1.5 m
+            np.testing.assert_allclose(np.abs(depths(*scene)).min(0), 0, atol=1e-6)
+    near = surface_clouds(scenes, 200, seeded(), region=PANDA_REGION).numpy()
+    assert PANDA_REGION.holds(near[near.any((1, 2))]).all() and near.any((1, 2)).sum() > 20
+
+
+def test_uniform_by_area():
+    kinds = np.array([[0, BOX, SPHERE]], np.int8)
+    params = np.zeros((1, 3, 10), np.float32)
+    params[0, 1] = [0.5, -0.3, 0.4, 0.2, 0.5, 0.3, 0.5, 0.5, -0.5, 0.5]
+    params[0, 2, :4] = [-0.4, 0.2, 0.6, 0.15]
+    n = 40_000
+    cloud = surface_clouds(PackedScenes(kinds, params), n, seeded())[0].double().numpy()
+    row = params[0, 1].astype(np.float64)
+    local = (cloud - row[:3]) @ rotation_from_quaternion(row[6:]) / (row[3:6] / 2)
+    on_box = np.isclose(np.abs(local).max(1), 1, atol=1e-5)
+    x, y, z = row[3:6]
+    areas = np.repeat([y * z, x * z, x * y], 2)
+    faces = [(np.isclose(local[:, a], s, atol=1e-5) & on_box).mean() for a in range(3) for s in (-1, 1)]
+    np.testing.assert_allclose(faces, areas / (areas.sum() + 4 * np.pi * 0.15**2), atol=4 * np.sqrt(0.25 / n))
+    for axis in range(3):  # even on the faces: second and third moments of a uniform number
+        on = local[on_box & (np.abs(local[:, axis]) < 0.9999), axis]
+        np.testing.assert_allclose([(on**2).mean(), on.mean()], [1 / 3, 0], atol=4 / np.sqrt(len(on)))
+    heights = (cloud[~on_box] - params[0, 2, :3]) / 0.15
+    np.testing.assert_allclose(heights.mean(0), 0, atol=4 / np.sqrt(3 * len(heights)))
+    np.testing.assert_allclose(heights.T @ heights / len(heights), np.eye(3) / 3, atol=0.015)
+
+
+def test_ordered_clouds_are_the_same_points():
+    scenes = some_scenes(30, 4, 2)
+    loose = surface_clouds(scenes, 300, seeded()).numpy()
+    for a, b in zip(loose, surface_clouds(scenes, 300, seeded(), ordered=True).numpy(), strict=True):
+        assert (np.lexsort(b.T[::-1]) == np.arange(300)).all()
+        steps = 1e-6 * np.abs(a).max() + 1e-7
+        for axis in range(3):
+            np.testing.assert_allclose(np.sort(b[:, axis]), np.sort(a[:, axis]), atol=2 * steps)
+
+
+def test_nothing_to_draw():
+    floor = rd.Scene([rd.Box([0, 0, -0.05], [2, 2, 0.1])])
+    nothing = PackedScenes.pack([floor] * 3, 4, floor=True)
+    assert not surface_clouds(nothing, 5, seeded()).any()
+    assert surface_clouds(PackedScenes.pack([floor] * 3, 0, floor=True), 5, seeded()).shape == (3, 5, 3)
+    assert surface_clouds(nothing[:0], 5, seeded()).shape == (0, 5, 3)
+    out_of_reach = PackedScenes.pack([rd.Scene([]), rd.Scene([rd.Sphere([5, 0, 0.5], 0.2)]), floor], 4)
+    assert not surface_clouds(out_of_reach, 5, seeded(), region=PANDA_REGION, ordered=True).any()
+    assert surface_clouds(out_of_reach, 5, seeded())[1].any()

@@ -14,6 +14,7 @@ from numpy import ndarray
 from trimesh.triangles import closest_point
 
 import robotdiffuse as rd
+from helpers.point_files import FORMS, PCD, lzf_packed, write_points
 from helpers.refusals import refuses
 from helpers.sphere_oracles import distance
 from robotdiffuse.core.mesh_files import read_triangles
@@ -107,8 +108,7 @@ def test_surface_is_shared_by_area_and_seeded() -> None:
 def test_surface_keeps_to_the_region() -> None:
     region = VisibleRegion()
     floor = rd.Box([0, 0, -0.05], [2, 2, 0.1])
-    table = rd.Box([1.5, 0, 0.4], [4.0, 4.0, 0.02])
-    points = sample_surface(rd.Scene([floor, table]), 512, np.random.default_rng(4))
+    points = sample_surface(rd.Scene([floor, rd.Box([1.5, 0, 0.4], [4.0, 4.0, 0.02])]), 512, np.random.default_rng(4))
     assert len(points) == 512 and (points[:, 2] > region.floor).all()
     assert (np.linalg.norm(points - region.center, axis=1) < region.reach).all()
 
@@ -154,8 +154,7 @@ def test_distinct_points_are_the_first_of_each_in_the_old_order(points: np.ndarr
 def test_thinning_keeps_one_point_of_each_cell(rows: list[tuple[float, float, float]], voxel: float) -> None:
     points = np.array(rows, np.float64).reshape(-1, 3)
     kept = voxel_thin(points, voxel)
-    cells = np.floor(points * (1 / voxel))
-    assert len(kept) == len(np.unique(cells, axis=0))
+    assert len(kept) == len(np.unique(np.floor(points * (1 / voxel)), axis=0))
     assert len(np.unique(np.floor(kept * (1 / voxel)), axis=0)) == len(kept)
     if len(points):
         gap = np.linalg.norm(points[:, None] - kept, axis=2).min(axis=1)
@@ -164,68 +163,12 @@ def test_thinning_keeps_one_point_of_each_cell(rows: list[tuple[float, float, fl
 
 
 def test_thinning_of_points_far_apart_and_crop() -> None:
-    points = np.array([[-1e9, 0, 0], [1e9, 5e8, 1e9], [1e9, 5e8, 1e9], [0, 0, 0]])
-    assert len(voxel_thin(points, 1e-3)) == 3
+    assert len(voxel_thin(np.array([[-1e9, 0, 0], [1e9, 5e8, 1e9], [1e9, 5e8, 1e9], [0, 0, 0]]), 1e-3)) == 3
     row = np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]])
     assert (crop(row, np.array([1.0, 0, 0]), 1.0) == row[:2]).all()
 
 
 POINTS = np.random.default_rng(7).uniform(-1, 1, (50, 3)).astype(np.float32).astype(np.float64)
-PCD = """# .PCD v0.7
-VERSION 0.7
-FIELDS rgb x y z _
-SIZE 4 4 4 4 1
-TYPE U F F F U
-COUNT 1 1 1 1 4
-WIDTH {n}
-HEIGHT 1
-VIEWPOINT 0 0 0 1 0 0 0
-POINTS {n}
-DATA {data}
-"""
-
-
-def ply(points: ndarray, binary: bool) -> bytes:
-    kind = "binary_little_endian" if binary else "ascii"
-    header = f"ply\nformat {kind} 1.0\nelement vertex {len(points)}\n"
-    header += "property float x\nproperty float y\nproperty float z\nend_header\n"
-    rows = points.astype("<f4").tobytes() if binary else text(points, " ")
-    return header.encode() + rows
-
-
-def pcd(points: ndarray, storage: str) -> bytes:
-    header = PCD.format(n=len(points), data=storage).encode()
-    if storage == "ascii":
-        return header + "".join(f"7 {x!r} {y!r} {z!r} 0 0 0 0\n" for x, y, z in points.tolist()).encode()
-    record = np.zeros(len(points), np.dtype([("rgb", "<u4"), ("xyz", "<f4", 3), ("_", "u1", 4)]))
-    record["xyz"] = points
-    if storage == "binary":
-        return header + record.tobytes()
-    columns = [record["rgb"], *record["xyz"].T, record["_"]]
-    content = b"".join(np.ascontiguousarray(column).tobytes() for column in columns)
-    packed = lzf_packed(content)
-    return header + struct.pack("<II", len(packed), len(content)) + packed
-
-
-def lzf_packed(content: bytes) -> bytes:
-    """Data in LibLZF's format: literal bytes, and repetitions of earlier bytes, which may overlap."""
-    out = bytearray()
-    at = 0
-    while at < len(content):
-        limit = min(len(content) - at, 264)
-        start = content.rfind(content[at : at + 3], max(at - 8192, 0), at + 2) if limit >= 3 else -1
-        if start < 0:
-            out += bytes([0, content[at]])
-            at += 1
-            continue
-        length = 3
-        while length < limit and content[start + length] == content[at + length]:
-            length += 1
-        away = at - start - 1
-        long = [length - 9] if length >= 9 else []
-        out += bytes([min(length - 2, 7) << 5 | away >> 8, *long, away & 255])
-        at += length
-    return bytes(out)
 
 
 @given(st.lists(st.sampled_from([b"a", b"bc", b"abcd", b"x" * 300, bytes(range(200))]), max_size=60))
@@ -244,35 +187,6 @@ def test_packed_data_of_hostile_sizes() -> None:
         lzf_unpacked(bomb, 100)
     with pytest.raises(ValueError, match="before the beginning"):
         lzf_unpacked(bytes([0, 7, 0x20, 200]), 100)
-
-
-def text(points: ndarray, delimiter: str, header: str = "") -> bytes:
-    return (header + "".join(delimiter.join(map(repr, row)) + "\n" for row in points.tolist())).encode()
-
-
-def write_points(folder: Path, form: str, points: ndarray) -> Path:
-    file = folder / f"cloud.{form.split()[0]}"
-    swapped = text(points[:, ::-1], ",", "z, y, x\n")
-    match form:
-        case "npy":
-            np.save(file, points)
-        case "npz":
-            np.savez(file, points=points, colors=points)
-        case "ply ascii" | "ply binary":
-            file.write_bytes(ply(points, form.endswith("binary")))
-        case "pcd ascii" | "pcd binary" | "pcd binary_compressed":
-            file.write_bytes(pcd(points, form.split()[1]))
-        case "csv":
-            file.write_bytes(text(points, ","))
-        case "csv with names":
-            file.write_bytes(swapped)
-        case "xyz":
-            file.write_bytes(text(np.column_stack([points, points]), " ", "# made by hand\n"))
-    return file
-
-
-PCD_FORMS = ["pcd ascii", "pcd binary", "pcd binary_compressed"]
-FORMS = ["npy", "npz", "ply ascii", "ply binary", *PCD_FORMS, "csv", "csv with names", "xyz"]
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -101,12 +101,10 @@ async def never(scope: Any, receive: Any, send: Any) -> None:
 
 
 def talked(application: Any, *sent: bytes, stuck: bool = False) -> tuple[bytes, bool, Any]:
-    """The bytes that a connection wrote in 0.2 s after it got these bytes, whether it closed itself, and its
-    state."""
+    """The bytes that a connection wrote in 0.2 s after it got these bytes, whether it closed itself, and its state."""
 
     async def talk() -> tuple[bytes, bool, Any]:
-        config = Config(application, interface="asgi3", lifespan="off", log_level="critical")
-        made = Connection(config, ServerState(), {})
+        made = Connection(Config(application, interface="asgi3", lifespan="off", log_level="critical"), ServerState(), {})
         transport = Transport()
         transport.connection = made
         made.connection_made(transport)
@@ -151,24 +149,21 @@ def test_slow_clients_are_answered_and_disconnected(
 
 def test_nothing_is_written_after_a_refusal() -> None:
     """Regression: h11 raised LocalProtocolError for a damaged chunk just before the application answered."""
-    head = b"POST / HTTP/1.1\r\nHost: a\r\nTransfer-Encoding: chunked\r\n\r\n0x5\r\n"
-    written, _, state = talked(slow, head)
+    written, _, state = talked(slow, b"POST / HTTP/1.1\r\nHost: a\r\nTransfer-Encoding: chunked\r\n\r\n0x5\r\n")
     assert written.startswith(b"HTTP/1.1 400") and b"late" not in written
     assert state in (h11.MUST_CLOSE, h11.CLOSED, h11.DONE)
 
 
 @pytest.mark.parametrize("head", [b"HTTP/1.0\r\n", b"HTTP/1.1\r\nHost: a\r\nConnection: close\r\n"])
 def test_bytes_after_the_last_request_do_not_cut_its_answer_off(head: bytes) -> None:
-    """Regression: these bytes were refused as not HTTP, and the connection was closed before the body was
-    written."""
+    """Regression: these bytes were refused as not HTTP, and the connection was closed before the body was written."""
     written, closed, _ = talked(slow, b"POST / " + head + b"Content-Length: 2\r\n\r\n{}]]", b"]]]]")
     assert written.startswith(b"HTTP/1.1 200") and b"late" in written and closed
 
 
 def test_a_cancelled_call_is_left_before_it_begins_and_when_it_checks_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Regression: a call that was canceled while its worker still read it went on planning, and the worker was
-    killed. A signal handler raised the exception anywhere in the call; inside a callback of compiled code it
-    killed the worker."""
+    """Regression: a call that was canceled while its worker still read it went on planning, and the worker was killed. A signal
+    handler raised the exception anywhere in the call; inside a callback of compiled code it killed the worker."""
     worker.accept({}, ServeSettings())
     answers = iter([True])
     monkeypatch.setattr(worker, "cancelled", lambda: next(answers))
@@ -202,8 +197,7 @@ def test_the_work_for_a_body_in_pieces_grows_with_their_number() -> None:
     pieces = [Piece(b"x") for _ in range(300)]
 
     async def receive() -> dict[str, Any]:
-        body = pieces.pop()
-        return {"type": "http.request", "body": body, "more_body": bool(pieces)}
+        return {"type": "http.request", "body": pieces.pop(), "more_body": bool(pieces)}
 
     scope = {"type": "http", "method": "POST", "headers": [(b"content-type", JSON.encode())]}
     pool = WorkerPool({}, ServeSettings(max_request_size=300))

@@ -20,7 +20,7 @@ import pytest
 
 import robotdiffuse as rd
 from helpers import waiting
-from helpers.commands import run
+from helpers.commands import Said
 from helpers.planners import DIES, EATS, EXITS, HANGS, KEEPS, RAISES, SEARCHES
 from helpers.refusals import refuses
 from helpers.serving import serving
@@ -159,8 +159,7 @@ def test_a_batch_is_answered_line_by_line_in_order(server: httpx.Client) -> None
 )
 def test_wrong_requests_are_one_line(server: httpx.Client, path: str, body: Any, code: int, message: str) -> None:
     """Regression: 5,000 constraints kept a worker busy for 29 s."""
-    content = body if isinstance(body, bytes) else json.dumps(body)
-    answer = server.post(path, content=content, headers=JSON)
+    answer = server.post(path, content=body if isinstance(body, bytes) else json.dumps(body), headers=JSON)
     assert answer.status_code == code and re.search(message, error(answer))
 
 
@@ -319,8 +318,7 @@ def test_a_worker_that_holds_too_much_memory_is_replaced_between_requests(server
 def test_it_stops_gracefully_and_leaves_no_worker() -> None:
     with serving("--workers", "1", "--max-time-limit", "60") as (client, process), ThreadPoolExecutor(2) as threads:
         workers = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True).stdout
-        slow = asked(planner="aorrtc", time_limit=2.0, until="time_limit")
-        first = threads.submit(client.post, "/plan", json=slow)
+        first = threads.submit(client.post, "/plan", json=asked(planner="aorrtc", time_limit=2.0, until="time_limit"))
         until(lambda: gauge(client, "workers_busy") == 1)
         second = threads.submit(client.post, "/plan", json=asked())
         until(lambda: gauge(client, "requests_waiting") == 1)
@@ -333,9 +331,8 @@ def test_it_stops_gracefully_and_leaves_no_worker() -> None:
         until(lambda: not any(os.path.exists(f"/proc/{worker}") for worker in workers.split()))
 
 
-def test_a_server_for_other_machines_needs_a_token_and_logs_each_request(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("serve", "--host", "0.0.0.0", "--port", "0") == 2
-    assert "ROBOTDIFFUSE_TOKEN" in capsys.readouterr().err
+def test_a_server_for_other_machines_needs_a_token_and_logs_each_request(said: Said) -> None:
+    assert "ROBOTDIFFUSE_TOKEN" in said(2, "serve", "--host", "0.0.0.0", "--port", "0")
     elsewhere = ("--workers", "1", "--host", "0.0.0.0")
     with serving(*elsewhere, stderr=subprocess.PIPE, ROBOTDIFFUSE_TOKEN="open sesame") as (client, process):
         told = {"Authorization": "Bearer open sesame"}
@@ -352,9 +349,8 @@ def test_a_server_for_other_machines_needs_a_token_and_logs_each_request(capsys:
     assert re.search(r" 127\.0\.0\.1:\d+ GET /nothing%0Ahere 404 \d+\.\d{3} s -$", nothing)
 
 
-def test_an_address_in_use_is_one_line(server: httpx.Client, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("serve", "--port", server.base_url.port) == 2
-    assert "cannot listen on 127.0.0.1" in capsys.readouterr().err
+def test_an_address_in_use_is_one_line(server: httpx.Client, said: Said) -> None:
+    assert "cannot listen on 127.0.0.1" in said(2, "serve", "--port", server.base_url.port)
 
 
 def test_robots_named_at_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path as FilePath
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -12,9 +13,9 @@ from dataclasses import replace
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm, box_mesh
-from helpers.commands import python
+from helpers.commands import Said, python
 from helpers.example_robots import example_robot
-from robotdiffuse.cli import main
+from helpers.refusals import refuses
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.robots.robot import ConvexMesh
 from robotdiffuse.simulation import PyBulletOracle, ReplaySettings, replay, world
@@ -78,8 +79,7 @@ def test_contact_is_reported_where_the_motion_runs_into_an_obstacle() -> None:
     assert (contact.link, contact.other) == ("l3", "sphere")
     assert contact.time == pytest.approx(run.times[int(first.at)], abs=0.02)
     assert -0.001 <= contact.depth < 0.05 and run.max_errors[0] > 0.1
-    apart = rd.Scene([rd.Sphere([0.9, 0.55, 0.25], 0.15)])
-    assert replay(robot, apart, trajectory).free
+    assert replay(robot, rd.Scene([rd.Sphere([0.9, 0.55, 0.25], 0.15)]), trajectory).free
 
 
 def test_links_that_touch_each_other_are_reported() -> None:
@@ -100,12 +100,10 @@ def test_skew_axes_sliding_joints_and_a_branch() -> None:
 
 def test_what_cannot_be_replayed() -> None:
     robot = box_arm()
-    trajectory = motion(robot, np.zeros(3), np.ones(3))
-    with pytest.raises(rd.InputError, match="the trajectory moves a, b, c; planar plans j0, j1, j2"):
-        replay(robot, rd.Scene(), replace(trajectory, joint_names=("a", "b", "c")))
+    renamed = replace(motion(robot, np.zeros(3), np.ones(3)), joint_names=("a", "b", "c"))
+    refuses("the trajectory moves a, b, c; planar plans j0, j1, j2", replay, robot, rd.Scene(), renamed)
     for name, value in (("time_step", 0.01), ("force", -1.0), ("gravity", np.nan)):
-        with pytest.raises(rd.InputError, match=f"replay.{name} is {value}"):
-            ReplaySettings(**{name: value})
+        refuses(f"replay.{name} is {value}", ReplaySettings, **{name: value})
 
 
 def result_file(folder: FilePath, scene: rd.Scene) -> str:
@@ -123,42 +121,34 @@ def test_importing_pybullet_without_standard_output() -> None:
 
 
 def test_a_world_that_fails_to_load_leaves_no_simulation(monkeypatch: pytest.MonkeyPatch) -> None:
-    def failing(*_: object) -> None:
-        raise OSError("no space left")
-
     clients: list[int] = []
     connect = world.pybullet.connect
     monkeypatch.setattr(world.pybullet, "connect", lambda mode: clients.append(connect(mode)) or clients[0])
-    monkeypatch.setattr(world, "write_urdf", failing)
+    monkeypatch.setattr(world, "write_urdf", Mock(side_effect=OSError("no space left")))
     with pytest.raises(OSError, match="no space left"):
         world.World(box_arm(), rd.Scene())
     assert not world.pybullet.isConnected(clients[0])
 
 
-def test_command(tmp_path: FilePath, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command(tmp_path: FilePath, said: Said) -> None:
     file = result_file(tmp_path, rd.Scene([rd.Sphere([0.0, 0.9, 0.6], 0.1)]))
-    assert main(["simulate", file]) == 0
-    printed = capsys.readouterr().out
+    printed = said(0, "simulate", file)
     assert "panda: free" in printed and "panda_joint7" in printed and "mrad" in printed
-    assert main(["simulate", file, "--out", str(tmp_path / "film.avi")]) == 2
-    assert "known: .html, .png" in capsys.readouterr().err
-    assert main(["simulate", file, "--out", str(tmp_path / "page.html")]) == 0
+    assert "known: .html, .png" in said(2, "simulate", file, "--out", tmp_path / "film.avi")
+    said(0, "simulate", file, "--out", tmp_path / "page.html")
     assert "panda_joint7" in (tmp_path / "page.html").read_text("utf-8")
     end = rd.load_robot("panda").fk(PANDA_START + 0.2, "panda_hand")[:3, 3]
     file = result_file(tmp_path, rd.Scene([rd.Sphere(end, 0.05)]))
-    assert main(["simulate", file]) == 1
-    printed = capsys.readouterr().out
+    printed = said(1, "simulate", file)
     assert "panda: contact" in printed and "panda_hand" in printed and "sphere" in printed
 
 
-def test_command_without_pybullet(
-    tmp_path: FilePath, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_without_pybullet(tmp_path: FilePath, monkeypatch: pytest.MonkeyPatch, said: Said) -> None:
     file = result_file(tmp_path, rd.Scene())
     for name in [name for name in sys.modules if name.startswith("robotdiffuse.simulation")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "pybullet", None)
-    assert main(["simulate", file]) == 2 and 'pip install "robotdiffuse[sim]"' in capsys.readouterr().err
+    assert 'pip install "robotdiffuse[sim]"' in said(2, "simulate", file)
 
 
 def test_moving_obstacles_are_contacts_where_the_validator_refuses_the_motion() -> None:

@@ -1,4 +1,4 @@
-"""Timing: limits hold, motions begin and end at rest, and they stay on the path or its checked rounded corners."""
+"""Timing: limits hold, motions begin and end at rest, and stay on the path or its checked rounded corners; times of lines."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,6 +10,7 @@ import pytest
 import toppra
 from hypothesis import example, given
 from hypothesis import strategies as st
+from scipy.optimize import linprog
 
 import robotdiffuse as rd
 from helpers.refusals import refuses
@@ -17,6 +18,7 @@ from robotdiffuse.planning.reactive.timed_path import TimedPath
 from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.trajectories import speed_limits, timing_kernel
 from robotdiffuse.trajectories.speed_limits import MIN_JERK, TimingSettings, symmetric_bounds, timing_grid
+from robotdiffuse.trajectories.straight_line import straight_line_time
 from robotdiffuse.trajectories.timing import SAME_WAYPOINT_DISTANCE, time_parameterize
 from robotdiffuse.trajectories.timing_kernel import BLEND_DEVIATION, RoundedLine, rounded_line
 from robotdiffuse.validation.rates import rate_violations
@@ -114,16 +116,14 @@ def test_limits_rest_and_geometry(seed: int, count: int, scale: float, settings:
         q[:, :6] = 0
     elif kind == "steps of all sizes":  # toppra failed on steps below 1e-6 among long ones
         q = q[0] + 10 ** rng.uniform(-9, 0, (count, 1)) * q
-    valid = (lambda _: rng.random() < 0.5) if seed % 2 else always
-    check(q, timed(q, valid, settings=settings), settings)
+    check(q, timed(q, (lambda _: rng.random() < 0.5) if seed % 2 else always, settings=settings), settings)
 
 
 def test_one_joint_against_the_closed_form() -> None:
     """Bang-bang: 2 sqrt(d / a) below the velocity limit, d / v + v / a above it."""
     robot = arm((2.0,), (8.0,))
     for d, expected in ((0.125, 2 * np.sqrt(0.125 / 8)), (3.0, 3.0 / 2 + 2.0 / 8)):
-        t = timed([[0.0], [d]], settings=NO_JERK_LIMIT, robot=robot)
-        assert t.duration == pytest.approx(expected, rel=0.01)
+        assert timed([[0.0], [d]], settings=NO_JERK_LIMIT, robot=robot).duration == pytest.approx(expected, rel=0.01)
 
 
 def test_path_of_length_zero_is_two_rows_at_rest() -> None:
@@ -173,8 +173,7 @@ def test_blend_reaches_the_deviation_and_is_twice_differentiable() -> None:
     assert line.half_widths[0] * BLEND_DEVIATION * np.sqrt(2) == pytest.approx(0.05)
     s = np.linspace(0, line.length, 20001)
     for order in (0, 1):
-        slope = np.gradient(line(s, order), s, axis=0)[1:-1]
-        assert np.abs(slope - line(s, order + 1)[1:-1]).max() < 2e-3
+        assert np.abs(np.gradient(line(s, order), s, axis=0)[1:-1] - line(s, order + 1)[1:-1]).max() < 2e-3
 
 
 @given(
@@ -213,8 +212,7 @@ def test_a_limit_of_jerk_is_kept_with_the_others(seed: int, count: int, jerk: fl
 def test_a_motion_from_a_start_velocity_keeps_all_limits_and_need_not_stop(
     seed: int, jerk: float, scale: float, ratio: float
 ) -> None:
-    """Checks velocities, accelerations and jerks every ms, first along a straight line and then around a
-    corner."""
+    """Checks velocities, accelerations and jerks every ms, first along a straight line and then around a corner."""
     robot = arm()
     rng = np.random.default_rng(seed)
     settings = TimingSettings(jerk=jerk, velocity_scale=scale, acceleration_scale=scale)
@@ -299,13 +297,11 @@ def test_the_estimated_time_is_near_the_exact_one(seed: int, narrow: float) -> N
     """Regression: the estimate was 7 % too short where a rounded corner began just after the start."""
     rng = np.random.default_rng(seed)
     q = np.cumsum(rng.normal(0, 0.4, (rng.integers(3, 8), 7)), axis=0)
-    deviations = 10 ** rng.uniform(-2, 0, len(q) - 2)
-    line = rounded_line(q, deviations)
+    line = rounded_line(q, 10 ** rng.uniform(-2, 0, len(q) - 2))
     line.half_widths[0] *= 1 - narrow
     velocity = rng.uniform(1, 3, 7)
     acceleration = rng.uniform(5, 20, 7)
-    settings = TimingSettings(corner_intervals=16, line_intervals=128)
-    exact = speed_limits.least_time(line, velocity, acceleration, settings)
+    exact = speed_limits.least_time(line, velocity, acceleration, TimingSettings(corner_intervals=16, line_intervals=128))
     assert 0.97 < timing_kernel.estimated_time(line, velocity, acceleration) / exact < 1.1
 
 
@@ -391,8 +387,7 @@ def test_rows_tell_the_acceleration_under_a_high_limit_of_jerk(jerk: float) -> N
 
 
 def test_a_dense_path_is_driven_without_stops() -> None:
-    """Regression: 46 of 46 waypoints of a sampled path were stops, since its rows did not show its
-    accelerations."""
+    """Regression: 46 of 46 waypoints of a sampled path were stops, since its rows did not show its accelerations."""
     rng = np.random.default_rng(3)
     along = np.linspace(0, 1, 48)[:, None]
     q = along * rng.normal(0, 1, 7) + np.sin(np.pi * along) * rng.normal(0, 0.4, 7)
@@ -443,15 +438,72 @@ def test_a_corner_that_its_neighbor_leaves_more_room_is_checked_again() -> None:
         near = corner[np.linalg.norm(corner - q[1], axis=1) < 0.3]
         return distance_to_polyline(corner, q).max() < 0.12 and distance_to_polyline(near, q).max(initial=0) < 0.01
 
-    t = timed(q, keeps=keeps)
-    assert keeps(t.positions)
+    assert keeps(timed(q, keeps=keeps).positions)
 
 
 def test_a_timed_path_is_as_fast_as_its_timing() -> None:
     """Except for the margin that it leaves to the limits, about 4 % of accelerations."""
     robot = rd.load_robot("panda")
-    waypoints = np.array([np.zeros(7), np.full(7, 0.8), np.linspace(0, 1, 7)])
-    line = rounded_line(waypoints, np.array([0.1]))
+    line = rounded_line(np.array([np.zeros(7), np.full(7, 0.8), np.linspace(0, 1, 7)]), np.array([0.1]))
     fastest = speed_limits.time_line(robot, line, TimingSettings())[0][-1]
     found = TimedPath(robot, 0.96 * robot.acceleration, line, True).on_then_rest(0.0, 0.0).duration
     assert found == pytest.approx(fastest, rel=0.05)
+
+
+START = np.zeros(2)
+FAR, NEAR = np.array([3.0, 1.0]), np.array([0.1, -0.05])
+
+
+def test_the_time_of_a_line_by_hand():
+    one = np.ones(2)
+    goals = np.stack([FAR, NEAR, START])
+    expected = [3.0 + 1.0, 2 * np.sqrt(0.1), 0.0]
+    assert np.allclose(straight_line_time(START, goals, one, one), expected)
+    # the slowest joint at each limit decides: times 1 / v, 1 / a of the share of the way
+    assert np.isclose(straight_line_time(START, FAR, np.array([6.0, 0.5]), np.array([3.0, 1.0])), 2.0 + 0.5)
+    # the greatest jerk alone binds in short motions
+    assert np.isclose(straight_line_time(START, NEAR, one, one, one), 4 * np.cbrt(0.05))
+
+
+def test_no_jerk_limit_is_the_limit_of_great_jerk():
+    one = np.ones(2)
+    for goal in (FAR, NEAR):
+        plain = straight_line_time(START, goal, one, one)
+        for jerk in (np.full(2, 1e9), np.full(2, np.inf), np.zeros(2)):
+            assert np.isclose(straight_line_time(START, goal, one, one, jerk), plain, rtol=1e-6)
+
+
+@pytest.mark.parametrize("limits", [(1.0, 2.0, 5.0), (1.0, 2.0, 0.5), (9.0, 0.8, 5.0), (9.0, 9.0, 3.0), (0.2, 5.0, 1.0)])
+def test_the_time_of_a_line_goes_exactly_its_distance(limits):
+    """Compares with the largest distance that an arm can travel within this time, by a linear program in discrete time."""
+    v, a, j = limits
+    time = float(straight_line_time(np.zeros(1), np.ones(1), *(np.array([x]) for x in limits)))
+    n = 200
+    h = time / n
+    to_a = h * np.tril(np.ones((n, n)))
+    before = np.vstack([np.zeros((1, n)), to_a[:-1]])
+    to_v = h * np.tril(np.ones((n, n))) @ ((to_a + before) / 2)
+    to_x = h * to_v.sum(axis=0)
+    rows = np.vstack([to_a, -to_a, to_v])
+    most = np.concatenate([np.full(2 * n, a), np.full(n, v)])
+    best = linprog(-to_x, rows, most, np.stack([to_a[-1], to_v[-1]]), np.zeros(2), bounds=(-j, j))
+    assert -best.fun == pytest.approx(1.0, rel=0.01)  # discrete switching times cost up to a step
+
+
+def test_along_a_line_as_toppra_times_it():
+    v = np.array([1.0, 0.7])
+    a = np.array([2.0, 3.0])
+    for goal in (FAR, NEAR):
+        path = toppra.SplineInterpolator([0.0, 1.0], np.stack([START, goal]))
+        limits = [
+            toppra.constraint.JointVelocityConstraint(np.stack([-v, v], axis=1)),
+            toppra.constraint.JointAccelerationConstraint(np.stack([-a, a], axis=1)),
+        ]
+        grid = np.linspace(0.0, 1.0, 1001)
+        by_toppra = toppra.algorithm.TOPPRA(limits, path, grid, parametrizer="ParametrizeConstAccel")
+        trajectory: Any = by_toppra.compute_trajectory(0, 0)
+        assert straight_line_time(START, goal, v, a) == pytest.approx(trajectory.duration, rel=5e-3)
+
+
+def test_limits_of_a_line_that_are_not_positive_are_refused():
+    refuses("acceleration", straight_line_time, START, FAR, np.ones(2), np.zeros(2))

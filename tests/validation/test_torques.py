@@ -27,14 +27,12 @@ def test_no_torque_leaves_its_chord_by_more_than_its_bound(name: str, step: floa
             torques = dynamics.torques(*pieces.states(piece, np.tile(u, len(bulges))))
             torques = torques.reshape(len(bulges), LOOKS, -1)
             chords = torques[:, :1] + u[:, None] * (torques[:, -1:] - torques[:, :1])
-            off = np.abs(torques - chords).max(axis=1)
-            assert (off <= bulges + 1e-9).all()
+            assert (np.abs(torques - chords).max(axis=1) <= bulges + 1e-9).all()
 
 
 @pytest.mark.parametrize(("effort", "valid"), [(9.70, False), (9.73, True)])
 def test_a_peak_between_two_rows_is_found(effort: float, valid: bool) -> None:
-    """The torque is 9.81 N m when the rod is horizontal, between two rows; the validator allows an excess of 1
-    %."""
+    """The torque is 9.81 N m when the rod is horizontal, between two rows; the validator allows an excess of 1 %."""
     robot = pendulum(effort)
     path = rd.Path(("hinge",), np.array([[0.3], [2.84], [2.9]]))
     problem = rd.Problem(robot, rd.Scene(), path.positions[0], path.positions[-1], payload=rd.Payload(0.0))
@@ -50,8 +48,7 @@ def beyond(effort: float, pieces: Pieces) -> Excess | None:
 
 
 def test_a_peak_between_two_times_is_found() -> None:
-    """At constant velocity, so that only gravity counts. Rows are a second apart, and the rod is horizontal at
-    none of them."""
+    """At constant velocity, so that only gravity counts. Rows are a second apart, and the rod is horizontal at none of them."""
     rows = np.pi / 2 + np.array([[-0.375], [-0.125], [0.125], [0.375]])
     motion = rd.Trajectory(("hinge",), np.arange(4.0), rows, np.full((4, 1), 0.25), np.zeros((4, 1)))
     found = beyond(9.66, trajectory_pieces(motion))
@@ -76,8 +73,7 @@ def test_a_motion_that_winds_on_and_on_is_refused_in_bounded_time() -> None:
 def test_a_motion_of_one_row_is_held() -> None:
     row = np.array([[1.5]])
     still = np.zeros((1, 1))
-    motion = rd.Trajectory(("hinge",), np.zeros(1), row, still, still)
-    for pieces in (static_pieces(row), trajectory_pieces(motion)):
+    for pieces in (static_pieces(row), trajectory_pieces(rd.Trajectory(("hinge",), np.zeros(1), row, still, still))):
         assert beyond(9.0, pieces) and not beyond(10.0, pieces)
 
 
@@ -92,8 +88,7 @@ def test_what_is_proved_holds_at_every_look() -> None:
     panda = rd.load_robot("panda")
     payload = rd.Payload(3.0, [0.0, 0.0, 0.1])
     low = [-0.6, 0.2, 0, -1.2, 0, 2.2, 0.2]
-    far = [0.6, 0.6, 0, -1.0, 0, 2.2, 0.2]
-    problem = rd.Problem(panda, rd.Scene(), low, far, payload=payload)
+    problem = rd.Problem(panda, rd.Scene(), low, [0.6, 0.6, 0, -1.0, 0, 2.2, 0.2], payload=payload)
     motion = rd.plan(problem, time_limit=10.0).trajectory
     assert motion is not None
     dynamics = Dynamics(panda, payload)

@@ -86,8 +86,7 @@ def test_a_thin_wall_between_two_waypoints_is_found(
     wall = rd.Box(reach * vector(np.cos(angle), np.sin(angle), 0), vector(0.2, thickness, 0.5), turn)
     rows = np.zeros((2 + extra, 3))
     rows[:, 0] = np.linspace(-1, 1, len(rows))
-    half = np.arctan2(0.03 + thickness / 2, reach - 0.1)
-    if np.abs(angle - rows[[0, -1], 0]).min() < half:
+    if np.abs(angle - rows[[0, -1], 0]).min() < np.arctan2(0.03 + thickness / 2, reach - 0.1):
         return
     found = refused(validator(rows, wall, robot=box_arm(spheres)), "scene_collision")
     assert found.other == "box"
@@ -118,8 +117,7 @@ def test_the_certificate_agrees_with_dense_sampling(seed: int, count: int) -> No
     hits = exact.collides(q)
     if report.valid:
         assert not hits.any() and report.min_clearance is not None
-        least = min(d.distance for row in q[::50] for d in exact.link_distances(row))
-        assert 0 < report.min_clearance <= least
+        assert 0 < report.min_clearance <= min(d.distance for row in q[::50] for d in exact.link_distances(row))
         return
     found = report.violation
     assert found is not None and found.excess is not None
@@ -169,8 +167,7 @@ def test_self_collision_between_waypoints() -> None:
 def test_meshes_decide_where_spheres_are_too_coarse() -> None:
     shelf = rd.Box(vector(0.6, 0, -0.032 - 0.05), vector(1.5, 1.5, 0.1))
     sides = trimesh.creation.box(shelf.size)
-    surface = rd.Mesh(np.asarray(sides.vertices), np.asarray(sides.faces), shelf.center)
-    for shape in (shelf, surface):
+    for shape in (shelf, rd.Mesh(np.asarray(sides.vertices), np.asarray(sides.faces), shelf.center)):
         report = validator(SWING, shape)
         assert report.min_clearance is not None and 0.001 <= report.min_clearance <= 0.002
     touching = rd.Box(vector(0.6, 0, -0.03005 - 0.05), vector(1.5, 1.5, 0.1))
@@ -187,17 +184,14 @@ def test_limits_start_and_goal() -> None:
     over = np.array([SWING[0], [0, 2.8 + 1e-3, 0], [0, 2.9, 0], SWING[1]])
     found = refused(rd.verify(*problem_and_path(over)), "limits")
     assert (found.subject, found.time) == ("j1", 1.0) and found.excess == pytest.approx(1e-3)
-    hair = np.array([SWING[0], [0, 2.8 + 1e-7, 0.5], SWING[1]])
-    assert rd.verify(*problem_and_path(hair)).valid
+    assert rd.verify(*problem_and_path(np.array([SWING[0], [0, 2.8 + 1e-7, 0.5], SWING[1]]))).valid
     assert refused(rd.verify(*problem_and_path(SWING + vector(1e-4, 0, 0))), "start").time == 0
     found = refused(rd.verify(*problem_and_path(SWING + np.array([[0, 0, 0], [0, 2e-4, 0]]))), "goal")
     assert found.time == 1 and found.excess == pytest.approx(2e-4)
     assert rd.verify(*problem_and_path(SWING + np.array([[0, 0, 0], [0, 5e-5, 0]]))).valid
     problem, path = problem_and_path(SWING)
-    several = rd.JointGoal(np.stack([SWING[0], SWING[1], -SWING[1]]))
-    assert rd.verify(replace(problem, goal=several), path).valid
-    unknown = np.array([[0, 0, 0], [0, 0, np.nan]])
-    assert refused(rd.verify(*problem_and_path(SWING + unknown)), "not_finite").time == 1
+    assert rd.verify(replace(problem, goal=rd.JointGoal(np.stack([SWING[0], SWING[1], -SWING[1]]))), path).valid
+    assert refused(rd.verify(*problem_and_path(SWING + np.array([[0, 0, 0], [0, 0, np.nan]]))), "not_finite").time == 1
 
 
 def test_the_earliest_of_different_violations_is_reported() -> None:
@@ -245,13 +239,11 @@ def strong(acceleration: float) -> rd.Robot:
 
 def verified(motion: rd.Trajectory, *shapes: Shape, robot: rd.Robot | None = None) -> Report:
     robot = robot or box_arm()
-    problem = rd.Problem(robot, rd.Scene(shapes), motion.positions[0], rd.JointGoal(motion.positions[-1:]))
-    return rd.verify(problem, motion)
+    return rd.verify(rd.Problem(robot, rd.Scene(shapes), motion.positions[0], rd.JointGoal(motion.positions[-1:])), motion)
 
 
 def wrong_rates(motion: rd.Trajectory, robot: rd.Robot | None = None) -> dict[str, str]:
-    """The messages of violations of velocities and accelerations, by kind. The validator must refuse the
-    motion."""
+    """The messages of violations of velocities and accelerations, by kind. The validator must refuse the motion."""
     assert not verified(motion, robot=robot).valid
     return {wrong.kind: wrong.message for wrong in rate_violations(robot or box_arm(), motion, RATES)}
 
@@ -303,8 +295,7 @@ def test_times_compressed_under_rates_of_zero(factor: float, jumps: bool) -> Non
     assert verified(good, robot=strong(1e3)).valid
     still = np.zeros_like(good.velocities)
     quick = replace(good, times=good.times / factor, velocities=still, accelerations=still)
-    kinds = {"velocity", "acceleration", "rates", *(["jump"] if jumps else [])}
-    assert wrong_rates(quick, strong(1e3)).keys() == kinds
+    assert wrong_rates(quick, strong(1e3)).keys() == {"velocity", "acceleration", "rates", *(["jump"] if jumps else [])}
 
 
 @pytest.mark.parametrize("factor", [-1, 0])
@@ -345,13 +336,11 @@ def test_no_motion_within_the_limits_is_refused(seed: int, most: float) -> None:
     place = np.concatenate([np.zeros((1, 3)), np.cumsum((speed[1:] + speed[:-1]) / 2, axis=0)]) * step
     every = max(int(most / step), 1)
     jumps = np.arange(0, len(place), count)
-    chosen = rng.choice(len(place), len(place) // every + 1)
-    rows = np.unique(np.concatenate([jumps, chosen, [len(place) - 1]]))
+    rows = np.unique(np.concatenate([jumps, rng.choice(len(place), len(place) // every + 1), [len(place) - 1]]))
     accelerations = np.concatenate([fine, fine[-1:]])[rows]
     place += rng.uniform(-1, 1, place.shape) * 0.99 * RATES.limit_slack
     motion = rd.Trajectory(robot.joint_names, rows * step, place[rows], speed[rows], accelerations)
-    wrong = {w.message for w in rate_violations(robot, motion, replace(RATES, rate_agreement=2.0))}
-    assert not wrong
+    assert not {w.message for w in rate_violations(robot, motion, replace(RATES, rate_agreement=2.0))}
 
 
 def in_micro_steps(step: float, time: float, way: float) -> rd.Trajectory:
@@ -363,8 +352,7 @@ def in_micro_steps(step: float, time: float, way: float) -> rd.Trajectory:
 
 @pytest.mark.parametrize(("step", "time"), [(1.9e-6, 1e-8), (1.9e-6, 1e-7), (1.9e-6, 5e-7), (1.0, 5e-324)])
 def test_micro_steps_hide_no_velocity(step: float, time: float) -> None:
-    """Each step is within the resolution of positions; together, the steps are 1.9 to 95 times as fast as the
-    arm."""
+    """Each step is within the resolution of positions; together, the steps are 1.9 to 95 times as fast as the arm."""
     assert "j0 at" in wrong_rates(in_micro_steps(step, time, max(step, 0.01)))["velocity"]
 
 
@@ -393,8 +381,7 @@ def test_rows_far_apart_are_validated_as_controllers_move_between_them() -> None
     out = rd.Trajectory(robot.joint_names, np.array([0.0, 1.0, 2.0, 3.0]), rows, speed, rates)
     assert verified(out).valid
     ball = rd.Sphere(1.1 * vector(np.cos(0.73), np.sin(0.73), 0), 0.02)
-    found = refused(verified(out, ball), "scene_collision")
-    assert 1.0 < found.time < 1.5
+    assert 1.0 < refused(verified(out, ball), "scene_collision").time < 1.5
     times, positions = Cubics(out).sampled(1e-3)[:2]
     assert np.isin(out.times, times).all()
     assert np.abs(positions[:, 0]).max() == pytest.approx(0.75, abs=1e-3)
@@ -443,8 +430,7 @@ def test_rates_between_two_rows_are_those_of_the_cubic(factor: float, valid: boo
     """From rest to rest, the cubic reaches 1.5 times the mean velocity. Its acceleration at both ends is 6
     times the mean velocity over the duration, with a mean of 0."""
     robot = box_arm()
-    times = [0.0, 1.5 * 1.2 / (factor * robot.velocity[0])]
-    report = verified(between_rest(SWING, times), robot=strong(1e3))
+    report = verified(between_rest(SWING, [0.0, 1.5 * 1.2 / (factor * robot.velocity[0])]), robot=strong(1e3))
     assert report.valid if valid else refused(report, "velocity").subject == "j0"
     motion = between_rest(SWING, [0.0, np.sqrt(6 * 1.2 / (factor * robot.acceleration[0]))])
     report = verified(motion)
@@ -496,11 +482,9 @@ def test_a_frame_keeps_its_speed_between_rows(factor: float, valid: bool, count:
     start = np.array([0.0, 0.2, 0.0, -1.9, 0.0, 2.1, 0.785])
     rows = start + np.outer(np.linspace(0, 0.3, count), np.eye(7)[0])
     motion = between_rest(rows, [0.0, 1.0, 2.0][:count], robot=panda)
-    radius = np.linalg.norm(panda.fk(start, "panda_hand")[:2, 3])
-    speed = float(factor * 1.5 * radius * 0.3 / (count - 1))
+    speed = float(factor * 1.5 * np.linalg.norm(panda.fk(start, "panda_hand")[:2, 3]) * 0.3 / (count - 1))
     line = rd.CartesianLine("panda_hand", 0.1, None, speed)
-    problem = rd.Problem(panda, rd.Scene(), rows[0], rows[-1], constraints=[line])
-    report = rd.verify(problem, motion)
+    report = rd.verify(rd.Problem(panda, rd.Scene(), rows[0], rows[-1], constraints=[line]), motion)
     assert report.valid if valid else refused(report, "speed").subject == "panda_hand"
 
 

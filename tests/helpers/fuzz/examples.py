@@ -116,4 +116,3 @@ SRDF = b"""<robot name="two">
 </robot>"""
 LIMITS = {"joint_limits": {"shoulder": {"max_velocity": 2.0, "max_acceleration": 3.0, "has_jerk_limits": False}}}
 MESHES = ("stl", "obj", "ply", "off", "glb", "dae")
-CLOUDS = ("ply", "pcd", "xyz", "csv", "npy", "npz")

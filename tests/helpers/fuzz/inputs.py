@@ -22,6 +22,7 @@ from PIL import Image
 
 import robotdiffuse as rd
 from helpers.fuzz import examples, server
+from helpers.point_files import FORMS, write_points
 from robotdiffuse.interop import read_motion, write_motion
 from robotdiffuse.interop.recorded_motion import joint_trajectory, motion_of_robot
 from robotdiffuse.problems.files import load_motion_bench_maker, load_problem, problem_from_record, problem_record
@@ -170,8 +171,7 @@ def _validated(file: Path) -> None:
     problem = load_problem(file)
     problem_from_record(problem_record(problem))
     if isinstance(problem.goal, rd.JointGoal):
-        rows = np.stack([problem.start, problem.goal.positions[0]])
-        Verifier(problem).path(rd.Path(problem.robot.joint_names, rows))
+        Verifier(problem).path(rd.Path(problem.robot.joint_names, np.stack([problem.start, problem.goal.positions[0]])))
 
 
 def _moveit(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
@@ -194,42 +194,21 @@ def yaml_text(rng: np.random.Generator, data: Any, other: int) -> bytes:
 
 
 def _cloud(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
-    ending = examples.CLOUDS[rng.integers(len(examples.CLOUDS))]
-    points = rng.normal(size=(5, 3)).astype(np.float32)
+    points = rng.normal(size=(5, 3))
     if rng.random() < 0.2:
         points[0, 0] = (np.inf, 1e38, 0)[rng.integers(3)]
-    stream = io.BytesIO()
-    if ending in ("xyz", "csv"):
-        np.savetxt(stream, points, delimiter="," if ending == "csv" else " ")
-    elif ending == "npy":
-        np.save(stream, points)
-    elif ending == "npz":
-        np.savez_compressed(stream, points=points)
-    elif ending == "pcd":
-        head = b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nPOINTS 5\nDATA "
-        binary = rng.random() < 0.5
-        stream.write(head + (b"binary\n" + points.tobytes() if binary else b"ascii\n"))
-        if not binary:
-            np.savetxt(stream, points)
-    else:
-        stream.write(trimesh.PointCloud(points).export(file_type="ply"))  # type: ignore[arg-type]
-    file = folder / f"cloud.{ending}"
-    file.write_bytes(damaged(rng, stream.getvalue()))
+    file = write_points(folder, FORMS[rng.integers(len(FORMS))], points)
+    file.write_bytes(damaged(rng, file.read_bytes()))
     return lambda: rd.PointCloud(read_points(file)[0])
 
 
-def mesh_file(rng: np.random.Generator, folder: Path, name: str, ending: str) -> Path:
+def _mesh(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
     """A small mesh with its bytes damaged."""
+    ending = examples.MESHES[rng.integers(len(examples.MESHES))]
     content = trimesh.creation.box((0.1, 0.2, 0.3)).export(file_type=ending)
     content = content.encode() if isinstance(content, str) else bytes(content)
-    file = folder / f"{name}.{ending}"
-    file.write_bytes(damaged(rng, content))
-    return file
-
-
-def _mesh(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
-    file = mesh_file(rng, folder, "part", examples.MESHES[rng.integers(len(examples.MESHES))])
-    problem = examples.PROBLEM | {"scene": [{"mesh": {"file": file.name, "xyz": [2, 2, 2]}}]}
+    (folder / f"part.{ending}").write_bytes(damaged(rng, content))
+    problem = examples.PROBLEM | {"scene": [{"mesh": {"file": f"part.{ending}", "xyz": [2, 2, 2]}}]}
     (folder / "problem.json").write_text(json.dumps(problem))
     return lambda: _validated(folder / "problem.json")
 
@@ -293,16 +272,14 @@ def _bundle(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
     text = (source / "robot.json").read_text()
     meshes = (source / "meshes.npz").read_bytes()
     damage = rng.random() < 0.7
-    content = text_of(rng, json.loads(text), ".json") if damage else text.encode()
-    (folder / "robot.json").write_bytes(content)
+    (folder / "robot.json").write_bytes(text_of(rng, json.loads(text), ".json") if damage else text.encode())
     if not damage and rng.random() < 0.7:
         stream = io.BytesIO()
         arrays = dict(np.load(source / "meshes.npz"))
         name = ("sizes", "vertices", "faces")[rng.integers(3)]
         flat = arrays[name] = arrays[name].copy()
         row = rng.integers(len(flat))
-        wrong = (np.nan, 1e30, np.inf) if name == "vertices" else (-1, 10**7, 10**12)
-        flat[row, 0] = wrong[rng.integers(3)]
+        flat[row, 0] = ((np.nan, 1e30, np.inf) if name == "vertices" else (-1, 10**7, 10**12))[rng.integers(3)]
         np.savez(stream, **arrays)
         meshes = stream.getvalue()
     elif not damage:
@@ -485,8 +462,7 @@ def _weights(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
 
     about, tensors = (BUNDLED / "panda" / f"mpinets.{ending}" for ending in ("json", "safetensors"))
     whole = rng.random() < 0.8
-    text = text_of(rng, json.loads(about.read_text()), ".json") if whole else about.read_bytes()
-    (folder / about.name).write_bytes(text)
+    (folder / about.name).write_bytes(text_of(rng, json.loads(about.read_text()), ".json") if whole else about.read_bytes())
     if whole:
         (folder / tensors.name).symlink_to(tensors)
     else:

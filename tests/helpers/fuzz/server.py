@@ -334,8 +334,7 @@ class Server:
         return answer.body
 
     def check(self) -> None:
-        """Raises WrongError unless the server is alive, answers correctly and uses no more memory than at
-        first."""
+        """Raises WrongError unless the server is alive, answers correctly and uses no more memory than at first."""
         if self.process.poll() is not None:
             raise WrongError(f"the server ended with {self.process.returncode}")
         if json.loads(self.answer(self.good))["waypoints"] != self.expected:

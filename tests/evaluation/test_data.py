@@ -1,5 +1,6 @@
-"""The check of a data set: both validators find and name wrong motions, and accept correct ones."""
+"""Data sets: both validators find and name wrong motions and accept right ones; figures against figures by hand, the page."""
 
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from helpers.refusals import refuses
 from helpers.stores import line, random_motions, record, write_motions
 from robotdiffuse.datasets.rows import motion_of, problem_of
 from robotdiffuse.datasets.shards import pick_rows, read_shard, shard_path, write_shard
+from robotdiffuse.evaluation import data_report
 from robotdiffuse.evaluation.checks import check_data
 
 ARM = box_arm()
@@ -88,8 +90,7 @@ def test_limits_on_the_way_are_found_but_not_of_continuous_joints(tmp_path, pybu
     robot = rd.load_robot("gen3")
     q = line(np.where(robot.continuous, 9.6, 0.0), np.where(robot.continuous, 9.5, 0.1))
     write_motions(tmp_path / "gen3", robot, [record(robot, rd.Scene([]), q)])
-    checked = check_data(tmp_path / "gen3", robot, pybullet=False)
-    assert any(robot.continuous) and checked.counts["limits"] == 0
+    assert any(robot.continuous) and check_data(tmp_path / "gen3", robot, pybullet=False).counts["limits"] == 0
 
 
 WRONG = {
@@ -132,8 +133,7 @@ def test_no_data_and_another_robot_are_refused(tmp_path):
 
 
 def test_random_motions_are_the_same_for_the_same_seed_and_all_are_in_more_processes(tmp_path):
-    bent = [record(ARM, BALL, line(AWAY, BACK)) for _ in range(6)]
-    write_motions(tmp_path, ARM, bent, shard=2)
+    write_motions(tmp_path, ARM, [record(ARM, BALL, line(AWAY, BACK)) for _ in range(6)], shard=2)
     a, b, c = (check_data(tmp_path, ARM, 3, seed, pybullet=False) for seed in (1, 1, 2))
     assert a.checked == a.counts["collision"] == 3
     assert a.findings == b.findings != c.findings
@@ -162,8 +162,7 @@ def test_rows_are_problems_and_motions_again(tmp_path):
     motion = motion_of(ARM, shard, 0)
     assert isinstance(motion, rd.Path) and np.array_equal(motion.positions, near["trajectories"])
     floor = {"center": [0.0, 0.0, -0.2], "size": [3.0, 2.0, 0.4]}
-    floored = replace(manifest, floors={"rop": floor, "rop_dense": None})
-    first, *others = problem_of(floored, ARM, shard, 0).scene.shapes
+    first, *others = problem_of(replace(manifest, floors={"rop": floor, "rop_dense": None}), ARM, shard, 0).scene.shapes
     assert isinstance(first, rd.Box) and first.size.tolist() == floor["size"] and first.name == "floor"
     assert len(others) == 2
     refuses("family is 0; the manifest has 0", problem_of, replace(manifest, families={}, floors={}), ARM, shard, 0)
@@ -183,3 +182,79 @@ def test_picked_rows_do_not_repeat():
         assert len(set(rows.tolist())) == len(rows) and all(0 <= row < sizes[index] for row in rows)
     every = [rows.tolist() for rows in pick_rows(sizes, None, 0).values()]
     assert every == [list(range(size)) for size in sizes.values()]
+
+
+@pytest.fixture
+def rows():
+    pytest.importorskip("matplotlib")
+    return random_motions(ARM, 11)
+
+
+def test_figures(tmp_path, rows):
+    write_motions(tmp_path, ARM, rows, shard=4)
+    found = data_report.read_figures(tmp_path)
+    costs = np.array([row["cost"] for row in rows])
+    assert (found.trajectories, found.manifest.trajectories, found.shards) == (11, 11, 3)
+    assert data_report.facts(found)[:2] == [("motions", "11"), ("waypoints, evenly spaced in length", "220")]
+    assert found.counts == {"tried": 17, "solved": 11, "unsolved": 3, "refused": 0, "thinned": 3}
+    assert sum(found.splits.values()) == 11 and list(found.splits) == ["train", "validation", "test"]
+    _, families, spreads = data_report.tables(found)
+    assert [row[:2] for row in families.rows] == [("rop", 6), ("rop_dense", 5)]
+    lengths = [costs.mean(), *np.quantile(costs, [0, 0.05, 0.5, 0.95, 1])]
+    assert spreads.texts[0] == ["length [rad]", *(f"{length:.3f}" for length in lengths)]
+    assert spreads.texts[1][1:] == ["1.000"] * 6
+    assert families.columns[5].heading == "trivial"
+    free = [[row["line_free"] for row in rows if row["family"] == family] for family in (0, 1)]
+    assert [row[5] for row in families.rows] == [pytest.approx(np.mean(each)) for each in free]
+    shares = np.array([row[5:13] for row in families.rows], float)
+    assert np.allclose(shares[:, :4].sum(axis=1), 1) and np.allclose(shares[:, 4:].sum(axis=1), 1)
+    assert found.safety_distance == pytest.approx(0.05)
+    assert [text for _, text in data_report.facts(found)[4:]] == [
+        "78.6 %; tried: 17, of these 3 unsolved, 0 refused, 3 thinned",  # 11 of 14
+        "100.0 %",
+        "100.0 %",
+        "1.0",
+        "63.6 %",  # 7 of 11
+    ]
+    assert found.bytes == sum(f.stat().st_size for f in tmp_path.glob("*.zarr/**/*") if f.is_file())
+
+
+def test_large_sets_are_sampled_evenly(tmp_path, rows, monkeypatch):
+    monkeypatch.setattr(data_report, "SAMPLED_MOTIONS", 4)
+    write_motions(tmp_path, ARM, rows, shard=3)
+    found = data_report.read_figures(tmp_path)
+    assert len(found.all["cost"]) == 11
+    chosen = [rows[i] for i in (0, 2, 4, 6, 8, 10)]
+    np.testing.assert_allclose(found.sample["goal_costs"], [row["goal_costs"] for row in chosen], rtol=1e-6)
+    kept = found.sample["trajectories"]
+    assert kept.shape == (6, min(data_report.SAMPLED_WAYPOINTS, 20), 3)
+    assert np.array_equal(kept[:, [0, -1]], [row["trajectories"][[0, -1]] for row in chosen])
+
+
+def test_page(tmp_path, rows):
+    data = tmp_path / "arm <1>"
+    file = tmp_path / "report.html"
+    write_motions(data, ARM, rows)
+    data_report.write_page(data, file, ARM)
+    page = file.read_text("utf-8")
+    assert page.count("<svg") == 3
+    told = "91.7 %; tried: 13, of these 1 unsolved, 0 refused, 1 thinned", "clearance [cm]", "up to 5 % longer"
+    for text in ("arm &lt;1&gt;", "rop_dense", *told, *ARM.joint_names):
+        assert text in page, text
+    assert "arm <1>" not in page
+    addresses = set(re.findall(r"""(?:src|href)=["'](.*?)["']""", page))
+    assert all(address.startswith(("data:", "#")) for address in addresses), "it must open without network"
+    before = file.read_bytes()
+    data_report.write_page(data, file, ARM)
+    assert file.read_bytes() == before
+
+
+def test_page_of_hardly_any_motions(tmp_path, rows):
+    write_motions(tmp_path, ARM, rows[:1])
+    data_report.write_page(tmp_path, tmp_path / "report.html", ARM)
+
+
+def test_other_robots_and_endings_are_refused(tmp_path, rows):
+    write_motions(tmp_path, ARM, rows)
+    for file, robot, message in (("a.pdf", ARM, "unknown ending"), ("a.html", rd.load_robot("panda"), "fingerprint")):
+        refuses(message, data_report.write_page, tmp_path, tmp_path / file, robot)

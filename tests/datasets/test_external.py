@@ -1,4 +1,4 @@
-"""The file layout of the paper's authors: exported motions are equal when read, and make an equal data set."""
+"""Data sets of motions from other sources: any motions, and the file layout of the paper's authors, both read as written."""
 
 import zipfile
 from pathlib import Path
@@ -8,6 +8,7 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
+from helpers.commands import Said
 from helpers.refusals import refuses
 from helpers.stores import line, random_arrays, record, write_motions, write_store
 from robotdiffuse.datasets import external as robot_npz
@@ -78,8 +79,7 @@ def test_what_was_exported_is_a_data_set_again(tmp_path):
         np.testing.assert_allclose(shard[name], before[name], rtol=1e-6)
     np.testing.assert_array_equal(shard["goals"][:, 0], shard["trajectories"][:, -1])
     np.testing.assert_array_equal(shard["obstacle_params"], before["obstacle_params"][:, :2])
-    least = before["clearance"].clip(max=shard["clearance"])
-    np.testing.assert_allclose(shard["clearance"], least, atol=1e-6)
+    np.testing.assert_allclose(shard["clearance"], before["clearance"].clip(max=shard["clearance"]), atol=1e-6)
     assert shard["line_free"].tolist() == [False, True, True]
     tip = PANDA.fk(shard["goals"][0, 0].astype(float), PANDA.tip)
     np.testing.assert_allclose(shard["target_pose"][:, 4:], [tip[:3, 3]] * 3, atol=1e-6)
@@ -134,3 +134,38 @@ def test_what_cannot_be_imported(tmp_path, monkeypatch):
     refuses("radius is 0", import_npz, whole, out, radius=0.0)
     monkeypatch.setattr(robot_npz, "load_robot", lambda name: box_arm())
     refuses(r"has 3 joints; robot\.npz holds 7", import_npz, whole, out, robot="arm.urdf")
+
+
+HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
+FLOOR = rd.Box([0, 0, -0.05], [3, 3, 0.1], name="floor")
+COUNT = 24
+RNG = np.random.default_rng(0)
+MOTIONS = [HOME + np.linspace(0, 1, 5 + i)[:, None] * RNG.uniform(-0.2, 0.2, 7) for i in range(COUNT)]
+SCENES = [rd.Scene([FLOOR, rd.Sphere([0.6, 0.01 * i, 0.9], 0.1)][: 1 + (i % 3 > 0)]) for i in range(COUNT)]
+
+
+def test_own_motions_are_a_data_set_like_any_other(tmp_path, said: Said):
+    mixed = [rd.Path(PANDA.joint_names, MOTIONS[0]), MOTIONS[1].tolist(), *MOTIONS[2:]]
+    assert rd.write_dataset(mixed, SCENES, tmp_path / "own", "panda", waypoints=48) == COUNT
+    manifest = read_manifest(tmp_path / "own")
+    assert (manifest.waypoints, manifest.slots, manifest.robot) == (48, 1, "panda")
+    shard = check_shard(tmp_path / "own", 0, manifest)
+    np.testing.assert_allclose(shard["trajectories"][3][[0, -1]], MOTIONS[3][[0, -1]], atol=1e-6)
+    names = [shape.name for shape in problem_of(manifest, PANDA, shard, 1).scene.shapes]
+    assert names == ["floor", "sphere"] and shard["line_free"][1]
+    assert next(iter(rd.RopDataset(tmp_path / "own").batches(4))).trajectories.shape[1:] == (48, 7)
+    assert "24" in said(0, "data", "check", tmp_path / "own", "--workers", 1, "--no-pybullet")
+    refuses("holds data already", rd.write_dataset, MOTIONS, SCENES, tmp_path / "own", PANDA)
+
+
+def test_what_is_wrong_is_named(tmp_path: Path) -> None:
+    far = [*MOTIONS[:2], MOTIONS[2] + 9.0]
+    for paths, around, message in (
+        ([], SCENES[0], "paths is empty"),
+        ([[0.0] * 7], SCENES[0], r"paths\[0\] is .* it must be n x 7 numbers"),
+        (far, SCENES[:3], r"paths\[2\], row 0: panda_joint1 is 9 rad; its limits are -2.8973"),
+        (MOTIONS, SCENES[:3], "scenes are 3; they must be one rd.Scene, or one for each of 24 paths"),
+        (MOTIONS[:1], rd.Scene([rd.Cylinder([1, 1, 1], 0.1, 0.1)]), "only spheres and boxes can be packed"),
+    ):
+        refuses(message, rd.write_dataset, paths, around, tmp_path / "own")
+    assert not (tmp_path / "own" / "manifest.json").exists()

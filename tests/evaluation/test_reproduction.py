@@ -1,4 +1,5 @@
-"""The paper's problems with both kinds of goal; Table 1: ComScores by hand, its rows, a page made once."""
+"""The paper's tables. Table 1: problems with both kinds of goal, ComScores by hand, its rows, a page made once. Table 2:
+configs by name, metrics of motions, the runner."""
 
 import json
 from pathlib import Path
@@ -8,14 +9,19 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.commands import Said
+from helpers.refusals import refuses
 from robotdiffuse.cli import main
-from robotdiffuse.evaluation import paper
+from robotdiffuse.evaluation import ablation, paper
 from robotdiffuse.evaluation.runs import read_records
 from robotdiffuse.evaluation.statistics import Indicators, comscores
 from robotdiffuse.learning.denoisers import DENOISERS
-from robotdiffuse.learning.encoders import ENCODERS
+from robotdiffuse.learning.encoders import ENCODERS, make_encoder
 from robotdiffuse.learning.motion_model import MotionModelSettings
-from robotdiffuse.learning.weight_files import BUNDLED, FORMAT
+from robotdiffuse.learning.motion_network import MotionNetwork
+from robotdiffuse.learning.training.config import CONFIGS, planner_training
+from robotdiffuse.learning.training.tasks import model_settings
+from robotdiffuse.learning.weight_files import BUNDLED, FORMAT, RobotIdentity
 from robotdiffuse.problems.held_out import CaseFile
 from robotdiffuse.validation.tolerances import goal_error
 
@@ -25,8 +31,7 @@ ROW_NAMES = {row.paper: row.name for row in paper.ROWS if row.paper}
 def test_scores_are_the_papers_and_further_rows_replace_its_method() -> None:
     of = {ROW_NAMES[row.name]: row.indicators for row in paper.PAPER_TABLE_1}
     printed = comscores([row.indicators for row in paper.PAPER_TABLE_1])
-    further = Indicators(100.0, 0.0, 14.0, 1.0)
-    found = paper.scores(paper.ROWS, of | {"aorrtc": further})
+    found = paper.scores(paper.ROWS, of | {"aorrtc": Indicators(100.0, 0.0, 14.0, 1.0)})
     for row, score in zip(paper.PAPER_TABLE_1, printed, strict=True):
         assert found[ROW_NAMES[row.name]] == pytest.approx(score)
     assert found["aorrtc"] == 1.0  # the best in all four
@@ -40,8 +45,7 @@ def test_the_papers_method_has_a_row_only_with_weights_that_see_the_code_alone(t
         (with_weights, "whose inputs include clearances"),
         (too_fast, r"single sample takes about .* denoising steps"),
     ):
-        with pytest.raises(rd.InputError, match=message):
-            paper.run_table1(settings, lambda _: None, lambda *_: None)
+        refuses(message, paper.run_table1, settings, lambda _: None, lambda *_: None)
     assert not list(tmp_path.iterdir())
     assert paper.NO_WEIGHTS in paper.notes(paper.Table1Settings(tmp_path))
 
@@ -89,8 +93,7 @@ def test_both_goals_are_of_one_problem() -> None:
     joint = drawn[paper.JOINT]
     assert isinstance(pose.goal, rd.PoseGoal)
     np.testing.assert_array_equal(pose.start, joint.start)
-    configuration = paper.goal_configurations(joint)[0]
-    assert goal_error(pose.robot, pose.goal, configuration) is None
+    assert goal_error(pose.robot, pose.goal, paper.goal_configurations(joint)[0]) is None
     several = paper.goal_configurations(pose)
     assert 2 <= len(several) <= 10
     assert all(goal_error(pose.robot, pose.goal, q) is None for q in several)
@@ -111,3 +114,40 @@ def test_problems_are_written_once(tmp_path: Path) -> None:
     numbers = [int(case.name.removeprefix("rop_pose/")) for case in cases]
     assert numbers == sorted(numbers)
     assert paper.trivial_share(tmp_path, paper.POSE) == 1 - 2 / (numbers[1] + 1)
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_every_config_makes_a_model(name: str) -> None:
+    given = {"data": "data"} if "encoder" in CONFIGS[name].changes else {"data": "data", "encoder": "folder"}
+    settings = planner_training(name, given)
+    encoder = settings.encoder if settings.jointly else "compression_autoencoder"
+    made = None if settings.encoder is None else make_encoder(encoder or "")
+    model = MotionNetwork(RobotIdentity.of(rd.load_robot("panda")), model_settings(settings, made))
+    assert isinstance(model.denoiser, DENOISERS.load(settings.denoiser))
+    assert (settings.minutes is None) != (settings.samples is None)
+
+
+def test_what_is_given_beside_a_config_wins() -> None:
+    settings = planner_training("paper", {"data": "d", "encoder": "e", "minutes": 3.0, "batch": 8})
+    assert (settings.minutes, settings.samples, settings.batch) == (3.0, None, 8)
+    refuses("table2_unet", planner_training, "papr", {"data": "d", "encoder": "e"})
+    refuses("config compact needs an encoder", planner_training, "compact", {"data": "d"})
+
+
+def test_bad_input(tmp_path: Path, said: Said) -> None:
+    base = ["reproduce", "table2", "--data", tmp_path, "--out", tmp_path / "out"]
+    assert "known: " in said(2, *base, "--rows", "Ourz")
+    assert "known: cabinet, clutter, crate" in said(2, *base, "--family", "ropp")
+    assert "no data set" in said(2, *base)
+
+
+def test_the_mean_of_two_trainings_leaves_unsolved_problems_out() -> None:
+    def evaluation(single: list[float], length: list[float]) -> ablation.Evaluation:
+        each = np.array(single, float)
+        return ablation.Evaluation(each, each, each, np.array(length, float), each)
+
+    nan = float("nan")
+    mean = ablation.Evaluation.mean([evaluation([0, 1, 0], [nan, 4, nan]), evaluation([1, 1, 0], [3, 6, nan])])
+    np.testing.assert_array_equal(mean.single, [0.5, 1, 0])
+    np.testing.assert_array_equal(mean.length, [3, 5, nan])
+    assert [ablation.Training("table2_jpc", seed).folder for seed in (0, 1)] == ["table2_jpc", "table2_jpc_seed1"]
