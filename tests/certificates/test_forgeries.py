@@ -12,6 +12,7 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
+from helpers.changes import later
 from robotdiffuse.certificates.proof import hash_of, request_parts, scene_parts
 from robotdiffuse.certificates.requirements import not_checked
 from robotdiffuse.cli.verify import described
@@ -64,12 +65,7 @@ def entry(record: Record, planes: bool = True) -> Record:
     return max(record["proof"], key=lambda one: len(one["planes"] if planes else one["start"]))
 
 
-def forgery(change: Callable[..., object]) -> Callable[..., Callable[[Record], object]]:
-    """A function that makes a forgery: called without the record, its first argument, it returns a change of a record."""
-    return lambda *of, **how: lambda record: change(record, *of, **how)
-
-
-@forgery
+@later
 def set_to(record: Any, *path: str | int, to: Any) -> None:
     """Sets one value."""
     for key in path[:-1]:
@@ -77,12 +73,12 @@ def set_to(record: Any, *path: str | int, to: Any) -> None:
     record[path[-1]] = to
 
 
-@forgery
+@later
 def scaled_rows(record: Record, name: str, factor: float) -> None:
     record["motion"][name] = (factor * np.array(record["motion"][name])).tolist()
 
 
-@forgery
+@later
 def scaled_time(record: Record, factor: float) -> None:
     """Scales times, velocities and accelerations so that they agree with each other."""
     for name, power in (("times", 1), ("velocities", -1), ("accelerations", -2)):
@@ -91,13 +87,13 @@ def scaled_time(record: Record, factor: float) -> None:
         record[name] = (factor * np.array(record[name])).tolist()
 
 
-@forgery
+@later
 def shifted_time(record: Record, by: float) -> None:
     for part, name in ((record["motion"], "times"), (record, "between"), (record, "looks")):
         part[name] = (np.array(part[name]) + by).tolist()
 
 
-@forgery
+@later
 def of_widest(record: Record, name: str, change: Callable[[Any], Any], planes: bool = False) -> None:
     claim = entry(record, planes)
     claim[name] = change(claim[name])
@@ -138,14 +134,14 @@ def reversed_proof(record: Record) -> None:
         entry(record, planes=False)[name].reverse()
 
 
-@forgery
+@later
 def of_claims(record: Record, **changes: Callable[[Record], Any]) -> None:
     """Sets fields of every claim, each computed by a function from the claim."""
     for claim in record["proof"]:
         claim.update({name: change(claim) for name, change in changes.items()})
 
 
-@forgery
+@later
 def normals(record: Record, factor: float) -> None:
     of_claims(planes=lambda one: [[*p[:3], *(factor * x for x in p[3:])] for p in one["planes"]])(record)
 
@@ -153,7 +149,7 @@ def normals(record: Record, factor: float) -> None:
 FIELDS = ("start", "stop", "clearance", "displacement", "by_planes", "planes")
 
 
-@forgery
+@later
 def without(record: Record, name: str, **rest: Any) -> None:
     """Removes a field of the problem; `rest` are fields of the certificate that it sets."""
     del record["problem"][name]

@@ -6,14 +6,15 @@ import os
 import shutil
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import zarr
 
 from helpers.box_arm import box_arm
+from helpers.changes import later
 from helpers.commands import python
+from helpers.factory_runs import contents
 from helpers.refusals import refuses
 from helpers.stores import manifest_of, random_arrays, write_store
 from robotdiffuse.core.errors import InputError, OutputError
@@ -40,10 +41,6 @@ def arrays():
 def store(tmp_path):
     write_store(tmp_path, ARM, (7, 3), WAYPOINTS)
     return tmp_path
-
-
-def files(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 def test_what_is_written_is_read(tmp_path, arrays):
@@ -81,13 +78,13 @@ def test_same_arrays_same_bytes_or_none_where_arrays_do_not_fit(tmp_path, arrays
     shards.write_shard(tmp_path / "b", 0, arrays, counts)  # once more in its place
     for wrong, message in (({"costs": arrays["cost"]}, "'costs'"), ({"cost": arrays["cost"][:3]}, "unequal rows")):
         refuses(message, shards.write_shard, tmp_path / "b", 1, arrays | wrong, {})
-    assert files(tmp_path / "a") == files(tmp_path / "b")
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
     assert [p.name for p in (tmp_path / "b").iterdir()] == ["shard_00000.zarr"]
 
 
 def test_a_full_disk(tmp_path, arrays, monkeypatch):
     shards.write_shard(tmp_path, 0, arrays, {})
-    before = files(tmp_path)
+    before = contents(tmp_path)
     create = zarr.Group.create_array
     made = []
 
@@ -101,10 +98,11 @@ def test_a_full_disk(tmp_path, arrays, monkeypatch):
     for index in (0, 1):
         with pytest.raises(OutputError, match=rf"shard_0000{index}\.zarr cannot be written: No space left"):
             shards.write_shard(tmp_path, index, arrays, {})
-    assert files(tmp_path) == before
+    assert contents(tmp_path) == before
     assert [p.name for p in tmp_path.iterdir()] == ["shard_00000.zarr"]
 
 
+@later
 def rewrite(store, name, change):
     group = zarr.open_group(shards.shard_path(store, 0), mode="a")
     prints = dict(group[name].attrs)
@@ -116,11 +114,13 @@ def chunk(store, name):
     return next(p for p in (shards.shard_path(store, 0) / name / "c").rglob("*") if p.is_file())
 
 
+@later
 def change_bytes(store, name, change):
     file = chunk(store, name)
     file.write_bytes(change(file.read_bytes()))
 
 
+@later
 def relabel(store, **attributes):
     zarr.open_group(shards.shard_path(store, 0), mode="a").attrs.update(attributes)
 
@@ -129,6 +129,7 @@ def about(store, array="seed"):
     return shards.shard_path(store, 0) / array / "zarr.json"
 
 
+@later
 def describe(store, **values):
     about(store).write_text(json.dumps(json.loads(about(store).read_text()) | values))
 
@@ -140,33 +141,27 @@ DAMAGE = [
         lambda store: shards.write_shard(store, 0, random(7) | {"trajectories": np.full((7, 12, 3), np.nan)}, {}),
     ),
     ("array goals: missing", lambda store: shutil.rmtree(shards.shard_path(store, 0) / "goals")),
-    (
-        "array trajectories is damaged: its chunk has 1,004 bytes",
-        lambda store: change_bytes(store, "trajectories", lambda data: data[:-4]),
-    ),
-    ("array start is damaged", lambda store: change_bytes(store, "start", lambda data: data[:-4])),
+    ("array trajectories is damaged: its chunk has 1,004 bytes", change_bytes("trajectories", lambda data: data[:-4])),
+    ("array start is damaged", change_bytes("start", lambda data: data[:-4])),
     ("array cost is damaged: a chunk is missing", lambda store: chunk(store, "cost").unlink()),
     ("array seed is damaged", lambda store: about(store).write_text("{")),
     ("array seed is damaged", lambda store: about(store).unlink()),
     (r"shard .*shard_00000\.zarr is damaged", lambda store: about(store, "").write_text("{")),
-    ("is damaged: its arrays have unequal numbers of rows", lambda store: rewrite(store, "detour", lambda a: a[:-1])),
-    (
-        "array detour is <f8 with 1 axes; it must be <f4 with 1",
-        lambda store: rewrite(store, "detour", lambda a: a.astype(np.float64)),
-    ),
+    ("is damaged: its arrays have unequal numbers of rows", rewrite("detour", lambda a: a[:-1])),
+    ("array detour is <f8 with 1 axes; it must be <f4 with 1", rewrite("detour", lambda a: a.astype(np.float64))),
     (
         r"array obstacle_params has rows of shape \(4, 9\); the manifest says \(4, 10\)",
-        lambda store: rewrite(store, "obstacle_params", lambda a: a[..., :9]),
+        rewrite("obstacle_params", lambda a: a[..., :9]),
     ),
     (
         "is damaged: its fingerprint is not that of its arrays",
-        lambda store: change_bytes(store, "trajectories", lambda a: a[:50] + bytes([a[50] ^ 1]) + a[51:]),
+        change_bytes("trajectories", lambda a: a[:50] + bytes([a[50] ^ 1]) + a[51:]),
     ),
-    ("format is 2; this version reads 1", lambda store: relabel(store, format=2)),
-    ("is damaged: its attributes are not those of shard 0", lambda store: relabel(store, index=4)),
-    ("array seed is damaged", lambda store: describe(store, shape=[10**30])),
-    ("array seed is damaged: a chunk is missing", lambda store: describe(store, shape=[10**15])),
-    ("array seed is damaged", lambda store: describe(store, shape=[10**15], chunk_grid=ENDLESS)),
+    ("format is 2; this version reads 1", relabel(format=2)),
+    ("is damaged: its attributes are not those of shard 0", relabel(index=4)),
+    ("array seed is damaged", describe(shape=[10**30])),
+    ("array seed is damaged: a chunk is missing", describe(shape=[10**15])),
+    ("array seed is damaged", describe(shape=[10**15], chunk_grid=ENDLESS)),
 ]
 
 

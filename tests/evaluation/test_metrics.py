@@ -94,13 +94,8 @@ def test_spectral_arc_length_of_a_gaussian(width: float) -> None:
 def test_interrupted_and_shaking_motions_are_less_smooth() -> None:
     straight = minimum_jerk(2.0, np.zeros(2), np.array([1.0, 0.5]))
     half = minimum_jerk(1.0, np.zeros(2), np.array([0.5, 0.25]))
-    stopping = rd.Trajectory(
-        half.joint_names,
-        np.concatenate([half.times, half.times[1:] + 1.0]),
-        np.concatenate([half.positions, half.positions[1:] + half.positions[-1]]),
-        np.concatenate([half.velocities, half.velocities[1:]]),
-        np.concatenate([half.accelerations, half.accelerations[1:]]),
-    )
+    parts = (half.times, 1.0), (half.positions, half.positions[-1]), (half.velocities, 0), (half.accelerations, 0)
+    stopping = rd.Trajectory(half.joint_names, *(np.concatenate([of, of[1:] + more]) for of, more in parts))
     smooth, stops = (metrics.measured(ARM, rd.Path(m.joint_names, m.positions[[0, -1]]), m) for m in (straight, stopping))
     assert stops["sparc_joint"] < smooth["sparc_joint"] - 0.1
     assert stops["sparc_tip"] < smooth["sparc_tip"] - 0.1

@@ -11,6 +11,12 @@ from helpers.made_arms import BALL, chain, joint, link, robot, row, written
 ARM = chain("base", row("j", 4))
 
 
+def ending(file: str, more: str = "") -> str:
+    """A last link of ARM, which is a mesh."""
+    shape = f'<collision><geometry><mesh filename="{file}" {more}/></geometry></collision>'
+    return link("end", shape) + joint("last", "j4_link", "end")
+
+
 def solid(mesh: trimesh.Trimesh | bytes, file: str = "part.stl", more: str = "") -> Callable[[Path], Path]:
     """An arm whose last link is a mesh."""
 
@@ -19,8 +25,7 @@ def solid(mesh: trimesh.Trimesh | bytes, file: str = "part.stl", more: str = "")
             (folder / file).write_bytes(mesh)
         else:
             mesh.export(folder / file)
-        shape = f'<collision><geometry><mesh filename="{file}" {more}/></geometry></collision>'
-        return written(folder, ARM, link("end", shape), joint("last", "j4_link", "end"))
+        return written(folder, ARM, ending(file, more))
 
     return make
 
@@ -93,14 +98,7 @@ WORKS: dict[str, tuple[Callable[[Path], Path], int]] = {
 """What is made, and how many joints are planned."""
 NOTHING = "<robot name='bare'><link name='base'/></robot>"
 REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
-    "a missing mesh": (
-        arm(
-            ARM,
-            link("end", '<collision><geometry><mesh filename="a.stl"/></geometry></collision>')
-            + joint("last", "j4_link", "end"),
-        ),
-        "mesh file 'a.stl' does not exist; add it",
-    ),
+    "a missing mesh": (arm(ARM, ending("a.stl")), "mesh file 'a.stl' does not exist; add it"),
     "no geometry": (text(robot(ARM).replace(BALL, "")), "add <collision> elements"),
     "a floating base": (
         arm(link("body"), joint("free", "base", "body", "floating"), chain("body", row("j", 6))),

@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -54,13 +53,11 @@ def wait_for_shards(run: subprocess.Popen[str], out: Path, count: int) -> None:
 
 def group_ends(group: int, seconds: float = 120.0) -> bool:
     """Whether all processes of a group end within a time."""
-    end = time.monotonic() + seconds
-    while members(group):
-        if time.monotonic() > end:
-            os.killpg(group, signal.SIGKILL)
-            return False
-        time.sleep(0.05)
-    return True
+    try:
+        until(lambda: not members(group), seconds)
+    except AssertionError:
+        os.killpg(group, signal.SIGKILL)
+    return not members(group)
 
 
 def members(group: int) -> list[int]:

@@ -5,9 +5,11 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
 import httpx
 
@@ -16,12 +18,13 @@ ROOT = Path(__file__).parents[2]
 
 @contextmanager
 def serving(
-    *arguments: str, stderr: int = subprocess.DEVNULL, **environment: str
+    *arguments: str, stderr: int | IO[bytes] = subprocess.DEVNULL, **environment: str
 ) -> Iterator[tuple[httpx.Client, subprocess.Popen]]:
     """A context with a client of a server that is ready, and the server's process, which ends with the context."""
     paths = os.pathsep.join((str(ROOT / "src"), str(ROOT / "tests")))
     process = subprocess.Popen(
         [sys.executable, "-m", "helpers.serving", "serve", "--port", "0", *arguments],
+        stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=stderr,
         text=True,
@@ -44,8 +47,13 @@ if __name__ == "__main__":
     from helpers.planners import ENTRY
     from robotdiffuse.cli import main
     from robotdiffuse.planning import PLANNERS
-    from robotdiffuse.server import connection
+    from robotdiffuse.server import connection, server
+
+    def end_with_parent() -> None:
+        os.read(0, 1)
+        os._exit(0)
 
     PLANNERS["faulty"] = ENTRY
-    connection.READ_TIMEOUT = 3.0
+    connection.READ_TIMEOUT = server.KEEP_ALIVE_TIMEOUT = float(os.environ.get("CLIENT_TIMEOUT", "3.0"))
+    threading.Thread(target=end_with_parent, daemon=True).start()
     sys.exit(main())

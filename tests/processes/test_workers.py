@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -19,23 +20,27 @@ ROOT = Path(__file__).parents[2]
 HELD = 60  # longer than a worker may outlive its parent [s]
 
 
-def test_a_single_worker_is_replaced_when_it_dies_or_is_ended() -> None:
-    worker = Worker()
-    try:
-        first = worker.call(os.getpid)
-        with pytest.raises(EndedError):
-            worker.call(os.kill, first, signal.SIGKILL)
-        second = worker.call(os.getpid)
-        worker.end(0.0)
-        third = worker.call(os.getpid)
-        assert len({first, second, third, os.getpid()}) == 4
-        with ThreadPoolExecutor(1) as threads:
-            sent = threads.submit(worker.call, time.sleep, HELD)
-            os.kill(third, signal.SIGTERM)
-            with pytest.raises(EndedError, match="by SIGTERM"):
-                sent.result(HELD)
-    finally:
-        worker.close()
+@pytest.fixture
+def worker() -> Iterator[Worker]:
+    made = Worker()
+    yield made
+    made.close(0.0)
+
+
+def test_a_single_worker_is_replaced_when_it_dies_or_is_ended(worker: Worker) -> None:
+    first = worker.call(os.getpid)
+    with pytest.raises(EndedError):
+        worker.call(os.kill, first, signal.SIGKILL)
+    second = worker.call(os.getpid)
+    worker.end(0.0)
+    third = worker.call(os.getpid)
+    assert len({first, second, third, os.getpid()}) == 4
+    with ThreadPoolExecutor(1) as threads:
+        sent = threads.submit(worker.call, time.sleep, HELD)
+        os.kill(third, signal.SIGTERM)
+        with pytest.raises(EndedError, match="by SIGTERM"):
+            sent.result(HELD)
+    worker.close()
     with pytest.raises(EndedError, match="closed"):
         worker.call(os.getpid)
 
@@ -66,39 +71,31 @@ def odd() -> None:
     raise OddError(1, 2)
 
 
-def test_a_call_that_takes_too_long_is_killed_unless_it_is_allowed_more_time() -> None:
-    worker = Worker()
-    try:
-        first = worker.call(os.getpid)
-        worker.call(sleep_allowed, 0.0, float(HELD), 0.0)  # imports this module
-        assert worker.call(sleep_allowed, 0.0, float(HELD), 4.0, timeout=3.0) == "done"
-        assert worker.call(os.getpid) == first
-        with pytest.raises(OverrunError):
-            worker.call(sleep_allowed, 0.0, 0.1, float(HELD), timeout=float(HELD))
-        assert worker.call(os.getpid) != first
-    finally:
-        worker.close(0.0)
+def test_a_call_that_takes_too_long_is_killed_unless_it_is_allowed_more_time(worker: Worker) -> None:
+    first = worker.call(os.getpid)
+    worker.call(sleep_allowed, 0.0, float(HELD), 0.0)  # imports this module
+    assert worker.call(sleep_allowed, 0.0, float(HELD), 4.0, timeout=3.0) == "done"
+    assert worker.call(os.getpid) == first
+    with pytest.raises(OverrunError):
+        worker.call(sleep_allowed, 0.0, 0.1, float(HELD), timeout=float(HELD))
+    assert worker.call(os.getpid) != first
 
 
-def test_errors_of_calls_keep_the_process() -> None:
-    worker = Worker()
-    try:
-        first = worker.call(os.getpid)
-        with pytest.raises(ZeroDivisionError) as raised:
-            worker.call(divmod, 1, 0)
-        assert "in a worker process" in raised.value.__notes__[0]
-        with pytest.raises(Exception, match="pickle"):
-            worker.call(eval, "lambda: None")
-        with pytest.raises(Exception, match="pickle"):
-            worker.call(print, lambda: None)
-        with pytest.raises(TypeError):
-            worker.call(odd)
-        with pytest.raises(SystemExit):
-            worker.call(sys.exit, "no license")
-        assert worker.call(os.getpid) == first and worker.call(renewed) == first
-        assert worker.call(os.getpid) != first
-    finally:
-        worker.close(0.0)
+def test_errors_of_calls_keep_the_process(worker: Worker) -> None:
+    first = worker.call(os.getpid)
+    with pytest.raises(ZeroDivisionError) as raised:
+        worker.call(divmod, 1, 0)
+    assert "in a worker process" in raised.value.__notes__[0]
+    with pytest.raises(Exception, match="pickle"):
+        worker.call(eval, "lambda: None")
+    with pytest.raises(Exception, match="pickle"):
+        worker.call(print, lambda: None)
+    with pytest.raises(TypeError):
+        worker.call(odd)
+    with pytest.raises(SystemExit):
+        worker.call(sys.exit, "no license")
+    assert worker.call(os.getpid) == first and worker.call(renewed) == first
+    assert worker.call(os.getpid) != first
 
 
 def test_running_and_waiting_calls_are_cancelled(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,17 +11,18 @@ import json
 import os
 import re
 import socket
-import subprocess
-import sys
 import tempfile
-import threading
 import time
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from helpers.fuzz.examples import JOINTS, PROBLEM
+from helpers.serving import serving
 
 CLIENT_TIMEOUT = 0.5
 """The server waits so long for a request, and for the next one of a connection [s]."""
@@ -305,18 +306,12 @@ class Server:
     def __init__(self, plan: dict[str, Any], path: dict[str, Any]) -> None:
         """`plan`: a good request; `path`: a path for its problem."""
         self.log = tempfile.TemporaryFile()  # noqa: SIM115, for as long as the process
-        self.process = subprocess.Popen(
-            [sys.executable, __file__],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self.log,
-            text=True,
-            env=os.environ | {"ROBOTDIFFUSE_TOKEN": TOKEN},
-        )
-        assert self.process.stdout is not None
-        found = re.search(r"http://([^:]+):(\d+)", self.process.stdout.readline())
-        assert found is not None and "ready" in self.process.stdout.readline(), "the server does not start"
-        self.address = found.group(1), int(found.group(2))
+        sizes = ("--workers", "1", "--max-time-limit", "1", "--max-request-size", "1")
+        environment = {"ROBOTDIFFUSE_TOKEN": TOKEN, "CLIENT_TIMEOUT": str(CLIENT_TIMEOUT)}
+        stack = ExitStack()
+        atexit.register(stack.close)
+        client, self.process = stack.enter_context(serving(*sizes, stderr=self.log, **environment))
+        self.address = client.base_url.host, client.base_url.port or 0
         self.good = Draft(b"POST", b"/plan", json.dumps(plan).encode())
         self.held = self.checks = self.read = 0
         first = {"problem": plan["problem"], "path": path}, {"problem": plan["problem"]}
@@ -376,29 +371,6 @@ def _memory(pid: int) -> int:
 @cache
 def running_server() -> Server:
     """The server, which the first call starts; it ends with this process."""
-    from helpers.fuzz.examples import JOINTS, PROBLEM
-
     problem = PROBLEM | {"scene": PROBLEM["scene"][:2]}
     path = {"joint_names": JOINTS, "positions": [problem["start"], problem["goal"]["joints"]]}
-    started = Server({"problem": problem, "planner": "rrt_connect", "time_limit": 1.0}, path)
-    atexit.register(started.process.kill)
-    return started
-
-
-def main() -> None:
-    """Serve with one worker and CLIENT_TIMEOUT; exit when standard input closes."""
-    from robotdiffuse.cli import main as command
-    from robotdiffuse.server import connection, server
-
-    connection.READ_TIMEOUT = server.KEEP_ALIVE_TIMEOUT = CLIENT_TIMEOUT
-
-    def ended() -> None:
-        sys.stdin.read()
-        os._exit(0)
-
-    threading.Thread(target=ended, daemon=True).start()
-    sys.exit(command(["serve", "--port", "0", "--workers", "1", "--max-time-limit", "1", "--max-request-size", "1"]))
-
-
-if __name__ == "__main__":
-    main()
+    return Server({"problem": problem, "planner": "rrt_connect", "time_limit": 1.0}, path)
