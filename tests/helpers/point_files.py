@@ -1,5 +1,6 @@
 """Files of points in all formats that are read, written here from the descriptions of the formats."""
 
+import io
 import struct
 from pathlib import Path
 
@@ -27,6 +28,12 @@ def ply(points: ndarray, binary: bool) -> bytes:
     header = f"ply\nformat {kind} 1.0\nelement vertex {len(points)}\n"
     header += "property float x\nproperty float y\nproperty float z\nend_header\n"
     return header.encode() + (points.astype("<f4").tobytes() if binary else text(points, " "))
+
+
+def npy(array: ndarray) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, array)
+    return stream.getvalue()
 
 
 def pcd(points: ndarray, storage: str) -> bytes:

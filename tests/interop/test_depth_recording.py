@@ -1,6 +1,7 @@
 """Depth images in MCAP files, and transforms over time."""
 
 from collections.abc import Callable
+from inspect import unwrap
 from pathlib import Path
 from typing import Any
 
@@ -251,7 +252,7 @@ def test_what_is_missing_is_said(change: Callable[[dict[str, Any]], object], mes
 
 def test_other_files_and_topics_are_refused(tmp_path: Path) -> None:
     (tmp_path / "text.mcap").write_text("no recording")
-    refuses("damaged", list, rd.read_depth_views(tmp_path / "text.mcap", PANDA))
+    refuses("is no MCAP file or was cut short", list, rd.read_depth_views(tmp_path / "text.mcap", PANDA))
     with pytest.raises(rd.InputError, match="'/other' holds no images; topics of images: /camera/image_rect"):
         list(rd.read_depth_views(recording(tmp_path / "r.mcap"), PANDA, ["/other"]))
     view = rd.DepthView(np.ones((2, 2)), (300, 300, 0.5, 0.5), np.eye(4))
@@ -273,6 +274,12 @@ def test_chains_are_followed_and_interpolated_and_at_the_ends_the_nearest_counts
     T = history().at("base", "camera", at, "the image")
     np.testing.assert_allclose(T[:3, :3], Rotation.from_rotvec([0, 0, share]).as_matrix(), atol=1e-6)
     np.testing.assert_allclose(T[:3, 3], [2 * np.cos(share), 2 * np.sin(share), 0.0], atol=1e-6)
+
+
+def test_wrong_arguments_are_said(tmp_path: Path) -> None:
+    read = unwrap(rd.read_depth_views)
+    refuses("topics is '/cam/depth'; it must be a list of names", list, read(tmp_path / "a.mcap", PANDA, "/cam/depth"))
+    refuses("robot is 'panda'; it must be a Robot", list, read(tmp_path / "a.mcap", "panda"))
 
 
 def test_missing_transforms_are_said() -> None:

@@ -4,6 +4,7 @@ import importlib.util
 import json
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
@@ -73,14 +74,40 @@ def test_depth_files(tmp_path: Path) -> None:
     Image.fromarray(image.astype(np.uint8)).save(tmp_path / "gray.png")
     np.save(tmp_path / "color.npy", np.zeros((4, 4, 3)))
     (tmp_path / "bad.png").write_bytes(b"no image")
+    with ZipFile(tmp_path / "text.npz", "w") as archive:
+        archive.writestr("notes.txt", "none")
     for name, message in {
         "gray.png": "grayscale with 16 bits",
         "color.npy": "holds float64 of 4 x 4 x 3",
-        "bad.png": "cannot be read",
+        "bad.png": "is damaged",
+        "text.npz": "notes.txt is b'none'; it must be an array",
         "none.png": "does not exist",
         "a.jpg": "unknown depth image format",
     }.items():
         refuses(message, read_depth, tmp_path / name)
+
+
+def test_integers_of_65535_are_no_returns(tmp_path: Path) -> None:
+    Image.fromarray(np.array([[1000, 65535]], np.uint16)).save(tmp_path / "a.png")
+    np.save(tmp_path / "a.npy", np.array([[1000, 65535]], np.uint16))
+    for name in ("a.png", "a.npy"):
+        assert read_depth(tmp_path / name).tolist() == [[1.0, 0.0]]
+    refuses("view.scale is -1.0; it must be a number", read_depth, tmp_path / "a.png", -1.0)
+
+
+def test_depths_that_files_write_for_infinity_are_infinite() -> None:
+    view = rd.DepthView([[1.0, np.inf]], K, T)
+    assert rd.DepthView(view_entry(view, None)["depth"], K, T).depth.tolist() == [[1.0, np.inf]]
+
+
+@pytest.mark.parametrize("points", [np.zeros((3, 2)), np.ones((2, 3)) + 1j, [[0, 0, np.nan]], "abc", []])
+def test_a_wrong_cloud_makes_no_view(points: object) -> None:
+    refuses("view.points", rd.DepthView.from_cloud, points, T)
+
+
+def test_noise_in_other_units_is_refused() -> None:
+    refuses("noise is 0.01; it must be what rd.measure_noise returns", rd.DepthView, np.ones((4, 4)), K, T, noise=0.01)
+    refuses("spread is 1.5; it must be between 0 and 0.1", DepthNoise, spread=1.5)
 
 
 def test_openexr_depth(tmp_path: Path) -> None:

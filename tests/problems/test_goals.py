@@ -211,3 +211,8 @@ def test_poses_are_drawn_on_as_long_as_none_is_free() -> None:
     result = rd.plan(problem, time_limit=60.0, seed=5)
     assert result.path is not None, result.reason
     assert link_pose(ROBOT, result.path.positions[-1], "panda_hand")[1, 3] < -0.35
+
+
+def test_any_of_goals_may_hold_any_of_goals() -> None:
+    one, two, three = (rd.JointGoal(np.full(7, x)) for x in (0.1, 0.2, 0.3))
+    assert rd.AnyGoal((one, rd.AnyGoal((two, three)))).goals == (one, two, three)

@@ -14,7 +14,7 @@ from numpy import ndarray
 from trimesh.triangles import closest_point
 
 import robotdiffuse as rd
-from helpers.point_files import FORMS, PCD, lzf_packed, write_points
+from helpers.point_files import FORMS, PCD, lzf_packed, npy, ply, text, write_points
 from helpers.refusals import refuses
 from helpers.sphere_oracles import distance
 from robotdiffuse.core.mesh_files import read_triangles
@@ -220,18 +220,41 @@ PACKED = PCD.format(n=10**9, data="binary_compressed").encode() + struct.pack("<
         ("cloud.las", b"x", "known: .bt, .csv, .npy, .npz, .pcd, .ply, .xyz"),
         ("cloud.ply", None, "does not exist"),
         ("cloud.ply", b"", "is empty"),
-        ("cloud.csv", b"1,2\n3,4\n", "an array of 2 x 2; it must be n x 3"),
-        ("cloud.xyz", b"1 2 3\n4 five 6\n", "cannot be read"),
+        ("cloud.csv", b"1,2\n3,4\n", "holds float64 of 2 x 2; it must be numbers, n x 3"),
+        ("cloud.xyz", b"1 2 3\n4 five 6\n", "is damaged"),
         ("cloud.pcd", PCD.format(n=1, data="zipped").encode(), "stored as 'zipped'"),
         ("cloud.pcd", PACKED, "unpacks to 40 bytes; its 1,000,000,000 points take"),
         ("cloud.pcd", PCD.replace("x y z", "i j k").format(n=1, data="ascii").encode(), "must have x, y and z"),
         ("cloud.pcd", PCD.format(n=3, data="ascii").encode() + b"1 2 3\n1 2 3\n", "holds 2 of its 3 points"),
+        ("cloud.pcd", PCD.replace("S {n}", "S -1").format(n=1, data="binary").encode(), "has -1 POINTS; it must be"),
+        ("cloud.pcd", PCD.replace("TH {n}", "TH 9").format(n=1, data="binary").encode(), "must be WIDTH x HEIGHT, 9 x 1"),
+        ("cloud.pcd", b"FIELDS x y z\nDATA ascii\n1 2 3\n", "has no POINTS in its header"),
+        ("cloud.ply", ply(POINTS, False).rpartition(b"\n" + text(POINTS[-1:], " "))[0], "holds 49 of its 50"),
+        ("cloud.csv", b"t,x,y\n0,1,2\n", "has the columns .'t', 'x', 'y'.; it must have x, y and z"),
+        ("cloud.npy", npy(POINTS + 1j), "holds complex128 of 50 x 3; it must be numbers"),
+        ("cloud.npy", npy(POINTS > 0), "holds bool of 50 x 3; it must be numbers"),
     ],
 )
 def test_wrong_point_files(name: str, content: bytes | None, message: str, tmp_path: Path) -> None:
     if content is not None:
         (tmp_path / name).write_bytes(content)
     refuses(message, read_points, tmp_path / name)
+
+
+def test_a_cut_ply_mesh_is_refused(tmp_path: Path) -> None:
+    mesh = trimesh.creation.box().export(file_type="ply", encoding="ascii")
+    (tmp_path / "cut.ply").write_bytes(b"\n".join(mesh.splitlines()[:-3]))
+    refuses("holds 17 of its 20 vertices, faces", read_triangles, tmp_path / "cut.ply")
+
+
+def test_the_first_point_after_a_byte_order_mark_is_read(tmp_path: Path) -> None:
+    (tmp_path / "marked.csv").write_bytes(b"\xef\xbb\xbf1,2,3\n4,5,6\n")
+    assert read_points(tmp_path / "marked.csv")[0].tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
+def test_names_of_columns_in_a_comment_are_read(tmp_path: Path) -> None:
+    (tmp_path / "named.csv").write_text("#r,x,y,z\n9,1,2,3\n")
+    assert read_points(tmp_path / "named.csv")[0].tolist() == [[1, 2, 3]]
 
 
 @pytest.mark.parametrize("ending", ["stl", "obj", "ply", "off", "glb"])

@@ -104,7 +104,7 @@ def distinct(*values: float | int, digits: int = 6) -> list[str]:
 
 def shown(value: object) -> str:
     """The value as one short line, for error messages."""
-    if isinstance(value, np.ndarray):
+    if isinstance(value, np.ndarray | np.generic):
         value = (value if value.size <= MAX_QUOTE else value.ravel()[:MAX_QUOTE]).tolist()
     if isinstance(value, str | bytes):
         value = value[: MAX_QUOTE + 1]

@@ -22,7 +22,7 @@ import numpy as np
 import yaml
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, reading, repeated, shortened, shown
+from robotdiffuse.core.errors import InputError, check_type, reading, repeated, shortened, shown
 
 MEGABYTE = 2**20
 MAX_FILE_SIZE = 256 * MEGABYTE
@@ -145,7 +145,10 @@ def read_arrays(file: str | Path) -> dict[str, ndarray]:
             limit = MAX_FILE_SIZE // MEGABYTE
             raise InputError(f"{file} unpacks to {size // MEGABYTE} MB; at most {limit} MB are read")
         with np.load(path, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
+            content = {name: arrays[name] for name in arrays.files}
+        for name, value in content.items():  # np.load gives other members of the archive as bytes
+            check_type(name, value, ndarray, "an array")
+        return content
 
 
 def read_array(file: str | Path, name: str) -> ndarray:

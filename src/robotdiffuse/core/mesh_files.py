@@ -3,6 +3,7 @@
 import io
 import logging
 import os
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from pathlib import Path
@@ -88,6 +89,8 @@ def read_triangles(
             options = {"resolver": _buffer_resolver(path)}
         if ending in (".glb", ".gltf", ".obj"):
             options["skip_materials"] = True
+        if ending == ".ply":
+            check_ply(content)
         with np.errstate(all="ignore"):
             mesh = trimesh.load_mesh(io.BytesIO(content), ending[1:], process=merge, **options)
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
@@ -100,6 +103,16 @@ def read_triangles(
         notes.append(f"{path.name} is in units of {meters:g} m; it is read in meters")
     vertices = meters * np.asarray(mesh.vertices, np.float64)
     return vertices @ R_UP[up].T, np.asarray(mesh.faces, np.int64)
+
+
+def check_ply(content: bytes) -> None:
+    """Raises InputError for an ASCII PLY file with another number of rows than its header states."""
+    header, _, body = content.partition(b"end_header")
+    if b"\nformat ascii" in header:
+        stated = sum(map(int, re.findall(rb"^element \S+ (\S+)", header, re.MULTILINE)))
+        rows = sum(map(bool, map(bytes.strip, body.splitlines())))
+        if rows != stated:
+            raise InputError(f"it holds {rows} of its {stated} vertices, faces and other elements")
 
 
 def _collada(content: bytes) -> tuple[bytes, str, float]:

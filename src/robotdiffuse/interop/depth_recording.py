@@ -21,7 +21,8 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
 
-from robotdiffuse.core.errors import InputError, reading
+from robotdiffuse.core.errors import InputError, check_list, check_type, reading
+from robotdiffuse.core.input_files import file_name
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
 from robotdiffuse.core.types import Configuration, JointValues, Pose
@@ -35,7 +36,7 @@ from robotdiffuse.interop.ros2 import (
     opened_recording,
     to_plain,
 )
-from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.depth_view import NO_RETURN, DepthView
 from robotdiffuse.robots.robot import Robot
 
 IMAGE = "sensor_msgs/msg/Image"
@@ -148,7 +149,10 @@ def read_depth_views(
         InputError: For a file that is damaged or holds no depth images, if no image has joint states and
             transforms within 0.1 s, and for distorted or compressed images.
     """
-    path = Path(file)
+    path = file_name(file)
+    check_type("robot", robot, Robot, "a Robot, e.g. rd.load_robot('panda')")
+    if topics is not None:
+        check_list("topics", topics, str, "names of topics")
     if path.suffix == ".db3":
         raise InputError(f"{path} is a part of a ROS 2 bag: give the folder with it and its metadata.yaml")
     with reading(file), opened_recording(path, MAX_SIZE) as recording:
@@ -256,7 +260,7 @@ def _depth(where: str, image: Any, unit: float | None) -> Float[ndarray, "h w"]:
     pixels = np.ascontiguousarray(rows[:, :size]).view((">" if image.is_bigendian else "<") + kind)
     if unit is not None and kind == "u2":
         scale = unit
-    return scale * pixels.astype(np.float32)
+    return scale * np.where(kind == "u2" and (pixels == NO_RETURN), 0, pixels).astype(np.float32)
 
 
 def around(history: list[tuple[float, Any]], stamp: float) -> tuple[Any, Any, float] | None:

@@ -10,6 +10,7 @@ attached as files.
 import bz2
 import io
 import json
+import os
 import sqlite3
 import struct
 import sys
@@ -49,7 +50,7 @@ with needs("mcap, mcap-protobuf-support, foxglove-schemas-protobuf and rosbags",
     from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud as PointCloudMessage
     from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
     from mcap.reader import McapReader, make_reader
-    from mcap.writer import Writer
+    from mcap.writer import MCAP0_MAGIC, Writer
     from mcap_protobuf.schema import register_schema
     from rosbags.highlevel import AnyReader
     from rosbags.rosbag1 import Reader as Ros1Reader
@@ -398,16 +399,26 @@ def problem_in(file: Path) -> Problem | None:
     """The problem that `write_mcap` attached; None if there is none."""
     path = input_file(file)
     with reading(file), path.open("rb") as stream:
-        attached = {attachment.name: attachment.data for attachment in make_reader(stream).iter_attachments()}
+        reader = checked_reader(stream, str(file))
+        attached = {attachment.name: attachment.data for attachment in reader.iter_attachments()}
         if PROBLEM_ATTACHMENT not in attached:
             return None
         record = parse_json(attached[PROBLEM_ATTACHMENT].decode(), f"{file}, {PROBLEM_ATTACHMENT}")
     return problem_from_record(record)
 
 
-def check_chunks(stream: io.BufferedReader, reader: McapReader, where: str) -> None:
-    """Raise InputError, naming `where`, if a chunk of the file unpacks to more than MAX_UNPACKED bytes, since
-    small files may unpack to gigabytes."""
+def checked_reader(stream: io.BufferedReader, where: str) -> McapReader:
+    """The reader of an MCAP file.
+
+    Raises InputError, naming `where`, if the file does not end as MCAP files do, and if a chunk unpacks to
+    more than MAX_UNPACKED bytes, since small files may unpack to gigabytes.
+    """
+    stream.seek(-min(len(MCAP0_MAGIC), os.fstat(stream.fileno()).st_size), io.SEEK_END)
+    if stream.read() != MCAP0_MAGIC:
+        advice = "`mcap recover` writes what is left to a new file"
+        raise InputError(f"{where} is no MCAP file or was cut short; {advice}")
+    stream.seek(0)
+    reader = make_reader(stream)
     summary = reader.get_summary()
     for chunk in summary.chunk_indexes if summary else ():
         stream.seek(chunk.chunk_start_offset + CHUNK_HEADER)
@@ -422,6 +433,7 @@ def check_chunks(stream: io.BufferedReader, reader: McapReader, where: str) -> N
             size = max(size, lz4.frame.get_frame_info(start)["content_size"])
         if size > MAX_UNPACKED:
             raise InputError(f"{where} has a chunk of {size:,} bytes; {MAX_UNPACKED:,} are allowed")
+    return reader
 
 
 def _typestore(schema: Any) -> Any:
@@ -507,7 +519,7 @@ def _check_unpacking(bag: Path) -> None:
         raise InputError(f"{bag} is compressed (mode {shown(mode)}); write it anew with: ros2 bag convert")
     for part in bag.glob("*.mcap"):
         with part.open("rb") as stream:
-            check_chunks(stream, make_reader(stream), str(part))
+            checked_reader(stream, str(part))
 
 
 # Motions in MCAP files and bags
@@ -552,8 +564,7 @@ def opened_recording(file: Path, largest: int = MAX_FILE_SIZE) -> Iterator[Recor
             yield Recording({connection.topic: connection.msgtype for connection in bag.connections}, of_bag)
         return
     with input_file(file, largest=largest).open("rb") as stream:
-        reader = make_reader(stream)
-        check_chunks(stream, reader, str(file))
+        reader = checked_reader(stream, str(file))
         summary = reader.get_summary()
         if summary is None:
             raise InputError(f"{file} is damaged: it ends before its summary")

@@ -6,6 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from robotdiffuse.core.errors import shown
 from robotdiffuse.core.types import Configuration
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.ray_caster import ray_cast
@@ -19,6 +20,14 @@ SAME_DEPTH = 0.03
 SPHERES_AHEAD = 0.01
 """How far the arm's covering spheres are in front of its surface, approximately [m]."""
 NOTHING = Scene(())
+FARTHEST = 50.0
+"""An image whose nearest return is farther than this is not in meters, or has numbers for no return [m]."""
+MIN_FOCAL_LENGTH = 0.05
+"""Smallest focal length, as a fraction of the image's width and height: such an image spans 169 degrees."""
+MAX_INTRINSICS = 100.0
+"""Largest intrinsics, as fractions of the image's width and height."""
+MAX_THROUGH = 0.9
+"""An image that sees through a larger fraction of the arm cannot be that of the stated camera."""
 MIN_CELLS = 40
 """With fewer cells that show the arm, the camera cannot be checked."""
 MIN_AGREEMENT = 0.6
@@ -42,7 +51,7 @@ def agreement(view: DepthView, robot: Robot, q: Configuration) -> tuple[float, f
     Returns, for the image cells in which the model shows the arm: the fraction whose depth is the arm's, the
     fraction that sees through the arm (larger depths), and the number of these cells.
     """
-    step = max(1, round(STEP_ANGLE * view.intrinsics[0]))
+    step = min(max(1, round(STEP_ANGLE * view.intrinsics[0])), *view.depth.shape)
     cells = view.depth[step // 2 :: step, step // 2 :: step]
     fx, fy, cx, cy = view.intrinsics
     coarse = (fx / step, fy / step, (cx - step // 2) / step, (cy - step // 2) / step)
@@ -53,6 +62,27 @@ def agreement(view: DepthView, robot: Robot, q: Configuration) -> tuple[float, f
         return 0.0, 0.0, 0
     same = np.abs(behind) < SAME_DEPTH
     return float(same.mean()), float((behind >= SAME_DEPTH).mean()), len(behind)
+
+
+def implausible(view: DepthView) -> str:
+    """What is wrong with the units of an image or of its intrinsics, whatever it shows; "" if nothing is."""
+    height, width = view.depth.shape
+    relative = np.abs(view.intrinsics) / (width, height, width, height)
+    if view.cloud is None and (relative[:2].min() < MIN_FOCAL_LENGTH or relative.max() > MAX_INTRINSICS):
+        return f"its intrinsics, {shown(view.intrinsics)}, do not fit an image of {width} x {height} pixels"
+    returns = view.depth[np.isfinite(view.depth) & (view.depth > 0)]
+    if len(returns) == 0 or returns.min() <= FARTHEST:
+        return ""
+    return (
+        f"its depths begin at {returns.min():.4g}; they must be in meters, and 0 where nothing was measured"
+    )
+
+
+def contradiction(view: DepthView, robot: Robot, q: Configuration) -> str:
+    """What `camera_note` finds if the image sees through nearly all of the arm. Only for cameras beside the
+    arm: a camera on the arm sees it from so near that it may see past it with a small error of its pose."""
+    _, through, count = agreement(view, robot, q)
+    return camera_note(view, robot, q) if count >= MIN_CELLS and through > MAX_THROUGH else ""
 
 
 def mistakes(view: DepthView) -> Iterator[tuple[str, DepthView]]:
@@ -92,6 +122,8 @@ def camera_note(view: DepthView, robot: Robot, start: Configuration) -> str:
 @lru_cache(maxsize=32)
 def _camera_note(view: DepthView, robot: Robot, joint_values: tuple[float, ...]) -> str:
     q = np.array(joint_values)
+    if wrong := implausible(view):
+        return wrong
     agreed, through, count = agreement(view, robot, q)
     if count >= MIN_CELLS and agreed >= MIN_AGREEMENT:
         return ""

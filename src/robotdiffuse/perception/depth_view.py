@@ -15,13 +15,24 @@ from numpy import ndarray
 from numpy.random import Generator
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import MAX_RATE, Value, numbers, positive, rigid_transform, vector
-from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.bounds import (
+    MAX_COORDINATE,
+    MAX_RATE,
+    Value,
+    numbers,
+    positive,
+    rigid_transform,
+    rows,
+    vector,
+)
+from robotdiffuse.core.errors import InputError, check_type, shown
 from robotdiffuse.core.settings import Bound, NotNegative, Positive, Settings
 from robotdiffuse.core.transforms import placed
 from robotdiffuse.core.types import Configuration, Points, Pose
 from robotdiffuse.scenes.shapes import PointCloud
 
+NO_RETURN = 65535
+"""Integer depths of this value, the largest of 16 bits, mean "no return"."""
 MIN_FOCAL_LENGTH = 1e-3
 """Minimum focal length [pixels]: smaller values underflow in float32, or are meaningless."""
 NEAREST = 0.05
@@ -40,8 +51,8 @@ class DepthView(Value):
     """A depth image of a pinhole camera, in the frame of the robot's base.
 
     A pixel without a return (0, negative or not a number) says nothing: its ray may be free or occupied. A
-    pixel of +inf means that nothing is within the camera's range (as in ROS, REP 117). Raises InputError for
-    arrays of the wrong shape and for matrices that are not poses.
+    pixel of +inf, or above 1e4, means that nothing is within the camera's range (as in ROS, REP 117). Raises
+    InputError for arrays of the wrong shape and for matrices that are not poses.
     """
 
     depth: Float32[ndarray, "h w"]
@@ -89,8 +100,8 @@ class DepthView(Value):
             )
         if self.range is not None:
             positive("view", "range", self.range)
-        with np.errstate(over="ignore"):  # values beyond float32 become +inf
-            depth = np.ascontiguousarray(depth, np.float32)
+        check_type("view.noise", self.noise, (DepthNoise, type(None)), "what rd.measure_noise returns")
+        depth = np.where(depth > MAX_COORDINATE, np.inf, depth).astype(np.float32)
         for key, value in {
             "depth": depth,
             "intrinsics": tuple(intrinsics.tolist()),
@@ -121,10 +132,10 @@ class DepthView(Value):
         by row."""
         if self.cloud is not None:
             return self.cloud
-        rows, columns = np.nonzero(np.isfinite(self.depth) & (self.depth > 0))
-        z = self.depth[rows, columns].astype(np.float64)
+        v, u = np.nonzero(np.isfinite(self.depth) & (self.depth > 0))
+        z = self.depth[v, u].astype(np.float64)
         fx, fy, cx, cy = self.intrinsics
-        in_camera = np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], axis=1)
+        in_camera = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=1)
         return placed(self.T_base_camera, in_camera)
 
     def moved(self, T: Pose) -> "DepthView":
@@ -157,9 +168,10 @@ class DepthView(Value):
             source: The file of the cloud, for problem files.
 
         Raises:
-            InputError: If no point is in front of the camera.
+            InputError: If no point is in front of the camera, and for anything but n x 3 finite numbers.
         """
         T = cls(np.zeros((1, 1)), (1.0, 1.0, 0.0, 0.0), T_base_camera, configuration).T_base_camera
+        points = rows("view.points", points, None, 3)
         in_camera = (points - T[:3, 3]) @ T[:3, :3]
         z = in_camera[:, 2]
         in_front = z > 1e-3
@@ -216,7 +228,7 @@ Angle = Annotated[float, Bound(least=0.0, below=np.pi / 2)]
 class DepthNoise(Settings, name="depth_noise"):
     """Noise of a real depth camera; the defaults resemble a stereo camera."""
 
-    spread: NotNegative = 0.0015
+    spread: Annotated[float, Bound(least=0.0, most=0.1)] = 0.0015
     """Standard deviation of depth at a distance of 1 m [m]; it grows with the square of the distance."""
     missing: ShareBelowOne = 0.0
     """Fraction of all pixels that have no return."""

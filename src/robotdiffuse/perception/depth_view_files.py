@@ -9,7 +9,9 @@ Further fields are range, noise and pose_deviation, with the meaning that they h
 """
 
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +20,13 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import numbers, positive, unit_quaternion, vector
-from robotdiffuse.core.errors import InputError, needs, reading, shortened, shown, unknown_name
+from robotdiffuse.core.errors import InputError, needs, reading, shown, unknown_name
 from robotdiffuse.core.input_files import input_file, read_array, read_arrays, read_json, read_yaml
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
-from robotdiffuse.core.types import Points
-from robotdiffuse.perception.depth_view import INTRINSICS, DepthNoise, DepthView
+from robotdiffuse.perception.depth_view import INTRINSICS, NO_RETURN, DepthNoise, DepthView
 from robotdiffuse.scenes.files import check_fields, name_from
 from robotdiffuse.scenes.point_cloud import read_points
 
-DEPTH_FORMATS = (".png", ".npy", ".npz", ".exr")
 IMAGE_FIELDS = ("intrinsics", "scale", "range", "noise")
 INTRINSICS_FORMATS = (".json", ".yaml", ".txt", ".npy")
 MAX_PIXELS = 2**24
@@ -38,19 +38,17 @@ INTEGER_SCALE = 0.001
 def read_depth(file: str | Path, scale: float | None = None) -> Float[ndarray, "h w"]:
     """A depth image [m] from a 16 bit .png, a .npy, a .npz (its array `depth`, or its only array), or a .exr.
 
-    scale: meters per unit; None: 0.001 for integers, 1 for floating-point numbers. Raises InputError for a
+    scale: meters per unit; None: 0.001 for integers, 1 for floating-point numbers. Integers of 65535 count as
+    0, "no return". Raises InputError for a
     file that is missing or is not a depth image.
     """
     file = Path(file)
-    if file.suffix.lower() not in DEPTH_FORMATS:
-        raise unknown_name(f"depth image format of {file}:", file.suffix, DEPTH_FORMATS)
+    read = _READERS.get(file.suffix.lower())
+    if read is None:
+        raise unknown_name(f"depth image format of {file}:", file.suffix, _READERS)
     input_file(file, "depth image")
-    try:
-        image = _READERS[file.suffix.lower()](file)
-    except InputError:
-        raise
-    except Exception as error:  # the libraries raise many kinds of errors for damaged files
-        raise InputError(f"depth image {file} cannot be read: {shortened(str(error))}") from None
+    with reading(f"depth image {file}"):
+        image = read(file)
     _check_size(file, image.size)
     if image.ndim == 3 and image.shape[2] == 1:
         image = image[:, :, 0]
@@ -59,9 +57,12 @@ def read_depth(file: str | Path, scale: float | None = None) -> Float[ndarray, "
         raise InputError(
             f"depth image {file} holds {image.dtype} of {form}; it must be numbers, height x width"
         )
+    whole = image.dtype.kind in "ui"
     if scale is None:
-        scale = INTEGER_SCALE if image.dtype.kind in "ui" else 1.0
-    return image.astype(np.float64) * scale
+        scale = INTEGER_SCALE if whole else 1.0
+    return np.where(
+        whole & (image == NO_RETURN), 0.0, image.astype(np.float64) * positive("view", "scale", scale)
+    )
 
 
 def _read_png(file: Path) -> ndarray:
@@ -79,10 +80,6 @@ def _read_png(file: Path) -> ndarray:
 def _check_size(file: Path, pixels: int) -> None:
     if pixels > MAX_PIXELS:
         raise InputError(f"depth image {file} has {pixels:,} pixels; it must have at most {MAX_PIXELS:,}")
-
-
-def _read_array(file: Path) -> ndarray:
-    return read_array(file, "depth")
 
 
 def _read_exr(file: Path) -> ndarray:
@@ -132,10 +129,9 @@ def _area(first: ndarray, last: ndarray) -> int:
     return width * height
 
 
-_READERS = {
+_READERS: dict[str, Callable[[Path], ndarray]] = {
     ".png": _read_png,
-    ".npy": _read_array,
-    ".npz": _read_array,
+    **dict.fromkeys((".npy", ".npz"), partial(read_array, name="depth")),
     ".exr": _read_exr,
 }
 
@@ -183,10 +179,10 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
             points, new_notes = read_points(file)
             notes.extend(new_notes)
             source = {"cloud": file}
-        view = DepthView.from_cloud(_rows(where, points), T_base_camera, configuration, source)
+        view = DepthView.from_cloud(points, T_base_camera, configuration, source)
         return replace(view, **optional_fields)
     image = values["depth"]
-    scale = positive("view", "scale", values["scale"]) if "scale" in values else None
+    scale = values.get("scale")
     if isinstance(image, str):
         file = str(folder / image)
         image = read_depth(file, scale)
@@ -205,13 +201,6 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
     if isinstance(intrinsics, str):
         intrinsics = read_intrinsics(folder / intrinsics)
     return DepthView(image, intrinsics, T_base_camera, configuration, source=source, **optional_fields)
-
-
-def _rows(where: str, points: Any) -> Points:
-    array = numbers(points)
-    if array is None or array.ndim != 2 or array.shape[1] != 3:
-        raise InputError(f"{where}.cloud is {shown(points)}; it must be the name of a file or n x 3 numbers")
-    return array
 
 
 def view_entry(view: DepthView, folder: Path | None) -> dict[str, Any]:

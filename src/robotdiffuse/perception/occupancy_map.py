@@ -11,6 +11,7 @@ from jaxtyping import Int32, UInt8
 from numpy import ndarray
 from scipy.spatial import KDTree
 
+from robotdiffuse.core import bounds
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.locked import locked
 from robotdiffuse.core.types import Configuration, Points, Values
@@ -79,12 +80,7 @@ class OccupancyMap:
         stamp: when the view was taken [s]. Its `configuration` is that of the arm at this time; without one,
         or with one of the wrong length, InputError is raised.
         """
-        q = view.configuration
-        if q is None or len(q) != self.robot.dof:
-            raise InputError(
-                f"view.configuration is {shown(q)}; a map needs the {self.robot.dof} joint positions of"
-                f" {self.robot.name} when the view was taken"
-            )
+        q = self.configuration_of(view)
         state, _, counts = carve_view(view, self.robot, q, MAP)
         new_voxels = self._update(state, counts, stamp)
         if any(view.pose_deviation):
@@ -92,11 +88,21 @@ class OccupancyMap:
         self._surely_free |= state == FREE
         return new_voxels
 
+    def configuration_of(self, view: DepthView) -> Configuration:
+        """The arm's configuration at a view. Raises InputError without one or for a wrong length."""
+        q = view.configuration
+        if q is None or len(q) != self.robot.dof:
+            raise InputError(
+                f"view.configuration is {shown(q)}; a map needs the {self.robot.dof} joint positions of"
+                f" {self.robot.name} when the view was taken"
+            )
+        return q
+
     @locked
     def add_points(self, points: Points, stamp: float = 0.0) -> None:
         """Take occupied points in the base frame into account [m], e.g. the points of an
         `rd.PointCloud.from_file`. They give no information about free space."""
-        at = MAP.indices(np.asarray(points))
+        at = MAP.indices(bounds.points("map", "points", points))
         at = at[MAP.contains(at)]
         counts = np.zeros(MAP.shape, np.int32)
         counts[tuple(at.T)] = 1
@@ -106,7 +112,7 @@ class OccupancyMap:
     def declare_free(self, zone: Corners) -> None:
         """Voxels inside a box, given by its low and high corner, count as free unless a view finds them
         occupied."""
-        low, high = np.asarray(zone, np.float64)
+        low, high = bounds.rows("free_zone", zone, 2, 3)
         if not (low < high).all():
             raise InputError(f"free_zone is {shown(zone)}; its low corner must be below its high corner")
         first = np.maximum(np.ceil((low - MAP.low) / MAP.edge - 1e-6), 0).astype(int)

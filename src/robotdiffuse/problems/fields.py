@@ -185,7 +185,8 @@ def equipped(robot: Robot, values: dict[str, Any], folder: Path, notes: list[str
         name = _text("tool.name", tool.get("name", TOOL))
         robot = robot.with_tool(link, pose_of("tool", tool), shapes.shapes, _touch_links("tool", tool), name)
     attached = values.get("attached")
-    for location, entry in entries_of("attached", attached or [], "objects, each with a link"):
+    objects = [] if attached is None else attached
+    for location, entry in entries_of("attached", objects, "objects, each with a link"):
         if not isinstance(entry, dict) or "link" not in entry:
             raise InputError(
                 f"{location} is {shown(entry)}; it must be a shape with its link, e.g. "

@@ -305,6 +305,7 @@ def _problem(
                 request = moveit_request(read_yaml(request_place), frames, folder)
             names += tuple(attached.name for attached in request.attached)
         contacts = values.get("allowed_contacts", {})
+        check_type("allowed_contacts", contacts, dict, "a mapping of obstacles to lists of links, or to all")
         if from_moveit:
             with located(scene_place):
                 scene = moveit_scene(content, frames, Path(scene_place).parent, names, contacts)

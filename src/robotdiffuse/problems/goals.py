@@ -5,6 +5,7 @@ As with shapes, the constructors check their arguments themselves: see `no_type_
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import no_type_check
 
 import numpy as np
@@ -123,14 +124,16 @@ class PosesGoal(Value):
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class AnyGoal(Value):
-    """Several goals, any of which may be reached."""
+    """Several goals, any of which may be reached. The goals of an AnyGoal among them become goals of this
+    one."""
 
     goals: "tuple[OneGoal, ...]"
 
     def __post_init__(self) -> None:
-        types = "rd.JointGoal, rd.PoseGoal and rd.PosesGoal"
-        check_list("goal.goals", self.goals, OneGoal, types, least=1)
-        object.__setattr__(self, "goals", tuple(self.goals))
+        types = "rd.JointGoal, rd.PoseGoal, rd.PosesGoal and rd.AnyGoal"
+        check_list("goal.goals", self.goals, Goal, types, least=1)
+        goals = [goal.goals if isinstance(goal, AnyGoal) else (goal,) for goal in self.goals]
+        object.__setattr__(self, "goals", tuple(chain(*goals)))
 
     def moved(self, T: Pose) -> "AnyGoal":
         """The goals after a rigid motion.

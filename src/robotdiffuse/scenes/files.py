@@ -8,7 +8,7 @@ from typing import Any
 
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import vector
+from robotdiffuse.core.bounds import MAX_ANGLE, vector
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.input_files import read_array
 from robotdiffuse.core.mesh_files import read_triangles
@@ -50,7 +50,7 @@ def check_fields(
     if "rpy" in data and "wxyz" in field_names:
         if "wxyz" in data:
             raise InputError(f"{where} has both wxyz and rpy; give one of them")
-        rpy = vector(where, "rpy", data["rpy"], 3)
+        rpy = vector(where, "rpy [rad]", data["rpy"], 3, MAX_ANGLE)
         data = {name: value for name, value in data.items() if name != "rpy"}
         data["wxyz"] = quaternion_from_rotation(rotation_from_rpy(*rpy)).tolist()
     for name in data:
@@ -78,7 +78,13 @@ def read_scene(
         )
     notes: list[str] = []
     shapes = [read_shape(f"{field}[{i}]", entry, folder, notes) for i, entry in enumerate(entries)]
-    return Scene(shapes, contacts), tuple(notes)  # type: ignore[arg-type]
+    scene = Scene(shapes, contacts)  # type: ignore[arg-type]
+    for i, (shape, named) in enumerate(zip(shapes, scene.shapes, strict=True)):
+        if shape.name not in (shape.kind, named.name):
+            notes.append(
+                f"{field}[{i}]: an earlier shape is named {shape.name} too; this one is {named.name}"
+            )
+    return scene, tuple(notes)
 
 
 def read_shape(where: str, entry: object, folder: Path, notes: list[str]) -> Shape:
@@ -102,8 +108,8 @@ def required_fields(kind: Any) -> list[str]:
 def _shape(where: str, kind: type[Shape], values: object, folder: Path, notes: list[str]) -> Shape:
     required = required_fields(kind)
     optional = [f.name for f in fields(kind) if f.name not in required]  # type: ignore[arg-type]
-    if isinstance(values, dict) and "file" in values:
-        content = FILE_CONTENT.get(kind.kind, ())
+    content = FILE_CONTENT.get(kind.kind, ())
+    if content and isinstance(values, dict) and "file" in values:
         required = ["file", *(name for name in required if name not in content)]
         optional = [name for name in optional if name != "file"]
         values = dict(check_fields(where, values, required, optional))

@@ -6,15 +6,20 @@ which follows. Bit 0, 1 or 2 of a child's number is set if the child is in the u
 OccupancyOcTreeBase::writeBinaryNode of https://github.com/OctoMap/octomap.
 """
 
+import io
+import math
+import re
 import struct
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
+from robotdiffuse.core.errors import InputError, reading, shown, unknown_name
 from robotdiffuse.core.input_files import input_file, read_array, read_bytes
+from robotdiffuse.core.mesh_files import check_ply
 from robotdiffuse.core.types import Points, Vector
 
 FIRST_LINE = b"# Octomap OcTree binary file"
@@ -109,6 +114,8 @@ def _shell(level: int) -> Points:
     return np.concatenate([np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3) for axes in blocks])
 
 
+UTF8 = "utf-8-sig"
+"""The encoding of texts, with or without a byte order mark."""
 POINT_RADIUS = 0.01
 """Default radius of points [m]."""
 
@@ -165,18 +172,16 @@ def read_points(file: str | Path) -> tuple[Points, tuple[str, ...]]:
         raise unknown_name(f"point cloud format of {file}:", file.suffix, READERS)
     if input_file(file, "point cloud file").stat().st_size == 0:
         raise InputError(f"point cloud file {file} is empty")
-    try:
-        points = np.asarray(reader(file), dtype=np.float64)
-    except InputError:
-        raise
-    except Exception as error:  # the libraries raise many kinds of errors for damaged files
-        raise InputError(f"point cloud file {file} cannot be read: {shortened(str(error))}") from None
+    with reading(f"point cloud file {file}"):
+        points = np.asarray(reader(file))
     if points.size == 0:
         return np.zeros((0, 3)), (f"{file} holds no points",)
-    if points.ndim != 2 or points.shape[1] < 3:
+    if points.dtype.kind not in "iuf" or points.ndim != 2 or points.shape[1] < 3:
         shape = " x ".join(map(str, points.shape))
-        raise InputError(f"point cloud file {file} holds an array of {shape}; it must be n x 3")
-    points = np.ascontiguousarray(points[:, :3])
+        raise InputError(
+            f"point cloud file {file} holds {points.dtype} of {shape}; it must be numbers, n x 3"
+        )
+    points = np.ascontiguousarray(points[:, :3], np.float64)
     finite = np.isfinite(points).all(axis=1)
     if finite.all():
         return points, ()
@@ -187,59 +192,63 @@ def read_points(file: str | Path) -> tuple[Points, tuple[str, ...]]:
 def _read_ply(file: Path) -> ndarray:
     from trimesh.exchange.ply import load_ply
 
-    with file.open("rb") as stream:
-        fields = load_ply(stream)
-    return fields.get("vertices", np.zeros((0, 3)))
+    content = file.read_bytes()
+    check_ply(content)
+    return load_ply(io.BytesIO(content)).get("vertices", np.zeros((0, 3)))
 
 
 def _read_text(file: Path) -> ndarray:
     """Columns of numbers, separated by commas or blanks. The first line may be a header with the names of the
     columns."""
-    with file.open(encoding="utf-8") as stream:
+    with file.open(encoding=UTF8) as stream:
         first = stream.readline()
     delimiter = "," if "," in first else None
-    names = [name.strip().strip('"').lower() for name in first.split(delimiter)]
+    names = [name.strip().strip('"').lower() for name in first.lstrip("#/ ").split(delimiter)]
     header = False
     try:
-        float(names[0])
+        float((names or "0")[0])
     except ValueError:
-        header = not names[0].startswith("#")
-    columns = [names.index(axis) for axis in "xyz"] if header and {"x", "y", "z"} <= {*names} else None
-    if header and not file.read_text(encoding="utf-8").partition("\n")[2].strip():
+        header = True
+    named = {"x", "y", "z"} & {*names}
+    if header and named and len(named) < 3 and first[0] not in "#/":
+        raise InputError(f"it has the columns {shown(names)}; it must have x, y and z")
+    columns = [names.index(axis) for axis in "xyz"] if header and len(named) == 3 else None
+    if header and not file.read_text(UTF8).partition("\n")[2].strip():
         return np.zeros((0, 3))
-    return np.loadtxt(file, delimiter=delimiter, skiprows=int(header), usecols=columns, ndmin=2, comments="#")
-
-
-def _read_array(file: Path) -> ndarray:
-    return read_array(file, "points")
+    return np.loadtxt(
+        file, delimiter=delimiter, skiprows=int(header), usecols=columns, ndmin=2, encoding=UTF8
+    )
 
 
 def _read_pcd(file: Path) -> ndarray:
     """PCD version 0.7: https://pointclouds.org/documentation/tutorials/pcd_file_format.html"""
     content = file.read_bytes()
-    header: dict[str, list[str]] = {}
-    at = 0
-    while "DATA" not in header:
-        end = content.index(b"\n", at)
-        words = content[at:end].decode("ascii").split()
-        at = end + 1
-        if words and not words[0].startswith("#"):
-            header[words[0]] = words[1:]
+    match = re.search(rb"^DATA[ \t]+\S[^\n]*(\n|\Z)", content, re.MULTILINE)
+    at = match.end() if match else 0
+    lines = map(str.split, content[:at].decode("ascii").splitlines())
+    header = {words[0]: words[1:] for words in lines if words}
+    missing = [name for name in ("FIELDS", "POINTS") if not header.get(name)] if match else ["DATA"]
+    if missing:
+        raise InputError(f"it has no {' and no '.join(missing)} in its header")
     names = header["FIELDS"]
     storage = header["DATA"][0]
     counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
     if not {"x", "y", "z"} <= {*names}:
-        raise InputError(f"point cloud file {file} has the fields {shown(names)}; it must have x, y and z")
+        raise InputError(f"it has the fields {shown(names)}; it must have x, y and z")
     total = int(header["POINTS"][0])
+    sides = [int(header[side][0]) for side in ("WIDTH", "HEIGHT") if header.get(side)]
+    if total < 0 or (sides and math.prod(sides) != total):
+        size = " x ".join(map(str, sides))
+        raise InputError(f"it has {total} POINTS; it must be WIDTH x HEIGHT, {size}")
     if storage == "ascii":
-        columns = [sum(counts[: names.index(axis)]) for axis in "xyz"]
-        rows = content[at:].decode("ascii").splitlines()[:total]
+        places = [sum(counts[: names.index(axis)]) for axis in "xyz"]
+        rows = [row for row in content[at:].decode("ascii").splitlines() if row.strip()]
         if len(rows) != total:
-            raise InputError(f"point cloud file {file} holds {len(rows)} of its {total} points")
-        return np.loadtxt(rows, usecols=columns, ndmin=2) if total else np.zeros((0, 3))
+            raise InputError(f"it holds {len(rows)} of its {total} points")
+        return np.loadtxt(rows, usecols=places, ndmin=2, comments=None) if total else np.zeros((0, 3))
     if storage not in ("binary", "binary_compressed"):
         advice = "it must be ascii, binary or binary_compressed"
-        raise InputError(f"point cloud file {file} is stored as {shown(storage)}; {advice}")
+        raise InputError(f"it is stored as {shown(storage)}; {advice}")
     kinds = [f"<{kind.lower()}{size}" for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]
     # Fields are named by position: PCL writes several padding fields that are all called "_".
     record = np.dtype([(str(i), kind, (n,)) for i, (kind, n) in enumerate(zip(kinds, counts, strict=True))])
@@ -251,14 +260,14 @@ def _read_pcd(file: Path) -> ndarray:
         packed, size = struct.unpack_from("<II", content, at)
         if size != total * record.itemsize:
             needed = f"{total:,} points take {total * record.itemsize:,}"
-            raise InputError(f"point cloud file {file} unpacks to {size:,} bytes; its {needed}")
+            raise InputError(f"it unpacks to {size:,} bytes; its {needed}")
         unpacked = lzf_unpacked(content[at + 8 : at + 8 + packed], size)
         columns = []
         for i in places:
             offset = sum(record[k].itemsize for k in range(i))
             values = np.frombuffer(unpacked, kinds[i], total * counts[i], total * offset)
             columns.append(values.reshape(total, counts[i])[:, 0])
-    return np.stack([column.astype(np.float64) for column in columns], axis=1)
+    return np.stack(columns, axis=1)
 
 
 def lzf_unpacked(packed: bytes, size: int) -> bytes:
@@ -298,8 +307,7 @@ READERS: dict[str, Callable[[Path], ndarray]] = {
     ".pcd": _read_pcd,
     ".xyz": _read_text,
     ".csv": _read_text,
-    ".npy": _read_array,
-    ".npz": _read_array,
+    **dict.fromkeys((".npy", ".npz"), partial(read_array, name="points")),
     ".bt": lambda file: read_octomap(file)[0],
 }
 

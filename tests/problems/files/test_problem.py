@@ -301,7 +301,7 @@ def test_wrong_names_and_angles() -> None:
             {"scene": [{"box": {"center": [1, 0, 0], "size": [1] * 3, "rpy": [0] * 3, "wxyz": [1] * 4}}]},
             "scene[0].box has both wxyz and rpy; give one of them",
         ),
-        ({"base": {"rpy": [0, 0]}}, "base.rpy is [0, 0]; it must be 3 finite numbers"),
+        ({"base": {"rpy": [0, 0]}}, "base.rpy [rad] is [0, 0]; it must be 3 finite numbers"),
     ):
         refuses(re.escape(message), problem_from_record, BASIC | changes)
 

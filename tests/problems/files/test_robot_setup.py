@@ -130,6 +130,13 @@ WRONG = {
     "base": ({"base": {"euler": [0, 0, 0]}}, "unknown field of base: .euler.; known: rpy, wxyz, xyz"),
     "tool link": ({"tool": {"xyz": [0, 0, 0]}}, "tool has no link"),
     "unknown tool link": ({"tool": {"link": "hand"}}, "unknown link in tool.link: 'hand'"),
+    "attached nothing": ({"attached": {}}, "attached is {}; it must be a list of objects"),
+    "contacts in a list": ({"allowed_contacts": []}, "allowed_contacts is \\[\\]; it must be a mapping of obstacles"),
+    "degrees": ({"base": {"rpy": [0, 0, 90]}}, r"base.rpy \[rad\] is \[0, 0, 90\]; .* within ±6.3"),
+    "cloud as a ball": (
+        {"scene": [{"sphere": {"center": [1, 0, 0], "radius": 0.1, "file": "a.ply"}}]},
+        "unknown field of scene.*: 'file'",
+    ),
     "attached": ({"attached": CUP}, "attached is .*; it must be a list of objects"),
     "no link": ({"attached": [WALL]}, r"attached\[0\] is .*; it must be a shape with its link"),
     "fixed link": ({"attached": [CUP | {"link": "panda_link0"}]}, r"attached\[0\]: attached.link: no"),
@@ -141,3 +148,8 @@ WRONG = {
 def test_wrong_equipment_is_one_line(case: str, tmp_path: Path) -> None:
     extra, message = WRONG[case]
     refuses(message, rd.load_problem, written(tmp_path, PLAIN | extra))
+
+
+def test_a_second_shape_of_one_name_is_noted(tmp_path: Path) -> None:
+    problem = rd.load_problem(written(tmp_path, PLAIN | {"scene": [WALL, WALL]}))
+    assert problem.notes == ("scene[1]: an earlier shape is named wall too; this one is wall_2",)

@@ -34,6 +34,7 @@ from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.locked import locked
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import FIRST, Configuration, Configurations, Path, Status, Trajectory
+from robotdiffuse.perception.camera_check import contradiction, implausible
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.occupancy_map import Corners, OccupancyMap, ViewMemory
 from robotdiffuse.perception.pose_refinement import PoseRefinement, is_on
@@ -175,8 +176,15 @@ class Explorer:
             stamp: Time of the exposure [s]; older evidence is forgotten after `max_age`.
 
         Raises:
-            InputError: For a view that does not fit the robot.
+            InputError: For a view that does not fit the robot, whose depths are not in meters, or that sees
+                through the arm.
         """
+        q = self.map.configuration_of(view)
+        wrong = implausible(view)
+        if not wrong and self._camera_of(view) is None:
+            wrong = contradiction(view, self.robot, q)
+        if wrong:
+            raise InputError(f"check the camera of the view: {wrong}")
         stated = view
         view = self._poses.observe(view)
         new_voxels = self.map.add(view, stamp)

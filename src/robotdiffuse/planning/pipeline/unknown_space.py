@@ -35,6 +35,7 @@ from robotdiffuse.perception.unknown_space import (
     MAX_UNSEEN_SHARE,
     PADDINGS,
     THRESHOLDS,
+    UNSEEN_CONFIDENCE,
     Assumption,
     OccupiedVoxels,
     Padded,
@@ -123,7 +124,7 @@ def plan_with_unknown_space(
                 f"views[{i}]: {100 * (1 - share):.0f} % of the pixels measure nothing, which lowers the"
                 " confidence; if the sensor gives 0 where nothing is in range, state the view's range"
             )
-    attempts = _Attempts(planner, context, unknown)
+    attempts = _Attempts(planner, context, unknown, UNSEEN_CONFIDENCE if any(cameras) else 1.0)
     as_seen = replace(problem, views=())
     limit = request.time_limit
     failed = list[str]()
@@ -257,6 +258,8 @@ class _Attempts:
     planner: Solver
     context: PlanningContext
     unknown: UnknownSpace
+    most: float
+    """Largest confidence: an image of a wrong camera may show other space as free."""
 
     def best(self, problem: Problem, assumption: str, until: float) -> PlanResult:
         """A motion found before `until` [s since the call], or the result that says why there is none.
@@ -306,6 +309,6 @@ class _Attempts:
             result,
             notes=(*result.notes, blind) if crossed.unseen_share > MAX_UNSEEN_SHARE else result.notes,
             assumption=assumption,
-            confidence=confidence(assumption, crossed),
+            confidence=min(confidence(assumption, crossed), self.most),
             swept_probability=crossed.risk,
         )
