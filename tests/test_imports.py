@@ -1,7 +1,11 @@
-"""The direction of imports, what `import robotdiffuse` costs, and that tests use public names."""
+"""The source: the direction of imports, what `import robotdiffuse` costs, that tests use public names, and that the code of
+each package has at most as many tokens as CONTRIBUTING.md allows; tokens ignore layout."""
 
 import ast
+import io
 import re
+import tokenize
+from collections import defaultdict
 from collections.abc import Iterator
 from functools import cache
 from graphlib import TopologicalSorter
@@ -9,7 +13,8 @@ from pathlib import Path
 
 from helpers.commands import python
 
-SOURCE = Path(__file__).parents[1] / "src" / "robotdiffuse"
+ROOT = Path(__file__).parents[1]
+SOURCE = ROOT / "src" / "robotdiffuse"
 MODULES = sorted(SOURCE.rglob("*.py"))
 ORDER = (
     *("core", "processes", "robots", "scenes", "collision", "perception"),
@@ -140,8 +145,7 @@ def used_names(tree: ast.AST) -> Iterator[str]:
 def test_tests_benchmarks_and_examples_use_no_private_names() -> None:
     private = {name for file in MODULES for name in defined_names(tree_of(file)) if name[0] == "_" != name[-1]}
     private -= {"_replace"}  # a public method of named tuples
-    root = SOURCE.parents[1]
-    folders = (root / folder for folder in ("tests", "benchmarks", "examples"))
+    folders = (ROOT / folder for folder in ("tests", "benchmarks", "examples"))
     for file in (file for folder in folders for file in folder.rglob("*.py")):
         text = file.read_text()
         if private.isdisjoint(re.findall(r"\b_\w+", text)):
@@ -149,7 +153,7 @@ def test_tests_benchmarks_and_examples_use_no_private_names() -> None:
         own = ast.parse(text)
         used = private.intersection(used_names(own))
         used -= set(defined_names(own)) if used else set()
-        assert not used, f"{file.relative_to(root)} uses {', '.join(sorted(used))}"
+        assert not used, f"{file.relative_to(ROOT)} uses {', '.join(sorted(used))}"
 
 
 def test_import_loads_nothing_heavy() -> None:
@@ -182,3 +186,42 @@ def test_public_names_resolve_and_verify_is_the_function() -> None:
         "print(callable(rd.verify), all(hasattr(rd, name) for name in dir(rd)))"
     )
     assert python(code).stdout == "True True\n"
+
+
+SLACK = 1.02
+# what a compiler does not see, and brackets and commas, which follow from the layout
+NOT_COUNTED = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
+
+
+def token_count(text: str) -> int:
+    """The tokens of a module without comments, docstrings, round brackets and commas."""
+    texts = {
+        line
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        for line in range(node.lineno, (node.end_lineno or node.lineno) + 1)
+    }
+    return sum(
+        token.type not in NOT_COUNTED
+        and token.string not in ("", ",", "(", ")")
+        and not (token.type == tokenize.STRING and token.start[0] in texts)
+        for token in tokenize.generate_tokens(io.StringIO(text).readline)
+    )
+
+
+def test_what_counts() -> None:
+    text = '"""Doc."""\nx = f(\n    1,  # one\n    2,\n)\n"""About x."""\n'
+    assert token_count(text) == len(["x", "=", "f", "1", "2"])
+
+
+def test_no_package_grows_beyond_its_row() -> None:
+    """A package that needs more tokens raises its number in the table and gives the reason; one that shrank lowers it."""
+    rows = re.findall(r"^\| `([\w.]+)` \| ([\d,]+) \|", (ROOT / "CONTRIBUTING.md").read_text(), re.MULTILINE)
+    allowed = {name: int(tokens.replace(",", "")) for name, tokens in rows}
+    tokens: dict[str, int] = defaultdict(int)
+    for file in SOURCE.rglob("*.py"):
+        parts = file.relative_to(SOURCE).parts
+        tokens[parts[0] if len(parts) > 1 else "."] += token_count(file.read_text())
+    assert tokens.keys() == allowed.keys()
+    larger = {name: count for name, count in tokens.items() if count > SLACK * allowed[name]}
+    assert not larger, f"shorten {larger} or raise their rows of CONTRIBUTING.md, with the reason"

@@ -1,15 +1,33 @@
-"""Every code block of the README and of the documentation does what it says; see helpers/code_blocks.py."""
+"""Every code block of the README and of the documentation does what it says; see helpers/code_blocks.py. Each example of
+docs/extending.md is saved as a module, added to its table by its line, and used."""
 
 import json
 import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+import robotdiffuse as rd
 from helpers.code_blocks import PAGES, ROOT, Notebook, code_blocks
+from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.evaluation.metrics import METRICS
+from robotdiffuse.learning.denoisers import DENOISERS
+from robotdiffuse.learning.diffusion import SAMPLERS
+from robotdiffuse.learning.encoders import ENCODERS
+from robotdiffuse.planning import PLANNERS
+from robotdiffuse.problems.families import FAMILIES, load_family
+from robotdiffuse.problems.families.family import Family
+from robotdiffuse.problems.files import problem_record
+from robotdiffuse.scenes.files import SHAPES
+from robotdiffuse.scenes.surface_points import sample_surface
+from robotdiffuse.simulation import PyBulletOracle
+from robotdiffuse.visualization.replay_page import write_replay
 
 pytestmark = pytest.mark.slow
 
@@ -59,3 +77,69 @@ def script(page: Path) -> str:
     """The Python blocks of a page that run, one after the other."""
     blocks = [block for block in code_blocks(page) if block.language == "python"]
     return "\n".join(b.code for b in blocks if "file" not in b.marks and b.marks.get("test") != "parse")
+
+
+TABLES: tuple[dict[str, Any], ...] = (*(PLANNERS, FAMILIES, METRICS, SHAPES), *(DENOISERS, ENCODERS, SAMPLERS))
+
+
+@pytest.fixture(scope="module")
+def names(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
+    """The names that the page's Python defines, while its entries are in the tables."""
+    folder = tmp_path_factory.mktemp("extending")
+    tables = [dict(table) for table in TABLES]
+    notebook = Notebook(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.syspath_prepend(folder)
+        try:
+            for block in code_blocks(ROOT / "docs" / "extending.md"):
+                notebook.try_block(block)
+            yield notebook.names
+        finally:
+            for table, before in zip(TABLES, tables, strict=True):
+                table.clear()
+                table.update(before)
+            for file in folder.glob("*.py"):
+                sys.modules.pop(file.stem, None)
+
+
+def test_planners_solve_and_are_validated(names: dict[str, Any]) -> None:
+    bent = names["bent"]
+    assert bent.solved and bent.planner == "one_bend" and len(bent.path.positions) == 3
+    assert rd.verify(names["problem"], bent.path).valid
+    assert rd.load_planner("one_bend").plan(names["problem"], seed=1).solved
+    sampled = names["sampled"]
+    assert sampled.solved and sampled.stage == "network" and sampled.planner == "shortened_sample"
+    assert rd.verify(names["problem"], sampled.path).valid
+
+
+def test_parts_of_the_learned_stack_are_used_by_name_and_a_metric_is_measured(names: dict[str, Any]) -> None:
+    assert names["training"].denoiser == "by_waypoint" and names["motions"].shape == (2, 48, 7)
+    assert names["code"].shape == (5, names["encoder"].settings.code)
+    at_once = names["at_once"]
+    assert at_once.planner == "diffusion" and "samples of the network" in at_once.reason
+    assert names["values"]["steps"] == 2
+
+
+def test_a_family_draws_problems(names: dict[str, Any]) -> None:
+    family = load_family("posts")
+    assert isinstance(family, Family)
+    assert len(names["drawn"].scene.shapes) <= 1 + family.max_obstacles
+    first, again = (family.draw(names["problem"].robot, np.random.default_rng(3)) for _ in range(2))
+    assert np.array_equal(first.start, again.start)
+
+
+def test_a_shape_is_everywhere(names: dict[str, Any], tmp_path: Path) -> None:
+    problem = names["around_cone"]
+    result = names["result"]
+    [cone] = problem.scene.shapes
+    assert result.solved and problem_record(problem)["scene"][0]["cone"]["height"] == cone.height  # type: ignore[index]
+    line = np.linspace(problem.start, problem.goal.positions[0], 50)
+    assert ExactCollision(problem.robot, problem.scene).collides(line).any(), "the cone is in the way"
+    with PyBulletOracle(problem.robot, problem.scene) as oracle:
+        assert any(oracle.collides(q) for q in line)
+        assert oracle.check_path(result.path) is None
+    cloud = sample_surface(problem.scene, 500, np.random.default_rng(0)) - cone.center
+    radius = np.linalg.norm(cloud[:, :2], axis=1)
+    assert (radius <= (1 - cloud[:, 2] / cone.height) * cone.radius * 1.01 + 1e-9).all()
+    write_replay(problem.robot, problem.scene, result.trajectory, tmp_path / "cone.html")
