@@ -126,7 +126,7 @@ def contacts_on_meshes(
     tolerance: PyBullet ignores contacts that are less deep than this [m]. oracle: PyBullet with the same
     robot, which is reused because loading a robot takes 30 ms; None: a new one.
     """
-    robot, scene = problem.standing()
+    robot, scene = problem.robot_and_scene_in_world()
     coal = int(ExactCollision(problem.robot, problem.scene).collides(q).sum())
     with nullcontext(oracle) if oracle else PyBulletOracle(robot, scene) as bullet:
         if oracle:

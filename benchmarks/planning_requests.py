@@ -201,7 +201,7 @@ def checked(named: NamedProblem, result: PlanResult) -> Checked:
     path = dense(result.path.positions, PATH_STEP)
     contacts = contacts_on_meshes(problem, np.concatenate([path, result.trajectory.positions]))
     end = result.trajectory.positions[-1]
-    standing, _ = problem.standing()
+    standing, _ = problem.robot_and_scene_in_world()
     with World(standing, rd.Scene()) as simulated:
         simulated.place(end)
         off = max(_off(problem, pose, simulated) for pose in poses_of(problem.goal))

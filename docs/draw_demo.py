@@ -27,7 +27,7 @@ COLORS = 256
 
 def frames(problem: rd.Problem, trajectory: rd.Trajectory) -> list[Image.Image]:
     """A frame for each moment: the arm, its start as a ghost, and the path of the cup so far."""
-    robot, scene = problem.standing()
+    robot, scene = problem.robot_and_scene_in_world()
     size = SIZE.width, SIZE.height
     camera = view_of_motion(DrawnArm(robot), drawables(scene), trajectory.positions, size, MARGINS)
     count = int(np.ceil(SLOWDOWN * trajectory.times[-1] / FRAME_TIME)) + 1

@@ -238,7 +238,7 @@ FORGED: dict[str, tuple[Callable[[Record], object], str]] = {
     "no torques": (set_to("torques", to=[]), "torques: they are not those"),
     "a smaller angle": (set_to("constraints", 0, 1, to=0.0), "constraints: the bound of axis_cone"),
     "no constraints": (set_to("constraints", to=[]), "constraints: they are not those"),
-    "another name": (set_to("robot", to="ur5e"), "robot: it is panda, not ur5e"),
+    "another name": (set_to("robot", to="ur5e"), "robot: the problem has panda, the certificate ur5e"),
     "spheres of before": (set_to("robot_parts", "spheres of panda_link5", to="0" * 16), "has changed"),
     "an unknown field": (set_to("holds", to=True), "holds is unknown"),
     # the problem, judged by the true one

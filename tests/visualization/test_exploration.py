@@ -36,6 +36,7 @@ def test_a_cube_has_six_faces_around_it() -> None:
 
 
 @pytest.mark.usefixtures("small_pictures")
+@pytest.mark.slow
 def test_each_moment_has_a_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     problem, explorer, _ = recorded()
     monkeypatch.setattr(exploration, "TILE", PictureSettings(width=240, height=150, ghosts=1))

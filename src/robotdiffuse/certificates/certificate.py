@@ -76,7 +76,8 @@ def load_certificate(file: str | FilePath) -> Certificate:
         raise InputError(f"{file} is not a certificate; write one by `robotdiffuse verify --certificate`")
     with reading(file):
         if record.get("version") != VERSION:
-            raise InputError(f"version is {shown(record.get('version'))}; this version reads {VERSION}")
+            version = shown(record.get("version"))
+            raise InputError(f"its format has version {version}; this release reads version {VERSION}")
         field_names = {"is", "version", *FIELDS}
         unknown = sorted(record.keys() - field_names)
         if unknown:
@@ -164,7 +165,7 @@ def _named_bounds(_: str, rows: list[Any]) -> tuple[tuple[str, float], ...]:
 def _vector(name: str, value: object) -> ndarray:
     array = np.zeros(0) if value == [] else numbers(value)
     if array is None or array.ndim != 1 or not within(array, MAX_RATE):
-        raise InputError(f"{name} must be a list of finite numbers")
+        raise InputError(f"{name} must be a list of numbers within ±{MAX_RATE:g}")
     return array
 
 

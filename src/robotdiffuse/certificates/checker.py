@@ -87,7 +87,7 @@ def check(
         if not stated >= 0:
             errors.append(f"tolerances: {name} is {stated:g}; it must not be negative")
     if certificate.robot != problem.robot.name:
-        errors.append(f"robot: it is {problem.robot.name}, not {certificate.robot}")
+        errors.append(f"robot: the problem has {problem.robot.name}, the certificate {certificate.robot}")
     if certificate.motion_hash != hash_of(certificate.motion):
         errors.append("motion: it is not the one that was certified: its hash differs")
     with np.errstate(

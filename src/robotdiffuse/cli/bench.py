@@ -173,7 +173,7 @@ def run_figures(arguments: Namespace) -> int:
     report.plot("figure3a.svg", caption, paper.plot_success_over_time(bench))
     compared = paper.compared_motions(bench)
     if compared is not None:
-        robot, scene = compared.case.problem.standing()
+        robot, scene = compared.case.problem.robot_and_scene_in_world()
         size = PictureSettings(shell=0.05)
         title = compared.case.name
         write_comparison(robot, scene, compared.motions, out / "figure3b.png", title=title, settings=size)

@@ -72,7 +72,8 @@ def run_planner(arguments: Namespace) -> None:
             arguments.denoiser
         )
     if {"denoiser", "objective", "waypoints"} & set(options):
-        options["progressive"] = False  # its stages suit the config's own denoiser, objective and waypoints
+        # the stages of progressive training suit the config's own denoiser, objective and waypoints
+        options["progressive"] = False
     if "encoder" in config:
         options.setdefault("encoder", config["encoder"])
     if arguments.config == "paper" and "encoder" not in options:

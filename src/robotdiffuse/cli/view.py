@@ -64,7 +64,7 @@ def _shown(problem: Problem) -> tuple[Robot, Scene]:
     if problem.views and policy_for(problem)[0] == PREDICTED:
         known_and_predicted = Scene([*problem.scene.shapes, predicted_obstacles(problem)])
         problem = replace(problem, scene=known_and_predicted, views=())
-    return problem.standing()
+    return problem.robot_and_scene_in_world()
 
 
 def open_in_browser(file: Path) -> None:
@@ -123,7 +123,7 @@ def run_simulate(arguments: Namespace) -> int:
     result, problem = read_solved(arguments.result)
     if result.trajectory is None:
         raise InputError(f"{arguments.result} holds a path without times; a replay needs a trajectory")
-    robot, scene = problem.standing()
+    robot, scene = problem.robot_and_scene_in_world()
     executed = replay(robot, scene, result.trajectory, moving=problem.moving_in_world)
     for name in (entry.name for entry in problem.moving if not entry.known):
         print(f"note: the motion of {name} is not known; it stands still here")
@@ -147,7 +147,7 @@ def run_simulate(arguments: Namespace) -> int:
                 entry.link,
                 entry.other,
                 f"{entry.time:.2f} s",
-                f"{1e3 * entry.depth:.1f} mm" if entry.depth > 0 else "none: closer than 2 mm",
+                f"{1e3 * entry.depth:.1f} mm" if entry.depth > 0 else "0 (gap below 2 mm)",
             )
             for entry in executed.contacts
         ]

@@ -427,7 +427,7 @@ class Problem(Value):
         goal = moved(goal, T_base_world)
         return cls(robot, scene, start, goal, T_world_base=T, **moved_options)  # type: ignore[arg-type]
 
-    def standing(self) -> tuple[Robot, Scene]:
+    def robot_and_scene_in_world(self) -> tuple[Robot, Scene]:
         """The robot and the scene in the world's frame, for pictures and simulators."""
         T = self.T_world_base
         return (self.robot, self.scene) if T is None else (self.robot.placed_in_world(T), self.scene.moved(T))

@@ -398,7 +398,7 @@ class Mesh(_Posed, Triangulated):
     xyz: GivenVector = (0.0, 0.0, 0.0)  # type: ignore[assignment]
     wxyz: GivenArray = IDENTITY  # type: ignore[assignment]
     file: str | None = None
-    """The file that the shape was read from. Problem files that are written refer to it."""
+    """The file that the shape was read from. A problem that is saved refers to this file."""
     name: str = "mesh"
     kind: ClassVar[str] = "mesh"
     origin: ClassVar[str] = "xyz"
@@ -483,7 +483,7 @@ class HeightMap(_Posed, Triangulated):
     xyz: GivenVector = (0.0, 0.0, 0.0)  # type: ignore[assignment]
     wxyz: GivenArray = IDENTITY  # type: ignore[assignment]
     file: str | None = None
-    """The file that the shape was read from. Problem files that are written refer to it."""
+    """The file that the shape was read from. A problem that is saved refers to this file."""
     name: str = "height_map"
     kind: ClassVar[str] = "height_map"
     origin: ClassVar[str] = "xyz"

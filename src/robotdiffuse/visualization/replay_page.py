@@ -289,7 +289,7 @@ def write_problem(problem: Problem, file: str | FilePath, result: PlanResult | N
     validities = {"start": problem.is_free(problem.start), "goal": validity}
     states = np.stack([problem.start] if goal is None else [problem.start, goal])
     scene = problem.scene.with_shapes([*problem.scene.shapes, *(moving.shape for moving in problem.moving)])
-    robot, scene = replace(problem, scene=scene, moving=()).standing()
+    robot, scene = replace(problem, scene=scene, moving=()).robot_and_scene_in_world()
     T_world_base = IDENTITY if problem.T_world_base is None else problem.T_world_base
     poses = (pose for goal in _goals(problem) for pose in poses_of(goal))
     T_world_poses = [T_world_base @ pose.T_base_frame for pose in poses]
@@ -551,7 +551,8 @@ def result_page(problem: Problem, result: PlanResult) -> str:
         if motion is None:
             write_problem(problem, file, result)
         else:
-            write_replay(*problem.standing(), motion, file, result=result, moving=problem.moving_in_world)
+            moving = problem.moving_in_world
+            write_replay(*problem.robot_and_scene_in_world(), motion, file, result=result, moving=moving)
         return file.read_text("utf-8")
 
 

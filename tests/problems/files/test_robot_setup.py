@@ -81,7 +81,7 @@ def test_distances_are_the_same_in_the_world() -> None:
     robot = rd.load_robot("panda").attach(rd.Sphere([0, 0, 0.15], 0.04, name="ball"), "panda_hand")
     scene = rd.Scene(SHAPES)
     problem = rd.Problem.in_world(T_WORLD_BASE, robot, scene.moved(T_WORLD_BASE), START, GOAL)
-    standing, world = problem.standing()
+    standing, world = problem.robot_and_scene_in_world()
     q = np.array(START)
     here = ExactCollision(robot, scene).link_distances(q)
     for there in (ExactCollision(robot, problem.scene), ExactCollision(standing, world)):
@@ -117,7 +117,7 @@ def test_pybullet_sees_no_contact_where_the_robot_stands_in_the_world() -> None:
     problem = rd.Problem.in_world(T, robot, rd.Scene([wall]), START, GOAL)
     result = rd.plan(problem, time_limit=10.0)
     assert result.path is not None, result.reason
-    standing, _ = problem.standing()
+    standing, _ = problem.robot_and_scene_in_world()
     with PyBulletOracle(standing, rd.Scene([wall])) as oracle:
         assert oracle.check_path(result.path) is None
         straight = rd.Path(robot.joint_names, np.array([START, GOAL]))

@@ -34,6 +34,7 @@ def session() -> Iterator[live.ExplorationSession]:
     session.close()
 
 
+@pytest.mark.slow
 def test_it_goes_one_step_and_then_to_the_end(session: live.ExplorationSession) -> None:
     seen: list[live.ExplorationState] = []
     session.on_change = lambda: seen.append(session.state)

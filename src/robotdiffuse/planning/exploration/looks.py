@@ -265,7 +265,7 @@ def next_view(problem: Problem, result: PlanResult, poses: Sequence[Pose] | None
         InputError: The problem has no views, the result has no motion, or `poses` is empty.
     """
     check_problem(problem)
-    check_type("result", result, PlanResult, "a PlanResult, as of rd.plan")
+    check_type("result", result, PlanResult, "a PlanResult, as rd.plan returns it")
     if not problem.views:
         raise InputError("next_view: the problem has no views; it is for scenes that cameras saw")
     if result.path is None:
