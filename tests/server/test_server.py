@@ -1,5 +1,6 @@
 """A real server on a port of its own: answers, errors, cancellation, and recovery from dead workers."""
 
+import asyncio
 import json
 import os
 import re
@@ -7,6 +8,8 @@ import shutil
 import signal
 import socket
 import subprocess
+import urllib.error
+import urllib.request
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -28,6 +31,8 @@ from robotdiffuse.cli.serve import served_robots
 from robotdiffuse.core.types import UNTIL
 from robotdiffuse.problems.files import problem_from_record
 from robotdiffuse.robots import DATA, ROBOTS
+from robotdiffuse.server.app import Access
+from robotdiffuse.server.settings import ServeSettings
 
 pytest.importorskip("fastapi")
 
@@ -170,6 +175,19 @@ def test_other_hosts_content_types_and_methods_are_refused(server: httpx.Client)
     assert server.get("/plan").status_code == 405 and server.get("/../../etc/passwd").status_code == 404
     for answer in (rebound, form, server.get("/plan"), server.get("/etc"), server.delete("/requests/x")):
         error(answer)
+
+
+def test_a_client_that_closes_after_sending_gets_its_error(server: httpx.Client) -> None:
+    """urllib sends all of its request before it reads, and asks to close the connection."""
+    for path, size, code in (("plan", 2**24, 413), ("nothing", 2**22, 404)):
+        request = urllib.request.Request(f"{server.base_url}/{path}", bytes(size), JSON)
+        with pytest.raises(urllib.error.HTTPError) as refused:
+            urllib.request.urlopen(request)
+        assert refused.value.code == code and b'{"error": "' in refused.value.read()
+
+
+def test_a_wrong_method_is_told_the_right_one(server: httpx.Client) -> None:
+    assert error(server.get("/plan")) == "'/plan' does not take GET; it takes POST"
 
 
 def test_lists_health_metrics_and_a_page_without_scripts(server: httpx.Client) -> None:
@@ -329,6 +347,20 @@ def test_it_stops_gracefully_and_leaves_no_worker() -> None:
         assert second.result().status_code == 503 and "stopping" in error(second.result())
         assert process.wait(300) == 0
         until(lambda: not any(os.path.exists(f"/proc/{worker}") for worker in workers.split()))
+
+
+def test_a_request_that_the_second_signal_ends_gets_an_error() -> None:
+    sent: list[Any] = []
+
+    async def ended(*_: object) -> None:
+        raise asyncio.CancelledError
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    scope = {"type": "http", "method": "GET", "path": "/", "raw_path": b"/", "client": None}
+    asyncio.run(Access(ended, ServeSettings())(scope | {"headers": [(b"host", b"localhost")]}, ended, send))
+    assert sent[0]["status"] == 503 and json.loads(sent[1]["body"]) == {"error": "the server is stopping"}
 
 
 def test_a_server_for_other_machines_needs_a_token_and_logs_each_request(said: Said) -> None:

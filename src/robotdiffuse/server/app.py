@@ -30,7 +30,7 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.server.connection import REFUSED, log_access
 from robotdiffuse.server.settings import ServeSettings
 from robotdiffuse.server.worker import PLAN, VERIFY, Answer, failed
-from robotdiffuse.server.worker_pool import RequestError, WorkerPool
+from robotdiffuse.server.worker_pool import STOPPING, RequestError, WorkerPool
 
 PROBLEM: dict[str, Any] = {
     "robot": "panda",
@@ -239,16 +239,30 @@ class Access:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         began = time.monotonic()
         code = CLIENT_GONE
+        request = Request(scope)
+        # The server closes the connection of a client that asks for it after the answer. A client that is
+        # still sending would lose the answer, so the rest of its request is read before.
+        unread = request.headers.get("connection", "").lower() == "close"
+
+        async def counting() -> Message:
+            nonlocal unread
+            message = await receive()
+            unread = unread and message.get("more_body", False)
+            return message
 
         async def noting(message: Message) -> None:
             nonlocal code
             if message["type"] == "http.response.start":
                 code = message["status"]
+                while unread and code >= 400:
+                    await counting()
             await send(message)
 
-        request = Request(scope)
         try:
-            await (self._refusal(request) or self.app)(scope, receive, noting)
+            await (self._refusal(request) or self.app)(scope, counting, noting)
+        except asyncio.CancelledError:  # by the second signal
+            if code == CLIENT_GONE:  # no answer has begun
+                await _error(503, STOPPING)(scope, receive, noting)
         finally:
             name = request.headers.get(REQUEST_ID, "")
             target = f"{scope['method']} {scope['raw_path'].decode('latin-1')}"
@@ -475,7 +489,8 @@ async def read_body(request: Request, pool: WorkerPool, kind: str) -> bytes:
     content_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if content_type != kind:
         raise RequestError(415, f"Content-Type is {shown(content_type)}; it must be {kind}")
-    too_large = RequestError(413, f"the request is too large: it may have {max_size} bytes", CLOSE)
+    # the connection stays open: many clients lose an answer if it is closed while they are sending
+    too_large = RequestError(413, f"the request is too large: it may have {max_size} bytes")
     length = request.headers.get("content-length", "0")
     if not length.isdecimal() or int(length) > max_size:
         raise too_large
@@ -487,7 +502,7 @@ async def read_body(request: Request, pool: WorkerPool, kind: str) -> bytes:
             if len(body) > max_size:
                 raise too_large
             if pool.arriving > MAX_ARRIVING * max_size:
-                raise RequestError(429, "too many requests are arriving", CLOSE)
+                raise RequestError(429, "too many requests are arriving")
     except ClientDisconnect:
         raise RequestError(CLIENT_GONE, "the client closed the connection") from None
     finally:
@@ -527,13 +542,14 @@ def _unexpected(_: Request, error: Exception) -> Response:
 
 def _http_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
-    if error.status_code == 404:
-        return _error(404, f"there is no {shown(request.url.path)}; see /docs")
-    return _error(error.status_code, str(error.detail), error.headers)
+    path = shown(request.url.path)
+    message = f"there is no {path}; see /docs"
+    if error.status_code == 405:
+        message = f"{path} does not take {request.method}; it takes {(error.headers or {}).get('Allow')}"
+    return _error(error.status_code, message, error.headers)
 
 
 LINES = "application/x-ndjson"
-CLOSE = {"Connection": "close"}
 CLIENT_GONE = 499
 """Status code of a request whose client closed the connection; nobody reads it."""
 
