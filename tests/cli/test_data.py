@@ -9,11 +9,9 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.commands import Said, run
+from helpers.panda import GOAL, PANDA, START
 from helpers.stores import line, random_motions, record, write_motions
 
-PANDA = rd.load_robot("panda")
-START = np.array([-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
-GOAL = np.array([1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 BALL = rd.Scene([rd.Sphere([0.5, 0.0, 0.5], 0.15)])
 
 

@@ -10,6 +10,7 @@ from numba.core.compiler_lock import global_compiler_lock
 import robotdiffuse as rd
 from helpers.clock import stop_clock
 from helpers.commands import python
+from helpers.panda import LEFT, PANDA, RIGHT
 from robotdiffuse.collision import exact_meshes, kernel_arrays
 from robotdiffuse.core.deadline import LONG, OutOfTimeError, check_time, check_timing, deadline
 from robotdiffuse.core.kernels import inner_kernel, kernel
@@ -131,11 +132,6 @@ def test_python_cannot_call_an_inner_kernel() -> None:
     assert twice(3) == 8
     with pytest.raises(TypeError, match="plus_one is an inner kernel"):
         plus_one(3)
-
-
-PANDA = rd.load_robot("panda")
-LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
-RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 
 
 def wall(sides: int = 20) -> rd.Mesh:

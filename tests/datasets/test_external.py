@@ -9,6 +9,7 @@ import pytest
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.commands import Said
+from helpers.panda import GOAL, HOME, PANDA, START
 from helpers.refusals import refuses
 from helpers.stores import line, random_arrays, record, write_motions, write_store
 from robotdiffuse.datasets import external as robot_npz
@@ -16,10 +17,6 @@ from robotdiffuse.datasets.external import export_npz, import_npz
 from robotdiffuse.datasets.rows import problem_of
 from robotdiffuse.datasets.shards import SPLITS, check_shard, read_manifest, read_shard, write_shard
 from robotdiffuse.scenes.scene_arrays import SPHERE
-
-PANDA = rd.load_robot("panda")
-START = np.array([-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
-GOAL = np.array([1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 
 
 def made(folder: Path) -> Path:
@@ -136,7 +133,6 @@ def test_what_cannot_be_imported(tmp_path, monkeypatch):
     refuses(r"has 3 joints; robot\.npz holds 7", import_npz, whole, out, robot="arm.urdf")
 
 
-HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 FLOOR = rd.Box([0, 0, -0.05], [3, 3, 0.1], name="floor")
 COUNT = 24
 RNG = np.random.default_rng(0)

@@ -11,15 +11,14 @@ from scipy.integrate import quad
 
 import robotdiffuse as rd
 from helpers.example_robots import planar_arm
+from helpers.panda import HOME, PANDA
 from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.evaluation import metrics, statistics
 from robotdiffuse.evaluation.paper import PAPER_TABLE_1
 from robotdiffuse.validation.validator import VerifySettings
 
-PANDA = rd.load_robot("panda")
 ARM = planar_arm(0.5, 0.4)
 MINIMUM_JERK = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
-START = np.array([0, -0.785, 0, -2.356, 0, 1.571, 0.785])
 END = np.array([0.6, -0.4, 0.3, -2.0, 0.2, 1.8, 0.5])
 
 
@@ -114,9 +113,9 @@ def test_a_motion_that_stands_still_has_figures(rows: np.ndarray) -> None:
 
 
 def test_clearance_to_the_scene_and_to_itself_apart() -> None:
-    rows = np.stack([START, START + 0.01])
-    ball = rd.Sphere(PANDA.fk(START, "panda_link4")[:3, 3] + np.array([0, 0, 0.4]), 0.1)
-    problem = rd.Problem(PANDA, rd.Scene([ball]), START, rows[1])
+    rows = np.stack([HOME, HOME + 0.01])
+    ball = rd.Sphere(PANDA.fk(HOME, "panda_link4")[:3, 3] + np.array([0, 0, 0.4]), 0.1)
+    problem = rd.Problem(PANDA, rd.Scene([ball]), HOME, rows[1])
     path = rd.Path(PANDA.joint_names, rows)
     verdict = rd.verify(problem, path)
     found = metrics.measured(PANDA, path, None, verdict)
@@ -133,8 +132,8 @@ def test_one_centimeter_and_fifteen_degrees_are_settings(shift: float, angle: fl
     axis = np.array([0.6, 0.0, 0.8])
     T = PANDA.fk(END, "panda_hand")
     T = transform(T[:3, 3] + shift * axis, rotation_about(axis, np.radians(angle)) @ T[:3, :3])
-    problem = rd.Problem(PANDA, rd.Scene(), START, rd.PoseGoal("panda_hand", T))
-    path = rd.Path(PANDA.joint_names, np.stack([START, END]))
+    problem = rd.Problem(PANDA, rd.Scene(), HOME, rd.PoseGoal("panda_hand", T))
+    path = rd.Path(PANDA.joint_names, np.stack([HOME, END]))
     loose = VerifySettings(goal_distance=0.012, goal_angle=float(np.radians(17)))
     strict = VerifySettings(goal_distance=0.008, goal_angle=float(np.radians(13)))
     for settings, expected in ((VerifySettings(), kind), (loose, ""), (strict, "goal")):

@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.panda import GOAL, PANDA, START
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.evaluation.methods import planned, restarted, sampled
 from robotdiffuse.evaluation.runs import Fields, Record, Run, run_all
 from robotdiffuse.planning.search.rrt import RRTConnect
 from robotdiffuse.problems.held_out import Case
 
-PANDA = rd.load_robot("panda")
-START = np.array([-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
-GOAL = START * np.array([-1, 1, 1, 1, 1, 1, 1])
 FREE = rd.Problem(PANDA, rd.Scene([]), START, rd.JointGoal(GOAL[None]))
 BLOCKED = rd.Problem(PANDA, rd.Scene([rd.Sphere([0.5, 0.0, 0.5], 0.2)]), START, rd.JointGoal(GOAL[None]))
 LENGTH_OF_LINE = float(np.linalg.norm(GOAL - START))

@@ -12,6 +12,7 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 import robotdiffuse as rd
+from helpers.panda import HOME, PANDA
 from helpers.refusals import refuses
 from robotdiffuse.perception.camera_check import OPTICAL, agreement, camera_note
 from robotdiffuse.perception.depth_filter import pose_error
@@ -21,8 +22,6 @@ from robotdiffuse.perception.ray_caster import looking_at, ray_cast, render_dept
 from robotdiffuse.perception.visibility import surface_balls
 from robotdiffuse.planning.exploration.simulated import measured, taken, wrist_camera
 
-PANDA = rd.load_robot("panda")
-HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 SCENE = rd.Scene([rd.Box((0, 0, -0.05), (4, 4, 0.1)), rd.Box((0.6, 0.4, 0.2), (0.3, 0.3, 0.4))])
 K = (230.0, 230.0, 159.5, 119.5)
 T = looking_at(np.array([1.2, -0.8, 0.9]), np.array([0.2, 0.0, 0.4]))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.panda import HOME, PANDA
 from helpers.refusals import refuses
 from robotdiffuse.perception.depth_filter import empty_regions, filtered, measured_share, median_filter, patch_noise
 from robotdiffuse.perception.depth_view import DepthNoise
@@ -16,8 +17,6 @@ from robotdiffuse.perception.seen_points import seen_points
 from robotdiffuse.perception.voxel_grid import FINE
 from robotdiffuse.planning.exploration.simulated import wrist_camera
 
-PANDA = rd.load_robot("panda")
-HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 FOCAL = 290.0
 FLOOR, CRATE = rd.Box((0, 0, -0.05), (6, 6, 0.1)), rd.Box((0.6, 0.3, 0.2), (0.3, 0.3, 0.4))
 

@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.panda import HOME, PANDA
 from helpers.refusals import refuses
 from helpers.sphere_oracles import depth_of_balls
 from robotdiffuse.perception.observed_volume import ObservedVolume, observe
 from robotdiffuse.perception.voxel_grid import LOW, SHAPE, VOXEL
 from robotdiffuse.robots.kinematics import placed_spheres
 
-PANDA = rd.load_robot("panda")
-HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 AWAY = np.array([3.0, 0.0, 0.0, -0.1, 0.0, 1.571, 0.785])
 """The arm stretched upwards, out of the way of what these views look at."""
 WIDTH = 320

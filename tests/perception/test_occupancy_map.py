@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.panda import HOME, PANDA
 from helpers.refusals import refuses
 from robotdiffuse.perception.depth_view import DepthNoise
 from robotdiffuse.perception.observed_volume import FREE, OUT, carve_view
@@ -14,8 +15,6 @@ from robotdiffuse.perception.occupancy_map import OccupancyMap
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
 from robotdiffuse.perception.voxel_grid import MAP
 
-PANDA = rd.load_robot("panda")
-HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 FLOOR, CRATE = rd.Box((0, 0, -0.05), (6, 6, 0.1)), rd.Box((0.6, 0.3, 0.2), (0.3, 0.3, 0.4))
 SCENE = rd.Scene([FLOOR, CRATE])
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy import ndarray
 
 import robotdiffuse as rd
+from helpers.panda import GOAL, PANDA, START
 from helpers.refusals import refuses
 from helpers.sphere_oracles import depth_of_balls
 from robotdiffuse.collision import CollisionChecker
@@ -17,9 +18,6 @@ from robotdiffuse.perception.depth_view import SeenPoints
 from robotdiffuse.problems.files import problem_from_record, problem_record, save_problem
 from robotdiffuse.robots.kinematics import placed_spheres
 
-PANDA = rd.load_robot("panda")
-START = np.array([-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
-GOAL = np.array([1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 BALL = rd.Sphere([0.6, 0.0, 0.5], 0.15)
 K = (150.0, 150.0, 79.5, 59.5)
 T = transform(np.array([2.0, 0.0, 0.5]), np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
