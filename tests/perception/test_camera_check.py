@@ -4,6 +4,7 @@ added to true poses are found."""
 import re
 from dataclasses import replace
 from functools import cache
+from inspect import unwrap
 from typing import Any
 
 import numpy as np
@@ -61,7 +62,7 @@ def test_nothing_is_said_of_a_camera_as_stated() -> None:
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"depth": 1000 * ray_cast(SCENE, T, K, (320, 240)).depth}, "its depths begin at .*; they must be in meters"),
+        ({"depth": 1000 * ray_cast(SCENE, T, K, (320, 240)).depth}, "its depths are about .*; they must be in meters"),
         ({"intrinsics": (0.7, 0.9, 0.5, 0.5)}, "do not fit an image of 320 x 240 pixels"),
         ({"intrinsics": (1e6, 1e6, 160, 120)}, "do not fit an image"),
         ({"T_base_camera": np.linalg.inv(T)}, "is the inverse, T_camera_base"),
@@ -114,6 +115,9 @@ def test_the_pose_is_estimated_from_views_of_the_arm() -> None:
     stated = found.pose_deviation
     assert position < 2 * stated[0] and angle < 2 * stated[1] and stated[0] < 0.04
     refuses("configuration", rd.calibrate_camera, [replace(at_home(), configuration=None)], PANDA)
+    refuses("0 of 1 views have a configuration", rd.calibrate_camera, [replace(at_home(), configuration=[1, 2])], PANDA)
+    refuses("views is .*; it must be a list of rd.DepthView", unwrap(rd.calibrate_camera), at_home(), PANDA)
+    refuses("robot is 'panda'; it must be a Robot", unwrap(rd.calibrate_camera), views, "panda")
     refuses("views differ in T_base_camera", rd.calibrate_camera, [*views, replace(views[0], T_base_camera=T)], PANDA)
     elsewhere = replace(at_home(), depth=np.full_like(at_home().depth, 3.0))
     refuses(r"hardly seen|agrees with the images", rd.calibrate_camera, [elsewhere], PANDA)

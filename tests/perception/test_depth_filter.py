@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from inspect import unwrap
 
 import numpy as np
 import pytest
@@ -50,6 +51,8 @@ def test_noise_is_measured_on_images_of_a_still_scene() -> None:
     stated = replace(noise.applied(view, np.random.default_rng(9)), noise=found)
     assert filtered(stated).spread == pytest.approx(filtered(replace(stated, noise=None)).spread, rel=0.5)
     refuses("at least two", rd.measure_noise, images[:1])
+    refuses("images are .'not numbers'", unwrap(rd.measure_noise), ["a", "b"])
+    refuses("images have depths about .*; they must be in meters", rd.measure_noise, [1000 * image for image in images])
 
 
 @pytest.mark.parametrize("correlation", (0.0, 1.5))

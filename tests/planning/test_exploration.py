@@ -54,13 +54,17 @@ def test_the_loop_ends_and_strict_motions_do_not_collide(policy: str) -> None:
 
 @pytest.mark.parametrize(
     ("factor", "message"),
-    [(1000.0, "its depths begin at .*; they must be in meters"), (2.0, "sees through 100 % of where the arm")],
+    [(1000.0, "its depths are about .*; they must be in meters"), (2.0, "sees through 100 % of where the arm")],
 )
 def test_an_image_that_sees_through_the_arm_is_refused(factor: float, message: str) -> None:
     arm = explorer(seen=False)
     view = simulated.camera_beside(PROBLEM, None, 0)
     refuses(f"check the camera of the view: .*{message}", arm.observe, replace(view, depth=factor * view.depth))
     assert arm.map.is_blind
+
+
+def test_a_negative_seed_is_refused() -> None:
+    refuses("seed is -1; it must be at least 0", rd.Explorer, PANDA, seed=-1)
 
 
 def test_a_view_of_another_thread_waits_for_the_step(monkeypatch: pytest.MonkeyPatch) -> None:

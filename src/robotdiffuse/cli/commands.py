@@ -139,7 +139,7 @@ PLANNING = (
             ),
             ("--time-limit S", "time limit of each search [s] (default: 1)", float),
             ("--noise", "simulate the noise of depth cameras"),
-            ("--seed N", "random seed (default: 0)", int, 0),
+            SEED,
             (
                 "--out FILE *",
                 "replay with what was known at each time (.html), or a strip of pictures, one a step (.png); "

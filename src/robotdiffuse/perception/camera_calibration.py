@@ -14,7 +14,7 @@ from numpy import ndarray
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, check_list, check_type
 from robotdiffuse.core.transforms import placed, transform
 from robotdiffuse.core.types import Configuration, Points, Pose
 from robotdiffuse.perception.camera_check import (
@@ -83,10 +83,13 @@ def calibrate_camera(views: Sequence[DepthView], robot: Robot) -> CameraCalibrat
         view = rd.DepthView(image, K, calibration.T_base_camera, pose_deviation=calibration.pose_deviation)
         ```
     """
-    each = [(view, view.configuration) for view in views if view.configuration is not None]
+    check_type("robot", robot, Robot, "a Robot, e.g. rd.load_robot('panda')")
+    check_list("views", views, DepthView, "rd.DepthView")
+    each = [(view, q) for view in views if (q := view.configuration) is not None and len(q) == robot.dof]
     if not each or len(each) < len(views):
         raise InputError(
-            f"{len(each)} of {len(views)} views have a configuration; calibrate_camera needs one for each"
+            f"{len(each)} of {len(views)} views have a configuration of {robot.name}'s {robot.dof} joints; "
+            "calibrate_camera needs one for each"
         )
     first, q = each[0]
     if any(not np.allclose(view.T_base_camera, first.T_base_camera) for view in views):

@@ -8,7 +8,7 @@ import numpy as np
 
 from robotdiffuse.core.errors import shown
 from robotdiffuse.core.types import Configuration
-from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.depth_view import FARTHEST, DepthView
 from robotdiffuse.perception.ray_caster import ray_cast
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -20,8 +20,6 @@ SAME_DEPTH = 0.03
 SPHERES_AHEAD = 0.01
 """How far the arm's covering spheres are in front of its surface, approximately [m]."""
 NOTHING = Scene(())
-FARTHEST = 50.0
-"""An image whose nearest return is farther than this is not in meters, or has numbers for no return [m]."""
 MIN_FOCAL_LENGTH = 0.05
 """Smallest focal length, as a fraction of the image's width and height: such an image spans 169 degrees."""
 MAX_INTRINSICS = 100.0
@@ -71,11 +69,10 @@ def implausible(view: DepthView) -> str:
     if view.cloud is None and (relative[:2].min() < MIN_FOCAL_LENGTH or relative.max() > MAX_INTRINSICS):
         return f"its intrinsics, {shown(view.intrinsics)}, do not fit an image of {width} x {height} pixels"
     returns = view.depth[np.isfinite(view.depth) & (view.depth > 0)]
-    if len(returns) == 0 or returns.min() <= FARTHEST:
+    middle = np.median(returns) if len(returns) else 0.0
+    if middle <= FARTHEST:
         return ""
-    return (
-        f"its depths begin at {returns.min():.4g}; they must be in meters, and 0 where nothing was measured"
-    )
+    return f"its depths are about {middle:.4g}; they must be in meters, and 0 where nothing was measured"
 
 
 def contradiction(view: DepthView, robot: Robot, q: Configuration) -> str:

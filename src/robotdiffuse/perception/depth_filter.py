@@ -9,11 +9,11 @@ from jaxtyping import Bool, Float, Float32, Int32
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import for_kernels
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.bounds import for_kernels, form, numbers
+from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import Points, Values
-from robotdiffuse.perception.depth_view import NEAREST, DepthNoise, DepthView
+from robotdiffuse.perception.depth_view import FARTHEST, NEAREST, DepthNoise, DepthView
 
 MIN_RETURNS = 4
 """A pixel with a return is kept if its 3 x 3 neighborhood has at least this many returns, itself included."""
@@ -248,11 +248,11 @@ def empty_regions(
     too_near = half < TOO_NEAR if arm is None else (half < TOO_NEAR) & ~arm[::2, ::2]
     # for each region, the number of returns beside it, and the number of those that are too near
     beside = np.zeros((2, len(is_empty)))
-    for numbers, seen, close in ((regions, ~lost, too_near), (regions.T, ~lost.T, too_near.T)):
+    for labels, seen, close in ((regions, ~lost, too_near), (regions.T, ~lost.T, too_near.T)):
         for own, neighbor in ((slice(1, None), slice(-1)), (slice(-1), slice(1, None))):
             returns = seen[neighbor]
             for row, weights in enumerate((None, close[neighbor][returns])):
-                beside[row] += np.bincount(numbers[own][returns], weights, len(is_empty))
+                beside[row] += np.bincount(labels[own][returns], weights, len(is_empty))
     is_empty &= beside[1] < NEAR_SHARE * beside[0]
     is_empty[0] = False
     height, width = depth.shape
@@ -324,15 +324,17 @@ def measure_noise(images: Sequence[ArrayLike]) -> DepthNoise:
         InputError: For fewer than two images, for images of different sizes, and if no pixel has a
             return in all images.
     """
-    arrays = [np.asarray(image, np.float32) for image in images]
-    if len(arrays) < 2 or len({image.shape for image in arrays}) > 1 or arrays[0].ndim != 2:
-        sizes = [image.shape for image in arrays]
-        raise InputError(f"images have the sizes {sizes}; at least two images of one size [h, w] are needed")
-    stack = np.stack(arrays)
+    forms = [form(numbers(image)) for image in images]
+    if len(forms) < 2 or len({*forms}) > 1 or forms[0].count(" x ") != 1:
+        raise InputError(f"images are {shown(forms)}; at least two images of one size, h x w, are needed")
+    stack = np.array(images, np.float32)
     seen = np.isfinite(stack) & (stack > 0)
     always = np.equal(seen.sum(axis=0), len(stack))
     if not always.any():
         raise InputError("images: no pixel has a return in all of them")
+    middle = np.median(stack[seen])
+    if middle > FARTHEST:
+        raise InputError(f"images have depths about {middle:.4g}; they must be in meters")
     inverse = np.divide(1.0, stack, out=np.zeros(stack.shape), where=seen)
     changes = (inverse - inverse.mean(axis=0)) * np.sqrt(len(stack) / (len(stack) - 1))
     both = always[:, 1:] & always[:, :-1]
@@ -341,7 +343,7 @@ def measure_noise(images: Sequence[ArrayLike]) -> DepthNoise:
     clipped = np.clip(changes, -3 * over_time, 3 * over_time)
     products = (clipped[:, :, 1:] * clipped[:, :, :-1])[:, both].sum()
     correlated = products / max((clipped**2)[:, always].mean() * len(stack) * both.sum(), 1e-30)
-    still = [patch_noise(image) for image in arrays]
+    still = [patch_noise(image) for image in stack]
     spread, neighbor_correlation = max((over_time, float(correlated)), *still)
     length = correlation_length(neighbor_correlation)
     missing = 1 - seen.sum() / max(len(stack) * int((seen.sum(axis=0) > 0).sum()), 1)

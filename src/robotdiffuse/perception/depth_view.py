@@ -37,6 +37,8 @@ MIN_FOCAL_LENGTH = 1e-3
 """Minimum focal length [pixels]: smaller values underflow in float32, or are meaningless."""
 NEAREST = 0.05
 """Nearer returns are ignored: they come from something that covers the lens [m]."""
+FARTHEST = 50.0
+"""An image of which half of the returns are farther is not in meters, or has numbers for no return [m]."""
 MAX_ANGLE = 0.5
 """Largest angle that `DepthView.pose_deviation` may state [rad]."""
 INTRINSICS = ("fx", "fy", "cx", "cy")

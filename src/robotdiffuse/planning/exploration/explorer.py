@@ -33,6 +33,7 @@ from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.locked import locked
 from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.settings import Natural, converted
 from robotdiffuse.core.types import FIRST, Configuration, Configurations, Path, Status, Trajectory
 from robotdiffuse.perception.camera_check import contradiction, implausible
 from robotdiffuse.perception.depth_view import DepthView
@@ -132,8 +133,8 @@ class Explorer:
         if free_zone is not None:
             self.map.declare_free(free_zone)
         self._planner = load_planner("robotdiffuse")
+        self._seed = converted("seed", Natural, seed)
         self._rng = np.random.default_rng(seed)
-        self._seed = seed
         on_arm = [(camera.link, camera.T_link_camera) for camera in cameras]
         self._poses = PoseRefinement(robot, scene, on_arm)
         self._views = ViewMemory(robot)
