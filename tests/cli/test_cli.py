@@ -132,9 +132,8 @@ def test_a_module_of_the_current_folder_adds_planners(tmp_path: Path, monkeypatc
         assert run("plan", write_problem(tmp_path), "--planner", "mine", "--import", "added_planners") == 0
     finally:
         PLANNERS.pop("mine", None)
-    assert "module 'no_such_module' cannot be imported: ModuleNotFoundError" in said(
-        2, "planner", "list", "--import", "no_such_module"
-    )
+    error = said(2, "planner", "list", "--import", "no_such_module")
+    assert "module 'no_such_module' cannot be imported: ModuleNotFoundError" in error
 
 
 def test_a_log_says_what_is_compiled(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:

@@ -68,9 +68,8 @@ def test_the_bundled_encoder_is_taken_where_none_is_named(trained: list[PlannerT
 
 @pytest.mark.parametrize("data", [("--data", "d"), ("--robot", "ur5e")])
 def test_cross_attention_without_points_is_refused_before_anything_is_made(data: tuple[str, str], said: Said) -> None:
-    assert "denoiser cross_attention need each other" in said(
-        2, "train", "planner", *data, "--out", "o", "--denoiser", "cross_attention"
-    )
+    error = said(2, "train", "planner", *data, "--out", "o", "--denoiser", "cross_attention")
+    assert "denoiser cross_attention need each other" in error
     assert not Path("o").exists()
 
 
@@ -123,9 +122,7 @@ def test_bad_input_is_a_clear_line(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert "unknown robot 'ur5x'; known: " in error("--robot", "ur5x")
     assert "give --robot to generate data" in error()
     assert "--data needs --out" in error("--data", str(tmp_path))
-    assert "--trajectories is for data to be generated" in error(
-        *("--data", str(tmp_path), "--out", "x", "--trajectories", "3")
-    )
+    assert "--trajectories is for data to be generated" in error("--data", tmp_path, "--out", "x", "--trajectories", 3)
     full = type("Usage", (), {"free": 1_000_000})
     with monkeypatch.context() as patch:
         patch.setattr(train_command.shutil, "disk_usage", lambda folder: full)

@@ -9,18 +9,13 @@ import yaml
 from helpers.commands import BALL, PROBLEM, Said, run
 from helpers.full_disk import full_disk
 
-SCENE = {
-    "world": {
-        "collision_objects": [
-            {
-                "header": {"frame_id": "panda_link0"},
-                "id": "ball",
-                "primitives": [{"type": "sphere", "dimensions": [0.15]}],
-                "primitive_poses": [{"position": [0.5, 0.0, 0.5], "orientation": [0, 0, 0, 1]}],
-            }
-        ]
-    }
+OBJECT = {
+    "header": {"frame_id": "panda_link0"},
+    "id": "ball",
+    "primitives": [{"type": "sphere", "dimensions": [0.15]}],
+    "primitive_poses": [{"position": [0.5, 0.0, 0.5], "orientation": [0, 0, 0, 1]}],
 }
+SCENE = {"world": {"collision_objects": [OBJECT]}}
 
 
 @pytest.fixture(autouse=True)

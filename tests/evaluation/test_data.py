@@ -58,13 +58,10 @@ def test_collision_is_found_by_both_validators(tmp_path, pybullet):
     assert found(tmp_path, pybullet=False) == {"collision": 1}
 
 
+COLLISION = {"collision": 1, "pybullet": 1}
 UNSOUND = {
-    "a collision between frames": (
-        rd.Scene([rd.Box([0.0, 1.1, 0.0], [0.01, 0.01, 0.01])]),
-        line(AWAY, BACK, waypoints=4),
-        {"collision": 1, "pybullet": 1},
-    ),
-    "self-collision": (rd.Scene(), line(0 * AWAY, np.array([0.0, 2.7, 2.7])), {"collision": 1, "pybullet": 1}),
+    "a collision between frames": (rd.Scene([rd.Box([0.0, 1.1, 0.0], [0.01] * 3)]), line(AWAY, BACK, waypoints=4), COLLISION),
+    "self-collision": (rd.Scene(), line(0 * AWAY, np.array([0.0, 2.7, 2.7])), COLLISION),
     "a start out of limits": (rd.Scene(), line(np.array([2.9, 0, 0]), -2 * AWAY), {"motion": 1}),
     "twitching": (rd.Scene(), line(AWAY, BACK)[[*(i * (i % 2 == 0) for i in range(19)), 19]], {"motion": 1}),
 }

@@ -214,6 +214,7 @@ def test_noise_is_as_its_settings_say() -> None:
     assert abs((replace(none, stray=0.1).applied(view, rng).depth[20:] < depth[20:]).mean() - 0.1) < 0.01
     np.testing.assert_array_equal(none.applied(view, rng).depth, depth)
     refuses("missing is 1", DepthNoise, missing=1.0)
+    refuses("spread is 1.5; it must be between 0 and 0.1", DepthNoise, spread=1.5)
 
 
 @pytest.mark.parametrize("angle", (0.1, 0.25))

@@ -247,14 +247,14 @@ def test_a_cut_ply_mesh_is_refused(tmp_path: Path) -> None:
     refuses("holds 17 of its 20 vertices, faces", read_triangles, tmp_path / "cut.ply")
 
 
-def test_the_first_point_after_a_byte_order_mark_is_read(tmp_path: Path) -> None:
-    (tmp_path / "marked.csv").write_bytes(b"\xef\xbb\xbf1,2,3\n4,5,6\n")
-    assert read_points(tmp_path / "marked.csv")[0].tolist() == [[1, 2, 3], [4, 5, 6]]
-
-
-def test_names_of_columns_in_a_comment_are_read(tmp_path: Path) -> None:
-    (tmp_path / "named.csv").write_text("#r,x,y,z\n9,1,2,3\n")
-    assert read_points(tmp_path / "named.csv")[0].tolist() == [[1, 2, 3]]
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [(b"\xef\xbb\xbf1,2,3\n4,5,6\n", [[1, 2, 3], [4, 5, 6]]), (b"#r,x,y,z\n9,1,2,3\n", [[1, 2, 3]])],
+    ids=["a byte order mark", "names of columns in a comment"],
+)
+def test_what_is_before_the_numbers_is_read(content: bytes, expected: list[list[int]], tmp_path: Path) -> None:
+    (tmp_path / "points.csv").write_bytes(content)
+    assert read_points(tmp_path / "points.csv")[0].tolist() == expected
 
 
 @pytest.mark.parametrize("ending", ["stl", "obj", "ply", "off", "glb"])

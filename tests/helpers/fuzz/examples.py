@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import numpy as np
+
 PROBLEM: dict[str, Any] = {
     "robot": "panda",
     "locked": {"panda_finger_joint1": 0.04, "panda_finger_joint2": 0.04},
@@ -17,6 +19,8 @@ PROBLEM: dict[str, Any] = {
     "goal": {"joints": [0.4, -0.785, 0, -2.356, 0, 1.571, 0.785]},
     "clearance": 0.01,
 }
+SMALL = PROBLEM | {"scene": PROBLEM["scene"][:1]}
+ROWS = np.linspace(PROBLEM["start"], PROBLEM["goal"]["joints"], 3).tolist()
 POSE = {"frame": "panda_hand", "xyz": [0.5, 0, 0.5], "wxyz": [0, 1, 0, 0]}
 VIEW = {"cloud": [[1, 0, 1], [1, 0.1, 1]], "camera": {"xyz": [0, 0, 1], "wxyz": [0.5, 0.5, 0.5, 0.5]}}
 EQUIPPED: dict[str, Any] = {
@@ -53,29 +57,16 @@ MOVING: dict[str, Any] = {
     ]
 }
 IN_MOTION: dict[str, Any] = {"start_velocity": [0.1, 0, 0, 0, 0, 0, 0]}
-MOVEIT = {
-    "name": "",
-    "robot_model_name": "panda",
-    "fixed_frame_transforms": [
-        {
-            "header": {"frame_id": "world"},
-            "child_frame_id": "table",
-            "transform": {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1]},
-        }
-    ],
-    "world": {
-        "collision_objects": [
-            {
-                "header": {"frame_id": "world"},
-                "id": "Can",
-                "primitives": [{"type": "cylinder", "dimensions": [0.2, 0.03]}, {"type": 1, "dimensions": [1, 1, 1]}],
-                "primitive_poses": [{"position": [1, 1, 1], "orientation": [0, 0, 0, 1]}] * 2,
-                "meshes": [{"vertices": [[1, 1, 0], [1, 2, 0], [2, 1, 0]], "triangles": [[0, 1, 2]]}],
-                "mesh_poses": [{"position": {"x": 0, "y": 0, "z": 0}, "orientation": [0, 0, 0, 1]}],
-            }
-        ]
-    },
+WORLD = {"header": {"frame_id": "world"}}
+TABLE = WORLD | {"child_frame_id": "table", "transform": {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1]}}
+CAN = WORLD | {
+    "id": "Can",
+    "primitives": [{"type": "cylinder", "dimensions": [0.2, 0.03]}, {"type": 1, "dimensions": [1, 1, 1]}],
+    "primitive_poses": [{"position": [1, 1, 1], "orientation": [0, 0, 0, 1]}] * 2,
+    "meshes": [{"vertices": [[1, 1, 0], [1, 2, 0], [2, 1, 0]], "triangles": [[0, 1, 2]]}],
+    "mesh_poses": [{"position": {"x": 0, "y": 0, "z": 0}, "orientation": [0, 0, 0, 1]}],
 }
+MOVEIT = {"name": "", "robot_model_name": "panda", "fixed_frame_transforms": [TABLE], "world": {"collision_objects": [CAN]}}
 JOINTS = [f"panda_joint{i}" for i in range(1, 8)]
 HELD = {
     "link_name": "panda_hand",

@@ -235,7 +235,6 @@ def _urdf(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
 
 
 def _result(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
-    rows = np.linspace(examples.PROBLEM["start"], examples.PROBLEM["goal"]["joints"], 3).tolist()
     record = {
         "status": "solved",
         "reason": "solved by hand",
@@ -245,13 +244,13 @@ def _result(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
         "planning_time": 0.1,
         "verified": True,
         "seed": 0,
-        "waypoints": rows,
+        "waypoints": examples.ROWS,
         "times": [0.0, 1.0, 2.0],
-        "positions": rows,
+        "positions": examples.ROWS,
         "velocities": [[0.0] * 7, [0.3] + [0.0] * 6, [0.0] * 7],
         "accelerations": [[0.0] * 7] * 3,
         "progress": [[0.1, 0.4]],
-        "problem": examples.PROBLEM | {"scene": examples.PROBLEM["scene"][:1]},
+        "problem": examples.SMALL,
     }
     file = folder / "result.json"
     file.write_bytes(text_of(rng, record, ".json"))
@@ -295,15 +294,11 @@ def _bundle(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
 
 def asked(rng: np.random.Generator, right: float = 0.0) -> tuple[str, bytes]:
     """The endpoint of a request over HTTP, and the request's body, which is undamaged with probability `right`."""
-    rows = np.linspace(examples.PROBLEM["start"], examples.PROBLEM["goal"]["joints"], 3).tolist()
-    problem = (
-        examples.PROBLEM
-        | {"scene": examples.PROBLEM["scene"][: rng.integers(7)]}
-        | (examples.EQUIPPED if rng.random() < 0.1 else {})
-    )
+    problem = examples.PROBLEM | {"scene": examples.PROBLEM["scene"][: rng.integers(7)]}
+    problem |= examples.EQUIPPED if rng.random() < 0.1 else {}
     plan = {"problem": problem, "planner": "rrt_connect", "time_limit": 0.05, "seed": 1, "until": "first"}
     plan |= {"velocity_scaling": 0.5, "acceleration_scaling": 0.5, "clearance": 0.01}
-    motion = {"joint_names": examples.JOINTS, "positions": rows}
+    motion = {"joint_names": examples.JOINTS, "positions": examples.ROWS}
     rates = {"velocities": [[0.0] * 7] * 3, "accelerations": [[0.0] * 7] * 3}
     validated = {"problem": problem, "path": motion, "trajectory": motion | {"times": [0.0, 1.0, 2.0]} | rates}
     what = "verify" if rng.random() < 0.5 else "plan"
@@ -348,8 +343,8 @@ def _socket(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
 
 
 def _motion(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
-    problem = problem_from_record(examples.PROBLEM | {"scene": examples.PROBLEM["scene"][:1]})
-    rows = np.linspace(examples.PROBLEM["start"], examples.PROBLEM["goal"]["joints"], 3)
+    problem = problem_from_record(examples.SMALL)
+    rows = np.array(examples.ROWS)
     times = np.array([0.0, 10.0, 20.0])
     still = np.zeros_like(rows)
     trajectory = rd.Trajectory(problem.robot.joint_names, times, rows, still, still)
@@ -405,7 +400,7 @@ def _depth(rng: np.random.Generator, folder: Path) -> Callable[[], object]:
         file.write_bytes(damaged(rng, file.read_bytes()))
     view = examples.VIEW | {"depth": file.name, "intrinsics": [6.0, 6.0, 4, 3], "scale": 0.001}
     del view["cloud"]
-    problem = examples.PROBLEM | {"scene": examples.PROBLEM["scene"][:1], "views": [view], "unknown": "padded"}
+    problem = examples.SMALL | {"views": [view], "unknown": "padded"}
     (folder / "problem.json").write_bytes(
         text_of(rng, problem, ".json") if rng.random() < 0.5 else json.dumps(problem).encode()
     )

@@ -182,7 +182,6 @@ def sent(rng: np.random.Generator, one: Draft, damaged: Any) -> Sent:
         damage(rng, one)
     name = b""
     answers = 1
-    leaves = False
     way = rng.integers(20)
     if way == 0:
         name = (b"mine", b"\xc3\xa9", b"a b", b"x" * 150)[rng.integers(4)]
@@ -194,18 +193,13 @@ def sent(rng: np.random.Generator, one: Draft, damaged: Any) -> Sent:
     if 1 <= way <= 3:
         cuts = np.sort(rng.integers(0, len(content) + 1, rng.integers(1, 5))).tolist()
         pieces = [content[a:b] for a, b in zip([0, *cuts], [*cuts, len(content)], strict=True)]
-    elif way in (4, 5):
-        pieces = [content[: rng.integers(len(content) + 1)]]
-        leaves = True
-    elif way == 6:
+    elif way in (4, 5, 6):
         pieces = [content[: rng.integers(len(content) + 1)]]
     elif way in (7, 8):
         answers = int(rng.integers(2, 5))
         pieces = [content * answers]
-    elif way == 9:
-        leaves = True
     head = one.method == b"HEAD" or b"HEAD" in content[:200]
-    return Sent(pieces, 1 if head else answers, leaves, name, head)
+    return Sent(pieces, 1 if head else answers, way in (4, 5, 9), name, head)
 
 
 def exchange(address: tuple[str, int], sent: Sent) -> str:
@@ -238,9 +232,7 @@ def _checked(answer: Answer, head: bool) -> str:
     """The error in an answer; "" for none."""
     if not (200 <= answer.status < 300 or 400 <= answer.status < 500 or answer.status == 503):
         raise WrongError(f"{answer.status} {answer.body[:200]!r}")
-    if head:
-        return ""
-    if answer.status == 200 and answer.kind.startswith(b"text/"):
+    if head or (answer.status == 200 and answer.kind.startswith(b"text/")):
         return ""
     if answer.status == 200 and answer.kind == b"application/x-ndjson":
         return [_error(json.loads(line)) for line in answer.body.splitlines()][-1]
