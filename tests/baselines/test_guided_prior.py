@@ -10,7 +10,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from helpers.refusals import refuses
-from helpers.short_training import trained
+from helpers.trainings import trained
 from robotdiffuse import JointGoal, Problem, Scene, Sphere, Status, load_robot
 from robotdiffuse.baselines import guided_prior
 from robotdiffuse.collision import CollisionChecker

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.short_training import trained
+from helpers.trainings import trained
 from robotdiffuse import Box, InputError, Problem, Scene, Sphere, Status, load_robot
 from robotdiffuse.baselines.mpinets import MPiNets, MPiNetsSettings
 from robotdiffuse.learning import mpinets

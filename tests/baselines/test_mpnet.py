@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.short_training import trained
+from helpers.trainings import trained
 from robotdiffuse import Box, InputError, JointGoal, Problem, Scene, load_robot, verify
 from robotdiffuse.baselines.mpnet import MPNet, MPNetPlannerSettings, NeuralPlanning
 from robotdiffuse.collision import CollisionChecker

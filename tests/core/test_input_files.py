@@ -279,13 +279,9 @@ class Name(str):
     __hash__ = str.__hash__
 
 
-@pytest.fixture
-def names(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def test_names_are_compared_a_few_times_each(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Name, "compared", 0)
-    return [Name(f"j{i}") for i in range(COUNT)]
-
-
-def test_names_are_compared_a_few_times_each(names: list[str]) -> None:
+    names = [Name(f"j{i}") for i in range(COUNT)]
     refuses("joint_names has j7 more than once", check_motion_arrays, [*names, Name("j7")], {"positions": [[0.0]]})
     assert Name.compared < 5 * COUNT
     few = names[:MAX_CONTACT_LINKS]

@@ -141,16 +141,12 @@ ONE = Rop(obstacles=(1, 1))
 """
 
 
-@pytest.fixture
-def one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rop:
+def test_worker_processes_have_the_entries_that_the_package_lacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A family in a separate module, added at run time."""
     (tmp_path / "one_obstacle.py").write_text(FAMILY)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setitem(FAMILIES, "one", Entry("one_obstacle:ONE", "for tests"))
-    return Rop(obstacles=(1, 1))
-
-
-def test_worker_processes_have_the_entries_that_the_package_lacks(one: Rop, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = Rop(obstacles=(1, 1))
     assert list(on_this_machine(load_family, [("one",)], 1)) == [(0, one)]
     worker = Worker(adopt_entries, (AddedEntries({}, ()),))
     assert worker.call(load_family, "one") == one
@@ -173,9 +169,8 @@ def test_adopted_entries_are_in_registries_made_later() -> None:
     assert (found["fruit"], found["nut"]) == ({"fig": theirs}, {"hazel": theirs})
 
 
-@pytest.fixture
-def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Registry:
-    """A registry, and an installed package with two entry points for it, one of them broken."""
+def test_entries_of_installed_packages_are_loaded_when_they_are_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A registry, and an installed package with entry points for it, of which one is broken."""
     package = tmp_path / "orchard-1.0.dist-info"
     package.mkdir()
     (package / "METADATA").write_text("Metadata-Version: 2.1\nName: orchard\nVersion: 1.0\n")
@@ -185,10 +180,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Registry:
     entry = "from robotdiffuse.core.registry import Entry\nPLUM = Entry('pathlib:Path', 'a plum')\nSTONE = 1\n"
     (tmp_path / "orchard.py").write_text(entry)
     monkeypatch.syspath_prepend(str(tmp_path))
-    return Registry("drupe", {"pear": Entry("pathlib:PurePath", "a pear")}, group="test.fruits")
-
-
-def test_entries_of_installed_packages_are_loaded_when_they_are_used(installed: Registry) -> None:
+    installed = Registry("drupe", {"pear": Entry("pathlib:PurePath", "a pear")}, group="test.fruits")
     assert list(installed) == ["pear"] and "plum" in installed
     assert installed.entry("plum").description == "a plum" and installed.load("plum") is Path
     assert list(installed) == ["pear", "plum"]

@@ -76,14 +76,9 @@ def test_records_hold_what_was_measured_and_are_not_made_twice(tmp_path: Path) -
     assert len(runs[0]["versions"]) > 3
 
 
-@pytest.fixture
-def faulty(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(PLANNERS, "faulty", planners.ENTRY)
-
-
 @pytest.mark.slow
-@pytest.mark.usefixtures("faulty")
 def test_failures_of_every_kind_are_records_and_the_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(PLANNERS, "faulty", planners.ENTRY)
     monkeypatch.setattr(bench, "GRACE", 8.0)
     asked = replace(settings(tmp_path, "faulty", count=1), seeds=7, time_limit=0.5)
     assert bench.run_bench(asked, quiet, quiet) == 7

@@ -9,7 +9,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from safetensors.torch import save_file
 
 from helpers.box_arm import box_arm
-from helpers.toy_task import ToyTask
+from helpers.trainings import ToyTask
 from robotdiffuse.core.interrupts import exit_fast
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.training import tasks as training

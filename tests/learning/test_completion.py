@@ -9,7 +9,7 @@ import torch
 
 import robotdiffuse as rd
 from helpers.refusals import refuses
-from helpers.short_training import trained
+from helpers.trainings import trained
 from robotdiffuse.learning.checkpoint import load_completion, save_network
 from robotdiffuse.learning.completion import (
     FREE,

@@ -16,7 +16,6 @@ from helpers import waiting
 from robotdiffuse.processes import workers as module
 from robotdiffuse.processes.workers import EndedError, OverrunError, Worker, Workers, allow, cancelled, renew
 
-ROOT = Path(__file__).parents[2]
 HELD = 60  # longer than a worker may outlive its parent [s]
 
 
@@ -141,16 +140,22 @@ def test_ready_workers_are_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert workers.submit(os.getpid).result(HELD) != first
 
 
+DEAF = """
+import os, sys
+from robotdiffuse.processes.workers import Workers
+workers = Workers(1)
+print(workers.submit(os.getpid).result(), flush=True)
+workers.submit(exec, "import ctypes; ctypes.PyDLL(None).sleep({held})")
+print("begun", flush=True)
+sys.stdin.read()
+"""
+"""Its worker holds Python's global lock (GIL) for a while, as compiled code may."""
+
+
 @pytest.mark.skipif(not hasattr(os, "O_ASYNC"), reason="needs a signal on a closed pipe")
 def test_a_worker_in_compiled_code_does_not_outlive_a_killed_parent() -> None:
-    paths = os.pathsep.join((str(ROOT / "src"), str(ROOT / "tests")))
-    with subprocess.Popen(
-        [sys.executable, "-m", "helpers.deaf_worker", str(HELD)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"PYTHONPATH": paths},
-    ) as parent:
+    command = [sys.executable, "-c", DEAF.format(held=HELD)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout is not None
         worker = Path("/proc", parent.stdout.readline().strip())
         assert parent.stdout.readline() == "begun\n" and worker.exists()

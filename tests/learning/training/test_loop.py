@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from helpers.toy_task import ToyTask
-from helpers.training_log import read_log
+from helpers.trainings import ToyTask, read_log
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.learning.training.loop import TrainingRun

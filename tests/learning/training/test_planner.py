@@ -15,7 +15,7 @@ from safetensors.torch import load_file
 import robotdiffuse as rd
 from helpers.refusals import refuses
 from helpers.small_model import SMALL_ENCODER
-from helpers.training_log import read_log
+from helpers.trainings import read_log
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.learning.checkpoint import load_encoder, load_network

@@ -1,19 +1,21 @@
-"""A training that takes almost no time."""
+"""Trainings for tests: one that takes almost no time, a short one of a network, and what their log says."""
 
+import csv
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from robotdiffuse.learning.training.config import TrainingSettings
 from robotdiffuse.learning.training.loop import Processes, TrainingTask, Validation
 
 
 class ToyTask(TrainingTask):
-    """A linear layer. The loss is the sum of its squared weights times a factor, which depends on the number of the call."""
+    """A training of a linear layer. The loss is the sum of its squared weights times a factor, which depends on the number of
+    the call."""
 
     title = "toy"
 
@@ -35,3 +37,22 @@ class ToyTask(TrainingTask):
 
     def save(self, folder: Path, training: dict[str, Any]) -> None:
         """Saves nothing."""
+
+
+def read_log(folder: Path) -> list[dict[str, str]]:
+    """The rows of log.csv."""
+    with open(folder / "log.csv") as file:
+        return list(csv.DictReader(file))
+
+
+def trained(network: nn.Module, loss_at: Callable[[int], Tensor], steps: int, rate: float) -> list[float]:
+    """The loss of each step of a training; `loss_at` gives the loss for the number of a step."""
+    optimizer = torch.optim.AdamW(network.parameters(), rate)
+    losses = []
+    for step in range(steps):
+        loss = loss_at(step)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    return losses
