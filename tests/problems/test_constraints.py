@@ -182,7 +182,7 @@ def test_bad_input_is_refused_by_one_line(make: Callable[[], object], message: s
 
 def test_files_name_the_field() -> None:
     for entry, message in (
-        ({"upright": {}}, r"unknown constraint in constraints\[0\]: 'upright'; known: axis_cone, cartesian"),
+        ({"upright": {}}, r"unknown field of constraints\[0\]: 'upright'; known: axis_cone, cartesian"),
         ({"axis_cone": {"frame": HAND}}, r"constraints\[0\].axis_cone has no axis and no direction"),
         ({"axis_cone": {"frame": HAND, "tilt": 1}}, "unknown field of .*axis_cone: 'tilt'"),
     ):

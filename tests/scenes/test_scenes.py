@@ -228,7 +228,7 @@ PACKED = PCD.format(n=10**9, data="binary_compressed").encode() + struct.pack("<
         ("cloud.pcd", PCD.format(n=3, data="ascii").encode() + b"1 2 3\n1 2 3\n", "holds 2 of its 3 points"),
         ("cloud.pcd", PCD.replace("S {n}", "S -1").format(n=1, data="binary").encode(), "has -1 POINTS; it must be"),
         ("cloud.pcd", PCD.replace("TH {n}", "TH 9").format(n=1, data="binary").encode(), "must be WIDTH x HEIGHT, 9 x 1"),
-        ("cloud.pcd", b"FIELDS x y z\nDATA ascii\n1 2 3\n", "has no POINTS in its header"),
+        ("cloud.pcd", b"FIELDS x y z\nDATA ascii\n1 2 3\n", "is damaged: KeyError: 'POINTS'"),
         ("cloud.ply", ply(POINTS, False).rpartition(b"\n" + text(POINTS[-1:], " "))[0], "holds 49 of its 50"),
         ("cloud.csv", b"t,x,y\n0,1,2\n", "has the columns .'t', 'x', 'y'.; it must have x, y and z"),
         ("cloud.npy", npy(POINTS + 1j), "holds complex128 of 50 x 3; it must be numbers"),

@@ -50,6 +50,7 @@ from robotdiffuse.scenes.files import (
     SHAPES,
     check_fields,
     contacts_entry,
+    only_field,
     plain_fields,
     read_scene,
     read_shape,
@@ -237,13 +238,7 @@ def read_goal(where: str, data: object, setting: Setting) -> Goal:
     if isinstance(data, list):
         kind = "joint_set" if data and all(isinstance(part, list) for part in data) else "joints"
         data = {"any" if any(isinstance(part, dict | str) for part in data) else kind: data}
-    if not isinstance(data, dict) or len(data) != 1:
-        raise InputError(
-            f"{where} is {shown(data)}; it must be one of {', '.join(GOALS)}, or a configuration"
-        )
-    [(kind, value)] = data.items()
-    if kind not in GOALS:
-        raise unknown_name(f"field of {where}:", kind, GOALS)
+    kind, value = only_field(where, data, GOALS, "a configuration, or a mapping with one field")
     where = f"{where}.{kind}"
     if kind == "any":
         if not isinstance(value, list) or not value:
@@ -303,14 +298,7 @@ def _pose_goal_entry(pose: PoseGoal) -> dict[str, Any]:
 
 
 def _constraint(where: str, entry: object) -> Constraint:
-    if not isinstance(entry, dict) or len(entry) != 1:
-        raise InputError(
-            f"{where} is {shown(entry)}; it must be one constraint, e.g. {{axis_cone: {{...}}}}; known: "
-            f"{', '.join(CONSTRAINTS)}"
-        )
-    [(name, raw_fields)] = entry.items()
-    if name not in CONSTRAINTS:
-        raise unknown_name(f"constraint in {where}:", name, CONSTRAINTS)
+    name, raw_fields = only_field(where, entry, CONSTRAINTS, "one constraint, e.g. {axis_cone: {...}}")
     field_schemas, required = _fields_of(CONSTRAINTS[name])
     at = f"{where}.{name}"
     values = dict(check_fields(at, raw_fields, required, field_schemas))

@@ -1,7 +1,7 @@
 """Reads and writes the scenes of problem files: converts plain dictionaries to shapes, and shapes to
 dictionaries."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
@@ -62,6 +62,17 @@ def check_fields(
     return data
 
 
+def only_field(where: str, entry: object, kinds: Collection[str], what: str) -> tuple[str, Any]:
+    """The name and the value of a mapping with one of the names in `kinds`. Raises InputError for anything
+    else; the message says what it must be (`what`)."""
+    if not isinstance(entry, dict) or len(entry) != 1:
+        raise InputError(f"{where} is {shown(entry)}; it must be {what}; known: {', '.join(kinds)}")
+    [(kind, value)] = entry.items()
+    if kind not in kinds:
+        raise unknown_name(f"field of {where}:", kind, kinds)
+    return kind, value
+
+
 def read_scene(
     entries: object, folder: Path, contacts: object = (), field: str = "scene"
 ) -> tuple[Scene, tuple[str, ...]]:
@@ -89,14 +100,7 @@ def read_scene(
 
 def read_shape(where: str, entry: object, folder: Path, notes: list[str]) -> Shape:
     """The shape of an entry such as {box: {...}}; as `read_scene`. Notes are added to `notes`."""
-    if not isinstance(entry, dict) or len(entry) != 1:
-        raise InputError(
-            f"{where} is {shown(entry)}; it must be one shape, e.g. {{sphere: {{...}}}}; "
-            f"known: {', '.join(SHAPES)}"
-        )
-    [(kind, values)] = entry.items()
-    if kind not in SHAPES:
-        raise unknown_name(f"shape in {where}:", kind, SHAPES)
+    kind, values = only_field(where, entry, SHAPES, "one shape, e.g. {sphere: {...}}")
     return _shape(f"{where}.{kind}", SHAPES[kind], values, folder, notes)
 
 

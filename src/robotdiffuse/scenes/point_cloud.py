@@ -227,9 +227,6 @@ def _read_pcd(file: Path) -> ndarray:
     at = match.end() if match else 0
     lines = map(str.split, content[:at].decode("ascii").splitlines())
     header = {words[0]: words[1:] for words in lines if words}
-    missing = [name for name in ("FIELDS", "POINTS") if not header.get(name)] if match else ["DATA"]
-    if missing:
-        raise InputError(f"it has no {' and no '.join(missing)} in its header")
     names = header["FIELDS"]
     storage = header["DATA"][0]
     counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
@@ -249,25 +246,22 @@ def _read_pcd(file: Path) -> ndarray:
     if storage not in ("binary", "binary_compressed"):
         advice = "it must be ascii, binary or binary_compressed"
         raise InputError(f"it is stored as {shown(storage)}; {advice}")
-    kinds = [f"<{kind.lower()}{size}" for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]
+    fields = zip(header["TYPE"], header["SIZE"], counts, strict=True)
     # Fields are named by position: PCL writes several padding fields that are all called "_".
-    record = np.dtype([(str(i), kind, (n,)) for i, (kind, n) in enumerate(zip(kinds, counts, strict=True))])
+    record = np.dtype([(str(i), f"<{kind.lower()}{size}", (n,)) for i, (kind, size, n) in enumerate(fields)])
     places = [names.index(axis) for axis in "xyz"]
     if storage == "binary":
-        points = np.frombuffer(content, record, count=total, offset=at)
-        columns = [points[str(i)][:, 0] for i in places]
+        points = np.frombuffer(content, record, total, at)
+        columns = [points[str(i)] for i in places]
     else:  # all values of one field, then all of the next
         packed, size = struct.unpack_from("<II", content, at)
         if size != total * record.itemsize:
             needed = f"{total:,} points take {total * record.itemsize:,}"
             raise InputError(f"it unpacks to {size:,} bytes; its {needed}")
         unpacked = lzf_unpacked(content[at + 8 : at + 8 + packed], size)
-        columns = []
-        for i in places:
-            offset = sum(record[k].itemsize for k in range(i))
-            values = np.frombuffer(unpacked, kinds[i], total * counts[i], total * offset)
-            columns.append(values.reshape(total, counts[i])[:, 0])
-    return np.stack(columns, axis=1)
+        offsets = total * np.cumsum([0, *(record[i].itemsize for i in range(len(names)))])
+        columns = [np.frombuffer(unpacked, record[i], total, offsets[i]) for i in places]
+    return np.stack([column[:, 0] for column in columns], axis=1)
 
 
 def lzf_unpacked(packed: bytes, size: int) -> bytes:
