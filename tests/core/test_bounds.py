@@ -96,7 +96,7 @@ def test_a_pose_by_quaternion_and_by_rpy_is_scipys() -> None:
 def test_wrong_poses_are_refused() -> None:
     for fields, message in (
         ({"wxyz": [1, 0, 0, 0], "rpy": [0, 0, 0]}, "pose has wxyz and rpy; give one of them"),
-        ({"rpy": [0, 0]}, r"pose.rpy is \[0, 0\]; it must be 3 finite numbers"),
+        ({"rpy": [0, 0]}, r"pose.rpy \[rad\] is \[0, 0\]; it must be 3 finite numbers"),
         ({"wxyz": [0, 0, 0, 0]}, "a quaternion must not be zero"),
         ({"xyz": [0, 0, np.nan]}, "pose.xyz is .*; it must be 3 finite numbers"),
     ):

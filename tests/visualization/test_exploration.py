@@ -117,3 +117,14 @@ def test_a_browser_shows_the_steps(page: Path) -> None:
     assert not errors and rows == ["false"] * (len(explorer.acts) - 1) + ["true"]
     assert toggles[:5] == ["Occupied", "Predicted", "Unknown", "Next look", "True scene"]
     assert np.array(pixels)[[0, 2]].min() > 6000
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+def test_buttons_leave_the_title_free_in_a_window_of_900_pixels(page: Path) -> None:
+    with opened("about:blank", 900, 600) as shown:
+        shown.goto(page.as_uri(), wait_until="commit")
+        title = shown.locator("header").bounding_box()
+        shown.wait_for_selector("#toggles button")
+        assert title["x"] + title["width"] < shown.locator("#toggles").bounding_box()["x"]

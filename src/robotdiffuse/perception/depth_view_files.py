@@ -169,9 +169,7 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
     camera = check_fields(f"{where}.camera", values["camera"], ("xyz", "wxyz"))
     rotation = rotation_from_quaternion(unit_quaternion("camera", camera["wxyz"]))
     T_base_camera = transform(vector("camera", "xyz", camera["xyz"], 3), rotation)
-    configuration = None
-    if values.get("configuration") is not None:
-        configuration = np.asarray(values["configuration"])
+    configuration = values.get("configuration")
     if cloud:
         points = values["cloud"]
         if isinstance(points, str):

@@ -280,16 +280,15 @@ def seen_points(views: Sequence[DepthView], robot: Robot, start: Configuration) 
             if count < 0:
                 break
         if count >= 0:
-            supported_cells = supported(keys, cells, sums, count, np.float32(_min_cell_points(views)))
+            # more than one point per isolated cell only if all images have enough pixels per cell
+            focal = min(
+                (0.0 if view.cloud is not None else view.intrinsics[0] for view in views), default=0.0
+            )
+            enough = (CELL * focal / CAMERA_DISTANCE) ** 2 >= MIN_CELL_POINTS**2
+            min_points = np.float32(MIN_CELL_POINTS if enough else 1)
+            supported_cells = supported(keys, cells, sums, count, min_points)
             return sums[:count, :3][supported_cells] / sums[:count, 3:][supported_cells]
         capacity *= 4
-
-
-def _min_cell_points(views: Sequence[DepthView]) -> int:
-    """Minimum number of points of an isolated cell: more than one only if all images have enough pixels per
-    cell, see CAMERA_DISTANCE."""
-    focal = min((0.0 if view.cloud is not None else view.intrinsics[0] for view in views), default=0.0)
-    return MIN_CELL_POINTS if (CELL * focal / CAMERA_DISTANCE) ** 2 >= MIN_CELL_POINTS**2 else 1
 
 
 def seen_shapes(

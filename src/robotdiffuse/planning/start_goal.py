@@ -396,9 +396,9 @@ def _pose_goals(
     if len(configurations):
         rejected = rejected[distances(rejected) < distances(configurations[:1])]
     if len(rejected):
-        configurations = np.concatenate(
-            [_free_meshes(robot, scene, rejected)[:MAX_GRAZING_GOALS], configurations]
-        )
+        meshes = _loaded("collision.exact_meshes").ExactCollision(robot, scene)
+        free = rejected[~meshes.collides(rejected)]
+        configurations = np.concatenate([free[:MAX_GRAZING_GOALS], configurations])
     if len(configurations):
         if note:
             context.note(note)
@@ -440,11 +440,6 @@ def _with_turns(context: PlanningContext, goals: Iterable[ndarray]) -> Configura
     robot = context.problem.robot
     start = context.problem.start
     return np.concatenate([robot.equivalent_configurations(q, start) for q in goals])
-
-
-def _free_meshes(robot: Robot, scene: Scene, q: Configurations) -> Configurations:
-    """The configurations whose exact meshes are free."""
-    return q[~_loaded("collision.exact_meshes").ExactCollision(robot, scene).collides(q)]
 
 
 def _explained(robot: Robot, scene: Scene, q: Configuration) -> str | None:

@@ -291,9 +291,9 @@ def make_app(pool: WorkerPool, robots: dict[str, Robot]) -> FastAPI:
         redirect_slashes=False,
     )
     app.add_middleware(Access, settings=pool.settings)
-    app.exception_handler(RequestError)(_request_error)
+    app.exception_handler(RequestError)(lambda _, error: _error(error.code, str(error), error.headers))
     app.exception_handler(HTTPException)(_http_error)
-    app.exception_handler(Exception)(_unexpected)
+    app.exception_handler(Exception)(lambda _, error: _error(500, f"{type(error).__name__}: {error}"))
     _add_requests(app, pool, pool.settings)
     _add_lists(app, pool, robots)
     _describe_bodies(app)
@@ -531,17 +531,7 @@ def _error(code: int, message: str, headers: Mapping[str, str] | None = None) ->
     return Response(answer.body, code, headers and {**headers}, JSON)
 
 
-def _request_error(_: Request, error: Exception) -> Response:
-    assert isinstance(error, RequestError)
-    return _error(error.code, str(error), error.headers)
-
-
-def _unexpected(_: Request, error: Exception) -> Response:
-    return _error(500, f"{type(error).__name__}: {error}")
-
-
-def _http_error(request: Request, error: Exception) -> Response:
-    assert isinstance(error, HTTPException)
+def _http_error(request: Request, error: Any) -> Response:
     path = shown(request.url.path)
     message = f"there is no {path}; see /docs"
     if error.status_code == 405:
