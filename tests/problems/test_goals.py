@@ -185,7 +185,8 @@ def pose(**more: Any) -> dict[str, Any]:
 
 WRONG = {
     "object": (pose(relative_to="shelf"), "unknown object in goal.pose.relative_to: 'shelf'; known: table"),
-    "tolerance": (pose(xyz_tolerance=[0.1]), "goal.xyz_tolerance is .*; it must be 3 finite numbers"),
+    "tolerance": (pose(xyz_tolerance=[0.1]), "goal.xyz_tolerance is .*; it must be 3 numbers from 0"),
+    "tolerance in degrees": (pose(rpy_tolerance=[0, 0, 5]), r"it must be 3 numbers from 0 to 3.2 \[rad\]"),
     "any": ({"goal": {"any": [{"pose": POSE}, {"joint": END}]}}, r"unknown field of goal.any\[1\]: 'joint'"),
     "waypoints": ({"waypoints": {"joints": END}}, "waypoints is .*; it must be a list of goals"),
     "blend": ({"blend": 0.1}, "blend is 0.1; there are no waypoints"),

@@ -110,7 +110,7 @@ def check_ply(content: bytes) -> None:
     header, _, body = content.partition(b"end_header")
     if b"\nformat ascii" in header:
         stated = sum(map(int, re.findall(rb"^element \S+ (\S+)", header, re.MULTILINE)))
-        rows = sum(map(bool, map(bytes.strip, body.splitlines())))
+        rows = sum(map(bool, map(bytes.strip, io.BytesIO(body))))
         if rows != stated:
             raise InputError(f"it holds {rows} of its {stated} vertices, faces and other elements")
 

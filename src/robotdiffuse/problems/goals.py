@@ -10,9 +10,12 @@ from typing import no_type_check
 
 import numpy as np
 
-from robotdiffuse.core.bounds import Value, numbers, rigid_transform
+from robotdiffuse.core.bounds import MAX_COORDINATE, Value, numbers, rigid_transform
 from robotdiffuse.core.errors import InputError, check_list, repeated, shown
 from robotdiffuse.core.types import GivenConfigurations, GivenPose, Pose, VectorOrNone
+
+MAX_TURN = 3.2
+"""Largest tolerance of an angle, a little more than half a turn [rad]; larger ones must be degrees."""
 
 
 @no_type_check
@@ -68,13 +71,13 @@ class PoseGoal(Value):
         if not isinstance(self.frame, str):
             raise InputError(f"goal.frame is {shown(self.frame)}; it must be the name of a link")
         object.__setattr__(self, "T_base_frame", rigid_transform("goal.T_base_frame", self.T_base_frame))
-        for name, unit in (("xyz_tolerance", "m"), ("rpy_tolerance", "rad")):
+        for name, most, unit in (("xyz_tolerance", MAX_COORDINATE, "m"), ("rpy_tolerance", MAX_TURN, "rad")):
             value = getattr(self, name)
             if value is not None:
                 array = numbers(value)
-                if array is None or array.shape != (3,) or not ((array >= 0) & (array < np.inf)).all():
+                if array is None or array.shape != (3,) or not ((array >= 0) & (array <= most)).all():
                     raise InputError(
-                        f"goal.{name} is {shown(value)}; it must be 3 finite numbers of at least 0 [{unit}]"
+                        f"goal.{name} is {shown(value)}; it must be 3 numbers from 0 to {most:g} [{unit}]"
                     )
                 object.__setattr__(self, name, array)
         super().__post_init__()
