@@ -271,7 +271,7 @@ def _octomap(entry: dict[str, Any], frames: MoveItFrames) -> list[Shape]:
         return []
     if not message.get("binary"):
         raise InputError(f"{location} is not binary; publish it as a binary octomap (octomap_binary)")
-    numbers = vector(f"{location}.octomap", "data", data, len(data)).astype(np.int64)
+    numbers = vector(f"{location}.octomap", "data", data, len(data), 255.0).astype(np.int64)
     edge = float(vector(f"{location}.octomap", "resolution", [message.get("resolution")], 1)[0])
     T = frames.of_header(location, entry) @ pose_of(f"{location}.origin", entry.get("origin") or NO_POSE)
     with located(location):

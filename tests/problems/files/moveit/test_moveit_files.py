@@ -184,6 +184,7 @@ WRONG_SCENES: dict[str, tuple[object, str]] = {
     ),
     "objects": ({"world": {"collision_objects": {}, "octomap": {"octomap": {"data": [1]}}}}, "not binary"),
     "octomap": (octomap([3, 0]), "world.octomap: the tree ends too soon"),
+    "octomap of no bytes": (octomap([300, 0]), r"octomap.data is \[300, 0\]; it must be 2 finite numbers within ±255"),
     "a problem": ({"robot": "panda", "scene": []}, "unknown field of a planning scene: 'robot'"),
     "misspelled world": ({"world": {"objects": []}}, "unknown field of world: 'objects'"),
     "misspelled object": (scene_data(primitive=[]), "unknown field of the object: 'primitive'; .* mean primitives"),
