@@ -5,7 +5,7 @@ from pathlib import Path
 
 from robotdiffuse.cli.arguments import Namespace
 from robotdiffuse.cli.console import clearances
-from robotdiffuse.core.errors import InputError, joined
+from robotdiffuse.core.errors import InputError, joined, located
 from robotdiffuse.core.output_files import check_output
 from robotdiffuse.core.results import NO_PROBLEM, PlanResult, load_result
 from robotdiffuse.core.types import Path as Waypoints
@@ -116,10 +116,8 @@ def _read(
         robot = load_robot(arguments.robot)
         scene, scene_notes = read_moveit_scene(str(arguments.scene), robot, arguments.ignore_joints)
         problem = problem_of_motion(recorded, robot, scene)
-    try:
+    with located(arguments.motion):
         converted = motion_of_robot(recorded, problem.robot)
-    except InputError as error:
-        raise InputError(f"{arguments.motion}: {error}") from None
     label = "trajectory" if isinstance(converted.motion, Trajectory) else "path"
     return problem, {label: converted.motion}, (*scene_notes, *converted.notes)
 

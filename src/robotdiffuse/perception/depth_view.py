@@ -172,7 +172,7 @@ class DepthView(Value):
         Raises:
             InputError: If no point is in front of the camera, and for anything but n x 3 finite numbers.
         """
-        T = cls(np.zeros((1, 1)), (1.0, 1.0, 0.0, 0.0), T_base_camera, configuration).T_base_camera
+        T = rigid_transform("view.T_base_camera", T_base_camera)
         points = rows("view.points", points, None, 3)
         in_camera = (points - T[:3, 3]) @ T[:3, :3]
         z = in_camera[:, 2]

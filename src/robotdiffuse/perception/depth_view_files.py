@@ -20,7 +20,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import numbers, positive, unit_quaternion, vector
-from robotdiffuse.core.errors import InputError, needs, reading, shown, unknown_name
+from robotdiffuse.core.errors import InputError, located, needs, reading, shown, unknown_name
 from robotdiffuse.core.input_files import input_file, read_array, read_arrays, read_json, read_yaml
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
 from robotdiffuse.perception.depth_view import INTRINSICS, NO_RETURN, DepthNoise, DepthView
@@ -147,11 +147,8 @@ def read_views(entries: object, folder: Path) -> tuple[tuple[DepthView, ...], tu
     views: list[DepthView] = []
     notes: list[str] = []
     for i, entry in enumerate(entries):
-        try:
+        with located(f"views[{i}]"):
             views.append(_view(f"views[{i}]", entry, folder, notes))
-        except InputError as error:
-            prefix = "" if str(error).startswith(f"views[{i}]") else f"views[{i}]: "
-            raise InputError(f"{prefix}{error}") from None
     return tuple(views), tuple(notes)
 
 

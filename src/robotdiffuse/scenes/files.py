@@ -9,7 +9,7 @@ from typing import Any
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import MAX_ANGLE, vector
-from robotdiffuse.core.errors import InputError, shown, unknown_name
+from robotdiffuse.core.errors import InputError, located, shown, unknown_name
 from robotdiffuse.core.input_files import read_array
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_rpy
@@ -120,12 +120,10 @@ def _shape(where: str, kind: type[Shape], values: object, folder: Path, notes: l
         if not isinstance(values["file"], str) or not values["file"]:
             raise InputError(f"{where}.file is {shown(values['file'])}; it must be the name of a file")
         values["file"] = str(folder / values["file"])
-        try:
+        with located(where):
             if kind is PointCloud:
                 values.setdefault("point_radius", default_radius(values["file"]))
             arrays = _content(kind, values["file"], notes)
-        except InputError as error:
-            raise InputError(f"{where}: {error}") from None
         values |= dict(zip(content, arrays, strict=True))
     else:
         values = check_fields(where, values, required, optional)

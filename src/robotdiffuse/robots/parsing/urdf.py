@@ -21,7 +21,7 @@ from robotdiffuse.core.bounds import (
     unit_quaternion,
     within,
 )
-from robotdiffuse.core.errors import InputError, joined, shown, unknown_name
+from robotdiffuse.core.errors import InputError, joined, located, shown, unknown_name
 from robotdiffuse.core.input_files import parse_xml, read_bytes, read_yaml
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import (
@@ -532,11 +532,9 @@ class UrdfTree:
             raise InputError(
                 f"{self.path}: {location} scale is {shown(shape.get('scale'))}; its numbers must not be 0"
             )
-        try:
+        with located(self.path):
             vertices, faces = read_triangles(file, merge=True, notes=self.notes)
             vertices = points(location, "vertices", vertices * scale)
-        except InputError as error:
-            raise InputError(f"{self.path}: {error}") from None
         if len(vertices) < 4:
             raise InputError(
                 f"{self.path}: link {link}: {file} has no triangle mesh with at least four vertices; "
