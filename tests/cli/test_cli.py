@@ -7,6 +7,7 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import rich.console
 import yaml
@@ -45,6 +46,12 @@ BAD_CALL = {
     "unknown option": (["plan", "problem.json", "--tme-limit=3"], "did you mean --time-limit?"),
     "unknown robot": (["robot", "info", "pandaa"], "pandaa"),
     "no workers": (["data", "generate", "--out", "d", "--workers", "0"], "'0' is not an integer"),
+    "no folder": (["data", "generate", "--out", ""], "--out: empty"),
+    "no planner": (["bench", "run", "--problems", "rop", "--planners", "aorrtc,", "--out", "d"], "--planners: empty"),
+    "a family without its share": (["data", "generate", "--out", "d", "--mix", "rop"], "'rop' is not NAME=NUMBER"),
+    "shares without a sum": (["data", "generate", "--out", "d", "--mix", "rop=1e308,shelf=1e308"], "at most 1e9"),
+    "a seed that is too large": (["train", "encoder", "--out", "e", "--seed", "9" * 20], "below 2^63"),
+    "more motions than a disk holds": (["data", "generate", "--out", "d", "--trajectories", "9" * 20], "at most 10^9"),
     "train without out": (["train", "encoder"], "--out"),
     "train twice as long": (["train", "encoder", "--out", "e", "--minutes", "1", "--samples", "9"], "not allowed with"),
     "no data": (["data", "info", "."], "no data set"),
@@ -71,6 +78,12 @@ def test_bad_call_is_status_2_in_one_line(case: str, tmp_path: Path, said: Said)
     argv, named = BAD_CALL[case]
     error = said(2, *argv)
     assert "error: " in error and named in error and error.count("\n") == 1
+
+
+def test_what_does_not_fit_into_memory_is_one_line(monkeypatch: pytest.MonkeyPatch, said: Said) -> None:
+    monkeypatch.setattr("robotdiffuse.cli.data.generate", lambda *_: np.empty(2**55))
+    error = said(2, "data", "generate", "--out", "d", "--waypoints", "999999999")
+    assert "not enough memory" in error and error.count("\n") == 1
 
 
 def test_help_and_version(said: Said) -> None:

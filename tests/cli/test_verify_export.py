@@ -82,7 +82,7 @@ def test_only_valid_motions_are_exported(planned: Path, said: Said) -> None:
     for command in (("export", "bad.json", "--out", "b.yaml"), ("publish", "bad.json", "--to", "localhost")):
         assert "is not exported: its motion is not valid" in said(2, *command)
     assert not Path("b.yaml").exists()
-    assert "'host:0' is not HOST or HOST:PORT" in said(2, "publish", planned / "r.json", "--to", "host:0")
+    assert "'70000' is not a port" in said(2, "publish", planned / "r.json", "--to", "host:70000")
     assert run("export", planned / "r.json", "--out", "fine.csv", "--rate", "1000") == 0
     assert Path("fine.csv").read_text().splitlines()[2].startswith("0.001,")
     assert run("export", planned / "r.json", "--out", "fine.csv", "--rate", "-1") == 2

@@ -71,8 +71,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return status
     except InputError as error:
-        print(f"robotdiffuse: error: {error}", file=sys.stderr)
-        return WRITE_FAILED if isinstance(error, OutputError) else BAD_INPUT
+        return _refused(error, WRITE_FAILED if isinstance(error, OutputError) else BAD_INPUT)
+    except MemoryError as error:
+        return _refused(f"not enough memory; use smaller numbers. {error}")
     except KeyboardInterrupt:
         print("robotdiffuse: stopped", file=sys.stderr)
         return STOPPED
@@ -84,10 +85,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise
     except OSError as error:
         if error.errno == errno.ENAMETOOLONG:
-            named = InputError(f"{error.filename}: {error.strerror}")
-            print(f"robotdiffuse: error: {named}", file=sys.stderr)
-            return BAD_INPUT
+            return _refused(InputError(f"{error.filename}: {error.strerror}"))
         return _write_failed(error.strerror or str(error))
+
+
+def _refused(why: object, status: int = BAD_INPUT) -> int:
+    """Report an error in one line; returns the exit status."""
+    print(f"robotdiffuse: error: {why}", file=sys.stderr)
+    return status
 
 
 def _prepare_streams() -> None:

@@ -31,10 +31,10 @@ def option(parser: ActionsContainer, spec: str, help: str, *more: Any) -> None:
     *values, keywords = more if more and isinstance(more[-1], dict) else (*more, {})
     kind, default, *_ = *values, None, None
     name, *words = spec.split()
-    called = [word for word in words if word not in ("*", "!")]
+    called = [word for word in words if word not in "*!"]
     about: dict[str, Any] = {"default": default}
     if called:
-        about |= {"metavar": called[0], "type": kind}
+        about |= {"metavar": called[0], "type": kind or filled}
     elif name.startswith("-") and "choices" not in keywords:
         about = {"action": "store_true"}
     if "*" in words:
@@ -51,7 +51,7 @@ def chosen(arguments: Namespace, names: Iterable[str]) -> dict[str, Any]:
 
 def check_workers(arguments: Namespace) -> None:
     """Refuses --workers together with --cluster."""
-    if arguments.cluster is not None and arguments.workers is not None:
+    if arguments.cluster and arguments.workers:
         raise InputError("--workers cannot be combined with --cluster, which uses all cores of the cluster")
 
 
@@ -74,9 +74,16 @@ def number(kind: type, fits: Callable[[Any], bool], what: str) -> Callable[[str]
 positive = number(float, lambda x: x > 0, "a positive number")
 not_negative = number(float, lambda x: x >= 0, "a number of at least 0")
 share = number(float, lambda x: 0 <= x <= 1, "between 0 and 1")
-natural = number(int, lambda _: True, "an integer of at least 0")
-count = number(int, lambda x: x > 0, "an integer of at least 1")
+natural = number(int, lambda x: x < 2**63, "an integer of at least 0, below 2^63")
+count = number(int, lambda x: 0 < x <= 10**9, "an integer of at least 1, at most 10^9")
 port = number(int, lambda x: x < 2**16, "a port, an integer from 0 to 65535")
+
+
+def filled(text: str) -> str:
+    """A text, such as a name, that is not empty."""
+    if not text:
+        raise ArgumentTypeError("empty; it must be a name or value")
+    return text
 
 
 def megabytes(text: str) -> int:
@@ -84,33 +91,31 @@ def megabytes(text: str) -> int:
     return MEGABYTE * count(text)
 
 
+def pair(text: str, kind: str = "FOLDER") -> tuple[str, str]:
+    """NAME=VALUE. kind: what messages call the value."""
+    name, _, value = text.partition("=")
+    if not name or not value:
+        raise ArgumentTypeError(f"{text!r} is not NAME={kind}")
+    return name, value
+
+
 def assignment(text: str) -> tuple[str, float]:
     """NAME=VALUE with a finite value."""
-    name, _, value = text.partition("=")
-    if not name:
-        raise ArgumentTypeError(f"{text!r} is not NAME=NUMBER")
+    name, value = pair(text, "NUMBER")
     return name, number(float, lambda _: True, "a number")(value)
 
 
 def shares(text: str) -> dict[str, float]:
-    """NAME=FRACTION,NAME=FRACTION,... with fractions of at least 0."""
-    pairs = [part.partition("=") for part in names(text)]
-    if len({name for name, _, _ in pairs}) < len(pairs):
+    """NAME=FRACTION,NAME=FRACTION,..."""
+    pairs = list(map(assignment, names(text)))
+    if len(dict(pairs)) < len(pairs):
         raise ArgumentTypeError(f"{text!r} names a family twice")
-    return {name: not_negative(value) for name, _, value in pairs}
-
-
-def folder(text: str) -> tuple[str, str]:
-    """NAME=FOLDER."""
-    name, _, path = text.partition("=")
-    if not name or not path:
-        raise ArgumentTypeError(f"{text!r} is not NAME=FOLDER")
-    return name, path
+    return dict(pairs)
 
 
 def names(text: str) -> tuple[str, ...]:
     """NAME,NAME,..."""
-    return tuple(part.strip() for part in text.split(","))
+    return tuple(map(filled, map(str.strip, text.split(","))))
 
 
 def positives(text: str) -> list[float]:
@@ -120,10 +125,5 @@ def positives(text: str) -> list[float]:
 
 def address(text: str) -> tuple[str, int]:
     """HOST or HOST:PORT."""
-    host, colon, number = text.rpartition(":")
-    if not colon:
-        host = text
-        number = str(ROSBRIDGE_PORT)
-    if not host or not (number.isascii() and number.isdecimal() and 0 < int(number) < 65536):
-        raise ArgumentTypeError(f"{text!r} is not HOST or HOST:PORT")
-    return host, int(number)
+    host, colon, at = text.rpartition(":")
+    return (filled(host), port(at)) if colon else (filled(text), ROSBRIDGE_PORT)

@@ -6,10 +6,10 @@ from robotdiffuse.cli.arguments import (
     address,
     assignment,
     count,
-    folder,
     megabytes,
     natural,
     not_negative,
+    pair,
     positive,
 )
 from robotdiffuse.cli.command import (
@@ -382,7 +382,7 @@ ROBOTS = (
                         "--package NAME=FOLDER *",
                         "folder of a ROS package (default: search ROS_PACKAGE_PATH, AMENT_PREFIX_PATH and "
                         "the folders above the URDF)",
-                        folder,
+                        pair,
                     ),
                     ("--limits FILE", "file of joint limits, as MoveIt's joint_limits.yaml"),
                     ("--license TEXT", "license of the URDF's geometry, to keep in the folder"),

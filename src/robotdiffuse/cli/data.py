@@ -26,7 +26,7 @@ from robotdiffuse.visualization.replay_page import GalleryEntry, write_gallery
 def run_generate(arguments: Namespace) -> None:
     check_workers(arguments)
     options = chosen(arguments, GenerationSettings.__dataclass_fields__)
-    if arguments.planner is not None and arguments.planner != GenerationSettings.planner:
+    if arguments.planner not in (None, GenerationSettings.planner):
         options["search"] = SEARCHES.defaults(arguments.planner)
     settings = GenerationSettings(**options)
     if arguments.safety_distance is not None:

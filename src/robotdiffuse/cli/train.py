@@ -210,7 +210,7 @@ def train_for_robot(
 def _check_disk(work: Path, motions: int) -> None:
     """Raises InputError if the disk has too little space."""
     existing = next(folder for folder in (work, *work.absolute().parents) if folder.exists())
-    written = sum(file.stat().st_size for file in work.rglob("*") if file.is_file()) if work.is_dir() else 0
+    written = sum(file.stat().st_size for file in work.rglob("*") if file.is_file())
     free = shutil.disk_usage(existing).free
     needed = motions * BYTES_PER_MOTION + BYTES_PER_TRAINING - written
     if free < needed:

@@ -115,8 +115,8 @@ class GenerationSettings(Settings):
         for name, share in self.mix.items():
             if name not in FAMILIES:
                 raise unknown_name("family of scenes in mix", name, FAMILIES)
-            if not 0 < share < float("inf"):
-                raise InputError(f"mix: the share of {name} is {share}; it must be positive")
+            if not 0 < share <= 1e9:
+                raise InputError(f"mix: the share of {name} is {share}; it must be above 0, at most 1e9")
         if not self.mix:
             raise InputError(f"mix is empty; it must name a family: {', '.join(FAMILIES)}")
 

@@ -6,10 +6,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from helpers.refusals import refuses
 from helpers.trainings import ToyTask, read_log
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.training.config import EncoderTraining
-from robotdiffuse.learning.training.loop import TrainingRun
+from robotdiffuse.learning.training.loop import TrainingRun, train
 
 
 def run_of(folder: Path, factor: Callable[[int], float]) -> TrainingRun:
@@ -27,6 +28,12 @@ def test_losses_that_are_not_finite_are_skipped(tmp_path: Path) -> None:
     assert int(read_log(tmp_path)[-1]["skipped"]) == 3
     with pytest.raises(InputError, match="not finite"):
         run_of(tmp_path / "hopeless", lambda call: float("nan")).loop()
+
+
+def test_a_short_training_that_diverged_writes_no_weights(tmp_path: Path) -> None:
+    settings = EncoderTraining(minutes=None, samples=3, batch=1)
+    task = ToyTask(settings, lambda call: float("nan") if call > 1 else 1.0)
+    refuses("diverged: the loss is not finite at step 3", train, task, str(tmp_path))
 
 
 def test_the_average_follows_the_weights_with_the_decay_of_the_settings(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path as FilePath
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, NoReturn, TypeVar
 
 import numpy as np
 import torch
@@ -300,14 +300,18 @@ class TrainingRun:
             self._bad += 1
             self.at.skipped += 1
             if self._bad == self.settings.bad_steps:
-                raise InputError(
-                    f"training in {self.out} diverged: the loss is not finite at step {self.at.step}"
-                )
+                self.diverged()
             return
         self._bad = 0
         self.optimizer.step()
         self._losses.append(mean)
         self.average.update_parameters(self.parameters)
+
+    def diverged(self) -> NoReturn:
+        raise InputError(
+            f"training in {self.out} diverged: the loss is not finite at step {self.at.step}; "
+            "use another folder and a lower learning rate"
+        )
 
     def _averaged(self, average: Tensor, parameter: Tensor, _count: Tensor | int) -> Tensor:
         decay = min(self.settings.average, self.at.step / (self.at.step + 10))
@@ -479,6 +483,8 @@ def train(task: TrainingTask, out: str) -> dict[str, float]:
     if not task.processes.first:
         return task.processes.share(None)
     with run.averaged():
+        if not math.isfinite(task.loss(1.0, run.rng).item()):  # a short run ends before `bad_steps`
+            run.diverged()
         report = task.finish() | {"samples": float(run.at.samples)}
         minutes = round(run.at.seconds / 60, 2)
         about = {"settings": task.settings.to_json(), **task.about(), "minutes": minutes, **report}
