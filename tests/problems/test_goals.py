@@ -186,6 +186,7 @@ def pose(**more: Any) -> dict[str, Any]:
 WRONG = {
     "object": (pose(relative_to="shelf"), "unknown object in goal.pose.relative_to: 'shelf'; known: table"),
     "tolerance": (pose(xyz_tolerance=[0.1]), "goal.xyz_tolerance is .*; it must be 3 numbers from 0"),
+    "relative to a list": (pose(relative_to=[]), r"unknown object in goal.pose.relative_to: \[\]; known"),
     "tolerance in degrees": (pose(rpy_tolerance=[0, 0, 5]), r"it must be 3 numbers from 0 to 3.2 \[rad\]"),
     "any": ({"goal": {"any": [{"pose": POSE}, {"joint": END}]}}, r"unknown field of goal.any\[1\]: 'joint'"),
     "waypoints": ({"waypoints": {"joints": END}}, "waypoints is .*; it must be a list of goals"),

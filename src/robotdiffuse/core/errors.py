@@ -1,7 +1,7 @@
 """InputError, the exception for bad input, and helpers that quote values in its message."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Hashable, Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
 from types import UnionType
@@ -138,6 +138,12 @@ def unknown_name(what: str, name: object, known: Iterable[object]) -> InputError
     """An InputError for a name that is not in a table; it lists the known names."""
     names = sorted(map(str, known))
     return InputError(f"unknown {what} {shown(name)}; known: {joined(names)}{suggestion(name, names)}")
+
+
+def check_name(what: str, name: object, known: Collection[object]) -> None:
+    """Raises the InputError of `unknown_name` unless the name is in the table."""
+    if not isinstance(name, Hashable) or name not in known:
+        raise unknown_name(what, name, known)
 
 
 def suggestion(name: object, known: Iterable[str]) -> str:

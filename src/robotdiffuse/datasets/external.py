@@ -21,7 +21,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.bounds import numbers
-from robotdiffuse.core.errors import InputError, shortened, shown
+from robotdiffuse.core.errors import InputError, reading, shown
 from robotdiffuse.core.input_files import input_file
 from robotdiffuse.core.output_files import lock_folder, write_atomically
 from robotdiffuse.core.types import Path, Trajectory
@@ -290,13 +290,8 @@ def _read(file: str | FilePath) -> tuple[Float32[ndarray, "n 254 7"], Float32[nd
     """The motions, and the centers of the two spheres of each."""
     row_shapes = {"x_train": (WAYPOINTS, DOF), "y_train": (CONDITION_NUMBERS,)}
     input_file(file, largest=sys.maxsize)
-    try:
-        with np.load(file, allow_pickle=False) as stored:
-            x, y = (np.asarray(stored[name], np.float32) for name in row_shapes)
-    except OSError as error:
-        raise InputError(f"cannot read {file}: {error.strerror or error}") from None
-    except Exception as error:  # NumPy, zipfile and Python's tokenizer raise many types of exceptions
-        raise InputError(f"{file} is no robot.npz: {shortened(str(error))}") from None
+    with reading(file), np.load(file, allow_pickle=False) as stored:
+        x, y = (np.asarray(stored[name], np.float32) for name in row_shapes)
     for (name, row), array in zip(row_shapes.items(), (x, y), strict=True):
         if array.shape != (len(x), *row) or not len(x):
             shape = " x ".join(map(str, ("n", *row)))

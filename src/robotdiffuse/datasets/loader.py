@@ -18,7 +18,7 @@ try:
 except ImportError:
     raise ImportError('RopDataset needs torch, not installed: pip install "robotdiffuse[train]"') from None
 
-from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.errors import InputError, check_name
 from robotdiffuse.datasets.rows import read_rows
 from robotdiffuse.datasets.shards import SPLITS, read_manifest
 from robotdiffuse.datasets.surface_clouds import surface_clouds
@@ -90,8 +90,7 @@ class RopDataset(Dataset[dict[str, Tensor]]):
             InputError: For unknown names, a folder without data or with damaged shards, and data of another
                 robot.
         """
-        if split not in SPLITS:
-            raise unknown_name("split", split, SPLITS)
+        check_name("split", split, SPLITS)
         if points < 1:
             raise InputError(f"points is {points}; it must be at least 1")
         if waypoints is not None and waypoints < 2:

@@ -21,7 +21,7 @@ from robotdiffuse.baselines.controls import (
     VIAS,
     ControlSettings,
 )
-from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.errors import InputError, check_name
 from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.core.settings import Count, OneOf, Settings
 from robotdiffuse.core.tables import Column, Figure, Table
@@ -174,8 +174,7 @@ def run_ablation(
     Raises InputError for an unknown row, listing the known ones, and for data of another robot.
     """
     for name in rows:
-        if name not in ROWS:
-            raise unknown_name("row of Table 2", name, ROWS)
+        check_name("row of Table 2", name, ROWS)
     read_manifest(settings.data).check_robot(load_robot("panda"))
     out = FilePath(settings.out)
     configs = dict.fromkeys(ROWS[name].config for name in rows)

@@ -20,7 +20,7 @@ from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 from robotdiffuse import __version__
-from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.errors import InputError, check_name
 from robotdiffuse.core.input_files import is_file
 from robotdiffuse.core.output_files import JsonLines, lock_folder
 from robotdiffuse.core.settings import Count, Filled, OneOf, Positive, Settings
@@ -566,8 +566,7 @@ def preset_settings(
     Raises:
         InputError: For an unknown preset; the message lists the known ones.
     """
-    if preset not in PRESETS:
-        raise unknown_name("preset", preset, PRESETS)
+    check_name("preset", preset, PRESETS)
     chosen = PRESETS[preset]
     preset_values = {"count": min(count or chosen.count, chosen.count), "equal_time": chosen.equal_time}
     sets = (*chosen.problems, *problems)

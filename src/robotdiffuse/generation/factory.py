@@ -21,7 +21,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.kernels.random import random_state
 from robotdiffuse.collision.motions import search_space
-from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.errors import InputError, check_name, unknown_name
 from robotdiffuse.core.interrupts import delay_interrupts
 from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.core.registry import Entry, Registry
@@ -113,8 +113,7 @@ class GenerationSettings(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name, share in self.mix.items():
-            if name not in FAMILIES:
-                raise unknown_name("family of scenes in mix", name, FAMILIES)
+            check_name("family of scenes in mix", name, FAMILIES)
             if not 0 < share <= 1e9:
                 raise InputError(f"mix: the share of {name} is {share}; it must be above 0, at most 1e9")
         if not self.mix:

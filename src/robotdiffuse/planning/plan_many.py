@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 from numbers import Integral
 from typing import Any
 
-from robotdiffuse.core.errors import InputError, shown, unknown_name
+from robotdiffuse.core.errors import InputError, check_name, shown
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.core.types import Status
@@ -84,8 +84,7 @@ def plan_many(
         raise InputError(f"unknown argument {shown(min(unknown))}; known: {', '.join(sorted(arguments))}")
     load_planner(planner, settings, weights)
     if cluster is not None:
-        if cluster not in CLUSTERS:
-            raise unknown_name("cluster", cluster, CLUSTERS)
+        check_name("cluster", cluster, CLUSTERS)
         if workers is not None:
             raise InputError(f"workers is {workers} and cluster is {cluster}; a cluster uses all its cores")
         results = _planned_on_cluster(problems, (planner, settings, weights), cluster, PlanRequest(**request))

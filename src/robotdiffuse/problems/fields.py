@@ -34,7 +34,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robotdiffuse.core.bounds import numbers, unit_quaternion, vector
-from robotdiffuse.core.errors import InputError, located, shown, unknown_name
+from robotdiffuse.core.errors import InputError, check_name, located, shown
 from robotdiffuse.core.settings import converted
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
 from robotdiffuse.core.types import Pose
@@ -272,8 +272,7 @@ def _pose_goal(where: str, value: object, scene: Scene, frame: object = None) ->
     if "relative_to" in pose:
         shapes = {shape.name: shape for shape in scene.shapes}
         name = pose["relative_to"]
-        if name not in shapes:
-            raise unknown_name(f"object in {where}.relative_to:", str(name), shapes)
+        check_name(f"object in {where}.relative_to:", name, shapes)
         with located(f"{where}.relative_to"):
             T = shapes[name].T_base_shape @ T
     return PoseGoal(pose["frame"], T, *(pose.get(name) for name in TOLERANCES))  # type: ignore[arg-type]

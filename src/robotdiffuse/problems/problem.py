@@ -16,7 +16,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import MAX_COORDINATE, MIN_RATE, Value, numbers, rigid_transform, short
-from robotdiffuse.core.errors import InputError, check_list, check_type, distinct, shown, unknown_name
+from robotdiffuse.core.errors import (
+    InputError,
+    check_list,
+    check_name,
+    check_type,
+    distinct,
+    shown,
+    unknown_name,
+)
 from robotdiffuse.core.transforms import inverse
 from robotdiffuse.core.types import AnyConfiguration, Configuration, JointValues, Pose, Values
 from robotdiffuse.perception.depth_view import DepthView, SeenPoints
@@ -187,8 +195,7 @@ def _values(robot: Robot, field: str, value: Any) -> Any:
         return value
     joint_names = [joint.name for joint in robot.joints]
     for name in value:
-        if name not in joint_names:
-            raise unknown_name(f"joint in {field}:", str(name), joint_names)
+        check_name(f"joint in {field}:", name, joint_names)
     return robot.planned_values(field, value)
 
 

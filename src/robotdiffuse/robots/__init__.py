@@ -6,7 +6,7 @@ from functools import lru_cache
 from os import PathLike
 from pathlib import Path
 
-from robotdiffuse.core.errors import InputError, check_type, unknown_name
+from robotdiffuse.core.errors import InputError, check_name, check_type
 from robotdiffuse.core.input_files import is_file
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.kinematic_tree import Joint
@@ -66,8 +66,7 @@ def names_a_file(name: str | Path) -> bool:
 
 def _by_name(name: str) -> Robot:
     robots = known_robots()
-    if name not in robots:
-        raise unknown_name("robot", name, robots)
+    check_name("robot", name, robots)
     return _read(robots[name], None if name in ROBOTS else name)
 
 

@@ -15,7 +15,7 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import MAX_COORDINATE, Value, numbers, within
-from robotdiffuse.core.errors import InputError, shown, unknown_name
+from robotdiffuse.core.errors import InputError, check_name, shown, unknown_name
 from robotdiffuse.core.types import Mask, Pose, Spheres, Values
 from robotdiffuse.robots.bodies import (
     TOOL,
@@ -266,8 +266,7 @@ class Robot(KinematicTree):
         """
         movable = {joint.name: joint for joint in self.joints if joint.kind in MOVING_KINDS}
         for name, value in locked.items():
-            if name not in movable:
-                raise unknown_name("joint in locked", name, movable)
+            check_name("joint in locked", name, movable)
             if not isinstance(value, Real) or not abs(value) <= MAX_COORDINATE:
                 raise InputError(
                     f"locked: {name} is {shown(value)}; it must be a number within ±{MAX_COORDINATE:g}"
@@ -364,8 +363,7 @@ class Robot(KinematicTree):
                 f"{field}.name is {body.name!r}, which is a link of {self.name}; give it another name"
             )
         for link in body.touch_links:
-            if link not in self.link_names:
-                raise unknown_name(f"link in {field}.touch_links:", str(link), self.link_names)
+            check_name(f"link in {field}.touch_links:", link, self.link_names)
         return _with_body(self, body)
 
     def detach(self, name: str) -> "Robot":
@@ -378,8 +376,7 @@ class Robot(KinematicTree):
             InputError: For an unknown name, and for a body to which another body is attached.
         """
         names = [body.name for body in self.attached]
-        if name not in names:
-            raise unknown_name("body to detach:", name, names)
+        check_name("body to detach:", name, names)
         held_bodies = [body.name for body in self.attached if body.link == name]
         if held_bodies:
             raise InputError(

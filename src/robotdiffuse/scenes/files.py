@@ -9,7 +9,7 @@ from typing import Any
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import MAX_ANGLE, vector
-from robotdiffuse.core.errors import InputError, located, shown, unknown_name
+from robotdiffuse.core.errors import InputError, check_name, located, shown, unknown_name
 from robotdiffuse.core.input_files import read_array
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_rpy
@@ -54,8 +54,7 @@ def check_fields(
         data = {name: value for name, value in data.items() if name != "rpy"}
         data["wxyz"] = quaternion_from_rotation(rotation_from_rpy(*rpy)).tolist()
     for name in data:
-        if name not in field_names:
-            raise unknown_name(f"field of {where}:", name, field_names)
+        check_name(f"field of {where}:", name, field_names)
     missing = [name for name in required if name not in data]
     if missing:
         raise InputError(f"{where} has no {' and no '.join(missing)}; known fields: {', '.join(field_names)}")
@@ -68,8 +67,7 @@ def only_field(where: str, entry: object, kinds: Collection[str], what: str) -> 
     if not isinstance(entry, dict) or len(entry) != 1:
         raise InputError(f"{where} is {shown(entry)}; it must be {what}; known: {', '.join(kinds)}")
     [(kind, value)] = entry.items()
-    if kind not in kinds:
-        raise unknown_name(f"field of {where}:", kind, kinds)
+    check_name(f"field of {where}:", kind, kinds)
     return kind, value
 
 

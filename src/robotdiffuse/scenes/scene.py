@@ -9,7 +9,7 @@ from typing import Any, no_type_check
 import numpy as np
 
 from robotdiffuse.core.bounds import Value
-from robotdiffuse.core.errors import InputError, joined, shown, unknown_name
+from robotdiffuse.core.errors import InputError, check_name, joined, shown, unknown_name
 from robotdiffuse.core.transforms import inverse, quaternion_from_rotation, transform
 from robotdiffuse.core.types import Configuration, Pose
 from robotdiffuse.robots.kinematics import link_pose
@@ -158,8 +158,7 @@ class Scene(Value):
             InputError: For an unknown obstacle, and in the cases in which `Robot.attach` raises it.
         """
         obstacles = {shape.name: shape for shape in self.shapes}
-        if name not in obstacles:
-            raise unknown_name("obstacle to attach:", name, obstacles)
+        check_name("obstacle to attach:", name, obstacles)
         link = robot.tip if link is None else link
         robot.link_frame(link)  # raises InputError, with the known links, for an unknown one
         taken_shape = obstacles.pop(name).moved(inverse(link_pose(robot, np.asarray(q, float), link)))

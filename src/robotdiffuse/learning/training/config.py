@@ -5,7 +5,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Annotated, Any, NamedTuple
 
-from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.errors import InputError, check_name
 from robotdiffuse.core.settings import (
     Bound,
     Count,
@@ -316,8 +316,7 @@ def planner_training(name: str, given: dict[str, Any]) -> PlannerTraining:
     Raises InputError for an unknown name, listing the known ones, and if neither config nor changes name an
     encoder.
     """
-    if name not in CONFIGS:
-        raise unknown_name("config", name, CONFIGS)
+    check_name("config", name, CONFIGS)
     changes = CONFIGS[name].changes | one_length(given)
     if "encoder" not in changes:
         raise InputError(f"config {name} needs an encoder: name a folder with a trained one")

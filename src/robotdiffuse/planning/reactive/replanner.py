@@ -27,7 +27,7 @@ from robotdiffuse.collision.kernels.motions import Space, motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.collision.moving_obstacles import MovingCollision
 from robotdiffuse.core.bounds import numbers, rigid_transform, within
-from robotdiffuse.core.errors import InputError, check_type, distinct, shown, unknown_name
+from robotdiffuse.core.errors import InputError, check_name, check_type, distinct, shown
 from robotdiffuse.core.locked import locked
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, NotNegative, Settings
@@ -356,8 +356,7 @@ class Replanner:
         if not isinstance(observation, Mapping):
             raise InputError(f"observation is {shown(observation)}; it must map names of obstacles to poses")
         for name in observation:
-            if name not in self._seen:
-                raise unknown_name("obstacle in observation:", str(name), self._seen)
+            check_name("obstacle in observation:", name, self._seen)
         observations = {name: self._seen[name].again(value, now) for name, value in observation.items()}
         self._seen |= observations
         self._now = now

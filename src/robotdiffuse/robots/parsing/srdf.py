@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from robotdiffuse.core.bounds import MAX_COORDINATE
-from robotdiffuse.core.errors import InputError, repeated, shown, unknown_name
+from robotdiffuse.core.errors import InputError, check_name, repeated, shown, unknown_name
 from robotdiffuse.core.input_files import is_file, parse_xml, read_bytes
 from robotdiffuse.robots.kinematic_tree import MOVING_KINDS, Joint, chain
 from robotdiffuse.robots.robot import Robot
@@ -71,8 +71,7 @@ class Srdf:
         content = self.groups[group]
         joint_names = {joint.name for joint in above.values()}
         for name in content.joints:
-            if name not in joint_names:
-                raise unknown_name(f"joint of group {group} in {self.path}", name, joint_names)
+            check_name(f"joint of group {group} in {self.path}", name, joint_names)
         names = set(content.joints)
         names |= {above[link].name for link in content.links if link in above}
         for base, tip in content.chains:

@@ -21,7 +21,7 @@ from robotdiffuse.core.bounds import (
     unit_quaternion,
     within,
 )
-from robotdiffuse.core.errors import InputError, joined, located, shown, unknown_name
+from robotdiffuse.core.errors import InputError, check_name, joined, located, shown
 from robotdiffuse.core.input_files import parse_xml, read_bytes, read_yaml
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import (
@@ -199,8 +199,7 @@ class UrdfTree:
         """
         base = base or self.root
         srdf = srdf or Srdf(self.path)
-        if base not in self.links:
-            raise unknown_name(f"base link in {self.path.name}", base, self.links)
+        check_name(f"base link in {self.path.name}", base, self.links)
         joints = self.below(base)
         names = [base, *(joint.child for joint in joints)]
         planned, ends = planned_joints(self.path, base, joints, tip, group, srdf)
@@ -625,8 +624,7 @@ def with_limits(robot: Robot, limits: dict[str, dict[str, float]]) -> Robot:
     """
     movable = {joint.name: joint for joint in robot.joints if joint.kind in MOVING_KINDS}
     for name in limits:
-        if name not in movable:
-            raise unknown_name("joint in joint_limits", name, movable)
+        check_name("joint in joint_limits", name, movable)
     changed = [
         _changed(joint, limits[joint.name]) if joint.name in limits else joint for joint in robot.joints
     ]
@@ -640,8 +638,7 @@ def _fields(file: str, joint: str, entry: object) -> dict[str, float]:
     for key, value in entry.items():
         if key in FLAGS:
             continue
-        if key not in FIELDS:
-            raise unknown_name(f"field of {joint} in {file}", key, FIELDS)
+        check_name(f"field of {joint} in {file}", key, FIELDS)
         kind = "position" if key.endswith("position") else key.removeprefix("max_")
         if entry.get(f"has_{kind}_limits") is False:
             continue

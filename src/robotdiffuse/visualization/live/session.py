@@ -18,7 +18,7 @@ import numpy as np
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.collision_cost import CLEARANCE_CAP
-from robotdiffuse.core.errors import InputError, shortened, unknown_name
+from robotdiffuse.core.errors import InputError, check_name, shortened, unknown_name
 from robotdiffuse.core.input_files import decoded, parse_json, parse_yaml
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, OneOf, Settings
@@ -218,8 +218,7 @@ class Session:
     def add_obstacle(self, kind: str) -> str:
         """Add an obstacle in front of the arm, at half the arm's reach, and return its name."""
         with self._lock:
-            if kind not in NEW_OBSTACLES:
-                raise unknown_name("kind of obstacle", kind, NEW_OBSTACLES)
+            check_name("kind of obstacle", kind, NEW_OBSTACLES)
             length = reach(self.state.problem.robot)
             obstacle = NEW_OBSTACLES[kind](length * NEW_POSITION, round(NEW_RADIUS * length, 2))
             self._set_scene([*self.state.obstacles.values(), obstacle])
@@ -230,8 +229,7 @@ class Session:
         unknown name."""
         with self._lock:
             obstacles = self.state.obstacles
-            if name not in obstacles:
-                raise unknown_name("obstacle", name, obstacles)
+            check_name("obstacle", name, obstacles)
             changed = {**obstacles, name: change(obstacles[name])}
             self._set_scene([shape for shape in changed.values() if shape is not None])
 
@@ -412,8 +410,7 @@ def resized(shape: Shape, dimension: str, value: float) -> Shape:
     """The shape with one of its `dimensions` changed. Raises InputError for another name, and for values that
     no shape may have."""
     sizes = dimensions(shape)
-    if dimension not in sizes:
-        raise unknown_name(f"dimension of {shape.name}:", dimension, sizes)
+    check_name(f"dimension of {shape.name}:", dimension, sizes)
     if isinstance(shape, Box):
         size = np.array([value if name == dimension else old for name, old in sizes.items()])
         return replace(shape, size=size)
