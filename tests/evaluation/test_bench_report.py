@@ -137,7 +137,7 @@ def test_figures_of_a_small_run(small: Path) -> None:
     assert star[1].figures.time == 1.0 and star[2].failures == {bench_comparisons.RAN_OUT: 1}
     net = rows(whole, 1.0)["mpnet"]
     assert (net.figures.success, net.figures.collision) == (50, 25)
-    assert net.interval == pytest.approx((0.150, 0.850), abs=1e-3)
+    assert str(net.success) == "50.0 (15.0 to 85.0)"
     assert net.failures == {"scene collision": 1, bench_comparisons.GAVE_UP: 1}
     assert net.figures.time == pytest.approx((0.02 + 1 + 1 + 0.02) / 4)
     assert net.paired is not None
@@ -184,6 +184,28 @@ def test_seeds_of_a_problem_are_one_row_of_the_comparison(tmp_path: Path) -> Non
     assert section.main.seeds == 3 and row.figures.success == pytest.approx(400 / 6)
     assert row.paired is not None and (row.paired.both, row.paired.b_only) == (1, 1)
     assert row.paired.ratio == pytest.approx(1.5)
+
+
+def test_intervals_are_over_problems_not_over_their_seeds(tmp_path: Path) -> None:
+    durations = {"a": 1.0, "b": 2.0, "c": 4.0}
+    (section,) = bench_comparisons.sections(
+        bench_comparisons.read_bench(
+            write(
+                tmp_path / "run",
+                [
+                    solved("mpd", name, 1.0, [(0.1, 2.0)], seed=seed, measures=MEASURES | {"duration": duration})
+                    for name, duration in durations.items()
+                    for seed in range(8)
+                ],
+            )
+        ),
+        [1.0],
+    )
+    row = rows(section, 1.0)["mpd"]
+    half = 1.96 * np.std([1, 2, 4], ddof=1) / np.sqrt(3)
+    mean = row.mean(METRICS["duration"])
+    assert str(mean) == f"{7 / 3:.2f} ± {half:.2f}"
+    assert str(row.success) == str(bench_report._success_in("rop", row)) == "100.0 (43.9 to 100.0)"  # of three
 
 
 def test_curves_end_where_they_are_no_longer_known_of_all_problems(small: Path) -> None:

@@ -6,8 +6,8 @@ longer limits.
 """
 
 import re
-from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
@@ -251,8 +251,6 @@ class Row:
     figures: Indicators
     """The paper's four indicators. The length is the mean over the solved problems, NaN if no problem is
     solved. The time is the mean until the planner returns; an unsolved problem counts with the time limit."""
-    interval: tuple[float, float]
-    """The 95 % interval of the share of solved problems, by E. B. Wilson's method over problems."""
     comscore: float
     """ComScore, normalized over the rows of this table; NaN with restarts."""
     paired: Paired | None
@@ -271,7 +269,7 @@ class Row:
     @property
     def success(self) -> Figure:
         """The share of solved problems with its interval."""
-        return share_cell(self.figures.success / 100, self.interval)
+        return solved_share(self.outcomes)
 
     @property
     def failures(self) -> Counter[str]:
@@ -279,8 +277,19 @@ class Row:
         return Counter(o.failure for o in self.outcomes if not o.solved)
 
     def mean(self, metric: Metric) -> Figure | None:
-        """The mean of a metric over the returned motions."""
-        return Mean.of(o.record.measures.get(metric.name) for o in self.solved).cell(metric)
+        """The mean of a metric over the solved problems; that of a problem is the mean over its motions."""
+        motions = defaultdict[str, list[float | None]](list)
+        for o in self.solved:
+            motions[o.record.name].append(o.record.measures.get(metric.name))
+        return Mean.of(Mean.of(values).value for values in motions.values()).cell(metric)
+
+
+def solved_share(outcomes: Collection[Outcome]) -> Figure:
+    """The share of solved calls with its 95 % interval by E. B. Wilson's method. Results of several seeds on
+    one problem are not independent, so a trial is a problem."""
+    share = float(np.mean([o.solved for o in outcomes]))
+    problems = len({o.record.name for o in outcomes})
+    return share_cell(share, wilson_interval(round(share * problems), problems))
 
 
 @dataclass(frozen=True)
@@ -454,14 +463,11 @@ def _comparison(
     names = {name for name, _ in keys}
     rows = []
     for planner, results in outcomes.items():
-        figures = _indicators(results)
         timed = {f"run {o.record.run or '?'}, {o.record.workers or '?'} at once" for o in results}
         row = Row(
             planner,
             tuple(results),
-            figures,
-            # results of several seeds on one problem are not independent, so a trial is a problem
-            wilson_interval(round(figures.success / 100 * len(names)), len(names)),
+            _indicators(results),
             scores.get(planner, np.nan),
             None if planner == bench.reference or reference is None else compare(lengths[planner], reference),
             all(o.full(limit, length) for o, length in zip(results, shortest, strict=True) if o.solved),

@@ -23,10 +23,11 @@ from robotdiffuse.evaluation.bench_comparisons import (
     deciding_record,
     outcome,
     plain_name,
+    solved_share,
 )
 from robotdiffuse.evaluation.metrics import METRICS, Metric
 from robotdiffuse.evaluation.problem_sets import read_cases
-from robotdiffuse.evaluation.report import Report, draw_plot, interval, share_cell
+from robotdiffuse.evaluation.report import Report, draw_plot, interval
 from robotdiffuse.evaluation.runs import (
     CRASHED,
     OVERRAN,
@@ -34,7 +35,7 @@ from robotdiffuse.evaluation.runs import (
     RESTARTED,
     Record,
 )
-from robotdiffuse.evaluation.statistics import Paired, wilson_interval
+from robotdiffuse.evaluation.statistics import Paired
 from robotdiffuse.planning import PLANNERS, SEARCH
 from robotdiffuse.problems.held_out import Case
 from robotdiffuse.problems.problem import JointGoal
@@ -69,7 +70,7 @@ NOTES = """\
 - ComScore: as in the paper, the mean of success, collision, length and time until the planner returns, each
   scaled from 0 for the worst row of the table to 1 for the best. It depends on the rows of the table; rows
   with restarts are left out. `robotdiffuse reproduce table1` computes it among the paper's rows.
-- Quality: means of the returned motions over the solved problems, with 95 % intervals. clearance: a lower
+- Quality: means over the solved problems (of means over their motions), 95 % intervals. clearance: a lower
   bound of the distance to obstacles (scene), between links of the arm (self), and the smaller of the two
   (min). over straight line: duration divided by the shortest time along the straight line without obstacles
   and jerk limits. stops: how often the whole arm stops on the way. peak and mean jerk: of the joint with
@@ -151,8 +152,7 @@ def tables(section: Section, comparison: Comparison, reference: str) -> list[Tab
 
 def _success_in(family: str, row: Row) -> Figure:
     """The share of solved calls among the calls on a family's problems."""
-    calls = [o.solved for o in row.outcomes if o.record.family == family]
-    return share_cell(sum(calls) / len(calls), wilson_interval(sum(calls), len(calls)))
+    return solved_share([o for o in row.outcomes if o.record.family == family])
 
 
 def main_table(section: Section, comparison: Comparison, reference: str) -> Table:
