@@ -25,6 +25,7 @@ __all__ = ["ROBOTS", "ConvexMesh", "Joint", "Robot", "load_robot"]
 DATA = Path(__file__).parent / "data"
 ROBOTS = tuple(sorted(file.parent.name for file in DATA.glob(f"*/{ROBOT_FILE}")))
 """Names of the bundled robots."""
+FILE_ENDINGS = (".urdf", ".xacro", ".xml")
 
 
 def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robot:
@@ -60,7 +61,7 @@ def names_a_file(name: str | Path) -> bool:
     """Whether `load_robot` takes this name as the path of a file or folder; else it looks up a robot's
     name."""
     text = str(name)
-    by_form = text.endswith((".urdf", ".xacro", ".xml")) or "/" in text or "\\" in text
+    by_form = text.endswith(FILE_ENDINGS) or "/" in text or "\\" in text
     return by_form or isinstance(name, Path) or is_file(Path(name) / ROBOT_FILE)
 
 

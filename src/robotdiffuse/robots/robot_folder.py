@@ -24,7 +24,7 @@ from numpy import ndarray
 from robotdiffuse.core.bounds import MAX_COORDINATE, MIN_RATE, unit_quaternion, within
 from robotdiffuse.core.errors import InputError, shortened, shown
 from robotdiffuse.core.input_files import is_file, read_arrays, read_json
-from robotdiffuse.core.output_files import write_atomically, write_error
+from robotdiffuse.core.output_files import lock_folder, write_atomically, write_error
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
 from robotdiffuse.robots.bodies import ConvexMesh, Surface, inertia_of
 from robotdiffuse.robots.kinematic_tree import CONTINUOUS_LIMIT, LIMITS, MOVING_KINDS, Joint, Mimic
@@ -63,19 +63,20 @@ def write_robot_folder(robot: Robot, folder: str | Path, source: dict[str, Any])
     folder = Path(folder)
     arrays = _packed([(link, mesh) for link, meshes in robot.meshes.items() for mesh in meshes])
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / SURFACE_FILE).unlink(missing_ok=True)  # an existing file may belong to other meshes
-        write_atomically(folder / MESH_FILE, _npz(arrays))
-        write_atomically(folder / ROBOT_FILE, _dump(_to_json(robot, source)) + "\n")
-        if robot.grazing:
-            arrays = _packed([*robot.surfaces.items()])
-            arrays |= {
-                "vertices": arrays["vertices"].astype(np.float32),  # relative rounding error of at most 6e-8
-                "faces": arrays["faces"].astype(np.int32),
-                "grazing": np.array(sorted(sorted(pair) for pair in robot.grazing), np.str_),
-                "of": np.array(_digest(robot)),
-            }
-            write_atomically(folder / SURFACE_FILE, _npz(arrays))
+        with lock_folder(folder):
+            for file in (ROBOT_FILE, SURFACE_FILE):  # existing files may belong to other meshes
+                (folder / file).unlink(missing_ok=True)
+            write_atomically(folder / MESH_FILE, _npz(arrays))
+            write_atomically(folder / ROBOT_FILE, _dump(_to_json(robot, source)) + "\n")
+            if robot.grazing:
+                arrays = _packed([*robot.surfaces.items()])
+                arrays |= {
+                    "vertices": arrays["vertices"].astype(np.float32),  # relative error of at most 6e-8
+                    "faces": arrays["faces"].astype(np.int32),
+                    "grazing": np.array(sorted(sorted(pair) for pair in robot.grazing), np.str_),
+                    "of": np.array(_digest(robot)),
+                }
+                write_atomically(folder / SURFACE_FILE, _npz(arrays))
     except OSError as error:
         raise write_error(folder, error) from None
 

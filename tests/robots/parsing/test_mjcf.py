@@ -208,6 +208,22 @@ def test_bad_models_are_one_line(text: str, wanted: str, tmp_path: Path) -> None
     refuses(wanted, lambda: UrdfTree(tmp_path / "m.xml", {}).robot())
 
 
+TIED = """
+<mujoco><worldbody><body><joint name="a" range="-1 1"/><geom size="0.1"/><body name="b" pos="0 0 1">
+  <joint name="j" range="-1 1"/><geom size="0.1"/></body></body></worldbody>
+  <tendon><fixed name="t"><joint joint="a" coef="1"/><joint joint="j" coef="1"/></fixed></tendon>
+  <equality><joint joint1="j" polycoef="0.3 0 0 0 0"/><connect body1="b" anchor="0 0 0"/><tendon tendon1="t"/>
+    <joint joint1="j" active="false"/></equality></mujoco>"""
+
+
+def test_constraints_that_are_not_followed_are_noted(tmp_path: Path) -> None:
+    """Regression: only polynomials of joints were noted."""
+    (tmp_path / "m.xml").write_text(TIED)
+    notes = [note for note in UrdfTree(tmp_path / "m.xml", {}).robot().notes if "equality" in note]
+    for note, kind in zip(notes, ("joint", "connect", "tendon"), strict=True):
+        assert f"({kind}) is ignored; hold what it ties" in note
+
+
 PLACED = """
 <mujoco>
   <compiler angle="radian"/>

@@ -14,9 +14,10 @@ import robotdiffuse.robots as robots
 from helpers.made_arms import BALL, chain, joint, link, read_urdf, row, written
 from helpers.quick_preparation import QUICK, coarse_grids
 from helpers.refusals import refuses
+from robotdiffuse.core import output_files
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_rpy
-from robotdiffuse.robots import load_robot
+from robotdiffuse.robots import load_robot, robot_folder
 from robotdiffuse.robots.fitting import preparation
 from robotdiffuse.robots.fitting.convex_parts import MIN_THICKNESS, Surface, convex_hull
 from robotdiffuse.robots.fitting.preparation import PreparationSettings, add_robot
@@ -268,6 +269,59 @@ def test_preparations_of_one_urdf_that_differ_are_refused(tmp_path: Path, monkey
     refuses("was added as limited, plain, same, which differ", load_robot, file)
 
 
+@pytest.mark.parametrize("name", ["panda", "my.urdf", "two\nlines"])
+def test_names_by_which_an_added_robot_could_not_be_loaded_are_refused(name: str, tmp_path: Path) -> None:
+    """Regression: the bundled panda was used in place of an added robot with this name."""
+    file = written(tmp_path, chain("base", ["j"]))
+    with pytest.raises(InputError, match=r"robot name is .*no file or bundled robot: give --name NAME"):
+        add_robot(file, name=name, settings=QUICK)
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ({"allow": [("base", "base")]}, "allow names link base twice"),
+        ({"srdf": "arm.urdf"}, "is not an SRDF, a <robot> without <link>"),
+        ({"srdf": "other.srdf"}, "is for another robot: it names no link"),
+    ],
+)
+def test_pairs_of_another_robot_and_of_one_link_are_refused(how: dict, message: str, tmp_path: Path) -> None:
+    """Regression: they were ignored."""
+    file = written(tmp_path, chain("base", ["j"]))
+    (tmp_path / "arm.urdf").write_text(file.read_text())
+    (tmp_path / "other.srdf").write_text('<robot name="o"><disable_collisions link1="x" link2="y"/></robot>')
+    if "srdf" in how:
+        how = {"srdf": tmp_path / how["srdf"]}
+    with pytest.raises(InputError, match=message):
+        add_robot(file, name="arm", settings=QUICK, **how)
+
+
+@pytest.mark.parametrize("tag", ["origin", "axis", "limit"])
+def test_a_joint_has_each_element_once(tag: str, tmp_path: Path) -> None:
+    """Regression: all but the first were ignored."""
+    file = written(tmp_path, chain("base", ["j"]))
+    file.write_text(file.read_text().replace("</joint>", 2 * f'<{tag} xyz="0 0 1"/>' + "</joint>"))
+    refuses(f"a <joint> must have one <{tag}>, not more", read_urdf, file)
+
+
+def test_a_robot_that_is_written_again_is_never_a_mixture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: new meshes with the old robot.json, if `robot add` was interrupted or ran twice at once."""
+    robot = load_robot("ur5")
+
+    def interrupted(file: Path, *rest: object) -> None:
+        output_files.write_atomically(file, *rest)  # type: ignore[arg-type]
+        if file.name == "meshes.npz":
+            raise KeyboardInterrupt
+
+    write_robot_folder(robot, tmp_path, {})
+    monkeypatch.setattr(robot_folder, "write_atomically", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_robot_folder(robot, tmp_path, {})
+    assert not (tmp_path / "robot.json").exists()
+    with output_files.lock_folder(tmp_path), pytest.raises(InputError, match="another process is filling"):
+        write_robot_folder(robot, tmp_path, {})
+
+
 def surfaces(file: Path, shape: str, origin: str = "") -> tuple[Surface, ...]:
     link = f'<link name="arm"><collision>{origin}<geometry>{shape}</geometry></collision></link>'
     file.write_text(f'<robot name="arm">{link}</robot>')
@@ -306,7 +360,8 @@ def test_meshes_by_package_relative_and_scaled(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("shape", "message"),
     [
-        ("", "link arm: a <collision> has no geometry"),
+        ("", "link arm: a <collision> has 0 shapes"),
+        ('<box size="1 1 1"/><sphere radius="3"/>', "link arm: a <collision> has 2 shapes"),
         ('<torus size="1"/>', "shape <torus> is not supported; known: box, capsule, cylinder, mesh, sphere"),
         ('<sphere radius="0"/>', "link arm: sphere radius is '0'; it must be positive"),
         ('<mesh filename="a.stl" scale="1 0 1"/>', "link arm: mesh scale is '1 0 1'; its numbers must"),

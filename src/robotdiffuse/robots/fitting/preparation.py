@@ -20,8 +20,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.errors import InputError, check_name
 from robotdiffuse.core.types import Mask, Points, Poses, Spheres
+from robotdiffuse.robots import FILE_ENDINGS, ROBOTS
 from robotdiffuse.robots.bodies import Surface
 from robotdiffuse.robots.fitting.convex_parts import PartSettings, convex_parts
 from robotdiffuse.robots.fitting.sampled_links import Links, joint_table
@@ -577,11 +578,18 @@ def add_robot(
     srdf_file = Path(srdf) if srdf is not None else None if tree.semantics else srdf_beside(urdf, tree.name)
     semantics = tree.semantics if srdf_file is None else read_srdf(srdf_file)
     robot = tree.robot(base, tip, locked, group, semantics)
-    for link in {link for pair in allow for link in pair} - {*robot.link_names}:
-        raise unknown_name("link in allow", link, robot.link_names)
+    for pair in allow:
+        for link in pair:
+            check_name("link in allow", link, robot.link_names)
+        if len({*pair}) < 2:
+            raise InputError(f"allow names link {pair[0]} twice; it must name two links")
     name = name or robot.name
-    if not name or Path(name).name != name or name.startswith("."):
-        raise InputError(f"robot name is {name!r}; it must be a valid folder name: give --name NAME")
+    ambiguous = out is None and (name in ROBOTS or name.endswith(FILE_ENDINGS) or "\\" in name)
+    if ambiguous or Path(name).name != name or name.startswith(".") or not name.isprintable():
+        raise InputError(
+            f"robot name is {name!r}; it must be a valid folder name, and no file or bundled robot: give "
+            f"--name NAME"
+        )
     robot = replace(robot, name=name)
     if limits is not None:
         changed, notes = read_limits(limits)
@@ -592,6 +600,9 @@ def add_robot(
             f"<collision> elements to its links"
         )
     srdf_allowed = {} if semantics is None else semantics.allowed
+    named_links = frozenset[str]().union(*srdf_allowed)
+    if srdf is not None and named_links and named_links.isdisjoint(tree.links):
+        raise InputError(f"{srdf} is for another robot: it names no link of {urdf}; give its own SRDF")
     allowed = {pair: "srdf" for pair in srdf_allowed} if srdf is not None or srdf_file is None else {}
     allowed |= {frozenset(pair): "named" for pair in allow}
     surfaces = {link: tree.surfaces(link) for link in robot.meshes}

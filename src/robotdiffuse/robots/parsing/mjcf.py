@@ -252,18 +252,18 @@ class ConvertedModel:
         model = self.model
         mimics: dict[int, dict[str, str]] = {}
         for k in range(model.neq):
-            if kind_of("Eq", model.eq_type[k]) != "joint" or not model.eq_active0[k]:
+            if not model.eq_active0[k]:
                 continue
             follower = int(model.eq_obj1id[k])
             leader = int(model.eq_obj2id[k])
             offset, slope, *higher = model.eq_data[k, :5].tolist()
-            if leader < 0 or leader in self.held:
-                continue
-            if any(higher):
+            kind = kind_of("Eq", model.eq_type[k])
+            if kind != "joint" or leader < 0 or any(higher):
                 self.notes.append(
-                    f"joint {self.joint_name(follower)} follows {self.joint_name(leader)} by a polynomial; "
-                    f"it is treated as independent"
+                    f"equality {self.name('equality', k)} ({kind}) is ignored; hold what it ties by --lock"
                 )
+                continue
+            if leader in self.held:
                 continue
             start = model.qpos0[model.jnt_qposadr[[follower, leader]]]
             mimics[follower] = {

@@ -113,8 +113,8 @@ def read_srdf(file: str | Path) -> Srdf:
     """Read an SRDF file; raises InputError that names the file if it is unreadable or incomplete."""
     path = Path(file)
     root = parse_xml(read_bytes(path, "SRDF"), str(path))
-    if root.tag != "robot":
-        raise InputError(f"{path} is not an SRDF: its root element is <{root.tag}>, not <robot>")
+    if root.tag != "robot" or root.find("link") is not None:
+        raise InputError(f"{path} is not an SRDF, a <robot> without <link>; its root is <{root.tag}>")
 
     def text(element: ET.Element, what: str) -> str:
         value = element.get(what)

@@ -21,7 +21,7 @@ from robotdiffuse.core.bounds import (
     unit_quaternion,
     within,
 )
-from robotdiffuse.core.errors import InputError, check_name, joined, located, shown
+from robotdiffuse.core.errors import InputError, check_name, joined, located, repeated, shown
 from robotdiffuse.core.input_files import parse_xml, read_bytes, read_yaml
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import (
@@ -66,6 +66,8 @@ PRIMITIVES = ("box", "capsule", "cylinder", "sphere")
 
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 KINDS = (*MOVING_KINDS, "fixed")
+SINGLE = ("origin", "geometry", "parent", "child", "axis", "limit", "mimic", "inertial")
+"""Elements that a link, a joint or a collision element has at most once."""
 MAX_LINKS = 500
 """Largest number of links of a robot; humanoids with hands have about 100."""
 MAX_LINK_SIZE = 10.0
@@ -284,6 +286,11 @@ class UrdfTree:
                 raise InputError(
                     f"{self.path}: two {what}s have the name {shown(name)}; rename or remove one"
                 )
+            for part in (element, *element.findall("collision")):
+                for tag in {*SINGLE}.intersection(repeated(child.tag for child in part)):
+                    raise InputError(
+                        f"{self.path}: {what} {name}: a <{part.tag}> must have one <{tag}>, not more"
+                    )
             elements[name] = element
         return elements
 
@@ -484,9 +491,12 @@ class UrdfTree:
             return self._surfaces[link]
         parts = []
         for element in self.links[link].findall(self.kind):
-            shape = next(iter(element.findall("geometry/*")), None)
-            if shape is None:
-                raise InputError(f"{self.path}: link {link}: a <{self.kind}> has no geometry")
+            shapes = element.findall("geometry/*")
+            if len(shapes) != 1:
+                raise InputError(
+                    f"{self.path}: link {link}: a <{self.kind}> has {len(shapes)} shapes; it must have one"
+                )
+            shape = shapes[0]
             if shape.tag == "mesh":
                 surface = self._mesh(shape, link)
             elif shape.tag in PRIMITIVES:
