@@ -67,6 +67,7 @@ BAD_CALL = {
     "two demos": (["demo", "--explore", "--camera"], ""),
     "unknown sampler": ([*TRAIN, "--sampler", "heun"], "known: ddim, ddpm"),
     "too few waypoints": ([*TRAIN, "--waypoints", "2"], "waypoints is 2"),
+    "more threads than a machine has": ([*TRAIN, "--threads", "1000000"], "threads is 1000000; it must be between"),
     "unknown device": ([*TRAIN, "--device", "tpu"], "known: cpu, cuda"),
     "workers for existing data": ([*TRAIN, "--workers", "2"], "--workers is for data to be generated"),
 }  # fmt: skip

@@ -48,13 +48,13 @@ def _bench_settings(arguments: Namespace) -> list[BenchSettings]:
     """The settings of each run of the bench: those of the preset, or a single one from the options."""
     check_workers(arguments)
     changes = _changes(arguments, BenchSettings)
-    if arguments.preset is not None:
+    if arguments.preset:
         fixed = ("planners", "time_limit", "seeds", "equal_time")
         options = [f"--{name.replace('_', '-')}" for name in fixed if changes.pop(name, None)]
         if options:
             raise InputError(f"--preset cannot be combined with {', '.join(options)}: the preset fixes these")
         return preset_settings(arguments.preset, **changes)
-    if arguments.planners is None or not arguments.problems:
+    if not (arguments.planners and arguments.problems):
         raise InputError("name --planners and --problems, or a --preset")
     return [BenchSettings(**changes)]
 

@@ -39,7 +39,7 @@ def run_generate(arguments: Namespace) -> None:
 
 
 def run_info(arguments: Namespace) -> None:
-    page = Path(arguments.page or Path(arguments.folder) / "report.html")
+    page = Path(arguments.page or f"{arguments.folder}/report.html")
     show(*tables(write_page(arguments.folder, page, arguments.robot and load_robot(arguments.robot))))
     print(f"wrote {page}")
 
@@ -63,7 +63,7 @@ def run_view(arguments: Namespace) -> None:
     folder = Path(arguments.folder)
     manifest = read_manifest(folder)
     out = check_output(arguments.out or folder / "samples.html", (".html", ".htm"))
-    robot = (arguments.robot and load_robot(arguments.robot)) or load_robot(manifest.robot)
+    robot = load_robot(arguments.robot or manifest.robot)
     manifest.check_robot(robot)
     entries = list(_gallery_entries(folder, robot, arguments.count, arguments.seed))
     if not entries:
@@ -91,8 +91,9 @@ def _gallery_entries(folder: Path, robot: Robot, number: int, seed: int) -> Iter
 
 def run_export(arguments: Namespace) -> None:
     count, left_out = export_npz(arguments.folder, arguments.file)
-    left_out_text = f"; left out {left_out:,}, whose scenes are not exactly two spheres" if left_out else ""
-    print(f"wrote {arguments.file}: {count:,} motions{left_out_text}")
+    print(
+        f"wrote {arguments.file}: {count:,} motions; {left_out:,} others have other scenes than two spheres"
+    )
 
 
 def run_import(arguments: Namespace) -> None:

@@ -23,7 +23,7 @@ def run_explore(arguments: Namespace) -> int:
     if arguments.view:
         outputs.append(check_output(f"{Path(arguments.problem).stem}.html", ENDINGS))
     recording = None
-    if arguments.record is not None:
+    if arguments.record:
         recording = check_output(arguments.record, (RECORDING,))
         WRITERS.load(RECORDING)  # its packages are installed
     settings = ExplorerSettings(**chosen(arguments, ExplorerSettings.__dataclass_fields__))

@@ -70,12 +70,12 @@ def _problem(arguments: Namespace) -> Problem:
     """The problem of the file, changed by --unknown and --blend."""
     problem = load_problem(arguments.problem, arguments.index, arguments.ignore_joints)
     unknown = arguments.unknown
-    if unknown is not None:
+    if unknown:
         check_unknown("--unknown", unknown)
     view_option = "--next-view" if arguments.next_view else unknown and f"--unknown {unknown}"
     if view_option and not problem.views:
         raise InputError(f"{view_option} needs a problem with views; this one has none")
-    if unknown is not None:
+    if unknown:
         problem = replace(problem, unknown=unknown)
     return problem if arguments.blend is None else replace(problem, blend=arguments.blend)
 

@@ -81,17 +81,17 @@ def run_planner(arguments: Namespace) -> None:
             "--config paper needs --encoder: a folder of "
             "`robotdiffuse train encoder --encoder compression_autoencoder --scenes rop`, the paper's encoder"
         )
-    if arguments.data is None:
-        if arguments.robot is None:
+    if not arguments.data:
+        if not arguments.robot:
             raise InputError("give --robot to generate data for an arm, or --data to use existing data")
         make_settings = partial(planner_training, arguments.config)
         common = arguments.robot, options, make_settings, arguments.out
         report, weights = train_for_robot(*common, arguments.trajectories, arguments.workers)
         return _print_report(report, str(weights))
-    if arguments.out is None:
+    if not arguments.out:
         raise InputError("--data needs --out, a folder for the weights")
     for name in ("trajectories", "workers"):
-        if getattr(arguments, name) is not None:
+        if getattr(arguments, name):
             raise InputError(f"--{name} is for data to be generated; --data names existing data")
     # with several processes, all would write the bundled encoder at once
     bundled = "encoder" not in options and int(os.environ.get("WORLD_SIZE", "1")) == 1

@@ -23,13 +23,13 @@ from robotdiffuse.validation.validator import verify, violations
 
 def run_verify(arguments: Namespace) -> int:
     out = arguments.certificate
-    if out is not None:
+    if out:
         out = check_output(out, (".json",), arguments.motion, arguments.problem)
     problem, motions, notes = _read(arguments)
     for note in (*problem.notes, *notes, *contact_notes(problem.scene)):
         print(f"note: {note}")
     valid = all([_validated(problem, label, motion, arguments.all) for label, motion in motions.items()])
-    if out is not None and valid:
+    if out and valid:
         from robotdiffuse.certificates.search import certify
 
         certificate = certify(problem, list(motions.values())[-1])
@@ -110,7 +110,7 @@ def _read(
     scene_notes = ()
     if only_motion:
         problem = _stored_problem(arguments.motion)
-    elif arguments.problem is not None:
+    elif arguments.problem:
         problem = load_problem(arguments.problem, arguments.index, arguments.ignore_joints)
     else:
         robot = load_robot(arguments.robot)
@@ -132,7 +132,7 @@ def run_check(arguments: Namespace) -> int:
 
     certificate = load_certificate(arguments.file)
     problem = None
-    if arguments.problem is not None:
+    if arguments.problem:
         problem = load_problem(arguments.problem)
     elif certificate.problem is not None:
         problem = problem_from_record(certificate.problem)

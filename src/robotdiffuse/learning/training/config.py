@@ -75,7 +75,7 @@ class TrainingSettings(Settings):
     """Decay of the moving average of the weights; the average is what is saved."""
     bad_steps: Count = 10
     """After this number of consecutive steps with a loss that is not finite, training ends with an error."""
-    threads: Count = 1
+    threads: Annotated[int, Bound(least=1.0, most=1024.0)] = 1
     """Number of threads of PyTorch. While other processes keep the cores busy, one thread is several times
     faster than two."""
     device: Annotated[str, OneOf(("cpu", "cuda"))] | None = None
