@@ -217,4 +217,4 @@ def test_poses_are_drawn_on_as_long_as_none_is_free() -> None:
 
 def test_any_of_goals_may_hold_any_of_goals() -> None:
     one, two, three = (rd.JointGoal(np.full(7, x)) for x in (0.1, 0.2, 0.3))
-    assert rd.AnyGoal((one, rd.AnyGoal((two, three)))).goals == (one, two, three)
+    assert rd.AnyGoal((one, rd.AnyGoal((two, three)))).goals == (one, two, three)  # type: ignore

@@ -3,6 +3,7 @@
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -242,7 +243,7 @@ def test_wrong_point_files(name: str, content: bytes | None, message: str, tmp_p
 
 
 def test_a_cut_ply_mesh_is_refused(tmp_path: Path) -> None:
-    mesh = trimesh.creation.box().export(file_type="ply", encoding="ascii")
+    mesh: Any = trimesh.creation.box().export(file_type="ply", encoding="ascii")
     (tmp_path / "cut.ply").write_bytes(b"\n".join(mesh.splitlines()[:-3]))
     refuses("holds 17 of its 20 vertices, faces", read_triangles, tmp_path / "cut.ply")
 

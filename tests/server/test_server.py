@@ -352,7 +352,7 @@ def test_it_stops_gracefully_and_leaves_no_worker() -> None:
 def test_a_request_that_the_second_signal_ends_gets_an_error() -> None:
     sent: list[Any] = []
 
-    async def ended(*_: object) -> None:
+    async def ended(*_: object) -> Any:
         raise asyncio.CancelledError
 
     async def send(message: Any) -> None:

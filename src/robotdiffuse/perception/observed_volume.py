@@ -188,7 +188,7 @@ def _minimum_table(min_depth, levels):
             b = before[min(v + step, h - 1)]
             for u in range(w - step):
                 now[v, u] = min(min(a[u], a[u + step]), min(b[u], b[u + step]))
-            for u in range(w - step, w):
+            for u in range(max(w - step, 0), w):
                 now[v, u] = min(a[u], b[u])
     return table
 
