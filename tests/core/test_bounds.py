@@ -31,6 +31,10 @@ def test_numbers_out_of_bounds() -> None:
         (lambda: rd.PointCloud([[0, 0, 0], [1e39, 0, 0], [0, 1e39, 0]]), r"points\[1\] is"),
         (lambda: rd.PoseGoal("l3", transform(np.array(FAR))), "goal.T_base_frame .* within ±10000"),
         (lambda: rd.DepthView([[1.0]], (1, 1, 0, 0), transform(np.array(FAR))), "view.T_base_camera"),
+        (
+            lambda: rd.load_robot("panda").with_locked({"panda_finger_joint1": 0.2}),
+            "locked: panda_finger_joint1 is 0.2; it is far beyond its limits, 0 to 0.04",
+        ),
         (lambda: box_arm().with_locked({"j0": 1e20}), r"locked: j0 is 1e\+20; it must be a number within"),
         (lambda: rd.Problem(box_arm(), rd.Scene(), [1e20, 0, 0], [0, 0, 0]), "start: j0"),
         (lambda: rd.Sphere([False, 0.5, 0], 1), r"sphere.center is \[False, 0.5, 0\]; it must be 3 finite"),

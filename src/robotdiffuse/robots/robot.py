@@ -254,15 +254,15 @@ class Robot(KinematicTree):
     def with_locked(self, locked: dict[str, float]) -> "Robot":
         """The robot with some joints locked at values. Joints that mimic them follow.
 
-        Values beyond the URDF's limits are accepted, since some published problems open grippers that far.
-        Calls with equal values return the same object.
+        Values beyond the URDF's limits are accepted up to the joint's range, since some published problems
+        open grippers that far. Calls with equal values return the same object.
 
         Args:
             locked: Values [rad] or [m] by joint name. Planned joints may be locked as well.
 
         Raises:
-            InputError: For an unknown or fixed joint, a value that is not finite, or a value of a mimic joint
-                that contradicts its leader.
+            InputError: For an unknown or fixed joint, a value that is not finite or is farther beyond a limit
+                than the joint's range, or a value of a mimic joint that contradicts its leader.
         """
         movable = {joint.name: joint for joint in self.joints if joint.kind in MOVING_KINDS}
         for name, value in locked.items():
@@ -270,6 +270,12 @@ class Robot(KinematicTree):
             if not isinstance(value, Real) or not abs(value) <= MAX_COORDINATE:
                 raise InputError(
                     f"locked: {name} is {shown(value)}; it must be a number within ±{MAX_COORDINATE:g}"
+                )
+            lower = movable[name].lower
+            upper = movable[name].upper
+            if lower < upper and not 2 * lower - upper <= value <= 2 * upper - lower:
+                raise InputError(
+                    f"locked: {name} is {value:g}; it is far beyond its limits, {lower:g} to {upper:g}"
                 )
         values_locked = with_mimics(
             self.joints, self.locked | {name: float(value) for name, value in locked.items()}
