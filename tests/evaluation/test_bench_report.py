@@ -205,7 +205,7 @@ def test_intervals_are_over_problems_not_over_their_seeds(tmp_path: Path) -> Non
     half = 1.96 * np.std([1, 2, 4], ddof=1) / np.sqrt(3)
     mean = row.mean(METRICS["duration"])
     assert str(mean) == f"{7 / 3:.2f} ± {half:.2f}"
-    assert str(row.success) == str(bench_report._success_in("rop", row)) == "100.0 (43.9 to 100.0)"  # of three
+    assert str(row.success) == str(bench_report.success_in("rop", row)) == "100.0 (43.9 to 100.0)"  # of three
 
 
 def test_curves_end_where_they_are_no_longer_known_of_all_problems(small: Path) -> None:

@@ -7,7 +7,7 @@ import robotdiffuse as rd
 from helpers.panda import HOME, PANDA
 from helpers.refusals import refuses
 from helpers.sphere_oracles import depth_of_balls
-from robotdiffuse.perception.observed_volume import ObservedVolume, _minimum_table, observe
+from robotdiffuse.perception.observed_volume import ObservedVolume, minimum_table, observe
 from robotdiffuse.perception.voxel_grid import LOW, SHAPE, VOXEL
 from robotdiffuse.robots.kinematics import placed_spheres
 
@@ -147,7 +147,7 @@ def test_missing_returns_and_flying_pixels_change_little() -> None:
 def test_minima_of_squares_in_images_narrower_than_the_squares(shape: tuple[int, int]) -> None:
     """Regression: the table was written beyond its ends, which ended the process."""
     depth = np.random.default_rng(0).random(shape).astype(np.float32)
-    table = _minimum_table(depth, 6)
+    table = minimum_table(depth, 6)
     for k, v, u in np.ndindex(table.shape):
         assert table[k, v, u] == depth[v : v + 2**k, u : u + 2**k].min()
 

@@ -124,7 +124,7 @@ def tables(section: Section, comparison: Comparison, reference: str) -> list[Tab
         ),
     )
     families: Spec = [
-        (Column(family), lambda row, family=family: _success_in(family, row))
+        (Column(family), lambda row, family=family: success_in(family, row))
         for family in dict.fromkeys(o.record.family for o in comparison.rows[0].outcomes)
     ]
     pairs: Spec = (
@@ -150,7 +150,7 @@ def tables(section: Section, comparison: Comparison, reference: str) -> list[Tab
     return [table for table in all_tables if table.rows and len(table.columns) > 2]
 
 
-def _success_in(family: str, row: Row) -> Figure:
+def success_in(family: str, row: Row) -> Figure:
     """The share of solved calls among the calls on a family's problems."""
     return solved_share([o for o in row.outcomes if o.record.family == family])
 

@@ -173,7 +173,7 @@ def _min_pooled(depth, factor):
 
 
 @kernel(fastmath=FASTMATH)
-def _minimum_table(min_depth, levels):
+def minimum_table(min_depth, levels):
     """Sparse table for range minima: table[k] holds, for each cell, the minimum depth of the square of
     2^k x 2^k cells that begins there and extends down and to the right."""
     h, w = min_depth.shape
@@ -195,7 +195,7 @@ def _minimum_table(min_depth, levels):
 
 @kernel(fastmath=FASTMATH)
 def _rectangle_minimum(table, v0, v1, u0, u1):
-    """Minimum depth of the cells of a rectangle with inclusive bounds, from `_minimum_table`."""
+    """Minimum depth of the cells of a rectangle with inclusive bounds, from `minimum_table`."""
     k = 0
     while 2 << k <= min(v1 - v0, u1 - u0) + 1 and k + 1 < len(table):
         k += 1
@@ -266,7 +266,7 @@ def carve(depth, intrinsics, T, spheres, low, voxel, errors, state, behind, coun
     _count_points(raw, arm, intrinsics, T, low, voxel, counts)
     factor = max(1, int(intrinsics[0] / POOLED_FOCAL_LENGTH))
     min_depth, missing = _min_pooled(raw, factor)
-    table = _minimum_table(min_depth, 6)
+    table = minimum_table(min_depth, 6)
     for i in range(0, nx, BLOCK):
         for j in range(0, ny, BLOCK):
             for k in range(0, nz, BLOCK):

@@ -36,7 +36,7 @@ from robotdiffuse.problems.moveit import (
     scene_robot_notes,
 )
 from robotdiffuse.problems.problem import Problem, moved
-from robotdiffuse.robots import ROBOTS, load_robot
+from robotdiffuse.robots import FILE_ENDINGS, ROBOTS, load_robot
 from robotdiffuse.robots.robot import MIMIC_SLACK, MOVING_KINDS, Robot
 from robotdiffuse.scenes.files import check_fields, read_scene
 from robotdiffuse.scenes.scene import Scene
@@ -334,7 +334,7 @@ def _robot(name: object, locked: object, folder: Path, robots: Mapping[str, Robo
         raise InputError(
             f"robot is {shown(name)}; it must be a bundled name ({', '.join(ROBOTS)}) or a URDF file"
         )
-    if name not in ROBOTS and (name.endswith((".urdf", ".xacro", ".xml")) or "/" in name):
+    if name not in ROBOTS and (name.endswith(FILE_ENDINGS) or "/" in name):
         name = str((folder / name).absolute())
     values = converted("locked", dict[str, Number], locked)
     return load_robot(name, locked=values) if robots is None else robots[name].with_locked(values)

@@ -12,8 +12,11 @@ from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.kinematic_tree import Joint
 from robotdiffuse.robots.robot import Robot, robot_fingerprint
 from robotdiffuse.robots.robot_folder import (
+    DATA,
+    FILE_ENDINGS,
     MESH_FILE,
     ROBOT_FILE,
+    ROBOTS,
     SURFACE_FILE,
     read_robot_folder,
     read_source,
@@ -21,11 +24,6 @@ from robotdiffuse.robots.robot_folder import (
 )
 
 __all__ = ["ROBOTS", "ConvexMesh", "Joint", "Robot", "load_robot"]
-
-DATA = Path(__file__).parent / "data"
-ROBOTS = tuple(sorted(file.parent.name for file in DATA.glob(f"*/{ROBOT_FILE}")))
-"""Names of the bundled robots."""
-FILE_ENDINGS = (".urdf", ".xacro", ".xml")
 
 
 def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robot:

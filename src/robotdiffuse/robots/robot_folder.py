@@ -48,6 +48,10 @@ FORMAT = 2
 AXIS_LENGTH_TOLERANCE = 1e-3
 """A joint axis in a file may differ from unit length by at most this."""
 ROBOT_FILE = "robot.json"
+DATA = Path(__file__).parent / "data"
+ROBOTS = tuple(sorted(file.parent.name for file in DATA.glob(f"*/{ROBOT_FILE}")))
+"""Names of the bundled robots."""
+FILE_ENDINGS = (".urdf", ".xacro", ".xml")
 MESH_FILE = "meshes.npz"
 
 

@@ -22,7 +22,6 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, check_name
 from robotdiffuse.core.types import Mask, Points, Poses, Spheres
-from robotdiffuse.robots import FILE_ENDINGS, ROBOTS
 from robotdiffuse.robots.bodies import Surface
 from robotdiffuse.robots.fitting.convex_parts import PartSettings, convex_parts
 from robotdiffuse.robots.fitting.sampled_links import Links, joint_table
@@ -51,7 +50,13 @@ from robotdiffuse.robots.kinematics import reach
 from robotdiffuse.robots.parsing.srdf import read_srdf, srdf_beside
 from robotdiffuse.robots.parsing.urdf import UrdfTree, read_limits, with_limits
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.robots.robot_folder import read_robot_folder, user_robots, write_robot_folder
+from robotdiffuse.robots.robot_folder import (
+    FILE_ENDINGS,
+    ROBOTS,
+    read_robot_folder,
+    user_robots,
+    write_robot_folder,
+)
 
 JOINT_SAMPLES = 9
 """Number of values of the joint between two links at which points are tested."""
