@@ -18,7 +18,7 @@ float32 numbers near 1 m."""
 # Smallest limit of a joint's velocity, acceleration or jerk, and largest value of these rates, in SI units.
 MIN_RATE = 1e-6
 MAX_RATE = 1e6
-MAX_ANGLE = 6.3
+MAX_RPY = 6.3
 """Largest absolute value of roll, pitch and yaw, a whole turn [rad]; larger values are likely degrees."""
 MAX_DURATION = 1e6
 """Longest motion in files and requests [s]."""

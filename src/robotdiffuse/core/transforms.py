@@ -8,7 +8,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import MAX_ANGLE, unit_quaternion, vector
+from robotdiffuse.core.bounds import MAX_RPY, unit_quaternion, vector
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Points, Pose, Rotation, Spheres, Vector
 
@@ -117,7 +117,7 @@ def pose(xyz: ArrayLike, *, wxyz: ArrayLike | None = None, rpy: ArrayLike | None
     if wxyz is not None:
         rotation = rotation_from_quaternion(unit_quaternion("pose", wxyz))
     if rpy is not None:
-        rotation = rotation_from_rpy(*vector("pose", "rpy [rad]", rpy, 3, MAX_ANGLE))
+        rotation = rotation_from_rpy(*vector("pose", "rpy [rad]", rpy, 3, MAX_RPY))
     return transform(vector("pose", "xyz", xyz, 3), rotation)
 
 

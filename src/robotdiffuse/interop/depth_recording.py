@@ -36,7 +36,7 @@ from robotdiffuse.interop.ros2 import (
     opened_recording,
     to_plain,
 )
-from robotdiffuse.perception.depth_view import NO_RETURN, DepthView
+from robotdiffuse.perception.depth_view import INTEGER_NO_RETURN, DepthView
 from robotdiffuse.robots.robot import Robot
 
 IMAGE = "sensor_msgs/msg/Image"
@@ -260,7 +260,7 @@ def _depth(where: str, image: Any, unit: float | None) -> Float[ndarray, "h w"]:
     pixels = np.ascontiguousarray(rows[:, :size]).view((">" if image.is_bigendian else "<") + kind)
     if unit is not None and kind == "u2":
         scale = unit
-    return scale * np.where(kind == "u2" and (pixels == NO_RETURN), 0, pixels).astype(np.float32)
+    return scale * np.where(kind == "u2" and (pixels == INTEGER_NO_RETURN), 0, pixels).astype(np.float32)
 
 
 def around(history: list[tuple[float, Any]], stamp: float) -> tuple[Any, Any, float] | None:

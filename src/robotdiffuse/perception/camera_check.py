@@ -20,7 +20,7 @@ SAME_DEPTH = 0.03
 SPHERES_AHEAD = 0.01
 """How far the arm's covering spheres are in front of its surface, approximately [m]."""
 NOTHING = Scene(())
-MIN_FOCAL_LENGTH = 0.05
+MIN_FOCAL_FRACTION = 0.05
 """Smallest focal length, as a fraction of the image's width and height: such an image spans 169 degrees."""
 MAX_INTRINSICS = 100.0
 """Largest intrinsics, as fractions of the image's width and height."""
@@ -63,10 +63,10 @@ def agreement(view: DepthView, robot: Robot, q: Configuration) -> tuple[float, f
 
 
 def implausible(view: DepthView) -> str:
-    """What is wrong with the units of an image or of its intrinsics, whatever it shows; "" if nothing is."""
+    """A message if the units of an image or its intrinsics cannot be right, of any scene; "" otherwise."""
     height, width = view.depth.shape
     relative = np.abs(view.intrinsics) / (width, height, width, height)
-    if view.cloud is None and (relative[:2].min() < MIN_FOCAL_LENGTH or relative.max() > MAX_INTRINSICS):
+    if view.cloud is None and (relative[:2].min() < MIN_FOCAL_FRACTION or relative.max() > MAX_INTRINSICS):
         return f"its intrinsics, {shown(view.intrinsics)}, do not fit an image of {width} x {height} pixels"
     returns = view.depth[np.isfinite(view.depth) & (view.depth > 0)]
     middle = np.median(returns) if len(returns) else 0.0

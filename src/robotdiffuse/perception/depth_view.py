@@ -31,7 +31,7 @@ from robotdiffuse.core.transforms import placed
 from robotdiffuse.core.types import Configuration, Points, Pose
 from robotdiffuse.scenes.shapes import PointCloud
 
-NO_RETURN = 65535
+INTEGER_NO_RETURN = 65535
 """Integer depths of this value, the largest of 16 bits, mean "no return"."""
 MIN_FOCAL_LENGTH = 1e-3
 """Minimum focal length [pixels]: smaller values underflow in float32, or are meaningless."""

@@ -23,7 +23,7 @@ from robotdiffuse.core.bounds import numbers, positive, unit_quaternion, vector
 from robotdiffuse.core.errors import InputError, located, needs, reading, shown, unknown_name
 from robotdiffuse.core.input_files import input_file, read_array, read_arrays, read_json, read_yaml
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
-from robotdiffuse.perception.depth_view import INTRINSICS, NO_RETURN, DepthNoise, DepthView
+from robotdiffuse.perception.depth_view import INTEGER_NO_RETURN, INTRINSICS, DepthNoise, DepthView
 from robotdiffuse.scenes.files import check_fields, name_from
 from robotdiffuse.scenes.point_cloud import read_points
 
@@ -39,8 +39,7 @@ def read_depth(file: str | Path, scale: float | None = None) -> Float[ndarray, "
     """A depth image [m] from a 16 bit .png, a .npy, a .npz (its array `depth`, or its only array), or a .exr.
 
     scale: meters per unit; None: 0.001 for integers, 1 for floating-point numbers. Integers of 65535 count as
-    0, "no return". Raises InputError for a
-    file that is missing or is not a depth image.
+    0, "no return". Raises InputError for a file that is missing or is not a depth image.
     """
     file = Path(file)
     read = _READERS.get(file.suffix.lower())
@@ -57,12 +56,11 @@ def read_depth(file: str | Path, scale: float | None = None) -> Float[ndarray, "
         raise InputError(
             f"depth image {file} holds {image.dtype} of {form}; it must be numbers, height x width"
         )
-    whole = image.dtype.kind in "ui"
+    integers = image.dtype.kind in "ui"
     if scale is None:
-        scale = INTEGER_SCALE if whole else 1.0
-    return np.where(
-        whole & (image == NO_RETURN), 0.0, image.astype(np.float64) * positive("view", "scale", scale)
-    )
+        scale = INTEGER_SCALE if integers else 1.0
+    depth = image.astype(np.float64) * positive("view", "scale", scale)
+    return np.where(integers & (image == INTEGER_NO_RETURN), 0.0, depth)
 
 
 def _read_png(file: Path) -> ndarray:

@@ -397,8 +397,8 @@ def _pose_goals(
         rejected = rejected[distances(rejected) < distances(configurations[:1])]
     if len(rejected):
         meshes = _loaded("collision.exact_meshes").ExactCollision(robot, scene)
-        free = rejected[~meshes.collides(rejected)]
-        configurations = np.concatenate([free[:MAX_GRAZING_GOALS], configurations])
+        grazing = rejected[~meshes.collides(rejected)][:MAX_GRAZING_GOALS]
+        configurations = np.concatenate([grazing, configurations])
     if len(configurations):
         if note:
             context.note(note)

@@ -52,6 +52,7 @@ DATA = Path(__file__).parent / "data"
 ROBOTS = tuple(sorted(file.parent.name for file in DATA.glob(f"*/{ROBOT_FILE}")))
 """Names of the bundled robots."""
 FILE_ENDINGS = (".urdf", ".xacro", ".xml")
+"""Endings of robot descriptions: URDF, xacro and MuJoCo models."""
 MESH_FILE = "meshes.npz"
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import MAX_ANGLE, vector
+from robotdiffuse.core.bounds import MAX_RPY, vector
 from robotdiffuse.core.errors import InputError, check_name, located, shown, unknown_name
 from robotdiffuse.core.input_files import read_array
 from robotdiffuse.core.mesh_files import read_triangles
@@ -50,7 +50,7 @@ def check_fields(
     if "rpy" in data and "wxyz" in field_names:
         if "wxyz" in data:
             raise InputError(f"{where} has both wxyz and rpy; give one of them")
-        rpy = vector(where, "rpy [rad]", data["rpy"], 3, MAX_ANGLE)
+        rpy = vector(where, "rpy [rad]", data["rpy"], 3, MAX_RPY)
         data = {name: value for name, value in data.items() if name != "rpy"}
         data["wxyz"] = quaternion_from_rotation(rotation_from_rpy(*rpy)).tolist()
     for name in data:
